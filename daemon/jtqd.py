@@ -36,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtqd`."""
     result = argparse.ArgumentParser(
         prog="jtqd",
-        description="Estimate the torque of two harmonic-drive joints at 1 kHz, as a CANopen master, without torque sensor.",
+        description="Estimate the torque of one to four harmonic-drive joints, as a CANopen master, without torque sensor.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )

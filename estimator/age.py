@@ -1,7 +1,7 @@
 """How old an estimate is, and with what it is compared.
 
 Every path of an estimator passes g/(s+g): its group delay at low frequency is 1/g (`observer`). An estimate of method
-`fused` is as old as its torsion path, whose bandwidth is g_t, or of now where the link is tracked: its bandwidth is then
+`fused` is as old as its torsion path, whose bandwidth is g_t, or of now where the torsion is tracked: its bandwidth is then
 infinite, and its age 0. Every other one is as old as the motor path.
 
 Like is compared with like: the sensor through the same filter (`aligned`, and `reference_of` where samples may be
@@ -13,27 +13,27 @@ from __future__ import annotations
 from math import inf
 from typing import TYPE_CHECKING
 
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Joint, Tracking
 from jtqd.estimator.settings import EstimatorSettings
 
 if TYPE_CHECKING:
     from jtqd.estimator.arrays import FloatArray
 
 
-def tracking_rad_s(joint: Joint, settings: EstimatorSettings) -> float:
-    """Return the rate at which a joint's link encoder is tracked; 0: it is not.
+def tracking_of(joint: Joint, settings: EstimatorSettings) -> Tracking | None:
+    """Return how a joint's torsion is tracked; None: it is not, and has a low pass.
 
     It is where the settings want it and the joint file says what it adds to sigma.
     """
-    fused = joint.fused if settings.method == "fused" and settings.track_link else None
-    if fused is None or fused.torsion is None or fused.tracking is None:
-        return 0.0
-    return fused.tracking.rate_rad_s
+    fused = joint.fused if settings.method == "fused" and settings.track_torsion else None
+    if fused is None or fused.torsion is None or fused.tracking is None or fused.tracking.wave_rad_s is None:
+        return None
+    return fused.tracking
 
 
 def bandwidth_of(joint: Joint, settings: EstimatorSettings) -> float:
     """Return the bandwidth of a joint's estimate [rad/s]; infinite for an estimate of now."""
-    if tracking_rad_s(joint, settings):
+    if tracking_of(joint, settings) is not None:
         return inf
     if settings.method == "fused" and joint.fused is not None and joint.fused.torsion is not None:
         return settings.own_torsion_bandwidth_rad_s

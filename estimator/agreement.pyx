@@ -109,7 +109,7 @@ def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, to
     restart_agreement(&s)
     found = []
     for k in range(x.shape[0]):
-        if completes(&zeros, x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5]):
+        if completes(&zeros, x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5] - law.spread_nm):
             dt = zeros.block.dt
             # nothing was taken off what is seen here: `update_zeros` expects that it was
             zeros.block.y += law.stiffness * zeros.link_rad * zeros.block.samples

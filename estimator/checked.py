@@ -6,6 +6,7 @@ Every message names the file, the key, what was found and what was expected. Who
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 import reprlib
@@ -271,7 +272,7 @@ def _whole(text: str, low: int) -> int:
     return value
 
 
-# Where results go: looked at before the work for them.
+# What a command needs and where its results go: looked at before the work.
 
 
 def check_output(path: Path) -> None:
@@ -297,6 +298,14 @@ def make_directory(path: Path) -> None:
         raise ConfigError(
             f"--out {path}: files cannot be created there: no right to, or a read-only file system"
         )
+
+
+def check_installed(extra: str, *packages: str) -> None:
+    """Raise ConfigError unless the packages are installed, import names of what an extra of pyproject.toml brings."""
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        raise ConfigError(f"{', '.join(missing)} {verb} not installed: pip install 'jtqd[{extra}]'")
 
 
 # Words of messages, and numbers of JSON.

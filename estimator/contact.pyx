@@ -4,7 +4,7 @@ Link side of one joint, own frame; neither current nor friction is in it. k: sam
 
     tau     = torsion, unfiltered: young + K (d - d_f) + D (d' - d_f')    d_f: d through the torsion's own filter g_t
     rate    = g_t K (d - d_f)                                             tau' through g_t/(s + g_t)
-              K d_f'                                                      where the link is tracked, as is d_f
+              K d_f'                                                      where the torsion is tracked, as is d_f
     p_k     = J (q_k - q_(k-1))/T                                         momentum of the link over a step
     load    = tau_(k-1) - (p_k - p_(k-1))/T                               what the joint hands on to what is beyond its link
 
@@ -29,7 +29,7 @@ from jtqd.estimator.observer cimport FusedObserved, GuardLaw, GuardState
 from jtqd.estimator.sample cimport Sample
 from jtqd.estimator.zeros cimport local_stiffness
 
-from jtqd.estimator.age import tracking_rad_s
+from jtqd.estimator.age import tracking_of
 from jtqd.estimator.sample import columns
 from jtqd.estimator.status import CONTACT_CODES
 
@@ -94,7 +94,7 @@ cdef void follow_link(
     if observer.tracking > 0.0:
         out.rate_nm_s = stiffness * now.d_rate
         if s.samples >= 1:
-            torque += law.damping * (now.track.velocity - step)
+            torque += law.damping * (now.d_moved - now.d_rate)
     else:
         out.rate_nm_s = observer.torsion_rate * stiffness * behind
         if s.samples >= 1:
@@ -250,7 +250,7 @@ def link_loads(joint, settings, dt_s, current_a, motor_position_rad, motor_veloc
         settings.bandwidth_rad_s,
         settings.link_bandwidth_rad_s,
         settings.own_torsion_bandwidth_rad_s,
-        tracking_rad_s(joint, settings),
+        tracking_of(joint, settings),
     )
     fill_link(&link, joint, joint.fused.torsion)
     restart_guard(&guarded)

@@ -57,7 +57,7 @@ cdef struct FusedLaw:
     double tracking_noise, tracking_viscous
     double physics_scale[4]
     double network_scale[4]
-    double stand_share, stand_floor, limit, network_limit, fade, inverse_fade
+    double stand_share, stand_floor, stand_sigmas, limit, network_limit, fade, inverse_fade
 
 cdef struct FusedState:
     GuardState guard
@@ -77,6 +77,9 @@ cdef class FusedEstimator(Estimator):
     ) noexcept nogil
     cdef bint left_behind(self) noexcept nogil
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil
+    cdef double half_interval(
+        self, const FusedObserved *seen, const Fused *physics, double half, double more, double sigma
+    ) noexcept nogil
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 
 cdef class ExtendedEstimator(Estimator):

@@ -22,7 +22,17 @@ from jtqd.estimator.agreement cimport (
 )
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
-from jtqd.estimator.fusion cimport Fused, fill_fusion, fuse_paths, keep, share_by_speed, widening
+from jtqd.estimator.fusion cimport (
+    Fused,
+    Rest,
+    at_rest,
+    fill_fusion,
+    fuse_paths,
+    keep,
+    share_by_speed,
+    sharpen,
+    widening,
+)
 from jtqd.estimator.losses cimport (
     AdditiveLaw,
     AdditiveLossModel,
@@ -60,6 +70,7 @@ from jtqd.estimator.zeros cimport (
     completes,
     drop_block,
     fill_zeros,
+    known_nm2,
     left_behind_nm,
     local_stiffness,
     restart_zeros,
@@ -74,7 +85,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator import status as st
-from jtqd.estimator.age import tracking_rad_s
+from jtqd.estimator.age import tracking_of
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.fusion import FOREIGN_SIGMAS
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, checked_network, native_of
@@ -84,7 +95,10 @@ from jtqd.estimator.validity import FADE_START
 from jtqd.estimator.learned import APART, LEFT
 
 STANDSTILL_SIGMAS: Final = 3.0
-"""Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open."""
+"""Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open.
+
+Of a joint file with section `fused.standstill` only of what the disagreement of the paths adds.
+"""
 
 LOWERED_S: Final = 0.1
 """So long the status stays lowered after the two paths have disagreed: it must not flicker."""
@@ -283,7 +297,7 @@ cdef class FusedEstimator(Estimator):
             settings.bandwidth_rad_s,
             settings.link_bandwidth_rad_s,
             settings.own_torsion_bandwidth_rad_s,
-            tracking_rad_s(joint, settings),
+            tracking_of(joint, settings),
         )
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
@@ -297,11 +311,13 @@ cdef class FusedEstimator(Estimator):
         fill_zeros(&self.law.zeros, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, watched)
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
-        network_scale = fused.sigma.scale if network is None else network.sigma_scale
+        physics_scale = fused.zeros.scale if self.law.zeros.spread > 0.0 else fused.sigma.scale
+        network_scale = physics_scale if network is None else network.sigma_scale
         for k in range(4):
-            self.law.physics_scale[k], self.law.network_scale[k] = fused.sigma.scale[k], network_scale[k]
+            self.law.physics_scale[k], self.law.network_scale[k] = physics_scale[k], network_scale[k]
         self.law.stand_share = 1.0 + settings.friction_uncertainty
         self.law.stand_floor = settings.sigma_floor * joint.rated_torque_nm
+        self.law.stand_sigmas = 0.0 if fused.standstill is None else fused.standstill.sigmas
         self.law.limit = settings.torque_limit * joint.rated_torque_nm
         self.law.network_limit = settings.network_limit * joint.rated_torque_nm
         self.law.fade = FADE_START * self.law.network_limit
@@ -425,10 +441,11 @@ cdef class FusedEstimator(Estimator):
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm, dt, innovation
+        cdef double noise = physics.variance - law.zeros.spread_nm  # the day's zero is a state, no noise
         cdef Loss next
         if status != VALID:
             drop_block(&s.zeros)
-        elif completes(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, physics.variance):
+        elif completes(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, noise):
             dt = s.zeros.block.dt
             next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
             innovation = update_zeros(
@@ -460,7 +477,7 @@ cdef class FusedEstimator(Estimator):
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, weight = 0.0, correction, size, apart, doubt
+        cdef double scale, weight = 0.0, correction, size, apart, doubt = 0.0, known = 0.0
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics
@@ -473,6 +490,9 @@ cdef class FusedEstimator(Estimator):
         lowered = self.foreign(&physics, x.dt_s)
         if law.zeros.watched:
             self.learn(seen, x, &physics, loss.nm, out.status)
+        if law.zeros.spread > 0.0:
+            known = known_nm2(&law.zeros, &s.zeros)
+            sharpen(&physics, known)
         out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
@@ -507,14 +527,43 @@ cdef class FusedEstimator(Estimator):
             doubt = doubt_of(&s.agreement, physics.alpha, seen.torsion_nm)
             if lowers(&law.agreement, doubt, out.sigma_nm):
                 s.lowered_s, lowered = LOWERED, True
+            # a zero that was learned from views that disagree is as doubtful as they are
+            doubt += physics.alpha * physics.alpha * fmin(known, s.agreement.doubt)
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + doubt)
         if lowered:
             out.status = DEGRADED
         elif out.status == STANDSTILL:
-            out.sigma_nm = fmin(law.stand_share * loss.half + law.stand_floor, STANDSTILL_WIDTH * out.sigma_nm)
+            out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider * wider + doubt, out.sigma_nm)
         if law.tracked and out.status != STANDSTILL:  # measured in motion
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + law.tracking_noise + law.tracking_viscous * v * v)
         publish_within(out, law.limit)
+
+    cdef double half_interval(
+        self, const FusedObserved *seen, const Fused *physics, double half, double more, double sigma
+    ) noexcept nogil:
+        """Return half the interval of a standing joint [Nm], by friction or by the fusion, whichever is less.
+
+        half: of the friction interval; more: what the paths' disagreement adds to sigma^2; sigma: as in motion.
+        """
+        cdef const FusedLaw *law = &self.law
+        cdef double friction = law.stand_share * half + law.stand_floor, width
+        cdef Rest rest
+        if law.stand_sigmas == 0.0:
+            return fmin(friction, STANDSTILL_WIDTH * sigma)
+        rest = at_rest(
+            &law.fusion,
+            physics.alpha,
+            seen.raw_nm,
+            self.state.half,
+            seen.joint_velocity_rad_s,
+            seen.torsion_nm,
+            seen.open_nm,
+        )
+        width = law.stand_sigmas * rest.spread + rest.bound
+        if more > 0.0:
+            width = sqrt(width * width + STANDSTILL_WIDTH * STANDSTILL_WIDTH * more)
+        # the friction interval is about the current path, not about the value
+        return fmin(friction + fabs(physics.alpha * physics.apart), width)
 
     def run_observed(self, seen):
         """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`.
@@ -596,7 +645,7 @@ def observe_run(
         settings.bandwidth_rad_s,
         settings.link_bandwidth_rad_s,
         settings.own_torsion_bandwidth_rad_s,
-        tracking_rad_s(joint, settings),
+        tracking_of(joint, settings),
     )
     restart_guard(&guard)
     n = inputs.shape[1]

@@ -15,6 +15,15 @@ cdef Fused fuse_paths(
     const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
 ) noexcept nogil
 
+cdef void sharpen(Fused *fused, double known) noexcept nogil
+
+cdef struct Rest:
+    double spread, bound
+
+cdef Rest at_rest(
+    const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
+) noexcept nogil
+
 cdef double widening(const Fused *fused, double left_nm) noexcept nogil
 
 cdef class Fusion:

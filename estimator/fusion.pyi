@@ -9,6 +9,7 @@ HOLD_S: Final[float]
 DISAGREE_SIGMAS: Final[float]
 FOREIGN_SIGMAS: Final[float]
 GAUSS: Final[float]
+LEAST_TORSION: Final[float]
 
 def turning(velocity_rad_s: FloatArray) -> FloatArray: ...
 def held(half_nm: FloatArray, dt_s: FloatArray, running: BoolArray) -> FloatArray: ...
@@ -33,6 +34,15 @@ class Fusion:
         torsion_nm: FloatArray,
         open_nm: FloatArray | float = 0.0,
     ) -> tuple[FloatArray, FloatArray]: ...
+    def weigh_known(
+        self,
+        raw_nm: FloatArray,
+        half_nm: FloatArray,
+        velocity_rad_s: FloatArray,
+        torsion_nm: FloatArray,
+        open_nm: FloatArray | float,
+        known_nm2: FloatArray,
+    ) -> tuple[FloatArray, FloatArray]: ...
     def variance_many(
         self,
         raw_nm: FloatArray,
@@ -42,6 +52,14 @@ class Fusion:
         open_nm: FloatArray | float = 0.0,
     ) -> FloatArray: ...
     def weigh_many(
+        self,
+        raw_nm: FloatArray,
+        half_nm: FloatArray,
+        velocity_rad_s: FloatArray,
+        torsion_nm: FloatArray,
+        open_nm: FloatArray | float = 0.0,
+    ) -> tuple[FloatArray, FloatArray]: ...
+    def rest_many(
         self,
         raw_nm: FloatArray,
         half_nm: FloatArray,

@@ -6,6 +6,8 @@
     s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2        half: what friction leaves open near v = 0
     s_t^2 = e^2 + (f tau_t)^2 + open^2     open: what the slip leaves open until its bounds have met
     sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2      reference: of the sensor of a comparison; 0 for the torque itself
+    at rest = k sd + alpha open + (1 - alpha) half      half the interval of a standing joint, k: `fused.standstill`; sd: as sigma,
+                                           without `half` and `open`, with the weight as it is
     widened by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)) where that is above 0
 
 Towards standstill `half` grows to the half width of the friction interval and the torsion takes over: continuous,
@@ -34,8 +36,12 @@ FOREIGN_SIGMAS: Final = 4.0
 GAUSS: Final = 1.6448536269514722
 """Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
 
+LEAST_TORSION: Final = 0.05
+"""Part of the torsion's variance that is left, whatever is known of its zero."""
+
 cdef double SLOW = SLOW_RAD_S, FAST = FAST_RAD_S, HOLD = HOLD_S
 cdef double DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS
+cdef double LEAST = LEAST_TORSION
 cdef double INVERSE_RANGE = 1.0 / (FAST_RAD_S - SLOW_RAD_S)
 
 
@@ -109,6 +115,32 @@ cdef Fused fuse_paths(
     return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t)
 
 
+cdef void sharpen(Fused *fused, double known) noexcept nogil:
+    """Weigh anew with a torsion whose variance is less by `known` [Nm^2]; `variance` stays that of the file.
+
+    For a reference of 0.
+    """
+    cdef double c = fused.alpha * fused.variance, t = fused.variance - c, alpha
+    t = fmax(t - known, LEAST * t)
+    alpha = c / (c + t)
+    fused.value += (alpha - fused.alpha) * fused.apart
+    fused.alpha, fused.sigma = alpha, sqrt(alpha * t)
+
+
+cdef Rest at_rest(
+    const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
+) noexcept nogil:
+    """Return standard deviation and bound [Nm] of the fused value of a standing joint.
+
+    What friction and slip leave open is no error that is small on most days: a push from outside changes the torque and not
+    the current, and a joint may have stopped at the end of its hysteresis. Both are bounds, counted by their weights.
+    """
+    cdef double rest = 1.0 - alpha
+    cdef double c = law.current + law.viscous * v * v + law.load * raw * raw
+    cdef double t = law.torsion + law.torsion_load * torsion * torsion if law.with_torsion else 0.0
+    return Rest(sqrt(alpha * alpha * t + rest * rest * c + law.reference), alpha * open_nm + rest * half)
+
+
 cdef double widening(const Fused *fused, double left_nm) noexcept nogil:
     """Return what a disagreement of the paths adds to sigma [Nm]; left_nm: known zero of the torsion that is not taken off.
 
@@ -158,6 +190,36 @@ cdef class Fusion:
     def variance_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
         """Return the variance of the difference of the two paths [n], Nm^2."""
         return self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)[3]
+
+    def weigh_known(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, known_nm2):
+        """Return the same as `weigh_many` where known_nm2 [n] of the torsion's variance is known: `sharpen`."""
+        alpha, _, sigma, variance = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        known = np.ascontiguousarray(known_nm2, np.float64)
+        cdef double[::1] share = alpha
+        cdef double[::1] spread = sigma
+        cdef const double[::1] whole = variance
+        cdef const double[::1] less = known
+        cdef Fused fused
+        cdef Py_ssize_t k
+        for k in range(share.shape[0]):
+            fused = Fused(share[k], 0.0, 0.0, 0.0, whole[k])
+            sharpen(&fused, less[k])
+            share[k], spread[k] = fused.alpha, sqrt(fused.sigma * fused.sigma + self.law.reference)
+        return alpha, sigma
+
+    def rest_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
+        """Return (standard deviation, bound) [Nm] of the value of a standing joint, arrays [n]."""
+        alpha = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)[0]
+        columns = (alpha, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        cdef const double[:, ::1] x = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
+        out = np.empty((2, x.shape[1]))
+        cdef double[:, ::1] to = out
+        cdef Rest rest
+        cdef Py_ssize_t k
+        for k in range(x.shape[1]):
+            rest = at_rest(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+            to[0, k], to[1, k] = rest.spread, rest.bound
+        return out[0], out[1]
 
     def _run(self, *columns):
         laid = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)

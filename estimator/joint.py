@@ -228,19 +228,52 @@ class Agreement:
 
 
 @dataclass(frozen=True, slots=True)
-class Tracking:
-    """How the link encoder is tracked where the configuration has `track_link`, and what that adds to sigma, as squares.
+class DayZeros:
+    """How far the zero of the link encoder differs from day to day, where `track_zeros` can learn it: zeros.pyx.
 
-    rate_rad_s: of the tracking filter: larger is noisier and follows quicker (observer.tracked); sigma_nm,
-    viscous_nms_per_rad |v|: of what is quicker than the motor path, found on runs that the fit had not seen.
+    spread_rad: standard deviation over the days of the fit; spread_nm: its part of sigma.torsion_nm, which what is learned
+    takes away again; scale: in place of sigma.scale where zeros are tracked.
+    """
+
+    spread_rad: Annotated[float, limits("rad", gt=0.0)]
+    spread_nm: Annotated[float, limits("Nm", gt=0.0)]
+    scale: Annotated[tuple[float, float, float, float], limits()]
+
+    def __post_init__(self) -> None:
+        check(self, "fused.zeros")
+        if not min(self.scale) > 0.0:
+            raise FieldError("fused.zeros", "scale", list(self.scale), "4 numbers > 0")
+
+
+@dataclass(frozen=True, slots=True)
+class Tracking:
+    """How the torsion is tracked where the configuration has `track_torsion`, and what that adds to sigma, as squares.
+
+    rate_rad_s, wave_rad_s: of the tracking filter: larger is noisier and follows quicker (observer.tracked); sigma_nm,
+    viscous_nms_per_rad |v|: of what is quicker than the motor path, found on runs that the fit had not seen. Without
+    wave_rad_s the section is of a filter that there no longer is, and counts for nothing.
     """
 
     rate_rad_s: Annotated[float, limits("rad/s", ge=10.0, le=5000.0)]
     sigma_nm: Annotated[float, limits("Nm", ge=0.0)]
     viscous_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)]
+    wave_rad_s: Annotated[float, limits("rad/s", ge=0.0, le=5000.0)] | None = None
 
     def __post_init__(self) -> None:
         check(self, "fused.tracking")
+
+
+@dataclass(frozen=True, slots=True)
+class Standstill:
+    """Half width of the interval of a standing joint in standard deviations, besides what friction and slip leave open.
+
+    Found on runs that the fit had not seen (`jtq fit losses`). Definition: fusion.pyx.
+    """
+
+    sigmas: Annotated[float, limits(gt=0.0, le=100.0)]
+
+    def __post_init__(self) -> None:
+        check(self, "fused.standstill")
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,7 +281,8 @@ class Fused:
     """Section `fused` of a joint file; torsion None: a joint whose link encoder says nothing about torque.
 
     agreement: of the two paths on runs that the fit had not seen. envelope: what the runs of the fit covered; outside of it
-    the status is degraded. tracking: of the link encoder. None: nothing is known of that.
+    the status is degraded. tracking: of the torsion. zeros: of the days. standstill: of the interval at rest. None: nothing
+    is known of that.
     """
 
     loss: AdditiveLoss
@@ -257,6 +291,13 @@ class Fused:
     agreement: Agreement | None = None
     envelope: Envelope | None = None
     tracking: Tracking | None = None
+    zeros: DayZeros | None = None
+    standstill: Standstill | None = None
+
+    def __post_init__(self) -> None:
+        if self.zeros is not None and not self.zeros.spread_nm < self.sigma.torsion_nm:
+            expected = f"less than sigma.torsion_nm ({self.sigma.torsion_nm:g} Nm), of which it is a part"
+            raise FieldError("fused.zeros", "spread_nm", self.zeros.spread_nm, expected)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists, as `Joint.to_mapping`."""

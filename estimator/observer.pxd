@@ -41,14 +41,15 @@ cdef struct Slip:
 cdef struct Bounds:  # of a slip's z
     double low, high
 
-cdef struct LinkTrack:  # of the link encoder: position, velocity, acceleration as the filter knows them
-    double position, velocity, acceleration
+cdef struct TorsionTrack:  # d = level + wave; quarter: the wave a quarter of its turn ago; pij: covariance, noise of d is 1
+    double level, rate, wave, quarter
+    double p00, p01, p02, p03, p11, p12, p13, p22, p23, p33
 
 cdef struct FusedObserverLaw:
     double gear, inverse_gear, kt, inertia_rate, rate, link_rate
     bint apart  # the torsion has a filter of its own
     double torsion_rate, torsion_share  # share: rate/torsion_rate
-    double tracking  # rate of the link's tracking filter; 0: the torsion has a low pass instead
+    double tracking, tracking_wave  # rates of the torsion's tracking filter; 0: the torsion has a low pass instead
     double stiffness, cubic, zero, damping, torsion_limit
     Wave two, four  # kinematic error at the ripple orders, which costs no further cos and sin
     int others, link_waves, hardenings, slips
@@ -63,8 +64,8 @@ cdef struct FusedObserverState:
     double torsion, torsion_z  # of the torsion's own filter, and through the rest of the motor path's
     Bounds bounds[MOST_SLIPS]
     double link, link_velocity
-    LinkTrack track
-    double d_rate  # of the deflection, where the link is tracked
+    TorsionTrack track
+    double d_rate, d_moved  # of the deflection, where it is tracked: the filter's rate, and over the step as read
 
 cdef struct GuardLaw:
     double max_gap, stop, leave, raw_limit
@@ -81,7 +82,7 @@ cdef int fill_fused_observer(
     double bandwidth,
     double link_bandwidth,
     double torsion_bandwidth,
-    double tracking
+    tracking
 ) except -1
 cdef void restart_reference(Reference *r) noexcept nogil
 cdef double follow_reference(Reference *r, double rate, double max_gap, double dt, double now) noexcept nogil

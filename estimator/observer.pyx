@@ -48,6 +48,9 @@ LINK_SPEED_LIMIT_RAD_S: Final = 1e3
 RIPPLE_ORDERS: Final = (2, 4)
 """Per motor revolution: twice the wave generator's turn, and its first harmonic."""
 
+TRACKED_FADE_S: Final = 0.2
+"""Within which the wave of the torsion's tracking filter is forgotten; chosen with its rates, docs/estimator.md."""
+
 cdef double LINK_SPEED_LIMIT = LINK_SPEED_LIMIT_RAD_S
 cdef int STARTING = st.STARTING, VALID = st.VALID, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
 
@@ -306,51 +309,113 @@ cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil
     return to
 
 
-cdef void _start_track(LinkTrack *t, double q, double v) noexcept nogil:
-    """Set the filter to a link that has always moved at this speed."""
-    t.position, t.velocity, t.acceleration = q, v, 0.0
+cdef double FADE_S = TRACKED_FADE_S
+cdef int WAVE_ORDER = RIPPLE_ORDERS[0]
 
 
-cdef inline double _track(LinkTrack *t, double fade, double dt, double q) noexcept nogil:
-    """Take a reading q of the link encoder, dt after the one before; return what of it is taken for noise [rad].
+cdef void _start_track(TorsionTrack *t, double ramp, double d) noexcept nogil:
+    """Set the filter to a torsion that was read once and does not change."""
+    t.level = d
+    t.rate = t.wave = t.quarter = 0.0
+    t.p00 = t.p22 = t.p33 = 1.0
+    t.p11 = ramp * ramp
+    t.p01 = t.p02 = t.p03 = t.p12 = t.p13 = t.p23 = 0.0
 
-    Least squares on a parabola whose past fades by `fade`, 1 - exp(-rate dt), from sample to sample (Morrison 1969: fading-memory polynomial of degree 2):
-    no lag at any constant acceleration.
+
+cdef inline double _track(
+    TorsionTrack *t, double ramp, double wave, double dt, double c, double s, double d
+) noexcept nogil:
+    """Take a deflection d as read, dt after the one before; return it without what is noise.
+
+    Kalman filter of a level with a rate and of a wave over the motor's angle, whose phase moved by atan2(s, c) in this step;
+    the rate of the level and the wave are random walks, the wave fades within TRACKED_FADE_S (bounded at rest, where wave
+    and level look alike). Only ratios of variances count: noise of a reading 1, of the rate (ramp dt)^4/dt^2, of the wave
+    (wave dt)^2 a step, so `ramp` and `wave` are about the rates [rad/s] at which it follows them.
     """
-    cdef double m = 1.0 - fade
-    cdef double off
-    t.position += dt * (t.velocity + 0.5 * dt * t.acceleration)
-    t.velocity += dt * t.acceleration
-    off = q - t.position
-    t.position += (1.0 - m * m * m) * off
-    off *= fade * fade / dt
-    t.velocity += 1.5 * (1.0 + m) * off
-    t.acceleration += fade / dt * off
-    return q - t.position
+    cdef double g = FADE_S / (FADE_S + dt)
+    cdef double x = ramp * dt, y = wave * dt
+    cdef double a, b, h0, h1, h2, h3, e
+    c *= g
+    s *= g
+    # the step before: state, then covariance, blocks (level, rate), cross, (wave, quarter)
+    t.level += dt * t.rate
+    a = t.wave
+    t.wave = c * a - s * t.quarter
+    t.quarter = s * a + c * t.quarter
+    t.p00 += dt * (2.0 * t.p01 + dt * t.p11)
+    t.p01 += dt * t.p11
+    t.p11 += x * x * ramp * ramp
+    a, b = t.p02 + dt * t.p12, t.p03 + dt * t.p13
+    t.p02, t.p03 = c * a - s * b, s * a + c * b
+    a, b = t.p12, t.p13
+    t.p12, t.p13 = c * a - s * b, s * a + c * b
+    a, b, e = t.p22, t.p23, t.p33
+    h0 = 2.0 * c * s * b
+    t.p22 = c * c * a - h0 + s * s * e + y * y
+    t.p33 = s * s * a + h0 + c * c * e + y * y
+    t.p23 = c * s * (a - e) + (c * c - s * s) * b
+    # the reading
+    h0, h1, h2, h3 = t.p00 + t.p02, t.p01 + t.p12, t.p02 + t.p22, t.p03 + t.p23
+    a = 1.0 / (h0 + h2 + 1.0)
+    e = (d - t.level - t.wave) * a
+    t.level += h0 * e
+    t.rate += h1 * e
+    t.wave += h2 * e
+    t.quarter += h3 * e
+    b = a * h0
+    t.p00 -= b * h0
+    t.p01 -= b * h1
+    t.p02 -= b * h2
+    t.p03 -= b * h3
+    b = a * h1
+    t.p11 -= b * h1
+    t.p12 -= b * h2
+    t.p13 -= b * h3
+    b = a * h2
+    t.p22 -= b * h2
+    t.p23 -= b * h3
+    t.p33 -= a * h3 * h3
+    return t.level + t.wave
 
 
-def tracked(position_rad, dt_s, double rate_rad_s, double max_gap_s=0.05):
-    """Return (noise [n], velocity [n]) of an encoder's positions [n]: reading less its tracking filter's, and the filter's.
+cdef inline double _track_rate(const TorsionTrack *t, double motor_velocity) noexcept nogil:
+    """Return the rate of what the filter follows [rad/s]; motor_velocity [rad/s] turns the wave."""
+    return t.rate - WAVE_ORDER * motor_velocity * t.quarter
 
-    dt_s [n]: step that ends at the sample; after one that is none, or longer than max_gap_s, the filter starts again, at rest.
+
+def tracked(
+    deflection_rad, motor_position_rad, motor_velocity_rad_s, dt_s, double rate_rad_s, double wave_rad_s, max_gap_s=0.05
+):
+    """Return (deflection [n], rate [n]) of torsion angles as read [n], through the tracking filter.
+
+    dt_s [n]: step that ends at the sample; after one that is none, or longer than max_gap_s, the filter starts again.
     Raises ValueError for arrays of different length.
     """
-    cdef const double[::1] q = np.ascontiguousarray(position_rad, np.float64)
-    cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
-    noise, velocity = np.zeros(len(q)), np.zeros(len(q))
-    cdef double[::1] e = noise
-    cdef double[::1] v = velocity
-    cdef LinkTrack t = LinkTrack(0.0, 0.0, 0.0)
+    rows = [np.asarray(each, np.float64) for each in (deflection_rad, motor_position_rad, motor_velocity_rad_s, dt_s)]
+    if len({len(each) for each in rows}) != 1:
+        found = ", ".join(str(len(each)) for each in rows)
+        raise ValueError(f"found {found} deflections, positions, velocities and steps, expected as many")
+    d, rate = rows[0].copy(), np.zeros(len(rows[0]))
+    angle = WAVE_ORDER * rows[1]
+    cdef const double[::1] x = np.ascontiguousarray(rows[0])
+    cdef const double[::1] c = np.cos(angle)
+    cdef const double[::1] s = np.sin(angle)
+    cdef const double[::1] w = np.ascontiguousarray(rows[2])
+    cdef const double[::1] dt = np.ascontiguousarray(rows[3])
+    cdef double[::1] to = d
+    cdef double[::1] v = rate
+    cdef double gap = max_gap_s
+    cdef TorsionTrack t
     cdef Py_ssize_t k
-    if q.shape[0] != dt.shape[0]:
-        raise ValueError(f"found {q.shape[0]} positions and {dt.shape[0]} steps, expected as many")
-    for k in range(q.shape[0]):
-        if k > 0 and 0.0 < dt[k] <= max_gap_s:
-            e[k] = _track(&t, -expm1(-rate_rad_s * dt[k]), dt[k], q[k])
+    for k in range(x.shape[0]):
+        if k > 0 and 0.0 < dt[k] <= gap:
+            to[k] = _track(
+                &t, rate_rad_s, wave_rad_s, dt[k], c[k] * c[k - 1] + s[k] * s[k - 1], s[k] * c[k - 1] - c[k] * s[k - 1], x[k]
+            )
+            v[k] = _track_rate(&t, w[k])
         else:
-            _start_track(&t, q[k], 0.0)
-        v[k] = t.velocity
-    return noise, velocity
+            _start_track(&t, rate_rad_s, x[k])
+    return d, rate
 
 
 cdef void _torsion(
@@ -373,7 +438,7 @@ cdef void _torsion(
 cdef void _age(const FusedObserverLaw *law, FusedObserverState *s, const Hold *h, FusedObserved *out) noexcept nogil:
     """Make the torsion as old as the motor path, and set by how much the young one is ahead of it.
 
-    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring. With the link
+    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring. With the torsion
     tracked the young one is of now: r = 0.
     """
     cdef double young = out.torsion_nm
@@ -440,7 +505,8 @@ cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const
     s.link_velocity = s.z.v
     s.d = s.z.d
     s.d_rate = 0.0
-    _start_track(&s.track, x.link_position_rad, s.z.v)
+    s.d_moved = 0.0
+    _start_track(&s.track, law.tracking, s.z.d)
     _torsion(law, s, s.z.d, 0.0, out)
     s.torsion = s.torsion_z = out.torsion_nm
     out.ahead_nm = 0.0
@@ -455,11 +521,19 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     s.z.u = _filtered(&h, s.z.u, now.u, s.last.u)
     s.z.v = _filtered(&h, s.z.v, now.v, s.last.v)
     cdef Hold own
-    cdef double damped, fade
+    cdef double damped
     if law.tracking > 0.0:
-        fade = h.gone if law.tracking == law.rate else -expm1(-law.tracking * x.dt_s)
-        s.z.d = now.d + _track(&s.track, fade, x.dt_s, x.link_position_rad)
-        s.d_rate = (now.d - s.last.d + x.link_position_rad - s.link) / x.dt_s - s.track.velocity
+        s.z.d = _track(
+            &s.track,
+            law.tracking,
+            law.tracking_wave,
+            x.dt_s,
+            now.cos2 * s.last.cos2 + now.sin2 * s.last.sin2,
+            now.sin2 * s.last.cos2 - now.cos2 * s.last.sin2,
+            now.d,
+        )
+        s.d_rate = _track_rate(&s.track, x.motor_velocity_rad_s)
+        s.d_moved = (now.d - s.last.d) / x.dt_s
         damped = law.damping * s.d_rate
     else:
         own = _hold(law.torsion_rate, x.dt_s) if law.apart else h
@@ -491,11 +565,13 @@ cdef int fill_fused_observer(
     double bandwidth,
     double link_bandwidth,
     double torsion_bandwidth,
-    double tracking
+    tracking
 ) except -1:
-    """Set the parameters from a joint file; torsion None: its torque is always 0; tracking: 0 for none."""
-    law.tracking = tracking if torsion is not None else 0.0
-    law.apart = torsion is not None and (torsion_bandwidth != bandwidth or tracking > 0.0)
+    """Set the parameters from a joint file; torsion None: its torque is always 0; tracking: None for none."""
+    law.tracking = law.tracking_wave = 0.0
+    if torsion is not None and tracking is not None:
+        law.tracking, law.tracking_wave = tracking.rate_rad_s, tracking.wave_rad_s
+    law.apart = torsion is not None and (torsion_bandwidth != bandwidth or law.tracking > 0.0)
     law.torsion_rate = torsion_bandwidth
     law.torsion_share = 0.0 if law.tracking > 0.0 else bandwidth / torsion_bandwidth
     law.gear = joint.gear_ratio
@@ -584,11 +660,11 @@ cdef class FusedObserver:
     g_t/(s+g_t). `torsion_nm` is then that torque through [g/(s+g)]/[g_t/(s+g_t)], as old as all the rest, and `ahead_nm`
     the young torque less it.
 
-    With the link tracked the deflection passes no filter: only what the tracking filter of the link encoder (`tracked`)
-    takes for noise is taken off it, and D d' has the filter's velocity. `torsion_nm` is that torque through g/(s+g).
+    With the torsion tracked, deflection and d' are those of a filter without lag (`tracked`), and `torsion_nm` is that torque
+    through g/(s+g).
 
-    torsion None: its torque is always 0. torsion_bandwidth_rad_s: g_t, None for g. tracking_rad_s: rate of the link's tracking
-    filter, 0 for none.
+    torsion None: its torque is always 0. torsion_bandwidth_rad_s: g_t, None for g. tracking: `joint.Tracking` with wave_rad_s,
+    None for the low pass.
     """
 
     def __init__(
@@ -598,11 +674,11 @@ cdef class FusedObserver:
         double bandwidth_rad_s,
         double link_bandwidth_rad_s,
         torsion_bandwidth_rad_s=None,
-        double tracking_rad_s=0.0,
+        tracking=None,
     ):
         own = bandwidth_rad_s if torsion_bandwidth_rad_s is None else torsion_bandwidth_rad_s
         fill_fused_observer(
-            &self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s, own, tracking_rad_s
+            &self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s, own, tracking
         )
 
     def start(

@@ -8,7 +8,7 @@ from typing import Annotated, Final
 from jtqd.estimator.decoder import FieldError, check, choice, limits
 
 TORSION_BANDWIDTH_RAD_S: Final = 800.0
-"""Of new configurations, and of what is fitted and scored here: chosen from a table, docs/estimator.md."""
+"""Of joints whose torsion is not tracked, in new configurations: chosen from a table, docs/estimator.md."""
 
 CONTACT_THRESHOLD: Final = 0.05
 """Torque from outside that is a contact, as a part of the rated torque."""
@@ -28,9 +28,9 @@ class EstimatorSettings:
     sigma_floor, torque_limit: parts of the rated torque (largest trusted difference between network and
     physics, sigma that nothing undercuts, largest believable torque); friction_uncertainty: standard
     deviation of friction as a part of it; load_uncertainty: of the classical observer, which knows no
-    efficiency, as a part of the load; track_zeros: of link encoder and current, method fused (`zeros`); track_link: a
-    tracking filter of the link encoder in place of the torsion's low pass, method fused, for joint files with
-    `fused.tracking` (`age`). Without these two keys as before there were such.
+    efficiency, as a part of the load; track_zeros: of link encoder and current, method fused (`zeros`); track_torsion: a
+    tracking filter, of now, in place of the torsion's low pass, method fused, for joint files with `fused.tracking`
+    (`age`). Without these two keys as before there were such.
     """
 
     method: Annotated[str, choice(METHODS)] = "network"
@@ -46,7 +46,7 @@ class EstimatorSettings:
     sigma_floor: Annotated[float, limits(ge=0.0, le=1.0)] = 0.005
     torque_limit: Annotated[float, limits(ge=1.0, le=10.0)] = 3.0
     track_zeros: bool = False
-    track_link: bool = False
+    track_torsion: bool = False
 
     def __post_init__(self) -> None:
         check(self, "estimator")
@@ -73,7 +73,9 @@ def recommended(method: str) -> EstimatorSettings:
     """Return the settings of a new configuration with this method. Raises ConfigError for an unknown one."""
     if method != "fused":
         return EstimatorSettings(method=method)
-    return EstimatorSettings(method=method, torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S, track_zeros=True)
+    return EstimatorSettings(
+        method=method, torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S, track_zeros=True, track_torsion=True
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,6 +16,7 @@ cdef struct ZerosLaw:
     double stiffness, torque_per_ampere, limit
     double floor  # variance of the link zero [rad^2] that the joint file's own sigma covers
     double known  # variance of the link zero [rad^2] below which it counts as learned
+    double spread, spread_nm  # variance of the link zero over the days [rad^2, Nm^2]; 0: the file does not say
 
 cdef struct Gathered:  # sums over the samples of a block
     double dt, y, direction, velocity, torsion, variance
@@ -40,6 +41,7 @@ cdef bint completes(
 ) noexcept nogil
 cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
 cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil
+cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef void tell_zeros(const ZerosLaw *law, const ZerosState *s, Learned *out) noexcept nogil

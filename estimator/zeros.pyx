@@ -22,6 +22,10 @@ ripple and errors of the encoders are not white.
 What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations (of the link zero: and of COVERED
 of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
 the estimate must not jump.
+
+Where the joint file says how far zeros differ from day to day (`fused.zeros`: S, and as a torque S_nm), at least the part
+k = S^2/(S^2 + sigma_x^2) of x is taken off, the mean of what is then known of the day's zero (Wiener), and what is known leaves the
+variance of the torsion in the fusion: s_t^2 - k S_nm^2, with S as large as before where nothing is known.
 """
 
 from libc.math cimport fabs, fmax, sqrt
@@ -99,6 +103,8 @@ cdef int fill_zeros(
     law.limit = torsion.zero_limit_rad
     law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
     law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
+    if law.used and fused.zeros is not None:
+        law.spread, law.spread_nm = fused.zeros.spread_rad**2, fused.zeros.spread_nm**2
     law.prior[0] = (LARGEST_LINK * rated_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
     law.prior[2] = sigma.current_nm**2 + (FRICTION_SHARE * constant) ** 2
@@ -156,9 +162,14 @@ cdef double local_stiffness(const FusedObserverLaw *law, double d) noexcept nogi
     return stiffness
 
 
-cdef double _used(double x, double variance) noexcept nogil:
-    """Return what is taken off of a zero x: firm shrinkage."""
-    cdef double w = (fabs(x) / sqrt(variance) - LOW) * INVERSE_RANGE
+cdef double _share(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
+    """Return the part of the day's link zero that is known, 0 to 1; 0 where the file does not say how far days differ."""
+    return law.spread / (law.spread + s.p[0][0]) if law.spread > 0.0 else 0.0
+
+
+cdef double _used(double x, double variance, double least) noexcept nogil:
+    """Return what is taken off of a zero x: firm shrinkage, and the part `least` of it in any case."""
+    cdef double w = fmax((fabs(x) / sqrt(variance) - LOW) * INVERSE_RANGE, least)
     if w >= 1.0:
         return x
     return x * w if w > 0.0 else 0.0
@@ -206,12 +217,46 @@ cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, d
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
-    s.link_rad += way * (_used(s.x[0], s.p[0][0] + law.floor) - s.link_rad)
-    s.current_a += way * (_used(s.x[1], s.p[1][1]) - s.current_a)
+    s.link_rad += way * (_used(s.x[0], s.p[0][0] + law.floor, _share(law, s)) - s.link_rad)
+    s.current_a += way * (_used(s.x[1], s.p[1][1], 0.0) - s.current_a)
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
     s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
     return innovation
+
+
+cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
+    """Return what the variance of the torsion [Nm^2] is less by what is known of the link zero, and already taken off."""
+    cdef double share = _share(law, s), late
+    if not share > 0.0:
+        return 0.0
+    late = law.stiffness * (_used(s.x[0], s.p[0][0] + law.floor, share) - s.link_rad)
+    return fmax(0.0, share * law.spread_nm - late * late)
+
+
+def followed(fused, rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness):
+    """Return (torsion, current, known): what tracked zeros add to both paths [Nm], and what they take off s_t^2 [Nm^2].
+
+    Arrays [n] of samples in motion, of a run from its start: apart_nm: torsion less current path; variance_nm2: of that;
+    slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring [Nm/rad].
+    """
+    columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness)
+    cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
+    out = np.zeros((3, x.shape[0]))
+    cdef double[:, ::1] to = out
+    cdef ZerosLaw law
+    cdef ZerosState s
+    cdef double link, current
+    cdef Py_ssize_t k
+    # the current zero counts as a torque: whatever a torque per ampere is, its part of the difference is the same
+    fill_zeros(&law, 1.0, rated_nm, fused, True, True)
+    restart_zeros(&law, &s)
+    for k in range(x.shape[0]):
+        link, current = x[k, 7] * s.link_rad, -(1.0 - x[k, 6]) * s.current_a
+        to[0, k], to[1, k], to[2, k] = link, current, known_nm2(&law, &s)
+        if completes(&s, x[k, 0], x[k, 1] + link - current, x[k, 2], x[k, 3], x[k, 4] + link, x[k, 5] - law.spread_nm):
+            update_zeros(&law, &s, x[k, 7], x[k, 6])
+    return tuple(out)
 
 
 cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil:

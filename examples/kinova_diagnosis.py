@@ -32,6 +32,8 @@ from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
 from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
+from jtqd.sysid.fit.few_runs import PRIOR
+from jtqd.sysid.fit.friction import effective_samples
 from jtqd.sysid.report import figures as parts
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
@@ -119,9 +121,15 @@ def run_lines(results: Sequence[Diagnosed]) -> list[str]:
 
 
 def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
-    """Return the error on each run of a regression fitted on the other: offset, Coulomb, viscous, inertia, load."""
+    """Return the error on each run of regressions fitted on the other: offset, Coulomb, viscous, inertia, load.
+
+    The ladder is least squares; "near the file" has the same terms with the priors of `sysid.fit.few_runs` about the file.
+    """
     runs = measured_runs()
-    lines = ["| joint | left out | ladder [Nm rms] | with the causes |", "|---|---|---|---|"]
+    lines = [
+        "| joint | left out | ladder [Nm rms] | near the file | with the causes |",
+        "|---|---|---|---|---|",
+    ]
     for one in results:
         checked = check_runs([(r.name, only(r, one.number).table) for r in runs], {one.number: one.joint})
         signals, _ = usable_signals(checked.runs, {one.number: one.joint}, (one.number,))
@@ -132,11 +140,85 @@ def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
         after = {} if one.findings.gain is None else {g.run: g.rmse_after_nm for g in one.findings.gain.runs}
         for (x, y, name), (fitted_x, fitted_y, _) in zip(parts, parts[::-1], strict=True):
             size = np.sqrt(np.mean(fitted_x**2, axis=0))
-            found = np.linalg.lstsq(fitted_x / size, fitted_y, rcond=1e-3)[0] / size
-            error = float(np.sqrt(np.mean((y - x @ found) ** 2)))
+            free = np.linalg.lstsq(fitted_x / size, fitted_y, rcond=1e-3)[0] / size
+            near = _near_the_file(fitted_x, fitted_y, one.joint)
+            ladder, regular = (float(np.sqrt(np.mean((y - x @ found) ** 2))) for found in (free, near))
             own = f"{after[name]:.2f}" if name in after else f"{float(np.sqrt(np.mean(y**2))):.2f} (file)"
-            lines.append(f"| {one.number} | {name} | {error:.2f} | {own} |")
+            lines.append(f"| {one.number} | {name} | {ladder:.2f} | {regular:.2f} | {own} |")
     return lines
+
+
+def single_lines(results: Sequence[Diagnosed]) -> list[str]:
+    """Return, for joints without a cause, each term of the ladder alone: its value by each run, and what it predicts.
+
+    Least squares, intervals of 95 % by effective samples; values are those of a joint file. Of a law that friction or
+    inertia forbids (below zero) the value counts as zero where it predicts.
+    """
+    runs = measured_runs()
+    lines = [
+        f"| joint | alone | value by {', '.join(RUNS)} | predicts (file): {RUNS[0]}, {RUNS[1]} [Nm rms] |",
+        "|---|---|---|---|",
+    ]
+    for one in results:
+        checked = check_runs([(r.name, only(r, one.number).table) for r in runs], {one.number: one.joint})
+        signals, _ = usable_signals(checked.runs, {one.number: one.joint}, (one.number,))
+        if one.findings.causes or len(signals) < len(RUNS):
+            continue
+        samples = bin_samples(s for run in signals for s in run)
+        parts = [_ladder(run, samples) for run in signals]
+        gear = one.joint.gear_ratio
+        terms = {
+            "offset, Nm": (0.0, 1.0, -math.inf),
+            "Coulomb friction, Nm": (one.joint.friction.coulomb_nm, 1.0, 0.0),
+            "viscous friction, Nms/rad": (one.joint.friction.viscous_nms_per_rad, 1.0, 0.0),
+            "rotor inertia, kg m2": (one.joint.rotor_inertia_kgm2, 1.0 / gear, 0.0),
+            "load friction": (0.0, 1.0, 0.0),
+        }
+        for k, (name, (file, unit, least)) in enumerate(terms.items()):
+            found = [_alone(x[:, k], y) for x, y, _ in parts]
+            values = (f"{file + unit * value:.2g} ± {1.96 * unit * spread:.1g}" for value, spread in found)
+            errors = []
+            for (x, y, _), (value, _) in zip(parts, found[::-1], strict=True):
+                used = (max(file + unit * value, least) - file) / unit
+                before, after = (float(np.sqrt(np.mean((y - c * x[:, k]) ** 2))) for c in (0.0, used))
+                errors.append(f"{after:.2f} ({before:.2f})")
+            lines.append(f"| {one.number} | {name} | {', '.join(values)} | {', '.join(errors)} |")
+    return lines
+
+
+def _alone(x: FloatArray, y: FloatArray) -> tuple[float, float]:
+    """Return least squares on one column, and its standard deviation."""
+    power = float(x @ x)
+    value = float(x @ y) / power
+    error = y - value * x
+    return value, math.sqrt(float(np.mean(error**2)) / power * len(y) / effective_samples(error))
+
+
+def _near_the_file(x: FloatArray, y: FloatArray, joint: Joint) -> FloatArray:
+    """Return the most probable coefficients of `_ladder` [5]: Gaussian priors about the file, coloured residual."""
+    rated, friction, inertia = (
+        joint.rated_torque_nm,
+        joint.friction,
+        joint.rotor_inertia_kgm2 * joint.gear_ratio**2,
+    )
+    mean = np.array((0.0, 0.0, 0.0, 0.0, PRIOR.load_mean))
+    spread = np.array(
+        (
+            PRIOR.offset_rated * rated,
+            math.hypot(PRIOR.coulomb_share * friction.coulomb_nm, PRIOR.coulomb_rated * rated),
+            math.hypot(PRIOR.viscous_share * friction.viscous_nms_per_rad, PRIOR.viscous_rated * rated),
+            PRIOR.inertia_share * inertia,
+            PRIOR.load,
+        )
+    )
+    found = mean
+    for _ in range(4):
+        error = y - x @ found
+        variance = max(float(np.mean(error**2)), (0.01 * rated) ** 2)
+        weight = effective_samples(error) / len(y) / variance
+        left = weight * (x.T @ x) + np.diag(spread**-2)
+        found = np.linalg.solve(left, weight * (x.T @ y) + mean / spread**2)
+    return np.asarray(found, np.float64)
 
 
 def _ladder(run: Sequence[JointSignals], samples: int) -> tuple[FloatArray, FloatArray, str]:
@@ -243,7 +325,19 @@ def main(arguments: list[str] | None = None) -> int:
     if options.json:
         print(json.dumps(as_mapping(results, sha256), indent=1, allow_nan=False))
     else:
-        print("\n".join((*table_lines(results), "", *run_lines(results), "", *ladder_lines(results))))
+        print(
+            "\n".join(
+                (
+                    *table_lines(results),
+                    "",
+                    *run_lines(results),
+                    "",
+                    *ladder_lines(results),
+                    "",
+                    *single_lines(results),
+                )
+            )
+        )
     return 0
 
 

@@ -12,6 +12,7 @@ import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.checked import check_installed
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (
@@ -66,11 +67,9 @@ def main(argv: list[str]) -> int:
     arguments = parser().parse_args(argv)
     joint = arguments.joint
     try:
+        check_installed("analysis", "matplotlib")
         check_picture(arguments.out)
         rmse = draw(read_topic(arguments.log, f"/joint/{joint}/state"), joint, arguments.out)
-    except ImportError:
-        print("jtq plot: matplotlib is not installed: pip install matplotlib", file=sys.stderr)
-        return 1
     except (LogError, OSError, ValueError) as error:
         text = (
             f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
@@ -142,8 +141,9 @@ def draw(log: Records, joint: int, path: Path) -> float:
     below.plot(time_s, error, color="#b4431f", linewidth=0.6)
     below.axhline(0.0, color="#222222", linewidth=0.6)
     rmse = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
+    when = f"both {age:.3g} ms old" if age > 0.0 else "now"
     title = (
-        f"estimate and sensor, both {age:.3g} ms old, RMSE {rmse:.2f} Nm in motion"
+        f"estimate and sensor, {when}, RMSE {rmse:.2f} Nm in motion"
         if with_sensor
         else "estimate; the log has no reference"
     )

@@ -25,7 +25,7 @@ from typing import Final, NamedTuple, NoReturn
 
 import yaml
 
-from jtqd.estimator.checked import ConfigError, count, make_directory, natural
+from jtqd.estimator.checked import ConfigError, check_installed, count, make_directory, natural
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import outside_runs
@@ -35,6 +35,7 @@ _OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
 _FINDINGS: Final = 3
 _OTHER_DAYS: Final = 7
 """Added to the seed: days and trajectories that no campaign has."""
+_NEEDED: Final = ("torch", "onnx", "scipy", "matplotlib", "jinja2")
 _QUICK_JOBS: Final = 2
 """Campaigns mostly wait, fits and training mostly compute."""
 _WRITTEN: Final = ("--out", "--plot")
@@ -85,6 +86,7 @@ def main(argv: list[str]) -> int:
     jobs = options.jobs or (_QUICK_JOBS if options.quick else 1)
     try:
         make_directory(out)
+        check_installed("train", *_NEEDED)  # a step asks for it only after an hour of campaigns
         (out / "models").mkdir(parents=True, exist_ok=True)
         _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
         worst = run_steps(tuple(steps(out, options.bus, options.quick, options.seed, options.plant)), jobs)

@@ -87,20 +87,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="J",
         help="joint whose torque the sensor measures (default: all)",
     )
-    for name, kind, unit, text in (
-        ("gear-ratio", _positive, "G", "motor revolutions per joint revolution"),
-        ("rated-torque", _positive, "NM", "rated torque of the joint [Nm]"),
-        ("torque-constant", _positive, "KT", "of the motor [Nm/A]"),
-        ("rated-current", _positive, "A", "of the motor [A], as 6075h should say"),
-        ("encoder-counts", _count, "N", "counts per revolution of the motor, all edges"),
-        ("link-encoder-counts", _count, "N", "counts per revolution of the joint, at the link"),
-    ):
-        made.add_argument(f"--{name}", type=kind, action="append", metavar=unit, help=text)
-    made.add_argument(
-        "--one-encoder",
-        action="store_true",
-        help="the joints have no link encoder (default: as the drives have 60E4h:1)",
-    )
+    add_values(made, action="append")
     made.add_argument(
         "--bitrate", type=_count, default=1_000_000, metavar="B", help="of the bus [bit/s] (default 1000000)"
     )
@@ -120,6 +107,25 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument("--no-questions", action="store_true", help="ask nothing, also on a terminal")
     made.add_argument("--json", action="store_true", help="print as JSON; asks nothing")
     return made
+
+
+def add_values(made: argparse.ArgumentParser, *, action: str = "store", of_joint: bool = True) -> None:
+    """Add the options that give what a drive does not tell (fields of `Wanted`); of_joint: also those of the joint file."""
+    for name, kind, unit, text in (
+        ("gear-ratio", _positive, "G", "motor revolutions per joint revolution"),
+        ("rated-torque", _positive, "NM", "rated torque of the joint [Nm]"),
+        ("torque-constant", _positive, "KT", "of the motor [Nm/A]"),
+        ("rated-current", _positive, "A", "of the motor [A], as 6075h should say"),
+        ("encoder-counts", _count, "N", "counts per revolution of the motor, all edges"),
+        ("link-encoder-counts", _count, "N", "counts per revolution of the joint, at the link"),
+    ):
+        if of_joint or name not in {"rated-torque", "torque-constant"}:
+            made.add_argument(f"--{name}", type=kind, action=action, metavar=unit, help=text)
+    made.add_argument(
+        "--one-encoder",
+        action="store_true",
+        help="the joints have no link encoder (default: as the drives have 60E4h:1)",
+    )
 
 
 def node_id(text: str) -> int:
@@ -389,7 +395,7 @@ def _each(name: str, values: list[Any] | None, count: int) -> list[Any]:
     return values
 
 
-_OPTIONS = {
+VALUES = {
     "gear_ratio": "gear_ratio",
     "rated_torque_nm": "rated_torque",
     "torque_constant_nm_per_a": "torque_constant",
@@ -402,7 +408,7 @@ _OPTIONS = {
 
 def _drafts(options: argparse.Namespace, found: Found) -> list[JointDraft]:
     count = len(found.nodes)
-    columns = {field: _each(name, getattr(options, name), count) for field, name in _OPTIONS.items()}
+    columns = {field: _each(name, getattr(options, name), count) for field, name in VALUES.items()}
     ask = sys.stdin.isatty() and not options.no_questions and not options.json
     drafts = []
     for position, node in enumerate(found.nodes):
@@ -422,7 +428,7 @@ def _draft(
             return draft_joint(*joint, survey, wanted, family)
         except DraftError as error:
             option = str(error).rpartition("give --")[2].partition(",")[0]
-            field = next((name for name, each in _OPTIONS.items() if each == option.replace("-", "_")), None)
+            field = next((name for name, each in VALUES.items() if each == option.replace("-", "_")), None)
             if not ask or field is None:
                 raise
             answer: Any = _answer(str(error).rpartition(":")[0], option)

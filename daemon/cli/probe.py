@@ -9,23 +9,42 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.cli.as_told import unit_problems
 from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
-from jtqd.daemon.cli.init import UsageError, description, eds_survey, family_of, merged, node_id, surveyed
+from jtqd.daemon.cli.init import (
+    MAX_JOINTS,
+    VALUES,
+    UsageError,
+    add_values,
+    description,
+    eds_survey,
+    family_of,
+    merged,
+    node_id,
+    surveyed,
+)
 from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
+from jtqd.drivers.devices import (
+    EVERY_SCALING_OBJECT,
+    SENSOR_SCALING_OBJECTS,
+    drive_layout,
+    sensor_tpdo1,
+)
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
-from jtqd.drivers.sdo import label
-from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, SurveyError
+from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, TORQUE, BusSurvey, Survey, SurveyError
 
 _EXAMPLES = """examples:
   jtq probe --bus can0                      which nodes are there
   jtq probe --bus can0 --node 5             identity, scaling, TPDOs, section of the configuration
   jtq probe --bus can0 --node 5 --eds drive.eds --json
+  jtq probe --bus can0 --node 6 --joint 2 --gear-ratio 101 --section >> arm/jtqd.yaml
 
 exit status: 0 jtqd can use it, 1 failure or no answer, 2 usage, 3 it lacks what this version of jtqd needs"""
 
@@ -46,6 +65,16 @@ def parser() -> argparse.ArgumentParser:
         choices=[*profile_names(), "none"],
         help="profile of its family (default: by its vendor-ID; docs/profiles.md)",
     )
+    made.add_argument(
+        "--joint",
+        type=int,
+        choices=range(1, MAX_JOINTS + 1),
+        default=1,
+        metavar="J",
+        help="number of the joint in the section (default 1)",
+    )
+    add_values(made, of_joint=False)
+    made.add_argument("--section", action="store_true", help="print the section of the configuration alone")
     made.add_argument("--json", action="store_true", help="print as JSON")
     return made
 
@@ -53,9 +82,10 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str]) -> int:
     """Read and print; returns the exit status."""
     options = parser().parse_args(argv)
-    if options.eds is not None and options.node is None:
-        print("jtq probe: --eds needs --node", file=sys.stderr)
-        return 2
+    for name in ("eds", "section"):
+        if getattr(options, name) and options.node is None:
+            print(f"jtq probe: --{name} needs --node", file=sys.stderr)
+            return 2
     try:
         bus = BusSurvey(options.bus)
         try:
@@ -96,11 +126,29 @@ def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
         found = merged(eds_survey(options.eds, options.node, options.profile), found, options.eds)
     family = family_of(found, options.profile)
     problems = problems_of(found, family)
+    wanted = Wanted(
+        **{field: getattr(options, name, None) for field, name in VALUES.items()},
+        one_encoder=options.one_encoder,
+    )
     if options.json:
         print(json.dumps(content(found, problems, family)))
+    elif options.section:
+        print("\n".join(_alone(found, wanted, family, options.joint)))
+        for problem in problems:
+            print(f"jtq probe: {problem}", file=sys.stderr)
     else:
-        print(text(found, problems, family))
+        print(text(found, problems, family, wanted, options.joint))
     return 3 if problems else 0
+
+
+def _alone(survey: Survey, wanted: Wanted, family: Family | None, joint: int) -> list[str]:
+    """Return the section as lines of a file. Raises UsageError where a value is missing that an option gives."""
+    if survey.profile not in (DRIVE, SENSOR):
+        raise UsageError(f"node {survey.node} is neither a drive (402) nor a sensor (404)")
+    try:
+        return section(survey, family, wanted, joint)
+    except DraftError as error:
+        raise UsageError(str(error)) from None
 
 
 def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
@@ -117,20 +165,22 @@ def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
     return [f"node {survey.node}: {description(survey)}: neither a drive (402) nor a sensor (404)"]
 
 
+NOTHING = Wanted()
+"""The operator gave nothing."""
+_CODES = {0x1018: 8, 0x6041: 4, 0x60A8: 8, 0x60A9: 8, 0x6131: 8}
+"""Objects whose values are codes (identity, statusword, units), with their hexadecimal digits."""
 _ANY = Wanted(1.0, 1.0, 1.0, 1.0, 1, 1)
 """Of a joint whose values do not matter: only what the drive lacks is asked."""
 
 
-def section(survey: Survey, family: Family | None = None) -> list[str]:
-    """Return its section of the configuration; objects that it has no value of are left to be given."""
+def section(
+    survey: Survey, family: Family | None = None, wanted: Wanted = NOTHING, joint: int = 1
+) -> list[str]:
+    """Return its section of the configuration; `wanted`: what the operator gave. Raises DraftError."""
     if survey.profile == SENSOR:
         return sensor_lines(survey.node, survey)
-    try:
-        known = Wanted(rated_torque_nm=1.0, torque_constant_nm_per_a=1.0)
-        draft = draft_joint(1, survey.node, survey, known, family)
-    except DraftError as error:
-        return [f"# jtq init: {error}"]
-    return drive_lines(draft)
+    known = replace(wanted, rated_torque_nm=1.0, torque_constant_nm_per_a=1.0)  # of the joint file alone
+    return drive_lines(draft_joint(joint, survey.node, survey, known, family))
 
 
 def content(survey: Survey, problems: list[str], family: Family | None = None) -> dict[str, Any]:
@@ -161,19 +211,53 @@ def content(survey: Survey, problems: list[str], family: Family | None = None) -
     }
 
 
-def text(survey: Survey, problems: list[str], family: Family | None = None) -> str:
+_NAMES: dict[Key, str] = {
+    **{key: name for key, (name, _) in (EVERY_SCALING_OBJECT | SENSOR_SCALING_OBJECTS).items()},
+    **{key: name for name, key in IDENTITY.items()},
+    **{
+        (each.index, each.subindex): each.name.replace("_", " ")
+        for pdo in (*drive_layout(1), sensor_tpdo1(1))
+        for each in pdo.objects
+    },
+    TORQUE: "torque",
+}
+"""What the objects are that are read."""
+
+
+def _object(key: Key, value: str) -> str:
+    return f"  {label(*key):<8} {value:<12} {_NAMES.get(key, '')}".rstrip()
+
+
+def _value(key: Key, value: int) -> str:
+    """Codes are looked up in hexadecimal."""
+    return f"{value:0{_CODES[key[0]]}X}h" if key[0] in _CODES else str(value)
+
+
+def text(
+    survey: Survey,
+    problems: list[str],
+    family: Family | None = None,
+    wanted: Wanted = NOTHING,
+    joint: int = 1,
+) -> str:
     """Return everything for people."""
     lines = [f"node {survey.node}: {description(survey)}"]
     if family is not None:
         lines.append(f"profile {family.name}: {family.title} (docs/profiles.md)")
-    lines += [f"  {label(*key):<8} {value}" for key, value in sorted(survey.numbers.items())]
-    lines += [f"  {label(*key):<8} not there" for key in sorted(survey.missing)]
+    lines += [_object(key, _value(key, value)) for key, value in sorted(survey.numbers.items())]
+    lines += [_object(key, "not there") for key in sorted(survey.missing)]
     lines.append("TPDOs as they are now (jtqd writes its own mapping at its start, where the drive lets it)")
     for each in survey.tpdos:
         kind = f"type {each.transmission_type}" if each.on else "off"
         lines.append(f"  {each.number}  {each.cob_id:X}h  {kind:<8}  {', '.join(each.objects) or 'nothing'}")
     if survey.profile in (DRIVE, SENSOR):
-        lines += ["section of the configuration", *(f"  {line}" for line in section(survey, family))]
+        try:
+            lines += [
+                "section of the configuration",
+                *(f"  {line}" for line in section(survey, family, wanted, joint)),
+            ]
+        except DraftError as error:
+            lines += [f"no section of the configuration yet: {error}"]
     if problems:
         lines += ["jtqd does not work with it yet:", *(f"  {line}" for line in problems)]
     return "\n".join(lines)

@@ -26,7 +26,10 @@ _FOOT_LINES = 2
 
 
 class Columns:
-    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all; nothing is cut."""
+    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all.
+
+    Nothing is cut, and a line below names the columns that went.
+    """
 
     def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
         self._headings = headings
@@ -43,7 +46,11 @@ class Columns:
             self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
             for dropped in range(len(self._dispensable) + 1)
         ]
-        yield first_that_fits(tables, console, options) or tables[-1]
+        shown = first_that_fits(tables, console, options) or tables[-1]
+        yield shown
+        if gone := self._dispensable[: tables.index(shown)]:
+            names = [name for name in self._headings if name in gone]
+            yield Text(f"no room for: {', '.join(names)}", style="dim")
 
     def _table(self, names: list[str]) -> Table:
         table = Table(

@@ -13,6 +13,8 @@ from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.checked import finite
 from jtqd.estimator.learned import Zeros
 
+_LOST = 0.05
+"""Part of the slots that a machine on which something else runs may miss at most before it is said."""
 _REFUSED = ("overruns", "latches", "latch_resets")
 """Counters beside those of the faults (docs/safety.md)."""
 
@@ -86,9 +88,7 @@ class Summary:
             if (each.name, each.subject) == ("deviation", f"joint {joint}")
         )
 
-    def text(self) -> str:
-        """Return the summary as text."""
-        counters = self.counters
+    def _timing(self) -> list[str]:
         lines = [
             f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
             "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (from wake-up to hand-over)".format(
@@ -96,8 +96,21 @@ class Summary:
             ),
             "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
         ]
+        slots = self.cycles + self.missed
+        if self.missed > _LOST * slots:
+            why = " (jtqd was not granted all that it asked for)" if self.refused else ""
+            share = 100.0 * self.missed / slots
+            lines.append(
+                f"real time     not kept: {share:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
+            )
         if self.stolen_s > 0.0:
             lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
+        return lines
+
+    def text(self) -> str:
+        """Return the summary as text."""
+        counters = self.counters
+        lines = self._timing()
         for joint, (rmse, now, age) in enumerate(
             zip(self.rmse_nm, self.rmse_now_nm, self.age_ms, strict=False), start=1
         ):

@@ -22,6 +22,7 @@ from jtqd.sim_can.bench_kernel.packages import (
     GUEST,
     SOURCE_ARCHIVE,
     SOURCE_PACKAGE,
+    Requirement,
     find_program,
     require,
 )
@@ -134,19 +135,28 @@ def find() -> Path | None:
     return Path(override)
 
 
+def needs() -> tuple[Requirement, ...]:
+    """Packages that a guest needs, and where no kernel is ready, those that it is built with.
+
+    Raises BuildError when it has to be built and is not built for this processor.
+    """
+    if find() is not None:
+        return GUEST
+    if platform.machine() != "x86_64":
+        raise BuildError(f"the bench kernel is built for x86_64 only, this machine is {platform.machine()}")
+    return (*BUILD, *GUEST)
+
+
 def ensure(*, install: bool = True) -> Path:
     """Path of the kernel binary; built first when it is not in the cache (2 to 5 minutes).
 
     Raises packages.MissingPackagesError naming what is missing and may not be installed, BuildError when the
     build fails.
     """
+    require(needs(), install=install)
     ready = find()
     if ready is not None:
-        require(GUEST, install=install)
         return ready
-    if platform.machine() != "x86_64":
-        raise BuildError(f"the bench kernel is built for x86_64 only, this machine is {platform.machine()}")
-    require((*BUILD, *GUEST), install=install)
     version = _source_version()
     if version is None:
         raise BuildError(f"{SOURCE_ARCHIVE} exists but dpkg has no package {SOURCE_PACKAGE}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import datetime as dt
-import importlib.util
 import json
 import os
 import re
@@ -14,7 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, count, counted, make_directory, seconds
+from jtqd.estimator.checked import ConfigError, check_installed, count, counted, make_directory, seconds
 from jtqd.estimator.settings import METHODS
 from jtqd.sysid.batch.run import (
     BY_DIRECTORY,
@@ -59,9 +58,8 @@ exit status: 0 every group finished (whatever the result), 3 some failed, 1 the 
 def main(argv: list[str]) -> int:
     """Run a batch; returns the exit status."""
     options = parser().parse_args(argv)
-    if importlib.util.find_spec("jinja2") is None:
-        return _error("jinja2 is not installed: pip install 'jtqd[analysis]'")
     try:
+        check_installed("analysis", "jinja2")
         groups, active = find_groups(
             options.logs, options.group_by or _GROUP_BY[options.command], _KINDS[options.command]
         )

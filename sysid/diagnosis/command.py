@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import datetime as dt
-import importlib.util
 import json
 import math
 import os
@@ -16,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, counted, make_directory
+from jtqd.estimator.checked import ConfigError, check_installed, counted, make_directory
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.alone import parsed_limits, with_limits
@@ -49,13 +48,10 @@ _OWN: Final = (
 def main(argv: list[str]) -> int:
     """Diagnose and write; exit status 0 no gap, 3 any other verdict, 1 failure, 2 usage."""
     options = parser().parse_args(argv)
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'", file=sys.stderr)
-        return 1
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
+        check_installed("analysis", *_NEEDED)
         check_joint_files(files)
         _check_out(options.out, options.force)
         runs = read_runs(options.runs, columns, in_pieces=True, joints=named_joints(files))

@@ -6,6 +6,7 @@ everything of it that the search, the refinement and the maps share.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -179,9 +180,10 @@ def usable_signals(
         ]
     moving = moving_s(out)
     if moving < SHORTEST_MOVING_S:
+        in_motion = math.floor(10.0 * moving) / 10.0
         return [], [
             *reasons,
-            f"found {moving:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s",
+            f"found {in_motion:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s",
         ]
     return out, reasons
 

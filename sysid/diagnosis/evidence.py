@@ -69,12 +69,12 @@ def information(
 
 def complete_minimum(search: Search, best: Hypothesis, candidate: EffectCandidate) -> dict[str, float] | None:
     """Return all parameters of a candidate at its minimum detectable size, None where no plausible size shows."""
-    value = next(iter(minimum_size(search, best, candidate).values())).value
+    ((lead, minimum),) = minimum_size(search, best, candidate).items()
+    value = minimum.value
     if not math.isfinite(value):
         return None
     rest = [0.0] * (candidate.size - 1)
     one, none = candidate.term.combine([1.0, *rest]), candidate.term.combine([0.0, *rest])
-    lead = next(iter(minimum_size(search, best, candidate)))
     step = one[lead] - none.get(lead, 0.0)
     return dict(candidate.term.combine([value / step, *rest]))
 

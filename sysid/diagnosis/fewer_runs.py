@@ -126,8 +126,8 @@ def with_fewer(found: Found, anew: Names) -> tuple[Found, list[str]]:
             said.append(Gone(c, tuple(runs), errors, why.get(key, "")).text)
     if kept is best:
         return found, said
-    if found.whole is best:
-        found = replace(found, whole=kept, shown=fit)
+    if found.whole.hypothesis is best:
+        return Found.of(case, fit, fit, found.few, found.refused), said
     return replace(found, named=fit), said
 
 

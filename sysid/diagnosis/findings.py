@@ -147,7 +147,8 @@ class Trace:
 @dataclass(frozen=True)
 class LeftOver:
     """What the causes leave that is structure, in the balance and run where it is most: rms [Nm], part of the rated torque,
-    share of all structure; from `relevant_nm` on it matters.
+    share of all structure; where it matters, what all effects found leave, named or not. From `relevant_nm` on it matters,
+    unless it is a small share or (`unconfirmed`) effects that few runs show and do not confirm explain it.
     """
 
     joint: int
@@ -157,6 +158,18 @@ class LeftOver:
     share: float
     relevant_nm: float
     matters: bool
+    unconfirmed: bool = False
+
+    def limit(self, relevant: str) -> str:
+        """Return from where on it matters, or why it does not although it is as large; relevant: `relevant_nm`."""
+        if self.matters or self.rms_nm <= self.relevant_nm:
+            return f"from {relevant} on it matters"
+        why = (
+            "effects that are not confirmed explain it"
+            if self.unconfirmed
+            else f"{self.share:.1%} of the gap"
+        )
+        return f"more than {relevant}, but {why}"
 
 
 @dataclass(frozen=True)
@@ -410,7 +423,7 @@ def summary_lines(findings: Findings) -> list[str]:
     if left is not None and (findings.causes or left.matters):
         lines.append(
             f"left over: {left.rms_nm:.3g} Nm rms ({left.of_rated:.2%} of rated) at joint {left.joint}, {left.balance} "
-            f"balance; from {left.relevant_nm:.3g} Nm on it matters"
+            f"balance; {left.limit(f'{left.relevant_nm:.3g} Nm')}"
         )
     gain = findings.gain
     if gain is not None and math.isfinite(gain.rmse_before_nm):

@@ -14,7 +14,6 @@ from jtqd.sysid.diagnosis.guards import nothing_of, objections
 from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
 from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
-from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.steadiness import steadiness
 
@@ -35,20 +34,25 @@ _MOST_SAID: Final = 4
 class Found:
     """What was found in a case, and what may be named of it.
 
-    whole: all that no guard objects to; named: what of it is certain enough; shown: the fit that what is left over is drawn
-    with; few: the rule for few runs, None with enough; left: what is left over; share: of all structure; limits: rms from
-    which it matters [Nm]; refused: the objections.
+    whole: all that no guard objects to; named: what of it is certain enough; few: the rule for few runs, None with enough;
+    left: what `whole` leaves over; share: of all structure; limits: rms from which it matters [Nm]; refused: the objections.
     """
 
     case: Case
-    whole: Hypothesis
+    whole: Fit
     named: Fit
-    shown: Fit
     few: LeaveOneOut | None
     left: Leftover
     share: float
     limits: Mapping[Channel, float]
     refused: Sequence[str]
+
+    @classmethod
+    def of(cls, case: Case, whole: Fit, named: Fit, few: LeaveOneOut | None, refused: Sequence[str]) -> Found:
+        """Return it with what `whole` leaves over."""
+        left = case.left_over(whole)
+        share = left.share(sum(case.energies_nm2(whole)))
+        return cls(case, whole, named, few, left, share, case.limits, refused)
 
     @property
     def large(self) -> bool:
@@ -81,28 +85,20 @@ class Found:
 def found_in(case: Case, fit: Fit) -> Found:
     """Return what was found in a case; fit: of the best set of its search."""
     few = LeaveOneOut(case.dataset, case.search) if case.few else None
-    fit, refused = _guarded(case, fit, bounds_only=few is not None)
-    whole, left, explained = fit.hypothesis, case.left_over(fit), sum(case.energies_nm2(fit))
+    whole, refused = _guarded(case, fit, bounds_only=few is not None)
+    found = Found.of(case, whole, whole, few, refused)
     if few is not None:  # what is left over is judged with all that was found, names need more
-        fit, refused = _guarded(case, case.fit(few.confirmed(whole)))
-        with_names = case.left_over(fit)
-        if with_names.energy_nm2() < left.energy_nm2():
-            whole, left, explained = fit.hypothesis, with_names, sum(case.energies_nm2(fit))
-    found = Found(case, whole, fit, fit, few, left, left.share(explained), case.limits, refused)
+        named, refused = _guarded(case, case.fit(few.confirmed(whole.hypothesis)))
+        with_names = Found.of(case, named, named, few, refused)
+        if with_names.left.energy_nm2() < found.left.energy_nm2():
+            return with_names
+        return replace(found, named=named, refused=refused)
     if not found.beside:
         return found
-    sure = certain(case, fit)
+    sure = certain(case, whole)
     weak = [c for c in whole.chosen if c not in sure.chosen]
     if weak and not found.matters:  # what is not certain is left over, too
-        left = case.left_over(sure)
-        found = replace(
-            found,
-            whole=sure.hypothesis,
-            shown=sure,
-            left=left,
-            share=left.share(sum(case.energies_nm2(sure))),
-            refused=[*refused, *(_refused(c, UNSTEADY) for c in weak)],
-        )
+        return Found.of(case, sure, sure, few, [*refused, *(_refused(c, UNSTEADY) for c in weak)])
     return replace(found, named=sure)
 
 

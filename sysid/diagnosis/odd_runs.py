@@ -28,7 +28,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OddRun, joint_text
-from jtqd.sysid.diagnosis.mixed_model import explained, solve
+from jtqd.sysid.diagnosis.mixed_model import explained, explained_each, solve
 from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
 from jtqd.sysid.diagnosis.search import ENTER, within
@@ -140,7 +140,8 @@ class Comparison:
         here: list[int] = []
         odd: list[tuple[int, int]] = []
         while blocks and len(here) < _MOST_COLUMNS:
-            worth = [explained(self.total, here, block) - cost for block, _, cost in blocks]
+            falls = explained_each(self.total, here, [block for block, _, _ in blocks])
+            worth = [fall - cost for fall, (_, _, cost) in zip(falls, blocks, strict=True)]
             if max(worth) < ENTER:
                 break
             block, new, _ = blocks.pop(int(np.argmax(worth)))

@@ -129,9 +129,7 @@ def refine(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> 
         if step >= _STEPS and settled:
             break
     model = best.model
-    for run_signals in dataset.signals:
-        for s in run_signals:
-            set_torsion(s, best.present)
+    set_torsions(dataset, best.present)
     certain = best.mixed.marginal(np.full_like(model.variances, 1e-12))[0]
     count = len(model.columns)
     share = np.zeros(count)
@@ -151,9 +149,7 @@ def refine(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> 
 
 def _linearised(dataset: Dataset, present: Sequence[PresentEffect], noise: Noise) -> _Iterate:
     signals, runs, samples, groups = dataset.signals, dataset.runs, dataset.samples, dataset.families
-    for run_signals in signals:
-        for s in run_signals:
-            set_torsion(s, present)
+    set_torsions(dataset, present)
     data = [_run_at(s, run, present, samples) for s, run in zip(signals, runs, strict=True)]
     count = sum(len(p.free) for p in present)
     sums = [run_sums(d, noise, count, len(groups)) for d in data]
@@ -172,6 +168,12 @@ def _stepped(iterate: _Iterate) -> tuple[list[PresentEffect], bool]:
         settled = settled and bool(np.all(np.abs(change) <= _SETTLED * deviation))
         now.append(moved)
     return now, settled
+
+
+def set_torsions(dataset: Dataset, present: Sequence[PresentEffect]) -> None:
+    """Set the torsion that effects see in all runs to what it is with these causes (`set_torsion`)."""
+    for s in (joint for run in dataset.signals for joint in run):
+        set_torsion(s, present)
 
 
 def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
@@ -194,6 +196,7 @@ def _run_at(
     """Return the run with what is left at these parameters, and derivatives by each free one, as regressors."""
     left = {c: d.residual.copy() for c, d in base.channels.items()}
     columns: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in base.channels}
+    made: dict[Channel, list[tuple[int | None, FloatArray]]] = {c: [] for c in base.channels}
     for p, mine in zip(present, places(present), strict=True):
         for s in run:
             if not shows_at(p.joint, s.number):
@@ -202,14 +205,20 @@ def _run_at(
             for balance in (MOTOR, TORSION):
                 channel = Channel(s.number, balance)
                 if channel in left and balance in here:
-                    left[channel] = left[channel] - binned(s.seen(balance, here[balance]), samples)
+                    made[channel].append((None, here[balance]))
             for place, name in enumerate(p.free, mine.start):
                 size = _step_size(p, name)
                 there = _contribution(p, s, {**p.values, name: p.values[name] + size})
                 for balance, value in there.items():
-                    slope = (value - here[balance]) / size
-                    seen = binned(s.seen(balance, slope), samples)
-                    columns[Channel(s.number, balance)].append((place, seen))
+                    made[Channel(s.number, balance)].append((place, (value - here[balance]) / size))
+    of = {s.number: s for s in run}
+    for channel, parts in made.items():
+        seen = of[channel.joint].seen_each(channel.balance, [value for _, value in parts])
+        for (column, _), value in zip(parts, seen, strict=True):
+            if column is None:
+                left[channel] = left[channel] - binned(value, samples)
+            else:
+                columns[channel].append((column, binned(value, samples)))
     channels = {}
     for c, d in base.channels.items():
         found = columns[c]

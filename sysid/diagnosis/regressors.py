@@ -72,8 +72,7 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
         order = p.get("order_per_motor_rev", 0.0)
         add(
             MOTOR,
-            effect.loss_nm(p, state, joint, x)
-            * s.visible_share(order * joint.gear_ratio * state.velocity_rad_s),
+            effect.loss_nm(p, state, joint, x) * s.visible_share_of(order),
         )
     if "current_a" in hooks:
         scale = joint.gear_ratio * joint.torque_constant_nm_per_a

@@ -195,12 +195,12 @@ class Smoother:
         return max(hz for hz, _ in self.parts) if whole - count <= _LITTLE * whole else math.inf
 
     def __call__(self, x: FloatArray) -> FloatArray:
-        """Return x [n] filtered."""
+        """Return x [.., n] filtered, rows one by one."""
         if not self.parts:
             return x
         out = np.array(x, np.float64)
         for hz, there in self.parts:
             sections = _low_pass(hz * self.step_s)
-            reach = min(len(x) - 1, max(12, round(1.0 / (hz * self.step_s))))
-            out[there] = signal.sosfiltfilt(sections, x, padlen=reach)[there]
+            reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * self.step_s))))
+            out[..., there] = signal.sosfiltfilt(sections, x, padlen=reach)[..., there]
         return out

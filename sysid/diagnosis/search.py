@@ -16,7 +16,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.current_zero import Readings, UnpoweredColumn, reading_misfit
-from jtqd.sysid.diagnosis.mixed_model import Mixed, Model, explained, solve
+from jtqd.sysid.diagnosis.mixed_model import Mixed, Model, explained_each, solve
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 
 ENTER: Final = 10.0
@@ -206,11 +206,11 @@ class Search:
         # at the parent's variances what is common to all runs can hide in them, so the prior's are tried too
         totals = [self.mixed.marginal(v)[0] for v in (parent.model.variances, self.mixed.prior)]
         base = list(parent.model.columns)
-        scored = []
-        for new in self.additions(parent.chosen):
-            columns = [k for c in new for k in c.columns]
-            drop = max(explained(total, base, columns) for total in totals)
-            scored.append((drop - sum(self.penalty(c) for c in new), new))
+        additions = self.additions(parent.chosen)
+        columns = [[k for c in new for k in c.columns] for new in additions]
+        drops = np.max([explained_each(total, base, columns) for total in totals], axis=0)
+        prices = [sum(self.penalty(c) for c in new) for new in additions]
+        scored = [(float(d) - price, new) for d, price, new in zip(drops, prices, additions, strict=True)]
         scored.sort(key=lambda pair: -pair[0])
         out = []
         tried = 0

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -176,6 +177,12 @@ class JointSignals:
         """
         return self.visible(x) if balance == MOTOR else x
 
+    def seen_each(self, balance: str, values: Sequence[FloatArray]) -> Sequence[FloatArray]:
+        """Return `seen` of each of the values; together, because a filter takes longer to be called than to run."""
+        if balance != MOTOR or not self.visible.parts or not values:
+            return values
+        return list(self.visible(np.array(values)))
+
     def usable(self, balance: str) -> BoolArray:
         """Return the samples that a balance can be judged at [n]: the motor's where friction has a direction; none within
         the reach of a filter from the ends.
@@ -194,6 +201,18 @@ class JointSignals:
             return self.state
         fields = {name: getattr(self.state, name) for name in State.__slots__}
         return State(**{**fields, "temperature_c": self.sensor_temperature_c})
+
+    def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
+        """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
+        if order_per_motor_rev not in self._shares:
+            self._shares.clear()
+            rate = order_per_motor_rev * self.joint.gear_ratio * self.state.velocity_rad_s
+            self._shares[order_per_motor_rev] = self.visible_share(rate)
+        return self._shares[order_per_motor_rev]
+
+    @cached_property
+    def _shares(self) -> dict[float, FloatArray]:
+        return {}
 
     def visible_share(self, rate_rad_s: FloatArray) -> FloatArray:
         """Return how much of a torque that swings at this rate [n] the motor balance holds [n].

@@ -48,21 +48,21 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     found, became = with_fewer(found_in(case, fit), anew)
     gain = held_out_gain(case.dataset, found.named.refined)
     named, classes = told_at_rest(case, found.named, found.classes)
+    left, shown = _remaining(found, named)
     explained = sum(case.energies_nm2(named))
-    total = max(explained + found.left.energy_nm2(), 1e-30)
+    total = max(explained, sum(case.energies_nm2(shown))) + left.energy_nm2()
+    total = max(total, 1e-30)
     causes = causes_of(case, named, classes, total)
     unsure, doubt = [], ""
     if found.few is not None:
-        unsure = found.few.unsure(found.whole, named.hypothesis, classes, causes)
+        unsure = found.few.unsure(found.whole.hypothesis, named.hypothesis, classes, causes)
         doubt = found.few.doubt(unsure) if unsure else ""
     rivals = {r.key: c.effect.name for c, others in zip(named.chosen, classes, strict=True) for r in others}
     table = candidate_table(case.search, named.hypothesis, rivals, left_over=found.beside)
     reasons: list[str] = []
-    left, shown = None, named
     if found.matters:
         verdict = UNEXPLAINED
-        left, shown = _least_left(found)
-        reasons = [*_closest(found.whole, causes, found.share), *left.reasons]
+        reasons = [*_closest(found.whole.hypothesis, causes, found.share), *left.reasons]
         reasons += _told_from(table, case.dataset.rated_torque_nm) if found.beside else []
     elif causes:
         verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
@@ -70,7 +70,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         verdict = INSUFFICIENT if doubt else NO_GAP
         reasons = [doubt] if doubt else []
     causes.sort(key=lambda c: -c.rms_nm)
-    gaps = channel_gaps(case.dataset, shown.refined, left)
+    gaps = channel_gaps(case.dataset, shown.refined, left if found.matters else None)
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
@@ -85,22 +85,23 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         next_experiment=_settling_experiment(verdict, causes, unsure, case.dataset),
         traces=traces(case.dataset, shown.refined),
         explained_share=explained / total if causes else math.nan,
-        left_over=_left_over(found, total),
+        left_over=_left_over(found, left, total),
     )
 
 
-def _left_over(found: Found, total_nm2: float) -> LeftOver:
+def _left_over(found: Found, left: Leftover, total_nm2: float) -> LeftOver:
     """Return what is left over in the channel where it is most, against its limit; total_nm2: energy of all structure."""
-    sizes = {c: found.left.worst_nm.get(c, 0.0) for c in found.limits}
+    sizes = {c: left.worst_nm.get(c, 0.0) for c in found.limits}
     worst = max(sizes, key=lambda c: sizes[c] / found.limits[c] if found.limits[c] > 0.0 else sizes[c])
     return LeftOver(
         worst.joint,
         worst.balance,
         sizes[worst],
         sizes[worst] / found.case.dataset.joints[worst.joint].rated_torque_nm,
-        found.left.energy_nm2() / total_nm2,
+        left.energy_nm2() / total_nm2,
         found.limits[worst],
         found.matters,
+        unconfirmed=not found.matters and left is not found.left,
     )
 
 
@@ -132,16 +133,22 @@ def _told_from(table: Sequence[CandidateEvidence], rated_nm: float) -> list[str]
     ]
 
 
-def _least_left(found: Found) -> tuple[Leftover, Fit]:
-    """Return what is left over, without any cause where that is less: a fit that is bent leaves more than there was, and in
-    other places.
+def _remaining(found: Found, named: Fit) -> tuple[Leftover, Fit]:
+    """Return what findings and report show as left over, and the fit that leaves it: that of the causes. Where something
+    matters that all effects found leave, that of all of them, or of none where that leaves less: a fit that is bent leaves
+    more than there was, and in other places.
     """
-    if found.shown.chosen:
-        bare = found.case.fit(found.case.search.hypothesis(()))
-        without = found.case.left_over(bare)
+    case, whole = found.case, found.whole
+    if not found.matters:
+        if named.hypothesis is whole.hypothesis:
+            return found.left, named
+        return case.left_over(named), named
+    if whole.chosen:
+        bare = case.fit(case.search.hypothesis(()))
+        without = case.left_over(bare)
         if without.energy_nm2() <= found.left.energy_nm2():
             return without, bare
-    return found.left, found.shown
+    return found.left, whole
 
 
 def _settling_experiment(

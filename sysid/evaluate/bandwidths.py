@@ -1,9 +1,9 @@
 """`python -m jtqd.sysid.evaluate.bandwidths`: noise of the fused estimate against its age, by the filter of its torsion.
 
-One row per bandwidth of the low pass, and per rate of the link's tracking filter (`+`), over emulated runs with their true
-torque: what a controller meets (error against the torque now, in motion), what is left when the age is no error, the noise
-from sample to sample in motion and at standstill, and the share of samples in motion inside the 90 % interval. Below it,
-what the age of a low pass alone costs, and at what frequencies.
+One row per bandwidth of the low pass, and per rate of the torsion's tracking filter (`+`), over emulated runs with their
+true torque: what a controller meets (error against the torque now, in motion), what is left when the age is no error, the
+noise from sample to sample in motion and at standstill, and the share of samples in motion inside the 90 % interval. Below
+it, what the age of a low pass alone costs, and at what frequencies.
 """
 
 from __future__ import annotations
@@ -28,12 +28,13 @@ from jtqd.estimator.run import JointColumns, RunTableError
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S, EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.evaluate.methods import OURS, SETTLE_S, load_models
+from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S
 from jtqd.sysid.runs.files import RunError, read_runs
 from jtqd.sysid.runs.truth import read_truth
 
 BANDWIDTHS_RAD_S: Final = (200.0, 300.0, 400.0, 600.0, 800.0, 1200.0, 1600.0)
-RATES_RAD_S: Final = (160.0, 200.0, 220.0, 260.0, 320.0)
-"""Of the link's tracking filter."""
+RATES_RAD_S: Final = (200.0, 300.0, 400.0, 500.0, 600.0)
+"""Of the torsion's tracking filter; its wave's is in proportion."""
 _MOVING_RAD_S: Final = 0.05
 _PIECE: Final = 400
 """Samples of a spectrum: 2.5 Hz at 1 kHz."""
@@ -43,7 +44,7 @@ _EXAMPLE: Final = "example: python -m jtqd.sysid.evaluate.bandwidths days --mode
 
 @dataclass(frozen=True)
 class Tradeoff:
-    """One filter: bandwidth or rate [rad/s], whether it tracks the link, age [ms], errors and noise in % of rated torque
+    """One filter: bandwidth or rate [rad/s], whether it tracks the torsion, age [ms], errors and noise in % of rated torque
     (RMS), coverage in %; over all runs.
     """
 
@@ -70,9 +71,9 @@ class TrueRun:
 def tradeoff(runs: Sequence[TrueRun], bandwidth_rad_s: float, *, tracks: bool = False) -> Tradeoff:
     """Score one filter over runs of joints with torsion. Raises ValueError without samples in motion.
 
-    tracks: the link at this rate, in place of the low pass of this bandwidth; sigma is that of the joint file's rate.
+    tracks: the torsion at this rate, in place of the low pass of this bandwidth; sigma is that of the joint file's rate.
     """
-    settings = EstimatorSettings(method=OURS, track_link=True)
+    settings = EstimatorSettings(method=OURS, track_torsion=True)
     if not tracks:
         settings = EstimatorSettings(method=OURS, torsion_bandwidth_rad_s=bandwidth_rad_s)
     now, fair, noise, standing, inside = [], [], [], [], []
@@ -110,7 +111,9 @@ def _at_rate(joint: Joint, rate_rad_s: float) -> Joint:
     if fused is None:
         raise ValueError(f"joint {joint.name}: found no section fused, expected one")
     known = fused.tracking or Tracking(rate_rad_s, 0.0, 0.0)
-    return replace(joint, fused=replace(fused, tracking=replace(known, rate_rad_s=rate_rad_s)))
+    wave = rate_rad_s * WAVE_RAD_S / TRACKING_RAD_S
+    at_rate = replace(known, rate_rad_s=rate_rad_s, wave_rad_s=wave)
+    return replace(joint, fused=replace(fused, tracking=at_rate))
 
 
 def _three(where: BoolArray) -> BoolArray:
@@ -156,8 +159,30 @@ def cost_of_age(runs: Sequence[TrueRun], bandwidth_rad_s: float = TORSION_BANDWI
     return Cost(100.0 * float(np.sqrt(square / count)), 100.0 * ripple / square)
 
 
-def true_runs(paths: Sequence[Path], models: Path, link_noise_urad: float, seed: int) -> list[TrueRun]:
-    """Return all joints of runs with their true torque; white noise of this RMS is added to the link positions.
+def latched_beside(
+    columns: JointColumns, time_s: FloatArray, beside_s: FloatArray, gear_ratio: float
+) -> JointColumns:
+    """Return a joint whose encoders were latched [n] s after the stamp, both at one instant, with the motor's speed."""
+    motor, link, speed = columns.motor_position_rad, columns.link_position_rad, columns.motor_velocity_rad_s
+    assert motor is not None
+    assert link is not None
+    assert speed is not None
+    twist = low_pass(motor / gear_ratio - link, np.diff(time_s, prepend=time_s[0]), TORSION_BANDWIDTH_RAD_S)
+    moved = speed * beside_s
+    return replace(
+        columns,
+        motor_position_rad=motor + moved,
+        link_position_rad=link + moved / gear_ratio - np.gradient(twist, time_s) * beside_s,
+    )
+
+
+def true_runs(
+    paths: Sequence[Path], models: Path, link_noise_urad: float, seed: int, late_us: float = 0.0
+) -> list[TrueRun]:
+    """Return all joints of runs with their true torque.
+
+    White noise of an RMS of link_noise_urad is added to the link positions; late_us: RMS by which the encoders of a sample
+    were latched beside its stamp, both joints' alike.
 
     Raises RunError, RunTableError, ConfigError, and ValueError for a run without true torque.
     """
@@ -166,6 +191,7 @@ def true_runs(paths: Sequence[Path], models: Path, link_noise_urad: float, seed:
     joints = {each.number: each.joint for each in load_models(models)}
     for file in read_runs(paths, None):
         truth = read_truth(file.path)
+        beside = 1e-6 * late_us * noise.standard_normal(len(file.table.time_s)) if late_us else None
         for number, joint in joints.items():
             if number not in truth:
                 raise ValueError(
@@ -175,6 +201,8 @@ def true_runs(paths: Sequence[Path], models: Path, link_noise_urad: float, seed:
             if link_noise_urad and columns.link_position_rad is not None:
                 added = 1e-6 * link_noise_urad * noise.standard_normal(len(file.table.time_s))
                 columns = replace(columns, link_position_rad=columns.link_position_rad + added)
+            if beside is not None:
+                columns = latched_beside(columns, file.table.time_s, beside, joint.gear_ratio)
             found.append(TrueRun(joint, file.table.time_s, columns, truth[number]))
     return found
 
@@ -209,10 +237,17 @@ def main(argv: list[str]) -> int:
     parser.add_argument(
         "--link-noise", type=float, default=0.0, metavar="URAD", help="added to the link encoder"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of that noise")
+    parser.add_argument(
+        "--late",
+        type=float,
+        default=0.0,
+        metavar="US",
+        help="by so much (RMS) both encoders are latched beside the stamp",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of what is added")
     options = parser.parse_args(argv)
     try:
-        runs = true_runs(options.runs, options.models, options.link_noise, options.seed)
+        runs = true_runs(options.runs, options.models, options.link_noise, options.seed, options.late)
         rows = [tradeoff(runs, bandwidth) for bandwidth in BANDWIDTHS_RAD_S]
         rows += [tradeoff(runs, rate, tracks=True) for rate in RATES_RAD_S]
         cost = cost_of_age(runs)
@@ -220,7 +255,7 @@ def main(argv: list[str]) -> int:
         print(
             f"age of a low pass of {TORSION_BANDWIDTH_RAD_S:.0f} rad/s alone: {cost.percent:.2f} % of rated, "
             f"{cost.ripple_percent:.0f} % of its square at {_RIPPLE_HZ[0]:.0f} to {_RIPPLE_HZ[1]:.0f} Hz; "
-            "+: the link tracked at that rate"
+            "+: the torsion tracked at that rate"
         )
     except (ConfigError, RunError, RunTableError, ValueError, OSError) as error:
         print(f"bandwidths: {error}", file=sys.stderr)

@@ -13,6 +13,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -32,6 +33,7 @@ from jtqd.sysid.evaluate.scores import (
     score,
     standstill,
 )
+from jtqd.sysid.evaluate.truth import for_intervals
 
 SCHEMA: Final = "jtq.accuracy/1"
 BASELINE: Final = "tob"
@@ -114,7 +116,11 @@ def method_of(models: JointModels) -> str:
 
 
 def make_card(samples: Sequence[Samples], joint: Joint, method: str) -> Card | None:
-    """Return the card of one joint from its runs; None where no run has a sample in motion."""
+    """Return the card of one joint from its runs; None where no run has a sample in motion.
+
+    It compares with the sensor, whose zero of the day is in every difference and no part of sigma: intervals have it added.
+    """
+    samples = [for_intervals(replace(each, true_nm=None)) for each in samples]
     own = [each for each in samples if method in each.estimate_nm and each.scored.any()]
     overall, interval = _error(own, method), covered(own, method, NOMINAL)
     if overall is None or interval is None:

@@ -89,7 +89,11 @@ def tiles(card: Card) -> list[tuple[str, str, str]]:
             ", ".join(filter(None, (f"{card.error.rmse_rated_percent:.2g} % of rated", beside))),
         ),
         ("95 % of errors", f"below {card.error.p95_nm:.2g} Nm", f"largest {card.error.max_nm:.2g} Nm"),
-        ("90 % interval", f"holds {100.0 * interval.share:.0f}{se} %", "of the sensor's values in motion"),
+        (
+            "90 % interval",
+            f"holds {100.0 * interval.share:.0f}{se} %",
+            "of the sensor in motion, its zero added",
+        ),
         (
             "Standstill",
             "not measured" if standing is None else f"holds {100.0 * standing.share:.0f} %",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import datetime as dt
-import importlib.util
 import json
 import os
 import sys
@@ -13,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.checked import ConfigError, make_directory
+from jtqd.estimator.checked import ConfigError, check_installed, make_directory
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.evaluate.card import BASELINE, Card, make_card, method_of
 from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate
@@ -26,7 +25,6 @@ from jtqd.sysid.runs.checks import RunIssue
 from jtqd.sysid.runs.files import RunError
 
 BY: Final = "jtq evaluate"
-_NEEDED: Final = ("matplotlib", "jinja2", "onnx")
 
 
 def main(argv: list[str]) -> int:
@@ -37,11 +35,8 @@ def main(argv: list[str]) -> int:
         arguments.error(
             "--card: found --outside as well, expected all runs as RUNS: the card sorts them by load"
         )
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        print(f"{BY}: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'", file=sys.stderr)
-        return 1
     try:
+        check_installed("analysis", "matplotlib", "jinja2", "onnx")
         models = load_models(options.models, options.joint)
         make_directory(options.out)
         inputs = read_inputs(options.runs, models, options.columns)

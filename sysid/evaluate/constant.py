@@ -153,6 +153,7 @@ class Range(NamedTuple):
 class Outside(NamedTuple):
     """Samples of one joint outside: how many of how many scored; ours and physics-only; share flagged degraded.
 
+    physics: None where no network is there, so that ours is its physics.
     by_load, by_temperature: samples beyond that limit (some are beyond both).
     """
 
@@ -163,7 +164,7 @@ class Outside(NamedTuple):
     by_load: int
     by_temperature: int
     ours: Score
-    physics: Score
+    physics: Score | None
     flagged: float
 
 
@@ -199,10 +200,12 @@ def outside_scores(samples: Sequence[Samples], envelopes: dict[int, Envelope]) -
         masks = [each.scored & (load | warm) for each, (load, warm) in zip(own, beyonds, strict=True)]
         pairs = list(zip(own, masks, strict=True))
         ours = score([Block(each.error_nm(OURS)[mask], each.rated_nm) for each, mask in pairs])
-        bare = "physics" if all("physics" in each.estimate_nm for each in own) else OURS
-        physics = score([Block(each.error_nm(bare)[mask], each.rated_nm) for each, mask in pairs])
-        if ours is None or physics is None:
+        if ours is None:
             continue
+        bare = all("physics" in each.estimate_nm for each in own)
+        physics = score(
+            [Block(each.error_nm("physics")[mask], each.rated_nm) for each, mask in pairs if bare]
+        )
         status = np.concatenate([each.status[OURS][mask] for each, mask in pairs])
         found.append(
             Outside(

@@ -422,7 +422,7 @@ def _coverage(variable: scores.IntervalTables | None, every: scores.IntervalTabl
 
 
 def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
-    worst = max(found, key=lambda each: each.ours.rmse_nm / each.physics.rmse_nm, default=None)
+    ratios = [each.ours.rmse_nm / each.physics.rmse_nm for each in found if each.physics is not None]
     flagged = min((each.flagged for each in found), default=None)
     return (
         Target(
@@ -430,15 +430,16 @@ def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
             "RMSE ours : physics, outside the envelope",
             "-",
             f"at most {_NO_WORSE:g}",
-            "not evaluated (--outside)"
-            if worst is None
-            else f"{worst.ours.rmse_nm / worst.physics.rmse_nm:.4f}",
-            None
-            if worst is None
-            else all(each.ours.rmse_nm <= _NO_WORSE * each.physics.rmse_nm for each in found),
+            f"{max(ratios):.4f}"
+            if ratios
+            else "no network: ours is its physics"
+            if found
+            else "not evaluated (--outside)",
+            max(ratios) <= _NO_WORSE if ratios else None,
             tuple(
-                f"j{each.number}: {each.ours.rmse_nm:.3f} against {each.physics.rmse_nm:.3f} Nm, "
-                f"{each.samples} samples outside"
+                f"j{each.number}: {each.ours.rmse_nm:.3f} "
+                + ("" if each.physics is None else f"against {each.physics.rmse_nm:.3f} ")
+                + f"Nm, {each.samples} samples outside"
                 for each in found
             ),
         ),

@@ -17,7 +17,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.estimator import FusedEstimator, observe_run, quadrants
+from jtqd.estimator.estimator import STANDSTILL_SIGMAS, observe_run, quadrants
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network
 from jtqd.estimator.observer import low_pass
@@ -150,26 +150,24 @@ class JointModels:
         self, time_s: FloatArray, columns: JointColumns
     ) -> tuple[Mapping[str, EstimateRun], ObservedRun]:
         """Return every method's estimates of a run and what the observer saw; ConfigError, ValueError as the estimators."""
-        runs = {}
-        for method in self.methods:
-            if method not in ("physics", OURS):
-                settings = recommended(method)
-                runs[method] = estimate_columns(
-                    self.joint, settings, self.networks.get(method), time_s, columns
-                )
-        settings = replace(recommended(OURS), track_zeros=False)  # one observer serves both
+        runs = {
+            method: estimate_columns(
+                self.joint, settings_of(method), self.networks.get(method), time_s, columns
+            )
+            for method in self.methods
+        }
         torsion = None if self.joint.fused is None else self.joint.fused.torsion
         dt = np.diff(time_s, prepend=time_s[0])
         current, motor, velocity, link = (getattr(columns, name) for name in _INPUTS)
         seen = observe_run(
-            self.joint, settings, torsion, dt, current, motor, velocity, link, columns.temperature_c
+            self.joint, recommended(OURS), torsion, dt, current, motor, velocity, link, columns.temperature_c
         )
-        for method in ("physics", OURS):
-            if method in self.methods:
-                network = self.networks.get(method)
-                estimator = FusedEstimator(self.joint, settings, network)  # type: ignore[arg-type]
-                runs[method] = estimator.run_observed(seen)
         return runs, seen
+
+
+def settings_of(method: str) -> EstimatorSettings:
+    """Return what a method of TITLES is judged with: the settings of a new configuration."""
+    return recommended(OURS if method == "physics" else method)
 
 
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
@@ -255,7 +253,8 @@ class Samples:
     scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
     method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
     guard around it, NaN where there is none. true_nm: the gear's torque itself, where the run is emulated and has it;
-    reference_nm: standard deviation of the sensor's zero, as the joint file has it.
+    reference_nm: standard deviation of the sensor's zero, standstill_sigmas: half width of the interval at rest in standard
+    deviations, as the joint file has them.
     """
 
     run: str
@@ -278,6 +277,7 @@ class Samples:
     sensors_nm: Mapping[str, FloatArray] = field(default_factory=dict)
     bandwidth_rad_s: Mapping[str, float] = field(default_factory=dict)
     reference_nm: float = 0.0
+    standstill_sigmas: float = STANDSTILL_SIGMAS
 
     def sensor_of(self, method: str) -> FloatArray:
         """Return the sensor [n] as old as a method's estimate [Nm]."""
@@ -303,10 +303,7 @@ def take_samples(
     if columns.torque_nm is None:
         raise ValueError(f"{run}: j{models.number}.torque_nm: missing")
     dt = np.diff(time_s, prepend=time_s[0])
-    rates = {
-        method: bandwidth_of(models.joint, recommended(OURS if method == "physics" else method))
-        for method in runs
-    }
+    rates = {method: bandwidth_of(models.joint, settings_of(method)) for method in runs}
     sensors = {rate: low_pass(columns.torque_nm, dt, rate) for rate in {PAPERS_BANDWIDTH, *rates.values()}}
     sensor = sensors[PAPERS_BANDWIDTH]
     settled = time_s - time_s[0] >= SETTLE_S
@@ -333,6 +330,9 @@ def take_samples(
         bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
         true_nm=true_nm,
         reference_nm=0.0 if models.joint.fused is None else models.joint.fused.sigma.reference_nm,
+        standstill_sigmas=STANDSTILL_SIGMAS
+        if models.joint.fused is None or models.joint.fused.standstill is None
+        else models.joint.fused.standstill.sigmas,
         sensors_nm={method: sensors[rate] for method, rate in rates.items() if rate != PAPERS_BANDWIDTH},
         bandwidth_rad_s=rates,
     )

@@ -17,7 +17,6 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.estimator import STANDSTILL_SIGMAS
 from jtqd.estimator.observer import low_pass
 from jtqd.sysid.evaluate.methods import PAPERS_BANDWIDTH, Samples
 from jtqd.sysid.evaluate.scores import IntervalTables, Row, Standstill, interval_tables, row, standstill
@@ -30,7 +29,7 @@ def for_intervals(samples: Samples) -> Samples:
     """Return samples whose `sensor_of` an interval is to hold: the true torque, aligned, where the run has it.
 
     Else the sensor, and sigma of ours grows by the sensor's zero, which the comparison contains: at standstill, where sigma
-    is a half width of STANDSTILL_SIGMAS, by as many.
+    is a half width of so many standard deviations, by as many.
     """
     if samples.true_nm is not None:
         dt = np.diff(samples.time_s, prepend=samples.time_s[0])
@@ -39,7 +38,7 @@ def for_intervals(samples: Samples) -> Samples:
             for method in samples.sensors_nm
         }
         return replace(samples, sensor_nm=low_pass(samples.true_nm, dt, PAPERS_BANDWIDTH), sensors_nm=young)
-    wider = samples.reference_nm * np.where(samples.standing, STANDSTILL_SIGMAS, 1.0)
+    wider = samples.reference_nm * np.where(samples.standing, samples.standstill_sigmas, 1.0)
     sigma = {
         method: np.hypot(values, wider) if method in _OURS else values
         for method, values in samples.sigma_nm.items()

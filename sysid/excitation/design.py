@@ -18,7 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, check_installed
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S
 from jtqd.models.files import load_joint, shipped
@@ -65,10 +65,9 @@ def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.
         values = criterion(first)
         best = int(np.argmin(values))
         return Found(first[best], float(values[best]))
-    try:
-        from scipy.optimize import differential_evolution
-    except ImportError:
-        raise ConfigError("excitation design: scipy is not installed: pip install 'jtqd[analysis]'") from None
+    check_installed("analysis", "scipy")
+    from scipy.optimize import differential_evolution
+
     generations = max(2, int((1.0 - POLISHING) * evaluations) // POPULATION)
     evolved = differential_evolution(
         lambda genomes: criterion(genomes.T),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import datetime as dt
 import difflib
-import importlib.util
 import json
 import math
 import sys
@@ -16,8 +15,8 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, check_output
-from jtqd.estimator.joint import CONVENTIONS, Joint
+from jtqd.estimator.checked import ConfigError, check_installed, check_output, counted
+from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint
@@ -30,10 +29,11 @@ from jtqd.sysid.fit.efficiency import (
     written_findings,
 )
 from jtqd.sysid.fit.efficiency_report import EfficiencyResult, as_mapping, plateau_mapping, report_lines
+from jtqd.sysid.fit.few_runs import MOST_RUNS, FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.friction import FitError
 from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
-from jtqd.sysid.fit.losses import LossFitError
+from jtqd.sysid.fit.losses import PER_K_PRIOR, LossFitError
 from jtqd.sysid.fit.no_load import NoLoadFit, fit_no_load, no_load
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, plateaus_of
 from jtqd.sysid.fit.signals import RunSignals, run_signals
@@ -125,17 +125,12 @@ EFFICIENCY_BY = "jtq fit efficiency"
 def efficiency_main(argv: list[str]) -> int:
     """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
     options = parse_fit(efficiency_parser(), argv)
-    if options.plot is not None and importlib.util.find_spec("matplotlib") is None:
-        print(
-            f"{EFFICIENCY_BY}: --plot: matplotlib is not installed (it is in the extra 'train')",
-            file=sys.stderr,
-        )
-        return 1
     try:
         joint = load_joint(options.joint)
         if options.out is not None:
             check_output(options.out)
         if options.plot is not None:
+            check_installed("analysis", "matplotlib")
             check_picture(options.plot)
         runs = read_runs(options.runs, options.columns, joints=only(options.number))
         number = joint_number(options.number, joint, runs)
@@ -337,7 +332,8 @@ def _friction_mapping(
 LOSSES_BY = "jtq fit losses"
 _EXAMPLE = (
     "  jtq fit losses campaigns/excitation --joint joint1.yaml --out joint1.fused.yaml\n"
-    "The runs must excite load, speed and both directions; `jtq campaign excitation` records them."
+    "The runs must excite load, speed and both directions; `jtq campaign excitation` records them.\n"
+    f"With one encoder one to {MOST_RUNS} runs will do, with a wider sigma."
 )
 
 
@@ -363,16 +359,22 @@ def losses_main(argv: list[str]) -> int:
             for finding in findings:
                 print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
             return 3
-        two = two_encoders(runs, number)
-        fit = fit_fused(
-            signals_of(runs, number, joint), joint.friction, joint.rated_torque_nm, with_torsion=two
-        )
+        two = two_encoders(runs, number) and not one_encoder_twice(runs, number, joint)
+        signals = signals_of(runs, number, joint)
         if not two:
             print(f"{LOSSES_BY}: {ONE_ENCODER}", file=sys.stderr)
-        written = _with_fused(joint, fit, runs)
-        print(json.dumps(_losses_mapping(fit), indent=1) if options.json else "\n".join(_lines(joint, fit)))
+        if not two and len(runs) <= MOST_RUNS:
+            few = fit_few_runs(signals, joint)
+            print(f"{LOSSES_BY}: {FEW_RUNS}", file=sys.stderr)
+            written = _with_few(few, runs)
+            told, lines = _few_mapping(few), _few_lines(few)
+        else:
+            fit = fit_fused(signals, joint.friction, joint.rated_torque_nm, with_torsion=two)
+            written = _with_fused(joint, fit, runs)
+            told, lines = _losses_mapping(fit), _lines(joint, fit)
+        print(json.dumps(told, indent=1) if options.json else "\n".join(lines))
         if options.out is not None:
-            write_joint(options.out, written, f"Written by {LOSSES_BY} from {len(runs)} runs.")
+            write_joint(options.out, written, f"Written by {LOSSES_BY} from {counted(len(runs), 'run')}.")
             print(f"{LOSSES_BY}: wrote {options.out}", file=sys.stderr)
     except (ConfigError, RunError, RunTableError, LossFitError, TorsionError, ValueError, OSError) as error:
         print(f"{LOSSES_BY}: {error}", file=sys.stderr)
@@ -383,6 +385,11 @@ def losses_main(argv: list[str]) -> int:
 ONE_ENCODER: Final = (
     "the runs have one encoder of this joint: no torsion is fitted, sigma is that of motor current less loss"
 )
+FEW_RUNS: Final = (
+    f"up to {MOST_RUNS} runs: what they do not tell stays near the joint file and widens sigma "
+    "(docs/measured_runs.md)"
+)
+_SAME_RAD: Final = 1e-9
 
 
 def two_encoders(runs: list[RunFile], number: int) -> bool:
@@ -393,6 +400,17 @@ def two_encoders(runs: list[RunFile], number: int) -> bool:
             f"{without[0]}: j{number}: found one position, other runs have both, expected both in all runs or in none"
         )
     return not without
+
+
+def one_encoder_twice(runs: list[RunFile], number: int, joint: Joint) -> bool:
+    """Return whether one position of a joint was made of the other, in all runs: a joint under load has torsion."""
+    every = [run.table.joint(number, joint.gear_ratio) for run in runs]
+    return all(
+        each.motor_position_rad is not None
+        and each.link_position_rad is not None
+        and float(np.ptp(each.motor_position_rad / joint.gear_ratio - each.link_position_rad)) < _SAME_RAD
+        for each in every
+    )
 
 
 def signals_of(runs: list[RunFile], number: int, joint: Joint) -> list[RunSignals]:
@@ -414,6 +432,47 @@ def _with_fused(joint: Joint, fit: FusedFit, runs: list[RunFile]) -> Joint:
         temperature_c=fit.fused.loss.temperature_c,
         notes={"unseen_rmse_nm": round(_unseen(fit), 4)},
     )
+
+
+def _with_few(fit: FewRunsFit, runs: list[RunFile]) -> Joint:
+    return with_fit(
+        fit.joint,
+        "fused",
+        by=LOSSES_BY,
+        runs={Path(run.name).name: run.sha256 for run in runs},
+        date=today(),
+        temperature_c=fit.fused.loss.temperature_c,
+        notes={
+            "unseen_rmse_nm": round(fit.unseen_nm, 4),
+            "few_runs": fit.lines(),
+            "rotor_inertia_kgm2": "fitted, too",
+        },
+    )
+
+
+def _few_mapping(fit: FewRunsFit) -> dict[str, object]:
+    """Return the mapping of `_losses_mapping`, and what few runs told of each thing."""
+    return {
+        "schema": "jtq.fit_losses/1",
+        "unseen_rmse_nm": [fit.unseen_nm],
+        "samples": fit.samples,
+        "viscous_per_k_sigma": PER_K_PRIOR[1],
+        "effective_samples": fit.effective,
+        "terms": [asdict(term) for term in fit.terms],
+        "rotor_inertia_kgm2": fit.joint.rotor_inertia_kgm2,
+        "fused": fit.fused.to_mapping(),
+    }
+
+
+def _few_lines(fit: FewRunsFit) -> list[str]:
+    sigma = fit.fused.sigma
+    scale = "/".join(f"{each:.2f}" for each in sigma.scale)
+    return [
+        f"{fit.joint.name}: few runs, one encoder",
+        *(f"  {line}" for line in fit.lines()),
+        f"  sigma of the torque on another day {sigma.current_nm:.2f} Nm, {sigma.viscous_nms_per_rad:.2f} Nms/rad, "
+        f"{100 * sigma.load:.1f} % of load, times {scale} by quadrant ({', '.join(QUADRANTS)})",
+    ]
 
 
 def _unseen(fit: FusedFit) -> float:
@@ -457,10 +516,23 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
             f"  current and torsion differ by up to {agreement.slow_nm:.2f} Nm slowly and {agreement.fast_nm:.2f} Nm "
             "over the motor's turn; sigma grows beyond"
         )
+    zeros = fit.fused.zeros
+    if zeros is not None:
+        lines.append(
+            f"  the link encoder's zero differs by {1e6 * zeros.spread_rad:.0f} urad, {zeros.spread_nm:.2f} Nm, from day to "
+            "day; with track_zeros it is learned"
+        )
+    standstill = fit.fused.standstill
+    if standstill is not None:
+        lines.append(
+            f"  at rest the interval is {standstill.sigmas:.2f} standard deviations and what slip and friction leave open"
+        )
+    elif torsion is not None:
+        lines.append("  too few runs come to rest to calibrate the interval there: 3 standard deviations")
     tracking = fit.fused.tracking
     if tracking is not None:
         lines.append(
-            f"  with the link tracked, an estimate of now: {tracking.sigma_nm:.2f} Nm and "
+            f"  with the torsion tracked, an estimate of now: {tracking.sigma_nm:.2f} Nm and "
             f"{tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares"
         )
     return lines

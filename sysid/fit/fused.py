@@ -10,7 +10,9 @@ With residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor on runs no
     e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
     scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
               (Vovk et al. 2005), every run weighted alike, its level set so that a run left out is covered to 90 %
+    zeros: how far the link encoder's zero differs from day to day (`sysid/fit/zeros.py`)
     tracking: what an estimate of now errs by beyond that (`sysid/fit/tracking.py`)
+    standstill: how wide the interval of a standing joint is (`sysid/fit/standstill.py`)
 
 A joint with one encoder has the current path alone (torsion None): nothing tells the sensor's zero from that path's
 own error, so reference is 0 and sigma holds both.
@@ -23,57 +25,51 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from scipy.optimize import nnls
 
 from jtqd.estimator.agreement import levels
-from jtqd.estimator.arrays import FloatArray, QuadrantArray
+from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.envelope import MAX_CELLS, Envelope
 from jtqd.estimator.estimator import SLOPE_NM, quadrants
-from jtqd.estimator.fusion import GAUSS, Fusion, held
-from jtqd.estimator.joint import AdditiveLoss, Agreement, Friction, Fused, FusedSigma, Torsion
+from jtqd.estimator.fusion import Fusion, held
+from jtqd.estimator.joint import (
+    AdditiveLoss,
+    Agreement,
+    DayZeros,
+    Friction,
+    Fused,
+    FusedSigma,
+    Torsion,
+    Tracking,
+)
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
+from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
 from jtqd.sysid.fit.agreement import fit_agreement
+from jtqd.sysid.fit.conformal import conformal_scale
 from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of, velocity_step
 from jtqd.sysid.fit.losses import LossFit, fit_loss
+from jtqd.sysid.fit.residuals import NowErrors, PathResiduals
 from jtqd.sysid.fit.signals import RunSignals
+from jtqd.sysid.fit.standstill import KNOWN, Standing, ahead_nm, fit_standstill
 from jtqd.sysid.fit.torsion import fit_torsion
-from jtqd.sysid.fit.torsion_signals import torsion_now, torsion_torque
-from jtqd.sysid.fit.tracking import TRACKING_RAD_S, fit_tracking
+from jtqd.sysid.fit.torsion_signals import (
+    deflection,
+    local_stiffness,
+    torsion_now,
+    torsion_through,
+    torsion_torque,
+)
+from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S, fit_tracking, worth_it
+from jtqd.sysid.fit.zeros import fit_zeros
 
-COVERAGE: Final = 0.9
 _FLOOR_NM: Final = 0.02
 _FAST_RAD_S: Final = 0.1
 """Slower samples do not count for sigma: near a reversal the loss is not settled, which `half` accounts for."""
-_FEWEST: Final = 50
-"""Samples of a run that a quadrant needs for the run to count there."""
-_LEAST_SCALE: Final = 0.05
-_NONE: Final = np.zeros(0)
-
-
-class PathResiduals(NamedTuple):
-    """One unseen run: arrays [n] of its moving samples (Nm, rad/s); half: `AdditiveLossModel.loss`; open: of the slip.
-
-    torsion_nm, open_nm and torsion_error_nm are 0 where there is no torsion. dt_s, direction and slope (dL/draw of the loss)
-    are for `fused.agreement`, now (the torsion's error with the link tracked, and through the motor path's filter) for
-    `fused.tracking`; empty: the run does not count there.
-    """
-
-    raw_nm: FloatArray
-    velocity_rad_s: FloatArray
-    half_nm: FloatArray
-    torsion_nm: FloatArray
-    open_nm: FloatArray
-    current_error_nm: FloatArray
-    torsion_error_nm: FloatArray
-    dt_s: FloatArray = _NONE
-    direction: FloatArray = _NONE
-    slope: FloatArray = _NONE
-    now: tuple[FloatArray, FloatArray] = (_NONE, _NONE)
 
 
 def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> FusedSigma:
@@ -124,75 +120,6 @@ def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> Fu
     )
 
 
-def conformal_scale(
-    errors: Sequence[FloatArray], sigmas: Sequence[FloatArray], quadrants: Sequence[QuadrantArray]
-) -> tuple[float, float, float, float]:
-    """Return the factor per quadrant that makes value +- GAUSS sigma cover COVERAGE of unseen samples.
-
-    One array per run each. Runs count alike in a quadrant, whatever their length; a quadrant in which no run has 50
-    samples takes the factor of all. Raises ValueError where there are no samples at all.
-    """
-    ratios = [np.abs(e) / s for e, s in zip(errors, sigmas, strict=True)]
-    if not any(map(len, ratios)):
-        raise ValueError("found no samples to calibrate sigma with, expected some")
-    every = _quantile_by_runs(ratios)
-    scales = []
-    for q in range(4):
-        inside = [ratio[quadrant == q] for ratio, quadrant in zip(ratios, quadrants, strict=True)]
-        inside = [part for part in inside if len(part) >= _FEWEST]
-        scales.append((_quantile_by_runs(inside) if inside else every) / GAUSS)
-    a, b, c, d = (max(scale, _LEAST_SCALE) for scale in scales)
-    return a, b, c, d
-
-
-_HIGHEST_LEVEL: Final = 0.97
-_STEPS: Final = 200
-"""Points of a run's distribution that the level is sought with: 0.25 % of a run between two of them at most."""
-
-
-def _quantile_by_runs(parts: Sequence[FloatArray]) -> float:
-    """Return the quantile of the samples of all parts, each part with the same weight, for COVERAGE on a new part."""
-    values = np.concatenate(parts)
-    weights = np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts])
-    order = np.argsort(values)
-    share = np.cumsum(weights[order])
-    level = unbiased_level(parts)
-    at = min(int(np.searchsorted(share, level * share[-1] * (1.0 - 1e-12))), len(values) - 1)
-    return float(values[order][at])
-
-
-def unbiased_level(parts: Sequence[FloatArray]) -> float:
-    """Return the level at which the quantile of all parts but one covers COVERAGE of that one, on average over all.
-
-    Runs are what is exchangeable, not samples. Where runs are all alike the level is COVERAGE; where each run is one
-    error of its own, COVERAGE (n + 1)/n, the mean of split conformal prediction without its rounding up (Lei et al.
-    2018, which guarantees at least COVERAGE and so covers more on average). Real runs lie in between, and leaving out
-    one run after the other tells where (Barber et al. 2021). At most _HIGHEST_LEVEL: the largest of few says nothing.
-    """
-    grid = (np.arange(_STEPS) + 0.5) / _STEPS
-    rows = np.array([np.quantile(part, grid) for part in parts if len(part)])
-    if len(rows) < 2:
-        return _HIGHEST_LEVEL
-    run = np.repeat(np.arange(len(rows)), _STEPS)
-    order = np.argsort(rows, axis=None, kind="stable")
-    values, run = rows.ravel()[order], run[order]
-    others = np.array([values[run != k] for k in range(len(rows))])
-
-    def covered(level: float) -> float:
-        ends = others[:, min(int(level * others.shape[1]), others.shape[1] - 1)]
-        return float(np.mean(rows <= ends[:, None]))
-
-    def root(target: float) -> float:
-        low, high = 0.0, _HIGHEST_LEVEL
-        while high - low > 1e-4:
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if covered(middle) >= target else (middle, high)
-        return high
-
-    # a few runs of one error each are covered in steps, and a step may lie at COVERAGE itself: its middle
-    return 0.5 * (root(COVERAGE - 1e-9) + root(COVERAGE + 1e-9))
-
-
 def quadrants_of(run: PathResiduals) -> QuadrantArray:
     """Return each sample's index into QUADRANTS [n]."""
     return quadrants(run.raw_nm, run.velocity_rad_s)
@@ -237,7 +164,7 @@ def fit_fused(
         raise ValueError(
             f"found {counted(len(runs), 'run')}, expected at least {_LEAST_RUNS}: standard deviations need held-out runs"
         )
-    unseen = _unseen(runs, friction, with_torsion=with_torsion)
+    unseen, standing = _unseen(runs, friction, with_torsion=with_torsion)
     sigma = fit_sigma(unseen, with_torsion=with_torsion)
     errors, sigmas = zip(*(fused_error(run, sigma, with_torsion=with_torsion) for run in unseen), strict=True)
     sigma = replace(sigma, scale=conformal_scale(errors, sigmas, [quadrants_of(run) for run in unseen]))
@@ -247,19 +174,42 @@ def fit_fused(
     envelope = None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
     fused = Fused(fit.loss, torsion, sigma, envelope=envelope)
     if rated_nm is not None and torsion is not None:
+        fused = replace(fused, zeros=_day_zeros(unseen, fused, rated_nm))
         fused = replace(fused, agreement=_agreement(unseen, fused, rated_nm))
-    if torsion is not None and all(len(run.now[0]) == len(run.raw_nm) for run in unseen):
-        scales = [np.array(sigma.scale)[quadrants_of(run)] for run in unseen]
+    if torsion is not None:
+        standing_errors = [_standing(*run, sigma) for run in standing]
         fused = replace(
             fused,
-            tracking=fit_tracking(
-                errors,
-                [scale * each for scale, each in zip(scales, sigmas, strict=True)],
-                [_error_now(run, sigma) for run in unseen],
-                [run.velocity_rad_s for run in unseen],
-            ),
+            tracking=tracking_of_unseen(unseen, sigma),
+            standstill=fit_standstill(standing_errors, sigma.reference_nm),
         )
     return FusedFit(fused, fit, rmse)
+
+
+def tracking_of_unseen(unseen: Sequence[PathResiduals], sigma: FusedSigma) -> Tracking | None:
+    """Return what an estimate of now adds to the calibrated sigma on unseen runs of a joint with torsion.
+
+    None where the low pass of new configurations errs no more, or positions are not known.
+    """
+    if not all(len(run.now.tracked_nm) == len(run.raw_nm) for run in unseen):
+        return None
+    if not worth_it([run.now.tracked_nm for run in unseen], [run.now.late_nm for run in unseen]):
+        return None
+    errors, sigmas = zip(*(fused_error(run, sigma) for run in unseen), strict=True)
+    scales = [np.array(sigma.scale)[quadrants_of(run)] for run in unseen]
+    return fit_tracking(
+        errors,
+        [scale * each for scale, each in zip(scales, sigmas, strict=True)],
+        [_error_now(run, sigma) for run in unseen],
+        [run.velocity_rad_s for run in unseen],
+    )
+
+
+def _day_zeros(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> DayZeros | None:
+    quadrant = [quadrants_of(run) for run in unseen]
+    return fit_zeros(
+        unseen, fused, rated_nm, lambda errors, sigmas: conformal_scale(errors, sigmas, quadrant)
+    )
 
 
 def _agreement(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> Agreement | None:
@@ -300,19 +250,34 @@ def _envelope(
     return made if max(len(made.known), len(made.known[0])) <= MAX_CELLS else None
 
 
-def _unseen(runs: Sequence[RunSignals], friction: Friction, *, with_torsion: bool) -> list[PathResiduals]:
-    """Return the residuals of every run with motion, in order, from fits on the runs of the other folds."""
-    found: dict[int, PathResiduals] = {}
+def _unseen(
+    runs: Sequence[RunSignals], friction: Friction, *, with_torsion: bool
+) -> tuple[list[PathResiduals], list[tuple[PathResiduals, FloatArray]]]:
+    """Return the residuals of every run with motion, in order, from fits on the runs of the other folds: moving; at rest.
+
+    At rest only with torsion, each with what `ahead_nm` says of its samples.
+    """
+    moving: dict[int, PathResiduals] = {}
+    standing: dict[int, tuple[PathResiduals, FloatArray]] = {}
     for known, judged in folds(runs):
         torsion = fit_torsion(known) if with_torsion else None
         loss = fit_loss(known, friction).loss
-        found |= {n: path_residuals(runs[n], loss, torsion) for n in judged if runs[n].moving.any()}
-    return [found[n] for n in sorted(found)]
+        for n in judged:
+            run = runs[n]
+            if not run.moving.any():
+                continue
+            moving[n] = path_residuals(run, loss, torsion)
+            if torsion is not None:
+                ahead = ahead_nm(run, torsion)[run.standing]
+                standing[n] = (path_residuals(run, loss, torsion, run.standing), ahead)
+    return [moving[n] for n in sorted(moving)], [standing[n] for n in sorted(standing)]
 
 
-def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None) -> PathResiduals:
-    """Return what both paths miss on a run's moving samples, with a loss and a torsion from elsewhere."""
-    keep, seen = run.moving, run.seen
+def path_residuals(
+    run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None, keep: BoolArray | None = None
+) -> PathResiduals:
+    """Return what both paths miss on samples `keep` [n] of a run, None: those in motion; loss and torsion from elsewhere."""
+    keep, seen = run.moving if keep is None else keep, run.seen
     loss_nm, wide = loss_and_width(run, loss)
     raw, sensor = seen.raw_nm[keep], run.sensor_nm[keep]
     current = raw - loss_nm[keep] - sensor
@@ -326,11 +291,15 @@ def path_residuals(run: RunSignals, loss: AdditiveLoss, torsion: Torsion | None)
     )
     slope = (more - loss_nm[keep]) / SLOPE_NM
     dt, direction = seen.dt_s[keep], seen.direction[keep]
-    now = (_NONE, _NONE)
+    now = NowErrors()
     if run.as_read is not None:
-        error = torsion_now(torsion, run, run.as_read, TRACKING_RAD_S) - run.as_read.sensor_nm
-        now = (error[keep], low_pass(error, seen.dt_s, run.bandwidth_rad_s)[keep])
-    return PathResiduals(raw, velocity, half, tau, open_nm, current, tau - sensor, dt, direction, slope, now)
+        error = torsion_now(torsion, run, run.as_read, TRACKING_RAD_S, WAVE_RAD_S) - run.as_read.sensor_nm
+        late = torsion_through(torsion, run, run.as_read, TORSION_BANDWIDTH_RAD_S) - run.as_read.sensor_nm
+        now = NowErrors(error[keep], low_pass(error, seen.dt_s, run.bandwidth_rad_s)[keep], late[keep])
+    stiffness = local_stiffness(torsion, deflection(torsion, run)[keep])
+    return PathResiduals(
+        raw, velocity, half, tau, open_nm, current, tau - sensor, dt, direction, slope, now, stiffness
+    )
 
 
 def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, FloatArray]:
@@ -352,11 +321,19 @@ def fused_error(
     return run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm), spread
 
 
+def _standing(run: PathResiduals, ahead: FloatArray, sigma: FusedSigma) -> Standing:
+    """Return what a standing run tells of the interval at rest."""
+    error, _ = fused_error(run, sigma)
+    spread, bound = Fusion(replace(sigma, reference_nm=0.0), True).rest_many(
+        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
+    )
+    return Standing(error + ahead, spread, bound, run.open_nm <= KNOWN * sigma.torsion_nm)
+
+
 def _error_now(run: PathResiduals, sigma: FusedSigma) -> FloatArray:
     """Return the error [n] of the estimate of now: tau_t + (1 - alpha) (tau_c - tau_t'), as `FusedEstimator` forms it."""
     alpha, _ = Fusion(sigma, True).weigh_many(
         run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
     )
-    young, aged = run.now
-    result: FloatArray = young + (1.0 - alpha) * (run.current_error_nm - aged)
+    result: FloatArray = run.now.tracked_nm + (1.0 - alpha) * (run.current_error_nm - run.now.aged_nm)
     return result

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.optimize import lsq_linear
 
@@ -207,18 +208,18 @@ def _solve(
     covariance = np.asarray(np.linalg.inv(left), np.float64)
     values = covariance @ right
     if (values[_SIGNED] < 0.0).any():
-        values = _bounded(left, right)
+        values = bounded(left, right, _SIGNED)
     return values, covariance
 
 
-def _bounded(left: FloatArray, right: FloatArray) -> FloatArray:
-    """Return the most probable values of which none in _SIGNED is below 0: bounded least squares (Stark and Parker 1995)."""
+def bounded(left: FloatArray, right: FloatArray, signed: NDArray[np.intp] | slice) -> FloatArray:
+    """Return the most probable values, none in `signed` below 0: bounded least squares (Stark and Parker 1995)."""
     root = np.linalg.cholesky(left)
     lowest = np.full(len(left), -np.inf)
-    lowest[_SIGNED] = 0.0
+    lowest[signed] = 0.0
     found = lsq_linear(root.T, solve_triangular(root, right, lower=True), (lowest, np.inf), method="bvls")
     result: FloatArray = found.x
-    result[_SIGNED] = np.maximum(result[_SIGNED], 0.0)
+    result[signed] = np.maximum(result[signed], 0.0)
     return result
 
 

@@ -31,10 +31,11 @@ _COLUMNS: Final = (
 
 
 class AsRead(NamedTuple):
-    """What no filter has passed, arrays [n]: torsion angle of both encoders [rad], torque sensor [Nm]."""
+    """What no filter of ours has passed [n]: torsion angle of both encoders [rad], sensor [Nm], motor's speed [rad/s]."""
 
     torsion_rad: FloatArray
     sensor_nm: FloatArray
+    motor_velocity_rad_s: FloatArray
 
 
 @dataclass(frozen=True)
@@ -98,5 +99,7 @@ def run_signals(
         np.asarray(motor, np.float64),
         np.asarray(link, np.float64),
         settings.bandwidth_rad_s,
-        AsRead(np.asarray(motor, np.float64) / joint.gear_ratio - link, sensor),
+        AsRead(
+            np.asarray(motor, np.float64) / joint.gear_ratio - link, sensor, np.asarray(velocity, np.float64)
+        ),
     )

@@ -21,7 +21,7 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Torsion
 from jtqd.estimator.observer import slipped
 from jtqd.sysid.fit.signals import RunSignals
-from jtqd.sysid.fit.torsion_signals import deflection, rate_of, stretched, torsion_torque
+from jtqd.sysid.fit.torsion_signals import deflection, local_stiffness, rate_of, stretched, torsion_torque
 
 WORTH: Final = 0.05
 """Part of the variance on runs left out that an extension must take away to be believed."""
@@ -80,15 +80,17 @@ def _table(run: RunSignals, torsion: Torsion, knots: Sequence[float]) -> _Table:
     assert run.link_position_rad is not None
     keep = np.flatnonzero(run.moving)[::_EVERY]
     d = deflection(torsion, run)
+    # an error of an angle is a torque by the spring's stiffness where it is: that at rest counts as 1
+    stiffer = (local_stiffness(torsion, d) / torsion.stiffness_nm_per_rad)[:, None]
     columns = {
         "spring": d[:, None],
         "cubic": d[:, None] ** 3,
         "damping": rate_of(d, run)[:, None],
-        "ripple": run.seen.waves,
+        "ripple": stiffer * run.seen.waves,
         "slip": slipped(d, torsion.hysteresis_travel_rad)[0][:, None],
         "hardening": np.column_stack([stretched(d, knot) for knot in knots]),
-        "link": np.hstack([run.waves(run.link_position_rad, order) for order in LINK_ORDERS]),
-        "motor": np.hstack([run.waves(run.motor_position_rad, order) for order in MOTOR_ORDERS]),
+        "link": stiffer * np.hstack([run.waves(run.link_position_rad, order) for order in LINK_ORDERS]),
+        "motor": stiffer * np.hstack([run.waves(run.motor_position_rad, order) for order in MOTOR_ORDERS]),
         "slips": np.column_stack([slipped(d, travel)[0] for travel in SLIP_TRAVELS_RAD]),
     }
     centred = {name: part[keep] - part[keep].mean(axis=0) for name, part in columns.items()}

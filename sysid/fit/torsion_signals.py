@@ -9,7 +9,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Torsion
-from jtqd.estimator.observer import RIPPLE_ORDERS, slipped, tracked
+from jtqd.estimator.observer import RIPPLE_ORDERS, low_pass, slipped, tracked
 from jtqd.sysid.fit.signals import AsRead, RunSignals
 
 
@@ -50,6 +50,14 @@ def stretched(d_rad: FloatArray, beyond_rad: float) -> FloatArray:
     return result
 
 
+def local_stiffness(torsion: Torsion, d_rad: FloatArray) -> FloatArray:
+    """Return d tau_t/d d [n, Nm/rad] of the spring at deflections [n], without slips."""
+    result: FloatArray = torsion.stiffness_nm_per_rad + 3.0 * torsion.cubic_nm_per_rad3 * d_rad * d_rad
+    for beyond, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
+        result = result + stiffness * (np.abs(d_rad) > beyond)
+    return result
+
+
 def rate_of(d_rad: FloatArray, run: RunSignals) -> FloatArray:
     """Return d' [n, rad/s] of a filtered deflection, as FusedObserver forms it: over the step before; 0 beside a gap."""
     dt_s = run.seen.dt_s
@@ -63,21 +71,35 @@ def torsion_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, Float
     return _torque(torsion, d, rate_of(d, run))
 
 
-def torsion_now(torsion: Torsion, run: RunSignals, as_read: AsRead, rate_rad_s: float) -> FloatArray:
-    """Return the torsion's torque [n] as FusedObserver forms it with the link tracked at this rate, of now.
+def torsion_now(
+    torsion: Torsion, run: RunSignals, as_read: AsRead, rate_rad_s: float, wave_rad_s: float
+) -> FloatArray:
+    """Return the torsion's torque [n] as FusedObserver forms it with the torsion tracked at these rates, of now.
 
     Raises ValueError where the run's positions are not known.
     """
-    link, motor, dt_s = run.link_position_rad, run.motor_position_rad, run.seen.dt_s
-    if link is None or motor is None:
+    d, motor = _as_read(torsion, run, as_read)
+    d, rate = tracked(d, motor, as_read.motor_velocity_rad_s, run.seen.dt_s, rate_rad_s, wave_rad_s)
+    return _torque(torsion, d, rate)[0]
+
+
+def torsion_through(torsion: Torsion, run: RunSignals, as_read: AsRead, bandwidth_rad_s: float) -> FloatArray:
+    """Return the torsion's torque [n] as FusedObserver forms it through a low pass of its own, 1/g_t old.
+
+    Raises ValueError where the run's positions are not known.
+    """
+    d = low_pass(_as_read(torsion, run, as_read)[0], run.seen.dt_s, bandwidth_rad_s)
+    return _torque(torsion, d, rate_of(d, run))[0]
+
+
+def _as_read(torsion: Torsion, run: RunSignals, as_read: AsRead) -> tuple[FloatArray, FloatArray]:
+    """Return the deflection through no filter, and the motor's position [n]."""
+    motor = run.motor_position_rad
+    if run.link_position_rad is None or motor is None:
         raise ValueError(f"{run.name}: found no positions, expected those of both encoders")
     waves = [part(order * motor) for order in RIPPLE_ORDERS for part in (np.cos, np.sin)]
     seen = replace(run.seen, torsion_nm=as_read.torsion_rad, waves=np.column_stack(waves))
-    d = deflection(torsion, replace(run, seen=seen, bandwidth_rad_s=inf))
-    noise, velocity = tracked(link, dt_s, rate_rad_s)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        moved = np.diff(d + link, prepend=np.nan) / np.where(dt_s > 0.0, dt_s, np.nan)
-    return _torque(torsion, d + noise, np.nan_to_num(moved - velocity, nan=0.0))[0]
+    return deflection(torsion, replace(run, seen=seen, bandwidth_rad_s=inf)), motor
 
 
 def _torque(torsion: Torsion, d: FloatArray, rate_rad_s: FloatArray) -> tuple[FloatArray, FloatArray]:

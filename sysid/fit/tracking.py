@@ -19,8 +19,9 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Tracking
 
-TRACKING_RAD_S: Final = 220.0
-"""Rate of the link's tracking filter: at rest hardly noisier than a low pass of 800 rad/s; chosen from a table,
+TRACKING_RAD_S: Final = 400.0
+WAVE_RAD_S: Final = 160.0
+"""Rates of the torsion's tracking filter: at rest no noisier than a low pass of 800 rad/s; chosen from a table,
 docs/estimator.md."""
 COVERAGE: Final = 0.9
 _MOST: Final = 4.0
@@ -49,4 +50,16 @@ def fit_tracking(
     while high - low > 1e-3:
         k = 0.5 * (low + high)
         low, high = (low, k) if covered(k) >= COVERAGE else (k, high)
-    return Tracking(TRACKING_RAD_S, high * float(np.sqrt(noise)), high * float(np.sqrt(viscous)))
+    return Tracking(TRACKING_RAD_S, high * float(np.sqrt(noise)), high * float(np.sqrt(viscous)), WAVE_RAD_S)
+
+
+def worth_it(errors_now: Sequence[FloatArray], errors_low_pass: Sequence[FloatArray]) -> bool:
+    """Return whether tracking beats the low pass of new configurations, over runs left out, against the sensor now.
+
+    Means of runs count for nothing: the zeros of a day are in both.
+    """
+
+    def square(runs: Sequence[FloatArray]) -> float:
+        return float(sum(np.sum((run - run.mean()) ** 2) for run in runs if len(run)))
+
+    return square(errors_now) < square(errors_low_pass)

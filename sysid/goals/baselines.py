@@ -75,8 +75,11 @@ class Example(NamedTuple):
     moving: np.ndarray[tuple[int], np.dtype[np.bool_]]
 
 
-def fit_baseline(baseline: Baseline, examples: Sequence[Example]) -> FloatArray:
-    """Return the coefficients [k] of ordinary least squares over the moving samples of all runs; ValueError without any."""
+def fit_baseline(baseline: Baseline, examples: Sequence[Example], rcond: float | None = None) -> FloatArray:
+    """Return the coefficients [k] of ordinary least squares over the moving samples of all runs; ValueError without any.
+
+    rcond: singular values below this part of the largest one count as 0, None: those of rounding size alone.
+    """
     rows, targets = [], []
     for each in examples:
         keep = np.flatnonzero(each.moving)[::EVERY]
@@ -87,5 +90,5 @@ def fit_baseline(baseline: Baseline, examples: Sequence[Example]) -> FloatArray:
         raise ValueError("found no samples in motion, expected some to fit a baseline to")
     x, y = np.concatenate(rows), np.concatenate(targets)
     size = np.sqrt(np.mean(x * x, axis=0))
-    found: FloatArray = np.linalg.lstsq(x / size, y, rcond=None)[0] / size
+    found: FloatArray = np.linalg.lstsq(x / size, y, rcond=rcond)[0] / size
     return found

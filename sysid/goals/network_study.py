@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -71,7 +71,7 @@ class Part:
 
 def part_of(run: Driven, one: Identified) -> Part:
     """Return what a network may see of a joint in a run, and what physics leaves there."""
-    joint, settings = one.joint, settings_of(OURS)
+    joint, settings = one.joint, replace(settings_of(OURS), track_torsion=False)
     columns = run.columns(one.number, joint)
     time_s = run.table.time_s
     dt = np.diff(time_s, prepend=time_s[0])

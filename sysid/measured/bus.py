@@ -1,6 +1,6 @@
 """Score jtqd itself on the measured runs: played on a CAN bus, estimated at 1 kHz, compared from its own log.
 
-For both runs, before and after fitting friction on the other run: the run is played by `jtq sim --play` as the
+For both runs, before and after fitting the losses on the other run: the run is played by `jtq sim --play` as the
 PDOs of two drives and a sensor, jtqd runs against it and records, and the log is compared with the sensor
 that came over the bus (filtered like the estimate) and with the estimate made offline from the file.
 """
@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.checked import Section
 from jtqd.estimator.decoder import decode
-from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings
@@ -178,10 +178,13 @@ def _played_row(time_s: Array, run_s: Array) -> NDArray[np.intp]:
 
 
 def _offline(played: Played) -> Array:
-    """Whole-run estimate from the file, as `offline` makes it; NaN where none would be published."""
+    """Whole-run estimate from the file, as `offline` makes it; NaN where none would be published.
+
+    Without the temperature: the played drives send none.
+    """
     table, joint = played.table, played.joint
     dt_s, current, motor, velocity, link = table.estimator_inputs(played.number, joint.gear_ratio)
-    result = JointEstimator(joint, played.settings).run(dt_s, current, motor, velocity, link)
+    result = make_estimator(joint, played.settings).run(dt_s, current, motor, velocity, link)
     return np.where(np.isin(result.status, PUBLISHED), result.torque_nm, np.nan)
 
 
@@ -199,13 +202,20 @@ def reference_torque(state: Records, time_s: Array, bandwidth_rad_s: float) -> A
 def _replay(state: Records, played: Played) -> float:
     """Return the largest difference between the logged torque and a whole-run estimate of the logged inputs [Nm]."""
     fed = np.isfinite(state["dt_s"])
-    names = ("dt_s", "current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
-    again = JointEstimator(played.joint, played.settings).run(
+    names = (
+        "dt_s",
+        "current_a",
+        "motor_position_rad",
+        "motor_velocity_rad_s",
+        "link_position_rad",
+        "temperature_c",
+    )
+    again = make_estimator(played.joint, played.settings).run(
         *(np.asarray(state[name][fed]) for name in names)
     )
     logged = state["torque_nm"][fed]
-    # The loop keeps its first cycles back as "starting"; there is no torque of theirs in the log.
-    expected = np.isfinite(again.torque_nm) & (state["status"][fed] != STARTING)
+    # The loop keeps back the torque of its first cycles, and of those beside a missing input; there is none in the log.
+    expected = np.isfinite(again.torque_nm) & ~np.isin(state["status"][fed], (STARTING, STALE))
     if not np.array_equal(np.isfinite(logged), expected):
         return float("inf")
     return float(np.max(np.abs(logged - again.torque_nm)[expected], initial=0.0))

@@ -18,7 +18,7 @@ from typing import Any
 from jtqd.daemon.logs import LogError
 from jtqd.estimator.checked import ConfigError, make_directory
 from jtqd.estimator.run import RunTableError
-from jtqd.sysid.fit.friction import FitError
+from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.measured import bus, offline
 from jtqd.sysid.runs.files import RunError
 
@@ -37,7 +37,7 @@ def main(arguments: list[str] | None = None) -> int:
     except OSError as error:
         print(f"jtq measured: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
         return 1
-    except (RunError, RunTableError, ConfigError, FitError, LogError, bus.PlayError) as error:
+    except (RunError, RunTableError, ConfigError, LossFitError, LogError, bus.PlayError) as error:
         print(f"jtq measured: {error}", file=sys.stderr)
         return 1
     return 0
@@ -47,7 +47,7 @@ def parser() -> argparse.ArgumentParser:
     """Arguments of `jtq measured`."""
     result = argparse.ArgumentParser(
         prog="jtq measured",
-        description="Score the torque observer on the Kinova Gen3 runs, before and after fitting friction.",
+        description="Score the torque observer on the Kinova Gen3 runs, before and after fitting the losses.",
         epilog="examples:\n  jtq measured --out measured\n  jtq measured --bus unix:/tmp/bus --out measured",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -76,7 +76,7 @@ def _offline(out: Path, joint_files: Path, as_json: bool) -> None:
     print("RMSE of the estimate against the arm's torque sensor, Nm (percent of rated torque)")
     print("\n".join(offline.table_lines(cases)))
     for (joint, run), fit in fits.items():
-        print(f"\njoint {joint}, friction fitted on {run}:", *fit.lines(), sep="\n  ")
+        print(f"\njoint {joint}, losses fitted on {run}:", *fit.lines(), sep="\n  ")
 
 
 def _on_bus(address: str, out: Path, as_json: bool) -> None:

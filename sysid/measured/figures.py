@@ -21,7 +21,7 @@ mpl.use("Agg")  # files only; a display is not needed
 SILENT = "#d9d9e6"
 LABELS = {
     "before": (parts.BEFORE, "before: joint file as shipped"),
-    "after": (parts.AFTER, "after: friction fitted on the other run"),
+    "after": (parts.AFTER, "after: losses fitted on the other run"),
 }
 
 
@@ -41,7 +41,7 @@ def draw_joint(cases: Sequence[Case], path: Path) -> None:
             (
                 case.after_nm,
                 parts.AFTER,
-                f"after: friction fitted on {case.fitted_on}, RMSE {case.after.rmse_nm:.2f} Nm",
+                f"after: losses fitted on {case.fitted_on}, RMSE {case.after.rmse_nm:.2f} Nm",
             ),
         )
         for values, colour, label in lines:

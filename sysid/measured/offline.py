@@ -1,9 +1,9 @@
-"""Score the estimator on measured runs by the arm's own torque sensor, before and after fitting friction.
+"""Score the estimator on measured runs by the arm's own torque sensor, before and after fitting the losses.
 
-For each joint and each run the estimate is made three times: with the joint file that ships (before), with
-its friction fitted on the OTHER run (after), and with no friction at all, for scale. Nothing but friction
-is fitted, and no run is scored by a fit that has seen it. The reference is the sensor passed through the
-observer's own low-pass, so that the known group delay is not counted as error.
+For each joint and each run the estimate is made three times: with the joint file that ships and method `tob` (before), with
+losses, offset and rotor inertia fitted on the OTHER run and method `fused` without torsion (after: `sysid.fit.few_runs`),
+and with no friction at all, for scale. No run is scored by a fit that has seen it. The reference is the sensor passed
+through the observer's own low-pass, so that the known group delay is not counted as error.
 """
 
 from __future__ import annotations
@@ -13,17 +13,18 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
-from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Friction, Joint
+from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import EstimateRun, RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.friction import FrictionFit, fit_friction
+from jtqd.sysid.fit.few_runs import FewRunsFit, fit_few_runs
+from jtqd.sysid.fit.joint_writer import write_joint
+from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import RunError, RunFile, read_run
 
@@ -32,6 +33,8 @@ Array = NDArray[np.float64]
 RUNS = ("opti_traj_testing1", "RunTrajectory1")
 JOINTS = (2, 4)
 SETTINGS = EstimatorSettings(method="tob", bandwidth_rad_s=200.0)
+AFTER = EstimatorSettings(method="fused", bandwidth_rad_s=200.0)
+"""Of the fitted joint files, which have section `fused`."""
 NO_FRICTION = Friction(coulomb_nm=0.0, viscous_nms_per_rad=0.0)
 
 
@@ -82,23 +85,32 @@ def score(estimate_nm: Array, sensor_nm: Array, dt_s: Array, bandwidth_rad_s: fl
 
 def estimate(joint: Joint, table: RunTable, number: int) -> EstimateRun:
     """Estimate joint `number` of a run; torque is NaN where none would be published. Raises RunTableError."""
+    settings = SETTINGS if joint.fused is None else AFTER
     dt_s, current, position, velocity, link = table.estimator_inputs(number, joint.gear_ratio)
-    return JointEstimator(joint, SETTINGS).run(dt_s, current, position, velocity, link)
+    temperature = table.joints[number].temperature_c
+    return make_estimator(joint, settings).run(dt_s, current, position, velocity, link, temperature)
 
 
-def fitted_joint(joint: Joint, fit: FrictionFit, file: RunFile, *, number: int, run: str, date: str) -> Joint:
-    """Return the joint with the fitted friction (four decimals) and where it comes from."""
-    friction: dict[str, float] = {key: round(value, 4) for key, value in asdict(fit.friction).items()}
-    temperature = file.table.joints[number].temperature_c
+def fit(joint: Joint, file: RunFile, *, number: int, run: str) -> FewRunsFit:
+    """Fit a joint to one run, by its motor side alone. Raises LossFitError, RunTableError, ValueError."""
+    columns = file.table.joint(number, joint.gear_ratio)
+    return fit_few_runs([run_signals(run, joint, SETTINGS, file.table.time_s, columns)], joint)
+
+
+def fitted_joint(joint: Joint, found: FewRunsFit, file: RunFile, *, run: str, date: str) -> Joint:
+    """Return the fitted joint, and where it comes from."""
     origin: dict[str, object] = {
-        "friction": f"fitted on {run}.csv.gz by jtq measured; no other value was fitted",
-        "friction_fit": fit.lines(),
+        "fused": f"fitted on {run}.csv.gz by jtq measured, and rotor_inertia_kgm2; no other value was fitted",
+        "few_runs": found.lines(),
         "log_sha256": file.sha256,
         "date": date,
     }
-    if temperature is not None:
-        origin["temperature_c"] = round(float(np.mean(temperature)), 1)
-    return replace(joint, friction=Friction(**friction), provenance={**joint.provenance, **origin})
+    return replace(
+        joint,
+        fused=found.fused,
+        rotor_inertia_kgm2=found.joint.rotor_inertia_kgm2,
+        provenance={**joint.provenance, **origin},
+    )
 
 
 def compare(joint: Joint, after: Joint, table: RunTable, *, number: int, run: str, fitted_on: str) -> Case:
@@ -127,7 +139,7 @@ def compare(joint: Joint, after: Joint, table: RunTable, *, number: int, run: st
     )
 
 
-def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tuple[int, str], FrictionFit]]:
+def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tuple[int, str], FewRunsFit]]:
     """Score all joints in all runs; return the cases, and the fits by (joint, run).
 
     Args:
@@ -135,20 +147,17 @@ def evaluate(joint_files: Path | None, date: str) -> tuple[list[Case], dict[tupl
         date: for their provenance.
 
     Raises:
-        RunError, RunTableError, ConfigError, FitError, OSError: a file cannot be used.
+        RunError, RunTableError, ConfigError, LossFitError, ValueError, OSError: a file cannot be used.
     """
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     files = {run: read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns) for run in RUNS}
     cases: list[Case] = []
-    fits: dict[tuple[int, str], FrictionFit] = {}
+    fits: dict[tuple[int, str], FewRunsFit] = {}
     for number in JOINTS:
         joint = load_joint(columns.joint_files[number])
         for run, other in (RUNS, RUNS[::-1]):
-            table = files[other].table
-            fit = fits[number, other] = fit_friction(
-                table.time_s, table.joints[number], joint, bandwidth_rad_s=SETTINGS.bandwidth_rad_s
-            )
-            after = fitted_joint(joint, fit, files[other], number=number, run=other, date=date)
+            found = fits[number, other] = fit(joint, files[other], number=number, run=other)
+            after = fitted_joint(joint, found, files[other], run=other, date=date)
             cases.append(compare(joint, after, files[run].table, number=number, run=run, fitted_on=other))
             if joint_files is not None:
                 _save(after, joint_files / f"joint{number}.fitted_on_{other}.yaml")
@@ -172,10 +181,10 @@ def table_lines(cases: list[Case]) -> list[str]:
     return lines
 
 
-def as_mapping(cases: list[Case], fits: dict[tuple[int, str], FrictionFit]) -> dict[str, object]:
+def as_mapping(cases: list[Case], fits: dict[tuple[int, str], FewRunsFit]) -> dict[str, object]:
     """Return the same for a program: scores per case, terms per fit."""
     return {
-        "schema": "jtq.measured/1",
+        "schema": "jtq.measured/2",
         "cases": [
             {
                 "joint": case.joint,
@@ -189,12 +198,20 @@ def as_mapping(cases: list[Case], fits: dict[tuple[int, str], FrictionFit]) -> d
             for case in cases
         ],
         "fits": [
-            {"joint": joint, "run": run, "friction": asdict(fit.friction), "report": fit.lines()}
-            for (joint, run), fit in fits.items()
+            {
+                "joint": joint,
+                "run": run,
+                "terms": [asdict(term) for term in found.terms],
+                "rotor_inertia_kgm2": found.joint.rotor_inertia_kgm2,
+                "fused": found.fused.to_mapping(),
+                "report": found.lines(),
+            }
+            for (joint, run), found in fits.items()
         ],
     }
 
 
 def _save(joint: Joint, path: Path) -> None:
-    text = yaml.safe_dump(joint.to_mapping(), sort_keys=False, width=120)
-    path.write_text(f"# Made by jtq measured: the shipped joint file with another friction.\n{text}")
+    write_joint(
+        path, joint, "Made by jtq measured: the shipped joint file with fitted losses and rotor inertia."
+    )

@@ -101,8 +101,8 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
             method == "fused" and (joint.fused is None or needs_torsion(table, number, joint))
         ):
             continue
-        # it is the joint file that is scored: one age for all files, also of before the link was tracked
-        settings = replace(recommended(method), track_zeros=False)
+        # it is the joint file that is scored: one age for all files, also of before the torsion was tracked
+        settings = replace(recommended(method), track_zeros=False, track_torsion=False)
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
         sensor = aligned(columns.torque_nm, dt, joint, settings)
         errors[title] = _rms((estimate - sensor)[settled])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import importlib.util
 import json
 import platform
 import sys
@@ -13,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, count, make_directory, natural
+from jtqd.estimator.checked import ConfigError, check_installed, count, make_directory, natural
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint
@@ -157,9 +156,7 @@ def main(argv: list[str]) -> int:
     try:
         joints = [load_joint(path) for path in options.joint]
         make_directory(options.out)  # training takes minutes, and its result must not be lost for it
-        missing = [name for name in ("torch", "onnx", "matplotlib") if importlib.util.find_spec(name) is None]
-        if missing:
-            raise ConfigError(f"{', '.join(missing)}: not installed: pip install 'jtqd[train]'")
+        check_installed("train", "torch", "onnx", "matplotlib")
         runs = read_runs(options.runs, options.columns, joints=only(options.number))
         numbers = [joint_number(options.number, joint, runs) for joint in joints]
         findings = [

@@ -25,8 +25,9 @@ from jtqd.estimator.fusion import Fusion, turning
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.sysid.fit.conformal import conformal_scale
 from jtqd.sysid.fit.envelope import envelope_of
-from jtqd.sysid.fit.fused import conformal_scale, folds, loss_and_width
+from jtqd.sysid.fit.fused import folds, loss_and_width
 from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion

@@ -19,11 +19,11 @@ import numpy as np
 
 from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import DEGRADED, VALID
-from jtqd.sysid.fit.fused import GAUSS
 from tests.benchmarks.zeros import SETTLED_S, WorldRun, world_runs
 
 Change = Callable[[FloatArray, FloatArray, float], FloatArray]

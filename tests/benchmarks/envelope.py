@@ -24,14 +24,15 @@ import numpy as np
 from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import load_joint
-from jtqd.sysid.fit.fused import GAUSS
 from jtqd.sysid.runs.files import read_run
+from tests.benchmarks.zeros import WorldRun
 from tests.worlds.judge import write
 from tests.worlds.mujoco_bench import MujocoBench
 from tests.worlds.recorder import Recorder
@@ -90,8 +91,8 @@ def judged(joint: Joint, table: RunTable, number: int, truth_nm: FloatArray) -> 
     ]
 
 
-def of_the_world(which: str, seed: int) -> list[list[float]]:
-    """Return the COLUMNS of every judged joint and run of a seed."""
+def judging_runs(which: str, seed: int) -> list[WorldRun]:
+    """Return every judged joint in a run of a seed, with its file fitted to the others and its true torque."""
     bench = MujocoBench(RUNS, SECONDS)
     drawn, days = bench.draw(seed), bench.days(seed)
     found = []
@@ -109,8 +110,13 @@ def of_the_world(which: str, seed: int) -> list[list[float]]:
                 table = read_run(paths[n]).table
                 sensor = table.joints[number].torque_nm
                 assert sensor is not None
-                found.append(judged(joint, table, number, sensor - days[n].sensor_nm))
+                found.append(WorldRun(joint, number, table, sensor - days[n].sensor_nm))
     return found
+
+
+def of_the_world(which: str, seed: int) -> list[list[float]]:
+    """Return the COLUMNS of every judged joint and run of a seed."""
+    return [judged(run.joint, run.table, run.number, run.truth_nm) for run in judging_runs(which, seed)]
 
 
 def main() -> None:

@@ -46,8 +46,11 @@ STAGES = tuple(
 )
 CYCLE = "cycle"
 """Two joints, method `fused`, of SYNC to the record, per cycle with a torque; what the kernel does is not counted."""
-SLOTS, PERIOD_US = 150, 20_000
-"""Under valgrind a cycle takes some milliseconds."""
+SLOTS, PERIOD_US = 120, 50_000
+WAIT_US, DEADLINE_US = 25_000, 45_000
+"""Under valgrind a cycle takes some milliseconds, and what answers SYNC waits for a busy machine."""
+LEAST_TORQUES = 0.95
+"""Of the slots: a cycle without a torque costs about half as much."""
 
 
 def work(method: str) -> None:
@@ -80,8 +83,11 @@ def cycles() -> None:
         directory = Path(name)
         original = shipped("bench.yaml")
         text = original.read_text(encoding="utf-8").replace("trained/", f"{original.parent}/trained/")
+        for key, us in (("period", PERIOD_US), ("wait", WAIT_US), ("deadline", DEADLINE_US)):
+            text, found = re.subn(rf"\b{key}_us: \d+", f"{key}_us: {us}", text)
+            assert found == 1, f"found {key}_us {found} times"
         configuration = directory / "bench.yaml"
-        configuration.write_text(text.replace("period_us: 1000", f"period_us: {PERIOD_US}"), encoding="utf-8")
+        configuration.write_text(text, encoding="utf-8")
         config = load_config(configuration)
         source = traffic(directory, Cpus(None, None), period_us=PERIOD_US)
         estimators = [loop.build_estimator(config, joint) for joint in config.joints]
@@ -97,7 +103,7 @@ def cycles() -> None:
         view = SnapshotReader(directory / "snapshot").read()
         source.end()
         torques = min(sum(spent[code] for code in PUBLISHED) for spent in view.status_cycles)
-        assert torques > SLOTS // 2, f"found {torques} cycles of {SLOTS} with a torque"
+        assert torques >= LEAST_TORQUES * SLOTS, f"found {torques} cycles of {SLOTS} with a torque"
         print(torques)
 
 

@@ -4,14 +4,15 @@ r"""What tracking the zeros changes: error and interval against the true torque,
         --hold 1.0 --seed 9311 --out days
     python -m tests.benchmarks.zeros MODELS days [--link-zero 1e-4]
     python -m tests.benchmarks.zeros MODELS --push 10 --plant models/plants/typical.yaml --seed 9312 [--link-zero 1e-4]
-    python -m tests.benchmarks.zeros --world 9403 9404 9405 [--link-zero 1e-4]
+    python -m tests.benchmarks.zeros --world 9403 9404 9405 [--link-zero 1e-4] [--day-zeros 6e-5]
 
 MODELS has joint1.yaml and joint2.yaml with section `fused`, fitted on the same plant; a run has its true torques beside it.
 Settings are those of new configurations; estimate and truth are of one age. `--link-zero` adds a zero [rad] to the link
 encoder from the first sample on. `--push` has runs of its own: the other joint pushes with so many Nm more from PUSH_S on,
 and the zero that is found is compared with that of the same day and noise without the push. `--world` draws joints and runs
 of a bench that shares no code with ours (tests/worlds, MuJoCo): fitted on some runs of each seed, scored on the others
-against its torque sensor without that sensor's zero of the day.
+against its torque sensor without that sensor's zero of the day. Its own link zeros are within 5 µrad; `--day-zeros` adds to
+every run, fitted or scored, one drawn within so much.
 """
 
 from __future__ import annotations
@@ -152,10 +153,15 @@ class WorldRun(NamedTuple):
     truth_nm: FloatArray
 
 
-def world_runs(seed: int) -> list[WorldRun]:
-    """Return the runs of one seed that its joints were not fitted on."""
+def world_runs(seed: int, day_zeros_rad: float = 0.0) -> list[WorldRun]:
+    """Return the runs of one seed that its joints were not fitted on; to each link encoder is added a zero of its day."""
     bench = MujocoBench(WORLD_RUNS, WORLD_SECONDS)
     drawn, days = bench.draw(seed), bench.days(seed)
+    source = np.random.default_rng([seed, len("zeros")])
+    for columns in drawn.runs:
+        for number in drawn.joints:
+            key = f"j{number}.link_position_rad"
+            columns[key] = columns[key] + day_zeros_rad * source.uniform(-1.0, 1.0)
     found = []
     with TemporaryDirectory() as directory:
         paths, files = write(Path(directory), drawn.runs, drawn.joints, Recorder(), seed)
@@ -182,10 +188,13 @@ def world_runs(seed: int) -> list[WorldRun]:
     return found
 
 
-def of_the_world(link_zero_rad: float, seed: int) -> list[tuple[Figures, Figures] | None]:
+def of_the_world(
+    link_zero_rad: float, day_zeros_rad: float, seed: int
+) -> list[tuple[Figures, Figures] | None]:
     """Return the figures of the runs of one seed that its joints were not fitted on."""
     return [
-        compared(run.joint, run.table, run.number, run.truth_nm, link_zero_rad) for run in world_runs(seed)
+        compared(run.joint, run.table, run.number, run.truth_nm, link_zero_rad)
+        for run in world_runs(seed, day_zeros_rad)
     ]
 
 
@@ -230,6 +239,7 @@ def main() -> None:
     parser.add_argument("models", type=Path, nargs="?")
     parser.add_argument("runs", type=Path, nargs="?")
     parser.add_argument("--link-zero", type=float, default=0.0, metavar="RAD")
+    parser.add_argument("--day-zeros", type=float, default=0.0, metavar="RAD")
     parser.add_argument("--push", type=float, metavar="NM")
     parser.add_argument("--plant", type=Path)
     parser.add_argument("--seed", type=int, default=0)
@@ -237,7 +247,7 @@ def main() -> None:
     options = parser.parse_args()
     if options.world is not None:
         with ProcessPoolExecutor(2) as pool:
-            drawn = pool.map(partial(of_the_world, options.link_zero), options.world)
+            drawn = pool.map(partial(of_the_world, options.link_zero, options.day_zeros), options.world)
             report([each for seed in drawn for each in seed])
         return
     if options.models is None:

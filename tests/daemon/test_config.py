@@ -44,6 +44,7 @@ def test_the_shipped_configuration_is_read() -> None:
         bandwidth_rad_s=200.0,
         torsion_bandwidth_rad_s=800.0,
         track_zeros=True,
+        track_torsion=True,
     )
     assert config.realtime == Realtime(80, None, True)
     assert all(joint.network is None and joint.temperature for joint in config.joints)

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
-from jtqd.estimator.checked import ConfigError, check_output, counted, make_directory
+from jtqd.estimator.checked import ConfigError, check_installed, check_output, counted, make_directory
+
+ROOT = Path(__file__).parents[2]
 
 
 def test_one_thing_has_no_plural() -> None:
@@ -48,3 +53,33 @@ def test_a_directory_is_made_where_it_can_be(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="file: cannot be created: it is a file"):
         make_directory(tmp_path / "file")
+
+
+def test_packages_that_are_missing_are_named_with_the_extra_that_brings_them(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    check_installed("analysis", "scipy", "onnx")
+    monkeypatch.setitem(sys.modules, "scipy", None)
+    with pytest.raises(ConfigError) as refused:
+        check_installed("analysis", "scipy", "onnx")
+    assert str(refused.value) == "scipy is not installed: pip install 'jtqd[analysis]'"
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(ConfigError, match="scipy, onnx are not installed"):
+        check_installed("analysis", "scipy", "onnx")
+
+
+def test_every_extra_that_is_asked_for_brings_what_is_asked_of_it() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = {
+        name: {re.split(r"\W", line)[0] for line in lines}
+        for name, lines in project["optional-dependencies"].items()
+    }
+    asked = [
+        (path, words)
+        for path in sorted((ROOT / "sysid").rglob("*.py"))
+        for words in re.findall(r'check_installed\("(.*?)"\)', path.read_text(encoding="utf-8"))
+    ]
+    assert len(asked) >= 5
+    for path, words in asked:
+        extra, *packages = words.split('", "')
+        assert set(packages) <= extras[extra], path

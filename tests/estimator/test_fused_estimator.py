@@ -14,7 +14,7 @@ import pytest
 from jtqd.estimator import status as st
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, FusedEstimator
 from jtqd.estimator.fusion import Fusion
-from jtqd.estimator.joint import QUADRANTS, Joint
+from jtqd.estimator.joint import QUADRANTS, Joint, Standstill
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import EstimatorSettings
@@ -199,6 +199,34 @@ def test_standstill_value_and_sigma() -> None:
     assert got.torque_nm == pytest.approx(
         2.0 * GAIN - AdditiveLossModel(PLAIN.fused.loss).loss(12.4, 0.0, 0.0)[0]
     )
+
+
+def test_a_calibrated_interval_at_rest_counts_what_is_left_open_in_full() -> None:
+    """k standard deviations by the weights, and what friction and slip leave open as bounds."""
+    assert NARROW.fused is not None
+    assert NARROW.fused.torsion is not None
+    slipping = replace(NARROW.fused.torsion, hysteresis_nm=1.5, hysteresis_travel_rad=2e-4)
+    for torsion, open_nm in ((NARROW.fused.torsion, 0.0), (slipping, 1.5)):
+        calibrated = replace(NARROW.fused, torsion=torsion, standstill=Standstill(1.8))
+        got = steady(estimator(says(3.0), replace(NARROW, fused=calibrated)), 2.0, 0.0, torsion_nm=7.0)
+        raw, half = 2.0 * GAIN, physics(2.0, 0.0, 7.0, joint=NARROW)[2]
+        c, t = 0.2**2 + (0.02 * raw) ** 2, 0.35**2 + (0.015 * 7.0) ** 2
+        alpha = (c + half**2) / (c + half**2 + t + open_nm**2)
+        spread = math.sqrt(alpha**2 * t + (1.0 - alpha) ** 2 * c)
+        assert got.status == st.STANDSTILL
+        assert got.sigma_nm == pytest.approx(1.8 * spread + alpha * open_nm + (1.0 - alpha) * half, abs=1e-9)
+
+
+def test_a_friction_interval_is_about_the_current_path_not_about_the_value() -> None:
+    """Friction that holds little: the far end of its interval counts, however wide the fusion's is."""
+    assert NARROW.fused is not None
+    wide = replace(NARROW, fused=replace(NARROW.fused, standstill=Standstill(50.0)))
+    loss, half = AdditiveLossModel(NARROW.fused.loss).loss(2.0 * GAIN, 0.0, 0.0)
+    for torsion_nm in (7.0, 10.0):
+        got = steady(estimator(joint=wide), 2.0, 0.0, torsion_nm=torsion_nm)
+        value = physics(2.0, 0.0, torsion_nm, joint=NARROW)[0]
+        ends = 2.0 * GAIN - loss + np.array((-1.0, 1.0)) * (1.15 * half + 0.2)
+        assert got.sigma_nm == pytest.approx(np.abs(ends - value).max(), abs=1e-9)
 
 
 def test_first_sample_starts_and_publishes_nothing() -> None:

@@ -11,12 +11,24 @@ from examples.kinova_diagnosis import (
     diagnose_all,
     draw_loads,
     draw_residuals,
+    ladder_lines,
     measured_runs,
     only,
+    single_lines,
     table_lines,
 )
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.diagnosis.findings import CAUSE, INSUFFICIENT, Cause, Findings, Gain, Gap, Trace, Value
+from jtqd.sysid.diagnosis.findings import (
+    CAUSE,
+    INSUFFICIENT,
+    UNEXPLAINED,
+    Cause,
+    Findings,
+    Gain,
+    Gap,
+    Trace,
+    Value,
+)
 
 
 @pytest.mark.parametrize("number", range(1, 8))
@@ -99,3 +111,29 @@ def test_the_table_says_gap_class_parameters_and_gain(tmp_path: Path) -> None:
         draw([one], tmp_path / f"{name}.png")
         draw([], tmp_path / f"{name}_none.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 10_000
+
+
+def nothing() -> Findings:
+    return Findings(UNEXPLAINED, (), ("a", "b"), (2,), (), ())
+
+
+def test_where_nothing_is_named_each_term_is_shown_alone() -> None:
+    """Joint 7: both runs agree that viscous friction is far below the file's 2 Nms/rad, and each predicts the other."""
+    joint = load_joint(shipped("kinova_gen3/joint7.yaml"))
+    lines = single_lines([Diagnosed(7, joint, nothing())])
+    (viscous,) = (line for line in lines if "viscous" in line)
+    cells = [cell.strip() for cell in viscous.strip("|").split("|")]
+    values = [each.split(" ± ") for each in cells[2].split(", ")]
+    for value, half in values:
+        assert 0.0 < float(value) < 2.0 - 2.0 * float(half)
+    for each in cells[3].split(", "):
+        after, before = each.rstrip(")").split(" (")
+        assert float(after) < 0.5 * float(before)
+
+
+def test_a_regression_near_the_file_is_never_far_worse_than_the_file() -> None:
+    joint = load_joint(shipped("kinova_gen3/joint2.yaml"))
+    rows = [line.strip("|").split("|") for line in ladder_lines([Diagnosed(2, joint, nothing())])[2:]]
+    for row in rows:
+        free, near, file = (float(cell.split()[0]) for cell in row[2:5])
+        assert near < min(free, 1.4 * file)

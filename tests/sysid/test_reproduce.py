@@ -75,6 +75,7 @@ def scripted(monkeypatch):
             return answer(command[3], len(called))
 
         monkeypatch.setattr(reproduce_command.Commands, "run", run)
+        monkeypatch.setattr(reproduce_command, "check_installed", lambda *_: None)  # nothing is trained here
         return called
 
     return put
@@ -195,6 +196,12 @@ def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):
     assert capsys.readouterr().err == f"jtq reproduce: --out {file}: cannot be created: it is a file\n"
     assert reproduce_command.main(["--out", str(file / "below")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_packages_that_training_needs_are_asked_for_before_the_first_campaign(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert reproduce_command.main(["--quick", "--out", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == "jtq reproduce: torch is not installed: pip install 'jtqd[train]'\n"
 
 
 def test_outside_plan_has_half_as_much_load_again_and_is_within_its_limits(tmp_path):

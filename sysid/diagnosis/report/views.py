@@ -288,12 +288,12 @@ def left_view(findings: Findings) -> LeftView | None:
     left = findings.left_over
     if left is None:
         return None
-    limit = f"from {number(left.relevant_nm)}{SPACE}Nm on it matters"
+    relevant = f"{number(left.relevant_nm)}{SPACE}Nm"
     place_ = f"joint {left.joint}, {left.balance} balance"
     return LeftView(
         f"{number(left.rms_nm)}{SPACE}Nm",
         percent(left.of_rated, 2),
-        f"{place_}; {'it matters' if left.matters else 'it does not matter'} ({limit})",
+        f"{place_}; {'it matters' if left.matters else 'it does not matter'} ({left.limit(relevant)})",
         _known_percent(findings.explained_share) if findings.causes else "",
     )
 

@@ -149,3 +149,17 @@ def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
         )
         assert [line for line in told.text().splitlines() if line.startswith("processors")] == lines
         assert told.content()["stolen_s"] == round(stolen_s, 2)
+
+
+def test_the_summary_says_that_real_time_was_not_kept() -> None:
+    def lines(cycles: int, missed: int, *refused: str) -> list[str]:
+        us = (1.0, 2.0, 3.0)
+        told = Summary(cycles, missed, 0, us, us, (), dict.fromkeys(COUNTERS, 0), refused, None, None, {})
+        return [line for line in told.text().splitlines() if line.startswith("real time")]
+
+    assert lines(0, 0) == lines(950, 50) == []
+    assert lines(900, 100) == [
+        "real time     not kept: 10 % of the slots missed; jtq doctor looks at the machine"
+    ]
+    (why,) = lines(4054, 15936, "SCHED_FIFO")
+    assert why.startswith("real time     not kept: 80 % of the slots missed (jtqd was not granted all that")

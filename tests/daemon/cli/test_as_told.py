@@ -124,7 +124,10 @@ def test_what_is_not_sure_is_a_guess() -> None:
 def test_increments_per_second_are_those_of_the_option() -> None:
     """A drive that names the unit of its velocity, and has no 608Fh that tells how many a turn are."""
     survey = drive({(0x608F, 1): 0, (0x608F, 2): 0, (0x60A8, 0): 0x00B5_0000, (0x60A9, 0): 0x00B5_0300})
-    assert "give --encoder-counts" in probe.section(survey)[0]
+    assert (
+        "no section of the configuration yet: node 5: 608Fh:1 is not known: give --encoder-counts"
+        in probe.text(survey, [])
+    )
     draft = draft_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, encoder_counts=4096))
     assert {name: each.keys for name, each in draft.instead.items()} == {"motor_velocity": {"by": "608Fh"}}
     assert draft.instead["motor_velocity"].why == "60A9h:0 is 0x00B50300, by the bus"

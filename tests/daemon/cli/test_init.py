@@ -424,6 +424,48 @@ def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
     assert "is of profile 404, but node 1 says 402 (1000h)" in capsys.readouterr().err
 
 
+def test_the_section_alone_goes_into_a_configuration_that_jtqd_reads(bench, tmp_path, capsys):
+    arm = tmp_path / "arm"
+    assert run(capsys, "--bus", bench, "--node", 1, "--sensor", "none", "--out", arm)[0] == 0
+    arguments = ["--bus", bench, "--node", "2", "--joint", "2", "--gear-ratio", "101"]
+    assert probe.main([*arguments, "--section"]) == 0
+    section = capsys.readouterr().out
+    with (arm / "jtqd.yaml").open("a") as file:
+        file.write(section)
+    (arm / "joint_2.yaml").write_text((arm / "joint_1.yaml").read_text().replace("100.0 ", "101.0 ", 1))
+    config = load_config(arm / "jtqd.yaml")
+    assert [(each.number, each.node_id) for each in config.joints] == [(1, 1), (2, 2)]
+    assert '"6091h:1": 101' in section
+    assert probe.main(["--bus", bench, "--section"]) == 2
+    assert capsys.readouterr().err == "jtq probe: --section needs --node\n"
+
+
+def test_a_drive_that_does_not_know_its_gear_has_a_section_with_the_option():
+    found = drive({(0x6091, 1): 1})
+    told = probe.text(found, [])
+    assert "no section of the configuration yet: " in told
+    assert "give --gear-ratio" in told
+    with pytest.raises(DraftError, match="give --gear-ratio"):
+        probe.section(found)
+    lines = probe.section(found, None, Wanted(gear_ratio=101.0), 3)
+    assert lines[0].startswith("joint_3:")
+    assert any('"6091h:1": 101' in line for line in lines)
+
+
+def test_probe_says_what_each_object_is():
+    lines = [line.split(maxsplit=2) for line in probe.text(drive(), []).splitlines()]
+    told = {line[0]: line[1:] for line in lines if len(line) == 3}
+    assert told["1018h:1"] == ["000007A1h", "vendor"]
+    assert told["608Fh:1"] == ["65536", "position encoder increments"]
+    assert told["6064h:0"][1] == "motor position"
+    assert (len(told["6041h:0"][0]), told["6041h:0"][1]) == (5, "statusword")
+    assert told["6075h:0"][1] == "motor rated current in mA"
+    named = [
+        each for each in probe.text(drive(), []).splitlines() if each.startswith("  ") and "h:" in each[:8]
+    ]
+    assert all(len(each.split()) >= 3 for each in named), "each has a name"
+
+
 def test_probe_names_what_a_drive_lacks():
     found = drive(without=[(0x6041, 0)])
     (problem,) = probe.problems_of(found)

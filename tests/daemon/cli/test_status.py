@@ -76,6 +76,9 @@ def test_the_picture_shows_everything_and_fits(tmp_path: Path, width: int) -> No
     ):
         assert wanted in " ".join(text.split()) or wanted in text, wanted
     assert ("100.0 %" in text) == ("-155.2 rad/s" in text) == (width >= 100), "where there is room"
+    told = [line.strip() for line in text.splitlines() if line.startswith("no room for: ")]
+    assert any(line.endswith("motor, with a torque") for line in told) == (width < 100), "and told where not"
+    assert (told == []) == (width >= 140)
 
 
 @pytest.mark.parametrize("width", [54, 66, 78])

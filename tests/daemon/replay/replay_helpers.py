@@ -36,7 +36,8 @@ def cut(
         channels: dict[str, int] = {}
         for definition, channel, message in reader.iter_messages(log_time_order=False):
             assert definition is not None
-            cyclic = channel.topic.startswith(("/joint/", "/can/"))
+            topic = channel.topic  # states of the estimators, once a second, are numbered by themselves
+            cyclic = topic.startswith(("/joint/", "/can/")) and not topic.endswith("/zeros")
             if cyclic and not keep(message.sequence):
                 continue
             if channel.topic not in channels:

@@ -90,7 +90,7 @@ def test_what_was_recorded_comes_out_bit_for_bit(log: Path, capsys: pytest.Captu
 def test_a_log_that_begins_in_the_middle(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What the observer knew is not in it: the replay says so, and is identical again when that is forgotten."""
+    """What the observer knew is not in it: the replay says so, and is identical again from the first state in the log on."""
     begin = cycles(log)[500]
     late = cut(log, tmp_path / "late.mcap", lambda cycle: cycle >= begin)
     status, found, _ = run(capsys, late)

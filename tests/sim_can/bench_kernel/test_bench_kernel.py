@@ -12,6 +12,7 @@ import time
 
 import pytest
 
+from jtqd.sim_can.bench_kernel import __main__ as command
 from jtqd.sim_can.bench_kernel import build, guest, packages
 
 FRAME = struct.Struct("<IB3x8s")
@@ -247,6 +248,17 @@ def test_require_names_the_packages_where_it_may_not_install(monkeypatch):
     with pytest.raises(packages.MissingPackagesError, match="apt-get install no-such-package"):
         packages.require([absent, packages.Requirement("dash", "sh")])
     packages.require([packages.Requirement("dash", "sh")])
+
+
+def test_a_build_asks_once_for_all_that_it_and_the_tests_need(monkeypatch, capsys):
+    monkeypatch.setattr(os, "geteuid", lambda: 65534)
+    monkeypatch.setattr(build, "find", lambda: None)
+    monkeypatch.setattr(build.platform, "machine", lambda: "x86_64")
+    absent = {"flex", "candump", "ip"}
+    monkeypatch.setattr(packages, "find_program", lambda name: None if name in absent else f"/usr/bin/{name}")
+    monkeypatch.setattr(packages.missing, "__defaults__", (packages.find_program, lambda _: True))
+    assert command.main(["build"]) == 1
+    assert "apt-get install can-utils flex iproute2\n" in capsys.readouterr().err
 
 
 def test_guest_environment_puts_this_python_first_and_drops_the_hosts_places():

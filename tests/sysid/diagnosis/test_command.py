@@ -177,6 +177,21 @@ def test_a_directory_with_tables_and_logs_is_read_once(tmp_path: Path, core: Cor
     assert [name for name, _ in core.asked[0][0]] == ["a.csv", "b.csv.gz"]
 
 
+def test_a_usage_error_is_said_before_a_missing_package(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name, *rest: None if name == "scipy" else real(name, *rest)
+    )
+    write_runs(tmp_path)
+    assert run(tmp_path, "--out", tmp_path / "o") == 2
+    assert "--joint: missing" in said(capsys)
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o") == 1
+    assert said(capsys) == "jtq diagnose: scipy is not installed: pip install 'jtqd[analysis]'\n"
+    assert not (tmp_path / "o").exists()
+
+
 def test_parquet_without_pyarrow_is_one_line(
     tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

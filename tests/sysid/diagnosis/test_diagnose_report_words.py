@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gain, Gap, Place, Value
+from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gain, Gap, LeftOver, Place, Value
 from jtqd.sysid.diagnosis.report.views import evidence_views, gain_views, gap_views
 from jtqd.sysid.diagnosis.report.words import effect_title, gain_sentence, parameter_title, verdict_sentence
 from tests.sysid.diagnosis import findings_examples as examples
@@ -163,3 +163,13 @@ def test_names_are_words() -> None:
         "gain",
         "offset",
     ]
+
+
+def test_what_is_as_large_as_what_matters_and_does_not_is_explained() -> None:
+    left = LeftOver(1, "motor", 0.3, 0.003, 0.04, 0.2, matters=False)
+    assert left.limit("0.2 Nm") == "more than 0.2 Nm, but 4.0% of the gap"
+    assert (
+        replace(left, unconfirmed=True).limit("0.2 Nm").endswith("effects that are not confirmed explain it")
+    )
+    assert replace(left, matters=True).limit("0.2 Nm") == "from 0.2 Nm on it matters"
+    assert replace(left, rms_nm=0.1).limit("0.2 Nm") == "from 0.2 Nm on it matters"

@@ -102,7 +102,7 @@ def test_beside_what_is_left_over_only_what_is_steady_is_kept(
     monkeypatch.setattr(named, "steadiness", lambda _, __, nothing: [steady for _ in nothing])
     case = Unfitted(cast("Dataset", None), cast("Noise", None), compared.search, 0.005)
     nothing, left = case.fit(compared.named), Leftover((), (), (), (), worst_nm={MOTOR1: left_nm})
-    found = Found(case, compared.named, nothing, nothing, None, left, 0.01, {MOTOR1: 0.2}, ())
+    found = Found(case, nothing, nothing, None, left, 0.01, {MOTOR1: 0.2}, ())
     key = LIBRARY[0].key
     best, why = _borne_out(found, compared, [(key, other)])
     assert (best is other, why) == (kept, {} if kept else {key: UNSTEADY})
@@ -142,8 +142,38 @@ def test_the_signals_end_with_the_torsion_of_what_is_named(monkeypatch: pytest.M
     monkeypatch.setattr(fewer_runs, "_named_by_fewer", of_fewer)
     best = search_of(problem(3, {0: 0.8}), LIBRARY).hypothesis(())
     found = SimpleNamespace(
-        case=Recorded(), named=Fit(best, cast(Refined, None)), classes=[], whole=best, shown=None
+        case=Recorded(),
+        named=Fit(best, cast(Refined, None)),
+        classes=[],
+        whole=Fit(best, cast(Refined, None)),
     )
     after, said = with_fewer(cast(Found, found), lambda number: [])
     assert (after, said) == (found, [])
     assert fitted == ["of fewer runs", best]
+
+
+def test_what_is_left_over_is_that_of_what_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All effects found and what they leave are of one fit, also when fewer runs have added one."""
+    search = search_of(problem(3, {0: 0.8}), LIBRARY)
+    before, kept = search.hypothesis(()), search.hypothesis(LIBRARY[:1])
+
+    class WithLeft(Unfitted):
+        def left_over(self, fit: Fit) -> Leftover:
+            return Leftover((), (), (), (), worst_nm={MOTOR1: 0.1 if fit.chosen else 0.5})
+
+        @property
+        def limits(self) -> dict[Channel, float]:
+            return {MOTOR1: 0.2}
+
+    case = WithLeft(cast("Dataset", None), cast("Noise", None), search, 0.005)
+    found = Found.of(case, case.fit(before), case.fit(before), None, ())
+    assert found.matters
+    monkeypatch.setattr(fewer_runs, "_named_by_fewer", lambda *_: [("run_1", LIBRARY[:1])])
+    monkeypatch.setattr(fewer_runs, "_borne_out", lambda *_: (kept, {}))
+    monkeypatch.setattr(Compared, "__init__", lambda self, *_: None)
+    monkeypatch.setattr(Compared, "nm", lambda *_: 0.3)
+    after, said = with_fewer(found, lambda number: [])
+    assert after.whole.hypothesis is after.named.hypothesis is kept
+    assert after.left.worst_nm == {MOTOR1: 0.1}
+    assert not after.matters
+    assert said[0].startswith("coulomb_friction of joint 1 is named because fewer")

@@ -11,7 +11,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import NO_GAP, Findings
 from jtqd.sysid.diagnosis.gain import left_out_steps
-from jtqd.sysid.diagnosis.mixed_model import _PRIOR_RUNS, explained, solve
+from jtqd.sysid.diagnosis.mixed_model import _MARGINALS_KEPT, _PRIOR_RUNS, explained, explained_each, solve
 from jtqd.sysid.diagnosis.refine import Refined
 from tests.hidden.case import draw
 from tests.hidden.trials import joint_files, tables
@@ -104,6 +104,21 @@ def test_solve_and_explained_are_least_squares() -> None:
         assert explained(total, chosen, extra) == pytest.approx(
             left(chosen) - left(chosen + extra), rel=1e-6, abs=1e-6
         )
+    extras = [[1], [3, 1], [], [3], [1, 3]]
+    assert explained_each(total, [0, 2], extras) == [explained(total, [0, 2], extra) for extra in extras]
+
+
+def test_marginals_that_are_kept_are_of_these_runs_and_variances() -> None:
+    mixed = PROBLEM.mixed([1.0, 1.0])
+    every = [k * VARIANCES for k in range(1, _MARGINALS_KEPT + 3)]
+    fresh = [PROBLEM.mixed([1.0, 1.0]).marginal(v) for v in every]
+    for v, (total, log) in [*zip(every, fresh, strict=True)] * 2:
+        assert mixed.marginal(v)[0] == pytest.approx(total, rel=1e-12)
+        assert mixed.marginal(v)[1] == log
+    assert mixed.marginal(every[0]) is mixed.marginal(every[0])
+    part, whole = mixed.subset([0, 1]).marginal(every[0])[0], fresh[0][0]
+    assert not np.allclose(part, whole)
+    assert not np.allclose(mixed.less(0.1 * mixed.grams).marginal(every[0])[0], whole)
 
 
 def test_steps_of_runs_left_out_are_fits_of_the_others() -> None:

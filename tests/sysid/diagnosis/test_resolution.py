@@ -94,4 +94,6 @@ def test_a_smoother_is_linear_has_no_delay_and_leaves_alone_what_is_fine() -> No
     assert smoother(quick)[:2000].tolist() == quick[:2000].tolist()
     assert np.max(np.abs(smoother(quick)[2200:3800])) < 0.01
     assert smoother(slow)[2200:3800] == pytest.approx(slow[2200:3800], abs=0.01)
+    both = np.array([slow, quick])
+    assert np.array_equal(smoother(both), [smoother(row) for row in both])
     assert Smoother.of(np.full(4000, 90.0), STEP_S, 80.0).parts == ()

@@ -6,20 +6,35 @@ The large campaign with sets drawn afresh is `tests.hidden.campaign`; here one s
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 import pytest
 
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis import dataset
 from jtqd.sysid.diagnosis import diagnose as module
+from jtqd.sysid.diagnosis.case import Case as Judged
+from jtqd.sysid.diagnosis.case import Fit
+from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
+from jtqd.sysid.diagnosis.leftover import Leftover
+from jtqd.sysid.diagnosis.named import Found
+from jtqd.sysid.diagnosis.noise import Noise
+from jtqd.sysid.diagnosis.refine import Refined
+from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.signals import Line
+from jtqd.sysid.diagnosis.verdict import _remaining
 from tests.hidden.case import Case, draw_many
 from tests.hidden.order import Hidden, Order
 from tests.hidden.scores import score
 from tests.hidden.trials import joint_files, tables
+from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, search_of
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, findings
+from tests.sysid.diagnosis.test_search import LIBRARY, problem
 
 SEED = 3
 KINDS = {
@@ -147,6 +162,8 @@ def test_data_that_cannot_serve_are_said_to_be_so(monkeypatch: pytest.MonkeyPatc
     assert reason_of(deaf, joints).startswith("run0: j1.torque_nm: missing")
     still = [(name, slice_of(table, 0.5)) for name, table in runs]
     assert "s in motion in all runs, expected at least 5 s" in reason_of(still, joints)
+    monkeypatch.setattr(dataset, "moving_s", lambda _: 4.97)
+    assert reason_of(runs, joints) == "found 4.9 s in motion in all runs, expected at least 5 s"
 
 
 def every(table: RunTable, k: int) -> RunTable:
@@ -159,3 +176,32 @@ def slice_of(table: RunTable, seconds: float) -> RunTable:
     columns, n = table.joints[1], int(np.sum(table.time_s < seconds))
     names = ("current_a", "motor_position_rad", "link_position_rad", "torque_nm")
     return RunTable(table.time_s[:n], {1: replace(columns, **{k: getattr(columns, k)[:n] for k in names})})
+
+
+class Two(Judged):
+    """A case in which what is left over falls with every effect."""
+
+    @property
+    def few(self) -> bool:
+        return True
+
+    def fit(self, hypothesis: Hypothesis) -> Fit:
+        return Fit(hypothesis, cast("Refined", None))
+
+    def left_over(self, fit: Fit) -> Leftover:
+        line = Line(MOTOR1, 2.5, 0.6 - 0.5 * len(fit.chosen), 30.0)
+        return Leftover((), (), (), (line,), worst_nm={MOTOR1: line.amplitude_nm})
+
+
+@pytest.mark.parametrize(("limit_nm", "matters"), [(0.2, False), (0.05, True)])
+def test_what_is_left_over_is_of_the_fit_that_is_shown(limit_nm: float, matters: bool) -> None:
+    """Not confirmed by few runs: the causes leave it, and nothing else is printed; that it is explained is said with it."""
+    search = search_of(problem(3, {0: 0.8}), LIBRARY)
+    case = Two(cast("Dataset", None), cast("Noise", None), search, 0.005)
+    whole, named = case.fit(search.hypothesis(LIBRARY[:1])), case.fit(search.hypothesis(()))
+    few = cast("LeaveOneOut", object())
+    found = Found(case, whole, named, few, case.left_over(whole), 1.0, {MOTOR1: limit_nm}, ())
+    assert found.matters is matters
+    left, shown = _remaining(found, named)
+    assert shown is (whole if matters else named)
+    assert left.worst_nm == case.left_over(shown).worst_nm

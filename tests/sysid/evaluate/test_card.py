@@ -92,6 +92,15 @@ def test_what_is_constant_within_a_run_is_called_a_zero() -> None:
     assert "too small" in card.advice[0].text
 
 
+def test_the_sensors_zero_is_no_error_of_sigma() -> None:
+    """Sigma is that of the torque; the card compares with a sensor that has another zero every day, truth or not."""
+    zeros = np.random.default_rng(5).normal(0.0, 0.3, 10)
+    runs = [sweep(f"run{'x' * k}", zero) for k, zero in enumerate(zeros)]
+    assert card_of(runs).interval.share < 0.5
+    known = [replace(each, reference_nm=0.3, true_nm=each.sensor_nm + 5.0) for each in runs]
+    assert card_of(known).interval.share == pytest.approx(0.9, abs=0.08)
+
+
 def test_what_was_not_measured_is_named() -> None:
     """Half of the speed and of the load, motor driving only, at one temperature, three runs that never stand."""
     runs = []

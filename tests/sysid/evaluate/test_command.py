@@ -59,7 +59,7 @@ def by_hand(bench: Path, name: str, number: int) -> dict[str, tuple[float, int]]
         file = {"network": f"joint{number}.onnx", "fused": f"joint{number}.fused.onnx"}.get(method)
         network = None if file is None else load_network(own, str(bench / "models" / file))
         young = 800.0 if own == "fused" else None
-        settings = EstimatorSettings(method=own, torsion_bandwidth_rad_s=young)
+        settings = EstimatorSettings(method=own, torsion_bandwidth_rad_s=young, track_zeros=own == "fused")
         runs[method] = estimate_columns(joint, settings, network, table.time_s, columns)
         sensors[method] = low_pass(columns.torque_nm, table.dt_s, 200.0 if young is None else young)
     keep = table.time_s >= 0.1

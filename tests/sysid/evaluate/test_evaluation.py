@@ -134,6 +134,15 @@ def test_outside_every_joint_counts(ours: float, flagged: float, reached: bool) 
     assert by_itself.ours == f"{100 * flagged:.2f} %"
 
 
+def test_outside_ours_without_a_network_is_not_compared_with_itself() -> None:
+    alone = Outside(1, Range((-9.0, 9.0), None), 10, 10, 10, 0, _score(0.5), None, 1.0)
+    found = target(replace(EMPTY, outside=(alone,)), "outside_rmse")
+    assert (found.ours, found.reached) == ("no network: ours is its physics", None)
+    assert found.details == ("j1: 0.500 Nm, 10 samples outside",)
+    beside = alone._replace(number=2, physics=_score(0.4))
+    assert target(replace(EMPTY, outside=(alone, beside)), "outside_rmse").ours == "1.2500"
+
+
 @pytest.mark.parametrize(("nm", "reached"), [(0.19, True), (0.21, False)])
 def test_the_largest_jump_of_ours_counts_and_the_papers_is_shown(nm: float, reached: bool) -> None:
     jump = Jump(nm, "run", 1, 0.5, "v = 0", 3, 0.1, 0.4, 0.15)

@@ -231,6 +231,7 @@ def test_outside_is_what_the_envelope_says_and_not_the_status() -> None:
     one.status["fused"][0] = VALID
     (found,) = outside_scores([one], {1: envelope})
     assert (found.samples, found.of, found.by_load, found.by_temperature) == (2, 4, 2, 0)
+    assert found.physics is not None
     assert found.physics.mse_nm2 == pytest.approx(1.0)
     assert found.ours.mse_nm2 == pytest.approx(2.5)
     assert found.flagged == 0.5
@@ -238,6 +239,8 @@ def test_outside_is_what_the_envelope_says_and_not_the_status() -> None:
     (found,) = outside_scores([warm], {1: envelope})
     assert (found.samples, found.by_load, found.by_temperature, found.flagged) == (4, 2, 4, 1.0)
     assert outside_scores([samples(errors, temperature_c=25.0)], {1: envelope}) == []
+    alone = samples({"fused": errors["fused"]}, raw_nm=raw, temperature_c=25.0, status=DEGRADED)
+    assert [each.physics for each in outside_scores([alone], {1: envelope})] == [None]
 
 
 def test_the_velocity_joint_is_the_one_whose_current_turns_over() -> None:

@@ -276,7 +276,7 @@ def test_search_closes_in_on_a_minimum():
 
 
 def test_a_search_needs_scipy_and_a_draw_does_not(monkeypatch):
-    monkeypatch.setitem(sys.modules, "scipy.optimize", None)
+    monkeypatch.setitem(sys.modules, "scipy", None)
     assert len(draw(LIMITS, count=1, duration_s=10.0)) == 1
     with pytest.raises(ConfigError, match="scipy is not installed: pip install"):
         design(LIMITS, **small())

@@ -10,10 +10,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
-from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.friction import FitError, effective_samples, fit_friction, student_975
-from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import read_run
 
 Array = NDArray[np.float64]
 DT_S = 0.001
@@ -170,18 +167,3 @@ def test_effective_samples_of_white_and_of_correlated_noise() -> None:
 )
 def test_student_quantile_against_the_table(freedom: float, value: float) -> None:
     assert student_975(freedom) == pytest.approx(value, rel=0.02)
-
-
-@pytest.mark.parametrize("number", [2, 4])
-@pytest.mark.parametrize("run", ["opti_traj_testing1", "RunTrajectory1"])
-def test_shipped_fits_are_what_the_shipped_runs_give(number: int, run: str) -> None:
-    columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
-    file = read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns)
-    nominal = load_joint(columns.joint_files[number])
-    fitted = load_joint(shipped(f"kinova_gen3/joint{number}.fitted_on_{run}.yaml"))
-    fit = fit_friction(file.table.time_s, file.table.joints[number], nominal)
-    assert fitted.friction.coulomb_nm == pytest.approx(fit.friction.coulomb_nm, abs=1e-4)
-    assert fitted.friction.viscous_nms_per_rad == pytest.approx(fit.friction.viscous_nms_per_rad, abs=1e-4)
-    # Nothing but friction differs, and the file says which log it comes from.
-    assert replace(fitted, friction=nominal.friction, provenance=nominal.provenance) == nominal
-    assert fitted.provenance["log_sha256"] == file.sha256

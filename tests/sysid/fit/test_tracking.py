@@ -12,11 +12,12 @@ from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Tracking
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.sysid.fit.fused import path_residuals, tracking_of_unseen
 from jtqd.sysid.fit.signals import run_signals
-from jtqd.sysid.fit.torsion_signals import torsion_now
-from jtqd.sysid.fit.tracking import TRACKING_RAD_S, fit_tracking
+from jtqd.sysid.fit.torsion_signals import torsion_now, torsion_through
+from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S, fit_tracking, worth_it
 from tests.estimator.fused_helpers import fused_joint, twisted
-from tests.estimator.test_torsion_bandwidth import SLIPPING
+from tests.estimator.test_torsion_bandwidth import SLIPPING, lossless
 
 TORSION = replace(
     SLIPPING,
@@ -38,7 +39,9 @@ def test_the_torsion_of_now_is_that_of_the_estimator() -> None:
     dt = np.full(len(dt), 0.001)
     joint = fused_joint(3, TORSION)
     assert joint.fused is not None
-    joint = replace(joint, fused=replace(joint.fused, tracking=Tracking(TRACKING_RAD_S, 0.1, 0.1)))
+    joint = replace(
+        joint, fused=replace(joint.fused, tracking=Tracking(TRACKING_RAD_S, 0.1, 0.1, WAVE_RAD_S))
+    )
     columns = JointColumns(
         current_a=current,
         motor_position_rad=motor,
@@ -48,10 +51,14 @@ def test_the_torsion_of_now_is_that_of_the_estimator() -> None:
     )
     run = run_signals("a", joint, EstimatorSettings(method="fused"), np.cumsum(dt), columns)
     assert run.as_read is not None
-    found = torsion_now(TORSION, run, run.as_read, TRACKING_RAD_S)
-    settings = EstimatorSettings(method="fused", track_link=True)
+    found = torsion_now(TORSION, run, run.as_read, TRACKING_RAD_S, WAVE_RAD_S)
+    settings = EstimatorSettings(method="fused", track_torsion=True)
     seen = observe_run(joint, settings, TORSION, dt, current, motor, velocity, link)
     np.testing.assert_allclose(found[300:], (seen.torsion_nm + seen.ahead_nm)[300:], atol=1e-6)
+    late = torsion_through(TORSION, run, run.as_read, 800.0)
+    settings = EstimatorSettings(method="fused", torsion_bandwidth_rad_s=800.0)
+    seen = observe_run(joint, settings, TORSION, dt, current, motor, velocity, link)
+    np.testing.assert_allclose(late[300:], (seen.torsion_nm + seen.ahead_nm)[300:], atol=1e-6)
 
 
 def test_the_interval_of_now_holds_90_percent_and_nothing_is_added_where_nothing_is_missing() -> None:
@@ -62,7 +69,7 @@ def test_the_interval_of_now_holds_90_percent_and_nothing_is_added_where_nothing
     sigmas = [np.full(n, 0.1)] * runs
     now = [e + rng.normal(0.0, 1.0, n) * np.hypot(0.08, 0.06 * v) for e, v in zip(errors, speed, strict=True)]
     found = fit_tracking(errors, sigmas, now, speed)
-    assert found.rate_rad_s == TRACKING_RAD_S
+    assert (found.rate_rad_s, found.wave_rad_s) == (TRACKING_RAD_S, WAVE_RAD_S)
     assert found.sigma_nm == pytest.approx(0.08, rel=0.1)
     assert found.viscous_nms_per_rad == pytest.approx(0.06, rel=0.1)
     inside = [
@@ -72,3 +79,36 @@ def test_the_interval_of_now_holds_90_percent_and_nothing_is_added_where_nothing
     assert np.mean(inside) == pytest.approx(0.9, abs=0.002)
     same = fit_tracking(errors, [np.full(n, 0.2)] * runs, errors, speed)
     assert (same.sigma_nm, same.viscous_nms_per_rad) == (0.0, 0.0)
+
+
+def test_it_is_worth_it_where_runs_left_out_err_less_than_with_the_low_pass_zeros_apart() -> None:
+    rng = np.random.default_rng(8)
+    small, large = ([zero + size * rng.normal(size=500) for zero in (-1.0, 2.0)] for size in (0.1, 0.2))
+    assert worth_it(small, large)
+    assert worth_it([5.0 + each for each in small], large)
+    assert not worth_it(large, small)
+
+
+@pytest.mark.parametrize("counts", [65536, 64])
+def test_a_coarse_motor_encoder_gets_no_tracking(counts: int) -> None:
+    """Of 64 counts a turn one is a milliradian of the joint: 12 Nm at 12 000 Nm/rad; the low pass takes more of it off."""
+    joint = lossless(0.3, 0.3)
+    assert joint.fused is not None
+    runs = []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        time = 1e-3 * np.arange(1200)
+        speed = 1.8 * np.sin(6.0 * time + seed)
+        link = np.cumsum(speed) * 1e-3
+        torque = 10.0 * np.sin(2.0 * time + seed) + 0.4 * np.sin(2.0 * joint.gear_ratio * link)
+        unit = 2.0 * np.pi / counts
+        columns = JointColumns(
+            current_a=torque / (joint.gear_ratio * joint.torque_constant_nm_per_a),
+            motor_position_rad=np.round(joint.gear_ratio * (link + torque / 12000.0) / unit) * unit,
+            motor_velocity_rad_s=joint.gear_ratio * speed,
+            link_position_rad=link + 6e-6 * rng.normal(size=len(time)),
+            torque_nm=torque + 0.02 * rng.normal(size=len(time)),
+        )
+        run = run_signals(str(seed), joint, EstimatorSettings(method="fused"), time, columns)
+        runs.append(path_residuals(run, joint.fused.loss, joint.fused.torsion))
+    assert (tracking_of_unseen(runs, joint.fused.sigma) is not None) == (counts == 65536)

@@ -63,7 +63,7 @@ def test_missing_packages_are_named_before_any_run_is_read(run, tmp_path, capsys
     real = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "torch" else real(name))
     assert train_command.main(arguments("nowhere.csv", tmp_path)) == 1
-    assert capsys.readouterr().err == "jtq train: torch: not installed: pip install 'jtqd[train]'\n"
+    assert capsys.readouterr().err == "jtq train: torch is not installed: pip install 'jtqd[train]'\n"
 
 
 def test_out_that_cannot_hold_files_is_one_line(run, tmp_path, capsys):

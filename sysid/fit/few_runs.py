@@ -1,0 +1,395 @@
+"""Fit loss and sigma of a joint with one encoder to one to five runs, where `fit_fused` wants six: a regularised fit.
+
+    tau_raw - tau + Jm G^2 alpha = loss + zero_r + J alpha
+    loss = (1+s)/2 L_+(tau_raw) - (1-s)/2 L_-(-tau_raw),    L_d(x) = c_d(x) + f_d |v| + Stribeck of the file
+
+alpha = dv/dt, s the observer's direction, c_d linear between loads of -R, 0 and R (R: rated torque), J the reflected rotor
+inertia. A few seconds do not hold what tells these apart: where a joint turns one way only, an offset is Coulomb friction,
+and where load and speed come together, load friction is viscous. Least squares then takes any split that fits, and errs by
+ten newton metres once the joint turns the other way. Here each has a prior in proportion to the joint, a Gaussian about the
+joint file (`Prior`): what a run tells is taken from it, what it does not tell stays near the file, and how little is known
+goes into sigma.
+
+- c_d = Fc +- o + m |x| + k x: Coulomb, offset of current and sensor, load friction, error of torque constant or sensor gain;
+  what is left over of each c and f has a prior, too: no joint is the same both ways.
+- zero_r: of the sensor on that day. It enters no result.
+- c_d and f_d are at least 0: friction takes energy.
+- **Effective samples**: the residual of a wrong law is no noise, it lasts. A run counts as n/(1 + 2 sum rho_k) samples
+  (`friction.effective_samples`), at most one per 0.1 s of motion.
+- **Sigma**: covariance of what was fitted, what the fit leaves over in fifths of each run that it had not seen, and what
+  friction changes from day to day, which one run cannot tell. As a^2 + (b v)^2 + (c tau_raw)^2 times a factor per
+  quadrant, fitted on a grid over all loads and speeds: a quadrant that no run was in gets the width of the prior.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from scipy.optimize import nnls
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.estimator import quadrants
+from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Joint, LossSide
+from jtqd.sysid.fit.friction import effective_samples
+from jtqd.sysid.fit.losses import PER_K_PRIOR, LossFitError, bounded
+from jtqd.sysid.fit.signals import RunSignals
+
+MOST_RUNS: Final = 5
+"""From six runs on `fit_fused` leaves out whole runs."""
+
+
+class Prior(NamedTuple):
+    """Standard deviations of the prior; `_rated`: parts of the rated torque (per rad/s where it is viscous).
+
+    Those of catalogues where these have any, else estimates, settled on emulated joints; what depends on them:
+    docs/measured_runs.md (`python -m jtqd.sysid.goals.few_runs --priors`).
+    """
+
+    coulomb_share: float = 0.5
+    """Of the file's value; no-load running torques scatter by as much over parts and temperatures."""
+    coulomb_rated: float = 0.02
+    viscous_share: float = 0.5
+    viscous_rated: float = 0.02
+    load_mean: float = 0.05
+    load: float = 0.1
+    """A harmonic drive loses 5 to 15 % of the load beside its no-load torque (catalogue efficiency 0.7 to 0.85)."""
+    gain: float = 0.05
+    """Catalogues allow 5 to 10 % on the torque constant."""
+    inertia_share: float = 0.3
+    offset_rated: float = 0.01
+    zero_rated: float = 0.01
+    other_way_rated: float = 0.005
+    """Of the constant part at no load, one direction against the other."""
+    curved_rated: float = 0.01
+    """The same at rated load: a loss is no straight line."""
+    other_way_viscous: float = 0.1
+    """Of the viscous part's own prior."""
+    day_share: float = 0.1
+    """Of the loss, from day to day."""
+
+
+PRIOR: Final = Prior()
+_SAMPLE_S: Final = 0.005
+_LONGEST_S: Final = 0.1
+"""A law that is not quite that of the joint errs alike for so long at least."""
+_SLOW_RAD_S: Final = 0.05
+"""Slower, the direction of friction is not settled."""
+_LEAST_MOTION_S: Final = 0.5
+_LEAST_RATED: Final = 0.01
+"""No law of friction is better than that, whatever a few seconds say."""
+_PARTS: Final = 5
+_REPETITIONS: Final = 4
+_FASTER: Final = 3.0
+"""The line of the viscous part goes on to so many times the fastest speed: it is the file's as much as the run's."""
+_NODES: Final = 6
+_VISCOUS: Final = slice(6, 8)
+_LOSS: Final = slice(0, 8)
+_INERTIA: Final = 8
+_COMMON: Final = 9
+"""c_+ at -R, 0, R, c_- at -R, 0, R, f_+, f_-, J; the zeros of the runs follow."""
+_NAMES: Final = (
+    ("Coulomb friction", "Nm"),
+    ("load friction", ""),
+    ("viscous friction", "Nms/rad"),
+    ("offset", "Nm"),
+    ("gain error", ""),
+    ("rotor inertia", "kg m2"),
+)
+
+
+@dataclass(frozen=True)
+class FewTerm:
+    """What the fit has found of one thing: value, its standard deviation, and both before the fit."""
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    file: float
+    file_sigma: float
+
+    def line(self) -> str:
+        """Return the line of the report; what the runs have told: the part of the prior's variance that they took away."""
+        told = 1.0 - (self.sigma / self.file_sigma) ** 2
+        unit = f" {self.unit}" if self.unit else ""
+        return (
+            f"{self.name} {self.value:.3g} +- {self.sigma:.2g}{unit} (before: {self.file:.3g} +- {self.file_sigma:.2g}; "
+            f"the runs tell {100.0 * max(told, 0.0):.0f} %)"
+        )
+
+
+@dataclass(frozen=True)
+class FewRunsFit:
+    """joint: with section `fused` (no torsion) and rotor inertia; terms: of the report; residual_nm, unseen_nm: RMS in the
+    runs, and in fifths of them that the fit had not seen; effective: samples that count; samples: used, thinned.
+    """
+
+    joint: Joint
+    terms: tuple[FewTerm, ...]
+    residual_nm: float
+    unseen_nm: float
+    effective: float
+    samples: int
+
+    @property
+    def fused(self) -> Fused:
+        """The section that was fitted."""
+        assert self.joint.fused is not None
+        return self.joint.fused
+
+    def lines(self) -> list[str]:
+        """Return the report, one fact per line."""
+        return [
+            *(term.line() for term in self.terms),
+            f"residual {self.residual_nm:.3f} Nm, in fifths left out {self.unseen_nm:.3f} Nm "
+            f"(effective samples: {self.effective:.0f} of {self.samples})",
+        ]
+
+
+class _Block(NamedTuple):
+    """Equations of one run: columns x [n, _COMMON], target y [n], speed [n], seconds of motion."""
+
+    x: FloatArray
+    y: FloatArray
+    v: FloatArray
+    motion_s: float
+
+
+def fit_few_runs(runs: Sequence[RunSignals], joint: Joint, prior: Prior = PRIOR) -> FewRunsFit:
+    """Return the joint with loss, sigma and rotor inertia of one to five runs.
+
+    joint: what is known before the runs. Raises LossFitError for too little motion.
+    """
+    rated = joint.rated_torque_nm
+    blocks = [_block(run, joint) for run in runs]
+    motion_s = sum(block.motion_s for block in blocks)
+    if motion_s < _LEAST_MOTION_S:
+        raise LossFitError(
+            f"found {motion_s:.2g} s in motion (above {_SLOW_RAD_S} rad/s), expected at least {_LEAST_MOTION_S} s"
+        )
+    blocks = [block for block in blocks if len(block.y)]
+    mean, spread = _prior(joint, prior)
+    known = np.asarray(np.linalg.inv(spread), np.float64)
+    zero = prior.zero_rated * rated
+    weights = [
+        block.motion_s / _LONGEST_S / len(block.y) / (2.0 * _LEAST_RATED * rated) ** 2 for block in blocks
+    ]
+    for _ in range(_REPETITIONS):
+        w, covariance = _solve(blocks, weights, mean, known, zero)
+        weights = [_weight(block, w, n, rated) for n, block in enumerate(blocks)]
+    w, covariance = _solve(blocks, weights, mean, known, zero)
+    residual = _rms([_error(block, w, n) for n, block in enumerate(blocks)])
+    unseen = _rms(_left_out(blocks, weights, mean, known, zero))
+    left = max(unseen, _LEAST_RATED * rated)
+    speed = max(float(np.abs(block.v).max()) for block in blocks)
+    sigma = _sigma(w[_LOSS], covariance[_LOSS, _LOSS], left, rated, speed, prior)
+    loss = _loss(w, joint, speed, _temperature(runs))
+    fitted = replace(
+        joint, rotor_inertia_kgm2=float(w[_INERTIA]) / joint.gear_ratio**2, fused=Fused(loss, None, sigma)
+    )
+    effective = sum(
+        weight * len(block.y) * _variance(block, w, n, rated)
+        for n, (block, weight) in enumerate(zip(blocks, weights, strict=True))
+    )
+    terms = _terms(w, covariance, mean, spread, joint)
+    return FewRunsFit(fitted, terms, residual, unseen, effective, sum(len(block.y) for block in blocks))
+
+
+def _block(run: RunSignals, joint: Joint) -> _Block:
+    """Return the equations of a run's moving samples, about 200 per second."""
+    seen, friction = run.seen, joint.friction
+    step = float(np.median(seen.dt_s[1:])) if len(seen.dt_s) > 1 else _SAMPLE_S
+    moving = np.flatnonzero(run.moving & (np.abs(np.nan_to_num(seen.velocity_rad_s)) > _SLOW_RAD_S))
+    index = moving[:: max(1, round(_SAMPLE_S / step))]
+    if not len(index):
+        return _Block(np.zeros((0, _COMMON)), np.zeros(0), np.zeros(0), 0.0)
+    time_s = np.cumsum(np.maximum(seen.dt_s, 1e-9))
+    alpha = np.gradient(np.nan_to_num(seen.velocity_rad_s), time_s)[index]
+    raw, v, s = seen.raw_nm[index], seen.velocity_rad_s[index], seen.direction[index]
+    peak = friction.stribeck_nm * np.exp(-((v / friction.stribeck_velocity_rad_s) ** 2)) * s
+    x = np.column_stack((_columns(raw, v, s, joint.rated_torque_nm), alpha))
+    return _Block(x, raw + _reflected(joint) * alpha - run.sensor_nm[index] - peak, v, step * len(moving))
+
+
+def _columns(raw: FloatArray, v: FloatArray, s: FloatArray, rated: float) -> FloatArray:
+    """Return the loss at unit value of each of its numbers [n, 8]."""
+    ahead, back = 0.5 * (1.0 + s)[:, None], -0.5 * (1.0 - s)[:, None]
+    speed = np.abs(v)[:, None]
+    return np.hstack((_hats(raw / rated) * ahead, _hats(-raw / rated) * back, speed * ahead, speed * back))
+
+
+def _hats(load: FloatArray) -> FloatArray:
+    """Return the shares [n, 3] of loads of -1, 0 and 1; lines beyond."""
+    below, above = np.maximum(-load, 0.0), np.maximum(load, 0.0)
+    return np.column_stack((below, 1.0 - below - above, above))
+
+
+def _reflected(joint: Joint) -> float:
+    return joint.rotor_inertia_kgm2 * joint.gear_ratio**2
+
+
+def _mixing(rated: float) -> FloatArray:
+    """Return [9, 6]: the numbers of the fit out of Coulomb, load, viscous, offset, gain and inertia."""
+    b = np.zeros((_COMMON, len(_NAMES)))
+    for n, x in enumerate((-rated, 0.0, rated)):
+        b[n] = 1.0, abs(x), 0.0, 1.0, x, 0.0
+        b[3 + n] = 1.0, abs(x), 0.0, -1.0, x, 0.0
+    b[_VISCOUS, 2] = 1.0
+    b[_INERTIA, 5] = 1.0
+    return b
+
+
+def _prior(joint: Joint, prior: Prior) -> tuple[FloatArray, FloatArray]:
+    """Return mean [9] and covariance [9, 9] of the fit's numbers before any run."""
+    rated, friction = joint.rated_torque_nm, joint.friction
+    viscous = float(np.hypot(prior.viscous_share * friction.viscous_nms_per_rad, prior.viscous_rated * rated))
+    sigmas = np.array(
+        (
+            np.hypot(prior.coulomb_share * friction.coulomb_nm, prior.coulomb_rated * rated),
+            prior.load,
+            viscous,
+            prior.offset_rated * rated,
+            prior.gain,
+            prior.inertia_share * _reflected(joint),
+        )
+    )
+    means = np.array(
+        (friction.coulomb_nm, prior.load_mean, friction.viscous_nms_per_rad, 0.0, 0.0, _reflected(joint))
+    )
+    side = np.array((prior.curved_rated, prior.other_way_rated, prior.curved_rated)) * rated
+    own = np.concatenate((side, side, np.full(2, prior.other_way_viscous * viscous), [0.0]))
+    b = _mixing(rated)
+    return b @ means, b @ np.diag(sigmas**2) @ b.T + np.diag(own**2)
+
+
+def _solve(
+    blocks: Sequence[_Block], weights: Sequence[float], mean: FloatArray, known: FloatArray, zero: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the most probable numbers, zeros of the runs behind them, and their covariance before the bounds."""
+    size = _COMMON + len(blocks)
+    left, right = np.zeros((size, size)), np.zeros(size)
+    left[:_COMMON, :_COMMON] = known
+    right[:_COMMON] = known @ mean
+    for n, (block, weight) in enumerate(zip(blocks, weights, strict=True)):
+        at = np.r_[:_COMMON, _COMMON + n]
+        x = np.column_stack((block.x, np.ones(len(block.y))))
+        left[np.ix_(at, at)] += weight * (x.T @ x)
+        left[_COMMON + n, _COMMON + n] += zero**-2
+        right[at] += weight * (x.T @ block.y)
+    covariance = np.asarray(np.linalg.inv(left), np.float64)
+    w = covariance @ right
+    if (w[:_COMMON] < 0.0).any():
+        w = bounded(left, right, slice(0, _COMMON))
+    return w, covariance
+
+
+def _error(block: _Block, w: FloatArray, run: int) -> FloatArray:
+    error: FloatArray = block.y - block.x @ w[:_COMMON] - w[_COMMON + run]
+    return error
+
+
+def _counted(block: _Block, error: FloatArray) -> float:
+    """Return how many samples of a run count."""
+    return min(effective_samples(error), max(2.0, block.motion_s / _LONGEST_S))
+
+
+def _variance(block: _Block, w: FloatArray, run: int, rated: float) -> float:
+    """Return the variance of an effective sample of a run, with the freedom that three numbers of a loss take."""
+    error = _error(block, w, run)
+    counted = _counted(block, error)
+    found = float(np.mean(error**2)) * counted / max(counted - 3.0, 1.0)
+    return max(found, (_LEAST_RATED * rated) ** 2)
+
+
+def _weight(block: _Block, w: FloatArray, run: int, rated: float) -> float:
+    """Return the weight of each of a run's samples: those that count share the run."""
+    counted = _counted(block, _error(block, w, run))
+    return counted / len(block.y) / _variance(block, w, run, rated)
+
+
+def _left_out(
+    blocks: Sequence[_Block], weights: Sequence[float], mean: FloatArray, known: FloatArray, zero: float
+) -> list[FloatArray]:
+    """Return the errors in each fifth of each run, of a fit that has not seen it."""
+    found = []
+    for n, block in enumerate(blocks):
+        edges = np.linspace(0, len(block.y), _PARTS + 1).astype(int).tolist()
+        for a, b in pairwise(edges):
+            keep = np.r_[:a, b : len(block.y)]
+            others = [*blocks]
+            others[n] = _Block(block.x[keep], block.y[keep], block.v[keep], block.motion_s)
+            w, _ = _solve(others, weights, mean, known, zero)
+            found.append(_error(block, w, n)[a:b])
+    return found
+
+
+def _rms(parts: Sequence[FloatArray]) -> float:
+    return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+
+
+def _sigma(  # noqa: PLR0917
+    w: FloatArray, covariance: FloatArray, left_nm: float, rated: float, speed: float, prior: Prior
+) -> FusedSigma:
+    """Return sigma of the current path on another day, over loads up to the rated one and speeds up to the fastest."""
+    slow = min(_SLOW_RAD_S, speed)
+    speeds = np.linspace(2.0 * slow if speed > 2.0 * slow else slow, speed, 8)
+    raw, v = (each.ravel() for each in np.meshgrid(np.linspace(-rated, rated, 21), np.r_[-speeds, speeds]))
+    x = _columns(raw, v, np.sign(v), rated)
+    variance = np.einsum("ij,jk,ik->i", x, covariance, x) + left_nm**2 + (prior.day_share * (x @ w)) ** 2
+    a, b, c = nnls(np.column_stack((np.ones_like(v), v * v, raw * raw)), variance)[0]
+    a = max(a, (0.5 * _LEAST_RATED * rated) ** 2)
+    ratio = variance / (a + b * v * v + c * raw * raw)
+    at = quadrants(raw, v)
+    one, two, three, four = (float(np.sqrt(np.mean(ratio[at == q]))) for q in range(4))
+    current = float(np.sqrt(a))
+    # without torsion the estimator does not read its sigma; the file must have a number above 0
+    return FusedSigma(
+        current, float(np.sqrt(b)), float(np.sqrt(c)), current, 0.0, 0.0, (one, two, three, four)
+    )
+
+
+def _temperature(runs: Sequence[RunSignals]) -> float:
+    known = [run.temperature_c for run in runs if np.isfinite(run.temperature_c)]
+    return float(np.mean(known)) if known else 25.0
+
+
+def _loss(w: FloatArray, joint: Joint, speed: float, temperature_c: float) -> AdditiveLoss:
+    rated, friction = joint.rated_torque_nm, joint.friction
+    return AdditiveLoss(
+        (-rated, 0.0, rated),
+        _side(w[:3], w[6], friction),
+        _side(w[3:_NODES], w[7], friction),
+        friction.stribeck_velocity_rad_s,
+        _FASTER * speed,
+        temperature_c,
+        float(np.mean(w[_VISCOUS])),
+        PER_K_PRIOR[0],
+    )
+
+
+def _side(constant: FloatArray, viscous: float, friction: Friction) -> LossSide:
+    one, two, three = (float(value) for value in constant)
+    return LossSide((one, two, three), (float(viscous),) * 3, (0.0,) * 3, friction.stribeck_nm)
+
+
+def _terms(
+    w: FloatArray, covariance: FloatArray, mean: FloatArray, spread: FloatArray, joint: Joint
+) -> tuple[FewTerm, ...]:
+    """Return what the fit says of things with a name: least squares on its numbers."""
+    back = np.linalg.pinv(_mixing(joint.rated_torque_nm))
+    back[np.abs(back) < 1e-12] = 0.0  # a prior of 0 is to read 0
+    units = np.array((1.0, 1.0, 1.0, 1.0, 1.0, joint.gear_ratio**-2))
+    columns = (
+        back @ w[:_COMMON] * units,
+        np.sqrt(np.diag(back @ covariance[:_COMMON, :_COMMON] @ back.T)) * units,
+        back @ mean * units,
+        np.sqrt(np.diag(back @ spread @ back.T)) * units,
+    )
+    return tuple(
+        FewTerm(name, unit, *(round(float(each[n]), 12) + 0.0 for each in columns))
+        for n, (name, unit) in enumerate(_NAMES)
+    )

@@ -1,0 +1,86 @@
+"""Fit section `fused.zeros` of a joint file: how far the link encoder's zero differs from day to day.
+
+    spread_nm^2 = variance of the torsion's run means - reference^2        on runs that the fit had not seen
+    spread_rad  = spread_nm over the mean stiffness of the spring
+
+The mean error of a run is its zero and the sensor's; reference^2 is the sensor's (`sysid/fit/fused.py`). The same runs are
+then estimated as in service, each from its start: zeros tracked, what is known of them taken off value and sigma. The
+section is written where that takes at least WORTH off the mean square error; scale is calibrated there, as that of
+`fused.sigma`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import Fusion
+from jtqd.estimator.joint import DayZeros, Fused
+from jtqd.estimator.zeros import followed
+from jtqd.sysid.fit.residuals import PathResiduals
+
+WORTH: Final = 0.05
+"""Part of the mean square error on runs left out that the learned zeros must take away to be believed."""
+_MOST: Final = 0.9
+"""Of the torsion's variance: the rest is never the day's zero."""
+_FEWEST: Final = 8
+"""Runs, of a day each, from which a spread of days can be told."""
+
+Scale = tuple[float, float, float, float]
+
+
+def fit_zeros(
+    runs: Sequence[PathResiduals],
+    fused: Fused,
+    rated_nm: float,
+    calibrate: Callable[[Sequence[FloatArray], Sequence[FloatArray]], Scale],
+) -> DayZeros | None:
+    """Return the section of runs left out; None where it is not worth it, or for too few runs.
+
+    calibrate: errors and sigmas [n] of each run -> factor per quadrant.
+    """
+    if len(runs) < _FEWEST or not all(len(run.dt_s) for run in runs):
+        return None
+    sigma = fused.sigma
+    means = np.array([run.torsion_error_nm.mean() for run in runs])
+    spread = min(float(np.var(means)) - sigma.reference_nm**2, _MOST * sigma.torsion_nm**2)
+    if not spread > 0.0:
+        return None
+    stiffness = float(np.mean([run.stiffness_nm_per_rad.mean() for run in runs]))
+    found = DayZeros(float(np.sqrt(spread)) / stiffness, float(np.sqrt(spread)), (1.0, 1.0, 1.0, 1.0))
+    before = [_estimated(run, fused, rated_nm)[0] for run in runs]
+    errors, sigmas = zip(
+        *(_estimated(run, replace(fused, zeros=found), rated_nm) for run in runs), strict=True
+    )
+    if not _mean_square(errors) < (1.0 - WORTH) * _mean_square(before):
+        return None
+    return replace(found, scale=calibrate(errors, sigmas))
+
+
+def _mean_square(errors: Sequence[FloatArray]) -> float:
+    return float(np.mean([np.mean(error * error) for error in errors]))
+
+
+def _estimated(run: PathResiduals, fused: Fused, rated_nm: float) -> tuple[FloatArray, FloatArray]:
+    """Return error and standard deviation [n] of the fused physics over a run with zeros tracked from its start on."""
+    fusion = Fusion(fused.sigma, True)
+    seen = (run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm)
+    torsion, current, known = followed(
+        fused,
+        rated_nm,
+        run.dt_s,
+        run.torsion_error_nm - run.current_error_nm,
+        run.direction,
+        run.velocity_rad_s,
+        run.torsion_nm,
+        fusion.variance_many(*seen),
+        run.slope,
+        run.stiffness_nm_per_rad,
+    )
+    alpha, spread = fusion.weigh_known(*seen, known)
+    e_c, e_t = run.current_error_nm + current, run.torsion_error_nm + torsion
+    return e_c + alpha * (e_t - e_c), spread

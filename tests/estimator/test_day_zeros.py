@@ -1,0 +1,105 @@
+"""Section `fused.zeros`: what is known of the day's zero is taken off value and sigma; where nothing is known, nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator import status as st
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.estimator import FusedEstimator
+from jtqd.estimator.fusion import Fusion
+from jtqd.estimator.joint import DayZeros, Joint
+from tests.estimator.fused_helpers import SIGMA
+from tests.estimator.test_fused_estimator import NARROW
+from tests.estimator.test_zeros import OFF, K, driven, error, tracked
+
+DAYS = DayZeros(2.5e-5, 0.3, SIGMA.scale)
+LEARNING = replace(NARROW, fused=replace(NARROW.fused, zeros=DAYS))  # type: ignore[type-var]
+
+
+@pytest.mark.parametrize("zero", [2.5e-5, -3.5e-5])
+def test_an_ordinary_zero_is_learned_and_the_interval_is_the_narrower_for_it(zero: float) -> None:
+    columns, torque = driven(8.0, link_zero_rad=zero)
+    without, known = tracked(columns)
+    found, zeros = tracked(columns, LEARNING)
+    assert abs(zeros.link_used_rad - zero) < 0.5 * abs(zero)
+    assert error(found, torque) < 0.9 * error(without, torque)  # most of it is the age
+    assert zeros.link_rad == pytest.approx(known.link_rad, abs=3e-6)
+    moving = (found.status == st.VALID) & (np.arange(len(torque)) > 5000)
+    assert found.sigma_nm[moving].mean() < 0.9 * without.sigma_nm[moving].mean()
+
+
+def test_before_the_joint_has_moved_both_ways_value_and_sigma_are_those_of_the_file() -> None:
+    one_way, _ = driven(0.4, velocity=lambda t: 1.0 + 0.3 * np.sin(2.5 * t), friction_nm=0.3)
+    without, found = (tracked(one_way, joint)[0] for joint in (NARROW, LEARNING))
+    moving = found.status == st.VALID
+    np.testing.assert_allclose(found.sigma_nm[moving], without.sigma_nm[moving], rtol=0.06)
+    np.testing.assert_allclose(found.torque_nm[moving], without.torque_nm[moving], atol=0.05)
+
+
+def test_friction_of_the_day_is_at_most_a_part_of_the_spread() -> None:
+    one_way, _ = driven(8.0, velocity=lambda t: 1.0 + 0.3 * np.sin(2.5 * t), friction_nm=0.3)
+    assert abs(tracked(one_way, LEARNING)[1].link_used_rad) < DAYS.spread_rad
+    both, _ = driven(8.0, friction_nm=0.3)
+    assert abs(tracked(both, LEARNING)[1].link_used_rad) * K < 0.1
+
+
+def test_a_zero_far_beyond_the_days_of_the_fit_is_found_as_without_the_section() -> None:
+    columns, torque = driven(8.0, link_zero_rad=1e-3)
+    found, zeros = tracked(columns, LEARNING)
+    assert zeros.link_used_rad == pytest.approx(1e-3, abs=2e-5)
+    assert error(found, torque) < 0.4
+    assert found.status[-1] == st.VALID
+
+
+def test_an_encoder_that_slips_makes_sigma_as_wide_as_the_file_s_again() -> None:
+    at = np.where(np.arange(6000) < 4000, 0.0, 6e-4)
+    columns, _ = driven(6.0, link_zero_rad=at)
+    without, found = (tracked(columns, joint)[0] for joint in (NARROW, LEARNING))
+    assert found.sigma_nm[3900] < 0.95 * without.sigma_nm[3900]
+    slipped = slice(4310, 4500)  # views were apart for JUMP_S
+    assert (found.sigma_nm[slipped] > 0.85 * without.sigma_nm[slipped]).all()
+
+
+def test_where_zeros_are_not_tracked_the_section_changes_nothing() -> None:
+    columns, _ = driven(link_zero_rad=5e-5)
+    one, other = (FusedEstimator(joint, OFF).run(*columns) for joint in (NARROW, LEARNING))
+    assert one.torque_nm.tobytes() == other.torque_nm.tobytes()
+    assert one.sigma_nm.tobytes() == other.sigma_nm.tobytes()
+
+
+def test_its_scale_counts_where_zeros_are_tracked() -> None:
+    wider = replace(DAYS, scale=tuple(2.0 * each for each in DAYS.scale))
+    joint = replace(LEARNING, fused=replace(LEARNING.fused, zeros=wider))  # type: ignore[type-var]
+    columns, _ = driven(2.0)
+    one, other = (tracked(columns, each)[0] for each in (LEARNING, joint))
+    moving = (one.status == st.VALID) & (np.arange(len(one.status)) > 100)  # the two paths have met
+    np.testing.assert_allclose(other.sigma_nm[moving], 2.0 * one.sigma_nm[moving], rtol=1e-9)
+
+
+def test_what_is_known_of_the_torsion_moves_the_weight_and_never_all_of_it() -> None:
+    fusion = Fusion(SIGMA, True)
+    one = np.ones(3)
+    seen = (5.0 * one, 0.0 * one, 1.0 * one, 5.0 * one, 0.0 * one)
+    alpha, sigma = fusion.weigh_known(*seen, np.array([0.0, 0.05, 1e6]))
+    np.testing.assert_allclose((alpha[0], sigma[0]), [each[0] for each in fusion.weigh_many(*seen)])
+    assert alpha[0] < alpha[1] < alpha[2] < 1.0
+    assert sigma[0] > sigma[1] > sigma[2] > SIGMA.reference_nm
+    c = 0.2**2 + 0.1**2 + (0.02 * 5.0) ** 2
+    t = 0.35**2 + (0.015 * 5.0) ** 2 - 0.05
+    assert alpha[1] == pytest.approx(c / (c + t))
+    assert sigma[1] == pytest.approx(np.sqrt(c * t / (c + t) + 0.15**2))
+
+
+def test_a_file_says_it_and_one_that_cannot_be_is_refused() -> None:
+    mapping = LEARNING.to_mapping()
+    assert mapping["fused"]["zeros"]["spread_nm"] == 0.3
+    assert Joint.from_mapping(mapping, "a.yaml") == LEARNING
+    mapping["fused"]["zeros"]["spread_nm"] = 0.36
+    with pytest.raises(
+        ConfigError, match=r"a\.yaml.*spread_nm.*0\.36.*less than sigma\.torsion_nm \(0\.35 Nm\)"
+    ):
+        Joint.from_mapping(mapping, "a.yaml")

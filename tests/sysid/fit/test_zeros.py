@@ -1,0 +1,95 @@
+"""Section `fused.zeros`: the spread of the days' zeros is found, believed where runs left out confirm it, and calibrated."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import DayZeros, Fused, FusedSigma
+from jtqd.sysid.fit.residuals import PathResiduals
+from jtqd.sysid.fit.zeros import fit_zeros
+from tests.estimator.test_fused_estimator import NARROW
+
+K, RATED, DAYS = 12000.0, 40.0, 24
+SIGMA = FusedSigma(0.6, 0.0, 0.0, 0.5, 0.0, 0.02, (1.0, 1.0, 1.0, 1.0))
+
+
+def runs(zero_nm: float, within_nm: float = 0.2) -> list[PathResiduals]:
+    """Runs to and fro of days whose zeros have this spread; both paths err within a run, the current more."""
+    rng = np.random.default_rng(5)
+    n = 8000
+    t = np.arange(n) * 1e-3
+    v = 1.2 * np.sin(2.5 * t)
+    torque = 8.0 * np.sin(1.7 * t)
+    found = []
+    for zero in rng.normal(0.0, zero_nm, DAYS):
+        slow = np.repeat(rng.normal(0.0, within_nm, n // 100), 100)
+        friction = rng.normal(0.0, 0.3) * np.sign(v) + np.repeat(rng.normal(0.0, 0.5, n // 100), 100)
+        none = np.zeros(n)
+        found.append(
+            PathResiduals(
+                torque, v, none, torque, none, friction, zero + slow, np.full(n, 1e-3), np.tanh(v / 0.02), none,
+                stiffness_nm_per_rad=np.full(n, K),
+            )
+        )  # fmt: skip
+    return found
+
+
+def fused(sigma: FusedSigma = SIGMA) -> Fused:
+    assert NARROW.fused is not None
+    return replace(NARROW.fused, sigma=sigma)
+
+
+def no_scale(errors: Sequence[FloatArray], sigmas: Sequence[FloatArray]) -> tuple[float, float, float, float]:
+    return (1.0, 1.0, 1.0, 1.0)
+
+
+def fitted(of: Sequence[PathResiduals], sigma: FusedSigma = SIGMA) -> DayZeros | None:
+    return fit_zeros(of, fused(sigma), RATED, no_scale)
+
+
+def test_the_spread_of_the_days_is_found_as_an_angle_and_as_a_torque() -> None:
+    days = runs(0.4)
+    found = fitted(days)
+    assert found is not None
+    drawn = float(np.std([run.torsion_error_nm.mean() for run in days]))
+    assert found.spread_nm == pytest.approx(drawn, rel=0.01)
+    assert found.spread_rad == pytest.approx(drawn / K, rel=0.01)
+
+
+def test_what_is_the_sensors_zero_is_not_the_encoders() -> None:
+    found, plain = fitted(runs(0.4), replace(SIGMA, reference_nm=0.2)), fitted(runs(0.4))
+    assert found is not None
+    assert plain is not None
+    assert found.spread_nm**2 == pytest.approx(plain.spread_nm**2 - 0.2**2 + 0.02**2, rel=1e-6)
+
+
+def test_days_that_hardly_differ_and_few_runs_have_no_section() -> None:
+    assert fitted(runs(0.02)) is None
+    assert fitted(runs(0.4)[:7]) is None
+
+
+def test_its_calibration_sees_the_errors_of_tracked_zeros() -> None:
+    seen = []
+
+    def calibrate(
+        errors: Sequence[FloatArray], sigmas: Sequence[FloatArray]
+    ) -> tuple[float, float, float, float]:
+        seen.append((errors, sigmas))
+        return (1.5, 1.6, 1.7, 1.8)
+
+    days = runs(0.4)
+    found = fit_zeros(days, fused(), RATED, calibrate)
+    assert found is not None
+    assert found.scale == (1.5, 1.6, 1.7, 1.8)
+    errors, sigmas = seen[0]
+    late = slice(5000, None)
+    learned = float(np.mean([np.mean(error[late] ** 2) for error in errors]))
+    alpha = 0.6**2 / (0.6**2 + 0.5**2)
+    plain = [run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm) for run in days]
+    assert learned < 0.8 * float(np.mean([np.mean(error[late] ** 2) for error in plain]))
+    assert np.mean([sigma[-1] for sigma in sigmas]) < 0.9 * np.mean([sigma[0] for sigma in sigmas])
