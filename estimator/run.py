@@ -21,6 +21,10 @@ class RunTableError(ValueError):
     """The columns of a run cannot be used; one line that names column, found and expected."""
 
 
+_SAME: Final = 1e-9
+"""Of the travel: what rounding leaves between a position and the one that it was made of."""
+
+
 @dataclass(frozen=True, slots=True)
 class JointColumns:
     """Columns [n] of one joint, None where the run has none; SI units.
@@ -45,10 +49,13 @@ class JointColumns:
             if column is not None:
                 object.__setattr__(self, item.name, _read_only(column, item.name))
 
-    @property
-    def two_encoders(self) -> bool:
-        """Whether both sides of the gear were measured: a torsion made of one encoder is zero, and no torsion."""
-        return self.motor_position_rad is not None and self.link_position_rad is not None
+    def two_encoders(self, gear_ratio: float) -> bool:
+        """Return whether both sides of the gear were measured: positions that are each other through the ratio are one."""
+        motor, link = self.motor_position_rad, self.link_position_rad
+        if motor is None or link is None:
+            return False
+        apart = float(np.ptp(motor / gear_ratio - link))
+        return apart > _SAME * float(np.ptp(link)) or float(np.ptp(motor)) == 0.0
 
     def derived(self, time_s: FloatArray, gear_ratio: float) -> JointColumns:
         """Return a copy in which missing positions and velocities are derived from what is there.

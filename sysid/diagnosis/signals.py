@@ -287,7 +287,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     time, sensor = table.time_s, columns.torque_nm
     motion = _motion(time, raw, columns, joint)
     velocity = motion.visible(motion.speed) / joint.gear_ratio
-    both = _two_encoders(raw, joint.gear_ratio)
+    both = raw.two_encoders(joint.gear_ratio)
     link = (
         columns.link_position_rad
         if columns.link_position_rad is not None
@@ -385,15 +385,6 @@ def _zero(apart: FloatArray, torque: FloatArray) -> float:
     if min(map(len, sides)) < 0.1 * len(apart):
         return float(np.median(apart))
     return 0.5 * float(np.median(sides[0]) + np.median(sides[1]))
-
-
-def _two_encoders(raw: JointColumns, gear_ratio: float) -> bool:
-    """Return whether both sides of the gear were measured: columns that are each other through the ratio are one encoder."""
-    motor, link = raw.motor_position_rad, raw.link_position_rad
-    if motor is None or link is None:
-        return False
-    apart = motor / gear_ratio - link
-    return float(np.ptp(apart)) > 1e-9 * max(float(np.ptp(link)), 1e-6)
 
 
 def _or_nan(column: FloatArray | None, count: int) -> FloatArray:

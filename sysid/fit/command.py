@@ -359,7 +359,7 @@ def losses_main(argv: list[str]) -> int:
             for finding in findings:
                 print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
             return 3
-        two = two_encoders(runs, number) and not one_encoder_twice(runs, number, joint)
+        two = two_encoders(runs, number, joint)
         signals = signals_of(runs, number, joint)
         if not two:
             print(f"{LOSSES_BY}: {ONE_ENCODER}", file=sys.stderr)
@@ -389,28 +389,16 @@ FEW_RUNS: Final = (
     f"up to {MOST_RUNS} runs: what they do not tell stays near the joint file and widens sigma "
     "(docs/measured_runs.md)"
 )
-_SAME_RAD: Final = 1e-9
 
 
-def two_encoders(runs: list[RunFile], number: int) -> bool:
+def two_encoders(runs: list[RunFile], number: int, joint: Joint) -> bool:
     """Return whether the runs have both encoders of a joint. Raises RunTableError where some have and some have not."""
-    without = [run.name for run in runs if not run.table.joints[number].two_encoders]
+    without = [run.name for run in runs if not run.table.joints[number].two_encoders(joint.gear_ratio)]
     if without and len(without) < len(runs):
         raise RunTableError(
             f"{without[0]}: j{number}: found one position, other runs have both, expected both in all runs or in none"
         )
     return not without
-
-
-def one_encoder_twice(runs: list[RunFile], number: int, joint: Joint) -> bool:
-    """Return whether one position of a joint was made of the other, in all runs: a joint under load has torsion."""
-    every = [run.table.joint(number, joint.gear_ratio) for run in runs]
-    return all(
-        each.motor_position_rad is not None
-        and each.link_position_rad is not None
-        and float(np.ptp(each.motor_position_rad / joint.gear_ratio - each.link_position_rad)) < _SAME_RAD
-        for each in every
-    )
 
 
 def signals_of(runs: list[RunFile], number: int, joint: Joint) -> list[RunSignals]:

@@ -112,7 +112,7 @@ def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunError
 def needs_torsion(table: RunTable, number: int, joint: Joint) -> bool:
     """Return whether the joint's method fused estimates from a torsion that this run does not have: one encoder."""
     torsion = joint.fused is not None and joint.fused.torsion is not None
-    return torsion and not table.joints[number].two_encoders
+    return torsion and not table.joints[number].two_encoders(joint.gear_ratio)
 
 
 def rows_of(scored: Sequence[Sequence[RunErrors]]) -> list[Row]:

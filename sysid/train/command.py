@@ -250,7 +250,7 @@ def _train_joint(
         if (n + 1) % 100 == 0:
             print(f"{joint.name}: iteration {n + 1} of {iterations}, mse {loss:.4f} Nm^2", file=sys.stderr)
 
-    if not two_encoders(runs, number):
+    if not two_encoders(runs, number, joint):
         raise ConfigError(
             f"{joint.name}: the runs have one encoder of this joint, expected both: "
             "jtqd uses no network without a link position"

@@ -63,6 +63,22 @@ def test_derivation_takes_the_nearest_source() -> None:
     assert nothing.link_velocity_rad_s is None
 
 
+def test_a_position_made_of_the_other_is_no_second_encoder() -> None:
+    time = np.arange(200) * 1e-3
+    motor = 100.0 * np.sin(time)
+    made = JointColumns(motor_position_rad=motor).derived(time, 100.0)
+    assert not made.two_encoders(100.0)
+    assert not JointColumns(motor_position_rad=motor).two_encoders(100.0)
+    assert (
+        JointColumns(motor_position_rad=motor, link_position_rad=motor / 100.0 + 3.0).two_encoders(100.0)
+        is False
+    )
+    twisted = motor / 100.0 - 1e-6 * np.cos(time)
+    assert JointColumns(motor_position_rad=motor, link_position_rad=twisted).two_encoders(100.0)
+    still = np.full(200, 0.5)
+    assert JointColumns(motor_position_rad=still, link_position_rad=still).two_encoders(100.0), "says nothing"
+
+
 def test_inputs_for_the_estimator() -> None:
     table = RunTable(T, {1: FULL})
     dt_s, *rest = table.estimator_inputs(1, 100.0)

@@ -225,7 +225,7 @@ def test_a_joint_with_one_encoder_has_no_link_position_and_the_reader_says_so(tm
     path = write_log(tmp_path / "a.mcap", regular(30, wanted))
     logged = log_to_run(path, all_needed=True)
     one, two = logged.table.joints[1], logged.table.joints[2]
-    assert (one.two_encoders, two.two_encoders) == (False, True)
+    assert (one.two_encoders(100.0), two.two_encoders(100.0)) == (False, True)
     assert one.link_position_rad is None
     assert one.current_a is not None
     assert len(one.current_a) == 29
