@@ -8,13 +8,17 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
+from jtqd.estimator.agreement import GAIN, LEVEL, levels
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.estimator import FusedEstimator
-from jtqd.estimator.fusion import Fusion
+from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
+from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import DayZeros, Joint
+from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.estimator.zeros import followed
 from tests.estimator.fused_helpers import SIGMA
+from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_fused_estimator import NARROW
-from tests.estimator.test_zeros import OFF, K, driven, error, tracked
+from tests.estimator.test_zeros import OFF, ON, K, driven, error, tracked
 
 DAYS = DayZeros(2.5e-5, 0.3, SIGMA.scale)
 LEARNING = replace(NARROW, fused=replace(NARROW.fused, zeros=DAYS))  # type: ignore[type-var]
@@ -62,6 +66,65 @@ def test_an_encoder_that_slips_makes_sigma_as_wide_as_the_file_s_again() -> None
     assert found.sigma_nm[3900] < 0.95 * without.sigma_nm[3900]
     slipped = slice(4310, 4500)  # views were apart for JUMP_S
     assert (found.sigma_nm[slipped] > 0.85 * without.sigma_nm[slipped]).all()
+
+
+def test_fits_see_what_the_loop_does() -> None:
+    """`followed` and `levels` of the signals of a run: zeros, what is known of them, and what doubt adds of both."""
+    columns, _ = driven(8.0, link_zero_rad=4e-5)
+    dt, _, motor, _, link, temperature = columns
+    wavy = link + 0.5 * (WAVIER(np.cumsum(dt), motor / 100.0, link) - link)
+    columns = (*columns[:4], wavy, temperature)
+    both = replace(LEARNING, fused=replace(LEARNING.fused, agreement=AGREEMENT))  # type: ignore[type-var]
+    assert both.fused is not None
+    seen = observe_run(both, ON, both.fused.torsion, *columns)
+    on = seen.status == st.VALID
+    raw, v, s, torsion, open_nm, half_dt = (
+        x[on] for x in (seen.raw_nm, seen.velocity_rad_s, seen.direction, seen.torsion_nm, seen.open_nm, dt)
+    )
+    model = AdditiveLossModel(both.fused.loss)
+    loss, half = model.loss_many(raw, v, temperature[on], s)
+    slope = (model.loss_many(raw + SLOPE_NM, v, temperature[on], s)[0] - loss) / SLOPE_NM
+    parts = (raw, held(half, half_dt, np.ones(len(raw), bool)), v, torsion, open_nm)
+    fusion = Fusion(both.fused.sigma, True)
+    signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.variance_many(*parts), slope)
+    taken, _, known = followed(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
+    slow, fast, gain, left = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
+
+    plain, zeros = tracked(columns, LEARNING)
+    doubted, _ = tracked(columns, both)
+    assert taken[-1] / K == pytest.approx(zeros.link_used_rad, rel=2e-3)
+    last = int(np.flatnonzero(on)[-1])
+    alpha = float(fusion.weigh_known(*parts, known)[0][-1])
+    doubt = LEVEL**2 * (max(slow - AGREEMENT.slow_nm**2, 0.0) + max(fast - AGREEMENT.fast_nm**2, 0.0))
+    doubt += max(left**2 - AGREEMENT.zero_nm**2, 0.0)
+    assert 0.05 < known[-1] < 0.5 * doubt
+    doubt += (GAIN * max(gain - AGREEMENT.gain, 0.0) * float(torsion[-1])) ** 2
+    more = max(alpha, 1.0 - alpha) ** 2 * doubt + alpha**2 * known[-1]
+    assert doubted.sigma_nm[last] ** 2 - plain.sigma_nm[last] ** 2 == pytest.approx(more, rel=0.03)
+    assert alpha**2 * known[-1] > 0.06 * more
+
+
+def test_what_is_not_yet_taken_off_is_not_known() -> None:
+    n = 4000
+    v = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4)
+    one, zero_nm = np.ones(n), 12.0
+    assert LEARNING.fused is not None
+    taken, _, known = followed(
+        LEARNING.fused,
+        40.0,
+        1e-3 * one,
+        -zero_nm * one,
+        np.sign(v),
+        v,
+        5.0 * np.sin(v),
+        0.3 * one,
+        0.0 * one,
+        K * one,
+    )
+    late = zero_nm - taken
+    assert taken[-1] == pytest.approx(zero_nm, rel=0.01)
+    assert known[late > DAYS.spread_nm].max() < 1e-3
+    assert known[-1] > 0.02
 
 
 def test_where_zeros_are_not_tracked_the_section_changes_nothing() -> None:

@@ -217,6 +217,26 @@ def test_a_calibrated_interval_at_rest_counts_what_is_left_open_in_full() -> Non
         assert got.sigma_nm == pytest.approx(1.8 * spread + alpha * open_nm + (1.0 - alpha) * half, abs=1e-9)
 
 
+def test_views_apart_widen_a_calibrated_interval_at_rest() -> None:
+    """By as many standard deviations as where nothing is calibrated."""
+    assert NARROW.fused is not None
+    loss, half = AdditiveLossModel(NARROW.fused.loss).loss(2.0 * GAIN, 0.0, 0.0)
+    raw = 2.0 * GAIN
+    c = 0.2**2 + (0.02 * raw) ** 2
+    torsion_nm = raw - loss
+    for _ in range(20):  # s_t grows with the torsion
+        t = 0.35**2 + (0.015 * torsion_nm) ** 2
+        distance = math.sqrt(c + half**2 + t)
+        torsion_nm = raw - loss + 3.6 * distance
+    calibrated = replace(NARROW, fused=replace(NARROW.fused, standstill=Standstill(1.8)))
+    got = steady(estimator(joint=calibrated), 2.0, 0.0, torsion_nm=torsion_nm)
+    alpha = (c + half**2) / distance**2
+    width = 1.8 * math.sqrt(alpha**2 * t + (1.0 - alpha) ** 2 * c) + (1.0 - alpha) * half
+    more = max(alpha, 1.0 - alpha) * 0.6 * distance / 1.6448536269514722
+    assert got.status == st.STANDSTILL
+    assert got.sigma_nm == pytest.approx(math.hypot(width, STANDSTILL_SIGMAS * more), rel=1e-6)
+
+
 def test_a_friction_interval_is_about_the_current_path_not_about_the_value() -> None:
     """Friction that holds little: the far end of its interval counts, however wide the fusion's is."""
     assert NARROW.fused is not None

@@ -16,6 +16,7 @@ from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Joint, Tracking
 from jtqd.estimator.observer import TRACKED_FADE_S, reference_of, tracked
 from jtqd.estimator.settings import EstimatorSettings, recommended
+from jtqd.estimator.status import STANDSTILL
 from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S
 from tests.estimator.fused_helpers import fused_joint, twisted
 from tests.estimator.test_torsion_bandwidth import OWN, SLIPPING, SPEED, WEIGHTS, estimated, lossless
@@ -238,6 +239,9 @@ def test_sigma_holds_what_is_quicker_than_the_motor_path() -> None:
         assert a.torque_nm == b.torque_nm
         assert b.sigma_nm**2 - a.sigma_nm**2 >= 9.0 - 1e-9
     assert max(b.sigma_nm**2 - a.sigma_nm**2 for a, b in moving) > 9.05
+    resting = [(a, b) for a, b in pairs if a.status == b.status == STANDSTILL]
+    assert len(resting) > 100
+    assert all(a.sigma_nm == b.sigma_nm for a, b in resting), "measured in motion"
 
 
 def test_arrays_give_what_the_loop_gives() -> None:
