@@ -516,8 +516,8 @@ cdef class FusedEstimator(Estimator):
             if weight < 1.0:
                 lowered = True
         elif law.with_envelope:
-            # at half the weight ends the cell that the fit has visited
-            if fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
+            # at half the weight ends what the fit knows; the same motor torque holds more load when it is back-driven
+            if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
                 lowered = True
         out.sigma_nm = scale * physics.sigma
         # a zero that is not taken off counts once: as doubt, where the file has what is usual
@@ -526,7 +526,16 @@ cdef class FusedEstimator(Estimator):
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
         if law.agreement.used:
             doubt = doubt_of(&s.agreement, physics.alpha, seen.torsion_nm)
-            if lowers(&law.agreement, doubt, out.sigma_nm):
+            if lowers(
+                &law.agreement,
+                &s.agreement,
+                doubt,
+                out.sigma_nm,
+                s.zeros.x[4],
+                s.zeros.p[4][4],
+                physics.alpha,
+                seen.torsion_nm,
+            ):
                 s.lowered_s, lowered = LOWERED, True
             # a zero that was learned from views that disagree is as doubtful as they are
             doubt += physics.alpha * physics.alpha * fmin(known, s.agreement.doubt)
