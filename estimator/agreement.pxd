@@ -5,7 +5,7 @@ cdef struct AgreementLaw:
     double slow, fast  # variances [Nm^2]
     double gain
     double zero  # square [Nm^2]
-    double relevant  # square [Nm^2]
+    double relevant, lowered  # squares [Nm^2]
 
 cdef struct AgreementState:
     double trend  # of the innovation [Nm]
@@ -18,4 +18,13 @@ cdef void follow_agreement(
     const AgreementLaw *law, AgreementState *s, double innovation, double dt, double gain, double left_nm
 ) noexcept nogil
 cdef double doubt_of(const AgreementState *s, double alpha, double torsion) noexcept nogil
-cdef bint lowers(const AgreementLaw *law, double doubt, double sigma) noexcept nogil
+cdef bint lowers(
+    const AgreementLaw *law,
+    const AgreementState *s,
+    double doubt,
+    double sigma,
+    double gain,
+    double gain_variance,
+    double alpha,
+    double torsion,
+) noexcept nogil

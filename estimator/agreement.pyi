@@ -10,6 +10,7 @@ LEVEL: Final[float]
 GAIN: Final[float]
 LOWER_SIGMAS: Final[float]
 LEAST_SHARE: Final[float]
+SURE_SIGMAS: Final[float]
 
 def levels(
     fused: Fused,
@@ -21,4 +22,4 @@ def levels(
     torsion_nm: FloatArray,
     variance_nm2: FloatArray,
     slope: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]: ...
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...

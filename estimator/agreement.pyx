@@ -15,11 +15,15 @@ taken off. The joint file has the level of each that the runs of the fit kept be
     doubt^2 = LEVEL^2 ([slow - slow_0]+ + [fast - fast_0]+) + [left^2 - left_0^2]+ + (GAIN [|g| - g_0]+ tau)^2
     sigma^2 = (as fused)^2 + (max(alpha, 1 - alpha) doubt)^2
 
+The status is lowered by a doubt of LOWER_SIGMAS sigmas and LEAST_SHARE of the rated torque; where the file says what ordinary days
+have (`lowered_nm`), by more than that, counting of the gain only what is surely one, |g| - SURE_SIGMAS sigma_g: a joint that is
+always driven, or always back-driven, shows friction and a gain alike.
+
 Which view is wrong is not known: the one that the estimate follows counts. What both views share (a wrong gear ratio of both
 encoders, an external load) is in neither difference, and nothing here sees it.
 """
 
-from libc.math cimport exp, fabs, fmax
+from libc.math cimport exp, fabs, fmax, sqrt
 from libc.string cimport memset
 
 from typing import Final
@@ -38,9 +42,12 @@ runs that no figure is reported on."""
 LOWER_SIGMAS: Final = 4.0
 LEAST_SHARE: Final = 0.02
 """The status is lowered where the doubt is this many times the estimate's own sigma, and this part of the rated torque."""
+SURE_SIGMAS: Final = 2.0
+"""So many of its own standard deviations a gain is in doubt to be one, for the status."""
 
 cdef double INVERSE_TREND = 1.0 / TREND_S, INVERSE_UP = 1.0 / UP_S, INVERSE_DOWN = 1.0 / DOWN_S
 cdef double LEVEL_SQUARE = LEVEL**2, GAIN_FACTOR = GAIN, LOWER_SQUARE = LOWER_SIGMAS**2
+cdef double SURE = SURE_SIGMAS
 
 
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1:
@@ -52,6 +59,7 @@ cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
     law.used = True
     law.slow, law.fast = agreement.slow_nm**2, agreement.fast_nm**2
     law.gain, law.zero = agreement.gain, agreement.zero_nm**2
+    law.lowered = agreement.lowered_nm**2
     return 0
 
 
@@ -84,37 +92,63 @@ cdef double doubt_of(const AgreementState *s, double alpha, double torsion) noex
     return share * share * (s.doubt + by_gain * by_gain)
 
 
-cdef bint lowers(const AgreementLaw *law, double doubt, double sigma) noexcept nogil:
-    """Return whether a doubt [Nm^2] beside the estimate's own sigma [Nm] lowers the status."""
-    return doubt > LOWER_SQUARE * sigma * sigma and doubt > law.relevant
+cdef double _sure(
+    const AgreementLaw *law, const AgreementState *s, double gain, double gain_variance, double torsion
+) noexcept nogil:
+    """Return the doubt [Nm^2] of the torsion [Nm] with what is surely a gain."""
+    cdef double by_gain = GAIN_FACTOR * fmax(0.0, fabs(gain) - SURE * sqrt(gain_variance) - law.gain) * torsion
+    return s.doubt + by_gain * by_gain
+
+
+cdef bint lowers(
+    const AgreementLaw *law,
+    const AgreementState *s,
+    double doubt,
+    double sigma,
+    double gain,
+    double gain_variance,
+    double alpha,
+    double torsion,
+) noexcept nogil:
+    """Return whether a doubt [Nm^2], as `doubt_of`, lowers the status beside the estimate's own sigma [Nm]."""
+    cdef double most = fmax(LOWER_SQUARE * sigma * sigma, law.relevant), share
+    if not doubt > most:
+        return False
+    if law.lowered == 0.0:
+        return True
+    share = fmax(alpha, 1.0 - alpha)
+    return share * share * _sure(law, s, gain, gain_variance, torsion) > fmax(most, law.lowered)
 
 
 def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope):
-    """Return (slow, fast, |gain|, |left|) after each block of a run, arrays [blocks] in Nm^2, Nm^2, 1 and Nm; zeros tracked.
+    """Return (slow, fast, |gain|, |left|, doubt) after each block of a run, arrays [blocks] in Nm^2, Nm^2, 1, Nm, Nm; zeros tracked.
 
+    doubt: of the torsion, with what is surely a gain, beyond the levels of `fused.agreement`; of all where that is None.
     Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope: dL/draw of the loss.
     """
     columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope)
     cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
     cdef ZerosLaw law
     cdef ZerosState zeros
-    cdef AgreementLaw none
+    cdef AgreementLaw usual
     cdef AgreementState s
-    cdef double dt, innovation
+    cdef double dt, innovation, torsion, left
     cdef Py_ssize_t k
     # the current zero counts as a torque: whatever a torque per ampere is, its part of the difference is the same
     fill_zeros(&law, 1.0, rated_nm, fused, True, True)
-    fill_agreement(&none, None, rated_nm)
+    fill_agreement(&usual, fused.agreement, rated_nm)
     restart_zeros(&law, &zeros)
     restart_agreement(&s)
     found = []
     for k in range(x.shape[0]):
         if completes(&zeros, x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5] - law.spread_nm):
-            dt = zeros.block.dt
+            dt, torsion = zeros.block.dt, zeros.block.torsion / zeros.block.samples
             # nothing was taken off what is seen here: `update_zeros` expects that it was
             zeros.block.y += law.stiffness * zeros.link_rad * zeros.block.samples
             zeros.block.y += (1.0 - x[k, 6]) * zeros.current_a * zeros.block.samples
             innovation = update_zeros(&law, &zeros, law.stiffness, x[k, 6])
-            follow_agreement(&none, &s, innovation, dt, zeros.x[4], left_behind_nm(&law, &zeros))
-            found.append((s.slow, s.fast, fabs(zeros.x[4]), fabs(left_behind_nm(&law, &zeros))))
-    return tuple(np.array(found, np.float64).reshape(-1, 4).T)
+            left = left_behind_nm(&law, &zeros)
+            follow_agreement(&usual, &s, innovation, dt, zeros.x[4], left)
+            doubt = sqrt(_sure(&usual, &s, zeros.x[4], zeros.p[4][4], torsion))
+            found.append((s.slow, s.fast, fabs(zeros.x[4]), fabs(left), doubt))
+    return tuple(np.array(found, np.float64).reshape(-1, 5).T)

@@ -22,7 +22,7 @@ class Envelope:
 
     velocity_step_rad_s, torque_step_nm: distance of cell centres; known: [2 nv + 1][2 nt + 1] of 0 and 1 over velocity
     and motor torque, its middle cell at zero; distance_nm: largest |torsion - current path|; temperature_c: lowest
-    and highest, None where the joint reports none.
+    and highest, None where the joint reports none; load_nm: largest |joint torque|, None where that is not known (networks).
     """
 
     velocity_step_rad_s: float
@@ -30,6 +30,7 @@ class Envelope:
     known: tuple[tuple[int, ...], ...]
     distance_nm: float
     temperature_c: tuple[float, float] | None
+    load_nm: float | None = None
 
     @classmethod
     def from_mapping(cls, mapping: Any) -> Envelope:
@@ -67,6 +68,7 @@ class Envelope:
             )
         }
         temperature = section.raw("temperature_c", None)
+        load = section.number("load_nm", "Nm", _LEAST, _MOST, None)
         section.finish()
         try:
             known = _checked_map([[int(cell) for cell in row] for row in rows])
@@ -76,18 +78,18 @@ class Envelope:
             found = f"{len(known)} rows of {len(known[0])} cells"
             raise section.error("known", found, f"at most {MAX_CELLS} of either")
         try:
-            return cls(known=known, temperature_c=_checked_range(temperature), **steps)
+            return cls(known=known, temperature_c=_checked_range(temperature), load_nm=load, **steps)
         except ValueError:
             raise section.error("temperature_c", temperature, "[lowest, highest] in degC, or none") from None
 
     def as_section(self) -> dict[str, Any]:
         """Return what `from_section` reads."""
         rows = ["".join(map(str, row)) for row in self.known]
-        values = self.to_mapping() | {"known": rows}
+        values = self.to_mapping() | {"known": rows, "load_nm": self.load_nm}
         return {key: value for key, value in values.items() if value is not None}
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for JSON."""
+        """Return plain values for a network's JSON, which knows no load."""
         return {
             "velocity_step_rad_s": self.velocity_step_rad_s,
             "torque_step_nm": self.torque_step_nm,

@@ -498,6 +498,8 @@ cdef class FusedEstimator(Estimator):
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
         self.features[3], self.features[4] = seen.cos2, seen.sin2
         self.features[5], self.features[6] = seen.cos4, seen.sin4
+        # at rest the current path says little of the torque, and its distance to the torsion nothing of the file
+        apart = 0.0 if out.status == STANDSTILL else self.features[2]
         if law.network.used:
             if network_wanted:
                 correction = (
@@ -506,7 +508,7 @@ cdef class FusedEstimator(Estimator):
                 out.network_nm = out.physics_nm + correction
                 size = fabs(correction)
                 if size <= law.network_limit:  # not so for NaN
-                    weight = fused_trust(&law.trust, v, raw, self.features[2], x.temperature_c)
+                    weight = fused_trust(&law.trust, v, raw, apart, x.temperature_c)
                     if size > law.fade:
                         weight = fmin(weight, (law.network_limit - size) * law.inverse_fade)
                     out.torque_nm += weight * share_by_speed(v) * correction
@@ -514,9 +516,8 @@ cdef class FusedEstimator(Estimator):
             if weight < 1.0:
                 lowered = True
         elif law.with_envelope:
-            # at half the weight ends the cell that the fit has visited; at rest the current path says little of the torque
-            apart = 0.0 if out.status == STANDSTILL else self.features[2]
-            if fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
+            # at half the weight ends what the fit knows; the same motor torque holds more load when it is back-driven
+            if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
                 lowered = True
         out.sigma_nm = scale * physics.sigma
         # a zero that is not taken off counts once: as doubt, where the file has what is usual
@@ -525,7 +526,16 @@ cdef class FusedEstimator(Estimator):
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
         if law.agreement.used:
             doubt = doubt_of(&s.agreement, physics.alpha, seen.torsion_nm)
-            if lowers(&law.agreement, doubt, out.sigma_nm):
+            if lowers(
+                &law.agreement,
+                &s.agreement,
+                doubt,
+                out.sigma_nm,
+                s.zeros.x[4],
+                s.zeros.p[4][4],
+                physics.alpha,
+                seen.torsion_nm,
+            ):
                 s.lowered_s, lowered = LOWERED, True
             # a zero that was learned from views that disagree is as doubtful as they are
             doubt += physics.alpha * physics.alpha * fmin(known, s.agreement.doubt)

@@ -25,6 +25,7 @@ cdef struct FusedTrustLaw:
     double distance, inverse_fade
     bint with_temperature
     double low, high
+    double load  # largest joint torque [Nm]
     unsigned char known[MOST_CELLS][MOST_CELLS]
 
 cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1

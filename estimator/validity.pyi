@@ -1,5 +1,6 @@
 from typing import Final
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
@@ -25,3 +26,4 @@ class FusedTrust:
     def weight(
         self, velocity_rad_s: float, raw_nm: float, distance_nm: float, temperature_c: float
     ) -> float: ...
+    def weigh_map(self, velocity_rad_s: FloatArray, raw_nm: FloatArray) -> FloatArray: ...

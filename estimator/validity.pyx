@@ -9,7 +9,7 @@
 A weight is 1 where the network is alone in charge and 0 where nothing of it is left.
 """
 
-from libc.math cimport fabs, fmax, fmin, isnan, sqrt
+from libc.math cimport INFINITY, NAN, fabs, fmax, fmin, isnan, sqrt
 from libc.string cimport memset
 
 from jtqd.estimator.losses cimport (
@@ -22,6 +22,8 @@ from jtqd.estimator.losses cimport (
 )
 
 from typing import Final
+
+import numpy as np
 
 from jtqd.estimator.envelope import MAX_CELLS
 
@@ -179,6 +181,7 @@ cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1:
     law.inverse_fade = 1.0 / (DISTANCE_MARGIN * envelope.distance_nm)
     law.with_temperature = envelope.temperature_c is not None
     law.low, law.high = envelope.temperature_c or (0.0, 0.0)
+    law.load = INFINITY if envelope.load_nm is None else envelope.load_nm
     return 0
 
 
@@ -226,3 +229,16 @@ cdef class FusedTrust:
         raw_nm: motor torque; distance_nm: torsion less current path; finite both, as is the velocity.
         """
         return fused_trust(&self.law, velocity_rad_s, raw_nm, distance_nm, temperature_c)
+
+    def weigh_map(self, velocity_rad_s, raw_nm):
+        """Return the weights [n] by speed and motor torque alone."""
+        cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
+        cdef const double[::1] raw = np.ascontiguousarray(raw_nm, np.float64)
+        cdef FusedTrustLaw law = self.law
+        law.with_temperature = False
+        out = np.empty(len(v))
+        cdef double[::1] to = out
+        cdef Py_ssize_t k
+        for k in range(v.shape[0]):
+            to[k] = fused_trust(&law, v[k], raw[k], 0.0, NAN)
+        return out

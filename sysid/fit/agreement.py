@@ -6,7 +6,8 @@ Levels of samples, not of runs: what is beyond is doubt that grows from zero, so
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -16,23 +17,31 @@ from jtqd.estimator.joint import Agreement
 
 QUANTILE: Final = 0.85
 """Of the blocks of all runs: the rest of ordinary days has a little doubt. Chosen on runs that no figure is reported on."""
+LOWERED: Final = 0.99
+"""Of the blocks of all runs: a doubt beyond it is none of ordinary days. What is left, and as much by the envelope
+(`envelope.BEYOND_SHARE`), is the 2 % that may be flagged without need."""
 _FEWEST: Final = 200
 """Blocks, 3 s of motion at 1 kHz: from less no level can be told."""
 _FLOOR_NM: Final = 1e-3
 
+Levels = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
+"""Of one run, as `estimator.agreement.levels` returns it."""
 
-def fit_agreement(runs: Iterable[tuple[FloatArray, FloatArray, FloatArray, FloatArray]]) -> Agreement | None:
-    """Return the levels of runs, each as `estimator.agreement.levels` returns it; None for too little motion."""
-    slow, fast, gain, left = (np.concatenate(parts) for parts in zip(*runs, strict=True))
+
+def fit_agreement(levels: Callable[[Agreement | None], Sequence[Levels]]) -> Agreement | None:
+    """Return the levels of runs; None for too little motion. levels: of all runs, their doubt beyond a section."""
+    slow, fast, gain, left, _ = (np.concatenate(parts) for parts in zip(*levels(None), strict=True))
     if len(slow) < _FEWEST:
         return None
 
     def level(values: FloatArray) -> float:
         return float(np.quantile(values, QUANTILE))
 
-    return Agreement(
+    found = Agreement(
         slow_nm=max(level(np.sqrt(slow)), _FLOOR_NM),
         fast_nm=max(level(np.sqrt(fast)), _FLOOR_NM),
         gain=level(gain),
         zero_nm=level(left),
     )
+    doubt = np.concatenate([run[-1] for run in levels(found)])
+    return replace(found, lowered_nm=max(float(np.quantile(doubt, LOWERED)), _FLOOR_NM))

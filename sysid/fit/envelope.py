@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.validity import FusedTrust
 
 VELOCITY_STEP_RAD_S: Final = 0.25
 VELOCITY_STEP_SHARE: Final = 1.0 / 12.0
@@ -23,8 +25,13 @@ FIT_ROOM_K: Final = 3.0
 """A friction that is known over some days is known 3 K beyond the warmest: 2 to 3 % per kelvin of its viscous part."""
 _VISITS: Final = 20
 """Samples at 1 kHz in a cell that make it known."""
+BEYOND_SHARE: Final = 0.01
+"""Of the samples of runs left out, that may lie beyond the map of the others."""
+MOST_WIDER: Final = 2
+"""Cells of load beside what was visited, 15 % of rated torque: runs that need more have not shown what they cover."""
 
 Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
+Counts = np.ndarray[tuple[int, int], np.dtype[np.int64]]
 
 
 def envelope_of(
@@ -43,21 +50,59 @@ def envelope_of(
     """
     rows = int(np.ceil(np.abs(velocity_rad_s).max() / velocity_step_rad_s)) + 1
     columns = int(np.ceil(np.abs(raw_nm).max() / torque_step_nm)) + 1
-    counts = np.zeros((2 * rows + 1, 2 * columns + 1), np.int64)
-    at = (
-        np.rint(velocity_rad_s / velocity_step_rad_s).astype(int) + rows,
-        np.rint(raw_nm / torque_step_nm).astype(int) + columns,
-    )
-    np.add.at(counts, at, 1)
-    known = filled(counts >= _VISITS)
+    steps = velocity_step_rad_s, torque_step_nm
+    known = filled(_visits(velocity_rad_s, raw_nm, steps, (2 * rows + 1, 2 * columns + 1)) >= _VISITS)
     temperatures = [each for each in temperatures_c if np.isfinite(each)]
     return Envelope(
-        velocity_step_rad_s,
-        torque_step_nm,
-        tuple(tuple(int(cell) for cell in row) for row in known),
+        *steps,
+        _as_rows(known),
         1.25 * float(np.quantile(np.abs(apart_nm), 0.999)),
         (min(temperatures) - room_k, max(temperatures) + room_k) if temperatures else None,
     )
+
+
+def _visits(
+    velocity_rad_s: FloatArray, raw_nm: FloatArray, steps: tuple[float, float], shape: tuple[int, int]
+) -> Counts:
+    """Return the samples in each cell of a map of this shape."""
+    counts = np.zeros(shape, np.int64)
+    at = (
+        np.rint(velocity_rad_s / steps[0]).astype(int) + shape[0] // 2,
+        np.rint(raw_nm / steps[1]).astype(int) + shape[1] // 2,
+    )
+    np.add.at(counts, at, 1)
+    return counts
+
+
+def widened(made: Envelope, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Envelope:
+    """Return the envelope of runs, each (velocity, motor torque) [n] in motion, with as many cells more of load as it needs.
+
+    Needed is that at most BEYOND_SHARE of the samples of a run, on average, lie beyond the map of the other runs. In speed
+    nothing is added: the map ends where the runs end, as the load does by `load_nm`.
+    """
+    steps = made.velocity_step_rad_s, made.torque_step_nm
+    counts = [_visits(v, raw, steps, (len(made.known), len(made.known[0]))) for v, raw in runs]
+    others = [filled(sum(counts) - own >= _VISITS) for own in counts]
+    for cells in range(MOST_WIDER + 1):
+        left_out = [
+            FusedTrust(replace(made, known=_as_rows(_wider(known, cells)))).weigh_map(v, raw) < 0.5
+            for known, (v, raw) in zip(others, runs, strict=True)
+        ]
+        if np.mean([each.mean() for each in left_out]) <= BEYOND_SHARE:
+            break
+    return replace(made, known=_as_rows(_wider(np.array(made.known, np.bool_), cells)))
+
+
+def _wider(known: Table, cells: int) -> Table:
+    """Also call cells known beside known ones, in load, on a map so much wider."""
+    padded = np.pad(known, ((0, 0), (2 * cells, 2 * cells)))
+    width = known.shape[1] + 2 * cells
+    result: Table = np.logical_or.reduce([padded[:, k : k + width] for k in range(2 * cells + 1)])
+    return result
+
+
+def _as_rows(known: Table) -> tuple[tuple[int, ...], ...]:
+    return tuple(tuple(int(cell) for cell in row) for row in known)
 
 
 def velocity_step(velocity_rad_s: FloatArray) -> float:

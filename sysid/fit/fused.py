@@ -49,9 +49,16 @@ from jtqd.estimator.joint import (
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
-from jtqd.sysid.fit.agreement import fit_agreement
+from jtqd.sysid.fit.agreement import Levels, fit_agreement
 from jtqd.sysid.fit.conformal import conformal_scale
-from jtqd.sysid.fit.envelope import FIT_ROOM_K, TORQUE_STEP_SHARE, envelope_of, velocity_step
+from jtqd.sysid.fit.envelope import (
+    FIT_ROOM_K,
+    MOST_WIDER,
+    TORQUE_STEP_SHARE,
+    envelope_of,
+    velocity_step,
+    widened,
+)
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.residuals import NowErrors, PathResiduals
 from jtqd.sysid.fit.signals import RunSignals
@@ -215,21 +222,28 @@ def _day_zeros(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -
 def _agreement(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> Agreement | None:
     """Return how far the two paths differ on unseen runs; None for too little motion."""
     fusion = Fusion(fused.sigma, True)
-    return fit_agreement(
-        levels(
-            fused,
-            rated_nm,
-            run.dt_s,
-            run.torsion_error_nm - run.current_error_nm,
-            run.direction,
-            run.velocity_rad_s,
-            run.torsion_nm,
-            fusion.variance_many(run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm),
-            run.slope,
-        )
-        for run in unseen
-        if len(run.dt_s)
-    )
+
+    def of_runs(agreement: Agreement | None) -> list[Levels]:
+        usual = replace(fused, agreement=agreement)
+        return [
+            levels(
+                usual,
+                rated_nm,
+                run.dt_s,
+                run.torsion_error_nm - run.current_error_nm,
+                run.direction,
+                run.velocity_rad_s,
+                run.torsion_nm,
+                fusion.variance_many(
+                    run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
+                ),
+                run.slope,
+            )
+            for run in unseen
+            if len(run.dt_s)
+        ]
+
+    return fit_agreement(of_runs)
 
 
 def _envelope(
@@ -247,7 +261,10 @@ def _envelope(
         torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
         room_k=FIT_ROOM_K,
     )
-    return made if max(len(made.known), len(made.known[0])) <= MAX_CELLS else None
+    if max(len(made.known), len(made.known[0])) > MAX_CELLS - 2 * MOST_WIDER:
+        return None
+    load = max(float(np.abs(run.torsion_nm).max()) for run in seen)
+    return replace(widened(made, [(run.velocity_rad_s, run.raw_nm) for run in seen]), load_nm=load)
 
 
 def _unseen(

@@ -322,6 +322,16 @@ def test_what_is_degraded_is_degraded_at_standstill() -> None:
     assert apart.sigma_nm > 10.0
 
 
+def test_at_rest_the_distance_of_the_views_is_friction_and_takes_no_trust() -> None:
+    """With a network as without one: else a standing joint is degraded and at rest by turns, as its friction happens to lie."""
+    close = replace(everywhere(), distance_nm=1.0)
+    own = replace(NARROW, fused=replace(NARROW.fused, envelope=close))  # type: ignore[type-var]
+    for network, joint in ((FakeNetwork(lambda *_: 1.5, close), NARROW), (None, own)):
+        for torsion_nm in (11.0, 15.0, 18.0):
+            assert steady(estimator(network, joint), 2.0, 0.0, torsion_nm).status == st.STANDSTILL
+        assert steady(estimator(network, joint), 2.0, 1.0, 7.5).status == st.DEGRADED
+
+
 ABSURD = [
     *product(range(4), (math.nan, math.inf, -math.inf)),
     *product((0, 1, 2, 3), (1e300, -1e300, 1.7e308)),
