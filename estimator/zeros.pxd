@@ -16,6 +16,7 @@ cdef struct ZerosLaw:
     double stiffness, torque_per_ampere, limit
     double floor  # variance of the link zero [rad^2] that the joint file's own sigma covers
     double known  # variance of the link zero [rad^2] below which it counts as learned
+    double correlation  # [s]: a block counts as its length over it
     double spread, spread_nm  # variance of the link zero over the days [rad^2, Nm^2]; 0: the file does not say
 
 cdef struct Gathered:  # sums over the samples of a block

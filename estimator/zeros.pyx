@@ -17,7 +17,8 @@ common to both goes by their prior widths, and the standard deviation of e never
 
 Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S, |s| > ONE_WAY. They are averaged over
 blocks of BLOCK samples, and a block counts as its length/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2:
-ripple and errors of the encoders are not white.
+ripple and errors of the encoders are not white. That variance holds the day's friction as well, which is a state here: `fused.zeros` has
+the time that belongs to what the states leave, `correlation_s`, found on the runs of the fit.
 
 What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations (of the link zero: and of COVERED
 of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
@@ -68,7 +69,7 @@ KNOWN_SHARE: Final = 0.5
 direction of motion alone never reaches."""
 
 cdef int SAMPLES = BLOCK
-cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
+cdef double INVERSE_SLEW = 1.0 / SLEW_S
 cdef double SLOWEST = MOVING_RAD_S, ONE_SIDED = ONE_WAY
 cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
 cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
@@ -103,7 +104,9 @@ cdef int fill_zeros(
     law.limit = torsion.zero_limit_rad
     law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
     law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
+    law.correlation = CORRELATION_S
     if law.used and fused.zeros is not None:
+        law.correlation = fused.zeros.correlation_s or CORRELATION_S
         law.spread, law.spread_nm = fused.zeros.spread_rad**2, fused.zeros.spread_nm**2
     law.prior[0] = (LARGEST_LINK * rated_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
@@ -190,7 +193,7 @@ cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, d
     h[2], h[3], h[4] = -b.direction * share, -b.velocity * share, b.torsion * share
     # the views were corrected: what was taken off belongs to what is seen
     innovation = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
-    variance = b.variance * share * CORRELATION / b.dt
+    variance = b.variance * share * law.correlation / b.dt
     for n in range(ZERO_STATES):
         s.p[n][n] += law.drift[n] * b.dt
         innovation -= h[n] * s.x[n]
