@@ -26,6 +26,8 @@ cdef struct Gathered:  # sums over the samples of a block
 cdef struct ZerosState:
     double x[ZERO_STATES]
     double p[ZERO_STATES][ZERO_STATES]
+    double wary_x[ZERO_STATES]  # the same for noise that lasts CORRELATION_S: what `agreement` judges by
+    double wary_p[ZERO_STATES][ZERO_STATES]
     double link_rad, current_a  # what is taken off the readings
     double left_nm  # what is known of the link zero and not yet taken off, as torque
     double apart_s  # for how long the views are farther apart than can be

@@ -69,7 +69,7 @@ KNOWN_SHARE: Final = 0.5
 direction of motion alone never reaches."""
 
 cdef int SAMPLES = BLOCK
-cdef double INVERSE_SLEW = 1.0 / SLEW_S
+cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
 cdef double SLOWEST = MOVING_RAD_S, ONE_SIDED = ONE_WAY
 cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
 cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
@@ -125,7 +125,7 @@ cdef void restart_zeros(const ZerosLaw *law, ZerosState *s) noexcept nogil:
     cdef int n
     memset(s, 0, sizeof(ZerosState))
     for n in range(ZERO_STATES):
-        s.p[n][n] = law.prior[n]
+        s.p[n][n] = s.wary_p[n][n] = law.prior[n]
 
 
 cdef void drop_block(ZerosState *s) noexcept nogil:
@@ -178,45 +178,64 @@ cdef double _used(double x, double variance, double least) noexcept nogil:
     return x * w if w > 0.0 else 0.0
 
 
+cdef double _innovation(const double *h, const double *x, double seen) noexcept nogil:
+    """Return what a difference of the views is beyond that of states x [Nm]."""
+    cdef int n
+    for n in range(ZERO_STATES):
+        seen -= h[n] * x[n]
+    return seen
+
+
+cdef void _take(
+    const double *h, double *x, double (*p)[ZERO_STATES], double innovation, double variance
+) noexcept nogil:
+    """Update states and covariance by an innovation [Nm] with noise of this variance."""
+    cdef double ph[ZERO_STATES]
+    cdef double gain
+    cdef int m, n
+    for n in range(ZERO_STATES):
+        ph[n] = 0.0
+        for m in range(ZERO_STATES):
+            ph[n] += p[n][m] * h[m]
+        variance += h[n] * ph[n]
+    for n in range(ZERO_STATES):
+        gain = ph[n] / variance
+        x[n] += gain * innovation
+        for m in range(n + 1):
+            p[n][m] -= gain * ph[m]
+            p[m][n] = p[n][m]
+
+
 cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil:
-    """Take the complete block; return its innovation [Nm].
+    """Take the complete block; return the innovation of the wary states [Nm].
 
     stiffness: local, of the spring; slope: dL/draw of the loss.
     """
     cdef Gathered b = s.block
     cdef double h[ZERO_STATES]
-    cdef double ph[ZERO_STATES]
-    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left, before = s.apart_s
-    cdef int m, n
+    cdef double share = 1.0 / SAMPLES, seen, innovation, wary, variance, way, left, before = s.apart_s
+    cdef int n
     memset(&s.block, 0, sizeof(Gathered))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
     h[2], h[3], h[4] = -b.direction * share, -b.velocity * share, b.torsion * share
     # the views were corrected: what was taken off belongs to what is seen
-    innovation = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
-    variance = b.variance * share * law.correlation / b.dt
+    seen = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
+    variance = b.variance * share / b.dt
     for n in range(ZERO_STATES):
         s.p[n][n] += law.drift[n] * b.dt
-        innovation -= h[n] * s.x[n]
+        s.wary_p[n][n] += law.drift[n] * b.dt
+    innovation, wary = _innovation(h, s.x, seen), _innovation(h, s.wary_x, seen)
     s.apart_s = s.apart_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
     if s.apart_s > LONGEST_S:
         if before <= LONGEST_S and s.p[0][0] < law.known:
             s.jumps += 1
         for n in range(ZERO_STATES):
-            s.p[0][n] = s.p[n][0] = 0.0
-        s.p[0][0] = law.prior[0]
-    for n in range(ZERO_STATES):
-        ph[n] = 0.0
-        for m in range(ZERO_STATES):
-            ph[n] += s.p[n][m] * h[m]
-        variance += h[n] * ph[n]
-    for n in range(ZERO_STATES):
-        gain = ph[n] / variance
-        s.x[n] += gain * innovation
-        for m in range(n + 1):
-            s.p[n][m] -= gain * ph[m]
-            s.p[m][n] = s.p[n][m]
+            s.p[0][n] = s.p[n][0] = s.wary_p[0][n] = s.wary_p[n][0] = 0.0
+        s.p[0][0] = s.wary_p[0][0] = law.prior[0]
+    _take(h, s.x, s.p, innovation, variance * law.correlation)
+    _take(h, s.wary_x, s.wary_p, wary, variance * CORRELATION)
     if not law.used:
-        return innovation
+        return wary
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
@@ -225,7 +244,7 @@ cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, d
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
     s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
-    return innovation
+    return wary
 
 
 cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
