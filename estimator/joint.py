@@ -234,12 +234,14 @@ class DayZeros:
     """How far the zero of the link encoder differs from day to day, where `track_zeros` can learn it: zeros.pyx.
 
     spread_rad: standard deviation over the days of the fit; spread_nm: its part of sigma.torsion_nm, which what is learned
-    takes away again; scale: in place of sigma.scale where zeros are tracked.
+    takes away again; scale: in place of sigma.scale where zeros are tracked; correlation_s: so long the difference of the two
+    paths keeps what is no state of the day, None: as without the section (`zeros.CORRELATION_S`).
     """
 
     spread_rad: Annotated[float, limits("rad", gt=0.0)]
     spread_nm: Annotated[float, limits("Nm", gt=0.0)]
     scale: Annotated[tuple[float, float, float, float], limits()]
+    correlation_s: Annotated[float, limits("s", gt=0.0, le=10.0)] | None = None
 
     def __post_init__(self) -> None:
         check(self, "fused.zeros")

@@ -17,7 +17,8 @@ common to both goes by their prior widths, and the standard deviation of e never
 
 Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S, |s| > ONE_WAY. They are averaged over
 blocks of BLOCK samples, and a block counts as its length/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2:
-ripple and errors of the encoders are not white.
+ripple and errors of the encoders are not white. That variance holds the day's friction as well, which is a state here: `fused.zeros` has
+the time that belongs to what the states leave, `correlation_s`, found on the runs of the fit.
 
 What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations (of the link zero: and of COVERED
 of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
@@ -103,7 +104,9 @@ cdef int fill_zeros(
     law.limit = torsion.zero_limit_rad
     law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
     law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
+    law.correlation = CORRELATION_S
     if law.used and fused.zeros is not None:
+        law.correlation = fused.zeros.correlation_s or CORRELATION_S
         law.spread, law.spread_nm = fused.zeros.spread_rad**2, fused.zeros.spread_nm**2
     law.prior[0] = (LARGEST_LINK * rated_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
@@ -122,7 +125,7 @@ cdef void restart_zeros(const ZerosLaw *law, ZerosState *s) noexcept nogil:
     cdef int n
     memset(s, 0, sizeof(ZerosState))
     for n in range(ZERO_STATES):
-        s.p[n][n] = law.prior[n]
+        s.p[n][n] = s.wary_p[n][n] = law.prior[n]
 
 
 cdef void drop_block(ZerosState *s) noexcept nogil:
@@ -175,45 +178,64 @@ cdef double _used(double x, double variance, double least) noexcept nogil:
     return x * w if w > 0.0 else 0.0
 
 
+cdef double _innovation(const double *h, const double *x, double seen) noexcept nogil:
+    """Return what a difference of the views is beyond that of states x [Nm]."""
+    cdef int n
+    for n in range(ZERO_STATES):
+        seen -= h[n] * x[n]
+    return seen
+
+
+cdef void _take(
+    const double *h, double *x, double (*p)[ZERO_STATES], double innovation, double variance
+) noexcept nogil:
+    """Update states and covariance by an innovation [Nm] with noise of this variance."""
+    cdef double ph[ZERO_STATES]
+    cdef double gain
+    cdef int m, n
+    for n in range(ZERO_STATES):
+        ph[n] = 0.0
+        for m in range(ZERO_STATES):
+            ph[n] += p[n][m] * h[m]
+        variance += h[n] * ph[n]
+    for n in range(ZERO_STATES):
+        gain = ph[n] / variance
+        x[n] += gain * innovation
+        for m in range(n + 1):
+            p[n][m] -= gain * ph[m]
+            p[m][n] = p[n][m]
+
+
 cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil:
-    """Take the complete block; return its innovation [Nm].
+    """Take the complete block; return the innovation of the wary states [Nm].
 
     stiffness: local, of the spring; slope: dL/draw of the loss.
     """
     cdef Gathered b = s.block
     cdef double h[ZERO_STATES]
-    cdef double ph[ZERO_STATES]
-    cdef double share = 1.0 / SAMPLES, innovation, variance, gain, way, left, before = s.apart_s
-    cdef int m, n
+    cdef double share = 1.0 / SAMPLES, seen, innovation, wary, variance, way, left, before = s.apart_s
+    cdef int n
     memset(&s.block, 0, sizeof(Gathered))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
     h[2], h[3], h[4] = -b.direction * share, -b.velocity * share, b.torsion * share
     # the views were corrected: what was taken off belongs to what is seen
-    innovation = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
-    variance = b.variance * share * CORRELATION / b.dt
+    seen = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
+    variance = b.variance * share / b.dt
     for n in range(ZERO_STATES):
         s.p[n][n] += law.drift[n] * b.dt
-        innovation -= h[n] * s.x[n]
+        s.wary_p[n][n] += law.drift[n] * b.dt
+    innovation, wary = _innovation(h, s.x, seen), _innovation(h, s.wary_x, seen)
     s.apart_s = s.apart_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
     if s.apart_s > LONGEST_S:
         if before <= LONGEST_S and s.p[0][0] < law.known:
             s.jumps += 1
         for n in range(ZERO_STATES):
-            s.p[0][n] = s.p[n][0] = 0.0
-        s.p[0][0] = law.prior[0]
-    for n in range(ZERO_STATES):
-        ph[n] = 0.0
-        for m in range(ZERO_STATES):
-            ph[n] += s.p[n][m] * h[m]
-        variance += h[n] * ph[n]
-    for n in range(ZERO_STATES):
-        gain = ph[n] / variance
-        s.x[n] += gain * innovation
-        for m in range(n + 1):
-            s.p[n][m] -= gain * ph[m]
-            s.p[m][n] = s.p[n][m]
+            s.p[0][n] = s.p[n][0] = s.wary_p[0][n] = s.wary_p[n][0] = 0.0
+        s.p[0][0] = s.wary_p[0][0] = law.prior[0]
+    _take(h, s.x, s.p, innovation, variance * law.correlation)
+    _take(h, s.wary_x, s.wary_p, wary, variance * CORRELATION)
     if not law.used:
-        return innovation
+        return wary
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
@@ -222,7 +244,7 @@ cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, d
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
     s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
-    return innovation
+    return wary
 
 
 cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
