@@ -22,7 +22,7 @@ from jtqd.sysid.diagnosis.signals import Channel, Line
 
 FLIPS: Final = 9999
 SIGNIFICANT: Final = 2e-4
-"""Some fifty maps are looked at: one in a hundred sets of runs has a map this unlikely by chance."""
+"""Some seventy maps are looked at: one in a hundred sets of runs has a map this unlikely by chance."""
 _BINS: Final = 12
 _FEWEST_BLOCKS: Final = 8
 UNITS: Final = {
