@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -33,16 +33,8 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
     """
     steps = left_out_steps(refined)
     pieces = refined.mixed.pieces
-    squares: dict[Channel, FloatArray] = {}
-    for place, run, left, step in zip(pieces, dataset.runs, refined.runs, steps, strict=True):
-        for channel, d in left.channels.items():
-            before = run.channels[channel].residual[d.valid]
-            after = (d.residual - d.regressors @ step[d.index])[d.valid]
-            if channel.balance == "torsion" and len(before):
-                before, after = before - before.mean(), after - after.mean()
-            rows = squares.setdefault(channel, np.zeros((refined.mixed.runs, 3)))
-            rows[place] += (float(before @ before), float(after @ after), len(before))
-    drops = {c: _rms(s, 0) - _rms(s, 1) for c, s in squares.items()}
+    squares = left_out_squares(dataset, refined, steps)
+    drops = falls_nm(squares)
     channel = max(drops, key=lambda c: drops[c])
     table = squares[channel]
     names = [dataset.runs[int(np.argmax(pieces == r))].name for r in range(len(table))]
@@ -65,6 +57,29 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
         ),
         *position,
     )
+
+
+def left_out_squares(
+    dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]
+) -> dict[Channel, FloatArray]:
+    """Return per channel and recording the sums of squares [Nm^2] before and after, and the count of bins [r, 3]; each run
+    with the parameters of all others (steps: `left_out_steps`).
+    """
+    squares: dict[Channel, FloatArray] = {}
+    for place, run, left, step in zip(refined.mixed.pieces, dataset.runs, refined.runs, steps, strict=True):
+        for channel, d in left.channels.items():
+            before = run.channels[channel].residual[d.valid]
+            after = (d.residual - d.regressors @ step[d.index])[d.valid]
+            if channel.balance == "torsion" and len(before):
+                before, after = before - before.mean(), after - after.mean()
+            rows = squares.setdefault(channel, np.zeros((refined.mixed.runs, 3)))
+            rows[place] += (float(before @ before), float(after @ after), len(before))
+    return squares
+
+
+def falls_nm(squares: Mapping[Channel, FloatArray]) -> dict[Channel, float]:
+    """Return per channel by how much the rms of all recordings falls [Nm]; squares: of `left_out_squares`."""
+    return {c: _rms(s, 0) - _rms(s, 1) for c, s in squares.items()}
 
 
 Before = tuple[float, float]

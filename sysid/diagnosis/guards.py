@@ -17,7 +17,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import joint_text
-from jtqd.sysid.diagnosis.gain import free_run_errors, left_out_steps
+from jtqd.sysid.diagnosis.gain import falls_nm, free_run_errors, left_out_squares, left_out_steps
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter, places
 from jtqd.sysid.diagnosis.search import Hypothesis
 
@@ -37,9 +37,10 @@ def nothing_of(best: Hypothesis) -> list[dict[str, float]]:
 def objections(
     dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
 ) -> list[tuple[int, str]]:
-    """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out;
-    else, where no torque was measured, one that raises the error of the position in a free run; else the smaller of two that
-    cancel each other. What is left must be fitted again before it is asked again.
+    """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out, or
+    helps least where all of them together do not lower the plain error there; else, where no torque was measured, one that
+    raises the error of the position in a free run; else the smaller of two that cancel each other. What is left must be
+    fitted again before it is asked again.
     """
     nothing = nothing_of(best)
     bound = [
@@ -48,9 +49,10 @@ def objections(
     bound = [(k, why) for k, why in bound if why]
     if bound or bounds_only or not refined.present:
         return bound
-    falls = held_out_gains(dataset, refined)
+    steps = left_out_steps(refined)
+    falls = held_out_gains(dataset, refined, steps)
     worst = int(np.argmin(falls))
-    if falls[worst] <= 0.0:
+    if falls[worst] <= 0.0 or max(falls_nm(left_out_squares(dataset, refined, steps)).values()) <= 0.0:
         return [(worst, "it raises the error on runs left out")]
     if dataset.no_torque:
         harmful = [k for k in range(len(refined.present)) if free_run_fall(dataset, refined, k) < 0.0]
@@ -97,11 +99,14 @@ def cancelling(dataset: Dataset, present: Sequence[PresentEffect]) -> tuple[int,
     return None
 
 
-def held_out_gains(dataset: Dataset, refined: Refined) -> list[float]:
-    """Return per cause by how much it lowers the plain squared error of the balances it acts in, each run with the
-    parameters of all others, as a part of what is there without it; at or below zero it is better left out.
+def held_out_gains(dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]) -> list[float]:
+    """Return per cause by how much it lowers the squared error of the balances it acts in, each run with the parameters of
+    all others (`left_out_steps`), as a part of what is there without it; at or below zero it is better left out.
+
+    What a run has of its own (zero and friction of the day) counts as little as it is usual: it can be several times an
+    effect, and by chance lie against it in the mean of the runs.
     """
-    steps = left_out_steps(refined)
+    floor = {c: float(np.nanmean(np.concatenate(x) ** 2)) for c, x in dataset.unexplained.items()}
     out = []
     for p, mine in zip(refined.present, places(refined.present), strict=True):
         here = contributions(dataset, p)
@@ -114,10 +119,20 @@ def held_out_gains(dataset: Dataset, refined: Refined) -> list[float]:
                 part = parts[r] + (d.regressors[:, own] @ step[d.index[own]])[d.valid]
                 if c.balance == TORSION and len(left):
                     left, part = left - left.mean(), part - part.mean()
-                within += float(left @ left)
-                without += float((left + part) @ (left + part))
+                both = np.column_stack((left, left + part))
+                squares = squares_beside(both, d.nuisances[d.valid], floor[c] / refined.variances[d.families])
+                within, without = within + float(squares[0]), without + float(squares[1])
         out.append(1.0 - within / without if without > 0.0 else 0.0)
     return out
+
+
+def squares_beside(columns: FloatArray, own: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return x' (1 + Z V Z'/s2)^-1 x of each column x [n, k], Nm^2: its square where what the run has of its own counts as
+    little as it is usual. own: Z [n, q]; weights: s2 / V [q], of noise and of the runs' own changes.
+    """
+    common = own.T @ columns
+    explained = np.sum(common * np.linalg.solve(own.T @ own + np.diag(weights), common), axis=0)
+    return np.asarray(np.sum(columns**2, axis=0) - explained)
 
 
 def free_run_fall(dataset: Dataset, refined: Refined, cause: int) -> float:

@@ -296,8 +296,9 @@ def pinned(chosen: Sequence[EffectCandidate], joints: int) -> bool:
 
 
 def units_changed(hypothesis: Hypothesis, joints: int) -> bool:
-    """Return whether stiffness and torque constant of every joint change by one factor: the sensor's gain in other words,
-    which is one effect instead of many, and shrinks the noise where the factor is below 1 (see `pinned`).
+    """Return whether most of the stiffnesses and torque constants of the joints change by one factor: the sensor's gain in
+    other words (with the rest changed the other way), which is fewer effects and shrinks the noise where the factor is below
+    1 (see `pinned`).
     """
     changes: list[float] = []
     for candidate in hypothesis.chosen:
@@ -306,10 +307,10 @@ def units_changed(hypothesis: Hypothesis, joints: int) -> bool:
             nothing = candidate.term.combine([0.0] * candidate.size)
             keyed = next(p.name for p in candidate.effect.parameters if p.key)
             changes.append(values[keyed] / nothing[keyed] - 1.0)
-    if len(changes) < len(_SCALED) * max(joints, 1):
-        return False
-    spread = max(changes) - min(changes)
-    return bool(spread < _ONE_FACTOR * abs(sum(changes) / len(changes)))
+    changes.sort()
+    most = len(_SCALED) * max(joints, 1) // 2 + 1
+    alike = (changes[k : k + most] for k in range(len(changes) - most + 1))
+    return any(some[-1] - some[0] < _ONE_FACTOR * abs(sum(some) / most) for some in alike)
 
 
 def within(candidate: EffectCandidate, coefficients: Sequence[float]) -> bool:

@@ -22,7 +22,7 @@ from jtqd.sysid.diagnosis.signals import Channel, Line
 
 FLIPS: Final = 9999
 SIGNIFICANT: Final = 2e-4
-"""Some fifty maps are looked at: one in a hundred sets of runs has a map this unlikely by chance."""
+"""Some seventy maps are looked at: one in a hundred sets of runs has a map this unlikely by chance."""
 _BINS: Final = 12
 _FEWEST_BLOCKS: Final = 8
 UNITS: Final = {
@@ -135,14 +135,13 @@ def axis_maps(
 
 
 def directions(runs: Sequence[RunData], channel: Channel) -> list[list[FloatArray] | None]:
-    """Return the signs in which a channel is looked at: as it is (None); the motor balance also in the direction of motion,
-    because a loss changes its sign with the direction and would cancel in a map of both, and in that of the current, as
-    what a drive loses does.
+    """Return the signs in which a channel is looked at: as it is (None); in the direction of motion, because a loss (of the
+    link too, which the torsion balance sees) changes its sign with it and would cancel in a map of both; the motor balance
+    also in the direction of the current, as what a drive loses does.
     """
-    if channel.balance != MOTOR:
-        return [None]
     axes = [run.axes[channel.joint] for run in runs]
-    return [None, [np.sign(a["velocity"]) for a in axes], [np.sign(a["current"]) for a in axes]]
+    out: list[list[FloatArray] | None] = [None, [np.sign(a["velocity"]) for a in axes]]
+    return [*out, [np.sign(a["current"]) for a in axes]] if channel.balance == MOTOR else out
 
 
 def signed(parts: Sequence[FloatArray], side: Sequence[FloatArray] | None) -> list[FloatArray]:

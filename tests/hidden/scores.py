@@ -20,6 +20,7 @@ LARGEST_CLASS: Final = 3
 _PLACES: Final = 3  # of the largest gap that may be right
 _MOMENT_S: Final = 0.3  # tolerance of a time
 _MOMENT: Final = re.compile(r"(run\d+)(?:\.csv)? ([\d.]+) s")
+_HELD: Final = re.compile(r"j\d\.(\w+): found exactly (\S+) .*clipped channel")
 
 Truth = Mapping[str, Any]
 
@@ -137,7 +138,11 @@ def _between(value: float, low: float, high: float, angle: bool) -> bool:
 
 
 def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bool:
-    """Return whether the verdict is "unexplained" and the map of the largest gap points at one of the right places."""
+    """Return whether the verdict is "unexplained" and the map of the largest gap points at one of the right places; or
+    whether nothing is explained and a channel check says which channel clips, and at what (`_channel_said`).
+    """
+    if _channel_said(truth, findings):
+        return True
     if findings.verdict != "unexplained" or not findings.gaps:
         return False
     largest = findings.gaps[0]
@@ -146,6 +151,18 @@ def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bo
     return any(_hit(place, right) for place in shown(largest) for right in truth["places"]) or _moments_hit(
         shown(largest), truth["places"], run_s
     )
+
+
+def _channel_said(truth: Truth, findings: Findings) -> bool:
+    """Return whether the user is told that a right place of axis "channel" clips, at its value within 1 %."""
+    if findings.verdict not in ("unexplained", "insufficient_data"):
+        return False
+    for right in truth["places"]:
+        for line in (*findings.reasons, *findings.channel_notes) if right["axis"] == "channel" else ():
+            at = _HELD.search(line)
+            if at and at[1] == right["channel"] and right["low"] <= abs(float(at[2])) <= right["high"]:
+                return True
+    return False
 
 
 def shown(gap: Gap) -> Sequence[Place]:

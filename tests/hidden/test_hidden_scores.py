@@ -140,6 +140,28 @@ def test_place_in_the_map(truth: dict[str, Any], found: Findings, right: bool) -
     assert not place_is_right(truth, elsewhere)
 
 
+@pytest.mark.parametrize(
+    ("verdict", "channel", "nm", "word", "right"),
+    [
+        ("insufficient_data", "torque_nm", -20.7, "saturated or clipped", True),
+        ("unexplained", "torque_nm", 20.7, "saturated or clipped", True),
+        ("no_gap", "torque_nm", 20.7, "saturated or clipped", False),
+        ("insufficient_data", "current_a", 20.7, "saturated or clipped", False),
+        ("insufficient_data", "torque_nm", 12.0, "saturated or clipped", False),
+        ("insufficient_data", "torque_nm", 20.7, "stuck", False),
+    ],
+)
+def test_a_channel_check_that_says_what_clips_has_placed_it(
+    verdict: str, channel: str, nm: float, word: str, right: bool
+) -> None:
+    place = {"axis": "channel", "channel": "torque_nm", "low": 20.5, "high": 20.9}
+    truth = {**unknown("load", 18.0, np.inf), "joint": "sensor"}
+    line = f"run1.csv: j2.{channel}: found exactly {nm} Nm held for 4.1% of the moving time: {word} channel"
+    found = replace(findings(verdict), reasons=(line,))
+    assert place_is_right({**truth, "places": [*truth["places"], place]}, found) is right
+    assert not place_is_right(truth, found), "what does not clip is not placed by it"
+
+
 def test_naming_times_is_no_answer_where_it_is_wrong_half_of_the_time() -> None:
     """The same four moments, three of them right: an answer where events are rare, luck where they fill half of the run."""
     named = mapped("time", "seconds: run1 2.0 s, run1 6.0 s, run1 14.0 s, run1 9.0 s", 0, 0, "s")

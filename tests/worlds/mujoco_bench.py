@@ -419,6 +419,7 @@ def _clip(tables: Sequence[Columns], share: float, truth: Sequence[dict[str, Any
     places: list[dict[str, Any]] = [
         {"axis": "load", "low": 0.9 * most, "high": np.inf},
         {"axis": "load", "low": -np.inf, "high": -0.9 * most},
+        {"axis": "channel", "channel": "torque_nm", "low": 0.99 * most, "high": 1.01 * most},
     ]
     for k, table in enumerate(tables):
         over = np.abs(table["j1.torque_nm"]) > most

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+import numpy as np
 import pytest
 
 from jtqd.estimator.effects.library import EFFECTS
-from jtqd.sysid.diagnosis.guards import beyond_bounds
+from jtqd.sysid.diagnosis.guards import beyond_bounds, squares_beside
 from jtqd.sysid.diagnosis.refine import PresentEffect, free_names
 from tests.sysid.diagnosis.diagnose_helpers import JOINT
 
@@ -49,3 +50,21 @@ def test_a_reference_temperature_out_of_range_is_an_objection_and_no_error() -> 
 def test_a_part_of_an_effect_that_is_switched_off_is_at_no_bound() -> None:
     values = {"amplitude_nm": 0.374, "share": 0.0, "phase_rad": 0.95}
     assert not said("sensor_crosstalk", values, {"amplitude_nm": 0.0, "share": 0.0, "phase_rad": 0.0})
+
+
+def test_what_a_run_has_of_its_own_does_not_speak_against_an_effect() -> None:
+    """A small loss under a friction of the day that is larger and lies against it: the plain square falls without it."""
+    rng = np.random.default_rng(0)
+    direction = np.sign(np.sin(np.linspace(0.0, 60.0, 500)))
+    loss = 0.2 * np.abs(np.cos(np.linspace(0.0, 17.0, 500))) * direction
+    with_it = -0.9 * direction + rng.normal(0.0, 0.05, 500)
+    both = np.column_stack((with_it, with_it + loss))
+    variance, noise = 0.8, 0.05
+    plain, beside = (
+        np.sum(both**2, axis=0),
+        squares_beside(both, direction[:, None], np.array([noise**2 / variance**2])),
+    )
+    assert plain[1] < plain[0]
+    assert beside[1] > 1.5 * beside[0]
+    dense = np.eye(500) + variance**2 / noise**2 * np.outer(direction, direction)
+    assert beside == pytest.approx([x @ np.linalg.solve(dense, x) for x in both.T])

@@ -341,3 +341,14 @@ def test_where_no_torque_was_measured_a_cause_must_lower_the_position_error_of_a
     assert guards.objections(dataset, best, result) == []
     found = guards.objections(replace(dataset, no_torque=True), best, result)
     assert found == [(0, "it raises the error of the position in a free run on runs left out")]
+
+
+def test_causes_that_lower_the_plain_error_nowhere_on_runs_left_out_are_none(
+    refined: tuple[Dataset, Refined], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, result = refined
+    monkeypatch.setattr(guards, "nothing_of", lambda _: [{}])
+    best = Hypothesis((), result, 0.0)  # type: ignore[arg-type]
+    assert guards.objections(dataset, best, result) == []
+    monkeypatch.setattr(guards, "falls_nm", lambda squares: dict.fromkeys(squares, 0.0))
+    assert guards.objections(dataset, best, result) == [(0, "it raises the error on runs left out")]

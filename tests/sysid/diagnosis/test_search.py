@@ -205,15 +205,17 @@ def test_something_must_fix_the_scale() -> None:
     [
         ((-0.06, -0.061, -0.059, -0.06), True),
         ((0.03, 0.032, 0.029, 0.03), True),
-        ((-0.06, -0.06, -0.06, 0.0), False),
-        ((-0.06, -0.03, -0.06, -0.06), False),
+        ((-0.06, -0.06, -0.06, 0.0), True),
+        ((-0.06, -0.03, -0.06, -0.06), True),
+        ((-0.06, -0.06, 0.03, 0.03), False),
+        ((-0.06, -0.03, -0.06, -0.03), False),
         ((0.06, -0.06, 0.06, -0.06), False),
     ],
 )
-def test_all_constants_by_one_factor_are_a_change_of_units(
+def test_most_constants_by_one_factor_are_a_change_of_units(
     shares: tuple[float, ...], one_factor: bool
 ) -> None:
-    """That is the sensor's gain; below 1 it would shrink the noise too, and be preferred for that."""
+    """That is the sensor's gain, the rest the other way; below 1 it would shrink the noise too, and be preferred for it."""
     four = SCALES[1:5]
     beta = np.zeros(SCALES[-1].columns.stop)
     for c, share in zip(four, shares, strict=True):
@@ -223,7 +225,7 @@ def test_all_constants_by_one_factor_are_a_change_of_units(
     h = search.hypothesis(four)
     assert units_changed(h, search.joints) is one_factor
     assert search.plausible(h) is not one_factor
-    assert not units_changed(search.hypothesis(four[:3]), 2), "one of them is as the file says"
+    assert not units_changed(search.hypothesis(four[:2]), 2), "half of them are as the file says"
 
 
 def collinear(apart: float, seed: int = 10) -> Search:
