@@ -41,7 +41,7 @@ def causes_of(case: Case, fit: Fit, classes: Classes, total_nm2: float) -> list[
                 candidate.effect.name,
                 candidate.joint,
                 _names(candidate, classes[k]),
-                _normal_phase(_values(fit, k)),
+                _normal_phase(values_of(fit, k)),
                 without.bic - fit.hypothesis.bic,
                 case.search.held_out(fit.hypothesis, candidate) / evidence,
                 rms[channel],
@@ -61,7 +61,7 @@ def _names(candidate: EffectCandidate, rivals: Sequence[EffectCandidate]) -> tup
     return tuple(dict.fromkeys([candidate.effect.name, *names]))
 
 
-def _values(fit: Fit, k: int) -> dict[str, Value]:
+def values_of(fit: Fit, k: int) -> dict[str, Value]:
     """Return the parameters of an effect with their 95 % intervals: Student's t by how much of the uncertainty is the runs'
     own changes, no narrower than INACCURATE, and with few runs than what the runs say one without the other.
     """

@@ -159,6 +159,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
             default=None,
         ),
         odd_runs=tuple(odd for f in parts for odd in f.odd_runs),
+        bounded=tuple(b for f in parts for b in f.bounded),
     )
 
 

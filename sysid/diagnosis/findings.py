@@ -173,6 +173,33 @@ class LeftOver:
 
 
 @dataclass(frozen=True)
+class BoundedValue:
+    """A value of a joint file that the runs put at or below the zero that it cannot pass: no cause, but at most `at_most` (end
+    of its 95 % interval), where the file has `file_value`. best: without that limit; runs: error of each run left out with
+    the file, and with the value of the other runs, not below zero.
+    """
+
+    name: str
+    joint: JointName
+    parameter: str
+    unit: str
+    file_value: float
+    best: float
+    at_most: float
+    runs: tuple[RunGain, ...]
+
+    @property
+    def text(self) -> str:
+        """One line for people."""
+        errors = ", ".join(f"{r.rmse_after_nm:.2f} instead of {r.rmse_before_nm:.2f}" for r in self.runs)
+        return (
+            f"{self.name} of {joint_text(self.joint)}: these runs say at most {self.at_most:.2g} {self.unit}, the joint file "
+            f"{self.file_value:.3g}; not named as a cause, because its best value, {self.best:.2g}, is below zero, which is not "
+            f"possible; held at zero or above it leaves {errors} Nm rms in the runs left out"
+        )
+
+
+@dataclass(frozen=True)
 class OddRun:
     """A run that differs from all others and is not used: what ("gain", "zero", "delay") of which column differs by `value`
     from the mean of the others, whose standard deviation is `usual`. others: deviations that fit nearly as well.
@@ -228,6 +255,7 @@ class Findings:
     explained_share: float = math.nan
     left_over: LeftOver | None = None
     odd_runs: tuple[OddRun, ...] = ()
+    bounded: tuple[BoundedValue, ...] = ()
 
 
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
@@ -261,6 +289,7 @@ def to_mapping(
         "next_experiment": _without_table(findings.next_experiment),
         "reasons": findings.reasons,
         "odd_runs": [_odd_run(each) for each in findings.odd_runs],
+        "bounded": [_bounded(each) for each in findings.bounded],
         "joints": findings.joints,
         "runs": [{"name": name, "sha256": (sha256 or {}).get(name)} for name in findings.runs],
         "gaps": [_gap(each) for each in findings.gaps],
@@ -288,6 +317,11 @@ def plain(value: Any) -> Any:
     if isinstance(value, Iterable):
         return [plain(item) for item in value]
     raise TypeError(f"found {type(value).__name__} in findings, expected plain values")
+
+
+def _bounded(bounded: BoundedValue) -> dict[str, Any]:
+    runs = [each._asdict() for each in bounded.runs]
+    return {key: value for key, value in vars(bounded).items() if key != "runs"} | {"runs": runs}
 
 
 def _gap(gap: Gap) -> dict[str, Any]:

@@ -242,13 +242,14 @@ class LeaveOneOut:
         """
         key = tuple(c.first for c in hypothesis.chosen)
         if key not in self._squares:
-            self._squares[key] = self._measured(hypothesis)
+            self._squares[key] = self.squares_with(hypothesis, self.search.held_out_beta(hypothesis))
         return self._squares[key]
 
-    def _measured(self, hypothesis: Hypothesis) -> list[Squares]:
+    def squares_with(self, hypothesis: Hypothesis, per_run: Sequence[FloatArray]) -> list[Squares]:
+        """Return the same with these coefficients of each run left out."""
         sums: list[dict[Channel, FloatArray]] = [{} for _ in range(self.search.mixed.runs)]
         columns = list(hypothesis.model.columns)
-        betas = self.search.of_pieces(self.search.held_out_beta(hypothesis))
+        betas = self.search.of_pieces(per_run)
         for r, run, beta in zip(self.search.mixed.pieces, self.dataset.runs, betas, strict=True):
             weight = dict(zip(columns, (float(b) for b in beta), strict=True))
             for channel, d in run.channels.items():

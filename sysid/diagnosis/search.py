@@ -147,6 +147,16 @@ class Search:
         squares = np.einsum("i,cij,j->c", beta, self._moments[:, own, own], beta)
         return float(np.sqrt(max(squares.max(), 0.0)))
 
+    def same_torques(self, one: Hypothesis, other: Hypothesis) -> bool:
+        """Return whether two sets differ by less than what is called an effect: one of them says in other words what the other
+        says. A wave of the sensor, as one at either joint, fits a little better, as much as a wave too small to name.
+        """
+        difference = np.zeros(len(self.column_rms))
+        difference[list(one.model.columns)] += one.model.beta
+        difference[list(other.model.columns)] -= other.model.beta
+        squares = np.einsum("i,cij,j->c", difference, self._moments, difference)
+        return bool(squares.max() < self.least_nm**2)
+
     def reading_misfit(self, hypothesis: Hypothesis) -> float:
         """Return the sum of squares that what the currents read without power leaves; 0 without such a reading."""
         beta = dict(zip(hypothesis.model.columns, hypothesis.model.beta, strict=True))
@@ -181,9 +191,11 @@ class Search:
                 break
             beam = sorted(grown.values(), key=lambda h: h.bic)[:_BEAM]
             best = min((best, beam[0]), key=_with_price)
-            seen.append(min(grown.values(), key=_with_price))
+            seen += [*beam, min(grown.values(), key=_with_price)]
         # what two that came together leave when one of them goes must be worth its effects, too
-        return min((self.pruned(best), *seen), key=_with_price)
+        best = min((self.pruned(best), *seen), key=_with_price)
+        shorter = [h for h in seen if len(h.chosen) < len(best.chosen) and self.same_torques(h, best)]
+        return min(shorter, key=lambda h: (len(h.chosen), h.bic), default=best)
 
     def confirmed(self) -> Hypothesis:
         """Return the best set of candidates less those that do not help on held-out runs."""
@@ -256,9 +268,13 @@ class Search:
 
     def held_out_beta(self, hypothesis: Hypothesis) -> list[FloatArray]:
         """Return per run the coefficients of a set of candidates from all other runs."""
+        return [beta for beta, _ in self.held_out_fits(hypothesis)]
+
+    def held_out_fits(self, hypothesis: Hypothesis) -> list[tuple[FloatArray, FloatArray]]:
+        """Return per run the coefficients of a set of candidates from all other runs, and their covariance."""
         grams, _ = self._per_run(hypothesis)
         total = grams.sum(axis=0)
-        return [solve(total - gram, len(hypothesis.model.columns))[0] for gram in grams]
+        return [solve(total - gram, len(hypothesis.model.columns)) for gram in grams]
 
     def of_pieces(self, per_run: Sequence[FloatArray]) -> list[FloatArray]:
         """Return the same for each piece of the runs."""

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from jtqd.sysid.diagnosis.bounded import bounded_values
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.causes import causes_of, told_at_rest
 from jtqd.sysid.diagnosis.dataset import Dataset
@@ -46,6 +47,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     recording.
     """
     found, became = with_fewer(found_in(case, fit), anew)
+    bounded = bounded_values(found)
     gain = held_out_gain(case.dataset, found.named.refined)
     named, classes = told_at_rest(case, found.named, found.classes)
     left, shown = _remaining(found, named)
@@ -75,7 +77,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
         verdict,
-        (*reasons, *found.refused, *became),
+        (*reasons, *(b.text for b in bounded), *found.refused, *became),
         names,
         numbers,
         gaps,
@@ -86,6 +88,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         traces=traces(case.dataset, shown.refined),
         explained_share=explained / total if causes else math.nan,
         left_over=_left_over(found, left, total),
+        bounded=tuple(bounded),
     )
 
 
