@@ -215,8 +215,8 @@ class Agreement:
     """How far the two paths differ on runs that the fit had not seen, zeros of the day apart; beyond it sigma grows.
 
     slow_nm, fast_nm: RMS levels of the difference's trend and of the rest; gain: of one path against the other; zero_nm: a
-    link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status (0: not known).
-    Definitions: agreement.pyx.
+    link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status; 0: not
+    known. Definitions: agreement.pyx.
     """
 
     slow_nm: Annotated[float, limits("Nm", gt=0.0)]

@@ -68,6 +68,7 @@ def judged(joint: Joint, table: RunTable, number: int, truth_nm: FloatArray) -> 
     envelope = joint.fused.envelope
     assert envelope is not None
     assert envelope.temperature_c is not None
+    assert envelope.load_nm is not None
     settings = replace(recommended("fused"), track_zeros=False)
     columns = table.joint(number, joint.gear_ratio)
     _, current, motor, velocity, link = table.estimator_inputs(number, joint.gear_ratio)
@@ -83,7 +84,9 @@ def judged(joint: Joint, table: RunTable, number: int, truth_nm: FloatArray) -> 
     return [
         low.mean(),
         ((celsius < envelope.temperature_c[0]) | (celsius > envelope.temperature_c[1])).mean(),
-        (~known(envelope, seen[:, 0], seen[:, 1])).mean(),
+        (
+            ~known(envelope, seen[:, 0], seen[:, 1]) | (np.abs(got.physics_nm[moving]) > envelope.load_nm)
+        ).mean(),
         (np.abs(seen[:, 2]) > envelope.distance_nm).mean(),
         float(np.sqrt(np.mean(error**2))),
         inside[low].mean() if low.any() else np.nan,

@@ -94,6 +94,39 @@ def test_great_doubt_lowers_the_status() -> None:
     assert np.mean(usual.status[200:] == st.DEGRADED) < 0.01
 
 
+def test_a_doubt_that_ordinary_days_have_lowers_no_status_and_widens_sigma_as_before() -> None:
+    usual, _ = judged(SOFTER)
+    for lowered_nm, share in ((0.3, 0.5), (30.0, 0.0)):
+        agreement = replace(AGREEMENT, lowered_nm=lowered_nm)
+        joint = replace(USUAL, fused=replace(USUAL.fused, agreement=agreement))  # type: ignore[type-var]
+        found, _ = judged(SOFTER, joint)
+        assert np.mean(found.status[2000:] == st.DEGRADED) >= share
+        assert share > 0.0 or np.array_equal(found.status, judged(SOFTER, NARROW)[0].status)
+        moving = (found.status == st.VALID) & (usual.status != st.STANDSTILL)
+        np.testing.assert_array_equal(found.sigma_nm[moving], usual.sigma_nm[moving])
+
+
+def test_always_back_driven_a_friction_is_no_gain_that_lowers_the_status() -> None:
+    """Torque against the motion throughout: a gain and a friction differ by so little that neither is sure."""
+    n = 400 * 16
+    t = np.arange(n) * 1e-3
+    v = 2.0 * np.sin(2.0 * np.pi * 0.4 * t)
+    s, fused = np.sign(v), replace(USUAL.fused, agreement=None)  # type: ignore[type-var]
+    doubt = {}
+    for name, torque in (("back-driven", -30.0 * s), ("both", np.where(t % 5.0 < 2.5, 30.0, -30.0))):
+        apart = 0.03 * torque  # of a gain; against the motion also that of a friction
+        *_, gain, _, sure = levels(
+            fused,
+            USUAL.rated_torque_nm,
+            *(np.full(n, 1e-3), apart, s, v, torque, np.full(n, 0.2), np.zeros(n)),
+        )
+        doubt[name] = gain[-1], sure[-1]
+    for name, least, most in (("both", 0.75, 1.0), ("back-driven", 0.0, 0.4)):
+        gain, sure = doubt[name]
+        assert gain > 0.02
+        assert least < sure / (GAIN * gain * 30.0) < most
+
+
 def test_doubt_fades_when_the_joint_is_again_that_of_its_file() -> None:
     mended, _ = judged(
         lambda t, motor, link: np.where(t < 3.0, WAVIER(t, motor, link), link), seconds=12.0 + DOWN_S
@@ -125,7 +158,7 @@ def test_sigma_is_the_formula_of_the_levels() -> None:
     alpha, _ = Fusion(fused.sigma, True).weigh_many(*parts)
     variance = Fusion(fused.sigma, True).variance_many(*parts)
     # `levels` tracks zeros: in so short a run, and with so small a zero, nothing is taken off
-    slow, fast, gain, left = levels(
+    slow, fast, gain, left, sure = levels(
         fused,
         USUAL.rated_torque_nm,
         *(x[on] for x in (dt, apart, s, v, parts[3], variance, (more - loss) / SLOPE_NM)),
@@ -136,6 +169,7 @@ def test_sigma_is_the_formula_of_the_levels() -> None:
     doubt += (GAIN * max(gain[-1] - AGREEMENT.gain, 0.0) * parts[3][last]) ** 2
     share = max(alpha[last], 1.0 - alpha[last])
     assert doubt > 0.1
+    assert sure[-1] ** 2 <= doubt * 1.02
     assert got.sigma_nm[last] ** 2 - plain.sigma_nm[last] ** 2 == pytest.approx(share**2 * doubt, rel=0.02)
 
 

@@ -28,7 +28,9 @@ def joint(envelope: Envelope | None) -> Joint:
     return replace(plain, fused=replace(plain.fused, envelope=envelope))
 
 
-@pytest.mark.parametrize("envelope", [GOOD, replace(GOOD, temperature_c=None), None])
+@pytest.mark.parametrize(
+    "envelope", [GOOD, replace(GOOD, temperature_c=None), replace(GOOD, load_nm=38.5), None]
+)
 def test_a_joint_file_holds_it(envelope: Envelope | None) -> None:
     mapping = joint(envelope).to_mapping()
     assert Joint.from_mapping(mapping, "j.yaml") == joint(envelope)

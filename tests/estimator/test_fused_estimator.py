@@ -323,7 +323,7 @@ def test_what_is_degraded_is_degraded_at_standstill() -> None:
 
 
 def test_at_rest_the_distance_of_the_views_is_friction_and_takes_no_trust() -> None:
-    """With a network as without one: else a standing joint is degraded and at rest by turns, as its friction happens to lie."""
+    """With a network as without one: else a standing joint is degraded and at rest by turns, as friction happens to lie."""
     close = replace(everywhere(), distance_nm=1.0)
     own = replace(NARROW, fused=replace(NARROW.fused, envelope=close))  # type: ignore[type-var]
     for network, joint in ((FakeNetwork(lambda *_: 1.5, close), NARROW), (None, own)):
@@ -411,5 +411,12 @@ def test_without_a_network_the_envelope_of_the_joint_file_lowers_the_status_and_
     close = replace(own, fused=replace(own.fused, envelope=replace(known, distance_nm=1.0)))  # type: ignore[type-var]
     assert steady(estimator(joint=close), 3.0, 1.0).status == st.DEGRADED
     assert steady(estimator(joint=close), 0.0, 0.0).status == st.STANDSTILL
+    for share, status in (
+        (1.01, st.VALID),
+        (0.99, st.DEGRADED),
+    ):  # of the load, however little the motor does
+        load = replace(known, load_nm=share * abs(physics(-1.0, 1.0, -8.0)[0]))
+        light = replace(own, fused=replace(own.fused, envelope=load))  # type: ignore[type-var]
+        assert steady(estimator(joint=light), -1.0, 1.0, -8.0).status == status
     trusted = steady(estimator(says(1.5), own), 32.0 / GAIN, 1.0)
     assert trusted.status == st.VALID, "a network has an envelope of its own"

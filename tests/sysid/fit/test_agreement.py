@@ -2,29 +2,47 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from jtqd.estimator.joint import Agreement
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.agreement import QUANTILE, fit_agreement
+from jtqd.sysid.fit.agreement import LOWERED, QUANTILE, Levels, fit_agreement
 from jtqd.sysid.fit.fused import fit_fused
 from tests.sysid.fit.test_fused import emulated
 
 
 def test_levels_are_quantiles_over_all_blocks() -> None:
     source = np.random.default_rng(3)
-    runs = [tuple(source.uniform(0.0, most, 1000) for most in (4.0, 1.0, 0.02, 0.5)) for _ in range(3)]
-    found = fit_agreement(runs)  # type: ignore[arg-type]
+    runs = [tuple(source.uniform(0.0, most, 1000) for most in (4.0, 1.0, 0.02, 0.5, 3.0)) for _ in range(3)]
+    found = fit_agreement(lambda beyond: runs)  # type: ignore[arg-type, return-value]
     assert found is not None
     assert found.slow_nm == pytest.approx(np.sqrt(4.0 * QUANTILE), rel=0.03)
     assert found.fast_nm == pytest.approx(np.sqrt(QUANTILE), rel=0.03)
     assert found.gain == pytest.approx(0.02 * QUANTILE, rel=0.03)
     assert found.zero_nm == pytest.approx(0.5 * QUANTILE, rel=0.03)
+    assert found.lowered_nm == pytest.approx(3.0 * LOWERED, rel=0.01)
+
+
+def test_ordinary_doubt_is_that_beyond_the_levels_found() -> None:
+    asked: list[Agreement | None] = []
+
+    def of_runs(beyond: Agreement | None) -> list[Levels]:
+        asked.append(beyond)
+        ones = np.ones(400)
+        return [(ones, ones, ones, ones, ones * (5.0 if beyond is None else 2.0))]
+
+    found = fit_agreement(of_runs)
+    assert found is not None
+    assert asked == [None, replace(found, lowered_nm=0.0)]
+    assert found.lowered_nm == pytest.approx(2.0)
 
 
 def test_too_little_motion_has_no_levels() -> None:
-    short = tuple(np.ones(150) for _ in range(4))
-    assert fit_agreement([short]) is None  # type: ignore[list-item]
+    short = tuple(np.ones(150) for _ in range(5))
+    assert fit_agreement(lambda beyond: [short]) is None  # type: ignore[arg-type, return-value, list-item]
 
 
 def test_the_fit_writes_levels_of_the_size_of_its_own_errors() -> None:
@@ -35,4 +53,9 @@ def test_the_fit_writes_levels_of_the_size_of_its_own_errors() -> None:
     assert fused.torsion is not None
     assert 0.2 * fused.sigma.torsion_nm < fused.agreement.slow_nm < 10.0 * fused.sigma.current_nm
     assert fused.agreement.gain < 0.05
+    assert 0.0 < fused.agreement.lowered_nm < 0.2 * joint.rated_torque_nm
+    assert fused.envelope is not None
+    assert fused.envelope.load_nm is not None
+    sensor = max(float(np.abs(run.sensor_nm[run.moving]).max()) for run in runs)
+    assert fused.envelope.load_nm == pytest.approx(sensor, rel=0.05)
     assert fit_fused(runs, joint.friction).fused.agreement is None  # nothing is known of the joint's size
