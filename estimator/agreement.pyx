@@ -115,6 +115,6 @@ def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, to
             zeros.block.y += law.stiffness * zeros.link_rad * zeros.block.samples
             zeros.block.y += (1.0 - x[k, 6]) * zeros.current_a * zeros.block.samples
             innovation = update_zeros(&law, &zeros, law.stiffness, x[k, 6])
-            follow_agreement(&none, &s, innovation, dt, zeros.wary_x[4], left_behind_nm(&law, &zeros))
-            found.append((s.slow, s.fast, fabs(zeros.wary_x[4]), fabs(left_behind_nm(&law, &zeros))))
+            follow_agreement(&none, &s, innovation, dt, zeros.x[4], left_behind_nm(&law, &zeros))
+            found.append((s.slow, s.fast, fabs(zeros.x[4]), fabs(left_behind_nm(&law, &zeros))))
     return tuple(np.array(found, np.float64).reshape(-1, 4).T)

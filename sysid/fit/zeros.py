@@ -78,7 +78,13 @@ def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: flo
     for run in runs:
         keep = (np.abs(run.velocity_rad_s) > MOVING_RAD_S) & (np.abs(run.direction) > ONE_WAY)
         apart = run.torsion_error_nm - run.current_error_nm
-        states = (run.stiffness_nm_per_rad, 1.0 - run.slope, run.direction, run.velocity_rad_s, run.torsion_nm)
+        states = (
+            run.stiffness_nm_per_rad,
+            1.0 - run.slope,
+            run.direction,
+            run.velocity_rad_s,
+            run.torsion_nm,
+        )
         seen = (run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm)
         variance = Fusion(sigma, True).variance_many(*seen) - spread_nm**2
         rows = np.column_stack((*states, apart, variance))[keep]
