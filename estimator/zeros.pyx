@@ -24,11 +24,12 @@ of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, G
 the estimate must not jump.
 
 Where the joint file says how far zeros differ from day to day (`fused.zeros`: S, and as a torque S_nm), the part
-k = S^2/(S^2 + sigma_d^2) of x_d is taken off in any case, the mean of what is then known of the day's zero (Wiener), w - k of x where that is
-above 0, and what is known leaves the variance of the torsion in the fusion: s_t^2 - k S_nm^2, with S as large as before where nothing is known.
-x_d, sigma_d: of a second filter with the noise that the states leave on the days of the fit (`correlation_s` of the file). The variance of
-both paths holds friction and zero of the day, which are states here; so the first one learns more slowly than an ordinary day allows. What is beyond
-ordinary days it judges, and the agreement of the views: a joint that has changed, or friction's law on a plateau, is no noise of the fit.
+k = S^2/(S^2 + sigma_d^2) of x_d is taken off in any case, the mean of what is then known of the day's zero (Wiener), w - k
+of x where that is above 0, and what is known leaves the variance of the torsion in the fusion: s_t^2 - k S_nm^2, with S as
+large as before where nothing is known. x_d, sigma_d: of a second filter with the noise that the states leave on the days of
+the fit (`correlation_s` of the file). The variance of both paths holds the day's friction, which is a state here, and is no
+noise for so long: the first filter learns more slowly than an ordinary day allows. It judges what is beyond ordinary days,
+and the agreement of the views: a joint that has changed, or friction's law on a plateau, is no noise of the fit.
 """
 
 from libc.math cimport fabs, fmax, sqrt

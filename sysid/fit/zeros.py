@@ -5,11 +5,11 @@
 
     correlation_s = long-run variance / assumed, of what a day's states leave of the difference of the paths
 
-The mean error of a run is its zero and the sensor's; reference^2 is the sensor's (`sysid/fit/fused.py`). The long-run variance is
-that of means over WINDOW_S, times WINDOW_S, after least squares with the states of `zeros.pyx` in each run. The same runs are
-then estimated as in service, each from its start: zeros tracked, what is known of them taken off value and sigma. The
-section is written where that takes at least WORTH off the mean square error; scale is calibrated there, as that of
-`fused.sigma`.
+The mean error of a run is its zero and the sensor's; reference^2 is the sensor's (`sysid/fit/fused.py`). The long-run
+variance is that of means over WINDOW_S, times WINDOW_S, after least squares with the states of `zeros.pyx` in each run;
+assumed is that of both paths, less that of the zero. The same runs are then estimated as in service, each from its start:
+zeros tracked, what is known of them taken off value and sigma. The section is written where that takes at least WORTH off
+the mean square error; scale is calibrated there, as that of `fused.sigma`.
 """
 
 from __future__ import annotations
