@@ -148,7 +148,7 @@ def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, to
             zeros.block.y += (1.0 - x[k, 6]) * zeros.current_a * zeros.block.samples
             innovation = update_zeros(&law, &zeros, law.stiffness, x[k, 6])
             left = left_behind_nm(&law, &zeros)
-            follow_agreement(&usual, &s, innovation, dt, zeros.wary_x[4], left)
-            doubt = sqrt(_sure(&usual, &s, zeros.wary_x[4], zeros.wary_p[4][4], torsion))
-            found.append((s.slow, s.fast, fabs(zeros.wary_x[4]), fabs(left), doubt))
+            follow_agreement(&usual, &s, innovation, dt, zeros.x[4], left)
+            doubt = sqrt(_sure(&usual, &s, zeros.x[4], zeros.p[4][4], torsion))
+            found.append((s.slow, s.fast, fabs(zeros.x[4]), fabs(left), doubt))
     return tuple(np.array(found, np.float64).reshape(-1, 5).T)

@@ -453,7 +453,7 @@ cdef class FusedEstimator(Estimator):
             )
             if law.agreement.used:
                 follow_agreement(
-                    &law.agreement, &s.agreement, innovation, dt, s.zeros.wary_x[4], left_behind_nm(&law.zeros, &s.zeros)
+                    &law.agreement, &s.agreement, innovation, dt, s.zeros.x[4], left_behind_nm(&law.zeros, &s.zeros)
                 )
 
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:
@@ -531,8 +531,8 @@ cdef class FusedEstimator(Estimator):
                 &s.agreement,
                 doubt,
                 out.sigma_nm,
-                s.zeros.wary_x[4],
-                s.zeros.wary_p[4][4],
+                s.zeros.x[4],
+                s.zeros.p[4][4],
                 physics.alpha,
                 seen.torsion_nm,
             ):

@@ -234,8 +234,8 @@ class DayZeros:
     """How far the zero of the link encoder differs from day to day, where `track_zeros` can learn it: zeros.pyx.
 
     spread_rad: standard deviation over the days of the fit; spread_nm: its part of sigma.torsion_nm, which what is learned
-    takes away again; scale: in place of sigma.scale where zeros are tracked; correlation_s: so long the difference of the two
-    paths keeps what is no state of the day, None: as without the section (`zeros.CORRELATION_S`).
+    takes away again; scale: in place of sigma.scale where zeros are tracked; correlation_s: so long the
+    difference of the two paths keeps what is no state of the day, None: `zeros.CORRELATION_S`.
     """
 
     spread_rad: Annotated[float, limits("rad", gt=0.0)]

@@ -16,7 +16,7 @@ cdef struct ZerosLaw:
     double stiffness, torque_per_ampere, limit
     double floor  # variance of the link zero [rad^2] that the joint file's own sigma covers
     double known  # variance of the link zero [rad^2] below which it counts as learned
-    double correlation  # [s]: a block counts as its length over it
+    double correlation  # [s]: of the noise on the days of the fit
     double spread, spread_nm  # variance of the link zero over the days [rad^2, Nm^2]; 0: the file does not say
 
 cdef struct Gathered:  # sums over the samples of a block
@@ -26,8 +26,8 @@ cdef struct Gathered:  # sums over the samples of a block
 cdef struct ZerosState:
     double x[ZERO_STATES]
     double p[ZERO_STATES][ZERO_STATES]
-    double wary_x[ZERO_STATES]  # the same for noise that lasts CORRELATION_S: what `agreement` judges by
-    double wary_p[ZERO_STATES][ZERO_STATES]
+    double day_x[ZERO_STATES]  # the same with the noise of the fit's days; followed where their spread is known
+    double day_p[ZERO_STATES][ZERO_STATES]
     double link_rad, current_a  # what is taken off the readings
     double left_nm  # what is known of the link zero and not yet taken off, as torque
     double apart_s  # for how long the views are farther apart than can be

@@ -17,16 +17,19 @@ common to both goes by their prior widths, and the standard deviation of e never
 
 Samples count in motion only, with the friction on one side: |v| > MOVING_RAD_S, |s| > ONE_WAY. They are averaged over
 blocks of BLOCK samples, and a block counts as its length/CORRELATION_S of an independent sample of variance s_c^2 + s_t^2:
-ripple and errors of the encoders are not white. That variance holds the day's friction as well, which is a state here: `fused.zeros` has
-the time that belongs to what the states leave, `correlation_s`, found on the runs of the fit.
+ripple and errors of the encoders are not white.
 
 What is taken off the readings is x w(|x|/sigma_x): nothing below DOUBT standard deviations (of the link zero: and of COVERED
 of the torsion's sigma), all of it above SURE, linear between (firm shrinkage, Gao and Bruce 1997): on a day without a zero worth it nothing is changed. It follows with SLEW_S:
 the estimate must not jump.
 
-Where the joint file says how far zeros differ from day to day (`fused.zeros`: S, and as a torque S_nm), at least the part
-k = S^2/(S^2 + sigma_x^2) of x is taken off, the mean of what is then known of the day's zero (Wiener), and what is known leaves the
-variance of the torsion in the fusion: s_t^2 - k S_nm^2, with S as large as before where nothing is known.
+Where the joint file says how far zeros differ from day to day (`fused.zeros`: S, and as a torque S_nm), the part
+k = S^2/(S^2 + sigma_d^2) of x_d is taken off in any case, the mean of what is then known of the day's zero (Wiener), w - k
+of x where that is above 0, and what is known leaves the variance of the torsion in the fusion: s_t^2 - k S_nm^2, with S as
+large as before where nothing is known. x_d, sigma_d: of a second filter with the noise that the states leave on the days of
+the fit (`correlation_s` of the file). The variance of both paths holds the day's friction, which is a state here, and is no
+noise for so long: the first filter learns more slowly than an ordinary day allows. It judges what is beyond ordinary days,
+and the agreement of the views: a joint that has changed, or friction's law on a plateau, is no noise of the fit.
 """
 
 from libc.math cimport fabs, fmax, sqrt
@@ -104,7 +107,6 @@ cdef int fill_zeros(
     law.limit = torsion.zero_limit_rad
     law.floor = (COVERED * sigma.torsion_nm / law.stiffness) ** 2
     law.known = KNOWN_SHARE * (sigma.current_nm / law.stiffness) ** 2
-    law.correlation = CORRELATION_S
     if law.used and fused.zeros is not None:
         law.correlation = fused.zeros.correlation_s or CORRELATION_S
         law.spread, law.spread_nm = fused.zeros.spread_rad**2, fused.zeros.spread_nm**2
@@ -125,7 +127,7 @@ cdef void restart_zeros(const ZerosLaw *law, ZerosState *s) noexcept nogil:
     cdef int n
     memset(s, 0, sizeof(ZerosState))
     for n in range(ZERO_STATES):
-        s.p[n][n] = s.wary_p[n][n] = law.prior[n]
+        s.p[n][n] = s.day_p[n][n] = law.prior[n]
 
 
 cdef void drop_block(ZerosState *s) noexcept nogil:
@@ -167,19 +169,25 @@ cdef double local_stiffness(const FusedObserverLaw *law, double d) noexcept nogi
 
 cdef double _share(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
     """Return the part of the day's link zero that is known, 0 to 1; 0 where the file does not say how far days differ."""
-    return law.spread / (law.spread + s.p[0][0]) if law.spread > 0.0 else 0.0
+    return law.spread / (law.spread + s.day_p[0][0]) if law.spread > 0.0 else 0.0
 
 
 cdef double _used(double x, double variance, double least) noexcept nogil:
-    """Return what is taken off of a zero x: firm shrinkage, and the part `least` of it in any case."""
-    cdef double w = fmax((fabs(x) / sqrt(variance) - LOW) * INVERSE_RANGE, least)
+    """Return what is taken off of a zero x by firm shrinkage, beyond the part `least` that is in any case."""
+    cdef double w = (fabs(x) / sqrt(variance) - LOW) * INVERSE_RANGE
     if w >= 1.0:
-        return x
-    return x * w if w > 0.0 else 0.0
+        w = 1.0
+    return x * (w - least) if w > least else 0.0
+
+
+cdef double _link_used(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
+    """Return what is to be taken off of the link's zero [rad]."""
+    cdef double share = _share(law, s), used = _used(s.x[0], s.p[0][0] + law.floor, share)
+    return used + share * s.day_x[0] if share > 0.0 else used
 
 
 cdef double _innovation(const double *h, const double *x, double seen) noexcept nogil:
-    """Return what a difference of the views is beyond that of states x [Nm]."""
+    """Return what a difference of the views [Nm] is beyond that of the states x."""
     cdef int n
     for n in range(ZERO_STATES):
         seen -= h[n] * x[n]
@@ -206,45 +214,52 @@ cdef void _take(
             p[m][n] = p[n][m]
 
 
+cdef void _forget_link(const ZerosLaw *law, double (*p)[ZERO_STATES]) noexcept nogil:
+    """Make the link's zero unknown in a covariance."""
+    cdef int n
+    for n in range(ZERO_STATES):
+        p[0][n] = p[n][0] = 0.0
+    p[0][0] = law.prior[0]
+
+
 cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil:
-    """Take the complete block; return the innovation of the wary states [Nm].
+    """Take the complete block; return its innovation [Nm].
 
     stiffness: local, of the spring; slope: dL/draw of the loss.
     """
     cdef Gathered b = s.block
     cdef double h[ZERO_STATES]
-    cdef double share = 1.0 / SAMPLES, seen, innovation, wary, variance, way, left, before = s.apart_s
+    cdef double share = 1.0 / SAMPLES, seen, innovation, way, left, before = s.apart_s
     cdef int n
     memset(&s.block, 0, sizeof(Gathered))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
     h[2], h[3], h[4] = -b.direction * share, -b.velocity * share, b.torsion * share
     # the views were corrected: what was taken off belongs to what is seen
     seen = b.y * share + h[0] * s.link_rad + h[1] * s.current_a
-    variance = b.variance * share / b.dt
     for n in range(ZERO_STATES):
         s.p[n][n] += law.drift[n] * b.dt
-        s.wary_p[n][n] += law.drift[n] * b.dt
-    innovation, wary = _innovation(h, s.x, seen), _innovation(h, s.wary_x, seen)
+        s.day_p[n][n] += law.drift[n] * b.dt
+    innovation = _innovation(h, s.x, seen)
     s.apart_s = s.apart_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
     if s.apart_s > LONGEST_S:
         if before <= LONGEST_S and s.p[0][0] < law.known:
             s.jumps += 1
-        for n in range(ZERO_STATES):
-            s.p[0][n] = s.p[n][0] = s.wary_p[0][n] = s.wary_p[n][0] = 0.0
-        s.p[0][0] = s.wary_p[0][0] = law.prior[0]
-    _take(h, s.x, s.p, innovation, variance * law.correlation)
-    _take(h, s.wary_x, s.wary_p, wary, variance * CORRELATION)
+        _forget_link(law, s.p)
+        _forget_link(law, s.day_p)
+    _take(h, s.x, s.p, innovation, b.variance * share * CORRELATION / b.dt)
+    if law.spread > 0.0:
+        _take(h, s.day_x, s.day_p, _innovation(h, s.day_x, seen), b.variance * share * law.correlation / b.dt)
     if not law.used:
-        return wary
+        return innovation
     way = b.dt * INVERSE_SLEW
     if way > 1.0:
         way = 1.0
-    s.link_rad += way * (_used(s.x[0], s.p[0][0] + law.floor, _share(law, s)) - s.link_rad)
+    s.link_rad += way * (_link_used(law, s) - s.link_rad)
     s.current_a += way * (_used(s.x[1], s.p[1][1], 0.0) - s.current_a)
     # beyond what is doubt about the zero: of a joint without one nothing is left, on average
     left = s.x[0] - s.link_rad
     s.left_nm = law.stiffness * sqrt(fmax(0.0, left * left - s.p[0][0] - law.floor))
-    return wary
+    return innovation
 
 
 cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
@@ -252,7 +267,7 @@ cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
     cdef double share = _share(law, s), late
     if not share > 0.0:
         return 0.0
-    late = law.stiffness * (_used(s.x[0], s.p[0][0] + law.floor, share) - s.link_rad)
+    late = law.stiffness * (_link_used(law, s) - s.link_rad)
     return fmax(0.0, share * law.spread_nm - late * late)
 
 

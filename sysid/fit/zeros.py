@@ -5,11 +5,11 @@
 
     correlation_s = long-run variance / assumed, of what a day's states leave of the difference of the paths
 
-The mean error of a run is its zero and the sensor's; reference^2 is the sensor's (`sysid/fit/fused.py`). The long-run variance is
-that of means over WINDOW_S, times WINDOW_S, after least squares with the states of `zeros.pyx` in each run. The same runs are
-then estimated as in service, each from its start: zeros tracked, what is known of them taken off value and sigma. The
-section is written where that takes at least WORTH off the mean square error; scale is calibrated there, as that of
-`fused.sigma`.
+The mean error of a run is its zero and the sensor's; reference^2 is the sensor's (`sysid/fit/fused.py`). The long-run
+variance is that of means over WINDOW_S, times WINDOW_S, after least squares with the states of `zeros.pyx` in each run;
+assumed is that of both paths, less that of the zero. The same runs are then estimated as in service, each from its start:
+zeros tracked, what is known of them taken off value and sigma. The section is written where that takes at least WORTH off
+the mean square error; scale is calibrated there, as that of `fused.sigma`.
 """
 
 from __future__ import annotations
@@ -78,7 +78,13 @@ def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: flo
     for run in runs:
         keep = (np.abs(run.velocity_rad_s) > MOVING_RAD_S) & (np.abs(run.direction) > ONE_WAY)
         apart = run.torsion_error_nm - run.current_error_nm
-        states = (run.stiffness_nm_per_rad, 1.0 - run.slope, run.direction, run.velocity_rad_s, run.torsion_nm)
+        states = (
+            run.stiffness_nm_per_rad,
+            1.0 - run.slope,
+            run.direction,
+            run.velocity_rad_s,
+            run.torsion_nm,
+        )
         seen = (run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm)
         variance = Fusion(sigma, True).variance_many(*seen) - spread_nm**2
         rows = np.column_stack((*states, apart, variance))[keep]

@@ -36,6 +36,17 @@ def test_an_ordinary_zero_is_learned_and_the_interval_is_the_narrower_for_it(zer
     assert found.sigma_nm[moving].mean() < 0.9 * without.sigma_nm[moving].mean()
 
 
+def test_with_the_noise_of_the_fits_days_an_ordinary_zero_is_learned_sooner() -> None:
+    columns, _ = driven(3.0, link_zero_rad=DAYS.spread_rad)
+    quick = replace(LEARNING, fused=replace(LEARNING.fused, zeros=replace(DAYS, correlation_s=0.02)))  # type: ignore[type-var]
+    (one, slow), (other, fast) = tracked(columns, LEARNING), tracked(columns, quick)
+    assert abs(fast.link_used_rad - DAYS.spread_rad) < 0.6 * abs(slow.link_used_rad - DAYS.spread_rad)
+    assert other.sigma_nm[-1] < one.sigma_nm[-1]
+    # what is told, and what a joint that has changed is judged by, is as wary as before
+    assert fast.link_rad == pytest.approx(slow.link_rad, rel=1e-3)
+    assert fast.link_sigma_rad == pytest.approx(slow.link_sigma_rad, rel=1e-3)
+
+
 def test_before_the_joint_has_moved_both_ways_value_and_sigma_are_those_of_the_file() -> None:
     one_way, _ = driven(0.4, velocity=lambda t: 1.0 + 0.3 * np.sin(2.5 * t), friction_nm=0.3)
     without, found = (tracked(one_way, joint)[0] for joint in (NARROW, LEARNING))

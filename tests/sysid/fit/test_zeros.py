@@ -11,11 +11,14 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import DayZeros, Fused, FusedSigma
 from jtqd.sysid.fit.residuals import PathResiduals
-from jtqd.sysid.fit.zeros import fit_zeros
+from jtqd.sysid.fit.zeros import correlation, fit_zeros
 from tests.estimator.test_fused_estimator import NARROW
 
 K, RATED, DAYS = 12000.0, 40.0, 24
 SIGMA = FusedSigma(0.6, 0.0, 0.0, 0.5, 0.0, 0.02, (1.0, 1.0, 1.0, 1.0))
+
+
+ARRAYS = tuple(name for name in PathResiduals._fields if name != "now")
 
 
 def runs(zero_nm: float, within_nm: float = 0.2) -> list[PathResiduals]:
@@ -66,6 +69,23 @@ def test_what_is_the_sensors_zero_is_not_the_encoders() -> None:
     assert found is not None
     assert plain is not None
     assert found.spread_nm**2 == pytest.approx(plain.spread_nm**2 - 0.2**2 + 0.02**2, rel=1e-6)
+
+
+def test_the_noise_is_what_the_states_of_the_day_leave() -> None:
+    within, friction, spread = 0.2, 0.5, 0.4
+    assumed = SIGMA.current_nm**2 + SIGMA.torsion_nm**2 - spread**2
+    expected = (
+        0.1 * (within**2 + friction**2) / assumed
+    )  # both last 0.1 s; zero and friction of the day are states
+    assert correlation(runs(spread, within), SIGMA, spread) == pytest.approx(expected, rel=0.15)
+    found = fitted(runs(spread, within))
+    assert found is not None
+    assert found.correlation_s == pytest.approx(expected, rel=0.15)
+
+
+def test_of_too_short_runs_no_noise_is_told() -> None:
+    short = [run._replace(**{name: getattr(run, name)[:3000] for name in ARRAYS}) for run in runs(0.4)]
+    assert correlation(short, SIGMA, 0.4) is None
 
 
 def test_days_that_hardly_differ_and_few_runs_have_no_section() -> None:
