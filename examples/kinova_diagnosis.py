@@ -21,6 +21,7 @@ from typing import Any, Final
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
+from scipy.optimize import lsq_linear
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
@@ -109,26 +110,18 @@ def table_lines(results: Sequence[Diagnosed]) -> list[str]:
     return lines
 
 
-def run_lines(results: Sequence[Diagnosed]) -> list[str]:
-    """Return the error on each held-out run, with and without the causes, as rows of a Markdown table."""
-    lines = ["| joint | left out | joint file [Nm rms] | with the causes |", "|---|---|---|---|"]
-    for one in results:
-        lines += [
-            f"| {one.number} | {run.run} | {run.rmse_before_nm:.2f} | {run.rmse_after_nm:.2f} |"
-            for run in (one.findings.gain.runs if one.findings.gain is not None else ())
-        ]
-    return lines
-
-
 def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
     """Return the error on each run of regressions fitted on the other: offset, Coulomb, viscous, inertia, load.
 
-    The ladder is least squares; "near the file" has the same terms with the priors of `sysid.fit.few_runs` about the file.
+    The ladder is least squares; the possible one has no friction or inertia below zero; "near the file" has the same terms
+    with the priors of `sysid.fit.few_runs` about the file.
+    Of a joint without causes the extended file is the file; in brackets a value that is known as a bound.
     """
     runs = measured_runs()
     lines = [
-        "| joint | left out | ladder [Nm rms] | near the file | with the causes |",
-        "|---|---|---|---|---|",
+        "| joint | left out | joint file [Nm rms] | ladder | possible ladder | near the file | extended file | "
+        "ladder beaten or equalled |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for one in results:
         checked = check_runs([(r.name, only(r, one.number).table) for r in runs], {one.number: one.joint})
@@ -142,9 +135,22 @@ def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
             size = np.sqrt(np.mean(fitted_x**2, axis=0))
             free = np.linalg.lstsq(fitted_x / size, fitted_y, rcond=1e-3)[0] / size
             near = _near_the_file(fitted_x, fitted_y, one.joint)
-            ladder, regular = (float(np.sqrt(np.mean((y - x @ found) ** 2))) for found in (free, near))
-            own = f"{after[name]:.2f}" if name in after else f"{float(np.sqrt(np.mean(y**2))):.2f} (file)"
-            lines.append(f"| {one.number} | {name} | {ladder:.2f} | {regular:.2f} | {own} |")
+            fits = (free, _possible(fitted_x, fitted_y, one.joint), near)
+            ladder, possible, regular = (float(np.sqrt(np.mean((y - x @ found) ** 2))) for found in fits)
+            file = float(np.sqrt(np.mean(y**2)))
+            own = after.get(name, file)
+            held = [
+                f" ({r.rmse_after_nm:.2f})" for b in one.findings.bounded for r in b.runs if r.run == name
+            ]
+            cells = (
+                f"{file:.2f}",
+                f"{ladder:.2f}",
+                f"{possible:.2f}",
+                f"{regular:.2f}",
+                f"{own:.2f}{''.join(held)}",
+            )
+            holds = "yes" if own < ladder + 0.005 else "no"
+            lines.append(f"| {one.number} | {name} | {' | '.join(cells)} | {holds} |")
     return lines
 
 
@@ -192,6 +198,16 @@ def _alone(x: FloatArray, y: FloatArray) -> tuple[float, float]:
     value = float(x @ y) / power
     error = y - value * x
     return value, math.sqrt(float(np.mean(error**2)) / power * len(y) / effective_samples(error))
+
+
+def _possible(x: FloatArray, y: FloatArray, joint: Joint) -> FloatArray:
+    """Return least squares of `_ladder` [5] with no friction or inertia below zero; what cannot be told is shared."""
+    friction, inertia = joint.friction, joint.rotor_inertia_kgm2 * joint.gear_ratio**2
+    least = -np.array((np.inf, friction.coulomb_nm, friction.viscous_nms_per_rad, inertia, 0.0))
+    size = np.sqrt(np.mean(x**2, axis=0))
+    ridge = 1e-3 * math.sqrt(len(y)) * np.eye(len(size))
+    scaled, target = np.vstack((x / size, ridge)), np.append(y, np.zeros(len(size)))
+    return np.asarray(lsq_linear(scaled, target, (least * size - 1e-12, np.inf)).x / size, np.float64)
 
 
 def _near_the_file(x: FloatArray, y: FloatArray, joint: Joint) -> FloatArray:
@@ -329,8 +345,6 @@ def main(arguments: list[str] | None = None) -> int:
             "\n".join(
                 (
                     *table_lines(results),
-                    "",
-                    *run_lines(results),
                     "",
                     *ladder_lines(results),
                     "",

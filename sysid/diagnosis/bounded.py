@@ -86,6 +86,8 @@ def _held_at(
     out = []
     for beta, covariance in search.held_out_fits(hypothesis):
         if beta[place] * np.sign(limit) > abs(limit):
-            beta = beta + covariance[:, place] / covariance[place, place] * (limit - beta[place])
-        out.append(beta)
+            change = covariance[:, place] / covariance[place, place] * (limit - beta[place])
+            out.append(beta + change)
+        else:
+            out.append(beta)
     return out

@@ -174,9 +174,9 @@ class LeftOver:
 
 @dataclass(frozen=True)
 class BoundedValue:
-    """A value of a joint file that the runs put at or below the zero that it cannot pass: no cause, but at most `at_most` (end
-    of its 95 % interval), where the file has `file_value`. best: without that limit; runs: error of each run left out with
-    the file, and with the value of the other runs, not below zero.
+    """A value of a joint file that the runs put below the zero that it cannot pass: no cause, but at most `at_most` (end of
+    its 95 % interval), where the file has `file_value`. best: without that limit; runs: error of each run left out with
+    what is named, and with the value of the other runs beside, zero where they say less.
     """
 
     name: str
@@ -193,9 +193,9 @@ class BoundedValue:
         """One line for people."""
         errors = ", ".join(f"{r.rmse_after_nm:.2f} instead of {r.rmse_before_nm:.2f}" for r in self.runs)
         return (
-            f"{self.name} of {joint_text(self.joint)}: these runs say at most {self.at_most:.2g} {self.unit}, the joint file "
-            f"{self.file_value:.3g}; not named as a cause, because its best value, {self.best:.2g}, is below zero, which is not "
-            f"possible; held at zero or above it leaves {errors} Nm rms in the runs left out"
+            f"{self.name} of {joint_text(self.joint)}: at most {self.at_most:.2g} {self.unit} by these runs, "
+            f"{self.file_value:.3g} in the joint file; not named as a cause, because its best value, {self.best:.2g}, is "
+            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the runs left out"
         )
 
 

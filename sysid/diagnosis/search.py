@@ -148,8 +148,8 @@ class Search:
         return float(np.sqrt(max(squares.max(), 0.0)))
 
     def same_torques(self, one: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether two sets differ by less than what is called an effect: one of them says in other words what the other
-        says. A wave of the sensor, as one at either joint, fits a little better, as much as a wave too small to name.
+        """Return whether two sets differ by less than what is called an effect: one says in other words what the other says.
+        A wave of the sensor, as one at either joint, fits better by as much as a wave that is too small to be named.
         """
         difference = np.zeros(len(self.column_rms))
         difference[list(one.model.columns)] += one.model.beta

@@ -135,5 +135,7 @@ def test_a_regression_near_the_file_is_never_far_worse_than_the_file() -> None:
     joint = load_joint(shipped("kinova_gen3/joint2.yaml"))
     rows = [line.strip("|").split("|") for line in ladder_lines([Diagnosed(2, joint, nothing())])[2:]]
     for row in rows:
-        free, near, file = (float(cell.split()[0]) for cell in row[2:5])
+        file, free, _, near, extended = (float(cell) for cell in row[2:7])
+        assert extended == file, "nothing is named"
+        assert row[7].strip() == ("yes" if file < free else "no")
         assert near < min(free, 1.4 * file)

@@ -6,7 +6,15 @@ from examples.kinova_diagnosis import diagnose_all
 from jtqd.sysid.diagnosis import named
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.findings import (
+    AMBIGUOUS,
+    CAUSE,
+    INSUFFICIENT,
+    NO_GAP,
+    UNEXPLAINED,
+    Findings,
+    to_mapping,
+)
 from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
 from jtqd.sysid.diagnosis.search import Search
 from tests.hidden.case import draw
@@ -95,3 +103,22 @@ def test_small_joints_agree_on_a_smaller_rotor(measured: dict[int, Findings]) ->
         rotor = next(c for c in measured[number].causes if c.name == "rotor_inertia")
         assert 5e-6 < rotor.parameters["rotor_inertia_kgm2"].value < 1.5e-5  # the file has 2.2e-5
         assert rotor.parameters["rotor_inertia_kgm2"].ci95[1] < 2.2e-5
+
+
+def test_a_value_below_zero_is_no_cause_but_a_bound(measured: dict[int, Findings]) -> None:
+    """Joint 7: both runs say that viscous friction is far below the file's 2 Nms/rad, together a little less than zero."""
+    assert not measured[7].causes
+    (bound,) = measured[7].bounded
+    assert (bound.name, bound.joint, bound.file_value) == ("viscous_friction", 7, 2.0)
+    assert bound.best < 0.0 < bound.at_most < 1.0
+    for run in bound.runs:
+        assert run.rmse_after_nm < 0.5 * run.rmse_before_nm
+    assert bound.text in measured[7].reasons
+    assert (
+        "viscous_friction of joint 7: at most 0.68 Nms/rad by these runs, 2 in the joint file" in bound.text
+    )
+    (written,) = to_mapping(measured[7])["bounded"]
+    assert written["at_most"] == bound.at_most
+    assert [run["run"] for run in written["runs"]] == ["opti_traj_testing1", "RunTrajectory1"]
+    for number in range(2, 7):
+        assert not measured[number].bounded, "what is named, or possible, or makes a run worse, is no bound"

@@ -395,3 +395,23 @@ def test_the_table_says_why_each_effect_was_not_chosen() -> None:
     assert rows["rotor_inertia"].shared > 0.95
     assert rows["coulomb_friction"].shared < 0.5 or rows["coulomb_friction"].delta_bic < ENTER
     assert rows["viscous_friction"].held_out_gain == pytest.approx(1.0, abs=0.1)
+
+
+def test_two_waves_that_say_what_one_says_are_that_one() -> None:
+    """A column that is nearly the sum of two others: the two fit better, but by less than what is an effect."""
+    x = columns(31)
+    near = np.random.default_rng(32).normal(size=x.shape[:2])
+    x[:, :, 0] = x[:, :, 1] + x[:, :, 3] + 0.4 * near
+    whole = problem(31, {1: 0.4, 3: 0.4}, x)
+    exact = search_of(whole, LIBRARY, least_nm=0.005)
+    one, two = exact.hypothesis([LIBRARY[0]]), exact.hypothesis([LIBRARY[1], LIBRARY[3]])
+    assert two.bic < one.bic - 2.0 * ENTER
+    assert names(exact.run()) == names(two)
+    change = np.zeros(WIDTH)
+    change[[0, 1, 3]] = one.model.beta[0], -two.model.beta[0], -two.model.beta[1]
+    products = np.mean(x[:, :, :, None] * x[:, :, None, :], axis=(0, 1))
+    size = float(np.sqrt(change @ products @ change))
+    assert size < 0.3
+    for least, chosen in ((0.9 * size, two), (1.1 * size, one)):
+        search = Search(exact.mixed, LIBRARY, float(exact.mixed.rows), products[None], least)
+        assert names(search.run()) == names(chosen)
