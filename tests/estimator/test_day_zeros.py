@@ -44,7 +44,7 @@ def test_with_the_noise_of_the_fits_days_an_ordinary_zero_is_learned_sooner() ->
     assert other.sigma_nm[-1] < one.sigma_nm[-1]
     # what is told, and what a joint that has changed is judged by, is as wary as before
     assert fast.link_rad == pytest.approx(slow.link_rad, rel=1e-3)
-    assert fast.link_sigma_rad == pytest.approx(slow.link_sigma_rad, rel=1e-3)
+    assert fast.link_sigma_rad == pytest.approx(slow.link_sigma_rad, rel=5e-3)
 
 
 def test_before_the_joint_has_moved_both_ways_value_and_sigma_are_those_of_the_file() -> None:
@@ -99,7 +99,7 @@ def test_fits_see_what_the_loop_does() -> None:
     fusion = Fusion(both.fused.sigma, True)
     signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.variance_many(*parts), slope)
     taken, _, known = followed(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
-    slow, fast, gain, left = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
+    slow, fast, gain, left, _ = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
 
     plain, zeros = tracked(columns, LEARNING)
     doubted, _ = tracked(columns, both)
