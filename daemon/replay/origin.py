@@ -64,9 +64,10 @@ PAST: dict[str, np.dtype[Any]] = {
     "cycle": np.dtype("<u8"),
     "past_layout": np.dtype("<u2"),
     "past_bytes": np.dtype("<u2"),
-    "past": np.dtype(("<u8", PAST_WORDS)),
 }
 """Of /joint/N/zeros: path -> type of each element."""
+STATE: dict[str, np.dtype[Any]] = {"past": np.dtype(("<u8", PAST_WORDS))}
+"""The same, of this layout: another one may have another length."""
 
 
 def check_fields(

@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from jtqd.daemon.logs import LogFile, iter_messages
 from jtqd.daemon.recording.schemas import ZEROS
-from jtqd.daemon.replay.origin import PAST, check_fields
+from jtqd.daemon.replay.origin import PAST, STATE, check_fields
 from jtqd.estimator.learned import PAST_LAYOUT
 
 
@@ -69,7 +69,10 @@ def _read(path: Path, topic: str) -> Pasts:
     for messages in iter_messages(path, topic):
         records = messages.records
         check_fields(records, PAST, path, topic)
-        for record in records[records["past_layout"] == PAST_LAYOUT]:
+        records = records[records["past_layout"] == PAST_LAYOUT]
+        if len(records):
+            check_fields(records, STATE, path, topic)
+        for record in records:
             cycles.append(int(record["cycle"]))
             content.append(record["past"].tobytes()[: int(record["past_bytes"])])
     order = np.argsort(np.array(cycles, np.uint64), kind="stable").tolist()

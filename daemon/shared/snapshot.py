@@ -213,7 +213,7 @@ _ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 _MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
-PAST_WORDS = 128
+PAST_WORDS = 160
 """Room for the state of an estimator."""
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""
