@@ -149,8 +149,8 @@ class Search:
 
     def same_torques(self, one: Hypothesis, other: Hypothesis) -> bool:
         """Return whether two sets differ by less than what is called an effect, at rest as in motion: one says in other
-        words what the other says. A wave of the sensor, as one at either joint, fits better by as much as a wave too small to
-        be named.
+        words what the other says. A wave of the sensor, as one at either joint, fits better by as much as a wave too small
+        to be named.
         """
         difference = np.zeros(len(self.column_rms))
         difference[list(one.model.columns)] += one.model.beta
