@@ -148,14 +148,16 @@ class Search:
         return float(np.sqrt(max(squares.max(), 0.0)))
 
     def same_torques(self, one: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether two sets differ by less than what is called an effect: one says in other words what the other says.
-        A wave of the sensor, as one at either joint, fits better by as much as a wave that is too small to be named.
+        """Return whether two sets differ by less than what is called an effect, at rest as in motion: one says in other
+        words what the other says. A wave of the sensor, as one at either joint, fits better by as much as a wave too small
+        to be named.
         """
         difference = np.zeros(len(self.column_rms))
         difference[list(one.model.columns)] += one.model.beta
         difference[list(other.model.columns)] -= other.model.beta
         squares = np.einsum("i,cij,j->c", difference, self._moments, difference)
-        return bool(squares.max() < self.least_nm**2)
+        at_rest = abs(self.reading_misfit(one) - self.reading_misfit(other))
+        return bool(squares.max() < self.least_nm**2) and at_rest < ENTER
 
     def reading_misfit(self, hypothesis: Hypothesis) -> float:
         """Return the sum of squares that what the currents read without power leaves; 0 without such a reading."""
