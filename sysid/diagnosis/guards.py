@@ -18,6 +18,7 @@ from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import joint_text
 from jtqd.sysid.diagnosis.gain import falls_nm, free_run_errors, left_out_squares, left_out_steps
+from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter, places
 from jtqd.sysid.diagnosis.search import Hypothesis
 
@@ -104,8 +105,9 @@ def held_out_gains(dataset: Dataset, refined: Refined, steps: Sequence[FloatArra
     all others (`left_out_steps`), as a part of what is there without it; at or below zero it is better left out.
 
     What a run has of its own (zero and friction of the day) counts as little as it is usual: it can be several times an
-    effect, and by chance lie against it in the mean of the runs.
+    effect, and by chance lie against it in the mean of the runs. With fewer than ENOUGH_RUNS the plain error decides.
     """
+    enough = refined.mixed.runs >= ENOUGH_RUNS
     floor = {c: float(np.nanmean(np.concatenate(x) ** 2)) for c, x in dataset.unexplained.items()}
     out = []
     for p, mine in zip(refined.present, places(refined.present), strict=True):
@@ -120,7 +122,9 @@ def held_out_gains(dataset: Dataset, refined: Refined, steps: Sequence[FloatArra
                 if c.balance == TORSION and len(left):
                     left, part = left - left.mean(), part - part.mean()
                 both = np.column_stack((left, left + part))
-                squares = squares_beside(both, d.nuisances[d.valid], floor[c] / refined.variances[d.families])
+                own_changes = d.nuisances[d.valid] if enough else np.empty((len(both), 0))
+                weights = floor[c] / refined.variances[d.families] if enough else np.empty(0)
+                squares = squares_beside(both, own_changes, weights)
                 within, without = within + float(squares[0]), without + float(squares[1])
         out.append(1.0 - within / without if without > 0.0 else 0.0)
     return out
