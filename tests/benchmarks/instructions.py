@@ -55,6 +55,10 @@ TRIES = 3
 """A machine that stops what answers SYNC for long is asked again."""
 
 
+class BusyError(RuntimeError):
+    """Too few cycles had a torque, in each of TRIES runs."""
+
+
 def work(method: str) -> None:
     """Estimate a run: what is counted."""
     joint = load_joint(shipped("trained/joint1.yaml"))
@@ -105,12 +109,14 @@ def cycles() -> None:
         view = SnapshotReader(directory / "snapshot").read()
         source.end()
         torques = min(sum(spent[code] for code in PUBLISHED) for spent in view.status_cycles)
-        assert torques >= LEAST_TORQUES * SLOTS, f"found {torques} cycles of {SLOTS} with a torque"
         print(torques)
 
 
 def count(method: str) -> float:
-    """Return the instructions of one sample, or of one CYCLE. Raises RuntimeError where they cannot be counted."""
+    """Return the instructions of one sample, or of one CYCLE.
+
+    Raises RuntimeError where they cannot be counted, BusyError where the machine was too busy for cycles.
+    """
     counted = [f"--toggle-collect={each}" for each in (STAGES if method == CYCLE else STEPS)]
     if shutil.which("valgrind") is None:
         raise RuntimeError("found no valgrind")
@@ -125,14 +131,17 @@ def count(method: str) -> float:
         environment = {**os.environ, "GLIBC_TUNABLES": plain}
         for _ in range(TRIES if method == CYCLE else 1):
             done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-            if done.returncode == 0:
+            if done.returncode:
+                raise RuntimeError(f"valgrind: {done.stderr[-500:]}")
+            samples = int(done.stdout) if method == CYCLE else SAMPLES
+            if method != CYCLE or samples >= LEAST_TORQUES * SLOTS:
                 break
-        if done.returncode:
-            raise RuntimeError(f"valgrind: {done.stderr[-500:]}")
+        else:
+            raise BusyError(f"found {samples} cycles of {SLOTS} with a torque, {TRIES} times: a busy machine")
         found = re.search(r"^(?:totals|summary): (\d+)", out.read_text(), re.MULTILINE)
     if found is None or int(found[1]) == 0:
         raise RuntimeError("callgrind has counted nothing: is the build stripped?")
-    return int(found[1]) / (int(done.stdout) if method == CYCLE else SAMPLES)
+    return int(found[1]) / samples
 
 
 def main() -> int:

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from tests.benchmarks.instructions import CYCLE, METHODS, STORED, count
+from tests.benchmarks.instructions import CYCLE, METHODS, STORED, BusyError, count
 
 WITHIN = 0.05
 
@@ -25,7 +25,7 @@ def compiler() -> str:
 @pytest.mark.parametrize(
     "method",
     [
-        pytest.param(each, marks=() if each in ("fused", CYCLE) else pytest.mark.campaign)
+        pytest.param(each, marks={"fused": (), CYCLE: pytest.mark.native}.get(each, pytest.mark.campaign))
         for each in (*METHODS, CYCLE)
     ],
 )
@@ -35,6 +35,10 @@ def test_a_step_costs_what_it_did(method: str) -> None:
         pytest.skip("found no valgrind: instructions cannot be counted here")
     if compiler() != stored["compiler"]:
         pytest.skip(f"found the compiler {compiler()}, the stored counts are of {stored['compiler']}")
-    assert count(method) == pytest.approx(stored["instructions"][method], rel=WITHIN), (
+    try:
+        counted = count(method)
+    except BusyError as error:
+        pytest.skip(f"INSTRUCTIONS OF A CYCLE ARE NOT COUNTED: {error}")
+    assert counted == pytest.approx(stored["instructions"][method], rel=WITHIN), (
         "on purpose: python -m tests.benchmarks.instructions --store WHY"
     )
