@@ -1,9 +1,13 @@
 """With fewer than four runs a name needs each held-out run: strong effects are still named, the rest is left open."""
 
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
 import pytest
 
 from examples.kinova_diagnosis import diagnose_all
-from jtqd.sysid.diagnosis import named
+from jtqd.sysid.diagnosis import bounded, named
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import (
@@ -122,3 +126,26 @@ def test_a_value_below_zero_is_no_cause_but_a_bound(measured: dict[int, Findings
     assert [run["run"] for run in written["runs"]] == ["opti_traj_testing1", "RunTrajectory1"]
     for number in range(2, 7):
         assert not measured[number].bounded, "what is named, or possible, or makes a run worse, is no bound"
+
+
+def test_a_bound_needs_a_large_fall_on_every_run_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Joint 7 leaves a fifth and a twelfth of the squared error: a fall of nine tenths is none of the first run."""
+    monkeypatch.setattr(bounded, "LARGE_FALL", 0.9)
+    [one] = diagnose_all(range(7, 8))
+    assert not one.findings.bounded
+
+
+@pytest.mark.parametrize(("limit", "held"), [(-0.5, True), (-5.0, False), (0.5, False)])
+def test_a_value_beyond_its_limit_is_held_there_and_the_others_follow(limit: float, held: bool) -> None:
+    """As least squares with that value fixed; one within its limit, or on its other side, stays."""
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(40, 3)) @ np.array([[1.0, 0.4, 0.2], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]])
+    y = x @ np.array([0.7, -1.2, 0.3]) + 0.1 * rng.normal(size=40)
+    fitted = np.linalg.lstsq(x, y, rcond=None)[0]
+    search = SimpleNamespace(held_out_fits=lambda _: [(fitted, np.linalg.inv(x.T @ x))])
+    hypothesis = SimpleNamespace(model=SimpleNamespace(columns=[10, 11, 12]))
+    [found] = bounded._held_at(
+        cast("Any", search), cast("Any", hypothesis), cast("Any", SimpleNamespace(first=11)), limit
+    )
+    rest = np.linalg.lstsq(x[:, [0, 2]], y - limit * x[:, 1], rcond=None)[0]
+    np.testing.assert_allclose(found, [rest[0], limit, rest[1]] if held else fitted, rtol=1e-9)
