@@ -44,8 +44,10 @@ from jtqd.sysid.diagnosis.signals import (
     about_zero,
     joint_signals,
     with_one_sensor,
+    without_held,
 )
 from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
+from jtqd.sysid.runs.held import clip_limits, held_rows
 
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0
@@ -58,6 +60,7 @@ STRONG_LINE: Final = 25.0
 _SIDELOBES: Final = 0.25
 _LOWEST_ORDER: Final = 0.7
 _MOST_LINES: Final = 4
+_SAME_HZ: Final = 0.3
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,7 @@ def usable_signals(
     out: list[list[JointSignals]] = []
     reasons: list[str] = []
     bases = {n: BaseLoss(joints[n]) for n in numbers}
+    limits = clip_limits((table for _, table in runs), {n: joints[n] for n in numbers})
     rates = [1.0 / float(np.median(np.diff(table.time_s))) for _, table in runs]
     usual = float(np.median(rates))
     for (name, table), rate in zip(runs, rates, strict=True):
@@ -157,7 +161,8 @@ def usable_signals(
             if n not in table.joints:
                 continue
             try:
-                mine.append(joint_signals(name, table, n, joints[n], bases[n]))
+                held = held_rows(table.time_s, table.joints[n], joints[n], limits[n])
+                mine.append(without_held(joint_signals(name, table, n, joints[n], bases[n]), held))
             except SignalsError as error:
                 reasons.append(str(error))
         if mine:
@@ -356,5 +361,6 @@ def unknown_lines(
         near = any(j == line.channel.joint and abs(o - line.order) < _SIDELOBES for j, o in known)
         if line.ratio > STRONG_LINE and line.order > _LOWEST_ORDER and not stronger and not near:
             out.append(sharpened(line, bare, residuals[line.channel], step_s))
-    out += [line for line in frequency_lines(bare, residuals, step_s) if line.ratio > STRONG_LINE][:1]
-    return out[:_MOST_LINES]
+    hz = [line for line in frequency_lines(bare, residuals, step_s) if line.ratio > STRONG_LINE]
+    # one vibration of the frame or the sensor, in every channel that shows it
+    return [*out[:_MOST_LINES], *(line for line in hz if abs(line.order - hz[0].order) < _SAME_HZ)]

@@ -130,6 +130,22 @@ def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[Flo
     return out
 
 
+def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
+    """Return what the rows of held channels (`runs.held`) are wrong by: rms over the run that has most of it [Nm], beyond what
+    is usual in the others; channels without such rows are left out.
+    """
+    out: dict[Channel, float] = {}
+    for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):
+        for channel, d in run.channels.items():
+            if d.held is None or not d.held.any():
+                continue
+            rest = left.channels[channel].residual - d.nuisances @ u[d.families]
+            usual = float(np.mean(rest[d.valid] ** 2)) if d.valid.any() else 0.0
+            excess = float(np.sum(rest[d.held] ** 2 - usual)) / int(np.sum(d.held | d.valid))
+            out[channel] = max(out.get(channel, 0.0), max(excess, 0.0) ** 0.5)
+    return out
+
+
 def events_left(dataset: Dataset, refined: Refined, noise: Noise) -> dict[Channel, Events]:
     """Return rare events where the causes leave any that are large enough to matter, else nothing.
 

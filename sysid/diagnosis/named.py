@@ -12,7 +12,7 @@ from jtqd.sysid.diagnosis.evidence import class_beside, equivalence_class
 from jtqd.sysid.diagnosis.findings import joint_text
 from jtqd.sysid.diagnosis.guards import nothing_of, objections
 from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
-from jtqd.sysid.diagnosis.leftover import Leftover
+from jtqd.sysid.diagnosis.leftover import Leftover, held_nm
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.steadiness import steadiness
@@ -59,8 +59,19 @@ class Found:
         """Whether what is left over is relevant by its size."""
         return any(nm > self.limits[c] for c, nm in self.left.worst_nm.items())
 
+    @cached_property
+    def held_nm(self) -> dict[Channel, float]:
+        """What held channels cost, where that is relevant by its size [Nm]."""
+        held = held_nm(self.case.dataset, self.whole.refined)
+        return {c: nm for c, nm in held.items() if nm > self.limits[c]}
+
     @property
     def matters(self) -> bool:
+        """Whether something is not explained that matters: what is left over, or what is wrong with a channel."""
+        return self.left_matters or bool(self.held_nm)
+
+    @property
+    def left_matters(self) -> bool:
         """Whether what is left over matters: by its size, and as a part of the gap."""
         part = UNEXPLAINED_SHARE if self.few is None else FEW_UNEXPLAINED_SHARE
         return self.large and (self.share > part or not self.whole.chosen)

@@ -139,7 +139,7 @@ Index = np.ndarray[tuple[int], np.dtype[np.intp]]
 @dataclass
 class ChannelData:
     """One channel of one run, binned: valid [n], residual [n], regressors [n, p] of columns `index` [p], nuisances
-    [n, q] of families `families` [q].
+    [n, q] of families `families` [q]. held [n]: bins that are not valid only because a channel is held (None: no such).
     """
 
     valid: BoolArray
@@ -148,6 +148,7 @@ class ChannelData:
     index: Index
     nuisances: FloatArray
     families: Index
+    held: BoolArray | None = None
 
 
 @dataclass
@@ -267,6 +268,7 @@ def run_data(
                 np.empty(0, np.intp),
                 np.column_stack([c for _, c in there]),
                 np.array([k for k, _ in there], np.intp),
+                all_in_bin(s.known(balance), samples) & ~valid if balance in s.held else None,
             )
     _fill(channels, run, candidates, samples)
     axes = {s.number: _axes(s, samples) for s in run}

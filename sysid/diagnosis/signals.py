@@ -14,20 +14,21 @@ itself at the frequencies where there is nothing else.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.effects.effect import MOTOR, Effect, State, Values
+from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, LossModel
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.diagnosis.resolution import Smoother, acceleration_noise, cutoff_hz, described, noise_of
+from jtqd.sysid.runs.held import Held
 
 _ALL_VISIBLE: Final = Smoother(1.0)
 
@@ -164,6 +165,9 @@ class JointSignals:
     per_torque: FloatArray | float = 1.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
     off: BoolArray | None = None
+    held: Mapping[str, BoolArray] = field(
+        default_factory=dict
+    )  # by balance: rows of a held channel (`runs.held`)
     of_position: bool = (
         True  # the acceleration is a second difference of the position, else one of the velocity
     )
@@ -184,8 +188,13 @@ class JointSignals:
         return list(self.visible(np.array(values)))
 
     def usable(self, balance: str) -> BoolArray:
-        """Return the samples that a balance can be judged at [n]: the motor's where friction has a direction; none within
-        the reach of a filter from the ends.
+        """Return the samples that a balance is judged at [n]: those of `known` at which no channel of it is held."""
+        out = self.known(balance)
+        return out & ~self.held[balance] if balance in self.held else out
+
+    def known(self, balance: str) -> BoolArray:
+        """Return the samples at which a balance is known, if the channels are right [n]: the motor's where friction has a
+        direction; none within the reach of a filter from the ends.
         """
         out = self.moving.copy() if balance == MOTOR else np.ones(len(self.time_s), bool)
         if self.visible.parts:
@@ -225,6 +234,25 @@ class JointSignals:
         if self.of_position:
             return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))
         return np.asarray(np.sin(turn) / turn)
+
+
+def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
+    """Return the signals with the samples at which a column is held, and those that its smoothing reaches, not usable:
+    torque in both balances, current in the motor's.
+    """
+    if not held:
+        return s
+    step = float(np.median(np.diff(s.time_s)))
+    reach = {TORSION: _SMOOTH_S, MOTOR: _SMOOTH_S}
+    if s.visible.parts:
+        reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
+    out = {}
+    for balance, columns in ((TORSION, ("torque_nm",)), (MOTOR, ("torque_nm", "current_a"))):
+        rows = [held[name].rows for name in columns if name in held]
+        if rows:
+            wide = max(1, round(reach[balance] / step)) + 2  # and that of a second difference
+            out[balance] = np.convolve(np.any(rows, axis=0), np.ones(2 * wide + 1), "same") > 0.5
+    return replace(s, held=out)
 
 
 def with_one_sensor(run: Sequence[JointSignals]) -> list[JointSignals]:

@@ -64,7 +64,12 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     reasons: list[str] = []
     if found.matters:
         verdict = UNEXPLAINED
-        reasons = [*_closest(found.whole.hypothesis, causes, found.share), *left.reasons]
+        reasons = [
+            f"joint {c.joint}, {c.balance} balance: {nm:.3g} Nm rms of the worst run where a channel is held (see the channels)"
+            for c, nm in found.held_nm.items()
+        ]
+        if found.left_matters:
+            reasons += [*_closest(found.whole.hypothesis, causes, found.share), *left.reasons]
         reasons += _told_from(table, case.dataset.rated_torque_nm) if found.beside else []
     elif causes:
         verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
@@ -72,7 +77,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         verdict = INSUFFICIENT if doubt else NO_GAP
         reasons = [doubt] if doubt else []
     causes.sort(key=lambda c: -c.rms_nm)
-    gaps = channel_gaps(case.dataset, shown.refined, left if found.matters else None)
+    gaps = channel_gaps(case.dataset, shown.refined, left if found.left_matters else None)
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
@@ -94,7 +99,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
 
 def _left_over(found: Found, left: Leftover, total_nm2: float) -> LeftOver:
     """Return what is left over in the channel where it is most, against its limit; total_nm2: energy of all structure."""
-    sizes = {c: left.worst_nm.get(c, 0.0) for c in found.limits}
+    sizes = {c: max(left.worst_nm.get(c, 0.0), found.held_nm.get(c, 0.0)) for c in found.limits}
     worst = max(sizes, key=lambda c: sizes[c] / found.limits[c] if found.limits[c] > 0.0 else sizes[c])
     return LeftOver(
         worst.joint,
@@ -142,7 +147,7 @@ def _remaining(found: Found, named: Fit) -> tuple[Leftover, Fit]:
     more than there was, and in other places.
     """
     case, whole = found.case, found.whole
-    if not found.matters:
+    if not found.left_matters:
         if named.hypothesis is whole.hypothesis:
             return found.left, named
         return case.left_over(named), named

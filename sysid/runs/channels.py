@@ -8,7 +8,7 @@ Nothing here is a fit. Every check asks a question that physics answers whatever
 - A motor that carries far more than its friction has a torque of its current's sign. Where it has not, the energy
   lost on the way, the integral of (G Kt i - tau) v dt, shows which of the two is swapped: losses are positive.
 
-`check_channels` holds for every use of a run. The others (`check_energy`, `check_held`, `check_spikes`) are for a
+`check_channels` holds for every use of a run. The others (`check_energy`, `check_spikes`; `held`) are for a
 diagnosis, which takes every column at its word.
 """
 
@@ -52,9 +52,6 @@ VELOCITY_TOLERANCE: Final = 0.05
 TURNED_RAD: Final = 0.5
 """Joint side; positions that moved less say nothing about ratio and signs."""
 _BLOCK_S: Final = 0.05
-LONGEST_HELD: Final = 0.02
-"""Of the moving time: a channel that is stuck or clipped for longer spoils what is fitted to the rest."""
-_CLIPPED_ROWS: Final = 5
 _SPIKE: Final = 12.0
 """Times the usual step of the channel from row to row, and more than _SPIKE_RATED of rated torque."""
 _SPIKE_RATED: Final = 0.1
@@ -314,82 +311,6 @@ def check_energy(time_s: FloatArray, run: JointColumns, joint: Joint, where: str
             "swapped sign of positions and velocities, or of current and torque_nm",
         )
     ]
-
-
-def check_held(
-    time_s: FloatArray, run: JointColumns, joint: Joint, where: str
-) -> tuple[list[RunIssue], list[RunIssue]]:
-    """Return stretches of one number while the joint moves and the partner changes: (long ones, short ones).
-
-    Long: more than LONGEST_HELD of the moving time.
-    """
-    velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
-    if velocity is None or run.current_a is None or run.torque_nm is None:
-        return [], []
-    moving = np.abs(velocity) / joint.gear_ratio > MOVING_RAD_S
-    motor = joint.gear_ratio * joint.torque_constant_nm_per_a * run.current_a
-    long: list[RunIssue] = []
-    short: list[RunIssue] = []
-    # A commanded current is constant for good reasons, and friction may vary beside it: only much counts there.
-    for name, values, partner, moved in (
-        ("torque_nm", run.torque_nm, motor, 0.1 * joint.rated_torque_nm),
-        ("current_a", run.current_a, run.torque_nm, 0.5 * joint.rated_torque_nm),
-    ):
-        stuck, clipped = _held_rows(time_s, values, partner, moving, moved)
-        rows = stuck | clipped
-        share = float(np.count_nonzero(rows)) / max(1, int(np.count_nonzero(moving)))
-        if not share:
-            continue
-        at = values[int(np.argmax(rows))]
-        word = "stuck" if np.any(stuck & ~clipped) else "saturated or clipped"
-        text = (
-            f"{where}.{name}: found exactly {at:.6g} {'Nm' if name == 'torque_nm' else 'A'} held for {share:.2%} of the "
-            f"moving time from {time_s[int(np.argmax(rows))]:.4g} s on while "
-            f"{'the motor torque' if name == 'torque_nm' else 'the measured torque'} changed: {word} channel"
-        )
-        issue = RunIssue(f"{name}_{word.split(maxsplit=1)[0]}", text)
-        (long if share > LONGEST_HELD else short).append(issue)
-    return long, short
-
-
-def _held_rows(
-    time_s: FloatArray,
-    values: FloatArray,
-    partner: FloatArray,
-    moving: NDArray[np.bool_],
-    moved: float,
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return rows [n] that are stuck for STUCK_S, and rows at the channel's limits for _CLIPPED_ROWS or more, often."""
-    starts = np.flatnonzero(np.diff(values, prepend=math.nan) != 0.0)
-    ends = np.append(starts[1:], len(values))
-    long = (ends - starts) >= _CLIPPED_ROWS
-    low, high = float(np.min(values)), float(np.max(values))
-    stuck, clipped = np.zeros(len(values), np.bool_), np.zeros(len(values), np.bool_)
-    at_limit: dict[float, list[tuple[int, int]]] = {low: [], high: []}
-    for start, end in zip(starts[long], ends[long], strict=True):
-        value = float(values[start])
-        if value in at_limit:
-            at_limit[value].append((int(start), int(end)))
-        if not moving[start] or not moving[end - 1]:
-            continue
-        if time_s[end - 1] - time_s[start] >= STUCK_S and _moved(partner[start:end]) > moved:
-            stuck[start:end] = True
-    for value, parts in at_limit.items():
-        there = sum(end - start for start, end in parts)
-        # A quantised channel also meets its extreme now and then; a limit is held, and more than once.
-        if len(parts) < 2 or there < 10 * _CLIPPED_ROWS or there < 0.8 * np.count_nonzero(values == value):
-            continue
-        if max(_moved(partner[start:end]) for start, end in parts) > 0.2 * moved:
-            for start, end in parts:
-                clipped[start:end] = True
-    return stuck & moving, clipped & moving
-
-
-def _moved(partner: FloatArray) -> float:
-    """Return how far a channel went, single rows of noise averaged."""
-    width = max(1, len(partner) // 8)
-    whole = len(partner) // width * width
-    return float(np.ptp(partner[:whole].reshape(-1, width).mean(axis=1)))
 
 
 def check_spikes(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:

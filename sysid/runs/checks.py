@@ -17,8 +17,9 @@ import numpy as np
 
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_held, check_spikes
+from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_spikes
 from jtqd.sysid.runs.files import RunFile
+from jtqd.sysid.runs.held import Limits, check_held, clip_limits
 from jtqd.sysid.runs.swapped import swapped_columns
 from jtqd.sysid.runs.time_base import (
     SKEW_NOTED_S,
@@ -79,12 +80,17 @@ class CheckedRuns:
 
 
 def check_run(
-    table: RunTable, joints: Mapping[int, Joint], name: str = "", *, thorough: bool = False
+    table: RunTable,
+    joints: Mapping[int, Joint],
+    name: str = "",
+    *,
+    thorough: bool = False,
+    limits: Mapping[int, Limits] | None = None,
 ) -> CheckedRun:
     """Check the joints of one run that have a joint file; `name` begins every line.
 
     thorough: as a diagnosis needs it; only then are columns changed (positions that roll over made continuous, uneven
-    steps made even, channels that are not needed left out when they are wrong).
+    steps made even, channels that are not needed left out when they are wrong). limits: where channels clip in other runs.
     """
     notes: list[RunIssue] = []
     if thorough:
@@ -101,7 +107,9 @@ def check_run(
     for number in sorted(set(joints) & set(table.joints) - {n for a, b, _ in exchanged for n in (a, b)}):
         where = f"{name}: j{number}" if name else f"j{number}"
         if thorough:
-            columns, why, odd = _checked_joint(table, number, joints[number], where)
+            columns, why, odd = _checked_joint(
+                table, number, joints[number], where, (limits or {}).get(number)
+            )
             notes += odd
         else:
             columns = table.joints[number]
@@ -119,7 +127,8 @@ def check_run(
 
 def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> CheckedRuns:
     """Return what of the runs can be used for a diagnosis of `joints` (joint file by number)."""
-    each = [(name, check_run(table, joints, name, thorough=True)) for name, table in runs]
+    limits = clip_limits((table for _, table in runs), joints)
+    each = [(name, check_run(table, joints, name, thorough=True, limits=limits)) for name, table in runs]
     usable = tuple((name, run.table) for name, run in each if run.table is not None)
     left = {number for _, table in usable for number in table.joints}
     recorded = {number for _, table in runs for number in table.joints}
@@ -143,7 +152,7 @@ def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list
 
 
 def _checked_joint(
-    table: RunTable, number: int, joint: Joint, where: str
+    table: RunTable, number: int, joint: Joint, where: str, limits: Limits | None
 ) -> tuple[JointColumns | None, list[RunIssue], list[RunIssue]]:
     """Return columns that may be used (None: the joint is left out of this run), why not, and notes."""
     columns = table.joints[number]
@@ -165,7 +174,7 @@ def _checked_joint(
         return None, refusing, notes
     columns, spared = _spared(columns, issues)
     notes += spared
-    refusing, short = check_held(table.time_s, columns, joint, where)
+    refusing, short = check_held(table.time_s, columns, joint, where, limits)
     notes += short + check_spikes(columns, joint, where)
     if refusing:
         return None, refusing, notes

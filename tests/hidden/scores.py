@@ -20,7 +20,10 @@ LARGEST_CLASS: Final = 3
 _PLACES: Final = 3  # of the largest gap that may be right
 _MOMENT_S: Final = 0.3  # tolerance of a time
 _MOMENT: Final = re.compile(r"(run\d+)(?:\.csv)? ([\d.]+) s")
-_HELD: Final = re.compile(r"j\d\.(\w+): found exactly (\S+) .*clipped channel")
+_HELD: Final = re.compile(
+    r"(run\d+)\S*: j(\d)\.(\w+): found exactly (\S+) (?:.*from ([\d., ]+) s on)?.*(clipped|stuck) channel"
+)
+_RELEVANCE: Final = 0.005
 
 Truth = Mapping[str, Any]
 
@@ -45,6 +48,7 @@ class Outcome:
     gain: tuple[float, float, float] | None = None  # rms before, after, after with the true model
     settled: bool | None = None
     place: bool | None = None
+    slight: bool = False  # what is in no library is worth less than the relevance
     shown: tuple[str, ...] = ()  # what the map of the largest gap shows first
     detail: Sequence[str] = ()
 
@@ -89,6 +93,7 @@ def score(
             for p in shown(g)
         ),
         place=place_is_right(strange[0], findings, run_s) if strange else None,
+        slight=any(t["parameters"].get("of_rated", 1.0) <= _RELEVANCE for t in strange),
         **more,
     )
 
@@ -139,7 +144,7 @@ def _between(value: float, low: float, high: float, angle: bool) -> bool:
 
 def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bool:
     """Return whether the verdict is "unexplained" and the map of the largest gap points at one of the right places; or
-    whether nothing is explained and a channel check says which channel clips, and at what (`_channel_said`).
+    whether nothing is explained and a channel check says which channel clips or is stuck, where (`_channel_said`).
     """
     if _channel_said(truth, findings):
         return True
@@ -154,14 +159,29 @@ def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bo
 
 
 def _channel_said(truth: Truth, findings: Findings) -> bool:
-    """Return whether the user is told that a right place of axis "channel" clips, at its value within 1 %."""
+    """Return whether the user is told that a right place of axis "channel" clips, at its value within 1 %; or that it is
+    stuck, at moments of which most are right.
+    """
     if findings.verdict not in ("unexplained", "insufficient_data"):
         return False
+    lines = filter(None, map(_HELD.search, dict.fromkeys((*findings.reasons, *findings.channel_notes))))
+    said = [line.groups() for line in lines]
+    spans = [(r["run"], r["low"], r["high"]) for r in truth["places"] if r["axis"] == "time"]
     for right in truth["places"]:
-        for line in (*findings.reasons, *findings.channel_notes) if right["axis"] == "channel" else ():
-            at = _HELD.search(line)
-            if at and at[1] == right["channel"] and right["low"] <= abs(float(at[2])) <= right["high"]:
+        if right["axis"] == "channel" and right.get("stuck"):
+            named = [
+                any(run == r and low - _MOMENT_S <= float(t) <= high + _MOMENT_S for r, low, high in spans)
+                for run, joint, channel, _, times, word in said
+                if (int(joint), channel, word) == (truth["joint"], right["channel"], "stuck")
+                for t in re.findall(r"\d[\d.]*", times or "")
+            ]
+            if named and sum(named) > 0.5 * len(named):
                 return True
+        elif right["axis"] == "channel":
+            for _, _, channel, value, _, word in said:
+                clips = word == "clipped" and channel == right["channel"]
+                if clips and right["low"] <= abs(float(value)) <= right["high"]:
+                    return True
     return False
 
 

@@ -43,7 +43,12 @@ def figures(outcomes: Sequence[Outcome], real: bool = False) -> list[Figure]:
             0.90,
             _most(o.verdict for o in of["foreign"]),
         ),
-        share("foreign called no_gap", [o.verdict == "no_gap" for o in of["foreign"]], -0.0),
+        share(
+            "foreign worth more than the relevance called no_gap",
+            [o.verdict == "no_gap" and not o.slight for o in of["foreign"]],
+            -0.0,
+            f"{sum(o.slight for o in of['foreign'])} worth less",
+        ),
         share(
             "cause beside a foreign effect: named",
             _found(of["beside"]),

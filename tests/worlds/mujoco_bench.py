@@ -38,6 +38,7 @@ class Instruments:
     clip_share: float = 0.0
     line: tuple[float, float] = (0.0, 0.0)
     frozen: dict[int, tuple[int, list[tuple[float, float]]]] = field(default_factory=dict)
+    frozen_of_rated: float = 0.0  # what that is worth as torque, rms over the worst run
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,9 @@ class MujocoBench:
             tables.append(_measured(happened, motion, joints, instruments, days[k], k, rng, quiet))
         if instruments.clip_share:
             _clip(tables, instruments.clip_share, truth)
+        for item in truth:
+            if item["name"] == "frozen_current":
+                item["parameters"]["of_rated"] = instruments.frozen_of_rated
         return Set(tables, {1: joints[0], 2: joints[1]}, truth)
 
 
@@ -313,7 +317,9 @@ def _measured(  # noqa: PLR0917
             link = _quantised(link, 2.0 * np.pi / LINK_COUNTS)
             temperature = np.round(temperature, 1)
         if run in c.frozen and c.frozen[run][0] == j:
-            current = _repeated(current, c.frozen[run][1])
+            measured, current = current, _repeated(current, c.frozen[run][1])
+            wrong = float(np.sqrt(np.mean((current - measured) ** 2))) / amps
+            c.frozen_of_rated = max(c.frozen_of_rated, wrong)
         name = f"j{j + 1}"
         columns[f"{name}.current_a"] = current
         columns[f"{name}.motor_position_rad"] = motor
@@ -449,7 +455,7 @@ def _vibrating_frame(  # noqa: PLR0917
 def _frozen_current(  # noqa: PLR0917
     item: Hidden, joints: Any, motions: Any, plants: Any, c: Instruments, rng: np.random.Generator
 ) -> dict[str, Any]:
-    places = []
+    places: list[dict[str, Any]] = [{"axis": "channel", "channel": "current_a", "stuck": True}]
     for k in range(len(plants)):
         spans = _spans(rng, (0.06, 0.15), 5)
         c.frozen[k] = (int(item.joint) - 1, spans)

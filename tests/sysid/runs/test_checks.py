@@ -111,7 +111,7 @@ def test_stuck_channels_by_how_long(run: RunTable) -> None:
     assert short.refused == ()
     assert any("stuck channel" in note and f"from {first / 1000:g} s" in note for note in short.notes)
     assert list(short.runs[0][1].joints) == [1, 2]
-    long = checked(changed(run, partial(held, "torque_nm", 5000, 12000)))
+    long = checked(changed(run, partial(held, "torque_nm", 3000, 18000)))
     assert "stuck channel" in long.refused[0]
 
 
