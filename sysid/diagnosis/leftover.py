@@ -131,8 +131,8 @@ def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[Flo
 
 
 def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
-    """Return what the rows of held channels (`runs.held`) are wrong by: rms over the run that has most of it [Nm], beyond what
-    is usual in the others; channels without such rows are left out.
+    """Return what the rows of held channels (`runs.held`) are wrong by: rms over the run that has most of it [Nm], beyond
+    what is usual in the others; channels without such rows are left out.
     """
     out: dict[Channel, float] = {}
     for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):

@@ -65,7 +65,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     if found.matters:
         verdict = UNEXPLAINED
         reasons = [
-            f"joint {c.joint}, {c.balance} balance: {nm:.3g} Nm rms of the worst run where a channel is held (see the channels)"
+            f"joint {c.joint}, {c.balance} balance: {nm:.3g} Nm rms of the worst run where a channel is held"
             for c, nm in found.held_nm.items()
         ]
         if found.left_matters:

@@ -93,7 +93,10 @@ def held_rows(
         stuck, clipped = _while_partner_moves(time_s, values, partner, moving, moved)
         for limit in (limits or {}).get(name, ()):
             clipped |= np.abs(values) == limit
-        stuck |= _without_noise(values, noisy)
+        noiseless = _without_noise(values, noisy)
+        ends = [v for v in (np.min(values), np.max(values)) if v != values[-1]]
+        clipped |= np.isin(values, np.unique(values[noiseless & np.isin(values, ends)]))
+        stuck |= noiseless
         if stuck.any() or clipped.any():
             out[name] = Held(clipped, stuck & ~clipped)
     return out

@@ -172,7 +172,7 @@ def _channel_said(truth: Truth, findings: Findings) -> bool:
             named = [
                 any(run == r and low - _MOMENT_S <= float(t) <= high + _MOMENT_S for r, low, high in spans)
                 for run, joint, channel, _, times, word in said
-                if (int(joint), channel, word) == (truth["joint"], right["channel"], "stuck")
+                if truth["joint"] in ("sensor", int(joint)) and (channel, word) == (right["channel"], "stuck")
                 for t in re.findall(r"\d[\d.]*", times or "")
             ]
             if named and sum(named) > 0.5 * len(named):

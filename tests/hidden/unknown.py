@@ -138,7 +138,7 @@ def _sensor_faults(
                 for s in rng.integers(1000, n - 1000, many)
             ]
         )
-    return Oddity(faults=faults)
+    return Oddity(faults=faults, places=[{"axis": "channel", "channel": "torque_nm", "stuck": True}])
 
 
 def _current_dead_band(

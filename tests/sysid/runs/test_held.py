@@ -83,8 +83,8 @@ def clipped(columns: JointColumns, limit: float, span: slice = slice(None)) -> J
 
 @pytest.mark.parametrize("span", [slice(None), slice(0, 1500)])
 def test_one_number_at_the_end_of_the_range_is_a_clip_however_long_or_seldom(span: slice) -> None:
-    """Of the second, only one crest is clipped: 0.9 s of one number, never again."""
-    limit = 0.25003 * JOINT.rated_torque_nm  # between two steps of the channel
+    """Of the second, only one crest is clipped: half a second of one number, never again."""
+    limit = 0.35003 * JOINT.rated_torque_nm  # between two steps of the channel
     there = clipped(run(), limit, span)
     if span.stop:
         assert there.torque_nm is not None
@@ -116,7 +116,7 @@ def test_one_number_in_the_middle_of_the_range_is_stuck() -> None:
 def test_what_never_comes_back_has_not_reached_a_limit() -> None:
     there = run()
     assert there.torque_nm is not None
-    top = int(np.argmax(there.torque_nm))
+    top = int(np.argmax(there.torque_nm[:6000]))
     stuck = held_rows(T, replace(there, torque_nm=frozen(there.torque_nm, top, len(T))), JOINT)["torque_nm"]
     assert stuck.stuck[top:].all()
     assert not stuck.clipped.any()
