@@ -12,7 +12,7 @@ from jtqd.sysid.diagnosis.evidence import class_beside, equivalence_class
 from jtqd.sysid.diagnosis.findings import joint_text
 from jtqd.sysid.diagnosis.guards import nothing_of, objections
 from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
-from jtqd.sysid.diagnosis.leftover import Leftover, held_nm
+from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.steadiness import steadiness
@@ -62,8 +62,7 @@ class Found:
     @cached_property
     def held_nm(self) -> dict[Channel, float]:
         """What held channels cost, where that is relevant by its size [Nm]."""
-        held = held_nm(self.case.dataset, self.whole.refined)
-        return {c: nm for c, nm in held.items() if nm > self.limits[c]}
+        return {c: nm for c, nm in self.case.held_nm(self.whole).items() if nm > self.limits[c]}
 
     @property
     def matters(self) -> bool:

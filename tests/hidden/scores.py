@@ -192,6 +192,8 @@ def shown(gap: Gap) -> Sequence[Place]:
 
 def _hit(place: Place, right: Mapping[str, Any]) -> bool:
     """Return whether a bin overlaps a right place; times are the matter of `_moments_hit`."""
+    if right["axis"] == "channel":  # the matter of `_channel_said`
+        return False
     low, high = right["low"], right["high"]
     if right["axis"] == "frequency":
         orders = "rev" in place.unit or "order" in place.bin

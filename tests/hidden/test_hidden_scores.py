@@ -162,6 +162,51 @@ def test_a_channel_check_that_says_what_clips_has_placed_it(
     assert not place_is_right(truth, found), "what does not clip is not placed by it"
 
 
+@pytest.mark.parametrize(
+    ("verdict", "line", "right"),
+    [
+        (
+            "unexplained",
+            "run2.csv: j1.current_a: found exactly 1 A held, from 5.1, 9.3 s on; stuck channel",
+            True,
+        ),
+        (
+            "unexplained",
+            "run2.csv: j1.current_a: found exactly 1 A held, from 5.1, 7, 8 s on; stuck channel",
+            False,
+        ),
+        (
+            "unexplained",
+            "run3.csv: j1.current_a: found exactly 1 A held, from 5.1, 9.3 s on; stuck channel",
+            False,
+        ),
+        (
+            "unexplained",
+            "run2.csv: j2.current_a: found exactly 1 A held, from 5.1, 9.3 s on; stuck channel",
+            False,
+        ),
+        (
+            "unexplained",
+            "run2.csv: j1.current_a: found exactly 1 A held, from 5.1 s on; clipped channel",
+            False,
+        ),
+        (
+            "no_gap",
+            "run2.csv: j1.current_a: found exactly 1 A held, from 5.1, 9.3 s on; stuck channel",
+            False,
+        ),
+    ],
+)
+def test_a_channel_check_that_says_when_a_channel_is_stuck_has_placed_it(
+    verdict: str, line: str, right: bool
+) -> None:
+    times = [unknown("time", t, t + 0.1, run="run2")["places"][0] for t in (5.0, 9.2)]
+    channel = {"axis": "channel", "channel": "current_a", "stuck": True}
+    truth = {**unknown("time", 0.0, 0.0), "joint": 1, "places": [*times, channel]}
+    elsewhere = mapped("load", "", 1.0, 2.0, "Nm").gaps
+    assert place_is_right(truth, replace(findings(verdict), channel_notes=(line,), gaps=elsewhere)) is right
+
+
 def test_naming_times_is_no_answer_where_it_is_wrong_half_of_the_time() -> None:
     """The same four moments, three of them right: an answer where events are rare, luck where they fill half of the run."""
     named = mapped("time", "seconds: run1 2.0 s, run1 6.0 s, run1 14.0 s, run1 9.0 s", 0, 0, "s")

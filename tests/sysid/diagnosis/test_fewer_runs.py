@@ -161,6 +161,9 @@ def test_what_is_left_over_is_that_of_what_is_kept(monkeypatch: pytest.MonkeyPat
         def left_over(self, fit: Fit) -> Leftover:
             return Leftover((), (), (), (), worst_nm={MOTOR1: 0.1 if fit.chosen else 0.5})
 
+        def held_nm(self, fit: Fit) -> dict[Channel, float]:
+            return {}
+
         @property
         def limits(self) -> dict[Channel, float]:
             return {MOTOR1: 0.2}

@@ -26,7 +26,7 @@ from jtqd.sysid.diagnosis.named import Found
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.signals import Line
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.verdict import _remaining
 from tests.hidden.case import Case, draw_many
 from tests.hidden.order import Hidden, Order
@@ -191,6 +191,9 @@ class Two(Judged):
     def left_over(self, fit: Fit) -> Leftover:
         line = Line(MOTOR1, 2.5, 0.6 - 0.5 * len(fit.chosen), 30.0)
         return Leftover((), (), (), (line,), worst_nm={MOTOR1: line.amplitude_nm})
+
+    def held_nm(self, fit: Fit) -> dict[Channel, float]:
+        return {}
 
 
 @pytest.mark.parametrize(("limit_nm", "matters"), [(0.2, False), (0.05, True)])

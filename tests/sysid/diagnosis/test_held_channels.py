@@ -1,0 +1,93 @@
+"""Samples of a held channel are in no fit, and count by what they cost; one vibration is one in all channels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis import dataset as datasets
+from jtqd.sysid.diagnosis.dataset import unknown_lines, usable_signals
+from jtqd.sysid.diagnosis.leftover import held_nm
+from jtqd.sysid.diagnosis.named import Found
+from jtqd.sysid.diagnosis.regressors import families, run_data
+from jtqd.sysid.diagnosis.signals import Channel, Line
+from tests.estimator.effects.effect_signals import PLAIN
+from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, rigid_run
+
+LIMIT = 0.2 * PLAIN.rated_torque_nm
+
+
+def clipped_runs() -> list[tuple[str, RunTable]]:
+    """Two runs of a sensor that clips: the first often, the second for the few samples before it is let go."""
+    out = []
+    for name, phase, last in (("often", 0.2, None), ("seldom", 0.9, 400)):
+        table = rigid_run(PLAIN, phase, seconds=5.0)
+        torque = table.joints[1].torque_nm
+        assert torque is not None
+        torque = torque.copy()
+        torque[:last] = np.clip(torque[:last], -LIMIT, LIMIT)
+        out.append((name, RunTable(table.time_s, {1: replace(table.joints[1], torque_nm=torque)})))
+    return out
+
+
+def test_clipped_samples_are_in_no_fit_however_few_and_count_by_what_they_cost() -> None:
+    runs, reasons = usable_signals(clipped_runs(), {1: PLAIN}, (1,))
+    assert not reasons
+    binned = [run_data(run, [], 5, families(runs)) for run in runs]
+    for (_, table), run in zip(clipped_runs(), binned, strict=True):
+        torque = table.joints[1].torque_nm
+        assert torque is not None
+        for channel in (MOTOR1, TORSION1):
+            d = run.channels[channel]
+            assert d.held is not None
+            at_limit = (np.abs(torque) == LIMIT)[: 5 * len(d.valid)].reshape(-1, 5).any(axis=1)
+            assert at_limit.any()
+            assert not (d.valid & (at_limit | d.held)).any()
+            rest = d.residual[d.valid]
+            assert np.sqrt(np.mean((rest - rest.mean()) ** 2)) < 0.01 * LIMIT, "what is left is measured"
+    none = [np.zeros(len(families(runs)))] * 2
+    cost = held_nm(
+        cast("Any", SimpleNamespace(runs=binned)), cast("Any", SimpleNamespace(runs=binned, nuisances=none))
+    )
+    whole = rigid_run(PLAIN, 0.2, seconds=5.0).joints[1].torque_nm
+    assert whole is not None
+    over = np.maximum(np.abs(whole) - LIMIT, 0.0)
+    assert cost[TORSION1] == pytest.approx(float(np.sqrt(np.mean(over**2))), rel=0.1)
+
+
+@pytest.mark.parametrize(("cost", "matters"), [(0.1, False), (0.3, True)])
+def test_a_held_channel_matters_by_its_size(cost: float, matters: bool) -> None:
+    nothing = SimpleNamespace(worst_nm={})
+    fit = SimpleNamespace(refined=None, chosen=())
+    case = SimpleNamespace(held_nm=lambda _: {MOTOR1: cost})
+    found = Found(
+        cast("Any", case),
+        cast("Any", fit),
+        cast("Any", fit),
+        None,
+        cast("Any", nothing),
+        0.0,
+        {MOTOR1: 0.2},
+        (),
+    )
+    assert found.matters is matters
+    assert not found.beside, "causes are judged by what is measured"
+
+
+def test_one_vibration_is_taken_out_of_every_channel_that_shows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    other = Channel(2, "torsion")
+    seen = [
+        Line(TORSION1, 24.5, 0.9, 900.0, "Hz"),
+        Line(other, 24.4, 0.9, 800.0, "Hz"),
+        Line(MOTOR1, 31.0, 0.2, 300.0, "Hz"),
+        Line(MOTOR1, 24.5, 0.1, 3.0, "Hz"),
+    ]
+    monkeypatch.setattr(datasets, "frequency_lines", lambda *_: seen)
+    monkeypatch.setattr(datasets, "order_lines", lambda *_: [])
+    runs, _ = usable_signals(clipped_runs(), {1: PLAIN}, (1,))
+    assert unknown_lines(runs, [], 5, 0.005) == seen[:2]
