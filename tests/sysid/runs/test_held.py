@@ -76,7 +76,7 @@ def test_a_current_without_noise_anywhere_or_without_power_is_none() -> None:
 
 def test_a_commanded_current_that_goes_to_a_level_and_on_is_measured() -> None:
     """It never repeats a number on its way, but it has no noise either, and the load does not change meanwhile."""
-    current = np.interp(T, [0.0, 3.0, 3.06, 8.0], [0.5, 2.0, 2.0, 5.0])
+    current = np.round(np.interp(T, [0.0, 3.0, 3.06, 8.0], [0.5, 2.15, 2.15, 4.867]), 4)
     assert held_rows(T, replace(run(swing=0.01), current_a=current), JOINT) == {}
 
 
