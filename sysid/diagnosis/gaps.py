@@ -119,13 +119,9 @@ def _floor(dataset: Dataset, refined: Refined, channel: Channel) -> tuple[float,
     square = float(np.nanmean(noise**2))
     drift, count = 0.0, 0
     usual = np.array([g.name != LINE for g in dataset.families])
-    first = np.unique(refined.mixed.pieces, return_index=True)[1]
-    recordings = len(first)
-    shared = refined.nuisances[first].mean(axis=0)  # what all runs share is no variation
-    scale = np.sqrt(recordings / max(recordings - 1, 1))
     for run, u in zip(refined.runs, refined.nuisances, strict=True):
         d = run.channels[channel]
-        part = (d.nuisances @ (scale * (u - shared) * usual)[d.families])[d.valid]
+        part = (d.nuisances @ (u * usual)[d.families])[d.valid]
         if channel.balance == "torsion" and len(part):
             part = part - part.mean()
         drift += float(part @ part)
