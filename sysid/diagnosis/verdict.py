@@ -75,7 +75,8 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         verdict = INSUFFICIENT if doubt else NO_GAP
         reasons = [doubt] if doubt else []
     causes.sort(key=lambda c: -c.rms_nm)
-    gaps = _below_bounds(channel_gaps(case.dataset, shown.refined, left if found.matters else None), bounded)
+    gaps = channel_gaps(case.dataset, shown.refined, left if found.matters else None)
+    gaps = _below_bounds(gaps, bounded)
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
@@ -99,17 +100,15 @@ def _below_bounds(gaps: Sequence[Gap], bounded: Sequence[BoundedValue]) -> tuple
     """Return the gaps with no noise floor above what a bounded value leaves on the runs left out: where nothing is named, the
     runs' own changes hold what all of them lack of it, and that is no noise.
     """
-    out = []
-    for gap in gaps:
-        mine = [b for b in bounded if b.joint == gap.joint and gap.balance == MOTOR]
-        left = [math.sqrt(float(np.mean([r.rmse_after_nm**2 for r in b.runs]))) for b in mine]
-        lower = min(left, default=math.inf)
-        if lower < gap.noise_floor_nm:
-            gap = replace(
-                gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on runs left out"
-            )
-        out.append(gap)
-    return tuple(out)
+    return tuple(_below(gap, [b for b in bounded if b.joint == gap.joint]) for gap in gaps)
+
+
+def _below(gap: Gap, bounded: Sequence[BoundedValue]) -> Gap:
+    left = [math.sqrt(float(np.mean([r.rmse_after_nm**2 for r in b.runs]))) for b in bounded]
+    lower = min(left, default=math.inf)
+    if gap.balance != MOTOR or lower >= gap.noise_floor_nm:
+        return gap
+    return replace(gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on runs left out")
 
 
 def _left_over(found: Found, left: Leftover, total_nm2: float) -> LeftOver:
