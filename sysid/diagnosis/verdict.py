@@ -97,8 +97,8 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
 
 
 def _below_bounds(gaps: Sequence[Gap], bounded: Sequence[BoundedValue]) -> tuple[Gap, ...]:
-    """Return the gaps with no noise floor above what a bounded value leaves on the runs left out: where nothing is named, the
-    runs' own changes hold what all of them lack of it, and that is no noise.
+    """Return the gaps with no noise floor above what a bounded value leaves on the runs left out: where nothing is named,
+    the runs' own changes hold what all of them lack of it, and that is no noise.
     """
     return tuple(_below(gap, [b for b in bounded if b.joint == gap.joint]) for gap in gaps)
 
