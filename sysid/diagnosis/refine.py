@@ -273,12 +273,15 @@ def _step_size(p: PresentEffect, name: str) -> float:
 
 
 def present_effects(best: Hypothesis) -> list[PresentEffect]:
-    """Return the chosen candidates as effects with parameters."""
+    """Return the chosen candidates as effects with parameters, none beyond the end of its range: a set that others left
+    behind may combine to a rate of no friction at all (infinite).
+    """
     out = []
     for c in best.chosen:
         values = dict(c.term.combine(best.coefficients(c)))
         for p in c.effect.parameters:
             if p.default is not None and not math.isnan(p.default):
                 values.setdefault(p.name, p.default)
-        out.append(PresentEffect(c.effect, c.joint, values, free_names(c.effect, values)))
+        free = free_names(c.effect, values)
+        out.append(PresentEffect(c.effect, c.joint, values, free).moved([0.0] * len(free)))
     return out

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
 
+from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.bounded import bounded_values
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.causes import causes_of, told_at_rest
@@ -21,6 +23,7 @@ from jtqd.sysid.diagnosis.findings import (
     INSUFFICIENT,
     NO_GAP,
     UNEXPLAINED,
+    BoundedValue,
     CandidateEvidence,
     Cause,
     Findings,
@@ -78,6 +81,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         reasons = [doubt] if doubt else []
     causes.sort(key=lambda c: -c.rms_nm)
     gaps = channel_gaps(case.dataset, shown.refined, left if found.left_matters else None)
+    gaps = _below_bounds(gaps, bounded)
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
@@ -95,6 +99,21 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         left_over=_left_over(found, left, total),
         bounded=tuple(bounded),
     )
+
+
+def _below_bounds(gaps: Sequence[Gap], bounded: Sequence[BoundedValue]) -> tuple[Gap, ...]:
+    """Return the gaps with no noise floor above what a bounded value leaves on the runs left out: where nothing is named,
+    the runs' own changes hold what all of them lack of it, and that is no noise.
+    """
+    return tuple(_below(gap, [b for b in bounded if b.joint == gap.joint]) for gap in gaps)
+
+
+def _below(gap: Gap, bounded: Sequence[BoundedValue]) -> Gap:
+    left = [math.sqrt(float(np.mean([r.rmse_after_nm**2 for r in b.runs]))) for b in bounded]
+    lower = min(left, default=math.inf)
+    if gap.balance != MOTOR or lower >= gap.noise_floor_nm:
+        return gap
+    return replace(gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on runs left out")
 
 
 def _left_over(found: Found, left: Leftover, total_nm2: float) -> LeftOver:

@@ -94,6 +94,17 @@ def test_friction_and_inertia_that_show_only_together_are_found(measured: dict[i
     assert floor < 0.3, "what all runs share is no noise"
 
 
+def test_the_noise_floor_is_below_what_a_fit_on_the_other_run_leaves(measured: dict[int, Findings]) -> None:
+    """Nothing is named in joint 7: what both runs lack in common is in their own changes, and is no variation."""
+    for number in range(3, 8):
+        findings = measured[number]
+        runs = [run for bound in findings.bounded for run in bound.runs]
+        runs += findings.gain.runs if findings.gain is not None else ()
+        assert runs
+        floor = next(gap.noise_floor_nm for gap in findings.gaps if gap.balance == "motor")
+        assert 0.05 < floor <= np.sqrt(np.mean([run.rmse_after_nm**2 for run in runs]))
+
+
 def test_what_one_encoder_and_one_joint_cannot_tell_apart_is_one_class(measured: dict[int, Findings]) -> None:
     inertia = next(c for c in measured[3].causes if "rotor_inertia" in c.names)
     assert "link_inertia" in inertia.names

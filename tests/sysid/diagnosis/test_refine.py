@@ -22,9 +22,10 @@ from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_app
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings, Gap
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import _repeats
-from jtqd.sysid.diagnosis.guards import free_run_fall
+from jtqd.sysid.diagnosis.guards import beyond_bounds, free_run_fall
+from jtqd.sysid.diagnosis.mixed_model import Model
 from jtqd.sysid.diagnosis.noise import ORDER, Noise
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, refine
+from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, present_effects, refine
 from jtqd.sysid.diagnosis.regressors import contribution, families
 from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
@@ -329,6 +330,18 @@ def test_terms_of_the_search_are_where_a_refinement_starts() -> None:
     columns = [contribution(one.effect, p, s)["motor"] for p in one.term.basis]
     whole = contribution(one.effect, one.term.combine([0.7, -1.1]), s)["motor"]
     assert whole == pytest.approx(0.7 * columns[0] - 1.1 * columns[1], abs=1e-9)
+
+
+def test_a_refinement_starts_within_the_ranges_of_its_parameters() -> None:
+    """Columns that others left behind can combine to an infinite rate; one of no size ended the diagnosis with an error."""
+    warm = candidates(PLAIN, ("temperature_dependent_friction", 1, 0))
+    columns = [0.0, -100.0]  # viscous friction that would feed energy in
+    assert warm[0].term.combine(columns)["viscous_per_k"] == -np.inf
+    model = Model((0, 1), np.array(columns), np.eye(2), np.ones(1), 0.0, 0.0, np.zeros((1, 1)))
+    (start,) = present_effects(Hypothesis(tuple(warm), model, 0.0))
+    limits = parameter(start.effect, "viscous_per_k")
+    assert start.values["viscous_per_k"] == limits.low
+    assert beyond_bounds(start, {}), "and is then refused"
 
 
 def test_where_no_torque_was_measured_a_cause_must_lower_the_position_error_of_a_free_run(
