@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.sysid.diagnosis.signals import JointSignals, smooth
 
 RATE_HZ: Final = 100.0
@@ -90,11 +90,33 @@ def _acceleration(s: JointSignals) -> float:
     return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * step)
 
 
+def no_room(joint: Joint, signals: Sequence[JointSignals]) -> str:
+    """Return why `room_of` gives none."""
+    if signals:
+        return (
+            "within motion_limits of the joint file (or --limits) the joint stood in these runs, or it needed more than "
+            f"{_TORQUE_SHARE:.0%} of the torque allowed"
+        )
+    return (
+        "no run that can be used shows where the joint may go, and motion_limits of the joint file (or --limits) lacks "
+        + ", ".join(_left_out(joint))
+    )
+
+
+def _left_out(joint: Joint) -> list[str]:
+    """Names of the limits that a motion without runs needs and the file does not give."""
+    limits = joint.motion_limits or MotionLimits()
+    sizes = {
+        "travel_rad": max(map(abs, limits.travel_rad)),
+        "velocity_rad_s": limits.velocity_rad_s,
+        "acceleration_rad_s2": limits.acceleration_rad_s2,
+    }
+    return [name for name, size in sizes.items() if size >= NO_LIMIT]
+
+
 def _of_limits(joint: Joint) -> Room | None:
     limits = joint.motion_limits
-    if limits is None or max(map(abs, limits.travel_rad)) >= NO_LIMIT:
-        return None
-    if max(limits.velocity_rad_s, limits.acceleration_rad_s2) >= NO_LIMIT:
+    if limits is None or _left_out(joint):
         return None
     torque = min(joint.rated_torque_nm, limits.torque_nm)
     return Room(*limits.travel_rad, limits.velocity_rad_s, limits.acceleration_rad_s2, torque, math.nan)

@@ -138,7 +138,7 @@ class Dataset:
 def usable_signals(
     runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: Sequence[int]
 ) -> tuple[list[list[JointSignals]], list[str]]:
-    """Return the signals [run][joint] of the usable runs, none if they are too few, and why others cannot be used."""
+    """Return the signals [run][joint] of the usable runs, and why others cannot be used."""
     if not numbers:
         return [], ["found no joint that is in both the runs and the joint files"]
     out: list[list[JointSignals]] = []
@@ -176,21 +176,20 @@ def usable_signals(
     out = [with_one_sensor(run) for run in out]
     if not out:
         return [], reasons or ["found no usable run"]
-    count = max(recordings(out)) + 1
+    return out, reasons
+
+
+def too_little(signals: Sequence[Sequence[JointSignals]]) -> str | None:
+    """Return why these runs [run][joint], at least one, are too few or too short for a diagnosis; None: they are not."""
+    count = max(recordings(signals)) + 1
     if count < FEWEST_RUNS:
-        found = counted(count, "usable run") + (" in pieces of one recording" if count < len(out) else "")
-        return [], [
-            *reasons,
-            f"found {found}, expected at least {FEWEST_RUNS}: a gain is measured on held-out runs",
-        ]
-    moving = moving_s(out)
+        found = counted(count, "usable run") + (" in pieces of one recording" if count < len(signals) else "")
+        return f"found {found}, expected at least {FEWEST_RUNS}: a gain is measured on held-out runs"
+    moving = moving_s(signals)
     if moving < SHORTEST_MOVING_S:
         in_motion = math.floor(10.0 * moving) / 10.0
-        return [], [
-            *reasons,
-            f"found {in_motion:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s",
-        ]
-    return out, reasons
+        return f"found {in_motion:.1f} s in motion in all runs, expected at least {SHORTEST_MOVING_S:.0f} s"
+    return None
 
 
 def moving_s(signals: Sequence[Sequence[JointSignals]]) -> float:

@@ -17,7 +17,13 @@ from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.case import search_case
-from jtqd.sysid.diagnosis.dataset import Dataset, build_dataset, resolution_notes, usable_signals
+from jtqd.sysid.diagnosis.dataset import (
+    Dataset,
+    build_dataset,
+    resolution_notes,
+    too_little,
+    usable_signals,
+)
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -81,9 +87,12 @@ def _diagnosed(
 ) -> Findings:
     names = tuple(name for name, _ in runs)
     usable, reasons = usable_signals(runs, joints, numbers)
-    if not usable:
+    few = too_little(usable) if usable else None
+    reasons += [few] if few else []
+    if not usable or few:
         there = {n: joints[n] for n in numbers}
-        plan = next_experiment([], there, "; ".join(reasons)) if there else None
+        seen = [run[0] for run in usable]
+        plan = next_experiment([], there, "; ".join(reasons), signals=seen) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     usable, dataset, odd = without_odd_runs(usable, joints, scope)
     case, fit = search_case(dataset, relevance)

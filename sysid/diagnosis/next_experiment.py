@@ -14,7 +14,7 @@ import numpy as np
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.plan import Plan, check_plan, travel_rad
-from jtqd.sysid.diagnosis.arm_motion import KINDS, Room, csv_text, described, motions, room_of
+from jtqd.sysid.diagnosis.arm_motion import KINDS, csv_text, described, motions, no_room, room_of
 from jtqd.sysid.diagnosis.experiment_choice import kinds_for
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS, VELOCITY_RAD_S, reach_of
@@ -54,13 +54,10 @@ def next_experiment(
     kinds = kinds_for(classes)
     if len(joints) == 1:
         [(number, joint)] = joints.items()
-        return _of_one_joint(classes, kinds, number, why, room_of(joint, signals))
+        return _of_one_joint(classes, number, why, joint, signals)
     if len(joints) > 2:
         return each_joint(
-            {
-                number: _of_one_joint(classes, kinds, number, why, room_of(joint, ()))
-                for number, joint in joints.items()
-            }
+            {number: _of_one_joint(classes, number, why, joint, ()) for number, joint in joints.items()}
         )
     reach = reach_of(joints, velocity_rad_s=velocity_rad_s, temperature=temperature)
     runs = tuple(run for kind in kinds for run in EXPERIMENTS[kind].runs(reach))
@@ -113,14 +110,17 @@ def each_joint(experiments: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _of_one_joint(
-    classes: Sequence[Sequence[str]], kinds: Sequence[str], number: int, why: str, room: Room | None
+    classes: Sequence[Sequence[str]],
+    number: int,
+    why: str,
+    joint: Joint,
+    signals: Sequence[JointSignals],
 ) -> dict[str, Any]:
-    """Return the experiment of a joint that nothing tows."""
+    """Return the experiment of a joint that nothing tows; signals: its runs so far."""
+    kinds, room = kinds_for(classes), room_of(joint, signals)
     parts = [*_begun(classes, why, {kind: KINDS[kind][0] for kind in kinds}), _TOWING]
     if room is None:
-        parts.append(
-            "No motion is planned: neither these runs nor motion_limits of the joint file (or --limits) say where it may go."
-        )
+        parts.append(f"No motion is planned: {no_room(joint, signals)}.")
         return {"why": " ".join(parts), "plan": None, "motion": None}
     made = motions(kinds, room)
     minutes = sum(motion.duration_s for motion in made) / 60.0

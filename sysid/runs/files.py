@@ -130,6 +130,9 @@ def read_runs(
     runs: list[RunFile] = []
     known: list[tuple[str, Stretches]] = []
     paths = run_paths(arguments)
+    twice = next((path for path in paths if paths.count(path) > 1), None)
+    if twice is not None:
+        raise RunError(f"{twice}: found it twice, expected every run once")
     groups = _recordings(paths) if in_pieces else [(path,) for path in paths]
     for path, *parts in progress(groups, "reading runs"):
         if parts:

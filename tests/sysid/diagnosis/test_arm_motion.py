@@ -9,9 +9,11 @@ from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.arm_motion import KINDS, RATE_HZ, Room, csv_text, motions, room_of
+from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS
+from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
 JOINT = load_joint(shipped("joint1.yaml"))
 GRAVITY_NM = 20.0
@@ -110,7 +112,24 @@ def test_without_runs_the_limits_of_the_file_are_the_room() -> None:
     assert made["motion"]["travel_rad"] == [-0.2, 0.4]
     assert "no run shows what torque that needs" in made["why"]
     assert next_experiment([], {1: JOINT})["motion"] is None
-    assert next_experiment([], {1: replace(JOINT, motion_limits=MotionLimits((-0.2, 0.4)))})["motion"] is None
+    without = next_experiment([], {1: replace(JOINT, motion_limits=MotionLimits((-0.2, 0.4), torque_nm=1.0))})
+    assert without["motion"] is None
+    assert without["why"].endswith("(or --limits) lacks velocity_rad_s, acceleration_rad_s2.")
+
+
+def test_one_run_is_too_few_and_shows_where_the_joint_may_go_all_the_same() -> None:
+    """Limits wider than the run's motion do not widen the experiment."""
+    table = bench_run(seconds=6.0, numbers=(1,))
+    position = table.joints[1].link_position_rad
+    assert position is not None
+    wide = MotionLimits((-50.0, 50.0), velocity_rad_s=90.0, acceleration_rad_s2=900.0)
+    found = diagnose([("a", table)], {1: replace(JOINT, motion_limits=wide)})
+    assert found.verdict == "insufficient_data"
+    assert "found 1 usable run, expected at least 2" in found.reasons[-1]
+    assert found.next_experiment is not None
+    low, high = found.next_experiment["motion"]["travel_rad"]
+    assert float(position.min()) < low < high < float(position.max())
+    assert found.next_experiment["motion"]["velocity_rad_s"] < 5.0
 
 
 def test_one_joint_gets_a_motion_and_no_towing_plan() -> None:

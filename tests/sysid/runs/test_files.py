@@ -4,6 +4,7 @@ import doctest
 import gzip
 import os
 import random
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -302,8 +303,12 @@ def test_a_directory_is_its_tables_and_names_are_unique(tmp_path: Path) -> None:
     read = read_runs([one, other / "a.csv.gz"])
     assert [run.name for run in read] == ["a.csv.gz", str(other / "a.csv.gz")]
     assert [(run.path, run.source) for run in read] == [(d / "a.csv.gz", "csv") for d in (one, other)]
+    for in_pieces in (False, True):
+        with pytest.raises(RunError, match=r"one/a\.csv\.gz: found it twice, expected every run once"):
+            read_runs([one, one / "a.csv.gz"], in_pieces=in_pieces)
+    shutil.copy(one / "a.csv.gz", one / "twin.csv.gz")
     with pytest.raises(RunError, match=r"same data as in a\.csv\.gz, expected every run once"):
-        read_runs([one, one / "a.csv.gz"])
+        read_runs([one])
     empty = tmp_path / "empty"
     empty.mkdir()
     with pytest.raises(RunError, match=r"no run file in it, expected names ending in \.csv, "):
