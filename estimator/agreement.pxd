@@ -6,6 +6,7 @@ cdef struct AgreementLaw:
     double gain
     double zero  # square [Nm^2]
     double relevant, lowered  # squares [Nm^2]
+    double level_square, gain_factor
 
 cdef struct AgreementState:
     double trend  # of the innovation [Nm]

@@ -6,8 +6,6 @@ from jtqd.estimator.joint import Fused
 TREND_S: Final[float]
 UP_S: Final[float]
 DOWN_S: Final[float]
-LEVEL: Final[float]
-GAIN: Final[float]
 LOWER_SIGMAS: Final[float]
 LEAST_SHARE: Final[float]
 SURE_SIGMAS: Final[float]
@@ -22,4 +20,17 @@ def levels(
     torsion_nm: FloatArray,
     variance_nm2: FloatArray,
     slope: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...
+def followed(
+    fused: Fused,
+    rated_nm: float,
+    dt_s: FloatArray,
+    apart_nm: FloatArray,
+    direction: FloatArray,
+    velocity_rad_s: FloatArray,
+    torsion_nm: FloatArray,
+    variance_nm2: FloatArray,
+    slope: FloatArray,
+    stiffness: FloatArray,
+    tracked: bool = True,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...

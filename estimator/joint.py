@@ -216,7 +216,7 @@ class Agreement:
 
     slow_nm, fast_nm: RMS levels of the difference's trend and of the rest; gain: of one path against the other; zero_nm: a
     link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status; 0: not
-    known. Definitions: agreement.pyx.
+    known; level_factor, gain_factor: how much larger an error is than its trace in the difference. All: agreement.pyx.
     """
 
     slow_nm: Annotated[float, limits("Nm", gt=0.0)]
@@ -224,6 +224,8 @@ class Agreement:
     gain: Annotated[float, limits(ge=0.0)]
     zero_nm: Annotated[float, limits("Nm", ge=0.0)]
     lowered_nm: Annotated[float, limits("Nm", ge=0.0)] = 0.0
+    level_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 1.4
+    gain_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 2.0
 
     def __post_init__(self) -> None:
         check(self, "fused.agreement")

@@ -1,8 +1,5 @@
 from typing import Final
 
-from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import Fused
-
 MOVING_RAD_S: Final[float]
 ONE_WAY: Final[float]
 BLOCK: Final[int]
@@ -19,16 +16,3 @@ DRIFT_S: Final[float]
 JUMP: Final[float]
 JUMP_S: Final[float]
 KNOWN_SHARE: Final[float]
-
-def followed(
-    fused: Fused,
-    rated_nm: float,
-    dt_s: FloatArray,
-    apart_nm: FloatArray,
-    direction: FloatArray,
-    velocity_rad_s: FloatArray,
-    torsion_nm: FloatArray,
-    variance_nm2: FloatArray,
-    slope: FloatArray,
-    stiffness: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray]: ...

@@ -271,31 +271,6 @@ cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
     return fmax(0.0, share * law.spread_nm - late * late)
 
 
-def followed(fused, rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness):
-    """Return (torsion, current, known): what tracked zeros add to both paths [Nm], and what they take off s_t^2 [Nm^2].
-
-    Arrays [n] of samples in motion, of a run from its start: apart_nm: torsion less current path; variance_nm2: of that;
-    slope: dL/draw of the loss; stiffness: d tau_t/d d of the spring [Nm/rad].
-    """
-    columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness)
-    cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
-    out = np.zeros((3, x.shape[0]))
-    cdef double[:, ::1] to = out
-    cdef ZerosLaw law
-    cdef ZerosState s
-    cdef double link, current
-    cdef Py_ssize_t k
-    # the current zero counts as a torque: whatever a torque per ampere is, its part of the difference is the same
-    fill_zeros(&law, 1.0, rated_nm, fused, True, True)
-    restart_zeros(&law, &s)
-    for k in range(x.shape[0]):
-        link, current = x[k, 7] * s.link_rad, -(1.0 - x[k, 6]) * s.current_a
-        to[0, k], to[1, k], to[2, k] = link, current, known_nm2(&law, &s)
-        if completes(&s, x[k, 0], x[k, 1] + link - current, x[k, 2], x[k, 3], x[k, 4] + link, x[k, 5] - law.spread_nm):
-            update_zeros(&law, &s, x[k, 7], x[k, 6])
-    return tuple(out)
-
-
 cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
     """Return what is believed of the link zero and not taken off, as torque [Nm]."""
     return law.stiffness * (s.x[0] - s.link_rad)

@@ -8,10 +8,10 @@ With residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor on runs no
     reference^2 = covariance of the two paths' run means, less its standard error: what both share is the sensor's zero
     e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2
     e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
-    scale_q = 90 % quantile of |error|/sigma in quadrant q, over 1.645: split conformal prediction by runs
-              (Vovk et al. 2005), every run weighted alike, its level set so that a run left out is covered to 90 %
     zeros: how far the link encoder's zero differs from day to day (`sysid/fit/zeros.py`)
+    agreement: how far the two paths differ on ordinary days (`sysid/fit/agreement.py`)
     tracking: what an estimate of now errs by beyond that (`sysid/fit/tracking.py`)
+    scale_q: in quadrant q, so that the interval with all of these holds on a run left out (`sysid/fit/calibration.py`)
     standstill: how wide the interval of a standing joint is (`sysid/fit/standstill.py`)
 
 A joint with one encoder has the current path alone (torsion None): nothing tells the sensor's zero from that path's
@@ -31,15 +31,14 @@ import numpy as np
 from scipy.optimize import nnls
 
 from jtqd.estimator.agreement import levels
-from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.envelope import MAX_CELLS, Envelope
-from jtqd.estimator.estimator import SLOPE_NM, quadrants
+from jtqd.estimator.estimator import SLOPE_NM
 from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import (
     AdditiveLoss,
     Agreement,
-    DayZeros,
     Friction,
     Fused,
     FusedSigma,
@@ -50,7 +49,7 @@ from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
 from jtqd.sysid.fit.agreement import Levels, fit_agreement
-from jtqd.sysid.fit.conformal import conformal_scale
+from jtqd.sysid.fit.calibration import calibrated
 from jtqd.sysid.fit.envelope import (
     FIT_ROOM_K,
     MOST_WIDER,
@@ -61,6 +60,7 @@ from jtqd.sysid.fit.envelope import (
 )
 from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.residuals import NowErrors, PathResiduals
+from jtqd.sysid.fit.served import served
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.standstill import KNOWN, Standing, ahead_nm, fit_standstill
 from jtqd.sysid.fit.torsion import fit_torsion
@@ -127,11 +127,6 @@ def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> Fu
     )
 
 
-def quadrants_of(run: PathResiduals) -> QuadrantArray:
-    """Return each sample's index into QUADRANTS [n]."""
-    return quadrants(run.raw_nm, run.velocity_rad_s)
-
-
 FOLDS: Final = 4
 _LEAST_RUNS: Final = 6
 
@@ -173,28 +168,27 @@ def fit_fused(
         )
     unseen, standing = _unseen(runs, friction, with_torsion=with_torsion)
     sigma = fit_sigma(unseen, with_torsion=with_torsion)
-    errors, sigmas = zip(*(fused_error(run, sigma, with_torsion=with_torsion) for run in unseen), strict=True)
-    sigma = replace(sigma, scale=conformal_scale(errors, sigmas, [quadrants_of(run) for run in unseen]))
     fit = fit_loss(runs, friction)
-    rmse = tuple(float(np.sqrt(np.mean(e * e))) for e in errors)
     torsion = fit_torsion(runs) if with_torsion else None
     envelope = None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
     fused = Fused(fit.loss, torsion, sigma, envelope=envelope)
+    rmse = tuple(float(np.sqrt(np.mean(served(run, fused).error_nm ** 2))) for run in unseen)
     if rated_nm is not None and torsion is not None:
-        fused = replace(fused, zeros=_day_zeros(unseen, fused, rated_nm))
+        fused = replace(fused, zeros=fit_zeros(unseen, fused, rated_nm))
         fused = replace(fused, agreement=_agreement(unseen, fused, rated_nm))
     if torsion is not None:
-        standing_errors = [_standing(*run, sigma) for run in standing]
+        standing_errors = [_standing(*run, fused) for run in standing]
         fused = replace(
             fused,
-            tracking=tracking_of_unseen(unseen, sigma),
+            tracking=tracking_of_unseen(unseen, fused),
             standstill=fit_standstill(standing_errors, sigma.reference_nm),
         )
+    fused = calibrated(unseen, fused, rated_nm)
     return FusedFit(fused, fit, rmse)
 
 
-def tracking_of_unseen(unseen: Sequence[PathResiduals], sigma: FusedSigma) -> Tracking | None:
-    """Return what an estimate of now adds to the calibrated sigma on unseen runs of a joint with torsion.
+def tracking_of_unseen(unseen: Sequence[PathResiduals], fused: Fused) -> Tracking | None:
+    """Return what an estimate of now adds to sigma on unseen runs of a joint with torsion.
 
     None where the low pass of new configurations errs no more, or positions are not known.
     """
@@ -202,20 +196,9 @@ def tracking_of_unseen(unseen: Sequence[PathResiduals], sigma: FusedSigma) -> Tr
         return None
     if not worth_it([run.now.tracked_nm for run in unseen], [run.now.late_nm for run in unseen]):
         return None
-    errors, sigmas = zip(*(fused_error(run, sigma) for run in unseen), strict=True)
-    scales = [np.array(sigma.scale)[quadrants_of(run)] for run in unseen]
+    each = [served(run, fused) for run in unseen]
     return fit_tracking(
-        errors,
-        [scale * each for scale, each in zip(scales, sigmas, strict=True)],
-        [_error_now(run, sigma) for run in unseen],
-        [run.velocity_rad_s for run in unseen],
-    )
-
-
-def _day_zeros(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> DayZeros | None:
-    quadrant = [quadrants_of(run) for run in unseen]
-    return fit_zeros(
-        unseen, fused, rated_nm, lambda errors, sigmas: conformal_scale(errors, sigmas, quadrant)
+        [run.error_nm for run in each], [run.now_nm for run in each], [run.velocity_rad_s for run in each]
     )
 
 
@@ -328,29 +311,10 @@ def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, Flo
     return value, held(half, seen.dt_s, running)
 
 
-def fused_error(
-    run: PathResiduals, sigma: FusedSigma, *, with_torsion: bool = True
-) -> tuple[FloatArray, FloatArray]:
-    """Return error and standard deviation [n] of the fused physics: its weights apply to the paths' errors alike."""
-    alpha, spread = Fusion(sigma, with_torsion).weigh_many(
-        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
-    )
-    return run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm), spread
-
-
-def _standing(run: PathResiduals, ahead: FloatArray, sigma: FusedSigma) -> Standing:
+def _standing(run: PathResiduals, ahead: FloatArray, fused: Fused) -> Standing:
     """Return what a standing run tells of the interval at rest."""
-    error, _ = fused_error(run, sigma)
-    spread, bound = Fusion(replace(sigma, reference_nm=0.0), True).rest_many(
+    spread, bound = Fusion(replace(fused.sigma, reference_nm=0.0), True).rest_many(
         run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
     )
-    return Standing(error + ahead, spread, bound, run.open_nm <= KNOWN * sigma.torsion_nm)
-
-
-def _error_now(run: PathResiduals, sigma: FusedSigma) -> FloatArray:
-    """Return the error [n] of the estimate of now: tau_t + (1 - alpha) (tau_c - tau_t'), as `FusedEstimator` forms it."""
-    alpha, _ = Fusion(sigma, True).weigh_many(
-        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
-    )
-    result: FloatArray = run.now.tracked_nm + (1.0 - alpha) * (run.current_error_nm - run.now.aged_nm)
-    return result
+    error = served(run, fused).error_nm
+    return Standing(error + ahead, spread, bound, run.open_nm <= KNOWN * fused.sigma.torsion_nm)

@@ -9,12 +9,12 @@ The mean error of a run is its zero and the sensor's; reference^2 is the sensor'
 variance is that of means over WINDOW_S, times WINDOW_S, after least squares with the states of `zeros.pyx` in each run;
 assumed is that of both paths, less that of the zero. The same runs are then estimated as in service, each from its start:
 zeros tracked, what is known of them taken off value and sigma. The section is written where that takes at least WORTH off
-the mean square error; scale is calibrated there, as that of `fused.sigma`.
+the mean square error; `sysid/fit/calibration.py` sets its scale.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
@@ -23,8 +23,9 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import DayZeros, Fused, FusedSigma
-from jtqd.estimator.zeros import CORRELATION_S, MOVING_RAD_S, ONE_WAY, followed
+from jtqd.estimator.zeros import CORRELATION_S, MOVING_RAD_S, ONE_WAY
 from jtqd.sysid.fit.residuals import PathResiduals
+from jtqd.sysid.fit.served import served
 
 WORTH: Final = 0.05
 """Part of the mean square error on runs left out that the learned zeros must take away to be believed."""
@@ -37,19 +38,9 @@ _SHORTEST_S: Final = 1e-3
 _FEWEST: Final = 8
 """Runs, of a day each, from which a spread of days can be told."""
 
-Scale = tuple[float, float, float, float]
 
-
-def fit_zeros(
-    runs: Sequence[PathResiduals],
-    fused: Fused,
-    rated_nm: float,
-    calibrate: Callable[[Sequence[FloatArray], Sequence[FloatArray]], Scale],
-) -> DayZeros | None:
-    """Return the section of runs left out; None where it is not worth it, or for too few runs.
-
-    calibrate: errors and sigmas [n] of each run -> factor per quadrant.
-    """
+def fit_zeros(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> DayZeros | None:
+    """Return the section of runs left out, scale 1; None where it is not worth it, or for too few runs."""
     if len(runs) < _FEWEST or not all(len(run.dt_s) for run in runs):
         return None
     sigma = fused.sigma
@@ -60,13 +51,11 @@ def fit_zeros(
     stiffness = float(np.mean([run.stiffness_nm_per_rad.mean() for run in runs]))
     nm = float(np.sqrt(spread))
     found = DayZeros(nm / stiffness, nm, (1.0, 1.0, 1.0, 1.0), correlation(runs, sigma, nm))
-    before = [_estimated(run, fused, rated_nm)[0] for run in runs]
-    errors, sigmas = zip(
-        *(_estimated(run, replace(fused, zeros=found), rated_nm) for run in runs), strict=True
+    before, after = (
+        _mean_square([served(run, section, rated_nm, tracked=True).error_nm for run in runs])
+        for section in (fused, replace(fused, zeros=found))
     )
-    if not _mean_square(errors) < (1.0 - WORTH) * _mean_square(before):
-        return None
-    return replace(found, scale=calibrate(errors, sigmas))
+    return found if after < (1.0 - WORTH) * before else None
 
 
 def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: float) -> float | None:
@@ -105,24 +94,3 @@ def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: flo
 
 def _mean_square(errors: Sequence[FloatArray]) -> float:
     return float(np.mean([np.mean(error * error) for error in errors]))
-
-
-def _estimated(run: PathResiduals, fused: Fused, rated_nm: float) -> tuple[FloatArray, FloatArray]:
-    """Return error and standard deviation [n] of the fused physics over a run with zeros tracked from its start on."""
-    fusion = Fusion(fused.sigma, True)
-    seen = (run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm)
-    torsion, current, known = followed(
-        fused,
-        rated_nm,
-        run.dt_s,
-        run.torsion_error_nm - run.current_error_nm,
-        run.direction,
-        run.velocity_rad_s,
-        run.torsion_nm,
-        fusion.variance_many(*seen),
-        run.slope,
-        run.stiffness_nm_per_rad,
-    )
-    alpha, spread = fusion.weigh_known(*seen, known)
-    e_c, e_t = run.current_error_nm + current, run.torsion_error_nm + torsion
-    return e_c + alpha * (e_t - e_c), spread

@@ -34,8 +34,8 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.towing.bench_file import AngleWave, TowedJoint, TowingBench
 from jtqd.sysid.campaign.plan import Run
 from jtqd.sysid.campaign.plans import make_plan
-from jtqd.sysid.fit.conformal import conformal_scale
-from jtqd.sysid.fit.fused import fit_sigma, fused_error, path_residuals, quadrants_of
+from jtqd.sysid.fit.calibration import calibrated
+from jtqd.sysid.fit.fused import fit_sigma, path_residuals
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.fit.torsion import TorsionError
@@ -234,16 +234,10 @@ def knowing(
         signals = run_signals(run.name, joint, settings, run.table.time_s, columns)
         if signals.moving.any():
             found.append(path_residuals(signals, joint.fused.loss, torsion))
-    sigma = fit_sigma(found)
-    errors, sigmas = zip(*(fused_error(run, sigma) for run in found), strict=True)
-    scale = conformal_scale(errors, sigmas, [quadrants_of(run) for run in found])
-    fused = Fused(joint.fused.loss, torsion, replace(sigma, scale=scale), tracking=joint.fused.tracking)
+    fused = Fused(joint.fused.loss, torsion, fit_sigma(found), tracking=joint.fused.tracking)
     if not zeros:  # else nothing is left to learn
-        quadrants = [quadrants_of(run) for run in found]
-        learned = fit_zeros(
-            found, fused, joint.rated_torque_nm, lambda e, s: conformal_scale(e, s, quadrants)
-        )
-        fused = replace(fused, zeros=learned)
+        fused = replace(fused, zeros=fit_zeros(found, fused, joint.rated_torque_nm))
+    fused = calibrated(found, fused, joint.rated_torque_nm)
     return replace(one, joint=replace(joint, fused=fused))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.agreement import DOWN_S, GAIN, LEVEL, levels
+from jtqd.estimator.agreement import DOWN_S, levels
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
@@ -111,7 +111,8 @@ def test_always_back_driven_a_friction_is_no_gain_that_lowers_the_status() -> No
     n = 400 * 16
     t = np.arange(n) * 1e-3
     v = 2.0 * np.sin(2.0 * np.pi * 0.4 * t)
-    s, fused = np.sign(v), replace(USUAL.fused, agreement=None)  # type: ignore[type-var]
+    every = replace(AGREEMENT, slow_nm=1e-3, fast_nm=1e-3, gain=0.0, zero_nm=0.0)
+    s, fused = np.sign(v), replace(USUAL.fused, agreement=every)  # type: ignore[type-var]
     doubt = {}
     for name, torque in (("back-driven", -30.0 * s), ("both", np.where(t % 5.0 < 2.5, 30.0, -30.0))):
         apart = 0.03 * torque  # of a gain; against the motion also that of a friction
@@ -124,7 +125,7 @@ def test_always_back_driven_a_friction_is_no_gain_that_lowers_the_status() -> No
     for name, least, most in (("both", 0.75, 1.0), ("back-driven", 0.0, 0.4)):
         gain, sure = doubt[name]
         assert gain > 0.02
-        assert least < sure / (GAIN * gain * 30.0) < most
+        assert least < sure / (AGREEMENT.gain_factor * gain * 30.0) < most
 
 
 def test_doubt_fades_when_the_joint_is_again_that_of_its_file() -> None:
@@ -164,9 +165,11 @@ def test_sigma_is_the_formula_of_the_levels() -> None:
         *(x[on] for x in (dt, apart, s, v, parts[3], variance, (more - loss) / SLOPE_NM)),
     )
     last = np.flatnonzero(on)[-1]
-    doubt = LEVEL**2 * (max(slow[-1] - AGREEMENT.slow_nm**2, 0.0) + max(fast[-1] - AGREEMENT.fast_nm**2, 0.0))
+    doubt = AGREEMENT.level_factor**2 * (
+        max(slow[-1] - AGREEMENT.slow_nm**2, 0.0) + max(fast[-1] - AGREEMENT.fast_nm**2, 0.0)
+    )
     doubt += max(left[-1] ** 2 - AGREEMENT.zero_nm**2, 0.0)
-    doubt += (GAIN * max(gain[-1] - AGREEMENT.gain, 0.0) * parts[3][last]) ** 2
+    doubt += (AGREEMENT.gain_factor * max(gain[-1] - AGREEMENT.gain, 0.0) * parts[3][last]) ** 2
     share = max(alpha[last], 1.0 - alpha[last])
     assert doubt > 0.1
     assert sure[-1] ** 2 <= doubt * 1.02

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.agreement import GAIN, LEVEL, levels
+from jtqd.estimator.agreement import followed, levels
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
 from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import DayZeros, Joint
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.zeros import followed
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_fused_estimator import NARROW
@@ -98,7 +97,7 @@ def test_fits_see_what_the_loop_does() -> None:
     parts = (raw, held(half, half_dt, np.ones(len(raw), bool)), v, torsion, open_nm)
     fusion = Fusion(both.fused.sigma, True)
     signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.variance_many(*parts), slope)
-    taken, _, known = followed(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
+    taken, _, known, *_ = followed(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
     slow, fast, gain, left, _ = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
 
     plain, zeros = tracked(columns, LEARNING)
@@ -106,10 +105,12 @@ def test_fits_see_what_the_loop_does() -> None:
     assert taken[-1] / K == pytest.approx(zeros.link_used_rad, rel=2e-3)
     last = int(np.flatnonzero(on)[-1])
     alpha = float(fusion.weigh_known(*parts, known)[0][-1])
-    doubt = LEVEL**2 * (max(slow - AGREEMENT.slow_nm**2, 0.0) + max(fast - AGREEMENT.fast_nm**2, 0.0))
+    doubt = AGREEMENT.level_factor**2 * (
+        max(slow - AGREEMENT.slow_nm**2, 0.0) + max(fast - AGREEMENT.fast_nm**2, 0.0)
+    )
     doubt += max(left**2 - AGREEMENT.zero_nm**2, 0.0)
     assert 0.05 < known[-1] < 0.5 * doubt
-    doubt += (GAIN * max(gain - AGREEMENT.gain, 0.0) * float(torsion[-1])) ** 2
+    doubt += (AGREEMENT.gain_factor * max(gain - AGREEMENT.gain, 0.0) * float(torsion[-1])) ** 2
     more = max(alpha, 1.0 - alpha) ** 2 * doubt + alpha**2 * known[-1]
     assert doubted.sigma_nm[last] ** 2 - plain.sigma_nm[last] ** 2 == pytest.approx(more, rel=0.03)
     assert alpha**2 * known[-1] > 0.06 * more
@@ -120,7 +121,7 @@ def test_what_is_not_yet_taken_off_is_not_known() -> None:
     v = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4)
     one, zero_nm = np.ones(n), 12.0
     assert LEARNING.fused is not None
-    taken, _, known = followed(
+    taken, _, known, *_ = followed(
         LEARNING.fused,
         40.0,
         1e-3 * one,

@@ -26,12 +26,11 @@ from jtqd.sysid.fit.fused import (
     fit_fused,
     fit_sigma,
     folds,
-    fused_error,
     path_residuals,
-    quadrants_of,
 )
 from jtqd.sysid.fit.losses import PER_K_PRIOR, fit_loss
 from jtqd.sysid.fit.residuals import PathResiduals
+from jtqd.sysid.fit.served import served
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
 from tests.estimator.fused_helpers import fused_joint
@@ -188,13 +187,16 @@ def test_folds_never_split_a_run_and_judge_each_once(count: int) -> None:
 # ---- the whole fit
 
 
+DRAWN = np.random.default_rng(41).uniform(-1.0, 1.0, (14, 3)).tolist()
+ZEROS_NM = [0.3 * (a - float(np.mean([b for b, _, _ in DRAWN]))) for a, _, _ in DRAWN]
+"""Of the sensor, by run."""
+
+
 @pytest.fixture(scope="module")
 def runs() -> list[RunSignals]:
-    rng = np.random.default_rng(41)
-    drawn = rng.uniform(-1.0, 1.0, (14, 3)).tolist()
     return [
-        made_run(4100 + k, smooth_loss(), STIFF, Nuisance(0.3 * a, 0.2 * b, 25.0 + 5.0 * c), noise_nm=0.1)
-        for k, (a, b, c) in enumerate(drawn)
+        made_run(4100 + k, smooth_loss(), STIFF, Nuisance(zero, 0.2 * b, 25.0 + 5.0 * c), noise_nm=0.1)
+        for k, (zero, (_, b, c)) in enumerate(zip(ZEROS_NM, DRAWN, strict=True))
     ]
 
 
@@ -212,20 +214,23 @@ def test_the_section_is_whole_and_can_be_written(fit: FusedFit) -> None:
 
 
 def test_unseen_runs_are_as_wrong_as_sigma_says(runs: list[RunSignals], fit: FusedFit) -> None:
-    """Zeros of +-0.3 Nm are 0.17 Nm RMS, noise 0.1; judged by fits without the run, the share inside is that aimed at."""
+    """Zeros of +-0.3 Nm are 0.17 Nm RMS, noise 0.1; fits without the run hold the torque, not the sensor, in 90 %."""
     assert len(fit.unseen_rmse_nm) == len(runs)
     assert fit.fused.sigma.reference_nm == pytest.approx(0.17, abs=0.06)
     assert 0.15 < np.sqrt(np.mean(np.square(fit.unseen_rmse_nm))) < 0.25
-    judged = []
+    torque, sensor = [], []
     for known, indices in folds(runs):
         loss, torsion = fit_loss(known, FRICTION).loss, fit_torsion(known)
         for n in indices:
-            parts = path_residuals(runs[n], loss, torsion)
-            error, sigma = fused_error(parts, fit.fused.sigma)
-            assert np.sqrt(np.mean(error**2)) == pytest.approx(fit.unseen_rmse_nm[n], rel=1e-6)
-            scale = np.array(fit.fused.sigma.scale)[quadrants_of(parts)]
-            judged.append(np.mean(np.abs(error) <= GAUSS * scale * sigma))
-    assert np.mean(judged) == pytest.approx(0.9, abs=0.02)
+            one = served(path_residuals(runs[n], loss, torsion), fit.fused)
+            assert np.sqrt(np.mean(one.error_nm**2)) == pytest.approx(fit.unseen_rmse_nm[n], rel=1e-6)
+            wide = GAUSS * np.hypot(
+                np.array(fit.fused.sigma.scale)[one.quadrant] * one.spread_nm, np.sqrt(one.more_nm2)
+            )
+            torque.append(np.mean(np.abs(one.error_nm - ZEROS_NM[n]) <= wide))
+            sensor.append(np.mean(np.abs(one.error_nm) <= wide))
+    assert np.mean(torque) == pytest.approx(0.92, abs=0.03)  # of 14 runs their zeros' mean is in doubt
+    assert np.mean(sensor) < 0.8
 
 
 def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> None:
@@ -233,9 +238,8 @@ def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> 
     run = runs[3]
     assert fit.fused.torsion is not None
     parts = path_residuals(run, fit.fused.loss, fit.fused.torsion)
-    error, sigma = fused_error(parts, fit.fused.sigma)
-    sensor = run.sensor_nm
-    value, spread = Fusion(fit.fused.sigma, True).fuse_many(
+    one, sensor = served(parts, fit.fused), run.sensor_nm
+    value, spread = Fusion(replace(fit.fused.sigma, reference_nm=0.0), True).fuse_many(
         parts.raw_nm,
         parts.raw_nm - sensor - parts.current_error_nm,
         parts.half_nm,
@@ -243,8 +247,8 @@ def test_the_error_of_the_fused_value(runs: list[RunSignals], fit: FusedFit) -> 
         parts.torsion_nm,
         parts.open_nm,
     )
-    assert error == pytest.approx(value - sensor, abs=1e-9)
-    assert np.array_equal(sigma, spread)
+    assert one.error_nm == pytest.approx(value - sensor, abs=1e-9)
+    assert one.spread_nm == pytest.approx(spread, rel=1e-9)
     assert parts.torsion_nm - parts.torsion_error_nm == pytest.approx(sensor, abs=1e-9)
 
 
@@ -261,10 +265,10 @@ def test_one_encoder_has_the_current_path_alone(runs: list[RunSignals]) -> None:
         loss = fit_loss(known, FRICTION).loss
         for n in indices:
             parts = path_residuals(blind[n], loss, None)
-            error, sigma = fused_error(parts, found.fused.sigma, with_torsion=False)
-            assert np.array_equal(error, parts.current_error_nm)
-            scale = np.array(found.fused.sigma.scale)[quadrants_of(parts)]
-            judged.append(np.mean(np.abs(error) <= GAUSS * scale * sigma))
+            one = served(parts, found.fused)
+            assert np.array_equal(one.error_nm, parts.current_error_nm)
+            scale = np.array(found.fused.sigma.scale)[one.quadrant]
+            judged.append(np.mean(np.abs(one.error_nm) <= GAUSS * scale * one.spread_nm))
     assert np.mean(judged) == pytest.approx(0.9, abs=0.03)
     joint = replace(fused_joint(), fused=found.fused)
     assert Joint.from_mapping(joint.to_mapping(), "x").fused == found.fused

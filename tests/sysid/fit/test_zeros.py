@@ -1,4 +1,4 @@
-"""Section `fused.zeros`: the spread of the days' zeros is found, believed where runs left out confirm it, and calibrated."""
+"""Section `fused.zeros`: the spread of the days' zeros is found, and believed where runs left out confirm it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import DayZeros, Fused, FusedSigma
 from jtqd.sysid.fit.residuals import PathResiduals
+from jtqd.sysid.fit.served import Served, served
 from jtqd.sysid.fit.zeros import correlation, fit_zeros
 from tests.estimator.test_fused_estimator import NARROW
 
@@ -47,12 +47,8 @@ def fused(sigma: FusedSigma = SIGMA) -> Fused:
     return replace(NARROW.fused, sigma=sigma)
 
 
-def no_scale(errors: Sequence[FloatArray], sigmas: Sequence[FloatArray]) -> tuple[float, float, float, float]:
-    return (1.0, 1.0, 1.0, 1.0)
-
-
 def fitted(of: Sequence[PathResiduals], sigma: FusedSigma = SIGMA) -> DayZeros | None:
-    return fit_zeros(of, fused(sigma), RATED, no_scale)
+    return fit_zeros(of, fused(sigma), RATED)
 
 
 def test_the_spread_of_the_days_is_found_as_an_angle_and_as_a_torque() -> None:
@@ -93,23 +89,18 @@ def test_days_that_hardly_differ_and_few_runs_have_no_section() -> None:
     assert fitted(runs(0.4)[:7]) is None
 
 
-def test_its_calibration_sees_the_errors_of_tracked_zeros() -> None:
-    seen = []
-
-    def calibrate(
-        errors: Sequence[FloatArray], sigmas: Sequence[FloatArray]
-    ) -> tuple[float, float, float, float]:
-        seen.append((errors, sigmas))
-        return (1.5, 1.6, 1.7, 1.8)
-
+def test_served_with_tracked_zeros_errs_less_and_knows_it() -> None:
     days = runs(0.4)
-    found = fit_zeros(days, fused(), RATED, calibrate)
+    found = fitted(days)
     assert found is not None
-    assert found.scale == (1.5, 1.6, 1.7, 1.8)
-    errors, sigmas = seen[0]
+    learned = [served(run, replace(fused(), zeros=found), RATED, tracked=True) for run in days]
+    plain = [served(run, fused()) for run in days]
     late = slice(5000, None)
-    learned = float(np.mean([np.mean(error[late] ** 2) for error in errors]))
-    alpha = 0.6**2 / (0.6**2 + 0.5**2)
-    plain = [run.current_error_nm + alpha * (run.torsion_error_nm - run.current_error_nm) for run in days]
-    assert learned < 0.8 * float(np.mean([np.mean(error[late] ** 2) for error in plain]))
-    assert np.mean([sigma[-1] for sigma in sigmas]) < 0.9 * np.mean([sigma[0] for sigma in sigmas])
+
+    def mean_square(of: list[Served]) -> float:
+        return float(np.mean([np.mean(run.error_nm[late] ** 2) for run in of]))
+
+    assert mean_square(learned) < 0.8 * mean_square(plain)
+    assert np.mean([run.spread_nm[-1] for run in learned]) < 0.9 * np.mean(
+        [run.spread_nm[0] for run in plain]
+    )
