@@ -15,7 +15,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Agreement
 
-QUANTILE: Final = 0.8
+QUANTILE: Final = 0.75
 """Of the blocks of all runs: the rest of ordinary days has a little doubt. Chosen on runs that no figure is reported on."""
 LOWERED: Final = 0.99
 """Of the blocks of all runs: a doubt beyond it is none of ordinary days. What is left, and as much by the envelope

@@ -25,9 +25,12 @@ _STEPS: Final = 200
 
 
 def conformal_scale(
-    errors: Sequence[FloatArray], sigmas: Sequence[FloatArray], quadrants: Sequence[QuadrantArray]
+    errors: Sequence[FloatArray],
+    sigmas: Sequence[FloatArray],
+    quadrants: Sequence[QuadrantArray],
+    coverage: float = COVERAGE,
 ) -> tuple[float, float, float, float]:
-    """Return the factor per quadrant that makes value +- GAUSS sigma cover COVERAGE of unseen samples.
+    """Return the factor per quadrant that makes value +- GAUSS sigma cover this share of unseen samples.
 
     One array per run each. Runs count alike in a quadrant, whatever their length; a quadrant in which no run has 50
     samples takes the factor of all. Raises ValueError where there are no samples at all.
@@ -35,12 +38,12 @@ def conformal_scale(
     ratios = [np.abs(e) / s for e, s in zip(errors, sigmas, strict=True)]
     if not any(map(len, ratios)):
         raise ValueError("found no samples to calibrate sigma with, expected some")
-    every = quantile_by_runs(ratios)
+    every = quantile_by_runs(ratios, coverage)
     scales = []
     for q in range(4):
         inside = [ratio[quadrant == q] for ratio, quadrant in zip(ratios, quadrants, strict=True)]
         inside = [part for part in inside if len(part) >= FEWEST]
-        scales.append((quantile_by_runs(inside) if inside else every) / GAUSS)
+        scales.append((quantile_by_runs(inside, coverage) if inside else every) / GAUSS)
     a, b, c, d = (max(scale, _LEAST_SCALE) for scale in scales)
     return a, b, c, d
 
