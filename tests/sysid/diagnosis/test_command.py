@@ -227,7 +227,7 @@ def test_parquet_is_the_same_run(tmp_path: Path, core: Core, capsys: pytest.Capt
     capsys.readouterr()
     spoilt = columns.current_a.copy() if columns.current_a is not None else None
     assert spoilt is not None
-    spoilt[4] = np.nan
+    spoilt[4] = np.inf
     for content, wanted in ((spoilt, "row 5, column 'j1.current_a'"), (["x"] * len(spoilt), "found 'x'")):
         parquet.write_table(arrow.table({**cells, "j1.current_a": content}), path)
         assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1
@@ -382,7 +382,7 @@ def cell(text: str, row: int, column: int, content: str) -> str:
     [
         (lambda text: "", "empty file"),
         (lambda text: text.splitlines()[0] + "\n", "0 samples"),
-        (lambda text: cell(text, 5, 1, "nan"), "line 6, column 'j1.current_a': found 'nan'"),
+        (lambda text: cell(text, 5, 1, "inf"), "line 6, column 'j1.current_a': found 'inf'"),
         (lambda text: cell(text, 7, 2, "12,5"), "line 8: found"),
         (lambda text: cell(text, 9, 1, "1.5 A"), "line 10, column 'j1.current_a': found '1.5 A'"),
         (lambda text: cell(text, 9, 0, "0.001"), "expected rising time"),
