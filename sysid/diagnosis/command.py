@@ -25,7 +25,7 @@ from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
 from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
@@ -51,6 +51,7 @@ def main(argv: list[str]) -> int:
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
+        check_effects(options.without, options.given)
         check_installed("analysis", *_NEEDED)
         check_joint_files(files)
         _check_out(options.out, options.force)

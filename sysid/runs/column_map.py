@@ -40,6 +40,9 @@ WINDOW_S: Final = 0.05
 """Longest piece of a position to which a cubic is fitted for its velocity and acceleration."""
 _QUIET: Final = 0.02
 _FEWEST_ROWS: Final = 7
+_SOURCE: Final = (
+    "a column of the file, an expression of columns, or {column: either, scale: 1.0, offset: 0.0}"
+)
 
 
 @dataclass(frozen=True)
@@ -114,9 +117,11 @@ class ColumnMap:
         section = Section(full, where)
         columns: dict[str, Column] = {}
         for key in targets():
-            inner = section.section(key, optional=key != TIME and full.get(key, "") is not None)
-            if inner is not None:
-                columns[key] = _column(inner)
+            value = section.raw(key, expected=_SOURCE) if key == TIME else section.raw(key, None)
+            if key in full:
+                if not isinstance(value, dict):
+                    raise section.error(key, value, _SOURCE)
+                columns[key] = _column(section.required(key))
         files = {
             joint: folder / section.text(f"j{joint}.joint_file")
             for joint in JOINTS
@@ -243,8 +248,11 @@ def _column(section: Section) -> Column:
     scale = section.number("scale", unit="target units per cell unit", default=1.0)
     if scale == 0.0:
         raise section.error("scale", scale, "a number other than 0")
+    name = section.raw("column", expected="a column of the file, or an expression of columns")
+    if not isinstance(name, str):
+        raise section.error("column", name, "a column of the file, or an expression of columns")
     column = Column(
-        section.text("column"),
+        name,
         scale,
         section.number("offset", unit="target units", default=0.0),
     )

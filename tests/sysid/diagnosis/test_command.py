@@ -287,7 +287,7 @@ def test_options_reach_the_diagnosis(tmp_path: Path, core: Core, capsys: pytest.
     assert asked_limits is not None
     assert (asked_limits.travel_rad, asked_limits.velocity_rad_s) == ((-0.5, 0.5), 1.0)
     assert load_joint(tmp_path / "o" / "extended.joint.yaml").motion_limits is None  # not of the joint
-    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--without", "gravity") == 1
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--without", "gravity") == 2
     assert "--without gravity: found no effect of that name" in capsys.readouterr().err
     for wrong in ("speed=1", "travel_rad=1", "travel_rad=1:-1", "velocity_rad_s=fast", "torque_nm=0"):
         with pytest.raises(SystemExit) as caught:
@@ -350,6 +350,8 @@ def test_a_failure_on_the_way_leaves_the_earlier_results(
         (("--joint", "a.yaml", "--joint", "b.yaml"), "two files for all joints"),
         (("--joint", "1=a.yaml", "--joint", "1=b.yaml"), "two files of joint 1"),
         (("--joint", "1=a.yaml", "--joint", "b.yaml"), "expected either"),
+        (("--joint", "a.yaml", "--given", "gravity"), "--given gravity: found no effect"),
+        (("--joint", "a.yaml", "--without", "cogging", "--given", "1=cogging"), "expected one of them"),
     ],
 )
 def test_usage(

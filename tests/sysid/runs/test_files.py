@@ -86,6 +86,16 @@ def test_map_renames_scales_shifts_and_flips(tmp_path: Path) -> None:
         ({"time_s": {"scale": 2.0}}, "time_s.column': missing"),
         ({"time_s": 3}, "key 'time_s': found 3"),
         ({"time_s": "t", "j1.current_a": None}, "key 'j1.current_a': found None"),
+        (
+            {"j1.current_a": "A"},
+            "missing, expected a column of the file, an expression of columns, or {column:",
+        ),
+        (
+            {"time_s": ["a"]},
+            "found ['a'], expected a column of the file, an expression of columns, or {column:",
+        ),
+        ({"time_s": {"scale": 2.0}}, "missing, expected a column of the file, or an expression of columns"),
+        ({"time_s": {"column": 3}}, "found 3, expected a column of the file, or an expression of columns"),
     ],
 )
 def test_wrong_maps_are_named(mapping: dict[str, object], said: str) -> None:
