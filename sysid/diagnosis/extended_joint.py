@@ -13,7 +13,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value, shows_at
 from jtqd.sysid.fit.joint_writer import write_joint
@@ -34,8 +33,9 @@ def extended(
 ) -> Joint:
     """Return the joint with the causes of joint `number` and of the sensor among its effects.
 
-    sha256: hash of each run's file by name; date: ISO 8601. What an effect of a whole class is written as is the first of
-    its class, and the provenance says so: on these runs all of the class fit alike, elsewhere they may not.
+    sha256: hash of each run's file by name, those that were used are kept; date: ISO 8601. What an effect of a whole
+    class is written as is the first of its class, and the provenance says so: on these runs all of the class fit alike,
+    elsewhere they may not.
 
     Raises ConfigError for an effect or a value that joint files do not allow.
     """
@@ -56,7 +56,7 @@ def extended(
             "rmse_after_nm": _rounded(gain.rmse_after_nm),
             "split": gain.split,
         }
-    record["sha256"] = {name: sha256[name] for name in findings.runs if name in sha256}
+    record["sha256"] = {name: sha256[name] for name in findings.used_runs if name in sha256}
     return replace(joint, effects=tuple(effects), provenance={**joint.provenance, "diagnosis": record})
 
 
@@ -77,9 +77,8 @@ def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
 def title(number: int, findings: Findings) -> str:
     """First line of an extended joint file."""
     names = [cause.name for cause in findings.causes if shows_at(cause.joint, number)]
-    runs = counted(len(findings.runs), "run")
     what = f"found {', '.join(names)}" if names else "found no effect of this joint to add"
-    return f"Written by jtq diagnose from {runs}: {what} (verdict {findings.verdict})."
+    return f"Written by jtq diagnose from {findings.runs_text}: {what} (verdict {findings.verdict})."
 
 
 def write_extended(

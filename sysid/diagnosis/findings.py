@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.file_values import FileValue, file_values
 
@@ -238,7 +239,9 @@ class OddRun:
 
 @dataclass(frozen=True)
 class Findings:
-    """All of it. gaps: largest excess first; causes: largest first; reasons: lines for people."""
+    """All of it. runs: all that were given; used: those of them that anything was found in, empty for all; gaps: largest
+    excess first; causes: largest first; reasons: lines for people.
+    """
 
     verdict: str
     reasons: tuple[str, ...]
@@ -256,6 +259,18 @@ class Findings:
     left_over: LeftOver | None = None
     odd_runs: tuple[OddRun, ...] = ()
     bounded: tuple[BoundedValue, ...] = ()
+    used: tuple[str, ...] = ()
+
+    @property
+    def used_runs(self) -> tuple[str, ...]:
+        """Runs that what was found is of."""
+        return self.used or self.runs
+
+    @property
+    def runs_text(self) -> str:
+        """How many runs were used, e.g. "6 of 7 runs"."""
+        used, count = len(self.used_runs), len(self.runs)
+        return counted(count, "run") if used == count else f"{used} of {counted(count, 'run')}"
 
 
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
@@ -291,7 +306,10 @@ def to_mapping(
         "odd_runs": [_odd_run(each) for each in findings.odd_runs],
         "bounded": [_bounded(each) for each in findings.bounded],
         "joints": findings.joints,
-        "runs": [{"name": name, "sha256": (sha256 or {}).get(name)} for name in findings.runs],
+        "runs": [
+            {"name": name, "sha256": (sha256 or {}).get(name), "used": name in findings.used_runs}
+            for name in findings.runs
+        ],
         "gaps": [_gap(each) for each in findings.gaps],
         "candidates": [_candidate(each) for each in findings.candidates],
         "channel_notes": findings.channel_notes,

@@ -295,6 +295,25 @@ def test_options_reach_the_diagnosis(tmp_path: Path, core: Core, capsys: pytest.
         assert caught.value.code == 2
 
 
+def test_limits_beyond_those_of_the_file_are_said(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path, numbers=(1,))
+    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": None, "motion": None})
+    limits = {"travel_rad": [-0.5, 0.5], "velocity_rad_s": 1.0}
+    (tmp_path / "j.yaml").write_text(joint_text(motion_limits=limits))
+    for asked, sentence in (
+        ("travel_rad=-0.4:0.5,velocity_rad_s=0.5,torque_nm=5", ""),
+        (
+            "travel_rad=-0.4:0.6,velocity_rad_s=2,torque_nm=5",
+            " --limits allows more than motion_limits of joint 1: travel_rad -0.4:0.6, the file -0.5:0.5; "
+            "velocity_rad_s 2, the file 1.",
+        ),
+    ):
+        options = ("--joint", tmp_path / "j.yaml", "--out", tmp_path / "o", "--limits", asked, "--force")
+        run(tmp_path / "a.csv", *options)
+        made = json.loads((tmp_path / "o" / "findings.json").read_text())
+        assert made["next_experiment"]["why"] == f"w.{sentence}"
+
+
 def test_a_known_load_of_the_map_is_no_sensor(tmp_path: Path, core: Core) -> None:
     paths = write_runs(tmp_path, numbers=(1,))
     names = ("current_a", "motor_position_rad", "link_position_rad")

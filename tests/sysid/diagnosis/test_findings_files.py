@@ -176,6 +176,15 @@ def test_files_read_back_as_the_joints_meant(tmp_path: Path) -> None:
     assert "torque_ripple, sensor_offset" in text.splitlines()[0]
 
 
+def test_a_file_says_how_many_runs_were_used() -> None:
+    made = replace(findings(causes=(COULOMB,)), runs=("a", "b", "c"), used=("a", "c"))
+    assert title(2, made).startswith("Written by jtq diagnose from 2 of 3 runs: found coulomb_friction")
+    origin = ORIGIN | {"sha256": {"a": "0", "b": "1", "c": "2"}}
+    assert extended(JOINT, 2, made, **origin).provenance["diagnosis"]["sha256"] == {"a": "0", "c": "2"}
+    assert [run["used"] for run in to_mapping(made)["runs"]] == [True, False, True]
+    assert title(2, replace(made, used=())).startswith("Written by jtq diagnose from 3 runs: ")
+
+
 def test_without_a_cause_the_joint_stays_as_it_is(tmp_path: Path) -> None:
     write_extended(tmp_path, {1: JOINT}, findings(NO_GAP), **ORIGIN)
     joint = load_joint(tmp_path / "extended.joint.yaml")
