@@ -177,7 +177,8 @@ class LeftOver:
 class BoundedValue:
     """A value of a joint file that the runs put below the zero that it cannot pass: no cause, but at most `at_most` (end of
     its 95 % interval), where the file has `file_value`. best: without that limit; runs: error of each run left out with
-    what is named, and with the value of the other runs beside, zero where they say less.
+    what is named, and with the value of the other runs beside, zero where they say less. in_file: the extended joint file
+    takes `value`.
     """
 
     name: str
@@ -188,15 +189,22 @@ class BoundedValue:
     best: float
     at_most: float
     runs: tuple[RunGain, ...]
+    in_file: bool = False
+
+    @property
+    def value(self) -> float:
+        """The best value that is possible."""
+        return max(self.best, 0.0)
 
     @property
     def text(self) -> str:
         """One line for people."""
+        taken = f"; the extended joint file takes {self.value:.3g}" if self.in_file else ""
         errors = ", ".join(f"{r.rmse_after_nm:.2f} instead of {r.rmse_before_nm:.2f}" for r in self.runs)
         return (
             f"{self.name} of {joint_text(self.joint)}: at most {self.at_most:.2g} {self.unit} by these runs, "
             f"{self.file_value:.3g} in the joint file; not named as a cause, because its best value, {self.best:.2g}, is "
-            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the runs left out"
+            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the runs left out{taken}"
         )
 
 

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.bounded import bounded_values
+from jtqd.sysid.diagnosis.bounded import bounded_values, in_the_file
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.causes import causes_of, told_at_rest
 from jtqd.sysid.diagnosis.dataset import Dataset
@@ -58,6 +58,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     remains = found.remains_nm2(left)
     total = max(max(explained, sum(case.energies_nm2(shown))) + remains, 1e-30)
     causes = causes_of(case, named, classes, total)
+    bounded = in_the_file(bounded, causes)
     unsure, doubt = [], ""
     if found.few is not None:
         unsure = found.few.unsure(found.whole.hypothesis, named.hypothesis, classes, causes)
