@@ -51,7 +51,6 @@ SHORTEST_PIECE_S: Final = 1.0
 """Also the least by which the time must step back for a new run to begin there, and no stamp to be wrong."""
 GAP_NOTED: Final = 1.5
 _BLANK: Final = ("", "nan")
-_SEPARATORS: Final = (",", ";", "\t")
 DEAD_ROWS: Final = 100
 """A channel without a single non-zero value over this many rows is dead, not quiet."""
 
@@ -436,7 +435,8 @@ def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) ->
     data, sha256 = _bytes(path)
     text = _text(path, data)
     first = text.lstrip().split("\n", 1)[0]
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=max(_SEPARATORS, key=first.count))
+    separator = next((mark for mark in ",;\t" if mark in first), ",")
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     header = _header(rows, path)
     columns = _wanted_columns(header, path, columns)
     wanted = _expressions(header, path, columns)
@@ -453,7 +453,7 @@ def _without_blanks(
     and notes. A column that is blank everywhere is absent. Raises RunError for one that cannot be.
     """
     blank = {name: np.isnan(cell) for name, cell in cells.items()}
-    absent = {name for name, rows in blank.items() if rows.all()}
+    absent = {name for name, rows in blank.items() if len(rows) and rows.all()}
     made = {f"j{n}" for n in (*(columns.loads or {}), *(columns.drives or {}))}
     for key, each in wanted.items():
         name = next((name for name in each.names if name in absent), None)
@@ -471,7 +471,7 @@ def _without_blanks(
         notes.append(
             f"{int((~keep).sum())} of {counted(len(keep), 'row')} left out for a blank cell ({which})"
         )
-    if np.count_nonzero(keep) < 2:
+    if count and np.count_nonzero(keep) < 2:
         raise RunError(
             f"{path}: {notes[-1]}: found {counted(int(keep.sum()), 'sample')}, expected at least 2"
         )

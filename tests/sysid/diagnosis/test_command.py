@@ -228,6 +228,9 @@ def test_parquet_is_the_same_run(tmp_path: Path, core: Core, capsys: pytest.Capt
     spoilt = columns.current_a.copy() if columns.current_a is not None else None
     assert spoilt is not None
     spoilt[4] = np.inf
+    parquet.write_table(arrow.table({name: cell[:1] for name, cell in cells.items()}), path)
+    assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1
+    assert "found 1 sample, expected at least 2" in said(capsys)
     for content, wanted in ((spoilt, "row 5, column 'j1.current_a'"), (["x"] * len(spoilt), "found 'x'")):
         parquet.write_table(arrow.table({**cells, "j1.current_a": content}), path)
         assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1

@@ -207,6 +207,11 @@ def test_what_a_load_is_computed_from_cannot_be_blank(tmp_path: Path) -> None:
         read_pieces(path, columns)
 
 
+def test_a_comma_separates_wherever_the_header_has_one(tmp_path: Path) -> None:
+    path = _file(tmp_path, '"t; x; y",i\n0.0,1\n0.1,2\n')
+    assert read_run(path, _map(time_s="t; x; y", j1__current_a="i")).table.time_s.tolist() == [0.0, 0.1]
+
+
 @pytest.mark.parametrize("separator", [";", "\t"])
 def test_other_separators_are_read(tmp_path: Path, separator: str) -> None:
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0}, separator)
