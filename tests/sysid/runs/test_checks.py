@@ -15,7 +15,7 @@ from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.time_base import on_even_steps, skew_s, unwrapped
-from jtqd.sysid.runs.wild import wild_rows
+from jtqd.sysid.runs.wild import wild_rows, without_wild_samples
 from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     JOINTS,
@@ -255,21 +255,33 @@ def test_every_run_is_judged_for_itself(run: RunTable) -> None:
     assert [line[0] for line in result.refused] == ["b", "c"]
 
 
-@pytest.mark.parametrize("name", sorted(set(COLUMN_NAMES) - {"enabled", "link_velocity_rad_s"}))
-@pytest.mark.parametrize("value", [1e30, -1e6, 4e3])
-def test_a_wild_sample_is_left_out_and_said(run: RunTable, name: str, value: float) -> None:
+def with_wild(run: RunTable, name: str, value: float) -> RunTable:
     column = getattr(run.joints[1], name).copy()
     column[7000] = value
-    result = checked(changed(run, lambda c: replace(c, **{name: column})))
+    return changed(run, lambda c: replace(c, **{name: column}))
+
+
+@pytest.mark.parametrize("name", sorted(set(COLUMN_NAMES) - {"enabled", "link_velocity_rad_s"}))
+@pytest.mark.parametrize("value", [1e30, -1e6, 4e3])
+def test_a_row_with_a_wild_sample_is_left_out_and_said(run: RunTable, name: str, value: float) -> None:
+    kept, [note] = without_wild_samples(with_wild(run, name, value), JOINTS, "r.csv")
+    assert f"j1.{name}: found 1 wild sample, {value:.4g} at 7 s" in note.text
+    assert np.array_equal(kept.time_s, np.delete(run.time_s, 7000))
+    for number, column in ((1, name), (2, "torque_nm")):
+        before = getattr(run.joints[number], column)
+        assert np.array_equal(getattr(kept.joints[number], column), np.delete(before, 7000))
+
+
+def test_a_wild_sample_is_interpolated_as_a_lost_row(run: RunTable) -> None:
+    result = checked(with_wild(run, "torque_nm", 1e30))
     wild, uneven = result.notes
-    assert f"j1.{name}: found 1 wild sample, {value:.4g} at 7 s" in wild
+    assert "1 wild sample" in wild
     assert "found 1 of 19998 steps off" in uneven
     assert result.refused == ()
-    kept = getattr(result.runs[0][1].joints[1], name)
-    assert len(kept) == len(column)
-    before = getattr(run.joints[1], name)
-    assert np.allclose(np.delete(kept, 7000), np.delete(before, 7000), atol=1e-6 * np.ptp(before))
-    assert before[6990:7010].min() - np.ptp(before) < kept[7000] < before[6990:7010].max() + np.ptp(before)
+    kept, before = result.runs[0][1].joints[1].torque_nm, run.joints[1].torque_nm
+    assert kept is not None
+    assert before is not None
+    assert kept == pytest.approx(before, abs=2.0)
 
 
 def test_what_a_joint_can_do_is_not_wild(run: RunTable) -> None:
