@@ -276,8 +276,9 @@ def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
     starts = [] if whole else _new_runs(time_s)
     runs = [slice(a, b) for a, b in pairwise([0, *starts, len(time_s)])]
     notes = list(content.notes)
-    for run in runs:
-        notes += _check_time(time_s, content.lines, path, run=run, whole=whole)
+    for number, run in enumerate(runs, 1):
+        found = _check_time(time_s, content.lines, path, run=run, whole=whole)
+        notes += [f"run {number}: {note}" if starts else note for note in found]
     cuts = [[run] if whole else _pieces(time_s, run) for run in runs]
     count = sum(map(len, cuts))
     long = [
@@ -307,12 +308,12 @@ def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
         notes += _unwrapped_over_gaps(content)
     if content.columns is not None:
         notes += content.columns.remarks()
-    found: list[RunFile] = []
+    read: list[RunFile] = []
     for number, each in enumerate(long, 1):
         name = f"{path.name} (run {number} of {len(runs)})" if starts else path.name
         for k, cut in enumerate(each, 1):
-            found.append(_piece(content, cut, name, [] if found else notes, (k, len(each))))
-    return found
+            read.append(_piece(content, cut, name, [] if read else notes, (k, len(each))))
+    return read
 
 
 def _piece(content: _Content, cut: slice, name: str, notes: Sequence[str], place: tuple[int, int]) -> RunFile:

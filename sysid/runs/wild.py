@@ -24,9 +24,13 @@ _FURTHER: Final = 10.0
 _MOST: Final = 1e-3
 """Part of the rows that may be wild, one at least: more are a fault of the channel."""
 _FEWEST_ROWS: Final = 50
+_PEAK: Final = 3.0
+"""Times the rating: a controller may start with a kick of one cycle."""
 _LEAST: Final[Mapping[str, Callable[[Joint], float]]] = {
-    "torque_nm": lambda joint: joint.rated_torque_nm,
-    "current_a": lambda joint: joint.rated_torque_nm / (joint.gear_ratio * joint.torque_constant_nm_per_a),
+    "torque_nm": lambda joint: _PEAK * joint.rated_torque_nm,
+    "current_a": lambda joint: (
+        _PEAK * joint.rated_torque_nm / (joint.gear_ratio * joint.torque_constant_nm_per_a)
+    ),
     "motor_position_rad": lambda joint: 0.1 * joint.gear_ratio,
     "motor_velocity_rad_s": lambda joint: joint.gear_ratio,
     "link_position_rad": lambda _: 0.1,
@@ -66,7 +70,7 @@ def wild_rows(column: FloatArray, least: float) -> BoolArray:
     if len(column) < _FEWEST_ROWS or np.ptp(column) <= least:
         return out
     middle = np.median(column[:: max(1, len(column) // 1000)])
-    steps = np.abs(np.diff(column, prepend=column[1], append=column[-2]))  # both ends have one neighbour
+    steps = np.abs(np.diff(column, prepend=column[0], append=column[-1]))  # an end has no two neighbours
     for off in (np.abs(column - middle), np.minimum(steps[:-1], steps[1:])):
         if np.max(off) <= least:
             continue

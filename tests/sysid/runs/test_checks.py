@@ -285,12 +285,14 @@ def test_a_wild_sample_is_interpolated_as_a_lost_row(run: RunTable) -> None:
 
 
 def test_what_a_joint_can_do_is_not_wild(run: RunTable) -> None:
-    """A blow of half the rating, a channel that steps, one that is wrong for longer."""
-    for rows, value in ((slice(7000, 7001), 18.0), (slice(7000, 8000), 1e3)):
+    """A kick of twice the rating at the start, a blow, a channel that steps, one that is wrong for longer."""
+    for rows, value in ((slice(1, 2), 80.0), (slice(7000, 7001), 18.0), (slice(7000, 8000), 1e3)):
         torque = np.array(run.joints[1].torque_nm)
         torque[rows] += value
-        assert not wild_rows(torque, JOINTS[1].rated_torque_nm).any()
+        kicked = changed(run, lambda c, torque=torque: replace(c, torque_nm=torque))  # type: ignore[misc]
+        assert without_wild_samples(kicked, JOINTS, "r.csv")[1] == []
     assert not wild_rows(np.repeat([0.0, 50.0], 500), 1.0).any()
+    assert not wild_rows(np.append([0.0], np.sin(np.arange(0.0, 20.0, 0.01)) + 9.0), 1.0).any(), "an end"
 
 
 @pytest.mark.parametrize("count", [2, 10, 900])

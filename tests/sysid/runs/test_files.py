@@ -160,6 +160,7 @@ def test_a_time_that_starts_again_is_another_run(tmp_path: Path) -> None:
         f"a.csv (run 2 of 2) ({k} of 3)" for k in (2, 3)
     ]
     assert "the time starts again 1 time: 2 runs in one file" in first.notes
+    assert "run 2: 2 steps are longer than 1.5 times the median of 0.01 s" in first.notes
     assert all(run.notes == () for run in others)
     assert first.table.time_s.tolist() == T.tolist()
     with pytest.raises(RunError, match="one run in a file here"):
