@@ -188,7 +188,7 @@ def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.Ca
         assert error.count("\n") == 1
         assert "Traceback" not in error
     assert run("efficiency", good, good, "--joint", JOINT) == 1
-    assert "same data" in capsys.readouterr().err
+    assert "found it twice" in capsys.readouterr().err
     assert run("efficiency", good, "--joint", JOINT, "--number", 5) == 1
     assert "j5" in capsys.readouterr().err
     assert run("efficiency", good, "--joint", tmp_path / "none.yaml") == 1
