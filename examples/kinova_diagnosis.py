@@ -115,7 +115,7 @@ def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
 
     The ladder is least squares; the possible one has no friction or inertia below zero; "near the file" has the same terms
     with the priors of `sysid.fit.few_runs` about the file.
-    Of a joint without causes the extended file is the file; in brackets a value that is known as a bound.
+    Of a joint without causes the extended file is the file, or the file with a value at its bound.
     """
     runs = measured_runs()
     lines = [
@@ -138,16 +138,15 @@ def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
             fits = (free, _possible(fitted_x, fitted_y, one.joint), near)
             ladder, possible, regular = (float(np.sqrt(np.mean((y - x @ found) ** 2))) for found in fits)
             file = float(np.sqrt(np.mean(y**2)))
+            bounds = [b for b in one.findings.bounded if b.in_file]
+            after |= {r.run: r.rmse_after_nm for b in bounds for r in b.runs}
             own = after.get(name, file)
-            held = [
-                f" ({r.rmse_after_nm:.2f})" for b in one.findings.bounded for r in b.runs if r.run == name
-            ]
             cells = (
                 f"{file:.2f}",
                 f"{ladder:.2f}",
                 f"{possible:.2f}",
                 f"{regular:.2f}",
-                f"{own:.2f}{''.join(held)}",
+                f"{own:.2f}{' (bound)' if bounds else ''}",
             )
             holds = "yes" if own < ladder + 0.005 else "no"
             lines.append(f"| {one.number} | {name} | {' | '.join(cells)} | {holds} |")

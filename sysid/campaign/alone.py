@@ -110,6 +110,19 @@ def with_limits(joint: Joint, given: Mapping[str, Any] | None) -> Joint:
     return replace(joint, motion_limits=replace(joint.motion_limits or MotionLimits(), **given))
 
 
+def beyond_file(joint: Joint, given: Mapping[str, Any] | None) -> str:
+    """Return which of these values (--limits) allow more than its file's `motion_limits`; "" for none."""
+    wider = []
+    for name, value in (given or {}).items():
+        file = getattr(joint.motion_limits or MotionLimits(), name)
+        if name == "travel_rad":
+            if (value[0] < file[0] or value[1] > file[1]) and max(map(abs, file)) < NO_LIMIT:
+                wider.append(f"{name} {value[0]:g}:{value[1]:g}, the file {file[0]:g}:{file[1]:g}")
+        elif file < value:
+            wider.append(f"{name} {value:g}, the file {file:g}")
+    return "; ".join(wider)
+
+
 def parsed_limits(text: str) -> dict[str, Any]:
     """Return the limits of a text such as "travel_rad=-0.5:0.5,velocity_rad_s=1". Raises ConfigError."""
     names = [item.name for item in fields(MotionLimits)]

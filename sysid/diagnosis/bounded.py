@@ -6,18 +6,23 @@ is certain all the same is that it is smaller than in the file, and by how much 
 lies below zero by less than its interval, and the value of the other runs, held at zero or above, takes away
 `LARGE_FALL` of the squared error of every run left out. Source of values with such a limit: the restricted least squares
 of Judge and Takayama 1966, J. Am. Stat. Assoc. 61.
+
+What is proven is the value at its limit, and nothing else changed. So the extended joint file takes a friction there if it
+is the only bound of a joint of which nothing is named (`in_the_file`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.library import EFFECTS
 from jtqd.sysid.diagnosis.causes import values_of
-from jtqd.sysid.diagnosis.findings import BoundedValue, JointName, RunGain
+from jtqd.sysid.diagnosis.findings import BoundedValue, Cause, JointName, RunGain, shows_at
 from jtqd.sysid.diagnosis.leave_one_out import LARGE_FALL, LeaveOneOut
 from jtqd.sysid.diagnosis.named import Found
 from jtqd.sysid.diagnosis.refine import parameter, set_torsions
@@ -40,6 +45,19 @@ def bounded_values(found: Found) -> list[BoundedValue]:
                 out[candidate.key] = one
     set_torsions(found.case.dataset, found.named.refined.present)  # as the fit of what is named left them
     return list(out.values())
+
+
+def in_the_file(bounded: Sequence[BoundedValue], causes: Sequence[Cause]) -> list[BoundedValue]:
+    """Return the bounds, those marked that the extended joint file takes."""
+    return [
+        replace(
+            one,
+            in_file=EFFECTS[one.name].dissipative
+            and [other.joint for other in bounded].count(one.joint) == 1
+            and not any(shows_at(cause.joint, int(one.joint)) for cause in causes),
+        )
+        for one in bounded
+    ]
 
 
 def _bounded(

@@ -13,7 +13,7 @@ from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT
 from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
-from jtqd.sysid.diagnosis.leftover import Leftover, events_left, held_nm, leftover
+from jtqd.sysid.diagnosis.leftover import Leftover, events_left, held_energies_nm2, held_nm, leftover
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.refine import Refined, contributions, present_effects, refine, set_torsions
@@ -94,6 +94,10 @@ class Case:
     def held_nm(self, fit: Fit) -> dict[Channel, float]:
         """Return what the samples of held channels are off by beside the effects (`leftover.held_nm`)."""
         return held_nm(self.dataset, fit.refined)
+
+    def held_energies_nm2(self, fit: Fit) -> dict[Channel, float]:
+        """Return the same as energy over all runs (`leftover.held_energies_nm2`)."""
+        return held_energies_nm2(self.dataset, fit.refined)
 
 
 def search_case(dataset: Dataset, relevance: float) -> tuple[Case, Fit]:

@@ -18,14 +18,14 @@ from typing import Any, Final
 from jtqd.estimator.checked import ConfigError, check_installed, counted, make_directory
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
-from jtqd.sysid.campaign.alone import parsed_limits, with_limits
+from jtqd.sysid.campaign.alone import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.campaign.plan import Plan
 from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
 from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
@@ -51,6 +51,7 @@ def main(argv: list[str]) -> int:
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
+        check_effects(options.without, options.given)
         check_installed("analysis", *_NEEDED)
         check_joint_files(files)
         _check_out(options.out, options.force)
@@ -67,9 +68,8 @@ def main(argv: list[str]) -> int:
             scope,
             options.relevance,
         )
-        findings = replace(
-            findings, joint_files=joints, next_experiment=_with_command(options, findings, joints)
-        )
+        experiment = _with_limits_said(_with_command(options, findings, joints), options, joints)
+        findings = replace(findings, joint_files=joints, next_experiment=experiment)
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
         print(f"{BY}: {error}", file=sys.stderr)
@@ -99,6 +99,17 @@ def _with_command(
     if options.config is not None:
         config = shlex.quote(str(options.config))
     return {**experiment, "command": campaign_command(plan, shlex.quote(options.bus), config)}
+
+
+def _with_limits_said(
+    experiment: dict[str, Any] | None, options: argparse.Namespace, joints: Mapping[int, Joint]
+) -> dict[str, Any] | None:
+    """Return the next experiment with a sentence where --limits let it go further than the joint files do."""
+    wider = {n: text for n, joint in joints.items() if (text := beyond_file(joint, options.limits))}
+    if experiment is None or not wider:
+        return experiment
+    said = [f"--limits allows more than motion_limits of joint {n}: {text}." for n, text in wider.items()]
+    return {**experiment, "why": " ".join([experiment["why"], *said])}
 
 
 def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:

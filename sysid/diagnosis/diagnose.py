@@ -106,7 +106,8 @@ def _diagnosed(
 
     findings = conclude(case, fit, names, numbers, anew)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
-    return replace(findings, channel_notes=notes, odd_runs=tuple(odd))
+    used = tuple(run[0].run for run in usable)
+    return replace(findings, channel_notes=notes, odd_runs=tuple(odd), used=used)
 
 
 def without_odd_runs(
@@ -169,6 +170,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
         ),
         odd_runs=tuple(odd for f in parts for odd in f.odd_runs),
         bounded=tuple(b for f in parts for b in f.bounded),
+        used=tuple(name for name in parts[0].runs if any(name in f.used_runs for f in parts)),
     )
 
 

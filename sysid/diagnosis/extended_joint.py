@@ -1,8 +1,8 @@
 """The extended joint file: a joint with the effects found and their values, intervals in its provenance.
 
 An effect that the joint file has already is replaced by the cause of the same name, so that diagnosing with the extended
-file again does not add the same thing twice. Effects of the torque sensor go into every joint's file. All of it is
-pure but `write_extended`.
+file again does not add the same thing twice. A bound that is proven by itself (`bounded`) is taken at its limit and marked.
+Effects of the torque sensor go into every joint's file. All of it is pure but `write_extended`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Value, shows_at
+from jtqd.sysid.diagnosis.findings import BoundedValue, Cause, Findings, Value, shows_at
 from jtqd.sysid.fit.joint_writer import write_joint
 
 FILE: Final = "extended.joint.yaml"
@@ -34,21 +33,29 @@ def extended(
 ) -> Joint:
     """Return the joint with the causes of joint `number` and of the sensor among its effects.
 
-    sha256: hash of each run's file by name; date: ISO 8601. What an effect of a whole class is written as is the first of
-    its class, and the provenance says so: on these runs all of the class fit alike, elsewhere they may not.
+    sha256: hash of each run's file by name, those that were used are kept; date: ISO 8601. What an effect of a whole
+    class is written as is the first of its class, and the provenance says so: on these runs all of the class fit alike,
+    elsewhere they may not.
 
     Raises ConfigError for an effect or a value that joint files do not allow.
     """
     causes = [cause for cause in findings.causes if shows_at(cause.joint, number)]
-    replaced = {cause.name for cause in causes}
+    bounds = _bounds(findings, number)
+    replaced = {cause.name for cause in causes} | {bound.name for bound in bounds}
     effects = [effect for effect in joint.effects if effect.name not in replaced]
     effects += [
         Effect(cause.name, {name: _rounded(each.value) for name, each in cause.parameters.items()})
         for cause in causes
     ]
+    effects += [Effect(bound.name, {bound.parameter: _rounded(bound.value)}) for bound in bounds]
     record: dict[str, Any] = {"by": by, "date": date, "verdict": findings.verdict}
     if causes:
         record["effects"] = [_record(cause) for cause in causes]
+    if bounds:
+        record["at_their_bound"] = [
+            {"name": b.name, "joint": b.joint, b.parameter: [_rounded(b.value), _rounded(b.at_most)]}
+            for b in bounds
+        ]
     gain = findings.gain
     if causes and gain is not None and math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
         record["gain"] = {
@@ -56,7 +63,7 @@ def extended(
             "rmse_after_nm": _rounded(gain.rmse_after_nm),
             "split": gain.split,
         }
-    record["sha256"] = {name: sha256[name] for name in findings.runs if name in sha256}
+    record["sha256"] = {name: sha256[name] for name in findings.used_runs if name in sha256}
     return replace(joint, effects=tuple(effects), provenance={**joint.provenance, "diagnosis": record})
 
 
@@ -77,9 +84,12 @@ def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
 def title(number: int, findings: Findings) -> str:
     """First line of an extended joint file."""
     names = [cause.name for cause in findings.causes if shows_at(cause.joint, number)]
-    runs = counted(len(findings.runs), "run")
     what = f"found {', '.join(names)}" if names else "found no effect of this joint to add"
-    return f"Written by jtq diagnose from {runs}: {what} (verdict {findings.verdict})."
+    what += "".join(
+        f", took {bound.name} at its bound ({bound.value:.3g}, at most {bound.at_most:.2g} {bound.unit})"
+        for bound in _bounds(findings, number)
+    )
+    return f"Written by jtq diagnose from {findings.runs_text}: {what} (verdict {findings.verdict})."
 
 
 def write_extended(
@@ -94,6 +104,10 @@ def write_extended(
         joint = extended(joints[number], number, findings, **origin)
         write_joint(directory / name, joint, title(number, findings))
     return list(names)
+
+
+def _bounds(findings: Findings, number: int) -> list[BoundedValue]:
+    return [bound for bound in findings.bounded if bound.in_file and bound.joint == number]
 
 
 def _first(numbers: Sequence[int], findings: Findings) -> int:

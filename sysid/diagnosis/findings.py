@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.file_values import FileValue, file_values
 
@@ -176,7 +177,8 @@ class LeftOver:
 class BoundedValue:
     """A value of a joint file that the runs put below the zero that it cannot pass: no cause, but at most `at_most` (end of
     its 95 % interval), where the file has `file_value`. best: without that limit; runs: error of each run left out with
-    what is named, and with the value of the other runs beside, zero where they say less.
+    what is named, and with the value of the other runs beside, zero where they say less. in_file: the extended joint file
+    takes `value`.
     """
 
     name: str
@@ -187,15 +189,22 @@ class BoundedValue:
     best: float
     at_most: float
     runs: tuple[RunGain, ...]
+    in_file: bool = False
+
+    @property
+    def value(self) -> float:
+        """The best value that is possible."""
+        return max(self.best, 0.0)
 
     @property
     def text(self) -> str:
         """One line for people."""
+        taken = f"; the extended joint file takes {self.value:.3g}" if self.in_file else ""
         errors = ", ".join(f"{r.rmse_after_nm:.2f} instead of {r.rmse_before_nm:.2f}" for r in self.runs)
         return (
             f"{self.name} of {joint_text(self.joint)}: at most {self.at_most:.2g} {self.unit} by these runs, "
             f"{self.file_value:.3g} in the joint file; not named as a cause, because its best value, {self.best:.2g}, is "
-            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the runs left out"
+            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the runs left out{taken}"
         )
 
 
@@ -238,7 +247,9 @@ class OddRun:
 
 @dataclass(frozen=True)
 class Findings:
-    """All of it. gaps: largest excess first; causes: largest first; reasons: lines for people."""
+    """All of it. runs: all that were given; used: those of them that anything was found in, empty for all; gaps: largest
+    excess first; causes: largest first; reasons: lines for people.
+    """
 
     verdict: str
     reasons: tuple[str, ...]
@@ -256,6 +267,18 @@ class Findings:
     left_over: LeftOver | None = None
     odd_runs: tuple[OddRun, ...] = ()
     bounded: tuple[BoundedValue, ...] = ()
+    used: tuple[str, ...] = ()
+
+    @property
+    def used_runs(self) -> tuple[str, ...]:
+        """Runs that what was found is of."""
+        return self.used or self.runs
+
+    @property
+    def runs_text(self) -> str:
+        """How many runs were used, e.g. "6 of 7 runs"."""
+        used, count = len(self.used_runs), len(self.runs)
+        return counted(count, "run") if used == count else f"{used} of {counted(count, 'run')}"
 
 
 _NO_GAP_MEASURED: Final[dict[str, Any]] = {
@@ -291,7 +314,10 @@ def to_mapping(
         "odd_runs": [_odd_run(each) for each in findings.odd_runs],
         "bounded": [_bounded(each) for each in findings.bounded],
         "joints": findings.joints,
-        "runs": [{"name": name, "sha256": (sha256 or {}).get(name)} for name in findings.runs],
+        "runs": [
+            {"name": name, "sha256": (sha256 or {}).get(name), "used": name in findings.used_runs}
+            for name in findings.runs
+        ],
         "gaps": [_gap(each) for each in findings.gaps],
         "candidates": [_candidate(each) for each in findings.candidates],
         "channel_notes": findings.channel_notes,

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
@@ -24,7 +24,7 @@ from jtqd.sysid.diagnosis.events import (
 )
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
-from jtqd.sysid.diagnosis.regressors import LINE, RunData
+from jtqd.sysid.diagnosis.regressors import LINE, ChannelData, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
@@ -134,15 +134,33 @@ def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
     """Return what the rows of held channels (`runs.held`) are wrong by: rms over the run that has most of it [Nm], beyond
     what is usual in the others; channels without such rows are left out.
     """
-    out: dict[Channel, float] = {}
+    return {c: max(e / n for e, n in runs) ** 0.5 for c, runs in _held(dataset, refined).items()}
+
+
+def held_energies_nm2(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
+    """Return the same as energy over all runs [Nm^2], as that of all other structure."""
+    return {
+        c: sum(e for e, _ in runs)
+        / sum(int(np.sum(_measured_or_held(run.channels[c]))) for run in dataset.runs)
+        for c, runs in _held(dataset, refined).items()
+    }
+
+
+def _measured_or_held(d: ChannelData) -> BoolArray:
+    return d.valid if d.held is None else d.valid | d.held
+
+
+def _held(dataset: Dataset, refined: Refined) -> dict[Channel, list[tuple[float, int]]]:
+    """Return (sum of squares [Nm^2], samples held or valid) of the runs with held rows, by channel."""
+    out: dict[Channel, list[tuple[float, int]]] = {}
     for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):
         for channel, d in run.channels.items():
             if d.held is None or not d.held.any():
                 continue
             rest = left.channels[channel].residual - d.nuisances @ u[d.families]
             usual = float(np.mean(rest[d.valid] ** 2)) if d.valid.any() else 0.0
-            excess = float(np.sum(rest[d.held] ** 2 - usual)) / int(np.sum(d.held | d.valid))
-            out[channel] = max(out.get(channel, 0.0), max(excess, 0.0) ** 0.5)
+            excess = max(float(np.sum(rest[d.held] ** 2 - usual)), 0.0)
+            out.setdefault(channel, []).append((excess, int(np.sum(_measured_or_held(d)))))
     return out
 
 

@@ -64,6 +64,11 @@ class Found:
         """What held channels cost, where that is relevant by its size [Nm]."""
         return {c: nm for c, nm in self.case.held_nm(self.whole).items() if nm > self.limits[c]}
 
+    def remains_nm2(self, left: Leftover) -> float:
+        """Return the energy of what is left over and of what `held_nm` is made of, summed over channels [Nm^2]."""
+        held = self.case.held_energies_nm2(self.whole) if self.held_nm else {}
+        return left.energy_nm2() + sum(held[c] for c in self.held_nm)
+
     @property
     def matters(self) -> bool:
         """Whether something is not explained that matters: what is left over, or what is wrong with a channel."""

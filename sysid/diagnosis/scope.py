@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.findings import SENSOR, JointName
+from jtqd.sysid.runs.joints import UsageError
 
 _ITEM: Final = re.compile(r"(?:(?P<joint>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
 
@@ -42,30 +42,42 @@ def scope_of(
     """Return the scope that options --without and --given ask for; items as "NAME", "2=NAME" or "sensor=NAME".
 
     Without: the effect is taken to be absent. Given: it is as the joint files have it, in `effects` or as one of their
-    values, which is then not questioned. Raises ConfigError for a name that is no effect, or a given effect that no joint
+    values, which is then not questioned. Raises UsageError for a name that is no effect, or a given effect that no joint
     file has.
     """
-    out: set[tuple[JointName | None, str]] = set()
-    for option, items in (("--without", without), ("--given", given)):
-        for text in items:
-            match = _ITEM.fullmatch(text)
-            if match is None or match["name"] not in EFFECTS:
-                raise ConfigError(
-                    f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
-                    f"{', '.join(sorted(EFFECTS))}"
-                )
-            where: JointName | None = match["joint"]
-            if where is not None and where != SENSOR:
-                where = int(where)
-                if where not in joints:
-                    have = ", ".join(str(number) for number in sorted(joints))
-                    raise ConfigError(
-                        f"{option} {text}: found no joint {where} in runs and joint files: {have}"
-                    )
-            if option == "--given":
-                _check_given(text, match["name"], where, joints)
-            out.add((where, match["name"]))
-    return Scope(frozenset(out), frozenset(known))
+    asked = [*named_effects("--without", without), *named_effects("--given", given)]
+    for option, text, where, name in asked:
+        if where is not None and where != SENSOR and where not in joints:
+            have = ", ".join(str(number) for number in sorted(joints))
+            raise UsageError(f"{option} {text}: found no joint {where} in runs and joint files: {have}")
+        if option == "--given":
+            _check_given(text, name, where, joints)
+    return Scope(frozenset((where, name) for *_, where, name in asked), frozenset(known))
+
+
+def check_effects(without: Iterable[str], given: Iterable[str]) -> None:
+    """Refuse what no runs are needed for: a name that is no effect, an effect that is both. Raises UsageError."""
+    absent = named_effects("--without", without)
+    for _, text, where, name in named_effects("--given", given):
+        for _, other, there, same in absent:
+            if name == same and (where == there or None in (where, there)):
+                raise UsageError(f"--without {other}: found it beside --given {text}, expected one of them")
+
+
+def named_effects(option: str, items: Iterable[str]) -> list[tuple[str, str, JointName | None, str]]:
+    """Return (option, text, joint, name) of each item of an option. Raises UsageError for a name that is no effect."""
+    found: list[tuple[str, str, JointName | None, str]] = []
+    for text in items:
+        match = _ITEM.fullmatch(text)
+        if match is None or match["name"] not in EFFECTS:
+            raise UsageError(
+                f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
+                f"{', '.join(sorted(EFFECTS))}"
+            )
+        joint = match["joint"]
+        where: JointName | None = int(joint) if joint and joint != SENSOR else joint
+        found.append((option, text, where, match["name"]))
+    return found
 
 
 def _check_given(text: str, name: str, where: JointName | None, joints: Mapping[int, Joint]) -> None:
@@ -74,7 +86,7 @@ def _check_given(text: str, name: str, where: JointName | None, joints: Mapping[
     in_file = any(effect.name == name for joint in asked for effect in joint.effects)
     if not in_file and not any(parameter.key for parameter in EFFECTS[name].parameters):
         files = " or ".join(joint.name for joint in asked)
-        raise ConfigError(
+        raise UsageError(
             f"--given {text}: found no effect {name} in {files}, expected it under `effects` with its parameters "
             f"(or --without {text} for an effect that is absent)"
         )

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.bounded import bounded_values
+from jtqd.sysid.diagnosis.bounded import bounded_values, in_the_file
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.causes import causes_of, told_at_rest
 from jtqd.sysid.diagnosis.dataset import Dataset
@@ -55,9 +55,10 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     named, classes = told_at_rest(case, found.named, found.classes)
     left, shown = _remaining(found, named)
     explained = sum(case.energies_nm2(named))
-    total = max(explained, sum(case.energies_nm2(shown))) + left.energy_nm2()
-    total = max(total, 1e-30)
+    remains = found.remains_nm2(left)
+    total = max(max(explained, sum(case.energies_nm2(shown))) + remains, 1e-30)
     causes = causes_of(case, named, classes, total)
+    bounded = in_the_file(bounded, causes)
     unsure, doubt = [], ""
     if found.few is not None:
         unsure = found.few.unsure(found.whole.hypothesis, named.hypothesis, classes, causes)
@@ -96,7 +97,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         next_experiment=_settling_experiment(verdict, causes, unsure, case.dataset),
         traces=traces(case.dataset, shown.refined),
         explained_share=explained / total if causes else math.nan,
-        left_over=_left_over(found, left, total),
+        left_over=_left_over(found, left, remains / total),
         bounded=tuple(bounded),
     )
 
@@ -116,8 +117,8 @@ def _below(gap: Gap, bounded: Sequence[BoundedValue]) -> Gap:
     return replace(gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on runs left out")
 
 
-def _left_over(found: Found, left: Leftover, total_nm2: float) -> LeftOver:
-    """Return what is left over in the channel where it is most, against its limit; total_nm2: energy of all structure."""
+def _left_over(found: Found, left: Leftover, share: float) -> LeftOver:
+    """Return what is left over in the channel where it is most, against its limit; share: of all structure, as energy."""
     sizes = {c: max(left.worst_nm.get(c, 0.0), found.held_nm.get(c, 0.0)) for c in found.limits}
     worst = max(sizes, key=lambda c: sizes[c] / found.limits[c] if found.limits[c] > 0.0 else sizes[c])
     return LeftOver(
@@ -125,7 +126,7 @@ def _left_over(found: Found, left: Leftover, total_nm2: float) -> LeftOver:
         worst.balance,
         sizes[worst],
         sizes[worst] / found.case.dataset.joints[worst.joint].rated_torque_nm,
-        left.energy_nm2() / total_nm2,
+        share,
         found.limits[worst],
         found.matters,
         unconfirmed=not found.matters and left is not found.left,

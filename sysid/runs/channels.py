@@ -313,6 +313,22 @@ def check_energy(time_s: FloatArray, run: JointColumns, joint: Joint, where: str
     ]
 
 
+def one_value(run: JointColumns, where: str) -> list[RunIssue]:
+    """Motion and current that are one number in the whole run; a current of zero may be that beside motion."""
+    motion = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
+    there = {name: column for name in motion if (column := getattr(run, name)) is not None}
+    stands = bool(there) and all(np.ptp(column) == 0.0 for column in there.values())
+    current = run.current_a
+    issues = []
+    if stands:
+        text = f"{where}: found one value of {' and '.join(there)} in the whole run, expected motion"
+        issues.append(RunIssue("standing", f"{text}: the joint stands, or dead channel"))
+    if current is not None and np.ptp(current) == 0.0 and (stands or current[0] != 0.0):
+        text = f"{where}.current_a: found {current[0]:.4g} A in the whole run, expected a measurement that changes"
+        issues.append(RunIssue("current_a_constant", f"{text}: dead channel, or a command"))
+    return issues
+
+
 def check_spikes(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
     """Jumps of the sensor from one row to the next: a spike or a drop-out is two of them."""
     torque = run.torque_nm

@@ -1,8 +1,9 @@
 """What of a run may be used: `check_run`, one set of checks for fits, campaigns, evaluation and diagnosis.
 
 Every check of a joint's channels against each other holds for every use (`channels`). A diagnosis takes every column at
-its word, so a thorough check asks more: time base (`time_base`), units (`units`), energy, held and clipped stretches,
-spikes, skew, columns exchanged between two joints (`swapped`). A joint of a run whose columns contradict each other (unit,
+its word, so a thorough check asks more: length and time base (`time_base`), single samples that are none (`wild`), channels
+of one value, units (`units`), energy, held and clipped stretches, spikes, skew, columns exchanged between two joints
+(`swapped`). A joint of a run whose columns contradict each other (unit,
 sign, dead, another joint's file or columns) is left out with one line; a channel that is only not needed (temperature, link
 encoder) is left out alone; what is usable but odd (short stuck stretches, clipping, spikes, uneven time) is a note.
 """
@@ -15,10 +16,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_spikes
-from jtqd.sysid.runs.files import RunFile
+from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_spikes, one_value
+from jtqd.sysid.runs.files import SHORTEST_PIECE_S, RunFile
 from jtqd.sysid.runs.held import Limits, check_held, clip_limits
 from jtqd.sysid.runs.swapped import swapped_columns
 from jtqd.sysid.runs.time_base import (
@@ -30,6 +32,7 @@ from jtqd.sysid.runs.time_base import (
     unwrapped,
 )
 from jtqd.sysid.runs.units import temperature_issue, unit_issues
+from jtqd.sysid.runs.wild import without_wild_samples
 
 __all__ = [
     "CheckedRun",
@@ -89,17 +92,22 @@ def check_run(
 ) -> CheckedRun:
     """Check the joints of one run that have a joint file; `name` begins every line.
 
-    thorough: as a diagnosis needs it; only then are columns changed (positions that roll over made continuous, uneven
-    steps made even, channels that are not needed left out when they are wrong). limits: where channels clip in other runs.
+    thorough: as a diagnosis needs it; only then are columns changed (rows with a wild sample left out, positions that roll
+    over made continuous, uneven steps made even, channels that are not needed left out when they are wrong). limits: where
+    channels clip in other runs.
     """
     notes: list[RunIssue] = []
     if thorough:
-        slow = check_rate(table.time_s, name)
-        if slow:
-            return CheckedRun(None, tuple(slow))
+        unfit = _too_short(table, name) or check_rate(table.time_s, name)
+        if unfit:
+            return CheckedRun(None, tuple(unfit))
+        table, wild = without_wild_samples(table, joints, name)
+        standing, still = _of_one_value(table, joints, name)
+        if standing:
+            return CheckedRun(None, tuple(standing), tuple(wild))
         table, rolled = unwrapped(table, name)
         table, uneven = on_even_steps(table, name)
-        notes += rolled + uneven
+        notes += wild + still + rolled + uneven
     refused: list[RunIssue] = []
     usable: dict[int, JointColumns] = {}
     exchanged = swapped_columns(table, joints, name) if thorough else []
@@ -127,7 +135,7 @@ def check_run(
 
 def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> CheckedRuns:
     """Return what of the runs can be used for a diagnosis of `joints` (joint file by number)."""
-    limits = clip_limits((table for _, table in runs), joints)
+    limits = clip_limits((without_wild_samples(table, joints, name)[0] for name, table in runs), joints)
     each = [(name, check_run(table, joints, name, thorough=True, limits=limits)) for name, table in runs]
     usable = tuple((name, run.table) for name, run in each if run.table is not None)
     left = {number for _, table in usable for number in table.joints}
@@ -149,6 +157,28 @@ def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list
         ]
         issues += check_run(run.table, {number: joint}, run.name).refused
     return issues
+
+
+def _too_short(table: RunTable, name: str) -> list[RunIssue]:
+    seconds = float(table.time_s[-1] - table.time_s[0] + np.median(np.diff(table.time_s)))
+    if seconds > (1.0 - 1e-6) * SHORTEST_PIECE_S:
+        return []
+    found = f"{counted(len(table.time_s), 'sample')}, {seconds:.3g} s"
+    return [
+        RunIssue("too_short", f"{name}: found {found}, expected a run of at least {SHORTEST_PIECE_S:g} s")
+    ]
+
+
+def _of_one_value(
+    table: RunTable, joints: Mapping[int, Joint], name: str
+) -> tuple[list[RunIssue], list[RunIssue]]:
+    """Return why nothing was measured in a run whose joints stand with a constant current, else notes of joints that stand
+    and of currents that never change in motion.
+    """
+    found = {n: one_value(table.joints[n], f"{name}: j{n}") for n in sorted(set(joints) & set(table.joints))}
+    issues = [issue for each in found.values() for issue in each]
+    dead = found and all(len(each) == 2 for each in found.values())
+    return (issues, []) if dead else ([], issues)
 
 
 def _checked_joint(

@@ -32,6 +32,7 @@ from jtqd.estimator.checked import ConfigError, Section
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.models.files import load_yaml
 from jtqd.sysid.runs.expressions import Expression, ExpressionError, parse
+from jtqd.sysid.runs.wild import wild_rows
 
 TIME: Final = "time_s"
 JOINTS: Final = range(1, 8)
@@ -40,6 +41,10 @@ WINDOW_S: Final = 0.05
 """Longest piece of a position to which a cubic is fitted for its velocity and acceleration."""
 _QUIET: Final = 0.02
 _FEWEST_ROWS: Final = 7
+_WILD_RAD: Final = 0.1
+_SOURCE: Final = (
+    "a column of the file, an expression of columns, or {column: either, scale: 1.0, offset: 0.0}"
+)
 
 
 @dataclass(frozen=True)
@@ -114,9 +119,11 @@ class ColumnMap:
         section = Section(full, where)
         columns: dict[str, Column] = {}
         for key in targets():
-            inner = section.section(key, optional=key != TIME and full.get(key, "") is not None)
-            if inner is not None:
-                columns[key] = _column(inner)
+            value = section.raw(key, expected=_SOURCE) if key == TIME else section.raw(key, None)
+            if key in full:
+                if not isinstance(value, dict):
+                    raise section.error(key, value, _SOURCE)
+                columns[key] = _column(section.required(key))
         files = {
             joint: folder / section.text(f"j{joint}.joint_file")
             for joint in JOINTS
@@ -208,8 +215,11 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
 
     The window is the shortest in which the position's noise (rounding included) is below _QUIET of the motion's largest
     acceleration, WINDOW_S at most: what is longer rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964,
-    doi 10.1021/ac60214a047).
+    doi 10.1021/ac60214a047). A wild sample (`wild`) is taken to lie between its neighbours: it would be in all the window.
     """
+    wild = wild_rows(position, _WILD_RAD)
+    if wild.any():
+        position = np.interp(time_s, time_s[~wild], position[~wild])
     step = float(np.median(np.diff(time_s)))
     longest = min(
         max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)),
@@ -243,8 +253,11 @@ def _column(section: Section) -> Column:
     scale = section.number("scale", unit="target units per cell unit", default=1.0)
     if scale == 0.0:
         raise section.error("scale", scale, "a number other than 0")
+    name = section.raw("column", expected="a column of the file, or an expression of columns")
+    if not isinstance(name, str):
+        raise section.error("column", name, "a column of the file, or an expression of columns")
     column = Column(
-        section.text("column"),
+        name,
         scale,
         section.number("offset", unit="target units", default=0.0),
     )

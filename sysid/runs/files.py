@@ -28,9 +28,8 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
 from jtqd.sysid.progress import progress
@@ -49,7 +48,9 @@ are notes."""
 BRIDGED_S: Final = 0.025
 """Taking apart, a gap this short is no end of a piece: what lies in it is interpolated (`time_base.on_even_steps`)."""
 SHORTEST_PIECE_S: Final = 1.0
+"""Also the least by which the time must step back for a new run to begin there, and no stamp to be wrong."""
 GAP_NOTED: Final = 1.5
+_BLANK: Final = ("", "nan")
 DEAD_ROWS: Final = 100
 """A channel without a single non-zero value over this many rows is dead, not quiet."""
 
@@ -68,7 +69,7 @@ class RunFile:
         sha256: of the file on disk (hex).
         table: its columns. The pieces of one recording keep its time.
         notes: what is suspicious about it, one line each.
-        piece: number of this piece of the file, and how many there are.
+        piece: number of this piece of its run in the file, and how many there are.
     """
 
     name: str
@@ -116,8 +117,9 @@ def read_runs(
     """Read all runs of files and directories (`run_paths`); a progress bar on a terminal.
 
     columns: a column map or its file. Names are unique: the file's, or its path where two files share a name.
-    in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error; the parts of
-    one run of jtqd are one recording.
+    in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error; rows with a
+    blank cell are gaps, and a table whose time starts again is several runs, "a.csv (run 1 of 2)"; the parts of one run of
+    jtqd are one recording.
     joints: numbers of those that are wanted of a log, where a row needs the inputs of all of them; None: all that it has. A
     table gives the joints that it has.
 
@@ -138,25 +140,28 @@ def read_runs(
         if parts:
             read = _checked(_read_log(path, *parts, joints=joints), whole=False)
         else:
-            read = _checked(_content(path, mapping, joints), whole=not in_pieces)
+            read = _checked(_content(path, mapping, joints, blanks=in_pieces), whole=not in_pieces)
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
-        found = [stretches(run.table) for run in read]
-        same = next((name for name, each in known for one in found if same_run(each, one)), None)
-        if same is not None:
-            raise RunError(
-                f"{path}: found the same run as in {same} (position and current agree), expected every run once"
-            )
-        if runs and mapping is not None:  # what holds for every file is said once
-            said = set(mapping.remarks())
-            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
         taken = {other.name for other in runs}
-        runs += [
+        read = [
             replace(run, name=run.name.replace(path.name, str(path), 1)) if run.name in taken else run
             for run in read
         ]
-        known += [(run.name, each) for run, each in zip(runs[-len(read) :], found, strict=True)]
+        for run in read:
+            found = stretches(run.table)
+            same = next((name for name, each in known if same_run(each, found)), None)
+            if same is not None:
+                raise RunError(
+                    f"{path}: found the same run{f' ({run.name})' if len(read) > 1 else ''} as in {same} (position and "
+                    "current agree), expected every run once"
+                )
+            known.append((run.name, found))
+        if runs and mapping is not None:  # what holds for every file is said once
+            said = set(mapping.remarks())
+            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
+        runs += read
     return runs
 
 
@@ -173,11 +178,12 @@ def read_run(
 
 
 def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunFile]:
-    """Read one file as `read_run`, taken apart at its gaps; pieces shorter than SHORTEST_PIECE_S are left out and noted.
+    """Read one file as `read_run`, taken apart where its time starts again, at its gaps and rows with a blank cell; pieces
+    shorter than SHORTEST_PIECE_S are left out and noted.
 
     Raises RunError, also where no piece is long enough.
     """
-    return _checked(_content(Path(path), columns), whole=False)
+    return _checked(_content(Path(path), columns, blanks=True), whole=False)
 
 
 def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
@@ -203,7 +209,10 @@ class _Content:
     columns: ColumnMap | None = None
 
 
-def _content(path: Path, columns: ColumnMap | None, joints: Sequence[int] | None = None) -> _Content:
+def _content(
+    path: Path, columns: ColumnMap | None, joints: Sequence[int] | None = None, *, blanks: bool = False
+) -> _Content:
+    """Read a file; blanks: rows of a table with a blank cell are left out, else refused."""
     if not path.is_file():
         found = "something that is no file" if path.exists() else "no such file"
         found = "a directory" if path.is_dir() else found
@@ -211,9 +220,9 @@ def _content(path: Path, columns: ColumnMap | None, joints: Sequence[int] | None
     if path.name.endswith(LOGS):
         return _read_log(path, joints=joints)
     if path.name.endswith(".parquet"):
-        return _read_parquet(path, columns)
+        return _read_parquet(path, columns, blanks=blanks)
     if path.name.endswith(TABLES):
-        return _read_csv(path, columns)
+        return _read_csv(path, columns, blanks=blanks)
     raise RunError(f"{path}: found a file ending in '{path.suffix}', expected {', '.join(TABLES + LOGS)}")
 
 
@@ -264,32 +273,51 @@ def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
     time_s, path = content.values[TIME], content.path
     if len(time_s) < 2:
         raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
-    notes = [*content.notes, *_check_time(time_s, content.lines, path, whole=whole)]
-    cuts = [slice(0, len(time_s))] if whole else _pieces(time_s)
-    long = [cut for cut in cuts if len(cuts) == 1 or _length_s(time_s, cut) >= SHORTEST_PIECE_S]
-    if not long:
-        longest = max(_length_s(time_s, cut) for cut in cuts)
+    starts = [] if whole else _new_runs(time_s)
+    runs = [slice(a, b) for a, b in pairwise([0, *starts, len(time_s)])]
+    notes = list(content.notes)
+    for number, run in enumerate(runs, 1):
+        found = _check_time(time_s, content.lines, path, run=run, whole=whole)
+        notes += [f"run {number}: {note}" if starts else note for note in found]
+    cuts = [[run] if whole else _pieces(time_s, run) for run in runs]
+    count = sum(map(len, cuts))
+    long = [
+        [cut for cut in each if count == 1 or _length_s(time_s, cut) >= SHORTEST_PIECE_S] for each in cuts
+    ]
+    if not any(long):
+        longest = max(_length_s(time_s, cut) for each in cuts for cut in each)
         raise RunError(
-            f"{path}: found {len(cuts)} pieces between gaps, the longest of {longest:.3g} s, expected one of at least "
+            f"{path}: found {count} pieces between gaps, the longest of {longest:.3g} s, expected one of at least "
             f"{SHORTEST_PIECE_S:g} s"
         )
-    if len(cuts) > 1:
-        kept = sum(_length_s(time_s, cut) for cut in long)
+    if starts:
+        notes.append(f"the time starts again {counted(len(starts), 'time')}: {len(runs)} runs in one file")
+    if count > len(runs):
+        kept = sum(_length_s(time_s, cut) for each in long for cut in each)
+        whole_s = sum(_length_s(time_s, run) for run in runs)
+        pieces = counted(sum(map(len, long)), "piece")
         notes.append(
-            f"{counted(len(cuts) - 1, 'gap')} of more than {BRIDGED_S:g} s: used as {counted(len(long), 'piece')} of one "
-            f"recording, {kept:.3g} s of {time_s[-1] - time_s[0]:.3g} s"
+            f"{counted(count - len(runs), 'gap')} of more than {BRIDGED_S:g} s: used as {pieces} of "
+            f"{'one recording' if len(runs) == 1 else 'these runs'}, {kept:.3g} s of {whole_s:.3g} s"
         )
+    elif sum(map(len, long)) < count:
+        notes.append(
+            f"{counted(count - sum(map(len, long)), 'run')} of less than {SHORTEST_PIECE_S:g} s left out"
+        )
+    if count > 1:
         notes += _unwrapped_over_gaps(content)
     if content.columns is not None:
         notes += content.columns.remarks()
-    return [
-        _piece(content, cut, notes if number == 1 else [], (number, len(long)))
-        for number, cut in enumerate(long, 1)
-    ]
+    read: list[RunFile] = []
+    for number, each in enumerate(long, 1):
+        name = f"{path.name} (run {number} of {len(runs)})" if starts else path.name
+        for k, cut in enumerate(each, 1):
+            read.append(_piece(content, cut, name, [] if read else notes, (k, len(each))))
+    return read
 
 
-def _piece(content: _Content, cut: slice, notes: Sequence[str], place: tuple[int, int]) -> RunFile:
-    """Make the run table of the rows of one piece."""
+def _piece(content: _Content, cut: slice, name: str, notes: Sequence[str], place: tuple[int, int]) -> RunFile:
+    """Make the run table of the rows of one piece; name: of its run."""
     path, notes = content.path, list(notes)
     values = {key: value[cut] for key, value in content.values.items()}
     if content.columns is not None:
@@ -314,16 +342,27 @@ def _piece(content: _Content, cut: slice, notes: Sequence[str], place: tuple[int
         table = RunTable(time_s=values[TIME], joints=joints)
     except RunTableError as error:  # a scale of the column map that leaves the range of a float
         raise RunError(f"{path}: {error}") from None
-    name = path.name if place[1] == 1 else f"{path.name} ({place[0]} of {place[1]})"
+    name = name if place[1] == 1 else f"{name} ({place[0]} of {place[1]})"
     return RunFile(name, path, content.source, content.sha256, table, tuple(notes), place)
 
 
-def _pieces(time_s: FloatArray) -> list[slice]:
-    """Return the rows between gaps; the time rises."""
+def _new_runs(time_s: FloatArray) -> list[int]:
+    """Return the rows at which the time starts again and goes on from there; a single wrong stamp is none."""
     steps = np.diff(time_s)
-    longest = max(LONGEST_GAP * float(np.median(steps)), BRIDGED_S)
-    ends = [0, *(np.flatnonzero(steps > longest) + 1), len(time_s)]
-    return [slice(int(a), int(b)) for a, b in pairwise(ends)]
+    longest = _longest_step(steps)
+    rows = np.flatnonzero(steps[:-1] <= -SHORTEST_PIECE_S) + 1
+    return [int(row) for row in rows if 0.0 < steps[row] <= longest]
+
+
+def _longest_step(steps: FloatArray) -> float:
+    return max(LONGEST_GAP * float(np.median(steps)), BRIDGED_S)
+
+
+def _pieces(time_s: FloatArray, run: slice) -> list[slice]:
+    """Return the rows between the gaps of a run; its time rises."""
+    steps = np.diff(time_s[run])
+    ends = [0, *(np.flatnonzero(steps > _longest_step(steps)) + 1), run.stop - run.start]
+    return [slice(run.start + int(a), run.start + int(b)) for a, b in pairwise(ends)]
 
 
 def _unwrapped_over_gaps(content: _Content) -> list[str]:
@@ -339,19 +378,25 @@ def _length_s(time_s: FloatArray, cut: slice) -> float:
 
 
 def _check_time(
-    time_s: NDArray[np.float64], lines: Sequence[int] | None, path: Path, *, whole: bool
+    time_s: FloatArray, lines: Sequence[int] | None, path: Path, *, run: slice, whole: bool
 ) -> list[str]:
-    """Refuse time that stands or runs back, and in a whole run long gaps; note the short gaps."""
+    """Refuse time of a run that stands or runs back, and in a whole one long gaps; note the short gaps."""
 
     def at(row: int) -> str:
-        return f"sample {row}" if lines is None else f"line {lines[row]}"
+        return f"sample {run.start + row}" if lines is None else f"line {lines[run.start + row]}"
 
+    time_s = time_s[run]
     steps = np.diff(time_s)
     if not np.all(steps > 0.0):
         row = int(np.argmax(steps <= 0.0)) + 1
+        several = (
+            ": one run in a file here (`jtq diagnose` takes several apart)"
+            if row in _new_runs(time_s)
+            else ""
+        )
         raise RunError(
             f"{path}: {at(row)}: found time {time_s[row]:.6g} s after {time_s[row - 1]:.6g} s, "
-            "expected rising time"
+            f"expected rising time{several}"
         )
     median = float(np.median(steps))
     longest = int(np.argmax(steps))
@@ -387,14 +432,51 @@ class _Rows(Protocol):
     def __next__(self) -> list[str]: ...
 
 
-def _read_csv(path: Path, columns: ColumnMap | None) -> _Content:
+def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> _Content:
     data, sha256 = _bytes(path)
-    rows = csv.reader(io.StringIO(_text(path, data), newline=""))
+    text = _text(path, data)
+    first = text.lstrip().split("\n", 1)[0]
+    separator = next((mark for mark in ",;\t" if mark in first), ",")
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     header = _header(rows, path)
     columns = _wanted_columns(header, path, columns)
     wanted = _expressions(header, path, columns)
-    cells, lines = _cells_of_text(rows, path, header, _names(wanted))
-    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, columns=columns)
+    cells, lines = _cells_of_text(rows, path, header, _names(wanted), blanks=blanks)
+    cells, keep, wanted, notes = _without_blanks(path, cells, wanted, columns)
+    lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
+    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, notes, columns)
+
+
+def _without_blanks(
+    path: Path, cells: Mapping[str, FloatArray], wanted: Mapping[str, Expression], columns: ColumnMap
+) -> tuple[dict[str, FloatArray], BoolArray, dict[str, Expression], tuple[str, ...]]:
+    """Return cells [n] without rows in which one is blank (NaN), the rows kept [all], the targets that have a value at all,
+    and notes. A column that is blank everywhere is absent. Raises RunError for one that cannot be.
+    """
+    blank = {name: np.isnan(cell) for name, cell in cells.items()}
+    absent = {name for name, rows in blank.items() if len(rows) and rows.all()}
+    made = {f"j{n}" for n in (*(columns.loads or {}), *(columns.drives or {}))}
+    for key, each in wanted.items():
+        name = next((name for name in each.names if name in absent), None)
+        if name is not None and (key == TIME or key.partition(".")[0] in made):
+            raise RunError(
+                f"{path}: column {name!r}: found it blank in every row, expected numbers for {key}"
+            )
+    there = {key: each for key, each in wanted.items() if not absent & set(each.names)}
+    used = _names(there)
+    keep = ~np.any([blank[name] for name in used], axis=0)
+    notes = [f"column {name!r} is blank in every row: taken as absent" for name in cells if name in absent]
+    count = {name: int(blank[name].sum()) for name in used if blank[name].any()}
+    if count:
+        which = ", ".join(f"{name!r} in {rows}" for name, rows in count.items())
+        notes.append(
+            f"{int((~keep).sum())} of {counted(len(keep), 'row')} left out for a blank cell ({which})"
+        )
+    if count and np.count_nonzero(keep) < 2:
+        raise RunError(
+            f"{path}: {notes[-1]}: found {counted(int(keep.sum()), 'sample')}, expected at least 2"
+        )
+    return {name: cells[name][keep] for name in used}, keep, there, tuple(notes)
 
 
 def _text(path: Path, data: bytes) -> str:
@@ -429,9 +511,11 @@ def _next_row(rows: _Rows, path: Path) -> list[str] | None:
 
 
 def _cells_of_text(
-    rows: _Rows, path: Path, header: list[str], wanted: Sequence[str]
+    rows: _Rows, path: Path, header: list[str], wanted: Sequence[str], *, blanks: bool
 ) -> tuple[dict[str, FloatArray], list[int]]:
-    """Return columns of the file as arrays [n], n >= 2, all finite, and the line [n] on which each sample ends."""
+    """Return columns of the file as arrays [n], n >= 2, all finite, and the line [n] on which each sample ends. blanks: a
+    blank cell is NaN.
+    """
     source = {name: header.index(name) for name in wanted}
     cells: dict[str, list[float]] = {name: [] for name in source}
     lines: list[int] = []
@@ -446,10 +530,11 @@ def _cells_of_text(
                 value = float(row[index])
             except ValueError:
                 value = math.nan
-            if not math.isfinite(value):
+            if not math.isfinite(value) and not (blanks and row[index].strip().lower() in _BLANK):
+                comma = " with a decimal point" if "," in row[index] else ""
                 raise RunError(
                     f"{path}: line {line}, column {name!r}: found {row[index][:40]!r}, "
-                    "expected a finite number"
+                    f"expected a finite number{comma}"
                 )
             cells[name].append(value)
         lines.append(line)
@@ -461,7 +546,7 @@ def _cells_of_text(
 # Parquet and logs.
 
 
-def _read_parquet(path: Path, columns: ColumnMap | None) -> _Content:
+def _read_parquet(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> _Content:
     data, sha256 = _bytes(path)
     if importlib.util.find_spec("pyarrow") is None:
         raise RunError(f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow")
@@ -478,12 +563,17 @@ def _read_parquet(path: Path, columns: ColumnMap | None) -> _Content:
         if isinstance(error, RunError):
             raise
         raise RunError(f"{path}: not a readable Parquet file: {' '.join(str(error).split())}") from None
-    cells = {name: _cells_of_arrow(path, name, table.column(name)) for name in table.column_names}
-    return _Content(path, "parquet", sha256, _scaled(cells, wanted, columns), columns=columns)
+    cells = {
+        name: _cells_of_arrow(path, name, table.column(name), blanks=blanks) for name in table.column_names
+    }
+    cells, _, wanted, notes = _without_blanks(path, cells, wanted, columns)
+    return _Content(path, "parquet", sha256, _scaled(cells, wanted, columns), None, notes, columns)
 
 
-def _cells_of_arrow(path: Path, name: str, column: Any) -> FloatArray:
-    """Return one column as float64 [n]; text that is no number, empty cells, NaN: RunError with the first bad row."""
+def _cells_of_arrow(path: Path, name: str, column: Any, *, blanks: bool) -> FloatArray:
+    """Return one column as float64 [n]; text that is no number, infinity and, unless blanks are allowed, empty cells and
+    NaN: RunError with the first bad row.
+    """
     values = column.to_numpy()
     try:
         cells: FloatArray = np.asarray(values, np.float64)
@@ -492,7 +582,7 @@ def _cells_of_arrow(path: Path, name: str, column: Any) -> FloatArray:
         raise RunError(
             f"{path}: row {row + 1}, column {name!r}: found {str(values[row])[:40]!r}, expected a finite number"
         ) from None
-    good = np.isfinite(cells)
+    good = ~np.isinf(cells) if blanks else np.isfinite(cells)
     if not good.all():
         row = int(np.argmin(good))
         raise RunError(

@@ -16,7 +16,7 @@ from jtqd.sysid.diagnosis.findings import Cause, Findings
 from tests.hidden.scores import Outcome
 from tests.worlds import campaign as campaigns
 from tests.worlds.campaign import Counts, campaign, jobs, main, read
-from tests.worlds.figures import figures, lost_to_wrong
+from tests.worlds.figures import failures, figures, lost_to_wrong
 from tests.worlds.judge import REFUSED, judged, write
 from tests.worlds.measured_bench import MeasuredBench
 from tests.worlds.oracle import sizes
@@ -224,6 +224,11 @@ def test_the_table_counts_what_the_targets_ask() -> None:
     assert rows["nothing hidden: a name, or unexplained"].value == 1.0
     assert rows["foreign: refused and placed"].reached
     assert rows["foreign worth more than the relevance called no_gap"].reached
+    beside = outcome("beside", named=(True,), classed=(False,), wrong=("cogging of 1",))
+    with_it = {f.what: f for f in figures([found, beside])}
+    assert with_it["a wrong name"].value == 0.5
+    assert with_it["cause beside a foreign effect: named"].value == 1.0
+    assert failures([found, beside])[0].startswith("beside")
     gone = outcome("foreign", verdict="no_gap", place=False)
     row = "foreign worth more than the relevance called no_gap"
     assert not {f.what: f for f in figures([gone])}[row].reached

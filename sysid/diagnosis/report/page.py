@@ -69,8 +69,7 @@ def library() -> Mapping[str, Effect]:
 
 def _scope(findings: Findings) -> str:
     """Return what was looked at, e.g. "6 runs, joints 1 and 2"."""
-    count = len(findings.runs)
-    runs = "1 run" if count == 1 else f"{count} runs"
+    runs = findings.runs_text
     if not findings.joints:
         return runs
     names = listed([str(j) for j in findings.joints])

@@ -18,7 +18,7 @@ def fleet(directory, names):
     """One directory with one short run each, no two the same: too little to judge, and quick."""
     for number, name in enumerate(names):
         (directory / name).mkdir(parents=True)
-        write_runs(directory / name, count=1, seconds=0.3 + 0.01 * number)
+        write_runs(directory / name, count=1, seconds=1.0 + 0.01 * number)
     return directory
 
 

@@ -199,7 +199,7 @@ def test_a_fleet_with_one_broken_log(tmp_path, capsys):
     assert "http" not in page.replace("http-equiv", "")
 
     before = results(out)
-    write_runs(logs / "r1" / "left", count=1, seconds=0.4)
+    write_runs(logs / "r1" / "left", count=1, seconds=1.1)
     (logs / "r1" / "right").rename(logs / "r1" / "moved")
     (logs / "r2" / "bad.csv").unlink()
     assert jtq(["batch", *arguments(logs, out, "--json")]) == 0

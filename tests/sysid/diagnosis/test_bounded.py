@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,7 +11,9 @@ import pytest
 
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis import bounded
+from jtqd.sysid.diagnosis.findings import BoundedValue, Cause
 from tests.sysid.diagnosis.diagnose_core_helpers import candidates, dense, search_of
+from tests.sysid.diagnosis.diagnose_helpers import COULOMB, OFFSET
 
 
 @pytest.mark.parametrize(("of_file", "said"), [(-0.05, True), (0.05, False), (0.3, False)])
@@ -45,3 +48,20 @@ def test_only_a_best_value_that_is_not_possible_is_said_as_a_bound(
     assert (result is not None) is said
     if result is not None:
         assert result.best == pytest.approx(of_file * file, rel=0.05)
+
+
+def test_the_extended_file_takes_the_only_bound_of_a_joint_of_which_nothing_is_named() -> None:
+    def of(name: str, joint: int = 1) -> BoundedValue:
+        return BoundedValue(name, joint, "x", "Nm", 2.0, -0.1, 0.7, ())
+
+    def taken(bounds: list[BoundedValue], *causes: Cause) -> list[bool]:
+        return [bound.in_file for bound in bounded.in_the_file(bounds, causes)]
+
+    viscous, coulomb, inertia = map(of, ("viscous_friction", "coulomb_friction", "rotor_inertia"))
+    assert taken([viscous]) == [True]
+    assert taken([viscous, of("coulomb_friction", 2)], COULOMB) == [True, False], "COULOMB is of joint 2"
+    assert taken([viscous], OFFSET) == [False], "of the sensor"
+    assert taken([viscous, coulomb]) == [False, False], "proven one by one, not together"
+    assert taken([inertia]) == [False], "a rotor without inertia cannot be simulated"
+    assert viscous.text.endswith("in the runs left out")
+    assert replace(viscous, in_file=True).text.endswith("; the extended joint file takes 0")

@@ -227,7 +227,10 @@ def test_parquet_is_the_same_run(tmp_path: Path, core: Core, capsys: pytest.Capt
     capsys.readouterr()
     spoilt = columns.current_a.copy() if columns.current_a is not None else None
     assert spoilt is not None
-    spoilt[4] = np.nan
+    spoilt[4] = np.inf
+    parquet.write_table(arrow.table({name: cell[:1] for name, cell in cells.items()}), path)
+    assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1
+    assert "found 1 sample, expected at least 2" in said(capsys)
     for content, wanted in ((spoilt, "row 5, column 'j1.current_a'"), (["x"] * len(spoilt), "found 'x'")):
         parquet.write_table(arrow.table({**cells, "j1.current_a": content}), path)
         assert run(path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1
@@ -287,12 +290,31 @@ def test_options_reach_the_diagnosis(tmp_path: Path, core: Core, capsys: pytest.
     assert asked_limits is not None
     assert (asked_limits.travel_rad, asked_limits.velocity_rad_s) == ((-0.5, 0.5), 1.0)
     assert load_joint(tmp_path / "o" / "extended.joint.yaml").motion_limits is None  # not of the joint
-    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--without", "gravity") == 1
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--without", "gravity") == 2
     assert "--without gravity: found no effect of that name" in capsys.readouterr().err
     for wrong in ("speed=1", "travel_rad=1", "travel_rad=1:-1", "velocity_rad_s=fast", "torque_nm=0"):
         with pytest.raises(SystemExit) as caught:
             run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--limits", wrong)
         assert caught.value.code == 2
+
+
+def test_limits_beyond_those_of_the_file_are_said(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path, numbers=(1,))
+    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": None, "motion": None})
+    limits = {"travel_rad": [-0.5, 0.5], "velocity_rad_s": 1.0}
+    (tmp_path / "j.yaml").write_text(joint_text(motion_limits=limits))
+    for asked, sentence in (
+        ("travel_rad=-0.4:0.5,velocity_rad_s=0.5,torque_nm=5", ""),
+        (
+            "travel_rad=-0.4:0.6,velocity_rad_s=2,torque_nm=5",
+            " --limits allows more than motion_limits of joint 1: travel_rad -0.4:0.6, the file -0.5:0.5; "
+            "velocity_rad_s 2, the file 1.",
+        ),
+    ):
+        options = ("--joint", tmp_path / "j.yaml", "--out", tmp_path / "o", "--limits", asked, "--force")
+        run(tmp_path / "a.csv", *options)
+        made = json.loads((tmp_path / "o" / "findings.json").read_text())
+        assert made["next_experiment"]["why"] == f"w.{sentence}"
 
 
 def test_a_known_load_of_the_map_is_no_sensor(tmp_path: Path, core: Core) -> None:
@@ -350,6 +372,8 @@ def test_a_failure_on_the_way_leaves_the_earlier_results(
         (("--joint", "a.yaml", "--joint", "b.yaml"), "two files for all joints"),
         (("--joint", "1=a.yaml", "--joint", "1=b.yaml"), "two files of joint 1"),
         (("--joint", "1=a.yaml", "--joint", "b.yaml"), "expected either"),
+        (("--joint", "a.yaml", "--given", "gravity"), "--given gravity: found no effect"),
+        (("--joint", "a.yaml", "--without", "cogging", "--given", "1=cogging"), "expected one of them"),
     ],
 )
 def test_usage(
@@ -382,7 +406,7 @@ def cell(text: str, row: int, column: int, content: str) -> str:
     [
         (lambda text: "", "empty file"),
         (lambda text: text.splitlines()[0] + "\n", "0 samples"),
-        (lambda text: cell(text, 5, 1, "nan"), "line 6, column 'j1.current_a': found 'nan'"),
+        (lambda text: cell(text, 5, 1, "inf"), "line 6, column 'j1.current_a': found 'inf'"),
         (lambda text: cell(text, 7, 2, "12,5"), "line 8: found"),
         (lambda text: cell(text, 9, 1, "1.5 A"), "line 10, column 'j1.current_a': found '1.5 A'"),
         (lambda text: cell(text, 9, 0, "0.001"), "expected rising time"),

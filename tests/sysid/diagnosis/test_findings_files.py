@@ -14,7 +14,16 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint
 from jtqd.sysid.diagnosis.extended_joint import extended, files, title, write_extended
-from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, CandidateEvidence, Value, plain, to_mapping
+from jtqd.sysid.diagnosis.findings import (
+    INSUFFICIENT,
+    NO_GAP,
+    UNEXPLAINED,
+    BoundedValue,
+    CandidateEvidence,
+    Value,
+    plain,
+    to_mapping,
+)
 from tests.sysid.diagnosis.diagnose_helpers import COULOMB, JOINT, OFFSET, RIPPLE, cause, findings, value
 
 ORIGIN = {"sha256": {"a.csv": "aa", "b.csv.gz": "bb", "other": "cc"}, "date": "2026-11-21"}
@@ -70,7 +79,10 @@ def test_values_are_those_of_the_findings_and_what_is_not_finite_is_null() -> No
     assert mapping["candidates"][0]["minimum"]["torque_nm"]["value"] is None
     assert mapping["candidates"][0]["evidence"]["held_out_gain"] is None
     assert mapping["next_experiment"] == {"why": "because", "plan": {"schema": "jtq.plan/1"}}
-    assert mapping["runs"] == [{"name": "a.csv", "sha256": "aa"}, {"name": "b.csv.gz", "sha256": None}]
+    assert mapping["runs"] == [
+        {"name": "a.csv", "sha256": "aa", "used": True},
+        {"name": "b.csv.gz", "sha256": None, "used": True},
+    ]
     assert "NaN" not in text
     assert "Infinity" not in text
 
@@ -174,6 +186,37 @@ def test_files_read_back_as_the_joints_meant(tmp_path: Path) -> None:
     text = (tmp_path / "extended.joint1.yaml").read_text()
     assert text.startswith(f"# {title(1, made)}")
     assert "torque_ripple, sensor_offset" in text.splitlines()[0]
+
+
+def test_a_bound_is_in_the_file_and_marked() -> None:
+    bound = BoundedValue("viscous_friction", 1, "viscous_nms_per_rad", "Nms/rad", 2.0, -0.1, 0.68, ())
+    joint = replace(JOINT, effects=(Effect("viscous_friction", {"viscous_nms_per_rad": 3.0}),))
+    made = replace(findings(UNEXPLAINED), bounded=(replace(bound, in_file=True),))
+    with_it = extended(joint, 1, made, **ORIGIN)
+    assert [(e.name, e.parameters) for e in with_it.effects] == [
+        ("viscous_friction", {"viscous_nms_per_rad": 0.0})
+    ]
+    assert with_it.provenance["diagnosis"]["at_their_bound"] == [
+        {"name": "viscous_friction", "joint": 1, "viscous_nms_per_rad": [0.0, 0.68]}
+    ]
+    assert "effects" not in with_it.provenance["diagnosis"]
+    assert "took viscous_friction at its bound (0, at most 0.68 Nms/rad)" in title(1, made)
+    assert to_mapping(made)["bounded"][0]["in_file"] is True
+    for other in (
+        extended(joint, 2, made, **ORIGIN),
+        extended(joint, 1, replace(made, bounded=(bound,)), **ORIGIN),
+    ):
+        assert other.effects == joint.effects
+        assert "at_their_bound" not in other.provenance["diagnosis"]
+
+
+def test_a_file_says_how_many_runs_were_used() -> None:
+    made = replace(findings(causes=(COULOMB,)), runs=("a", "b", "c"), used=("a", "c"))
+    assert title(2, made).startswith("Written by jtq diagnose from 2 of 3 runs: found coulomb_friction")
+    origin = ORIGIN | {"sha256": {"a": "0", "b": "1", "c": "2"}}
+    assert extended(JOINT, 2, made, **origin).provenance["diagnosis"]["sha256"] == {"a": "0", "c": "2"}
+    assert [run["used"] for run in to_mapping(made)["runs"]] == [True, False, True]
+    assert title(2, replace(made, used=())).startswith("Written by jtq diagnose from 3 runs: ")
 
 
 def test_without_a_cause_the_joint_stays_as_it_is(tmp_path: Path) -> None:

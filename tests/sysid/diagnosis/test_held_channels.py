@@ -12,7 +12,7 @@ import pytest
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import dataset as datasets
 from jtqd.sysid.diagnosis.dataset import unknown_lines, usable_signals
-from jtqd.sysid.diagnosis.leftover import held_nm
+from jtqd.sysid.diagnosis.leftover import held_energies_nm2, held_nm
 from jtqd.sysid.diagnosis.named import Found
 from jtqd.sysid.diagnosis.regressors import families, run_data
 from jtqd.sysid.diagnosis.signals import Channel, Line
@@ -51,13 +51,17 @@ def test_clipped_samples_are_in_no_fit_however_few_and_count_by_what_they_cost()
             rest = d.residual[d.valid]
             assert np.sqrt(np.mean((rest - rest.mean()) ** 2)) < 0.01 * LIMIT, "what is left is measured"
     none = [np.zeros(len(families(runs)))] * 2
-    cost = held_nm(
-        cast("Any", SimpleNamespace(runs=binned)), cast("Any", SimpleNamespace(runs=binned, nuisances=none))
-    )
+    data, fit = SimpleNamespace(runs=binned), SimpleNamespace(runs=binned, nuisances=none)
+    cost = held_nm(cast("Any", data), cast("Any", fit))
     whole = rigid_run(PLAIN, 0.2, seconds=5.0).joints[1].torque_nm
     assert whole is not None
     over = np.maximum(np.abs(whole) - LIMIT, 0.0)
     assert cost[TORSION1] == pytest.approx(float(np.sqrt(np.mean(over**2))), rel=0.1)
+    other = rigid_run(PLAIN, 0.9, seconds=5.0).joints[1].torque_nm
+    assert other is not None
+    few = np.maximum(np.abs(other[:400]) - LIMIT, 0.0)
+    energy = float(np.sum(over**2) + np.sum(few**2)) / (len(over) + len(other))
+    assert held_energies_nm2(cast("Any", data), cast("Any", fit))[TORSION1] == pytest.approx(energy, rel=0.2)
 
 
 @pytest.mark.parametrize(("cost", "matters"), [(0.1, False), (0.3, True)])
@@ -77,6 +81,18 @@ def test_a_held_channel_matters_by_its_size(cost: float, matters: bool) -> None:
     )
     assert found.matters is matters
     assert not found.beside, "causes are judged by what is measured"
+
+
+def test_what_a_held_channel_costs_is_in_the_share_that_is_left_over() -> None:
+    left = SimpleNamespace(worst_nm={}, energy_nm2=lambda: 0.01)
+    fit = SimpleNamespace(refined=None, chosen=())
+    case = SimpleNamespace(
+        held_nm=lambda _: {MOTOR1: 0.3, TORSION1: 0.1},
+        held_energies_nm2=lambda _: {MOTOR1: 0.03, TORSION1: 5.0},
+    )
+    parts = (case, fit, fit, None, left, 0.0, {MOTOR1: 0.2, TORSION1: 0.2}, ())
+    found = Found(*cast("Any", parts))
+    assert found.remains_nm2(cast("Any", left)) == pytest.approx(0.04), "of the channel that matters"
 
 
 def test_one_vibration_is_taken_out_of_every_channel_that_shows_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,6 +78,7 @@ def test_one_run_is_named_and_the_joint_is_not(
     (found,) = to_mapping(findings)["odd_runs"]
     assert (found["run"], found["what"], found["joint"]) == ("run2", what, odd.joint)
     assert odd.text in findings.channel_notes
+    assert findings.used_runs == tuple(name for name in findings.runs if name != "run2")
 
 
 def test_what_all_runs_share_is_an_effect_and_days_are_none() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import Sums
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.runs.files import read_runs, write_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
 
 JOINTS = {1: JOINT, 2: JOINT}
@@ -66,6 +68,22 @@ def test_the_middle_of_one_recording_does_not_go_on_in_another() -> None:
         for k, rows in ((1, slice(0, HALF)), (2, slice(HALF + 150, None)))
     ]
     assert recordings(signals(*runs)) == [0, 0, 1, 1, 2]
+
+
+def test_one_recording_whose_time_starts_again_counts_once(tmp_path: Path) -> None:
+    """Cut in the middle of the motion: the stamps say two runs, the motion one."""
+    whole = bench_run(seconds=6.0)
+    halves = [cut(whole, slice(0, HALF)), cut(whole, slice(HALF, None))]
+    text = []
+    for part in (*halves, bench_run(phase=0.7)):
+        write_run(tmp_path / "part.csv", cut(part, slice(None), from_zero=True))
+        text += (tmp_path / "part.csv").read_text().splitlines(keepends=True)[1 if text else 0 :]
+    (tmp_path / "part.csv").unlink()
+    (tmp_path / "a.csv").write_text("".join(text))
+    runs = read_runs([tmp_path], in_pieces=True)
+    assert [run.name for run in runs] == [f"a.csv (run {k} of 3)" for k in (1, 2, 3)]
+    found = signals(*((run.name, run.table) for run in runs))
+    assert recordings(found) == [0, 0, 1, 2]
 
 
 def test_runs_with_motions_of_their_own_are_runs() -> None:

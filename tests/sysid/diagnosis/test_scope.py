@@ -5,12 +5,12 @@ from dataclasses import replace
 
 import pytest
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.file_values import file_values
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, scope_of
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
+from jtqd.sysid.runs.joints import UsageError
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
 JOINT = load_joint(shipped("joint1.yaml"))
@@ -60,9 +60,27 @@ def test_no_sensor_effect_touches_a_known_load() -> None:
     ],
 )
 def test_wrong_names_are_told(without: list[str], given: list[str], said: str) -> None:
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(UsageError) as caught:
         scope_of(without, given, JOINTS)
     assert said.replace("synthetic_joint_1", JOINT.name) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("without", "given", "refused"),
+    [
+        ("coulomb_friction", "coulomb_friction", True),
+        ("1=coulomb_friction", "coulomb_friction", True),
+        ("coulomb_friction", "2=coulomb_friction", True),
+        ("1=coulomb_friction", "2=coulomb_friction", False),
+        ("coulomb_friction", "viscous_friction", False),
+    ],
+)
+def test_an_effect_is_absent_or_given(without: str, given: str, refused: bool) -> None:
+    if refused:
+        with pytest.raises(UsageError, match=f"--without {without}: found it beside --given {given}"):
+            check_effects([without], [given])
+    else:
+        check_effects([without], [given])
 
 
 def test_given_is_what_the_file_has() -> None:

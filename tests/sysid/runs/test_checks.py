@@ -9,12 +9,13 @@ from functools import partial
 import numpy as np
 import pytest
 
-from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.time_base import on_even_steps, skew_s, unwrapped
+from jtqd.sysid.runs.wild import wild_rows, without_wild_samples
 from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     JOINTS,
@@ -252,3 +253,83 @@ def test_every_run_is_judged_for_itself(run: RunTable) -> None:
     assert [(name, list(table.joints)) for name, table in result.runs] == [("a", [1, 2]), ("b", [2])]
     assert result.lost == ()
     assert [line[0] for line in result.refused] == ["b", "c"]
+
+
+def with_wild(run: RunTable, name: str, value: float) -> RunTable:
+    column = getattr(run.joints[1], name).copy()
+    column[7000] = value
+    return changed(run, lambda c: replace(c, **{name: column}))
+
+
+@pytest.mark.parametrize("name", sorted(set(COLUMN_NAMES) - {"enabled", "link_velocity_rad_s"}))
+@pytest.mark.parametrize("value", [1e30, -1e6, 4e3])
+def test_a_row_with_a_wild_sample_is_left_out_and_said(run: RunTable, name: str, value: float) -> None:
+    kept, [note] = without_wild_samples(with_wild(run, name, value), JOINTS, "r.csv")
+    assert f"j1.{name}: found 1 wild sample, {value:.4g} at 7 s" in note.text
+    assert np.array_equal(kept.time_s, np.delete(run.time_s, 7000))
+    for number, column in ((1, name), (2, "torque_nm")):
+        before = getattr(run.joints[number], column)
+        assert np.array_equal(getattr(kept.joints[number], column), np.delete(before, 7000))
+
+
+def test_a_wild_sample_is_interpolated_as_a_lost_row(run: RunTable) -> None:
+    result = checked(with_wild(run, "torque_nm", 1e30))
+    wild, uneven = result.notes
+    assert "1 wild sample" in wild
+    assert "found 1 of 19998 steps off" in uneven
+    assert result.refused == ()
+    kept, before = result.runs[0][1].joints[1].torque_nm, run.joints[1].torque_nm
+    assert kept is not None
+    assert before is not None
+    assert kept == pytest.approx(before, abs=2.0)
+
+
+def test_what_a_joint_can_do_is_not_wild(run: RunTable) -> None:
+    """A kick of twice the rating at the start, a blow, a channel that steps, one that is wrong for longer."""
+    for rows, value in ((slice(1, 2), 80.0), (slice(7000, 7001), 18.0), (slice(7000, 8000), 1e3)):
+        torque = np.array(run.joints[1].torque_nm)
+        torque[rows] += value
+        kicked = changed(run, lambda c, torque=torque: replace(c, torque_nm=torque))  # type: ignore[misc]
+        assert without_wild_samples(kicked, JOINTS, "r.csv")[1] == []
+    assert not wild_rows(np.repeat([0.0, 50.0], 500), 1.0).any()
+    assert not wild_rows(np.append([0.0], np.sin(np.arange(0.0, 20.0, 0.01)) + 9.0), 1.0).any(), "an end"
+
+
+@pytest.mark.parametrize("count", [2, 10, 900])
+def test_a_run_that_is_too_short_says_so(run: RunTable, count: int) -> None:
+    [line] = checked(each_column(run, lambda x: x[:count])).refused
+    assert line == (f"r.csv: found {count} samples, {count * 1e-3:.3g} s, expected a run of at least 1 s")
+
+
+def test_a_run_in_which_nothing_changes_is_not_used(run: RunTable) -> None:
+    """As from a dead bus: position and current (of the duty) are one number, the torque of the load follows from them."""
+
+    def dead(columns: JointColumns) -> JointColumns:
+        one = np.ones(len(run.time_s))
+        return JointColumns(current_a=0.5 * one, motor_position_rad=7.0 * one, torque_nm=columns.torque_nm)
+
+    one = RunTable(run.time_s, {1: dead(run.joints[1])})
+    result = checked(one, {1: JOINTS[1]})
+    assert result.runs == ()
+    stands, constant = result.refused
+    assert (
+        "j1: found one value of motor_position_rad in the whole run, expected motion: the joint stands"
+        in stands
+    )
+    assert "j1.current_a: found 0.5 A in the whole run" in constant
+    assert constant.endswith("dead channel, or a command")
+    beside = checked(changed(run, dead))  # the other joint moves
+    assert (beside.refused, set(beside.notes)) == ((), set(result.refused))
+
+
+def test_one_value_of_current_or_motion_is_said(run: RunTable) -> None:
+    one = np.ones(len(run.time_s))
+    commanded = checked(changed(run, lambda c: replace(c, current_a=1.5 * one)))
+    assert any("j1.current_a: found 1.5 A in the whole run" in note for note in commanded.notes)
+    still = replace(
+        run.joints[1], motor_position_rad=one, link_position_rad=one, motor_velocity_rad_s=0.0 * one
+    )
+    [note] = checked(changed(run, lambda _: still)).notes
+    assert "found one value of motor_position_rad and motor_velocity_rad_s and link_position_rad" in note
+    towed = checked(changed(run, lambda c: replace(c, current_a=0.0 * one)))
+    assert not any("in the whole run" in line for line in (*towed.notes, *towed.refused))

@@ -164,6 +164,28 @@ def test_gaps_make_pieces_that_keep_their_time(tmp_path: Path) -> None:
     assert pieces[1].notes == ()
 
 
+def test_a_wild_position_is_not_in_the_torque_of_the_load_beside_it(tmp_path: Path) -> None:
+    wild = np.sin(T)
+    wild[1000] = 1e6
+    torques = []
+    for angle in (np.sin(T), wild):
+        path = table(tmp_path / "a.csv", {"t": T, "q": angle, "i": T})
+        columns = ColumnMap.from_mapping(
+            {
+                "time_s": "t",
+                "j1.current_a": "i",
+                "j1.link_position_rad": "q",
+                "j1.load": {"inertia_kgm2": 2.0},
+            },
+            "m",
+            Path(),
+        )
+        torque = read_run(path, columns).table.joints[1].torque_nm
+        assert torque is not None
+        torques.append(torque)
+    assert torques[1] == pytest.approx(torques[0], abs=0.1)
+
+
 def test_turns_in_a_gap_are_not_known(tmp_path: Path) -> None:
     keep = ~((T > 2.0) & (T < 2.5))
     path = table(tmp_path / "a.csv", {"t": T[keep], "q": np.mod(9.0 * T[keep], 2.0 * np.pi), "i": Q[keep]})

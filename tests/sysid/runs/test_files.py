@@ -16,7 +16,7 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sysid import runs
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, read_run, read_runs, write_run
+from jtqd.sysid.runs.files import RunError, read_pieces, read_run, read_runs, write_run
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
 GOOD = "time_s,j1.current_a,j1.torque_nm\n0.000,1.5,-2\n0.001,2.5,-3\n0.002,3.5,-4\n"
@@ -86,6 +86,16 @@ def test_map_renames_scales_shifts_and_flips(tmp_path: Path) -> None:
         ({"time_s": {"scale": 2.0}}, "time_s.column': missing"),
         ({"time_s": 3}, "key 'time_s': found 3"),
         ({"time_s": "t", "j1.current_a": None}, "key 'j1.current_a': found None"),
+        (
+            {"j1.current_a": "A"},
+            "missing, expected a column of the file, an expression of columns, or {column:",
+        ),
+        (
+            {"time_s": ["a"]},
+            "found ['a'], expected a column of the file, an expression of columns, or {column:",
+        ),
+        ({"time_s": {"scale": 2.0}}, "missing, expected a column of the file, or an expression of columns"),
+        ({"time_s": {"column": 3}}, "found 3, expected a column of the file, or an expression of columns"),
     ],
 )
 def test_wrong_maps_are_named(mapping: dict[str, object], said: str) -> None:
@@ -126,6 +136,92 @@ def test_bad_files_are_refused_in_one_line(tmp_path: Path, content: str | bytes,
     assert said in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+T = np.arange(0.0, 4.0, 0.01)
+
+
+def _table(path: Path, columns: dict[str, object], separator: str = ",") -> Path:
+    rows = zip(*(np.asarray(column).tolist() for column in columns.values()), strict=True)
+    lines = [separator.join(columns), *(separator.join(str(cell) for cell in row) for row in rows)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def test_a_time_that_starts_again_is_another_run(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0).normal(size=3 * len(T))
+    gap = np.concatenate((T[T < 1.5], T[T > 2.1]))
+    time_s = np.concatenate((T, gap, 100.0 + T))
+    cells = {"time_s": time_s, "j1.current_a": noise[: len(time_s)], "j1.motor_position_rad": time_s}
+    path = _table(tmp_path / "a.csv", cells)
+    [first, *others] = read_runs([path], in_pieces=True)
+    names = [run.name for run in (first, *others)]
+    assert names == ["a.csv (run 1 of 2)", "a.csv (run 2 of 2) (1 of 3)"] + [
+        f"a.csv (run 2 of 2) ({k} of 3)" for k in (2, 3)
+    ]
+    assert "the time starts again 1 time: 2 runs in one file" in first.notes
+    assert "run 2: 2 steps are longer than 1.5 times the median of 0.01 s" in first.notes
+    assert all(run.notes == () for run in others)
+    assert first.table.time_s.tolist() == T.tolist()
+    with pytest.raises(RunError, match="one run in a file here"):
+        read_run(path)
+
+
+def test_one_wrong_stamp_is_no_other_run(tmp_path: Path) -> None:
+    for row, stamp in ((250, 0.3), (250, 2.4)):
+        time_s = T.copy()
+        time_s[row] = stamp
+        path = _table(tmp_path / "a.csv", {"time_s": time_s, "j1.current_a": T})
+        with pytest.raises(RunError, match=f"line {row + 2}: found time .*expected rising time"):
+            read_pieces(path)
+
+
+def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
+    current = np.random.default_rng(1).normal(size=len(T))
+    cells = {"time_s": T, "j1.current_a": current, "j1.motor_position_rad": np.cumsum(current)}
+    path = _table(tmp_path / "a.csv", {name: np.tile(column, 2) for name, column in cells.items()})
+    with pytest.raises(RunError, match=r"same run \(a.csv \(run 2 of 2\)\) as in a.csv \(run 1 of 2\)"):
+        read_runs([path], in_pieces=True)
+
+
+def test_rows_with_a_blank_cell_are_gaps(tmp_path: Path) -> None:
+    current, warm = np.round(np.sin(T), 3).astype(object), np.full(len(T), "", object)
+    current[[50, 51]], current[200:220] = "", "NaN"
+    path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": current, "j1.temperature_c": warm})
+    first, second = read_pieces(path)
+    assert "22 of 400 rows left out for a blank cell ('j1.current_a' in 22)" in first.notes
+    assert "column 'j1.temperature_c' is blank in every row: taken as absent" in first.notes
+    assert first.table.joints[1].temperature_c is None
+    assert (len(first.table.time_s), float(second.table.time_s[0])) == (198, 2.2)
+    with pytest.raises(RunError, match=r"line 2, column 'j1.temperature_c': found ''"):
+        read_run(path)
+    current[7] = "inf"
+    with pytest.raises(RunError, match=r"line 9, column 'j1.current_a': found 'inf'"):
+        read_pieces(_table(path, {"time_s": T, "j1.current_a": current}))
+
+
+def test_what_a_load_is_computed_from_cannot_be_blank(tmp_path: Path) -> None:
+    path = _table(tmp_path / "a.csv", {"t": T, "q": np.full(len(T), "", object), "i": T})
+    load = {"inertia_kgm2": 0.1}
+    columns = _map(time_s="t", j1__link_position_rad="q", j1__current_a="i", j1__load=load)
+    with pytest.raises(RunError, match="column 'q': found it blank in every row"):
+        read_pieces(path, columns)
+
+
+def test_a_comma_separates_wherever_the_header_has_one(tmp_path: Path) -> None:
+    path = _file(tmp_path, '"t; x; y",i\n0.0,1\n0.1,2\n')
+    assert read_run(path, _map(time_s="t; x; y", j1__current_a="i")).table.time_s.tolist() == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_other_separators_are_read(tmp_path: Path, separator: str) -> None:
+    path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0}, separator)
+    current = read_run(path).table.joints[1].current_a
+    assert current is not None
+    assert current.tolist() == (T + 1.0).tolist()
+    path.write_text(path.read_text().replace("3.0", "3,0"))
+    with pytest.raises(RunError, match="expected a finite number with a decimal point"):
+        read_run(path)
 
 
 @pytest.mark.parametrize("keep", [0, 5, 30])

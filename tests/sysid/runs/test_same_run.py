@@ -96,6 +96,15 @@ def test_a_log_and_its_table_are_refused_in_one_line(
     assert "expected every run once" in told
 
 
+def test_a_table_of_all_cycles_is_the_same_run_without_its_blank_cells(tmp_path: Path) -> None:
+    table = tmp_path / "all.csv"
+    export.main(["csv", str(LOG), "--out", str(table), "--all-cycles"])
+    [found] = read_runs([table], in_pieces=True)
+    assert "193 of 1050 rows left out for a blank cell ('j1.temperature_c' in 193" in found.notes[0]
+    with pytest.raises(RunError, match=r"found the same run as in network\.mcap"):
+        read_runs([LOG, table], in_pieces=True)
+
+
 def test_two_runs_are_read(tmp_path: Path) -> None:
     for seed in (1, 2):
         write_run(tmp_path / f"{seed}.csv", run(seed, rows=3000))
