@@ -1,0 +1,112 @@
+"""`python -m jtqd.sysid.goals.other_plant`: whether a joint file of another plant is told, and how soon.
+
+The joints of each plant of docs/benches.md are identified on campaigns of that plant and run on days of every other, zeros
+tracked, as new configurations have it. A joint in a run is told within 1 s where the status is degraded, or there is no
+value, within the first second of motion.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator.arrays import BoolArray
+from jtqd.estimator.checked import natural
+from jtqd.estimator.fusion import GAUSS
+from jtqd.sysid.goals.identify import (
+    FIT_SEED,
+    JUDGE_SEED,
+    QUICK,
+    Driven,
+    Identified,
+    Sizes,
+    drive,
+    identify_physics,
+    judging_runs,
+    nominal_joints,
+)
+from jtqd.sysid.goals.judge import ZEROS, Judged, flagged, judge
+from jtqd.sysid.goals.plants import PlantFile, the_three
+
+BY: Final = "python -m jtqd.sysid.goals.other_plant"
+SOON_S: Final = 1.0
+
+
+class Told(NamedTuple):
+    """Told within SOON_S: % of joints in runs; degraded, inside the 90 % interval: % of the samples in motion; RMSE now."""
+
+    soon: float
+    degraded: float
+    inside: float
+    rmse_nm: float
+
+
+def first_s(flags: BoolArray, moving: BoolArray, dt_s: float) -> float:
+    """Return how long a joint had moved [s] when it was flagged first; infinite for never. Arrays [n]."""
+    seen = flags[moving]
+    return float(np.argmax(seen)) * dt_s if seen.any() else np.inf
+
+
+def told(judged: Sequence[Judged], dt_s: float) -> Told:
+    """Return the figures of joints in runs that moved."""
+    rows = []
+    for one in judged:
+        if one.moving.any():
+            result, moving = one.results[ZEROS], one.moving
+            flags, error = flagged(result), (result.torque_nm - one.true_nm)[moving]
+            inside = np.nanmean(result.inside(GAUSS)[moving])
+            rows.append(
+                (
+                    first_s(flags, moving, dt_s) <= SOON_S,
+                    flags[moving].mean(),
+                    inside,
+                    np.nanmean(error**2),
+                )
+            )
+    soon, degraded, within, square = np.mean(np.array(rows, np.float64), axis=0)
+    return Told(100.0 * soon, 100.0 * degraded, 100.0 * within, float(np.sqrt(square)))
+
+
+def crossed(
+    plants: Sequence[PlantFile], sizes: Sizes, fit_seed: int, seed: int
+) -> dict[tuple[str, str], Told]:
+    """Return the figures by (plant of the joint files, plant of the days). Raises as `identify`."""
+    models: dict[str, tuple[Identified, ...]] = {}
+    days: dict[str, list[Driven]] = {}
+    for plant in plants:
+        models[plant.name] = identify_physics(plant, sizes, fit_seed)[0]
+        days[plant.name] = drive(plant.bench(), judging_runs(sizes, nominal_joints(plant), seed), seed)
+    return {
+        (of, on): told(
+            [judge(run, one, None, (ZEROS,)) for run in runs for one in files],
+            float(np.median(runs[0].table.dt_s)),
+        )
+        for of, files in models.items()
+        for on, runs in days.items()
+    }
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Print the table; exit status 0 done."""
+    parser = argparse.ArgumentParser(
+        prog=BY, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--seed", type=natural, default=JUDGE_SEED, help="of the days (default %(default)s)")
+    parser.add_argument("--fit-seed", type=natural, default=FIT_SEED, help="of the campaigns (%(default)s)")
+    options = parser.parse_args(argv)
+    found = crossed(the_three(), QUICK, options.fit_seed, options.seed)
+    print("| joint files of | days of | told within 1 s | degraded | inside 90 % | RMSE now |")
+    print("|---|---|---|---|---|---|")
+    for (of, on), one in found.items():
+        print(
+            f"| {of} | {on} | {one.soon:.0f} % | {one.degraded:.0f} % | {one.inside:.0f} % | {one.rmse_nm:.2f} Nm |"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
