@@ -1,8 +1,8 @@
 """`python -m jtqd.sysid.goals.other_plant`: whether a joint file of another plant is told, and how soon.
 
 The joints of each plant of docs/benches.md are identified on campaigns of that plant and run on days of every other, zeros
-tracked, as new configurations have it. A joint in a run is told within 1 s where the status is degraded, or there is no
-value, within the first second of motion.
+tracked, as new configurations have it. A joint in a run is told within a time where the status is degraded, or there is no
+value, within the first of its motion that is as long.
 """
 
 from __future__ import annotations
@@ -33,13 +33,14 @@ from jtqd.sysid.goals.judge import ZEROS, Judged, flagged, judge
 from jtqd.sysid.goals.plants import PlantFile, the_three
 
 BY: Final = "python -m jtqd.sysid.goals.other_plant"
-SOON_S: Final = 1.0
+WITHIN_S: Final = (1.0, 3.0, 10.0)
+"""The first one is the goal; the others tell how long it takes where that is missed."""
 
 
 class Told(NamedTuple):
-    """Told within SOON_S: % of joints in runs; degraded, inside the 90 % interval: % of the samples in motion; RMSE now."""
+    """Told within WITHIN_S: % of joints in runs; degraded, inside the 90 % interval: % of samples in motion; RMSE now."""
 
-    soon: float
+    within: tuple[float, ...]
     degraded: float
     inside: float
     rmse_nm: float
@@ -59,16 +60,19 @@ def told(judged: Sequence[Judged], dt_s: float) -> Told:
             result, moving = one.results[ZEROS], one.moving
             flags, error = flagged(result), (result.torque_nm - one.true_nm)[moving]
             inside = np.nanmean(result.inside(GAUSS)[moving])
+            first = first_s(flags, moving, dt_s)
             rows.append(
                 (
-                    first_s(flags, moving, dt_s) <= SOON_S,
                     flags[moving].mean(),
                     inside,
                     np.nanmean(error**2),
+                    *(first <= limit for limit in WITHIN_S),
                 )
             )
-    soon, degraded, within, square = np.mean(np.array(rows, np.float64), axis=0)
-    return Told(100.0 * soon, 100.0 * degraded, 100.0 * within, float(np.sqrt(square)))
+    degraded, inside, square, *within = np.mean(np.array(rows, np.float64), axis=0)
+    return Told(
+        tuple(100.0 * one for one in within), 100.0 * degraded, 100.0 * inside, float(np.sqrt(square))
+    )
 
 
 def crossed(
@@ -99,11 +103,13 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--fit-seed", type=natural, default=FIT_SEED, help="of the campaigns (%(default)s)")
     options = parser.parse_args(argv)
     found = crossed(the_three(), QUICK, options.fit_seed, options.seed)
-    print("| joint files of | days of | told within 1 s | degraded | inside 90 % | RMSE now |")
+    times = ", ".join(f"{limit:g}" for limit in WITHIN_S)
+    print(f"| joint files of | days of | told within {times} s | degraded | inside 90 % | RMSE now |")
     print("|---|---|---|---|---|---|")
     for (of, on), one in found.items():
+        told_by = ", ".join(f"{share:.0f}" for share in one.within)
         print(
-            f"| {of} | {on} | {one.soon:.0f} % | {one.degraded:.0f} % | {one.inside:.0f} % | {one.rmse_nm:.2f} Nm |"
+            f"| {of} | {on} | {told_by} % | {one.degraded:.0f} % | {one.inside:.0f} % | {one.rmse_nm:.2f} Nm |"
         )
     return 0
 

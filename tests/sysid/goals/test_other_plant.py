@@ -32,7 +32,7 @@ def judged(first: int | None) -> Judged:
 
 def test_joints_in_runs_that_are_told_soon_are_counted() -> None:
     found = told([judged(0), judged(900), judged(1500), judged(None)], 1e-3)
-    assert found.soon == 50.0
+    assert found.within == (50.0, 75.0, 75.0)
     assert found.degraded == pytest.approx(25.0 * (1.0 + 0.7 + 0.5))
     assert found.inside == 100.0
     assert found.rmse_nm == pytest.approx(0.5)
