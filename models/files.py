@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,38 +15,69 @@ from jtqd.estimator.joint import Joint
 
 _LARGEST_YAML: Final = 1_000_000
 """Bytes; ours have 3000. A log given by mistake must not keep the parser busy for minutes."""
-_MOST_KEYS: Final = 100_000
-"""Of all mappings together, those that were merged into others counted again."""
+_MOST_MERGED: Final = 100_000
+"""Keys taken over by merging (<<), those that were merged before counted again."""
+_MERGE_TAG: Final = "tag:yaml.org,2002:merge"
 _SHIPPED: Final = Path(__file__).resolve().parent
 
 
 class _Loader(yaml.SafeLoader):
     """SafeLoader that refuses a key given twice: YAML says unique, PyYAML would silently keep the last.
 
-    It also refuses merge keys (<<) that multiply: a few hundred bytes of them would take hours and all memory.
+    Merge keys (<<) are resolved here: which of two merged values holds is not the same in all versions of PyYAML.
     """
 
     _merged = 0
 
     def flatten_mapping(self, node: yaml.MappingNode) -> None:
-        super().flatten_mapping(node)
-        self._merged += len(node.value)
-        if self._merged > _MOST_KEYS:
-            raise yaml.constructor.ConstructorError(
-                None, None, f"more than {_MOST_KEYS} keys by merging", node.start_mark
-            )
+        """Put merged keys before the mapping's own: own keys hold, then the first of a list (yaml.org/type/merge)."""
+        merges = [value for key, value in node.value if key.tag == _MERGE_TAG]
+        if not merges:
+            return
+        own = [pair for pair in node.value if pair[0].tag != _MERGE_TAG]
+        node.value = own  # first, so that a mapping that merges itself ends
+        known = {_identity(key) for key, _ in own}
+        merged = []
+        for source in _sources(merges):
+            self.flatten_mapping(source)
+            self._merged += len(source.value)
+            if self._merged > _MOST_MERGED:
+                raise yaml.constructor.ConstructorError(
+                    None, None, f"more than {_MOST_MERGED} keys by merging", node.start_mark
+                )
+            for pair in source.value:
+                if (identity := _identity(pair[0])) not in known:
+                    known.add(identity)
+                    merged.append(pair)
+        node.value = merged + own
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key_node, _ in node.value:
             key = key_node.value
-            if isinstance(key, str) and key_node.tag != "tag:yaml.org,2002:merge":
+            if isinstance(key, str):
                 if key in seen:
                     raise yaml.constructor.ConstructorError(
                         None, None, f"the key '{key}' is given twice", key_node.start_mark
                     )
                 seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def _sources(merges: list[yaml.Node]) -> Iterator[yaml.MappingNode]:
+    """Yield the mappings that merge keys name, the one that holds first."""
+    for merge in merges:
+        for source in merge.value if isinstance(merge, yaml.SequenceNode) else [merge]:
+            if not isinstance(source, yaml.MappingNode):
+                raise yaml.constructor.ConstructorError(
+                    None, None, "expected the mapping that << merges", source.start_mark
+                )
+            yield source
+
+
+def _identity(key: yaml.Node) -> tuple[str, str | int]:
+    """What makes two keys the same: kind and text, or the place of a key that is no scalar."""
+    return (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else (key.tag, id(key))
 
 
 def read_regular(path: str | os.PathLike[str], largest: int, expected: str) -> bytes:

@@ -209,6 +209,11 @@ def test_files(tmp_path: Path) -> None:
     assert data == path.read_bytes()
     for text, words in (
         (b"a: 1\na: 2\n", "line 2, column 1 not YAML: the key 'a' is given twice"),
+        (b"a: &a {b: 1}\nc: {<<: *a, <<: *a}\n", "line 2, column 13 not YAML: the key '<<' is given twice"),
+        (
+            b"a: &a [1]\nc: {<<: *a}\n",
+            "not YAML: expected the mapping that << merges",
+        ),
         (b"a: [1\n", "line 2, column 1 not YAML: expected ',' or ']', found the end of the file"),
         (b'a: "b\n', "found the end of the file (while scanning a text in quotes that begins in line 1)"),
         (
@@ -234,6 +239,26 @@ def test_files(tmp_path: Path) -> None:
     for bad in (tmp_path / "absent.yaml", tmp_path):
         with pytest.raises(ConfigError, match="cannot be read"):
             load_yaml(bad)
+
+
+def test_what_holds_of_merged_mappings_does_not_depend_on_the_library(tmp_path: Path) -> None:
+    path = tmp_path / "merged.yaml"
+    path.write_text(
+        "deep: {er: {found: &late {<<: {torque: 8}, torque: 9}}}\n"
+        "a: &a {torque: 1, speed: 2}\n"
+        "b: &b {torque: 3, gear: 4}\n"
+        "first_of_a_list: {<<: [*a, *b]}\n"
+        "its_own: {<<: [*b, *a], speed: 5}\n"
+        "through: {<<: {<<: *a, speed: 6}, gear: 7}\n"
+        "merged_before_it_is_read: {<<: *late}\n"
+        "itself: &me {<<: *me, torque: 1}\n"
+    )
+    content = load_yaml(path)
+    assert content["first_of_a_list"] == {"torque": 1, "speed": 2, "gear": 4}
+    assert content["its_own"] == {"torque": 3, "gear": 4, "speed": 5}
+    assert content["through"] == {"torque": 1, "speed": 6, "gear": 7}
+    assert content["deep"]["er"]["found"] == content["merged_before_it_is_read"] == {"torque": 9}
+    assert content["itself"] == {"torque": 1}
 
 
 def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_reading_it_all(

@@ -46,8 +46,9 @@ def bombs() -> dict[str, bytes]:
     lol = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
         f"{chr(98 + n)}: &{chr(98 + n)} [{','.join(['*' + chr(97 + n)] * 9)}]\n" for n in range(9)
     )
-    merge = "a: &a {x: 1}\n" + "".join(
-        f"{chr(98 + n)}: &{chr(98 + n)} {{<<: [{','.join(['*' + chr(97 + n)] * 9)}]}}\n" for n in range(9)
+    keys = ",".join(f"k{n}: 1" for n in range(500))
+    merge = f"a: &a {{{keys}}}\n" + "".join(
+        f"{chr(98 + n)}: &{chr(98 + n)} {{<<: [{','.join(['*' + chr(97 + n)] * 99)}]}}\n" for n in range(9)
     )
     return {
         "aliases": lol.encode(),
