@@ -6,6 +6,7 @@ away, summed over the runs left out one by one (`explained_by_bins`). Noise of a
 it is, so bins that only follow the noise explain nothing or less, and more bins are no advantage; nor is a condition that
 merely goes with the run (temperature, time), because other runs do not confirm it. Events and seconds with a deviating mean
 explain only what the best axis does not predict: a bump that makes a step on every pass is the angle's, not the moments'.
+A range of the link's turn that one run alone gets to is confirmed by the passes of it (`passes`).
 The condition that explains most is the first location; what it explains is taken out, and the search is made again
 (`locate`). Energies in Nm^2.
 """
@@ -23,6 +24,7 @@ from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
 from jtqd.sysid.diagnosis.leftover import Leftover, less_nuisances
+from jtqd.sysid.diagnosis.passes import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.regressors import LINE, Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
@@ -278,6 +280,9 @@ def locate(
         axis = _best_axis(
             runs, channel, now, maps, used=used, least_nm2=LEAST * whole, certain=limits is not None
         )
+        if limits is not None and "link_angle" in maps and "link_angle" not in used:
+            turn = _by_passes(runs, channel, now, maps["link_angle"].edges)
+            axis = max((a for a in (axis, turn) if a is not None), key=lambda a: a.energy_nm2, default=None)
         rest = now if axis is None else [x - y for x, y in zip(now, axis.prediction, strict=True)]
         found = [] if axis is None else [Location(axis.energy_nm2, axis.axis, _descending(axis.bins))]
         found += [
@@ -341,8 +346,7 @@ def _best_axis(
         if axis in used or (certain and not used and drawn.p >= SIGNIFICANT):
             continue
         edges, bins = drawn.edges, len(drawn.edges) - 1
-        values = [axis_values(run.axes[channel.joint], axis) for run in runs]
-        places = [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, bins - 1) for v in values]
+        places = _binned(runs, channel, axis, edges)
         for side in directions(runs, channel):
             explained, means = explained_by_bins(places, signed(parts, side), bins, step_s)
             explained /= count
@@ -359,6 +363,37 @@ def _best_axis(
         if p < _BEYOND:
             return _Axis(axis, energy, prediction, explained.sum(axis=0))
     return None
+
+
+def _by_passes(
+    runs: Sequence[RunData], channel: Channel, parts: Sequence[FloatArray], edges: FloatArray
+) -> _Axis | None:
+    """Return the link angle as the axis of what passes of a range of it have in common, None where there is none."""
+    step_s = float(np.median(np.diff(runs[0].time_s)))
+    places = _binned(runs, channel, "link_angle", edges)
+    found = turn_range(places, parts, edges, step_s)
+    if found is None:
+        return None
+    count = max(sum(int(np.isfinite(x).sum()) for x in parts), 1)
+    best: _Axis | None = None
+    for side in directions(runs, channel):
+        seen = signed(parts, side)
+        means = predicted_by_passes(found, places, seen)
+        bins = np.zeros(len(edges) - 1)
+        for place, x, m in zip(places, seen, means, strict=True):
+            good = np.isfinite(x)
+            less = x[good] ** 2 - (x - m)[good] ** 2
+            bins += np.bincount(place[good], less, minlength=len(bins))
+        energy = float(bins.sum()) / count
+        if best is None or energy > best.energy_nm2:
+            best = _Axis("link_angle", energy, signed(means, side), bins)
+    return best
+
+
+def _binned(runs: Sequence[RunData], channel: Channel, axis: str, edges: FloatArray) -> list[Index]:
+    """Return the bin of every sample [run][n]."""
+    values = [axis_values(run.axes[channel.joint], axis) for run in runs]
+    return [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2) for v in values]
 
 
 def _causes(dataset: Dataset, refined: Refined, channel: Channel) -> list[FloatArray]:
