@@ -4,6 +4,10 @@ Per joint, on the joint side: a rotor (armature, frictionloss, damping, a motor 
 tendon as the gear's spring (stiffness, damping, springlength: its dead zone), and a link. An equality constraint couples
 the links face to face; its force is what the sensor feels. What MuJoCo has no element for is a generalised force on
 rotor and link in the same step.
+
+The integrator is `Euler`, on purpose: the implicit ones take the damping of a tendon into the step for each body of its own
+and leave out what couples two bodies, as rotor and link are here. Both inertias were then larger than told by time step
+times damping, 4 to 8 % for a link.
 """
 
 from __future__ import annotations
@@ -102,7 +106,7 @@ def model_xml(joints: tuple[JointPlant, JointPlant]) -> str:
     <general joint="motor{k}" gear="{j.ratio!r}" gainprm="{j.kt!r}" biastype="none" dyntype="filterexact"
       dynprm="{CURRENT_LAG_S}"/>"""
         )
-    return f"""<mujoco><option timestep="{DT_S}" gravity="0 0 0" integrator="implicitfast" solver="Newton"/>
+    return f"""<mujoco><option timestep="{DT_S}" gravity="0 0 0" integrator="Euler" solver="Newton"/>
   <worldbody>{"".join(bodies)}
   </worldbody>
   <tendon>{"".join(tendons)}

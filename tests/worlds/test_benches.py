@@ -10,6 +10,7 @@ import pytest
 
 from tests.worlds.measured_bench import JOINTS, MeasuredBench, acceleration, recordings
 from tests.worlds.mujoco_bench import MujocoBench
+from tests.worlds.mujoco_plant import JointPlant, model_xml
 from tests.worlds.oracle import hidden_size, residuals, sizes
 from tests.worlds.sets import SENSOR, Array, Bench, Hidden, Set
 from tests.worlds.units import UNITS, parameters
@@ -169,6 +170,24 @@ def test_a_kinematic_error_takes_torque_from_the_motor(mujoco_bench: MujocoBench
         assert loss is not None
         traces.append(np.where(np.abs(order * run["j1.motor_velocity_rad_s"]) < 100.0, loss, 0.0))
     assert amplitude(drawn, plain, traces, 1, 0) == pytest.approx(1.0, abs=0.2)
+
+
+def test_a_free_bench_has_the_inertias_that_it_is_given() -> None:
+    """A constant current turns both joints: the torque is that of all inertias, the sensor's that of joint 2's."""
+    mujoco = pytest.importorskip("mujoco", reason="mujoco is not installed: pip install -e '.[dev]'")
+    one = JointPlant(100.0, 0.05, 1.0, 2e4, 20.0, 0.12, coulomb=0.0, viscous=0.0)
+    model = mujoco.MjModel.from_xml_string(model_xml((one, one)))
+    data = mujoco.MjData(model)
+    current = 2.0
+    data.ctrl[0] = data.act[0] = current
+    for _ in range(4000):
+        before = float(data.qvel[0])
+        mujoco.mj_step(model, data)
+    found = (float(data.qvel[0]) - before) / model.opt.timestep
+    inertia = one.inertia + one.link_inertia
+    expected = one.ratio * one.kt * current / (2.0 * inertia)
+    assert found == pytest.approx(expected, rel=1e-4)
+    assert -float(data.qfrc_constraint[1]) == pytest.approx(inertia * expected, rel=1e-4)
 
 
 def test_inertias_are_inertias(mujoco_bench: MujocoBench, plain: Set) -> None:
