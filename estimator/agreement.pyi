@@ -1,7 +1,7 @@
 from typing import Final
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import Fused
+from jtqd.estimator.joint import Fused, Turn
 
 TREND_S: Final[float]
 UP_S: Final[float]
@@ -9,6 +9,14 @@ DOWN_S: Final[float]
 LOWER_SIGMAS: Final[float]
 LEAST_SHARE: Final[float]
 SURE_SIGMAS: Final[float]
+TURN_ORDERS: Final[tuple[int, int, int]]
+TURNING_RAD_S: Final[float]
+TURN_TREND_S: Final[float]
+TURN_SETTLE_S: Final[float]
+TURN_MEMORY_S: Final[float]
+LEAST_S: Final[float]
+EVERY: Final[int]
+TURN_BLOCK: Final[int]
 
 def levels(
     fused: Fused,
@@ -34,3 +42,12 @@ def followed(
     stiffness: FloatArray,
     tracked: bool = True,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...
+def turn_waves(
+    turn: Turn,
+    dt_s: FloatArray,
+    apart_nm: FloatArray,
+    direction: FloatArray,
+    velocity_rad_s: FloatArray,
+    loss_nm: FloatArray,
+    waves: FloatArray,
+) -> tuple[FloatArray, FloatArray]: ...

@@ -22,6 +22,18 @@ The status is lowered by a doubt of LOWER_SIGMAS sigmas and LEAST_SHARE of the r
 have (`lowered_nm`), by more than that, counting of the gain only what is surely one, |g| - SURE_SIGMAS sigma_g: a joint that is
 always driven, or always back-driven, shows friction and a gain alike.
 
+**Waves over the motor's turn** tell another joint sooner than levels can: errors of gear and motor encoder and waves of friction are
+fixed to the motor's angle, and hardly differ from day to day. What the runs of the fit have of them in the difference of the
+views is in the file (`fused.agreement.turn`): w_k, filtered cos and sin of 1, 2 and 4 times the motor's angle, each with
+
+    c_k + l_k loss + u_k v + q_k v^2      kinematic errors; friction; lags; the motor encoder's error, taken for an acceleration
+
+The rest, r = tau_t - tau_c - sum_k w_k (c_k + ...), has waves a by least squares with forgetting, r and w less their trends:
+
+    a = (sum w w' + LEAST_S 1)^-1 sum w r,        square = a' C^-1 a
+
+C: covariance of a over the runs of the fit. Beyond the file's `limit` the status is lowered; sigma does not know of it.
+
 Which view is wrong is not known: the one that the estimate follows counts. What both views share (a wrong gear ratio of both
 encoders, an external load) is in neither difference, and nothing here sees it.
 """
@@ -44,6 +56,8 @@ from jtqd.estimator.zeros cimport (
     update_zeros,
 )
 
+from jtqd.estimator.zeros import ONE_WAY
+
 TREND_S: Final = 0.1
 UP_S: Final = 0.15
 DOWN_S: Final = 5.0
@@ -53,7 +67,26 @@ LEAST_SHARE: Final = 0.02
 SURE_SIGMAS: Final = 2.0
 """So many of its own standard deviations a gain is in doubt to be one, for the status."""
 
+TURN_ORDERS: Final = (1, 2, 4)
+"""Of the motor's turn."""
+TURNING_RAD_S: Final = 0.1
+"""Slower, a wave of the motor's angle looks like a change of friction."""
+TURN_TREND_S: Final = 0.05
+TURN_MEMORY_S: Final = 1.0
+"""Time of motion within which waves over the motor's turn are forgotten."""
+LEAST_S: Final = 0.02
+"""What is believed of no waves at all, as time of motion times the square of a wave: they start from there."""
+TURN_SETTLE_S: Final = 0.05
+"""After a start of the observer: ten of its time constants."""
+EVERY: Final = 4
+TURN_BLOCK: Final = 16
+"""Every fourth sample counts, and after so many of them the waves are judged: 64 ms at 1 kHz."""
+
 cdef double INVERSE_TREND = 1.0 / TREND_S, INVERSE_UP = 1.0 / UP_S, INVERSE_DOWN = 1.0 / DOWN_S
+cdef double SLOWEST_TURN = TURNING_RAD_S, ONE_SIDED = ONE_WAY
+cdef double INVERSE_TURN_TREND = 1.0 / TURN_TREND_S, INVERSE_MEMORY = 1.0 / TURN_MEMORY_S, LEAST = LEAST_S
+cdef double SETTLE = TURN_SETTLE_S
+cdef int TAKEN_EVERY = EVERY, TAKEN_BLOCK = TURN_BLOCK
 cdef double LOWER_SQUARE = LOWER_SIGMAS**2, SURE = SURE_SIGMAS
 
 
@@ -68,6 +101,21 @@ cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
     law.gain, law.zero = agreement.gain, agreement.zero_nm**2
     law.lowered = agreement.lowered_nm**2
     law.level_square, law.gain_factor = agreement.level_factor**2, agreement.gain_factor
+    if agreement.turn is not None:
+        fill_turn(law, agreement.turn)
+    return 0
+
+
+cdef int fill_turn(AgreementLaw *law, turn) except -1:
+    """Set what the views differ by over the motor's turn."""
+    law.turned, law.turn_limit = True, turn.limit
+    rows = np.column_stack((turn.constant_nm, turn.loss_share, turn.viscous_nms_per_rad, turn.quadratic_nms2_per_rad2))
+    lower = np.linalg.inv(np.linalg.cholesky(turn.covariance))
+    for k in range(TURN_WAVES):
+        for n in range(TURN_PARTS):
+            law.own[k][n] = rows[k, n]
+    for k, value in enumerate(lower[np.tril_indices(TURN_WAVES)]):
+        law.whitening[k] = value
     return 0
 
 
@@ -92,6 +140,150 @@ cdef void follow_agreement(
     s.doubt = law.level_square * (fmax(0.0, s.slow - law.slow) + fmax(0.0, s.fast - law.fast))
     s.doubt += fmax(0.0, left_nm * left_nm - law.zero)
     s.gain_doubt = law.gain_factor * fmax(0.0, fabs(gain) - law.gain)
+
+
+cdef void pause_turn(AgreementState *s) noexcept nogil:
+    """Take the next sample for the first one of a motion: trends start there."""
+    s.turn.going = False
+
+
+cdef void unsettle_turn(AgreementState *s) noexcept nogil:
+    """Wait: the observer starts, perhaps in the middle of an acceleration that its motor path does not know yet."""
+    s.turn.going, s.turn.settle_s = False, SETTLE
+
+
+cdef void follow_turn(
+    const AgreementLaw *law,
+    AgreementState *s,
+    double dt,
+    double apart,
+    double direction,
+    double velocity,
+    double loss,
+    const double *wave,
+) noexcept nogil:
+    """Take a sample in motion: difference of the views and loss [Nm], and the waves, as old as they are.
+
+    Near a reversal friction changes within a part of a turn: trends start again behind it.
+    """
+    cdef TurnState *t = &s.turn
+    cdef double rest = apart, square = velocity * velocity, way
+    cdef double x[TURN_WAVES]
+    cdef int k, n, i = 0
+    if fabs(velocity) < SLOWEST_TURN or fabs(direction) < ONE_SIDED:
+        t.going = False
+        return
+    if t.settle_s > 0.0:
+        t.settle_s -= dt
+        return
+    t.dt += dt
+    t.skipped += 1
+    if t.going and t.skipped < TAKEN_EVERY:
+        return
+    for k in range(TURN_WAVES):
+        rest -= wave[k] * (
+            law.own[k][0] + law.own[k][1] * loss + law.own[k][2] * velocity + law.own[k][3] * square
+        )
+    dt = t.dt
+    t.dt, t.skipped = 0.0, 0
+    if not t.going:
+        t.going = True
+        for k in range(TURN_WAVES):
+            t.trend[k] = wave[k]
+        t.trend[TURN_WAVES] = rest
+        return
+    way = 1.0 - exp(-dt * INVERSE_TURN_TREND)
+    t.trend[TURN_WAVES] += way * (rest - t.trend[TURN_WAVES])
+    rest = dt * (rest - t.trend[TURN_WAVES])
+    for k in range(TURN_WAVES):
+        t.trend[k] += way * (wave[k] - t.trend[k])
+        x[k] = wave[k] - t.trend[k]
+        t.z[k] += rest * x[k]
+        for n in range(k + 1):
+            t.m[i] += dt * x[k] * x[n]
+            i += 1
+    t.moved += dt
+    t.taken += 1
+    if t.taken == TAKEN_BLOCK:
+        _judge_turn(law, t)
+
+
+cdef void _solve_turn(const TurnState *t, double *a) noexcept nogil:
+    """Set a [Nm] to the waves of the sums so far, by Cholesky's decomposition."""
+    cdef double lower[TURN_SUMS]
+    cdef double sum
+    cdef int k, n, j, row = 0, other
+    for k in range(TURN_WAVES):
+        other = 0
+        for n in range(k + 1):
+            sum = t.m[row + n]
+            for j in range(n):
+                sum -= lower[row + j] * lower[other + j]
+            if n == k:
+                lower[row + n] = sqrt(sum + LEAST)
+            else:
+                lower[row + n] = sum / lower[other + n]
+            other += n + 1
+        sum = t.z[k]
+        for j in range(k):
+            sum -= lower[row + j] * a[j]
+        a[k] = sum / lower[row + k]
+        row += k + 1
+    for k in range(TURN_WAVES - 1, -1, -1):
+        row -= k + 1
+        a[k] /= lower[row + k]
+        for j in range(k):
+            a[j] -= lower[row + j] * a[k]
+
+
+cdef void _judge_turn(const AgreementLaw *law, TurnState *t) noexcept nogil:
+    """Compare the waves of a complete block, and those before, with what the file has of them; then forget a part."""
+    cdef double part, kept = exp(-t.moved * INVERSE_MEMORY)
+    cdef int k, n, i = 0
+    _solve_turn(t, t.a)
+    t.square = 0.0
+    for k in range(TURN_WAVES):
+        part = 0.0
+        for n in range(k + 1):
+            part += law.whitening[i] * t.a[n]
+            t.m[i] *= kept
+            i += 1
+        t.z[k] *= kept
+        t.square += part * part
+    t.moved, t.taken = 0.0, 0
+
+
+cdef bint turns_otherwise(const AgreementLaw *law, const AgreementState *s) noexcept nogil:
+    """Return whether the views differ over the motor's turn as those of the file's joint do on no ordinary day."""
+    return law.turned and s.turn.square > law.turn_limit
+
+
+def turn_waves(turn, dt_s, apart_nm, direction, velocity_rad_s, loss_nm, waves):
+    """Return (waves [blocks, 6] in Nm, square [blocks]) of a run from its start beyond `fused.agreement.turn`.
+
+    Arrays [n] of samples in motion: apart_nm: torsion less current path; waves [n, 6]: filtered cos and sin of TURN_ORDERS
+    times the motor's angle.
+    """
+    columns = (dt_s, apart_nm, direction, velocity_rad_s, loss_nm)
+    cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
+    cdef const double[:, ::1] w = np.ascontiguousarray(waves, np.float64)
+    cdef AgreementLaw law
+    cdef AgreementState s
+    cdef Py_ssize_t k
+    cdef bint last
+    if w.shape[0] != x.shape[0] or w.shape[1] != TURN_WAVES:
+        raise ValueError(f"found waves of shape {waves.shape}, expected {(x.shape[0], TURN_WAVES)}")
+    memset(&law, 0, sizeof(AgreementLaw))
+    fill_turn(&law, turn)
+    restart_agreement(&s)
+    found, squares = [], []
+    for k in range(x.shape[0]):
+        last = s.turn.taken == TAKEN_BLOCK - 1
+        follow_turn(&law, &s, x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], &w[k, 0])
+        if last and s.turn.taken == 0:
+            found.append([s.turn.a[n] for n in range(TURN_WAVES)])
+            squares.append(s.turn.square)
+    return np.array(found, np.float64).reshape(-1, TURN_WAVES), np.array(squares, np.float64)
 
 
 cdef double doubt_of(const AgreementState *s, double alpha, double torsion) noexcept nogil:

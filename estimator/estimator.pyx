@@ -14,11 +14,16 @@ from libc.math cimport NAN, fabs, fmin, sqrt
 from libc.string cimport memcmp
 
 from jtqd.estimator.agreement cimport (
+    TURN_WAVES,
     doubt_of,
     fill_agreement,
     follow_agreement,
+    follow_turn,
     lowers,
+    pause_turn,
     restart_agreement,
+    turns_otherwise,
+    unsettle_turn,
 )
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
@@ -432,6 +437,7 @@ cdef class FusedEstimator(Estimator):
         else:
             self.state.half = 0.0
             drop_block(&self.state.zeros)
+            unsettle_turn(&self.state.agreement)
             restart_link(&self.state.link)
 
     cdef void learn(
@@ -443,6 +449,14 @@ cdef class FusedEstimator(Estimator):
         cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm, dt, innovation
         cdef double noise = physics.variance - law.zeros.spread_nm  # the day's zero is a state, no noise
         cdef Loss next
+        cdef double wave[TURN_WAVES]
+        if law.agreement.turned:
+            if status == VALID:
+                wave[0], wave[1], wave[2] = seen.cos1, seen.sin1, seen.cos2
+                wave[3], wave[4], wave[5] = seen.sin2, seen.cos4, seen.sin4
+                follow_turn(&law.agreement, &s.agreement, x.dt_s, physics.apart, seen.direction, v, loss, wave)
+            else:
+                pause_turn(&s.agreement)
         if status != VALID:
             drop_block(&s.zeros)
         elif completes(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, noise):
@@ -459,7 +473,7 @@ cdef class FusedEstimator(Estimator):
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:
         """Return whether the two paths are not of this joint file: they disagree, or the link's zero is impossible."""
         cdef FusedState *s = &self.state
-        if fabs(physics.apart) > FOREIGN * sqrt(physics.variance):
+        if fabs(physics.apart) > FOREIGN * sqrt(physics.variance) or turns_otherwise(&self.law.agreement, &s.agreement):
             s.lowered_s = LOWERED
         elif s.lowered_s > 0.0:
             s.lowered_s -= dt
@@ -578,14 +592,18 @@ cdef class FusedEstimator(Estimator):
     def run_observed(self, seen):
         """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`.
 
-        Raises ValueError where zeros are tracked: they act on what is observed, use `run`.
+        Raises ValueError where zeros are tracked: they act on what is observed, use `run`; and for a run without `turn` where
+        the joint file has what the views differ by over the motor's turn.
         """
         if self.law.zeros.used:
             raise ValueError("found an estimator that tracks zeros, expected one without, or a run of samples")
         n = len(seen.raw_nm)
+        if self.law.agreement.turned and len(seen.turn) != n:
+            raise ValueError("found a run without waves of the motor's turn, expected one of `observe_run`")
         values, features, status = np.full((5, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
+        turn = seen.turn if len(seen.turn) == n else np.zeros((n, 2))
         rows = np.column_stack(
-            (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm, seen.ahead_nm)
+            (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm, seen.ahead_nm, turn)
         )
         cdef const double[:, ::1] row = np.ascontiguousarray(rows)
         cdef const double[::1] dt = np.ascontiguousarray(seen.dt_s)
@@ -607,10 +625,12 @@ cdef class FusedEstimator(Estimator):
                 if asked[k] != VALID and asked[k] != STANDSTILL:
                     self.state.half = 0.0
                     drop_block(&self.state.zeros)
+                    unsettle_turn(&self.state.agreement)
                     continue
                 one.raw_nm, one.joint_velocity_rad_s, one.torsion_nm = row[k, 0], row[k, 1], row[k, 2]
                 one.cos2, one.sin2, one.cos4, one.sin4 = row[k, 3], row[k, 4], row[k, 5], row[k, 6]
                 one.direction, one.open_nm, one.ahead_nm = row[k, 7], row[k, 8], row[k, 9]
+                one.cos1, one.sin1 = row[k, 10], row[k, 11]
                 sample.dt_s, sample.temperature_c = dt[k], temperature[k]
                 no_values(&out, asked[k])
                 if self.law.zeros.watched:
@@ -659,7 +679,7 @@ def observe_run(
     )
     restart_guard(&guard)
     n = inputs.shape[1]
-    rows, waves, status = np.full((6, n), NAN), np.full((n, 4), NAN), np.empty(n, np.uint8)
+    rows, waves, status = np.full((6, n), NAN), np.full((n, 6), NAN), np.empty(n, np.uint8)
     cdef const double[:, ::1] x = inputs
     cdef double[:, ::1] to = rows
     cdef double[:, ::1] w = waves
@@ -671,9 +691,13 @@ def observe_run(
                 to[0, k], to[1, k], to[2, k] = out.raw_nm, out.joint_velocity_rad_s, out.torsion_nm
                 to[3, k], to[4, k], to[5, k] = out.direction, out.open_nm, out.ahead_nm
                 w[k, 0], w[k, 1], w[k, 2], w[k, 3] = out.cos2, out.sin2, out.cos4, out.sin4
+                w[k, 4], w[k, 5] = out.cos1, out.sin1
             s[k] = guard.status
     raw, v, torsion_nm, direction, open_nm, ahead_nm = rows
-    return ObservedRun(status, raw, v, torsion_nm, waves, inputs[5], direction, inputs[0], open_nm, ahead_nm)
+    ripple, turn = np.ascontiguousarray(waves[:, :4]), np.ascontiguousarray(waves[:, 4:])
+    return ObservedRun(
+        status, raw, v, torsion_nm, ripple, inputs[5], direction, inputs[0], open_nm, ahead_nm, turn
+    )
 
 
 # Joints with effects --------------------------------------------------------------------------------------------------

@@ -13,6 +13,9 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import Annotated, Any, Final
 
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import Section, Verbatim
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits, numbers_text
 from jtqd.estimator.effects.library import EFFECTS, checked_parameters, read_parameters
@@ -210,13 +213,63 @@ class FusedSigma:
             raise FieldError("fused.sigma", "scale", list(self.scale), "4 numbers > 0")
 
 
+TURN_WAVES: Final = 6
+"""Cos and sin of 1, 2 and 4 times the motor's angle, in this order."""
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """What the two paths differ by over the motor's turn on runs that the fit had not seen: agreement.pyx.
+
+    One number per wave, TURN_WAVES of them: the part that does not change, and those that go with the loss [Nm/Nm], the
+    speed and its square. covariance_nm2: lower triangle, row by row, of what days and motions leave of the waves; limit: largest
+    square of what is left, against that covariance.
+    """
+
+    constant_nm: Annotated[tuple[float, ...], limits("Nm")]
+    loss_share: Annotated[tuple[float, ...], limits()]
+    viscous_nms_per_rad: Annotated[tuple[float, ...], limits("Nms/rad")]
+    quadratic_nms2_per_rad2: Annotated[tuple[float, ...], limits("Nms2/rad2")]
+    covariance_nm2: Annotated[tuple[float, ...], limits("Nm2")]
+    limit: Annotated[float, limits(gt=0.0)]
+
+    def __post_init__(self) -> None:
+        check(self, "fused.agreement.turn")
+        sizes = dict.fromkeys(
+            ("constant_nm", "loss_share", "viscous_nms_per_rad", "quadratic_nms2_per_rad2"), TURN_WAVES
+        )
+        for key, count in {**sizes, "covariance_nm2": TURN_WAVES * (TURN_WAVES + 1) // 2}.items():
+            found = getattr(self, key)
+            if len(found) != count:
+                raise FieldError(
+                    "fused.agreement.turn", key, numbers_text(len(found)), f"a list of {count} finite numbers"
+                )
+        try:
+            np.linalg.cholesky(self.covariance)
+        except np.linalg.LinAlgError:
+            raise FieldError(
+                "fused.agreement.turn",
+                "covariance_nm2",
+                list(self.covariance_nm2),
+                "the lower triangle of a covariance: positive definite",
+            ) from None
+
+    @property
+    def covariance(self) -> FloatArray:
+        """The whole covariance [6, 6], Nm2."""
+        result = np.zeros((TURN_WAVES, TURN_WAVES))
+        result[np.tril_indices(TURN_WAVES)] = self.covariance_nm2
+        return result + np.tril(result, -1).T
+
+
 @dataclass(frozen=True, slots=True)
 class Agreement:
     """How far the two paths differ on runs that the fit had not seen, zeros of the day apart; beyond it sigma grows.
 
     slow_nm, fast_nm: RMS levels of the difference's trend and of the rest; gain: of one path against the other; zero_nm: a
     link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status; 0: not
-    known; level_factor, gain_factor: how much larger an error is than its trace in the difference. All: agreement.pyx.
+    known; level_factor, gain_factor: how much larger an error is than its trace in the difference; turn: waves over the
+    motor's turn, None: not known. All: agreement.pyx.
     """
 
     slow_nm: Annotated[float, limits("Nm", gt=0.0)]
@@ -226,6 +279,7 @@ class Agreement:
     lowered_nm: Annotated[float, limits("Nm", ge=0.0)] = 0.0
     level_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 1.4
     gain_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 2.0
+    turn: Turn | None = None
 
     def __post_init__(self) -> None:
         check(self, "fused.agreement")

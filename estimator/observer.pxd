@@ -16,11 +16,11 @@ cdef struct ObserverState:
     double link, link_velocity
 
 cdef struct Inputs:  # of the filter: u = i Kt + J g w, v, deflection d, waves, direction
-    double u, v, d, cos2, sin2, cos4, sin4, direction
+    double u, v, d, cos1, sin1, cos2, sin2, cos4, sin4, direction
 
 cdef struct FusedObserved:  # as Observed, and the filtered waves; open: what the torsion's slip leaves open
     double raw_nm, joint_velocity_rad_s, link_velocity_rad_s, torsion_nm
-    double cos2, sin2, cos4, sin4, direction, open_nm, ahead_nm  # ahead: what the torsion's own filter knows earlier
+    double cos1, sin1, cos2, sin2, cos4, sin4, direction, open_nm, ahead_nm  # ahead: what the torsion's own filter knows earlier
 
 cdef struct Reference:  # a sensor as old as the estimate
     double last, z, since, settled

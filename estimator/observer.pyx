@@ -286,6 +286,7 @@ cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil
     cdef Inputs to
     cdef double c = cos(x.motor_position_rad)  # of the angle itself: a multiple of a finite angle need not be finite
     cdef double s = sin(x.motor_position_rad)
+    to.cos1, to.sin1 = c, s
     to.cos2 = c * c - s * s
     to.sin2 = 2.0 * c * s
     to.cos4 = to.cos2 * to.cos2 - to.sin2 * to.sin2
@@ -491,6 +492,7 @@ cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s,
     """Set what comes out of the filter as it is."""
     out.joint_velocity_rad_s = s.z.v
     out.link_velocity_rad_s = s.link_velocity
+    out.cos1, out.sin1 = s.z.cos1, s.z.sin1
     out.cos2, out.sin2, out.cos4, out.sin4 = s.z.cos2, s.z.sin2, s.z.cos4, s.z.sin4
     out.direction = s.z.direction
 
@@ -539,6 +541,8 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
         own = _hold(law.torsion_rate, x.dt_s) if law.apart else h
         s.z.d = _filtered(&own, s.z.d, now.d, s.last.d)
         damped = law.damping * (s.z.d - s.d) / x.dt_s
+    s.z.cos1 = _filtered(&h, s.z.cos1, now.cos1, s.last.cos1)
+    s.z.sin1 = _filtered(&h, s.z.sin1, now.sin1, s.last.sin1)
     s.z.cos2 = _filtered(&h, s.z.cos2, now.cos2, s.last.cos2)
     s.z.sin2 = _filtered(&h, s.z.sin2, now.sin2, s.last.sin2)
     s.z.cos4 = _filtered(&h, s.z.cos4, now.cos4, s.last.cos4)

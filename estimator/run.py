@@ -8,7 +8,7 @@ Column names in messages are those of the files: `time_s`, `j1.current_a`, `j1.m
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Final
 
@@ -169,7 +169,8 @@ class ObservedRun:
     Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
     the motor angle; temperature [n], NaN where unknown; direction [n], -1 to 1; dt_s [n], time since the sample before;
     open_nm [n]: what the torsion's slip leaves open to either side; ahead_nm [n]: the torsion that went through its own
-    filter only, less torsion_nm, which is as old as raw_nm.
+    filter only, less torsion_nm, which is as old as raw_nm; turn [n, 2]: filtered cos and sin of the motor angle, [0, 2] where
+    they are not known.
     """
 
     status: StatusArray
@@ -182,6 +183,7 @@ class ObservedRun:
     dt_s: FloatArray
     open_nm: FloatArray
     ahead_nm: FloatArray
+    turn: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
 
 
 @dataclass(frozen=True, slots=True)

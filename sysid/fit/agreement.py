@@ -2,18 +2,24 @@
 
 Levels of samples, not of runs: what is beyond is doubt that grows from zero, so a run that is a little beyond costs little
 (estimator/agreement.pyx).
+
+Waves of the difference over the motor's turn, in contrast, are those of the joint on every day. What all runs have of them is
+found by least squares, the slow part of each second left out on both sides; what is left in a run then counts by its covariance
+over all runs, and the limit is beyond the largest that any run came to.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
+from jtqd.estimator.agreement import EVERY, TURNING_RAD_S, turn_waves
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import Agreement
+from jtqd.estimator.joint import TURN_WAVES, Agreement, Turn
+from jtqd.estimator.zeros import ONE_WAY
 
 QUANTILE: Final = 0.75
 """Of the blocks of all runs: the rest of ordinary days has a little doubt. Chosen on runs that no figure is reported on."""
@@ -50,3 +56,64 @@ def fit_agreement(levels: Callable[[Agreement | None], Sequence[Levels]]) -> Agr
     )
     doubt = np.concatenate([run[-1] for run in levels(found)])
     return replace(found, lowered_nm=max(float(np.quantile(doubt, LOWERED)), _FLOOR_NM))
+
+
+TURN_BEYOND: Final = 1.1
+"""So many times the largest square of any run is the limit. Chosen on runs that no figure is reported on."""
+_FEWEST_RUNS: Final = 16
+"""With motion: from fewer no covariance of the six waves can be told."""
+_TURN_FLOOR_NM: Final = 1e-2
+_PART_S: Final = 1.0
+"""What is slow is left out of so long a part of a run at once."""
+
+
+class TurnRun(NamedTuple):
+    """One unseen run, arrays [n] of its samples in motion, as `estimator.agreement.turn_waves` takes them."""
+
+    dt_s: FloatArray
+    apart_nm: FloatArray
+    direction: FloatArray
+    velocity_rad_s: FloatArray
+    loss_nm: FloatArray
+    waves: FloatArray
+
+
+def fit_turn(runs: Sequence[TurnRun]) -> Turn | None:
+    """Return what runs have in common over the motor's turn, and how far they differ; None for too few runs."""
+    parts = _own_waves(runs)
+    found = Turn(
+        *(tuple(map(float, part)) for part in parts), covariance_nm2=_lower(np.eye(TURN_WAVES)), limit=1.0
+    )
+    each = [waves for waves in (turn_waves(found, *run)[0] for run in runs) if len(waves)]
+    if len(each) < _FEWEST_RUNS:
+        return None
+    left = np.concatenate(each)
+    covariance = left.T @ left / len(left) + _TURN_FLOOR_NM**2 * np.eye(TURN_WAVES)
+    found = replace(found, covariance_nm2=_lower(covariance))
+    largest = max(float(turn_waves(found, *run)[1].max(initial=0.0)) for run in runs)
+    return replace(found, limit=TURN_BEYOND * largest)
+
+
+def _lower(matrix: FloatArray) -> tuple[float, ...]:
+    return tuple(map(float, matrix[np.tril_indices(len(matrix))]))
+
+
+def _own_waves(runs: Sequence[TurnRun]) -> FloatArray:
+    """Return the parts [4, 6] of the waves that all runs have: constant, by loss, by speed, by its square."""
+    squares, products = np.zeros((4 * TURN_WAVES, 4 * TURN_WAVES)), np.zeros(4 * TURN_WAVES)
+    for run in runs:
+        turning = (np.abs(run.velocity_rad_s) > TURNING_RAD_S) & (np.abs(run.direction) > ONE_WAY)
+        keep = np.flatnonzero(turning)[::EVERY]
+        if not len(keep):
+            continue
+        v, loss, w = run.velocity_rad_s[keep], run.loss_nm[keep], run.waves[keep]
+        columns = np.column_stack([w * part[:, None] for part in (np.ones_like(v), loss, v, v * v)])
+        both = np.column_stack((columns, run.apart_nm[keep]))
+        slow = np.column_stack((np.ones_like(v), run.direction[keep], v, loss))
+        count = max(1, round(float(run.dt_s[keep].sum()) * EVERY / _PART_S))
+        for part in np.array_split(np.arange(len(keep)), count):
+            rest = both[part] - slow[part] @ np.linalg.lstsq(slow[part], both[part], rcond=None)[0]
+            squares += rest[:, :-1].T @ rest[:, :-1]
+            products += rest[:, :-1].T @ rest[:, -1]
+    result: FloatArray = np.linalg.lstsq(squares, products, rcond=None)[0].reshape(4, TURN_WAVES)
+    return result

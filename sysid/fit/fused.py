@@ -48,7 +48,7 @@ from jtqd.estimator.joint import (
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
-from jtqd.sysid.fit.agreement import Levels, fit_agreement
+from jtqd.sysid.fit.agreement import Levels, TurnRun, fit_agreement, fit_turn
 from jtqd.sysid.fit.calibration import calibrated
 from jtqd.sysid.fit.envelope import (
     FIT_ROOM_K,
@@ -226,7 +226,22 @@ def _agreement(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -
             if len(run.dt_s)
         ]
 
-    return fit_agreement(of_runs)
+    found = fit_agreement(of_runs)
+    if found is None:
+        return None
+    turning = [
+        TurnRun(
+            run.dt_s,
+            run.torsion_error_nm - run.current_error_nm,
+            run.direction,
+            run.velocity_rad_s,
+            run.loss_nm,
+            run.turn,
+        )
+        for run in unseen
+        if len(run.turn)
+    ]
+    return replace(found, turn=fit_turn(turning))
 
 
 def _envelope(
@@ -298,7 +313,20 @@ def path_residuals(
         now = NowErrors(error[keep], low_pass(error, seen.dt_s, run.bandwidth_rad_s)[keep], late[keep])
     stiffness = local_stiffness(torsion, deflection(torsion, run)[keep])
     return PathResiduals(
-        raw, velocity, half, tau, open_nm, current, tau - sensor, dt, direction, slope, now, stiffness
+        raw,
+        velocity,
+        half,
+        tau,
+        open_nm,
+        current,
+        tau - sensor,
+        dt,
+        direction,
+        slope,
+        now,
+        stiffness,
+        loss_nm[keep],
+        np.column_stack((seen.turn, seen.waves))[keep] if len(seen.turn) else np.zeros(0),
     )
 
 

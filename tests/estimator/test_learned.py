@@ -28,7 +28,7 @@ def learned(joint: Joint = NARROW, settings: EstimatorSettings = ON) -> Estimato
 
 def test_the_layout_of_the_past_is_the_one_of_its_number() -> None:
     """Where this fails, what logs hold means something else: count `PAST_LAYOUT` up, then change the size here."""
-    assert (PAST_LAYOUT, len(FusedEstimator(NARROW, ON).past)) == (5, 1120)
+    assert (PAST_LAYOUT, len(FusedEstimator(NARROW, ON).past)) == (6, 1520)
 
 
 @pytest.mark.parametrize("effects", [(), (EFFECT,)])

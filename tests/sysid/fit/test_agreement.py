@@ -7,9 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jtqd.estimator.agreement import turn_waves
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Agreement
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.agreement import LOWERED, QUANTILE, Levels, fit_agreement
+from jtqd.sysid.fit.agreement import LOWERED, QUANTILE, Levels, TurnRun, fit_agreement, fit_turn
 from jtqd.sysid.fit.fused import fit_fused
 from tests.sysid.fit.test_fused import emulated
 
@@ -59,3 +61,46 @@ def test_the_fit_writes_levels_of_the_size_of_its_own_errors() -> None:
     sensor = max(float(np.abs(run.sensor_nm[run.moving]).max()) for run in runs)
     assert fused.envelope.load_nm == pytest.approx(sensor, rel=0.05)
     assert fit_fused(runs, joint.friction).fused.agreement is None  # nothing is known of the joint's size
+
+
+PARTS = np.random.default_rng(5).normal(size=(4, 6)) * np.array([[0.5], [0.1], [0.3], [0.2]])
+
+
+def turning(seed: int, parts: FloatArray = PARTS) -> TurnRun:
+    """A run of a joint with these waves, whose day changes them a little, and what is slow a lot."""
+    source, n = np.random.default_rng(seed), 4000
+    t = np.arange(n) * 1e-3
+    v = 1.2 + 0.8 * np.sin(2.0 * t + source.uniform(0.0, 6.0))
+    loss = source.uniform(2.0, 6.0) + v
+    angle = 100.0 * np.cumsum(v) * 1e-3
+    waves = np.column_stack([f(order * angle) for order in (1, 2, 4) for f in (np.cos, np.sin)])
+    of_day = parts + 0.05 * source.normal(size=parts.shape) * np.array([[1.0], [0.0], [0.0], [0.0]])
+    size = np.column_stack((np.ones(n), loss, v, v * v)) @ of_day
+    apart = np.einsum("nk,nk->n", waves, size) + source.normal() + 0.5 * source.normal() * v
+    return TurnRun(np.full(n, 1e-3), apart + 0.05 * source.normal(size=n), np.ones(n), v, loss, waves)
+
+
+def test_waves_of_the_turn_are_those_that_runs_have_in_common() -> None:
+    found = fit_turn([turning(seed) for seed in range(24)])
+    assert found is not None
+    values = (found.constant_nm, found.loss_share, found.viscous_nms_per_rad, found.quadratic_nms2_per_rad2)
+    other = turning(101, PARTS * np.array([[-1.0], [1.0], [1.0], [1.0]]))
+    for run in (turning(100), other):
+        expected = np.einsum(
+            "nk,nk->n",
+            run.waves,
+            np.column_stack((np.ones(4000), run.loss_nm, run.velocity_rad_s, run.velocity_rad_s**2))
+            @ (np.array(values) - PARTS),
+        )
+        assert np.sqrt(np.mean(expected**2)) < 0.1
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), 0.05, rtol=0.5)
+    assert turn_waves(found, *turning(100))[1].max() < found.limit
+    _, square = turn_waves(found, *other)
+    assert square[1000 // 64] > found.limit, "the first second"
+
+
+def test_too_few_runs_have_no_waves() -> None:
+    assert fit_turn([turning(seed) for seed in range(15)]) is None
+    standing = turning(99)._replace(velocity_rad_s=np.zeros(4000))
+    assert fit_turn([*[turning(seed) for seed in range(15)], standing]) is None
+    assert fit_turn([]) is None
