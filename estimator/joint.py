@@ -222,8 +222,8 @@ class Turn:
     """What the two paths differ by over the motor's turn on runs that the fit had not seen: agreement.pyx.
 
     One number per wave, TURN_WAVES of them: the part that does not change, and those that go with the loss [Nm/Nm], the
-    speed and its square. covariance_nm2: lower triangle, row by row, of what days and motions leave of the waves; limit: largest
-    square of what is left, against that covariance.
+    speed and its square. covariance_nm2: lower triangle, row by row, of what days and motions leave of the waves; limit:
+    largest square of what is left, against that covariance.
     """
 
     constant_nm: Annotated[tuple[float, ...], limits("Nm")]

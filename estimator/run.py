@@ -169,8 +169,8 @@ class ObservedRun:
     Torques [Nm, joint side], velocity [rad/s, joint side]; waves [n, 4]: filtered cos and sin of 2 and 4 times
     the motor angle; temperature [n], NaN where unknown; direction [n], -1 to 1; dt_s [n], time since the sample before;
     open_nm [n]: what the torsion's slip leaves open to either side; ahead_nm [n]: the torsion that went through its own
-    filter only, less torsion_nm, which is as old as raw_nm; turn [n, 2]: filtered cos and sin of the motor angle, [0, 2] where
-    they are not known.
+    filter only, less torsion_nm, which is as old as raw_nm; turn [n, 2]: filtered cos and sin of the motor angle, [0, 2]
+    where they are not known.
     """
 
     status: StatusArray

@@ -3,9 +3,9 @@
 Levels of samples, not of runs: what is beyond is doubt that grows from zero, so a run that is a little beyond costs little
 (estimator/agreement.pyx).
 
-Waves of the difference over the motor's turn, in contrast, are those of the joint on every day. What all runs have of them is
-found by least squares, the slow part of each second left out on both sides; what is left in a run then counts by its covariance
-over all runs, and the limit is beyond the largest that any run came to.
+Waves of the difference over the motor's turn, in contrast, are those of the joint on every day. What all runs have of them
+is found by least squares, the slow part of each second left out on both sides; what is left in a run then counts by its
+covariance over all runs, and the limit is beyond the largest that any run came to.
 """
 
 from __future__ import annotations

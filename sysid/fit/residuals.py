@@ -25,8 +25,8 @@ class PathResiduals(NamedTuple):
 
     torsion_nm, open_nm and torsion_error_nm are 0 where there is no torsion. dt_s, direction and slope (dL/draw of the loss)
     are for `fused.agreement`, stiffness (d tau_t/d d) for `fused.zeros`, now for `fused.tracking`; empty: the run does not
-    count there. loss_nm, turn [n, 6] (filtered cos and sin of 1, 2 and 4 times the motor's angle): for `fused.agreement.turn`;
-    empty: as before.
+    count there. loss_nm, turn [n, 6] (filtered cos and sin of 1, 2 and 4 times the motor's angle): for
+    `fused.agreement.turn`, empty as before.
     """
 
     raw_nm: FloatArray
