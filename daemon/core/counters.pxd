@@ -30,7 +30,7 @@ cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c
 
 cdef enum:
-    PAST_WORDS = 160  # room for the state of an estimator
+    PAST_WORDS = 192  # room for the state of an estimator
 
 cdef struct LearnedBlock:  # `LEARNED` of the snapshot: zeros, and the state after the cycle of the last estimate
     Learned told
