@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from jtqd.daemon.shared.snapshot import PAST_WORDS
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.learned import FORGOTTEN, KEPT, LEARNED, NOTHING, PAST_LAYOUT, TRACKED, Zeros, hand_over
