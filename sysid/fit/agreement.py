@@ -80,10 +80,8 @@ class TurnRun(NamedTuple):
 
 def fit_turn(runs: Sequence[TurnRun]) -> Turn | None:
     """Return what runs have in common over the motor's turn, and how far they differ; None for too few runs."""
-    parts = _own_waves(runs)
-    found = Turn(
-        *(tuple(map(float, part)) for part in parts), covariance_nm2=_lower(np.eye(TURN_WAVES)), limit=1.0
-    )
+    constant, loss, viscous, quadratic = (tuple(map(float, part)) for part in _own_waves(runs))
+    found = Turn(constant, loss, viscous, quadratic, _lower(np.eye(TURN_WAVES)), limit=1.0)
     each = [waves for waves in (turn_waves(found, *run)[0] for run in runs) if len(waves)]
     if len(each) < _FEWEST_RUNS:
         return None
@@ -100,7 +98,8 @@ def _lower(matrix: FloatArray) -> tuple[float, ...]:
 
 def _own_waves(runs: Sequence[TurnRun]) -> FloatArray:
     """Return the parts [4, 6] of the waves that all runs have: constant, by loss, by speed, by its square."""
-    squares, products = np.zeros((4 * TURN_WAVES, 4 * TURN_WAVES)), np.zeros(4 * TURN_WAVES)
+    products: FloatArray = np.zeros(4 * TURN_WAVES)
+    squares: FloatArray = np.zeros((4 * TURN_WAVES, 4 * TURN_WAVES))
     for run in runs:
         turning = (np.abs(run.velocity_rad_s) > TURNING_RAD_S) & (np.abs(run.direction) > ONE_WAY)
         keep = np.flatnonzero(turning)[::EVERY]
@@ -111,8 +110,8 @@ def _own_waves(runs: Sequence[TurnRun]) -> FloatArray:
         both = np.column_stack((columns, run.apart_nm[keep]))
         slow = np.column_stack((np.ones_like(v), run.direction[keep], v, loss))
         count = max(1, round(float(run.dt_s[keep].sum()) * EVERY / _PART_S))
-        for part in np.array_split(np.arange(len(keep)), count):
-            rest = both[part] - slow[part] @ np.linalg.lstsq(slow[part], both[part], rcond=None)[0]
+        for at in np.array_split(np.arange(len(keep)), count):
+            rest = both[at] - slow[at] @ np.linalg.lstsq(slow[at], both[at], rcond=None)[0]
             squares += rest[:, :-1].T @ rest[:, :-1]
             products += rest[:, :-1].T @ rest[:, -1]
     result: FloatArray = np.linalg.lstsq(squares, products, rcond=None)[0].reshape(4, TURN_WAVES)
