@@ -114,5 +114,4 @@ def _own_waves(runs: Sequence[TurnRun]) -> FloatArray:
             rest = both[at] - slow[at] @ np.linalg.lstsq(slow[at], both[at], rcond=None)[0]
             squares += rest[:, :-1].T @ rest[:, :-1]
             products += rest[:, :-1].T @ rest[:, -1]
-    result: FloatArray = np.linalg.lstsq(squares, products, rcond=None)[0]
-    return result.reshape(4, TURN_WAVES)
+    return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0], np.float64).reshape(4, TURN_WAVES)
