@@ -12,7 +12,7 @@ from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.findings import Cause, Value, joint_text
 from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.guards import nothing_of
-from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.refine import parameter, places
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.steadiness import steadiness

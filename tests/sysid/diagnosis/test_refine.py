@@ -23,7 +23,7 @@ from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import _repeats
 from jtqd.sysid.diagnosis.guards import beyond_bounds, free_run_fall
-from jtqd.sysid.diagnosis.mixed_model import Model
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, Model
 from jtqd.sysid.diagnosis.noise import ORDER, Noise
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, present_effects, refine
 from jtqd.sysid.diagnosis.regressors import contribution, families
@@ -44,8 +44,9 @@ def signals(table: RunTable, joint: Joint = PLAIN, name: str = "run") -> JointSi
     return joint_signals(name, table, 1, joint, BaseLoss(joint))
 
 
-def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Dataset:
-    """Runs of a joint with a Stribeck peak that its file knows nothing of."""
+def peaked(runs: int, seed: float, noise: float = NOISE_NM, day_nm: float = 0.0) -> Dataset:
+    """Runs of a joint with a Stribeck peak unknown to its file; day_nm: more Coulomb friction than in the file."""
+    file = replace(PLAIN, friction=replace(PLAIN.friction, coulomb_nm=PLAIN.friction.coulomb_nm - day_nm))
     tables = [
         rigid_run(
             PLAIN,
@@ -56,10 +57,11 @@ def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Dataset:
         )
         for k in range(runs)
     ]
-    made = [[signals(t, name=f"run{k}")] for k, t in enumerate(tables)]
+    made = [[signals(t, file, f"run{k}")] for k, t in enumerate(tables)]
     groups = families(made)
     binned = [columns_module.run_data(s, [], SAMPLES, groups) for s in made]
-    unexplained = {c: [np.zeros(len(r.time_s)) for r in binned] for c in binned[0].channels}
+    floor = noise / SAMPLES**0.5
+    unexplained = {c: [np.full(len(r.time_s), floor) for r in binned] for c in binned[0].channels}
     return Dataset(made, binned, [], SAMPLES, SAMPLES * 1e-3, unexplained, groups, [])
 
 
@@ -365,3 +367,26 @@ def test_causes_that_lower_the_plain_error_nowhere_on_runs_left_out_are_none(
     assert guards.objections(dataset, best, result) == []
     monkeypatch.setattr(guards, "falls_nm", lambda squares: dict.fromkeys(squares, 0.0))
     assert guards.objections(dataset, best, result) == [(0, "it raises the error on runs left out")]
+
+
+@pytest.mark.parametrize("runs", [3, 4])
+def test_a_friction_of_the_day_that_lies_against_a_cause_speaks_against_it_with_few_runs_only(
+    runs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A peak of 1.2 Nm, days with 0.5 Nm less friction than the file: without the peak the plain error is less."""
+    dataset = peaked(runs, 0.2, day_nm=-0.5)
+    result = refine(dataset, [start(stribeck_nm=0.6, stribeck_velocity_rad_s=0.12)], WHITE)
+    assert result.present[0].values == pytest.approx(TRUTH, rel=0.15)
+    gain = held_out_gain(dataset, result)
+    monkeypatch.setattr(guards, "nothing_of", lambda _: [{}])
+    found = guards.objections(dataset, Hypothesis((), result, 0.0), result)  # type: ignore[arg-type]
+    if runs < ENOUGH_RUNS:
+        assert found == [(0, "it raises the error on runs left out")]
+        assert gain.plain_nm is None
+        assert gain.rmse_after_nm >= gain.rmse_before_nm
+        return
+    assert found == []
+    assert gain.plain_nm is not None
+    assert gain.plain_nm[1] > gain.plain_nm[0] > gain.rmse_before_nm > 1.3 * gain.rmse_after_nm
+    assert gain.rmse_after_nm == pytest.approx(WHITE.sigma[0], rel=0.1)
+    assert gain.split.endswith("beside what each run has of its own")
