@@ -27,7 +27,8 @@ cdef struct ContactLaw:
     int settle, longest, brief  # samples: until it is believed, of one contact, in which the load stays what it was
 
 cdef struct ContactState:
-    double trend, under, side  # under: trend of x during a contact; side: its sign
+    double trend, before  # before: residual of the last sample
+    double under, side, size  # of a contact: trend of the residual, sign, largest residual of its beginning
     double later[CONTACT_LATER]
     double wave[CONTACT_WAVES]
     double residual_nm

@@ -13,11 +13,12 @@ A torque from outside on the link makes `load` less than what is beyond the link
     x = -load                       joint alone: what is beyond is not known, and steady or slow
     x = load_other - load           two joints that turn one link against each other: the other one says what is beyond
     e = x - w - z                   w: waves of 1 and 2 per motor turn, z: trend; both learned from e, slower than a contact
-    contact where |e| > threshold, until x steps back by as much, or |e| < RELEASE threshold within 1/TREND_RAD_S, or
-    LONGEST_S have passed; then BLIND samples in which nothing is told, since z begins anew
+    m = (e_k + e_(k-1))/2           told as the residual: encoder noise is in second differences, and mostly cancels in it
+    contact where |m| > threshold, until m steps back by as much and by RELEASE of the push, or |m| < RELEASE threshold
+    within 1/TREND_RAD_S, or LONGEST_S have passed; then BLIND samples in which nothing is told, since z begins anew
 
-While there is a contact, neither w nor z learns: e is the size of the push. The load under it goes on meanwhile, with the
-error that it has by the torque, so that e alone does not say when the push ends; a second trend of x, from its beginning,
+While there is a contact, neither w nor z learns: m is the size of the push. The load under it goes on meanwhile, with the
+error that it has by the torque, so that m alone does not say when the push ends; a second trend, of e from its beginning,
 says what a step back is.
 """
 
@@ -43,7 +44,8 @@ TREND_RAD_S: Final = 50.0
 NOTCH_RAD_S: Final = 10.0
 """Rate at which w is learned."""
 RELEASE: Final = 0.5
-"""A contact that has just begun ends below this part of the threshold."""
+"""Part of a push that a step back must have, since the link swings; a contact that has just begun ends below this part of
+the threshold."""
 LONGEST_S: Final = 0.5
 """What lasts longer is load."""
 BLIND: Final = 6
@@ -134,13 +136,14 @@ cdef void restart_contact(ContactState *s) noexcept nogil:
     s.samples = s.missed = s.held = s.blind = s.at = 0
     for k in range(CONTACT_WAVES):
         s.wave[k] = 0.0
+    s.before = 0.0
     s.residual_nm = NAN
     s.told = CONTACT_UNKNOWN
 
 
 cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_nm, double angle) noexcept nogil:
     """Take x [Nm] at a motor angle [rad], NaN where it is not known; sets `residual_nm` and `told`."""
-    cdef double c1, s1, c2, s2, x, e, back
+    cdef double c1, s1, c2, s2, x, e, m
     cdef int k
     if isnan(outside_nm + angle):
         s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
@@ -157,31 +160,37 @@ cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_n
     if s.samples < law.settle:
         s.samples += 1
     if s.blind:
-        s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
+        s.residual_nm, s.told, s.before = NAN, CONTACT_UNKNOWN, 0.0
         if s.blind <= MEAN_OF:
             set_trend(s, s.trend + (x - s.trend) / (MEAN_OF - s.blind + 1))
         s.blind -= 1
         return
     e = x - s.trend
+    m, s.before = 0.5 * (e + s.before), e
     if s.samples == law.settle:
-        s.residual_nm, s.told = e, CONTACT_NONE
+        s.residual_nm, s.told = m, CONTACT_NONE
     else:
         s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
     if s.held:
         s.held += 1
-        back = (s.under - x) * s.side
-        if back > law.threshold or s.held > law.longest or (s.held <= law.brief and fabs(e) < law.release):
+        if s.held <= law.brief:
+            s.size = max(s.size, fabs(m))
+        if (
+            (s.under - m) * s.side > max(law.threshold, BACK * s.size)
+            or s.held > law.longest
+            or (s.held <= law.brief and fabs(m) < law.release)
+        ):
             s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
             s.held, s.blind = 0, NOT_TOLD
             return
         s.told = CONTACT_THERE
-        s.under += law.trend * (later(s, x) - s.under)
+        s.under += law.trend * (later(s, e) - s.under)
         return
-    if s.told == CONTACT_NONE and fabs(e) > law.threshold:
-        s.told, s.held, s.under = CONTACT_THERE, 1, x
-        s.side = 1.0 if e > 0.0 else -1.0
+    if s.told == CONTACT_NONE and fabs(m) > law.threshold:
+        s.told, s.held, s.under = CONTACT_THERE, 1, e
+        s.side, s.size = 1.0 if m > 0.0 else -1.0, fabs(m)
         for k in range(CONTACT_LATER):
-            s.later[k] = x
+            s.later[k] = e
         return
     s.wave[0] += law.notch * e * c1
     s.wave[1] += law.notch * e * s1
@@ -212,7 +221,7 @@ cdef class ContactDetector:
     Raises ValueError for a threshold or a period that is none.
 
     Attributes:
-        residual_nm: e of the last sample, NaN where unknown. told: OFF, UNKNOWN, NONE or CONTACT.
+        residual_nm: m of the last sample, NaN where unknown. told: OFF, UNKNOWN, NONE or CONTACT.
     """
 
     cdef ContactLaw law
