@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import guards
 from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
-from jtqd.sysid.diagnosis.causes import _normal_phase
+from jtqd.sysid.diagnosis.case import Fit
+from jtqd.sysid.diagnosis.causes import INACCURATE, _normal_phase, values_of
 from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_applied
@@ -323,6 +325,37 @@ def test_an_amplitude_is_positive_and_its_phase_within_a_turn() -> None:
     assert around["phase_rad"].ci95 == pytest.approx((6.0 - 2 * np.pi, 6.4 - 2 * np.pi))
     plain = {"gain": value(-1.0)}
     assert _normal_phase(plain) == plain
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("hysteresis", {"torque_nm": 0.5, "travel_rad": 3.1e-5}),
+        ("stribeck_friction", {"stribeck_nm": 0.5, "stribeck_velocity_rad_s": 0.052}),
+        ("torque_constant", {"torque_constant_nm_per_a": 0.084}),
+    ],
+)
+def test_no_interval_is_narrower_than_a_part_of_the_size(name: str, values: dict[str, float]) -> None:
+    """A travel or a velocity is its own size, however near it lies to where the search began; a constant of the file differs
+    from the file's by its size.
+    """
+    (one,) = candidates(PLAIN, (name, 1, 0))
+    free = tuple(values)
+    certain = Refined(
+        (PresentEffect(one.effect, 1, values, free),),
+        1e-18 * np.eye(len(free)),
+        np.zeros(len(free)),
+        SimpleNamespace(runs=6),  # type: ignore[arg-type]
+        np.ones(1),
+        np.zeros((6, 1)),
+        (),
+    )
+    model = Model((), np.empty(0), np.empty((0, 0)), np.ones(1), 0.0, 0.0, np.zeros((1, 1)))
+    found = values_of(Fit(Hypothesis((one,), model, 0.0), certain), 0)
+    base = {"torque_constant_nm_per_a": 0.08}
+    for key, true in values.items():
+        half = INACCURATE * (true - base.get(key, 0.0))
+        assert found[key].ci95 == pytest.approx((true - half, true + half))
 
 
 def test_terms_of_the_search_are_where_a_refinement_starts() -> None:
