@@ -24,14 +24,15 @@ cdef struct LinkSeen:
 
 cdef struct ContactLaw:
     double threshold, release, trend, notch  # trend, notch: shares per sample
-    int settle, longest  # samples: until it is believed, and of one contact
+    int settle, longest, brief  # samples: until it is believed, of one contact, in which the load stays what it was
 
 cdef struct ContactState:
-    double trend
+    double trend, before  # before: residual of the last sample
+    double under, side, size  # of a contact: trend of the residual, sign, largest residual of its beginning
     double later[CONTACT_LATER]
     double wave[CONTACT_WAVES]
     double residual_nm
-    int samples, missed, held, at, told
+    int samples, missed, held, blind, at, told
 
 cdef int fill_link(LinkLaw *law, joint, torsion) except -1
 cdef void restart_link(LinkState *s) noexcept nogil

@@ -13,9 +13,13 @@ A torque from outside on the link makes `load` less than what is beyond the link
     x = -load                       joint alone: what is beyond is not known, and steady or slow
     x = load_other - load           two joints that turn one link against each other: the other one says what is beyond
     e = x - w - z                   w: waves of 1 and 2 per motor turn, z: trend; both learned from e, slower than a contact
-    contact where |e| > threshold, until |e| < RELEASE threshold or LONGEST_S have passed
+    m = (e_k + e_(k-1))/2           told as the residual: encoder noise is in second differences, and mostly cancels in it
+    contact where |m| > threshold, until m steps back by as much and by RELEASE of the push, or |m| < RELEASE threshold
+    within 1/TREND_RAD_S, or LONGEST_S have passed; then BLIND samples in which nothing is told, since z begins anew
 
-While there is a contact, neither w nor z learns; after LONGEST_S it counts as load.
+While there is a contact, neither w nor z learns: m is the size of the push. The load under it goes on meanwhile, with the
+error that it has by the torque, so that m alone does not say when the push ends; a second trend, of e from its beginning,
+says what a step back is.
 """
 
 from libc.math cimport NAN, cos, fabs, isnan, sin
@@ -40,9 +44,13 @@ TREND_RAD_S: Final = 50.0
 NOTCH_RAD_S: Final = 10.0
 """Rate at which w is learned."""
 RELEASE: Final = 0.5
-"""A contact ends below this part of the threshold."""
+"""Part of a push that a step back must have, since the link swings; a contact that has just begun ends below this part of
+the threshold."""
 LONGEST_S: Final = 0.5
 """What lasts longer is load."""
+BLIND: Final = 6
+"""Samples after a contact: two in which a push may still be ending, and MEANT of which the new trend is the mean."""
+MEANT: Final = 4
 SETTLE_S: Final = 0.1
 """After a start nothing is told for so long."""
 UNEVEN: Final = 0.05
@@ -53,7 +61,7 @@ LONGEST_GAP: Final = 50
 
 cdef double RATE = TREND_RAD_S, LEARNED = NOTCH_RAD_S, BACK = RELEASE, MOST_S = LONGEST_S, BELIEVED_S = SETTLE_S
 cdef double UNEVEN_STEPS = UNEVEN
-cdef int MOST_MISSED = LONGEST_GAP
+cdef int MOST_MISSED = LONGEST_GAP, NOT_TOLD = BLIND, MEAN_OF = MEANT
 
 
 # The link of a joint --------------------------------------------------------------------------------------------------
@@ -118,22 +126,24 @@ cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) exc
     law.threshold, law.release = threshold_nm, BACK * threshold_nm
     law.trend, law.notch = RATE * period_s, 2.0 * LEARNED * period_s
     law.settle, law.longest = <int> (BELIEVED_S / period_s + 0.5), <int> (MOST_S / period_s + 0.5)
+    law.brief = <int> (1.0 / law.trend + 0.5)
     return 0
 
 
 cdef void restart_contact(ContactState *s) noexcept nogil:
     """Forget the past: unknown until it has settled."""
     cdef int k
-    s.samples = s.missed = s.held = s.at = 0
+    s.samples = s.missed = s.held = s.blind = s.at = 0
     for k in range(CONTACT_WAVES):
         s.wave[k] = 0.0
+    s.before = 0.0
     s.residual_nm = NAN
     s.told = CONTACT_UNKNOWN
 
 
 cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_nm, double angle) noexcept nogil:
     """Take x [Nm] at a motor angle [rad], NaN where it is not known; sets `residual_nm` and `told`."""
-    cdef double c1, s1, c2, s2, x, e
+    cdef double c1, s1, c2, s2, x, e, m
     cdef int k
     if isnan(outside_nm + angle):
         s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
@@ -146,37 +156,63 @@ cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_n
     c2, s2 = c1 * c1 - s1 * s1, 2.0 * s1 * c1
     x = outside_nm - (s.wave[0] * c1 + s.wave[1] * s1 + s.wave[2] * c2 + s.wave[3] * s2)
     if s.samples == 0:
-        s.trend = x
-        for k in range(CONTACT_LATER):
-            s.later[k] = x
-    e = x - s.trend
+        set_trend(s, x)
     if s.samples < law.settle:
         s.samples += 1
+    if s.blind:
+        s.residual_nm, s.told, s.before = NAN, CONTACT_UNKNOWN, 0.0
+        if s.blind <= MEAN_OF:
+            set_trend(s, s.trend + (x - s.trend) / (MEAN_OF - s.blind + 1))
+        s.blind -= 1
+        return
+    e = x - s.trend
+    m, s.before = 0.5 * (e + s.before), e
     if s.samples == law.settle:
-        if s.held == 0:
-            s.held = 1 if fabs(e) > law.threshold else 0
-        elif fabs(e) < law.release:
-            s.held = 0
-        elif s.held < law.longest:
-            s.held += 1
-        else:  # it is load from here on
-            s.trend += e
-            for k in range(CONTACT_LATER):
-                s.later[k] = s.trend
-            s.held, e = 0, 0.0
-        s.residual_nm = e
-        s.told = CONTACT_THERE if s.held else CONTACT_NONE
+        s.residual_nm, s.told = m, CONTACT_NONE
     else:
         s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
     if s.held:
+        s.held += 1
+        if s.held <= law.brief:
+            s.size = max(s.size, fabs(m))
+        if (
+            (s.under - m) * s.side > max(law.threshold, BACK * s.size)
+            or s.held > law.longest
+            or (s.held <= law.brief and fabs(m) < law.release)
+        ):
+            s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
+            s.held, s.blind = 0, NOT_TOLD
+            return
+        s.told = CONTACT_THERE
+        s.under += law.trend * (later(s, e) - s.under)
+        return
+    if s.told == CONTACT_NONE and fabs(m) > law.threshold:
+        s.told, s.held, s.under = CONTACT_THERE, 1, e
+        s.side, s.size = 1.0 if m > 0.0 else -1.0, fabs(m)
+        for k in range(CONTACT_LATER):
+            s.later[k] = e
         return
     s.wave[0] += law.notch * e * c1
     s.wave[1] += law.notch * e * s1
     s.wave[2] += law.notch * e * c2
     s.wave[3] += law.notch * e * s2
-    s.trend += law.trend * (s.later[s.at] - s.trend)
+    s.trend += law.trend * (later(s, x) - s.trend)
+
+
+cdef void set_trend(ContactState *s, double x) noexcept nogil:
+    """Let the trend be x [Nm], as it was for all samples that it is behind."""
+    cdef int k
+    s.trend = x
+    for k in range(CONTACT_LATER):
+        s.later[k] = x
+
+
+cdef double later(ContactState *s, double x) noexcept nogil:
+    """Return the x [Nm] of CONTACT_LATER samples before, and keep this one."""
+    cdef double before = s.later[s.at]
     s.later[s.at] = x
     s.at = (s.at + 1) % CONTACT_LATER
+    return before
 
 
 cdef class ContactDetector:
@@ -185,7 +221,7 @@ cdef class ContactDetector:
     Raises ValueError for a threshold or a period that is none.
 
     Attributes:
-        residual_nm: e of the last sample, NaN where unknown. told: OFF, UNKNOWN, NONE or CONTACT.
+        residual_nm: m of the last sample, NaN where unknown. told: OFF, UNKNOWN, NONE or CONTACT.
     """
 
     cdef ContactLaw law

@@ -12,9 +12,8 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT
-from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.leftover import Leftover, events_left, held_energies_nm2, held_nm, leftover
-from jtqd.sysid.diagnosis.mixed_model import Mixed
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, Mixed
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.refine import Refined, contributions, present_effects, refine, set_torsions
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, column_moments

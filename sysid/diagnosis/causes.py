@@ -12,7 +12,7 @@ from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.findings import Cause, Value, joint_text
 from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.guards import nothing_of
-from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.refine import parameter, places
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.steadiness import steadiness
@@ -68,7 +68,7 @@ def values_of(fit: Fit, k: int) -> dict[str, Value]:
     candidate, refined = fit.chosen[k], fit.refined
     present, runs = refined.present[k], refined.mixed.runs
     first = places(refined.present)[k].start
-    zero = candidate.term.combine([0.0] * candidate.size)
+    nothing = _of_nothing(candidate)
     values: dict[str, Value] = {}
     for name, value in present.values.items():
         p = parameter(present.effect, name)
@@ -78,7 +78,7 @@ def values_of(fit: Fit, k: int) -> dict[str, Value]:
             freedom = min((runs - 1.0) / max(share, 1e-3) ** 2, 1e4)
             half = student_975(freedom) * float(np.sqrt(refined.covariance[place, place]))
             # a phase has no size of its own: an angle of the same part of the wave
-            size = 1.0 if name == "phase_rad" else abs(value - zero.get(name, 0.0))
+            size = 1.0 if name == "phase_rad" else abs(value - nothing.get(name, 0.0))
             half = float(np.hypot(half, INACCURATE * size))
             if runs < ENOUGH_RUNS:
                 half = max(half, *(abs(float(step[place])) for step in left_out_steps(refined)))
@@ -89,6 +89,14 @@ def values_of(fit: Fit, k: int) -> dict[str, Value]:
         elif p.fixed:
             values[name] = Value(value, (value, value), p.unit)
     return values
+
+
+def _of_nothing(candidate: EffectCandidate) -> dict[str, float]:
+    """Return the parameters of the effect where it has no size; not those that no coefficient changes, as the travel of a
+    hysteresis: what the search took for it is a place on a grid, and its size is all of it.
+    """
+    none, some = (candidate.term.combine([size] * candidate.size) for size in (0.0, 1.0))
+    return {name: value for name, value in none.items() if some[name] != value}
 
 
 def _normal_phase(values: Mapping[str, Value]) -> dict[str, Value]:

@@ -118,7 +118,10 @@ class RunGain(NamedTuple):
 
 @dataclass(frozen=True)
 class Gain:
-    """Held-out error before and after, runs left out one by one; ci95: of rmse_before - rmse_after [Nm]."""
+    """Held-out error before and after, runs left out one by one; ci95: of rmse_before - rmse_after [Nm].
+
+    plain_nm: the errors with all that each run has of its own, where they do not fall; the others are then beside it.
+    """
 
     rmse_before_nm: float
     rmse_after_nm: float
@@ -129,6 +132,18 @@ class Gain:
     runs: tuple[RunGain, ...] = ()
     free_run_position_before: float = math.nan  # rad, joint side
     free_run_position_after: float = math.nan
+    plain_nm: tuple[float, float] | None = None
+
+    @property
+    def judged_beside(self) -> str:
+        """Beside what the error falls, and that it does not with it; "" for the plain error."""
+        if self.plain_nm is None:
+            return ""
+        before, after = self.plain_nm
+        return (
+            "beside what each run has of its own (zero and friction of the day), which is most of the error: with it "
+            f"{before:.3g} -> {after:.3g} Nm rms"
+        )
 
 
 @dataclass(frozen=True)
@@ -449,6 +464,7 @@ def _gain(gain: Gain) -> dict[str, Any]:
         "rmse_after_nm": gain.rmse_after_nm,
         "split": gain.split,
         "ci95": gain.ci95,
+        "plain_nm": gain.plain_nm,
         "free_run_before_rad_s": gain.free_run_before,
         "free_run_after_rad_s": gain.free_run_after,
         "free_run_position_before_rad": gain.free_run_position_before,
@@ -491,6 +507,7 @@ def summary_lines(findings: Findings) -> list[str]:
         lines.append(
             f"gain on held-out runs: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
             f"(reduced by {low:.3g} to {high:.3g} Nm, 95 % interval)"
+            + (f", {gain.judged_beside}" if gain.judged_beside else "")
         )
     if gain is not None and math.isfinite(gain.free_run_position_before):
         lines.append(

@@ -18,7 +18,7 @@ from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gain, RunGain, shows_at
-from jtqd.sysid.diagnosis.mixed_model import solve
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, solve
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
 from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
 
@@ -28,12 +28,12 @@ _BOOTSTRAPS: Final = 2000
 def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
     """Return the error of the simulation's torque before and after, each run with the parameters of all others.
 
-    In the balance where most goes away; the run's own zero and friction of the day stay in, as in service. ci95: of
-    rmse_before - rmse_after [Nm], bootstrap over runs.
+    In the balance where most goes away; the run's own zero and friction of the day stay in, as in service, if the error
+    falls with them (`judged_squares`). ci95: of rmse_before - rmse_after [Nm], bootstrap over runs.
     """
     steps = left_out_steps(refined)
     pieces = refined.mixed.pieces
-    squares = left_out_squares(dataset, refined, steps)
+    squares, plain = judged_squares(dataset, refined, steps)
     drops = falls_nm(squares)
     channel = max(drops, key=lambda c: drops[c])
     table = squares[channel]
@@ -47,7 +47,8 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
     return Gain(
         _rms(table, 0),
         _rms(table, 1),
-        f"each of {len(table)} runs left out once; {channel.balance} balance of joint {channel.joint}",
+        f"each of {len(table)} runs left out once; {channel.balance} balance of joint {channel.joint}"
+        + ("; beside what each run has of its own" if plain else ""),
         (float(low), float(high)),
         *velocity,
         tuple(
@@ -56,16 +57,37 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
             if row[0, 2] > 0.0
         ),
         *position,
+        plain_nm=(_rms(plain[channel], 0), _rms(plain[channel], 1)) if plain else None,
     )
 
 
-def left_out_squares(
+Squares = dict[Channel, FloatArray]
+"""Per channel and recording the sums of squares before and after [Nm^2], and the count of bins: [r, 3]."""
+
+
+def judged_squares(
     dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]
-) -> dict[Channel, FloatArray]:
-    """Return per channel and recording the sums of squares [Nm^2] before and after, and the count of bins [r, 3]; each run
-    with the parameters of all others (steps: `left_out_steps`).
+) -> tuple[Squares, Squares]:
+    """Return the squares by which the gain is judged, and the plain ones where it is not by those, else nothing.
+
+    What a run has of its own can be several times all causes together, and in the mean of a few runs lie against them by
+    chance: then the plain error falls in no balance, whatever the causes are worth. With ENOUGH_RUNS to know how large it
+    usually is, it counts as little as it is usual (`squares_beside`); with fewer the plain error decides.
     """
-    squares: dict[Channel, FloatArray] = {}
+    plain = left_out_squares(dataset, refined, steps)
+    if refined.mixed.runs < ENOUGH_RUNS or max(falls_nm(plain).values()) > 0.0:
+        return plain, {}
+    return left_out_squares(dataset, refined, steps, beside_own=True), plain
+
+
+def left_out_squares(
+    dataset: Dataset, refined: Refined, steps: Sequence[FloatArray], *, beside_own: bool = False
+) -> Squares:
+    """Return the squares of each run with the parameters of all others (steps: `left_out_steps`); beside_own: with what the
+    run has of its own counted as little as it is usual.
+    """
+    squares: Squares = {}
+    floor = noise_squares(dataset)
     for place, run, left, step in zip(refined.mixed.pieces, dataset.runs, refined.runs, steps, strict=True):
         for channel, d in left.channels.items():
             before = run.channels[channel].residual[d.valid]
@@ -73,8 +95,25 @@ def left_out_squares(
             if channel.balance == "torsion" and len(before):
                 before, after = before - before.mean(), after - after.mean()
             rows = squares.setdefault(channel, np.zeros((refined.mixed.runs, 3)))
-            rows[place] += (float(before @ before), float(after @ after), len(before))
+            both = np.column_stack((before, after))
+            own = d.nuisances[d.valid] if beside_own else np.empty((len(both), 0))
+            weights = floor[channel] / refined.variances[d.families] if beside_own else np.empty(0)
+            rows[place] += (*squares_beside(both, own, weights).tolist(), len(before))
     return squares
+
+
+def noise_squares(dataset: Dataset) -> dict[Channel, float]:
+    """Return per channel the mean square of what no effect explains [Nm^2]."""
+    return {c: float(np.nanmean(np.concatenate(x) ** 2)) for c, x in dataset.unexplained.items()}
+
+
+def squares_beside(columns: FloatArray, own: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return x' (1 + Z V Z'/s2)^-1 x of each column x [n, k], Nm^2: its square where what the run has of its own counts as
+    little as it is usual. own: Z [n, q]; weights: s2 / V [q], of noise and of the runs' own changes.
+    """
+    common = own.T @ columns
+    explained = np.sum(common * np.linalg.solve(own.T @ own + np.diag(weights), common), axis=0)
+    return np.asarray(np.sum(columns**2, axis=0) - explained)
 
 
 def falls_nm(squares: Mapping[Channel, FloatArray]) -> dict[Channel, float]:

@@ -14,12 +14,12 @@ The condition that explains most is the first location; what it explains is take
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
@@ -53,6 +53,8 @@ _BEYOND: Final = 0.01
 """Largest p of an axis that explains what others before it do not."""
 _FEWEST_RUNS: Final = 2
 """An axis is confirmed by this many runs at least."""
+_AGREE: Final = 0.25
+"""Part of the energy of passes that the other passes predict, where they agree: half of it as torque."""
 _PRIOR_S: Final = 1.0
 """A bin's mean over the other runs counts as if it had been zero for so long before."""
 
@@ -92,6 +94,8 @@ def channel_gaps(dataset: Dataset, refined: Refined, left: Leftover | None) -> t
         by_axis = {m.axis: m for m in mine}
         locations = locate(dataset.runs, channel, shown[channel], limits, lines=lines, maps=by_axis)
         excess = max(rmse**2 - noise**2, 1e-30)
+        if left is not None:  # locations are those of events, too, which the maps leave out
+            by_axis = {a: _with_events(dataset.runs, m, shown[channel]) for a, m in by_axis.items()}
         places = _places(locations, by_axis, noise, excess, left is not None)
         out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, tuple(places), tuple(every)))
     if left is not None:  # what is not explained comes first, wherever the gap is largest
@@ -183,6 +187,17 @@ def _every_bin(m: AxisMap, floor: float) -> list[Place]:
     ]
 
 
+def _with_events(runs: Sequence[RunData], m: AxisMap, parts: Sequence[FloatArray]) -> AxisMap:
+    """Return the map with time spent and mean square of this residual [run][n] in its bins."""
+    bins = len(m.edges) - 1
+    count, square = np.zeros(bins), np.zeros(bins)
+    for place, x in zip(_binned(runs, m.channel, m.axis, m.edges), parts, strict=True):
+        good = np.isfinite(x)
+        count += np.bincount(place[good], minlength=bins)
+        square += np.bincount(place[good], x[good] ** 2, minlength=bins)
+    return replace(m, count=count, square_nm2=np.where(count > 0, square / np.maximum(count, 1.0), np.nan))
+
+
 def _places(
     locations: Sequence[Location],
     maps: Mapping[str, AxisMap],
@@ -233,12 +248,30 @@ def _bin_name(m: AxisMap, k: int) -> str:
 
 @dataclass(frozen=True)
 class _Axis:
-    """An axis in one direction: energy explained; prediction [run][n] of the residual; energy explained per bin."""
+    """An axis in one direction: energy explained; prediction [run][n] of the residual; energy explained per bin.
+
+    passes: samples [run][n] at a range that its passes confirm, and their energy above what it is elsewhere: the moments in
+    them are the range's as a whole, as those of events are the events'.
+    """
 
     axis: str
     energy_nm2: float
     prediction: list[FloatArray]
     bins: FloatArray
+    passes: list[BoolArray] | None = None
+    passes_nm2: float = 0.0
+
+    @property
+    def whole_nm2(self) -> float:
+        """What is ranked beside events: energy explained, of passes all that they have above what it is elsewhere."""
+        return max(self.energy_nm2, self.passes_nm2)
+
+    def taken_from(self, parts: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return the residual [run][n] less the prediction, NaN in passes."""
+        less = [x - y for x, y in zip(parts, self.prediction, strict=True)]
+        if self.passes is None:
+            return less
+        return [np.where(m, np.nan, x) for m, x in zip(self.passes, less, strict=True)]
 
 
 def explained_by_bins(
@@ -283,8 +316,8 @@ def locate(
         if limits is not None and "link_angle" in maps and "link_angle" not in used:
             turn = _by_passes(runs, channel, now, maps["link_angle"].edges)
             axis = max((a for a in (axis, turn) if a is not None), key=lambda a: a.energy_nm2, default=None)
-        rest = now if axis is None else [x - y for x, y in zip(now, axis.prediction, strict=True)]
-        found = [] if axis is None else [Location(axis.energy_nm2, axis.axis, _descending(axis.bins))]
+        rest = now if axis is None else axis.taken_from(now)
+        found = [] if axis is None else [Location(axis.whole_nm2, axis.axis, _descending(axis.bins))]
         found += [
             Location(0.5 * x.amplitude_nm**2, line=x) for x in lines if all(t.line is not x for t in out)
         ]
@@ -303,7 +336,7 @@ def locate(
             break
         out.append(best)
         if best.axis and axis is not None:
-            now = [x - y for x, y in zip(now, axis.prediction, strict=True)]
+            now = axis.taken_from(now)
         elif best.burst is not None and limits is not None:
             now = masked if best.burst.what == "events" else _less_seconds(now, limits.step_s)
     return out
@@ -368,13 +401,21 @@ def _best_axis(
 def _by_passes(
     runs: Sequence[RunData], channel: Channel, parts: Sequence[FloatArray], edges: FloatArray
 ) -> _Axis | None:
-    """Return the link angle as the axis of what passes of a range of it have in common, None where there is none."""
+    """Return the link angle as the axis of what passes of a range of it have in common, None where there is none.
+
+    The moments in the passes are the range's if what the other passes predict of a pass is not only that it deviates.
+    """
     step_s = float(np.median(np.diff(runs[0].time_s)))
     places = _binned(runs, channel, "link_angle", edges)
     found = turn_range(places, parts, edges, step_s)
     if found is None:
         return None
     count = max(sum(int(np.isfinite(x).sum()) for x in parts), 1)
+    masks = [np.isin(place, found.around) for place in places]
+    inside = np.concatenate([x[m] for x, m in zip(parts, masks, strict=True)]) ** 2
+    outside = np.concatenate([x[~m] for x, m in zip(parts, masks, strict=True)]) ** 2
+    usual = float(np.nanmean(outside)) if np.isfinite(outside).any() else 0.0
+    whole = float(np.nansum(inside - usual)) / count
     best: _Axis | None = None
     for side in directions(runs, channel):
         seen = signed(parts, side)
@@ -387,6 +428,8 @@ def _by_passes(
         energy = float(bins.sum()) / count
         if best is None or energy > best.energy_nm2:
             best = _Axis("link_angle", energy, signed(means, side), bins)
+    if best is not None and best.energy_nm2 > _AGREE * whole:
+        return replace(best, passes=masks, passes_nm2=whole)
     return best
 
 

@@ -17,8 +17,15 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import joint_text
-from jtqd.sysid.diagnosis.gain import falls_nm, free_run_errors, left_out_squares, left_out_steps
-from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS
+from jtqd.sysid.diagnosis.gain import (
+    falls_nm,
+    free_run_errors,
+    judged_squares,
+    left_out_steps,
+    noise_squares,
+    squares_beside,
+)
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, contributions, parameter, places
 from jtqd.sysid.diagnosis.search import Hypothesis
 
@@ -39,7 +46,7 @@ def objections(
     dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
 ) -> list[tuple[int, str]]:
     """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out, or
-    helps least where all of them together do not lower the plain error there; else, where no torque was measured, one that
+    helps least where all of them together lower the error of no balance there; else, where no torque was measured, one that
     raises the error of the position in a free run; else the smaller of two that cancel each other. What is left must be
     fitted again before it is asked again.
     """
@@ -53,7 +60,7 @@ def objections(
     steps = left_out_steps(refined)
     falls = held_out_gains(dataset, refined, steps)
     worst = int(np.argmin(falls))
-    if falls[worst] <= 0.0 or max(falls_nm(left_out_squares(dataset, refined, steps)).values()) <= 0.0:
+    if falls[worst] <= 0.0 or max(falls_nm(judged_squares(dataset, refined, steps)[0]).values()) <= 0.0:
         return [(worst, "it raises the error on runs left out")]
     if dataset.no_torque:
         harmful = [k for k in range(len(refined.present)) if free_run_fall(dataset, refined, k) < 0.0]
@@ -108,7 +115,7 @@ def held_out_gains(dataset: Dataset, refined: Refined, steps: Sequence[FloatArra
     effect, and by chance lie against it in the mean of the runs. With fewer than ENOUGH_RUNS the plain error decides.
     """
     enough = refined.mixed.runs >= ENOUGH_RUNS
-    floor = {c: float(np.nanmean(np.concatenate(x) ** 2)) for c, x in dataset.unexplained.items()}
+    floor = noise_squares(dataset)
     out = []
     for p, mine in zip(refined.present, places(refined.present), strict=True):
         here = contributions(dataset, p)
@@ -128,15 +135,6 @@ def held_out_gains(dataset: Dataset, refined: Refined, steps: Sequence[FloatArra
                 within, without = within + float(squares[0]), without + float(squares[1])
         out.append(1.0 - within / without if without > 0.0 else 0.0)
     return out
-
-
-def squares_beside(columns: FloatArray, own: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return x' (1 + Z V Z'/s2)^-1 x of each column x [n, k], Nm^2: its square where what the run has of its own counts as
-    little as it is usual. own: Z [n, q]; weights: s2 / V [q], of noise and of the runs' own changes.
-    """
-    common = own.T @ columns
-    explained = np.sum(common * np.linalg.solve(own.T @ own + np.diag(weights), common), axis=0)
-    return np.asarray(np.sum(columns**2, axis=0) - explained)
 
 
 def free_run_fall(dataset: Dataset, refined: Refined, cause: int) -> float:

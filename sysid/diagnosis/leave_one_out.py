@@ -20,13 +20,11 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import WITHIN
 from jtqd.sysid.diagnosis.findings import Cause, JointName, joint_text
-from jtqd.sysid.diagnosis.mixed_model import explained
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search, friction_pairs
 from jtqd.sysid.diagnosis.signals import Channel
 
-ENOUGH_RUNS: Final = 4
-"""From here on the sum over runs left out decides, as everywhere else."""
 FALL: Final = 0.05
 """Part of the squared error of every held-out run that an effect must take away."""
 LARGE_FALL: Final = 0.3

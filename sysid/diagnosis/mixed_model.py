@@ -21,6 +21,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.noise import Sums
 
+ENOUGH_RUNS: Final = 4
+"""From here on the runs tell how much they usually differ, and the sum over runs left out decides."""
 _EM_STEPS: Final = 12
 _PRIOR_RUNS: Final = 4.0
 _RIDGE: Final = 1e-10

@@ -9,6 +9,9 @@ is in all runs, a change from day to day is small; what is in one run alone and 
    the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by `search.ENTER`.
 2. A run is odd where a deviation was chosen and, beside the effects chosen, differs from the mean of the other runs by more
    than FAR standard deviations: its own error, and the spread of the others with what is usual (USUAL, worth four runs).
+3. What sets that run apart, its squared error per row above the median of the others', must be this deviation for the most
+   part (`_MOST`). A brake that drags or a cover that rubs in one run is imitated by a delay of the current, too, which
+   explains some per cent of it: such a run is no odd one, and what is in it must not go with it.
 
 All effects at once would not do: with a coefficient for everything a library with temperatures and gains follows any single
 run. Two runs cannot tell which of them is odd. One run at a time is taken away, fewer than half of all (`diagnose`).
@@ -48,6 +51,8 @@ _AS_GOOD: Final = 0.8
 """Part of the drop of the squared error that another deviation of the same run must reach to be named beside."""
 _NOT_BESIDE: Final = frozenset({"sensor_gain"})
 """With the sensor's gain free beside all else, everything can be scaled away (`noise.saturated_residuals`)."""
+_MOST: Final = 0.5
+"""Part of what sets a run apart that its deviation must explain."""
 _MOST_COLUMNS: Final = 24
 
 
@@ -82,11 +87,17 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
         sums = [run_sums(run, noise, columns, len(sigma) + len(kinds)) for run in runs]
         grams = np.zeros((count, *sums[0].gram.shape))
         np.add.at(grams, pieces, np.array([s.gram for s in sums]))
-        rows = sum(s.rows for s in sums) / noise.inflation
+        each = np.zeros(count)
+        np.add.at(each, pieces, np.array([s.rows / noise.inflation for s in sums]))
+        rows = float(each.sum())
         comparison = Comparison(without_days(grams, columns, sigma), columns)
         chosen, odd = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))
         found = [(comparison.drop(chosen, odd, *at), at, comparison.far(chosen, at, kinds)) for at in odd]
-        far = [(drop, at, size) for drop, at, size in found if size is not None]
+        far = [
+            (drop, at, size)
+            for drop, at, size in found
+            if size is not None and comparison.explains_what_is_apart(chosen, odd, at, each)
+        ]
         if not far:
             return None
         leave = set(range(columns)) - set(chosen)
@@ -160,6 +171,27 @@ class Comparison:
         """Return by how much deviation k of run r lowers the squared error beside the effects and other runs' deviations."""
         beside = [*chosen, *(self.place(*at) for at in odd if at[0] != r)]
         return explained(self.total, beside, [self.place(r, k)])
+
+    def explains_what_is_apart(
+        self, chosen: Sequence[int], odd: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
+    ) -> bool:
+        """Return whether a deviation is most of what sets its run apart beside all else that was chosen; rows: per run."""
+        ends = np.array([*chosen, *(self.place(*one) for one in odd), -1], np.intp)
+        beta, _ = solve(self.total[ends[:, None], ends], len(ends) - 1)
+        effects = np.append(-beta[: len(chosen)], 1.0)
+
+        def square(r: int, own: Sequence[int]) -> float:
+            """Return the squared error per row of a run with these deviations free."""
+            fixed, free = np.array([*chosen, -1], np.intp), self.columns + np.array(own, np.intp)
+            right = self.runs[r][free[:, None], fixed] @ effects
+            whole = float(effects @ self.runs[r][fixed[:, None], fixed] @ effects)
+            gram = self.runs[r][free[:, None], free]
+            return (whole - float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])) / float(rows[r])
+
+        own = {r: [k for q, k in odd if q == r] for r in range(len(self.runs))}
+        usual = float(np.median([square(r, own[r]) for r in own if r != at[0]]))
+        without, with_it = square(at[0], [k for k in own[at[0]] if k != at[1]]), square(at[0], own[at[0]])
+        return without - with_it > _MOST * (without - usual)
 
     def far(
         self, chosen: Sequence[int], at: tuple[int, int], kinds: Sequence[Deviation]

@@ -36,10 +36,13 @@ _SHORTEST_S: Final = 0.02
 
 @dataclass(frozen=True)
 class TurnRange:
-    """Bins of the link angle, those that hold most first, and the passes of them."""
+    """Bins of the link angle, those that hold most first, and the passes of them; around: these bins and the next on either
+    side, through which the ends of the range may cut.
+    """
 
     bins: tuple[int, ...]
     passes: tuple[tuple[int, int, int], ...]  # run, first sample, sample after the last
+    around: tuple[int, ...]
 
 
 def turn_range(
@@ -62,7 +65,10 @@ def turn_range(
         inside = (np.arange(first, first + count) % bins).tolist()
         found = _passes(places, parts, inside, round(_SHORTEST_S / step_s))
         if len(found) >= _FEWEST and _chance(found, parts, bins * widest) < _SURE:
-            return TurnRange(tuple(sorted(inside, key=lambda k: -square[k])), tuple(found))
+            wider = range(first - 1, first + count + 1)
+            around = {k % bins for k in wider if circular or 0 <= k < bins}
+            largest_first = sorted(inside, key=lambda k: -square[k])
+            return TurnRange(tuple(largest_first), tuple(found), tuple(sorted(around)))
     return None
 
 

@@ -116,14 +116,20 @@ def axis_values(axes: Mapping[str, FloatArray], axis: str) -> FloatArray:
 def axis_maps(
     runs: Sequence[RunData], residuals: Mapping[Channel, list[FloatArray]], step_s: float, seed: int = 0
 ) -> list[AxisMap]:
-    """Return the maps of all channels and axes; residuals per channel and run [n], NaN where not valid."""
+    """Return the maps of all channels and axes; residuals per channel and run [n], NaN where not valid.
+
+    The bins cover what was visited while the residual was valid; those of the link angle all that was visited, because at an
+    event, which is left out of maps, load or speed may be far off, the angle is not.
+    """
     rng = np.random.default_rng(seed)
     block = max(2, round(BLOCK_S / step_s))
     out = []
     for channel, plain in residuals.items():
         for axis in axes_of(channel):
             values = [axis_values(run.axes[channel.joint], axis) for run in runs]
-            there = [v[np.isfinite(x)] for v, x in zip(values, plain, strict=True)]
+            there = [
+                v if axis == "link_angle" else v[np.isfinite(x)] for v, x in zip(values, plain, strict=True)
+            ]
             edges = axis_edges(axis, np.concatenate(there))
             if edges is not None:
                 maps = [

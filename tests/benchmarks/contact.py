@@ -39,7 +39,7 @@ BENCHES = {
     "typical": "plants/typical.yaml",
     "bad day": "plants/bad_day.yaml",
 }
-PRACTICE, REPORTED, PUSHED = 100, 300, 900
+PRACTICE, REPORTED, PUSHED = 100, 2300, 2900
 """First seeds of the days: of the threshold, of the false alarms, of the pushes."""
 MARGIN = 1.2
 RUNS, RUN_S, HOLD_S = 12, 8.0, 0.6
@@ -82,6 +82,7 @@ def identified(bench: str, directory: Path) -> Path:
             "--seconds",
             "10",
         ]
+        models.mkdir(parents=True, exist_ok=True)
         with contextlib.redirect_stdout(io.StringIO()):
             campaign.main([*kind, "--evaluations", "60", "--seed", "1", "--out", str(runs)])
             files = [str(path) for path in sorted(runs.glob("*.csv.gz")) if "_02" not in path.name]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.contact import CONTACT, NONE, UNKNOWN, ContactDetector, link_loads
+from jtqd.estimator.contact import BLIND, CONTACT, NONE, UNKNOWN, ContactDetector, link_loads
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.models.files import load_joint, shipped
@@ -70,7 +70,40 @@ def test_a_push_is_told_within_two_samples_with_its_size_and_sign(torque_nm: flo
 
 def test_the_end_of_a_push_is_the_end_of_the_contact() -> None:
     _, told = opposed(run((Push(1.0, 3.0), Push(1.2, 0.0))))
-    assert (told[1206:1400] == NONE).all()
+    ended = 1100 + int(np.argmax(told[1100:] == NONE))
+    assert 1201 <= ended - BLIND <= 1203
+    assert (told[ended - BLIND : ended] == UNKNOWN).all(), "the load is learned anew"
+    assert (told[ended:1400] == NONE).all()
+
+
+@pytest.mark.parametrize("drift_nm", [2.5, -2.5])
+def test_a_load_that_goes_on_under_a_push_neither_ends_nor_outlasts_it(drift_nm: float) -> None:
+    """Its error moves by almost the push itself in 0.2 s; what steps back is the end, and no contact of the other sign."""
+    t = np.arange(2400) * 1e-3
+    moved = drift_nm * np.clip((t - 1.0) / 0.2, 0.0, 1.0)
+    pushes = np.where((t >= 1.0) & (t < 1.2), 3.0, 0.0) - np.where((t >= 1.5) & (t < 1.7), 3.0, 0.0)
+    residual, told = ContactDetector(2.0).run(moved + pushes, np.zeros(len(t)))
+    there = told == CONTACT
+    assert there[1001:1200].all()
+    assert there[1501:1700].all()
+    assert not there[:1000].any()
+    assert not there[1201:1500].any()
+    assert not there[1701:].any()
+    assert residual[1001] > 0.0 > residual[1501]
+
+
+def test_a_wild_sample_is_no_contact_and_two_of_them_are_a_brief_one() -> None:
+    x = np.zeros(1000)
+    x[500] = 1.9
+    residual, told = ContactDetector(1.0).run(x, np.zeros(len(x)))
+    assert not (told == CONTACT).any()
+    assert residual[500] == pytest.approx(0.95)
+    x[501] = 1.2
+    x[502:] = 0.7  # less than a step of the threshold back
+    _, told = ContactDetector(1.5).run(x, np.zeros(len(x)))
+    there = np.flatnonzero(told == CONTACT)
+    assert there[0] == 501
+    assert len(there) < 20
 
 
 def test_motion_reversal_and_load_are_no_contact() -> None:

@@ -163,7 +163,8 @@ def gain_sentence(findings: Findings) -> str:
         return ""
     return (
         f"With {'it' if len(findings.causes) == 1 else 'them'}, the error on held-out runs falls from "
-        f"{number(before)} to {number(gain.rmse_after_nm)}{SPACE}Nm, by {gain_interval(gain)}."
+        f"{number(before)} to {number(gain.rmse_after_nm)}{SPACE}Nm, by {gain_interval(gain)}"
+        + (f", {gain.judged_beside}." if gain.judged_beside else ".")
     )
 
 

@@ -272,7 +272,8 @@ def test_an_encoder_that_is_not_believed_says_nothing_about_contacts(
         assert not joint.input_flags & (cr.FLAG_CONTACT | cr.FLAG_CONTACT_KNOWN)
         assert math.isnan(joint.contact_nm)
         assert (sent[row].contact[0], sent[row].torque_rate_nm_s[0]) == (1, None)
-    assert sent[invalid[-1]].contact[1] != 1, "joint 2 goes on"
+    goes_on = [sent[row].contact[1] != 1 for row in invalid]
+    assert sum(goes_on) > 0.8 * len(invalid), "joint 2 goes on"
 
 
 def test_rows_of_a_log_give_the_same_bits(tmp_path: Path, exact: ExactTime) -> None:

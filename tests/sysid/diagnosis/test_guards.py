@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.effects.library import EFFECTS
-from jtqd.sysid.diagnosis.guards import beyond_bounds, squares_beside
+from jtqd.sysid.diagnosis.gain import squares_beside
+from jtqd.sysid.diagnosis.guards import beyond_bounds
 from jtqd.sysid.diagnosis.refine import PresentEffect, free_names
 from tests.sysid.diagnosis.diagnose_helpers import JOINT
 

@@ -19,7 +19,8 @@ from jtqd.sysid.diagnosis.findings import (
     Findings,
     to_mapping,
 )
-from jtqd.sysid.diagnosis.leave_one_out import ENOUGH_RUNS, LeaveOneOut
+from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.search import Search
 from tests.hidden.case import draw
 from tests.hidden.trials import joint_files, tables

@@ -13,7 +13,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Findings, OddRun, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.odd_runs import apart_from_others, own_deviations
+from jtqd.sysid.diagnosis.odd_runs import Comparison, apart_from_others, own_deviations
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 
 NOMINAL = load_joint(shipped("joint1.yaml"))
@@ -104,6 +104,18 @@ def test_size_of_a_deviation_beside_the_others() -> None:
     values, errors = own_deviations(np.array([b.T @ b for b in blocks]), [0], 1, 100.0)
     assert values == pytest.approx([0.0, 0.0, 0.5, 0.0], abs=0.2)
     assert errors == pytest.approx(np.full(4, np.sqrt(1.0 + 1.0 / 3.0) / np.sqrt(300.0)), rel=0.1)
+
+
+@pytest.mark.parametrize(("own", "strange", "odd"), [(3.0, 1.0, True), (0.5, 5.0, False)])
+def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: bool) -> None:
+    """A brake that drags in one run is imitated by a delay that explains a little of it: no odd run, however certain."""
+    rng = np.random.default_rng(4)
+    rows = [rng.normal(size=(2000, 3)) for _ in range(5)]  # an effect of all, a deviation, the residual
+    for k, row in enumerate(rows):
+        row[:, 2] = 0.7 * row[:, 0] + (own * row[:, 1] + strange * row[:, 2] if k == 2 else row[:, 2])
+    comparison = Comparison(np.array([row.T @ row for row in rows]), 1)
+    assert comparison.drop([0], [(2, 0)], 2, 0) > 300.0, "certain in both cases"
+    assert comparison.explains_what_is_apart([0], [(2, 0)], (2, 0), np.full(5, 2000.0)) == odd
 
 
 def test_text_says_what_run_and_channel() -> None:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.events import EventLimits
+from jtqd.sysid.diagnosis.events import EventLimits, events
 from jtqd.sysid.diagnosis.gaps import locate
 from jtqd.sysid.diagnosis.passes import predicted_by_passes, turn_range
-from jtqd.sysid.diagnosis.regressors import Index
+from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.structure import axis_maps
 from tests.sysid.diagnosis.diagnose_core_helpers import TORSION1, run_data
 
@@ -96,3 +96,56 @@ def test_a_pass_is_predicted_by_the_others() -> None:
             assert np.all(means[a:b][place[a:b] == k] == pytest.approx(np.nanmean(others)))
         outside[a:b] = False
     assert np.all(means[outside] == 0.0)
+
+
+def turning(
+    centre: float, moments: tuple[float, ...] = ()
+) -> tuple[list[RunData], list[FloatArray], list[FloatArray]]:
+    """Runs of whole turns through a cover, which pulls otherwise in each; residuals with it, and without what is an event.
+
+    moments: seconds in run 1 at which something happens elsewhere.
+    """
+    runs, parts, rest = [], [], []
+    for k in range(4):
+        t = STEP_S * np.arange(COUNT)
+        rate = 0.9 + 0.1 * k
+        angle = rate * t + 0.3 * k
+        near = np.mod(angle - centre + np.pi, 2.0 * np.pi) - np.pi
+        x = np.where(np.abs(near) < 0.2, 2.0 + 0.5 * k, 0.0) + noise(k)
+        event = np.abs(near) < 0.22
+        for moment in moments if k == 1 else ():
+            x[round(moment / STEP_S) :][:30] += 6.0
+            event[round(moment / STEP_S) :][:30] = True
+        axes = {"link_angle": angle, "velocity": np.full(COUNT, rate), "load": 5.0 * np.cos(t), "time": t}
+        runs.append(run_data(f"run{k}", {TORSION1: x}, axes))
+        parts.append(x)
+        rest.append(np.where(event, np.nan, x))
+    return runs, parts, rest
+
+
+@pytest.mark.parametrize("centre", [3.24, 0.7], ids=["at_the_seam", "within"])
+def test_a_cover_whose_passes_are_all_events_is_at_its_angle(centre: float) -> None:
+    """The maps leave events out, and with them all angles at which the cover rubs."""
+    runs, parts, rest = turning(centre)
+    maps = {m.axis: m for m in axis_maps(runs, {TORSION1: rest}, STEP_S)}
+    limits = EventLimits(np.array([0.9]), STEP_S, 0.5, 0.3)
+    assert events(runs, TORSION1, parts, limits) is not None
+    found = locate(runs, TORSION1, parts, limits, lines=(), maps=maps)
+    edges = maps["link_angle"].edges
+    assert found[0].axis == "link_angle"
+    for k in found[0].bins[:2]:
+        middle = np.mod(0.5 * (edges[k] + edges[k + 1]) - centre + np.pi, 2.0 * np.pi) - np.pi
+        assert abs(middle) < 0.2 + 0.5 * (edges[1] - edges[0])
+    assert all(place.burst is None for place in found), "what happens in the range is the range's"
+
+
+def test_moments_elsewhere_are_told_beside_the_range() -> None:
+    runs, parts, rest = turning(0.7, (3.0, 9.7))
+    maps = {m.axis: m for m in axis_maps(runs, {TORSION1: rest}, STEP_S)}
+    limits = EventLimits(np.array([0.9]), STEP_S, 0.5, 0.3)
+    first, second, *_ = locate(runs, TORSION1, parts, limits, lines=(), maps=maps)
+    assert first.axis == "link_angle"
+    assert second.burst is not None
+    assert all(run == "run1" and min(abs(t - 3.0), abs(t - 9.7)) < 0.3 for run, t in second.burst.times), (
+        second.burst.times
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import guards
 from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
-from jtqd.sysid.diagnosis.causes import _normal_phase
+from jtqd.sysid.diagnosis.case import Fit
+from jtqd.sysid.diagnosis.causes import INACCURATE, _normal_phase, values_of
 from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_applied
@@ -23,7 +25,7 @@ from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import _repeats
 from jtqd.sysid.diagnosis.guards import beyond_bounds, free_run_fall
-from jtqd.sysid.diagnosis.mixed_model import Model
+from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, Model
 from jtqd.sysid.diagnosis.noise import ORDER, Noise
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, present_effects, refine
 from jtqd.sysid.diagnosis.regressors import contribution, families
@@ -44,8 +46,9 @@ def signals(table: RunTable, joint: Joint = PLAIN, name: str = "run") -> JointSi
     return joint_signals(name, table, 1, joint, BaseLoss(joint))
 
 
-def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Dataset:
-    """Runs of a joint with a Stribeck peak that its file knows nothing of."""
+def peaked(runs: int, seed: float, noise: float = NOISE_NM, day_nm: float = 0.0) -> Dataset:
+    """Runs of a joint with a Stribeck peak unknown to its file; day_nm: more Coulomb friction than in the file."""
+    file = replace(PLAIN, friction=replace(PLAIN.friction, coulomb_nm=PLAIN.friction.coulomb_nm - day_nm))
     tables = [
         rigid_run(
             PLAIN,
@@ -56,10 +59,11 @@ def peaked(runs: int, seed: float, noise: float = NOISE_NM) -> Dataset:
         )
         for k in range(runs)
     ]
-    made = [[signals(t, name=f"run{k}")] for k, t in enumerate(tables)]
+    made = [[signals(t, file, f"run{k}")] for k, t in enumerate(tables)]
     groups = families(made)
     binned = [columns_module.run_data(s, [], SAMPLES, groups) for s in made]
-    unexplained = {c: [np.zeros(len(r.time_s)) for r in binned] for c in binned[0].channels}
+    floor = noise / SAMPLES**0.5
+    unexplained = {c: [np.full(len(r.time_s), floor) for r in binned] for c in binned[0].channels}
     return Dataset(made, binned, [], SAMPLES, SAMPLES * 1e-3, unexplained, groups, [])
 
 
@@ -323,6 +327,37 @@ def test_an_amplitude_is_positive_and_its_phase_within_a_turn() -> None:
     assert _normal_phase(plain) == plain
 
 
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("hysteresis", {"torque_nm": 0.5, "travel_rad": 3.1e-5}),
+        ("stribeck_friction", {"stribeck_nm": 0.5, "stribeck_velocity_rad_s": 0.052}),
+        ("torque_constant", {"torque_constant_nm_per_a": 0.084}),
+    ],
+)
+def test_no_interval_is_narrower_than_a_part_of_the_size(name: str, values: dict[str, float]) -> None:
+    """A travel or a velocity is its own size, however near it lies to where the search began; a constant of the file differs
+    from the file's by its size.
+    """
+    (one,) = candidates(PLAIN, (name, 1, 0))
+    free = tuple(values)
+    certain = Refined(
+        (PresentEffect(one.effect, 1, values, free),),
+        1e-18 * np.eye(len(free)),
+        np.zeros(len(free)),
+        SimpleNamespace(runs=6),  # type: ignore[arg-type]
+        np.ones(1),
+        np.zeros((6, 1)),
+        (),
+    )
+    model = Model((), np.empty(0), np.empty((0, 0)), np.ones(1), 0.0, 0.0, np.zeros((1, 1)))
+    found = values_of(Fit(Hypothesis((one,), model, 0.0), certain), 0)
+    base = {"torque_constant_nm_per_a": 0.08}
+    for key, true in values.items():
+        half = INACCURATE * (true - base.get(key, 0.0))
+        assert found[key].ci95 == pytest.approx((true - half, true + half))
+
+
 def test_terms_of_the_search_are_where_a_refinement_starts() -> None:
     """Coefficients of a wave's two columns and the wave refined are the same torque."""
     (one,) = candidates(PLAIN, ("torque_ripple", 1, 1))
@@ -365,3 +400,26 @@ def test_causes_that_lower_the_plain_error_nowhere_on_runs_left_out_are_none(
     assert guards.objections(dataset, best, result) == []
     monkeypatch.setattr(guards, "falls_nm", lambda squares: dict.fromkeys(squares, 0.0))
     assert guards.objections(dataset, best, result) == [(0, "it raises the error on runs left out")]
+
+
+@pytest.mark.parametrize("runs", [3, 4])
+def test_a_friction_of_the_day_that_lies_against_a_cause_speaks_against_it_with_few_runs_only(
+    runs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A peak of 1.2 Nm, days with 0.5 Nm less friction than the file: without the peak the plain error is less."""
+    dataset = peaked(runs, 0.2, day_nm=-0.5)
+    result = refine(dataset, [start(stribeck_nm=0.6, stribeck_velocity_rad_s=0.12)], WHITE)
+    assert result.present[0].values == pytest.approx(TRUTH, rel=0.15)
+    gain = held_out_gain(dataset, result)
+    monkeypatch.setattr(guards, "nothing_of", lambda _: [{}])
+    found = guards.objections(dataset, Hypothesis((), result, 0.0), result)  # type: ignore[arg-type]
+    if runs < ENOUGH_RUNS:
+        assert found == [(0, "it raises the error on runs left out")]
+        assert gain.plain_nm is None
+        assert gain.rmse_after_nm >= gain.rmse_before_nm
+        return
+    assert found == []
+    assert gain.plain_nm is not None
+    assert gain.plain_nm[1] > gain.plain_nm[0] > gain.rmse_before_nm > 1.3 * gain.rmse_after_nm
+    assert gain.rmse_after_nm == pytest.approx(WHITE.sigma[0], rel=0.1)
+    assert gain.split.endswith("beside what each run has of its own")
