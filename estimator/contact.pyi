@@ -7,6 +7,7 @@ from jtqd.estimator.settings import EstimatorSettings
 TREND_RAD_S: Final[float]
 NOTCH_RAD_S: Final[float]
 RELEASE: Final[float]
+ALONE: Final[float]
 LONGEST_S: Final[float]
 BLIND: Final[int]
 MEANT: Final[int]

@@ -13,7 +13,8 @@ A torque from outside on the link makes `load` less than what is beyond the link
     x = -load                       joint alone: what is beyond is not known, and steady or slow
     x = load_other - load           two joints that turn one link against each other: the other one says what is beyond
     e = x - w - z                   w: waves of 1 and 2 per motor turn, z: trend; both learned from e, slower than a contact
-    m = (e_k + e_(k-1))/2           told as the residual: encoder noise is in second differences, and mostly cancels in it
+    m = (e_k + e_(k-1))/2, or ALONE e_k where that is larger; told as the residual. Encoder noise is in second differences,
+                                    and mostly cancels in the mean; what is large at once need not wait for it
     contact where |m| > threshold, until m steps back by as much and by RELEASE of the push, or |m| < RELEASE threshold
     within 1/TREND_RAD_S, or LONGEST_S have passed; then BLIND samples in which nothing is told, since z begins anew
 
@@ -46,6 +47,8 @@ NOTCH_RAD_S: Final = 10.0
 RELEASE: Final = 0.5
 """Part of a push that a step back must have, since the link swings; a contact that has just begun ends below this part of
 the threshold."""
+ALONE: Final = 0.8
+"""What one residual counts beside the mean of two: the largest mean of quiet hours is this part of the largest residual."""
 LONGEST_S: Final = 0.5
 """What lasts longer is load."""
 BLIND: Final = 6
@@ -59,7 +62,7 @@ that is 50 us off, of samples that are not, looks like 1 Nm on a link of 0.01 kg
 LONGEST_GAP: Final = 50
 """Samples without inputs, after which the past is forgotten."""
 
-cdef double RATE = TREND_RAD_S, LEARNED = NOTCH_RAD_S, BACK = RELEASE, MOST_S = LONGEST_S, BELIEVED_S = SETTLE_S
+cdef double RATE = TREND_RAD_S, LEARNED = NOTCH_RAD_S, BACK = RELEASE, ONE = ALONE, MOST_S = LONGEST_S, BELIEVED_S = SETTLE_S
 cdef double UNEVEN_STEPS = UNEVEN
 cdef int MOST_MISSED = LONGEST_GAP, NOT_TOLD = BLIND, MEAN_OF = MEANT
 
@@ -167,6 +170,8 @@ cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_n
         return
     e = x - s.trend
     m, s.before = 0.5 * (e + s.before), e
+    if ONE * fabs(e) > fabs(m):
+        m = ONE * e
     if s.samples == law.settle:
         s.residual_nm, s.told = m, CONTACT_NONE
     else:

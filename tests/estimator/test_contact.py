@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.contact import BLIND, CONTACT, NONE, UNKNOWN, ContactDetector, link_loads
+from jtqd.estimator.contact import ALONE, BLIND, CONTACT, NONE, UNKNOWN, ContactDetector, link_loads
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.models.files import load_joint, shipped
@@ -95,10 +95,14 @@ def test_a_load_that_goes_on_under_a_push_neither_ends_nor_outlasts_it(drift_nm:
 def test_a_wild_sample_is_no_contact_and_two_of_them_are_a_brief_one() -> None:
     x = np.zeros(1000)
     x[500] = 1.9
-    residual, told = ContactDetector(1.0).run(x, np.zeros(len(x)))
+    residual, told = ContactDetector(1.6).run(x, np.zeros(len(x)))
     assert not (told == CONTACT).any()
-    assert residual[500] == pytest.approx(0.95)
-    x[501] = 1.2
+    assert residual[500] == pytest.approx(ALONE * 1.9)
+    assert residual[501] == pytest.approx(0.95, abs=0.1), "the mean with the one after"
+    assert np.flatnonzero(ContactDetector(1.5).run(x, np.zeros(len(x)))[1] == CONTACT)[0] == 500, (
+        "large at once"
+    )
+    x[500], x[501] = 1.8, 1.3
     x[502:] = 0.7  # less than a step of the threshold back
     _, told = ContactDetector(1.5).run(x, np.zeros(len(x)))
     there = np.flatnonzero(told == CONTACT)
