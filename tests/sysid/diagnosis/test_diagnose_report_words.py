@@ -8,7 +8,17 @@ from dataclasses import replace
 
 import pytest
 
-from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gain, Gap, LeftOver, Place, Value
+from jtqd.sysid.diagnosis.findings import (
+    CandidateEvidence,
+    Findings,
+    Gain,
+    Gap,
+    LeftOver,
+    Place,
+    Value,
+    summary_lines,
+    to_mapping,
+)
 from jtqd.sysid.diagnosis.report.views import evidence_views, gain_views, gap_views
 from jtqd.sysid.diagnosis.report.words import effect_title, gain_sentence, parameter_title, verdict_sentence
 from tests.sysid.diagnosis import findings_examples as examples
@@ -96,6 +106,21 @@ def test_the_gain_is_said_with_its_interval_which_is_in_newton_metres() -> None:
     assert (bar.before_width, bar.after_width) == (100.0, 25.0)
     assert bar.whisker == pytest.approx((20.0, 30.0))
     assert gain_sentence(replace(findings, causes=())) == ""
+
+
+def test_a_gain_beside_what_runs_have_of_their_own_is_said_with_the_plain_errors() -> None:
+    gain = Gain(0.2, 0.1, "split; beside what each run has of its own", (0.08, 0.12), plain_nm=(0.141, 0.142))
+    findings = replace(examples.one_cause(), gain=gain)
+    beside = (
+        "beside what each run has of its own (zero and friction of the day), which is most of the error: with it "
+        "0.141 -> 0.142 Nm rms"
+    )
+    assert (
+        gain_sentence(findings).translate(PLAIN_SPACE).endswith(f"(95 % interval 0.080 to 0.120), {beside}.")
+    )
+    (line,) = [line for line in summary_lines(findings) if line.startswith("gain on held-out runs")]
+    assert line.endswith(f"95 % interval), {beside}")
+    assert to_mapping(findings)["gain"]["plain_nm"] == [0.141, 0.142]
 
 
 def test_a_gain_that_is_a_loss_fits_its_bars() -> None:

@@ -118,6 +118,11 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
     assert comparison.explains_what_is_apart([0], [(2, 0)], (2, 0), np.full(5, 2000.0)) == odd
 
 
+def test_a_run_that_is_set_apart_by_something_else_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Comparison, "explains_what_is_apart", lambda *_: False)
+    assert diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).odd_runs == ()
+
+
 def test_text_says_what_run_and_channel() -> None:
     odd = OddRun("b.csv", "delay", "current_a", 3, -0.004, 0.0002, "s", ("delay of torque_nm of the sensor",))
     assert odd.text == (
