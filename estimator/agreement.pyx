@@ -110,7 +110,9 @@ cdef int fill_turn(AgreementLaw *law, turn) except -1:
     """Set what the views differ by over the motor's turn."""
     law.turned, law.turn_limit = True, turn.limit
     rows = np.column_stack((turn.constant_nm, turn.loss_share, turn.viscous_nms_per_rad, turn.quadratic_nms2_per_rad2))
-    lower = np.linalg.inv(np.linalg.cholesky(turn.covariance))
+    root = np.zeros((TURN_WAVES, TURN_WAVES))
+    root[np.tril_indices(TURN_WAVES)] = [value for row in turn.root() for value in row]
+    lower = np.linalg.inv(root)
     for k in range(TURN_WAVES):
         for n in range(TURN_PARTS):
             law.own[k][n] = rows[k, n]

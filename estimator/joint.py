@@ -7,15 +7,13 @@ along the motion, x = sign(v) G Kt i_eff: positive when driving, negative when b
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Annotated, Any, Final
 
-import numpy as np
-
-from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import Section, Verbatim
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits, numbers_text
 from jtqd.estimator.effects.library import EFFECTS, checked_parameters, read_parameters
@@ -245,8 +243,8 @@ class Turn:
                     "fused.agreement.turn", key, numbers_text(len(found)), f"a list of {count} finite numbers"
                 )
         try:
-            np.linalg.cholesky(self.covariance)
-        except np.linalg.LinAlgError:
+            self.root()
+        except (ValueError, ZeroDivisionError):
             raise FieldError(
                 "fused.agreement.turn",
                 "covariance_nm2",
@@ -254,12 +252,22 @@ class Turn:
                 "the lower triangle of a covariance: positive definite",
             ) from None
 
-    @property
-    def covariance(self) -> FloatArray:
-        """The whole covariance [6, 6], Nm2."""
-        result = np.zeros((TURN_WAVES, TURN_WAVES))
-        result[np.tril_indices(TURN_WAVES)] = self.covariance_nm2
-        return result + np.tril(result, -1).T
+    def root(self) -> list[list[float]]:
+        """Return the rows of the lower triangle R [Nm] with R R' = covariance, by Cholesky without numpy: the supervisor
+        does not load it. Raises ValueError or ZeroDivisionError where the covariance is not positive definite.
+        """
+        rows: list[list[float]] = []
+        left = iter(self.covariance_nm2)
+        for k in range(TURN_WAVES):
+            row: list[float] = []
+            for n in range(k):
+                known = sum(a * b for a, b in zip(row, rows[n], strict=False))
+                row.append((next(left) - known) / rows[n][n])
+            row.append(math.sqrt(next(left) - sum(a * a for a in row)))
+            rows.append(row)
+        if not all(row[-1] > 0.0 for row in rows):
+            raise ValueError("found a covariance that is singular, expected a positive definite one")
+        return rows
 
 
 @dataclass(frozen=True, slots=True)
