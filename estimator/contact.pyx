@@ -149,7 +149,7 @@ cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_n
     cdef double c1, s1, c2, s2, x, e, m
     cdef int k
     if isnan(outside_nm + angle):
-        s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
+        s.residual_nm, s.told, s.before = NAN, CONTACT_UNKNOWN, 0.0
         s.missed += 1
         if s.missed > MOST_MISSED:
             restart_contact(s)
