@@ -234,3 +234,11 @@ def test_a_joint_without_torsion_has_no_load() -> None:
     zero = np.zeros(3)
     with pytest.raises(ValueError, match="joint joint1: found no section fused"):
         link_loads(load_joint(shipped("joint1.yaml")), SETTINGS, zero, zero, zero, zero, zero)
+
+
+def test_what_was_before_a_missing_sample_is_in_no_mean() -> None:
+    x = np.zeros(1000)
+    x[500:503] = 1.9, np.nan, 1.5
+    residual, told = ContactDetector(1.6).run(x, np.zeros(len(x)))
+    assert residual[502] == pytest.approx(ALONE * 1.5, abs=0.1)
+    assert not (told == CONTACT).any()
