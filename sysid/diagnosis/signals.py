@@ -210,12 +210,16 @@ class JointSignals:
 
     def state_of(self, effect: Effect, p: Values) -> State:
         """Return what the hooks of an effect with parameters p use: the one sensor has one temperature, for every joint's
-        balances.
+        balances; rates are means over the age of a reading.
         """
-        if self.sensor_temperature_c is None or not effect.at_sensor_of(p):
+        other: dict[str, FloatArray] = {}
+        if self.sensor_temperature_c is not None and effect.at_sensor_of(p):
+            other["temperature_c"] = self.sensor_temperature_c
+        if age := effect.age_s(p):
+            other |= {name: mean_ahead(self.time_s, getattr(self.state, name), age) for name in _RATES}
+        if not other:
             return self.state
-        fields = {name: getattr(self.state, name) for name in State.__slots__}
-        return State(**{**fields, "temperature_c": self.sensor_temperature_c})
+        return State(**{name: getattr(self.state, name) for name in State.__slots__} | other)
 
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
@@ -240,6 +244,16 @@ class JointSignals:
         if self.of_position:
             return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))
         return np.asarray(np.sin(turn) / turn)
+
+
+_RATES: Final = ("current_rate_a_s", "link_velocity_rad_s", "torque_rate_nm_s")
+"""What the hooks of an effect on a reading that is old use."""
+
+
+def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
+    """Return the mean of x from each time to span_s later [n], by Simpson's rule; the last value goes on after the end."""
+    middle, end = (np.interp(time_s + part * span_s, time_s, x) for part in (0.5, 1.0))
+    return np.asarray((x + 4.0 * middle + end) / 6.0)
 
 
 def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
