@@ -174,6 +174,7 @@ class JointSignals:
     held: Mapping[str, BoolArray] = field(
         default_factory=dict
     )  # by balance: rows of a held channel (`runs.held`)
+    held_nm: Mapping[str, FloatArray] = field(default_factory=dict)  # by balance: what they are worth there
     of_position: bool = (
         True  # the acceleration is a second difference of the position, else one of the velocity
     )
@@ -258,7 +259,8 @@ def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
 
 def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """Return the signals with the samples at which a column is held, and those that its smoothing reaches, not usable:
-    torque in both balances, current in the motor's.
+    torque in both balances, current in the motor's. `held_nm` is what they are from a straight line between those around
+    them: at rest nothing else says it.
     """
     if not held:
         return s
@@ -267,13 +269,19 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     reach = {TORSION: calmed, MOTOR: calmed}
     if s.visible.parts:
         reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
-    out = {}
+    out, worth = {}, {}
+    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
+    apart = {name: h.apart for name, h in held.items()}
     for balance, columns in ((TORSION, ("torque_nm",)), (MOTOR, ("torque_nm", "current_a"))):
         rows = [held[name].rows for name in columns if name in held]
         if rows:
+            units = [
+                (scale if name == "current_a" else -1.0, apart[name]) for name in columns if name in held
+            ]
+            worth[balance] = np.asarray(sum(unit * x for unit, x in units))
             wide = max(1, round(reach[balance] / step)) + 2  # and that of a second difference
             out[balance] = np.convolve(np.any(rows, axis=0), np.ones(2 * wide + 1), "same") > 0.5
-    return replace(s, held=out)
+    return replace(s, held=out, held_nm=worth)
 
 
 def with_one_sensor(run: Sequence[JointSignals]) -> list[JointSignals]:
