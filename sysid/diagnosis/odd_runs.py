@@ -8,7 +8,8 @@ is in all runs, a change from day to day is small; what is in one run alone and 
 1. Effects of the library and deviations of single runs are added one by one, whichever lowers the squared error most, beside
    the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by `search.ENTER`.
 2. A run is odd where a deviation was chosen and, beside the effects chosen, differs from the mean of the other runs by more
-   than FAR standard deviations: its own error, and the spread of the others with what is usual (USUAL, worth four runs).
+   than FAR standard deviations: its own error, and the spread of the others with what is usual (USUAL, worth four runs). Of
+   a gain only what is beyond its `echo` counts: a channel that is all noise explains its own noise in the residual.
 3. What sets that run apart, its squared error per row above the median of the others', must be this deviation for the most
    part (`_MOST`). A brake that drags or a cover that rubs in one run is imitated by a delay of the current, too, which
    explains some per cent of it: such a run is no odd one, and what is in it must not go with it.
@@ -79,6 +80,10 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
     ]
     columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
     sigma = np.array([family.sigma for family in dataset.families])
+    echoes = np.zeros((count, len(kinds)))
+    for place, signals in zip(pieces, dataset.signals, strict=True):
+        mine = [echo(kind, signals, dataset.samples) for kind in kinds]
+        echoes[place] = np.maximum(echoes[place], mine)
     leave = gain_columns(dataset.candidates)
     for _ in range(_PASSES):
         # the noise is first what nothing explains, then what the chosen effects leave
@@ -90,7 +95,7 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
         each = np.zeros(count)
         np.add.at(each, pieces, np.array([s.rows / noise.inflation for s in sums]))
         rows = float(each.sum())
-        comparison = Comparison(without_days(grams, columns, sigma), columns)
+        comparison = Comparison(without_days(grams, columns, sigma), columns, echoes)
         chosen, odd = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))
         found = [(comparison.drop(chosen, odd, *at), at, comparison.far(chosen, at, kinds)) for at in odd]
         far = [
@@ -114,10 +119,13 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Normal equations of every run over effects, deviations and residual [r, P + K + 1, same]; columns: P."""
+    """Normal equations of every run over effects, deviations and residual [r, P + K + 1, same]; columns: P; echoes: of every
+    run's deviations [r, K].
+    """
 
     runs: FloatArray
     columns: int
+    echoes: FloatArray
 
     @property
     def kinds(self) -> int:
@@ -200,7 +208,8 @@ class Comparison:
         r, k = at
         values, errors = own_deviations(self.runs, chosen, self.columns + k, _FREE * kinds[k].usual)
         apart, spread = apart_from_others(values, r, kinds[k].usual)
-        return (apart, spread) if abs(apart) > FAR * float(np.hypot(spread, errors[r])) else None
+        least = FAR * float(np.hypot(spread, errors[r])) + float(self.echoes[r, k])
+        return (apart, spread) if abs(apart) > least else None
 
 
 def deviations(joints: Mapping[int, object]) -> list[Deviation]:
@@ -232,6 +241,16 @@ def column(kind: Deviation, s: JointSignals, balance: str) -> FloatArray | None:
         "delay": state.torque_rate_nm_s,
     }
     return np.asarray(made[kind.what] * (s.per_torque if balance == MOTOR else 1.0))
+
+
+def echo(kind: Deviation, signals: Sequence[JointSignals], samples: int) -> float:
+    """Return the gain that a channel's own noise makes in a run: its part of what the channel shows, in bins."""
+    if kind.what != "gain":
+        return 0.0
+    s = next(s for s in signals if kind.joint in (s.number, "sensor"))
+    shown = s.state.current_a if kind.channel == "current_a" else s.state.torque_nm
+    noise = s.noise.get(kind.channel, 0.0) ** 2 / samples
+    return noise / max(float(np.var(binned(shown, samples))), 1e-300) if noise else 0.0
 
 
 def _with_columns(

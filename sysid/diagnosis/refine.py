@@ -33,6 +33,11 @@ _SETTLED: Final = 0.02
 """Of a parameter's standard deviation: smaller steps are none. At least _STEPS are made, at most _MOST_STEPS."""
 _AS_GOOD: Final = 1.0
 """Of the deviance: the last parameters are taken that leave no more than this beyond the least."""
+_MOST_TORSION_STEPS: Final = 8
+_TORSION_STEP: Final = 1e-4
+"""Of the twist at the rated torque: smaller steps of the torsion are none."""
+_SOFTEST: Final = 0.1
+"""Of the file's stiffness: less is taken for no spring."""
 _LARGEST_STEP: Final = 0.5
 """Of a parameter's own size or a tenth of its plausible range, whichever is more."""
 
@@ -184,10 +189,29 @@ def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     if s.twist_rad is not None and any(p.effect.follows_torsion for p in mine):
         s.state.torsion_rad = s.twist_rad
         return
-    total = s.state.torque_nm
-    for p in mine:
-        total = total + _contribution(p, s, p.values).get(TORSION, 0.0)
-    s.state.torsion_rad = total / s.joint.stiffness_nm_per_rad
+    bent = [p for p in mine if "torsion_rad" in p.effect.needs]
+    stiffness = s.joint.stiffness_nm_per_rad
+    total = s.state.torque_nm + _torsion_sum(s, [p for p in mine if p not in bent])
+    s.state.torsion_rad = total / stiffness
+    if not bent:
+        return
+    usual = s.joint.rated_torque_nm / stiffness
+    for _ in range(
+        _MOST_TORSION_STEPS
+    ):  # Newton: a spring that hardens by its own stiffness is no small change
+        d = s.state.torsion_rad
+        here = _torsion_sum(s, bent)
+        s.state.torsion_rad = d + _TORSION_STEP * usual
+        slope = (_torsion_sum(s, bent) - here) / (_TORSION_STEP * usual)
+        step = (total + here - stiffness * d) / np.maximum(stiffness - slope, _SOFTEST * stiffness)
+        s.state.torsion_rad = d + step
+        if float(np.max(np.abs(step))) < _TORSION_STEP * usual:
+            return
+
+
+def _torsion_sum(s: JointSignals, present: Sequence[PresentEffect]) -> FloatArray | float:
+    """Return what these causes contribute to the torsion balance [n], Nm."""
+    return sum((_contribution(p, s, p.values).get(TORSION, 0.0) for p in present), 0.0)
 
 
 def _run_at(

@@ -178,6 +178,7 @@ class JointSignals:
     of_position: bool = (
         True  # the acceleration is a second difference of the position, else one of the velocity
     )
+    noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
@@ -402,6 +403,10 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         twist_rad=bent,
         off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
         of_position=motion.of_position,
+        noise={
+            "current_a": float(np.median(noise_of(columns.current_a))),
+            "torque_nm": float(np.median(noise_of(sensor))),
+        },
         visible=motion.visible,
         coarse=motion.coarse,
     )
