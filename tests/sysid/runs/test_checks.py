@@ -322,6 +322,15 @@ def test_a_run_in_which_nothing_changes_is_not_used(run: RunTable) -> None:
     assert (beside.refused, set(beside.notes)) == ((), set(result.refused))
 
 
+def test_a_sensor_that_reads_one_number_is_dead_where_the_joint_moves(run: RunTable) -> None:
+    one = np.ones(len(run.time_s))
+    [line] = checked(changed(run, lambda c: replace(c, torque_nm=7.5 * one))).refused
+    assert line == (
+        "r.csv: j1.torque_nm: found 7.5 Nm in the whole run while the joint moves, expected a measurement that changes: "
+        "dead channel"
+    )
+
+
 def test_one_value_of_current_or_motion_is_said(run: RunTable) -> None:
     one = np.ones(len(run.time_s))
     commanded = checked(changed(run, lambda c: replace(c, current_a=1.5 * one)))
