@@ -179,7 +179,7 @@ def read_run(
 
 def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunFile]:
     """Read one file as `read_run`, taken apart where its time starts again, at its gaps and rows with a blank cell; pieces
-    shorter than SHORTEST_PIECE_S are left out and noted.
+    shorter than SHORTEST_PIECE_S are left out and noted, and so are rows written twice.
 
     Raises RunError, also where no piece is long enough.
     """
@@ -270,6 +270,8 @@ def _scaled(
 
 def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
     """Check time and columns of a file and make its run table, or one for each of its pieces."""
+    if not whole:
+        content = _without_repeated_rows(content)
     time_s, path = content.values[TIME], content.path
     if len(time_s) < 2:
         raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
@@ -344,6 +346,20 @@ def _piece(content: _Content, cut: slice, name: str, notes: Sequence[str], place
         raise RunError(f"{path}: {error}") from None
     name = name if place[1] == 1 else f"{name} ({place[0]} of {place[1]})"
     return RunFile(name, path, content.source, content.sha256, table, tuple(notes), place)
+
+
+def _without_repeated_rows(content: _Content) -> _Content:
+    """Return the content without rows that were written twice, one after the other, and a note. Two rows that share only
+    their stamp stay, to be refused: one of their times is wrong.
+    """
+    columns = np.array(list(content.values.values()))
+    again = np.concatenate(([False], np.all(columns[:, 1:] == columns[:, :-1], axis=0)))
+    if not again.any():
+        return content
+    lines = None if content.lines is None else [content.lines[k] for k in np.flatnonzero(~again)]
+    note = f"{int(again.sum())} of {counted(len(again), 'row')} left out: they are the row before once more"
+    values = {key: value[~again] for key, value in content.values.items()}
+    return replace(content, values=values, lines=lines, notes=(*content.notes, note))
 
 
 def _new_runs(time_s: FloatArray) -> list[int]:

@@ -176,6 +176,21 @@ def test_one_wrong_stamp_is_no_other_run(tmp_path: Path) -> None:
             read_pieces(path)
 
 
+def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
+    t = 0.002 * np.arange(2000.0)
+    rows = np.sort(np.concatenate((np.arange(2000), [700, 900, 900])))
+    cells = {"time_s": t[rows], "j1.current_a": np.sin(t)[rows]}
+    path = _table(tmp_path / "twice.csv", cells)
+    [run] = read_pieces(path)
+    assert run.table.time_s.tolist() == t.tolist()
+    assert run.notes == ("3 of 2003 rows left out: they are the row before once more",)
+    with pytest.raises(RunError, match=r"line 703: found time 1\.4 s after 1\.4 s, expected rising time"):
+        read_run(path)
+    cells["j1.current_a"][701] += 0.1  # one of both has a wrong time
+    with pytest.raises(RunError, match=r"line 703: found time 1\.4 s after 1\.4 s, expected rising time"):
+        read_pieces(_table(tmp_path / "stamp.csv", cells))
+
+
 def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
     current = np.random.default_rng(1).normal(size=len(T))
     cells = {"time_s": T, "j1.current_a": current, "j1.motor_position_rad": np.cumsum(current)}
