@@ -228,7 +228,8 @@ def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
         return [
             RunIssue(
                 "torque_nm_missing",
-                f"{where}.torque_nm: found no valid torque sensor channel, expected the reference of a diagnosis",
+                f"{where}.torque_nm: found no valid torque sensor channel, expected the reference of a diagnosis: a sensor, "
+                "or a known load or a model's torque (jN.load of a column map)",
             )
         ]
     if np.ptp(columns.torque_nm) == 0.0 and _moves(columns):
