@@ -23,7 +23,7 @@ import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -451,9 +451,7 @@ class _Rows(Protocol):
 def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> _Content:
     data, sha256 = _bytes(path)
     text = _text(path, data)
-    first = text.lstrip().split("\n", 1)[0]
-    separator = next((mark for mark in ",;\t" if mark in first), ",")
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_separator(text))
     header = _header(rows, path)
     columns = _wanted_columns(header, path, columns)
     wanted = _expressions(header, path, columns)
@@ -461,6 +459,21 @@ def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) ->
     cells, keep, wanted, notes = _without_blanks(path, cells, wanted, columns)
     lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
     return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, notes, columns)
+
+
+def _separator(text: str) -> str:
+    """Return the mark by which the header and the row below have as many cells, the rarer one in names before the comma
+    ("Zeit, ms;Weg, mm"); without such the first that the header has.
+    """
+    header = text.lstrip().split("\n", 1)[0]
+    for mark in "\t;,":
+        try:
+            names, row = islice(csv.reader(io.StringIO(text.lstrip(), newline=""), delimiter=mark), 2)
+        except (ValueError, csv.Error):  # no row below, or no CSV
+            continue
+        if len(names) == len(row) > 1:
+            return mark
+    return next((mark for mark in ",;\t" if mark in header), ",")
 
 
 def _without_blanks(

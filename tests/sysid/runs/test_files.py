@@ -229,6 +229,18 @@ def test_a_comma_separates_wherever_the_header_has_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_comma_in_a_name_separates_nothing_where_the_rows_have_none(tmp_path: Path, separator: str) -> None:
+    path = _table(tmp_path / "a.csv", {"Zeit, ms": 1e3 * T, "Strom, A": T + 1.0}, separator)
+    columns = _map(time_s={"column": "Zeit, ms", "scale": 1e-3}, j1__current_a="Strom, A")
+    assert np.allclose(read_run(path, columns).table.time_s, T)
+    path.write_text(path.read_text().replace(".", ","))
+    with pytest.raises(
+        RunError, match=r"column 'Zeit, ms': found '.*', expected a finite number with a decimal point"
+    ):
+        read_run(path, columns)
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
 def test_other_separators_are_read(tmp_path: Path, separator: str) -> None:
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0}, separator)
     current = read_run(path).table.joints[1].current_a
