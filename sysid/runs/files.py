@@ -356,7 +356,7 @@ def _without_repeated_rows(content: _Content) -> _Content:
     again = np.concatenate(([False], np.all(columns[:, 1:] == columns[:, :-1], axis=0)))
     if not again.any():
         return content
-    lines = None if content.lines is None else [content.lines[k] for k in np.flatnonzero(~again)]
+    lines = None if content.lines is None else [content.lines[int(k)] for k in np.flatnonzero(~again)]
     note = f"{int(again.sum())} of {counted(len(again), 'row')} left out: they are the row before once more"
     values = {key: value[~again] for key, value in content.values.items()}
     return replace(content, values=values, lines=lines, notes=(*content.notes, note))
