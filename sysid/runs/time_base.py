@@ -34,6 +34,8 @@ _SKEW_GAIN: Final = 0.3
 """Part of the residual energy that a shift must take away to be believed."""
 _SKEW_MATTERS: Final = 0.005
 """Part of the torque's variance that it must take away: where a regression leaves next to nothing, stiction bends that."""
+_TURN_PER_ROW: Final = 0.25
+"""Part of a turn from one row to the next up to which a roll-over is told from motion."""
 _POSITIONS: Final = ("motor_position_rad", "link_position_rad")
 
 
@@ -163,13 +165,13 @@ def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
 
 def _turn(position: FloatArray) -> float | None:
     """The period of a position that rolls over by 2 pi (or by 360, for what is still to be found in degrees), else None."""
-    steps = np.diff(position)
-    usual = float(np.quantile(np.abs(steps), 0.99))
-    jumps = np.abs(steps[np.abs(steps) > max(3.0, 20.0 * usual)])
-    if not len(jumps):
-        return None
+    steps = np.abs(np.diff(position))
     for period in (2.0 * math.pi, 360.0):
-        if np.all(np.abs(jumps - period) < 0.1 * period + usual):
+        jumps = steps > 0.5 * period
+        if not jumps.any() or jumps.all():
+            continue
+        usual = float(np.quantile(steps[~jumps], 0.99))
+        if usual < _TURN_PER_ROW * period and np.all(np.abs(steps[jumps] - period) < 0.1 * period + usual):
             return period
     return None
 

@@ -206,6 +206,21 @@ def test_uneven_time_is_brought_to_equal_steps(run: RunTable, seed: int) -> None
     assert len(result.notes) == 1
 
 
+@pytest.mark.parametrize("speed", [40.0, 300.0])
+def test_a_fast_motor_rolls_over_in_many_rows(speed: float) -> None:
+    """At 250 Hz a motor at 300 rad/s has five rows to a turn: every fifth step is a jump."""
+    t = 0.004 * np.arange(3000)
+    position = speed * np.sin(t)
+    table = RunTable(t, {1: JointColumns(motor_position_rad=np.mod(position, 2.0 * math.pi))})
+    made, notes = unwrapped(table, "r")
+    again = made.joints[1].motor_position_rad
+    assert again is not None
+    assert np.allclose(again - again[0], position - position[0])
+    assert "found it rolling over by 6.283 rad" in notes[0].text
+    degrees = RunTable(t, {1: JointColumns(motor_position_rad=np.rad2deg(position))})
+    assert unwrapped(degrees, "r")[1] == []
+
+
 def swing(time_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> RunTable:
     """A joint that swings, with an encoder's rounding, sampled at these times."""
     position = np.round(80.0 * np.sin(2.0 * time_s) / 1e-4) * 1e-4
