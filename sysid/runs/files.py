@@ -451,14 +451,26 @@ class _Rows(Protocol):
 def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> _Content:
     data, sha256 = _bytes(path)
     text = _text(path, data)
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=_separator(text))
+    separator = _separator(text)
+    text, cut = _without_cut_row(text, separator) if blanks else (text, ())
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     header = _header(rows, path)
     columns = _wanted_columns(header, path, columns)
     wanted = _expressions(header, path, columns)
     cells, lines = _cells_of_text(rows, path, header, _names(wanted), blanks=blanks)
     cells, keep, wanted, notes = _without_blanks(path, cells, wanted, columns)
     lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
-    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, notes, columns)
+    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, (*cut, *notes), columns)
+
+
+def _without_cut_row(text: str, separator: str) -> tuple[str, tuple[str, ...]]:
+    """Return the text without a last row that ends before its line does, in less cells than the row before, and a note: a
+    recorder was ended while it wrote.
+    """
+    *before, row, last = ("", "", *text.rsplit("\n", 2))[-3:]
+    if not last or last.count(separator) >= row.count(separator):
+        return text, ()
+    return "\n".join([*before, row, ""]), (f"the last row left out: it ends after {last[-20:]!r}",)
 
 
 def _separator(text: str) -> str:

@@ -191,6 +191,22 @@ def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
         read_pieces(_table(tmp_path / "stamp.csv", cells))
 
 
+def test_a_row_that_a_recorder_did_not_finish_is_left_out_and_said(tmp_path: Path) -> None:
+    path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0, "j1.motor_position_rad": T})
+    whole = path.read_text()
+    path.write_text(whole + "5.0,6.")
+    [run] = read_pieces(path)
+    assert run.table.time_s.tolist() == T.tolist()
+    assert run.notes == ("the last row left out: it ends after '5.0,6.'",)
+    with pytest.raises(RunError, match="found 2 cells, expected 3"):
+        read_run(path)
+    path.write_text(whole.rstrip())  # whole, without its line's end
+    assert read_pieces(path)[0].notes == ()
+    path.write_text(whole + "5.0,6.0\n")
+    with pytest.raises(RunError, match="found 2 cells, expected 3"):
+        read_pieces(path)
+
+
 def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
     current = np.random.default_rng(1).normal(size=len(T))
     cells = {"time_s": T, "j1.current_a": current, "j1.motor_position_rad": np.cumsum(current)}
