@@ -173,8 +173,9 @@ def _played(name: str, what: str, start: float, moves: Iterable[Move]) -> Motion
         way = target - at
         top = min(speed, math.sqrt(2.0 * acceleration * abs(way) / math.pi))
         if top > 0.0:
-            ramp = max(round(0.5 * math.pi * top / acceleration * RATE_HZ), 2)
-            plateau = max(round((abs(way) / top) * RATE_HZ) - ramp, 0)
+            # rounded up: neither speed nor acceleration is passed
+            ramp = max(math.ceil(0.5 * math.pi * top / acceleration * RATE_HZ), 2)
+            plateau = max(math.ceil((abs(way) / top) * RATE_HZ) - ramp, 0)
             up = 0.5 * (1.0 - np.cos(np.pi * (np.arange(ramp) + 0.5) / ramp))
             shape = np.concatenate((up, np.ones(plateau), up[::-1]))
             velocity.append(shape * (way / (np.sum(shape) * step)))

@@ -104,12 +104,17 @@ def _with_command(
 def _with_limits_said(
     experiment: dict[str, Any] | None, options: argparse.Namespace, joints: Mapping[int, Joint]
 ) -> dict[str, Any] | None:
-    """Return the next experiment with a sentence where --limits let it go further than the joint files do."""
-    wider = {n: text for n, joint in joints.items() if (text := beyond_file(joint, options.limits))}
-    if experiment is None or not wider:
+    """Return the next experiment with a sentence where it goes further than --limits, or --limits than the joint files."""
+    if experiment is None or options.limits is None:
         return experiment
+    wider = {n: text for n, joint in joints.items() if (text := beyond_file(joint, options.limits))}
     said = [f"--limits allows more than motion_limits of joint {n}: {text}." for n, text in wider.items()]
-    return {**experiment, "why": " ".join([experiment["why"], *said])}
+    if experiment.get("plan") and "travel_rad" in options.limits:
+        said.append(
+            "travel_rad of --limits is not kept: two joints on one sensor are taken for a towing bench, whose coupling "
+            "turns freely; that of the plan's own limits is."
+        )
+    return {**experiment, "why": " ".join([experiment["why"], *said])} if said else experiment
 
 
 def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:

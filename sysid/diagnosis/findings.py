@@ -228,7 +228,8 @@ class OddRun:
     """A run that differs from all others and is not used: what ("gain", "zero", "delay") of which column differs by `value`
     from the mean of the others, whose standard deviation is `usual`. others: deviations that fit nearly as well.
 
-    unit: "" for a gain (0.07: it reads 7 % more), "of rated" (torque; of a current, its torque), "s" (late).
+    unit: "" for a gain (0.07: it reads 7 % more; -2: the opposite), "of rated" (torque; of a current, its torque),
+    "s" (late).
     """
 
     run: str
@@ -244,6 +245,12 @@ class OddRun:
     def text(self) -> str:
         """One line for people."""
         channel = "torque_nm" if self.joint == SENSOR else f"j{self.joint}.{self.channel}"
+        either = f", or it differs in the {' or '.join(self.others)}" if self.others else ""
+        if self.what == "gain" and self.value < -1.0:
+            return (
+                f"{self.run}: {channel} has the opposite direction of that in the other runs, {-1.0 - self.value:.3g} times "
+                f"as large{either}: a matter of this run, which is not used"
+            )
         what, scale, unit = {
             "gain": ("reads", 100.0, "%"),
             "zero": ("has its zero", 100.0, "% of rated torque"),
@@ -253,7 +260,6 @@ class OddRun:
             self.what
         ]
         side = sides[0] if self.value > 0.0 else sides[1]
-        either = f", or it differs in the {' or '.join(self.others)}" if self.others else ""
         return (
             f"{self.run}: {channel} {what} {abs(scale * self.value):.3g} {unit} {side} than in the other runs, which differ "
             f"by {scale * self.usual:.2g} {unit} among themselves{either}: a matter of this run, which is not used"

@@ -114,7 +114,17 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
     )
     places = [int(p) for p in np.flatnonzero(pieces == r)]
     kind, name = kinds[k], dataset.runs[places[0]].name
+    if kind.what == "gain":
+        apart = of_truth(apart)
     return places, OddRun(name, kind.what, kind.channel, kind.joint, apart, spread, kind.unit, others)
+
+
+def of_truth(gain: float) -> float:
+    """Return by what part of the true value a channel is off that is off by the part `gain` of what it reads.
+
+    The columns are made of what was read: g of the true value is g / (1 + g) of that; the other direction (-2) is 2 of it.
+    """
+    return gain / (1.0 - gain)
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,7 @@ __all__ = [
 
 _REFUSING: Final = ("_dead", "_sign", "_scale", "_unit")
 _REFUSING_KINDS: Final = ("gear_ratio", "joint_file")
+_MOTION: Final = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
 _SPARE: Final = {
     "link_position_rad_stuck": ("link_position_rad", "link_velocity_rad_s"),
     "motor_position_rad_stuck": ("motor_position_rad",),
@@ -222,22 +223,31 @@ def _checked_joint(
 
 
 def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
-    """Return the first column that is missing and without which a joint cannot be diagnosed."""
+    """Return the first column that is missing or dead and without which a joint cannot be diagnosed."""
     if columns.torque_nm is None or not np.any(columns.torque_nm):
         return [
             RunIssue(
                 "torque_nm_missing",
-                f"{where}.torque_nm: found no valid torque sensor channel, expected the reference of a diagnosis",
+                f"{where}.torque_nm: found no valid torque sensor channel, expected the reference of a diagnosis: a sensor, "
+                "or a known load or a model's torque (jN.load of a column map)",
             )
         ]
+    if np.ptp(columns.torque_nm) == 0.0 and _moves(columns):
+        text = (
+            f"{where}.torque_nm: found {columns.torque_nm[0]:.4g} Nm in the whole run while the joint moves"
+        )
+        return [RunIssue("torque_nm_dead", f"{text}, expected a measurement that changes: dead channel")]
     if columns.current_a is None:
         text = f"{where}.current_a: found no such column, expected the motor current"
         return [RunIssue("current_a_missing", text)]
-    motion = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
-    if all(getattr(columns, name) is None for name in motion):
+    if all(getattr(columns, name) is None for name in _MOTION):
         text = f"{where}: found no position and no velocity, expected at least one of them"
         return [RunIssue("motion_missing", text)]
     return []
+
+
+def _moves(columns: JointColumns) -> bool:
+    return any(np.ptp(column) > 0.0 for name in _MOTION if (column := getattr(columns, name)) is not None)
 
 
 def _spared(columns: JointColumns, issues: Sequence[RunIssue]) -> tuple[JointColumns, list[RunIssue]]:

@@ -61,6 +61,12 @@ _OPERATORS: Final[Mapping[type[ast.operator], Callable[[FloatArray, FloatArray],
     ast.Mult: np.multiply,
     ast.Div: np.divide,
 }
+_REFUSED: Final[Mapping[type[ast.operator], str]] = {
+    ast.Pow: "**",
+    ast.Mod: "%",
+    ast.FloorDiv: "//",
+    ast.MatMult: "@",
+}
 _ALLOWED: Final = "numbers, columns of the file, + - * /, pi and " + ", ".join(FUNCTIONS)
 
 
@@ -157,9 +163,18 @@ def _check(node: ast.expr, whole: _Text, columns: dict[str, str], depth: int) ->
                 f"found no column '{column}', expected it for {whole.target} (there are {_some(whole.header)})"
             )
     else:
-        raise whole.error(type(node).__name__)
+        raise whole.error(_kind(node))
     for each in inner:
         _check(each, whole, columns, depth + 1)
+
+
+def _kind(node: ast.expr) -> str:
+    """What is not allowed, in words; a comma is one that was meant as a decimal point, most of the time."""
+    if isinstance(node, ast.BinOp):
+        return f"the operator {_REFUSED.get(type(node.op), type(node.op).__name__)}"
+    if isinstance(node, ast.Subscript):
+        return "brackets (a name with signs stands in backquotes)"
+    return "a comma" if isinstance(node, ast.Tuple) else type(node).__name__
 
 
 def _check_number(node: ast.Constant, whole: _Text) -> None:

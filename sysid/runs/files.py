@@ -23,7 +23,7 @@ import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -179,7 +179,7 @@ def read_run(
 
 def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunFile]:
     """Read one file as `read_run`, taken apart where its time starts again, at its gaps and rows with a blank cell; pieces
-    shorter than SHORTEST_PIECE_S are left out and noted.
+    shorter than SHORTEST_PIECE_S are left out and noted, and so are rows written twice.
 
     Raises RunError, also where no piece is long enough.
     """
@@ -270,6 +270,8 @@ def _scaled(
 
 def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
     """Check time and columns of a file and make its run table, or one for each of its pieces."""
+    if not whole:
+        content = _without_repeated_rows(content)
     time_s, path = content.values[TIME], content.path
     if len(time_s) < 2:
         raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
@@ -344,6 +346,20 @@ def _piece(content: _Content, cut: slice, name: str, notes: Sequence[str], place
         raise RunError(f"{path}: {error}") from None
     name = name if place[1] == 1 else f"{name} ({place[0]} of {place[1]})"
     return RunFile(name, path, content.source, content.sha256, table, tuple(notes), place)
+
+
+def _without_repeated_rows(content: _Content) -> _Content:
+    """Return the content without rows that were written twice, one after the other, and a note. Two rows that share only
+    their stamp stay, to be refused: one of their times is wrong.
+    """
+    columns = np.array(list(content.values.values()))
+    again = np.concatenate(([False], np.all(columns[:, 1:] == columns[:, :-1], axis=0)))
+    if not again.any():
+        return content
+    lines = None if content.lines is None else [content.lines[int(k)] for k in np.flatnonzero(~again)]
+    note = f"{int(again.sum())} of {counted(len(again), 'row')} left out: they are the row before once more"
+    values = {key: value[~again] for key, value in content.values.items()}
+    return replace(content, values=values, lines=lines, notes=(*content.notes, note))
 
 
 def _new_runs(time_s: FloatArray) -> list[int]:
@@ -435,8 +451,8 @@ class _Rows(Protocol):
 def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> _Content:
     data, sha256 = _bytes(path)
     text = _text(path, data)
-    first = text.lstrip().split("\n", 1)[0]
-    separator = next((mark for mark in ",;\t" if mark in first), ",")
+    separator = _separator(text)
+    text, cut = _without_cut_row(text, separator) if blanks else (text, ())
     rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     header = _header(rows, path)
     columns = _wanted_columns(header, path, columns)
@@ -444,7 +460,32 @@ def _read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) ->
     cells, lines = _cells_of_text(rows, path, header, _names(wanted), blanks=blanks)
     cells, keep, wanted, notes = _without_blanks(path, cells, wanted, columns)
     lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
-    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, notes, columns)
+    return _Content(path, "csv", sha256, _scaled(cells, wanted, columns), lines, (*cut, *notes), columns)
+
+
+def _without_cut_row(text: str, separator: str) -> tuple[str, tuple[str, ...]]:
+    """Return the text without a last row that ends before its line does, in less cells than the row before, and a note: a
+    recorder was ended while it wrote.
+    """
+    *before, row, last = ("", "", *text.rsplit("\n", 2))[-3:]
+    if not last or last.count(separator) >= row.count(separator):
+        return text, ()
+    return "\n".join([*before, row, ""]), (f"the last row left out: it ends after {last[-20:]!r}",)
+
+
+def _separator(text: str) -> str:
+    """Return the mark by which the header and the row below have as many cells, the rarer one in names before the comma
+    ("Zeit, ms;Weg, mm"); without such the first that the header has.
+    """
+    header = text.lstrip().split("\n", 1)[0]
+    for mark in "\t;,":
+        try:
+            names, row = islice(csv.reader(io.StringIO(text.lstrip(), newline=""), delimiter=mark), 2)
+        except (ValueError, csv.Error):  # no row below, or no CSV
+            continue
+        if len(names) == len(row) > 1:
+            return mark
+    return next((mark for mark in ",;\t" if mark in header), ",")
 
 
 def _without_blanks(

@@ -18,6 +18,13 @@ SLOWEST_HZ: Final = 50.0
 """Below it accelerations and reversals are not in the data; ripple of slow motion folds."""
 UNEVEN: Final = 0.3
 """A step this part off the median is an uneven one: jitter of a stamp is less, a lost row more."""
+JITTER: Final = 0.05
+"""Less is no jitter (`diagnosis.signals.second_difference` takes such steps for even)."""
+_SMOOTHER: Final = 0.7
+"""Part of the roughness of positions at the stamps' word that equal steps must leave to be believed."""
+_ROWS_AHEAD: Final = 4
+_FOLLOWED: Final = 0.05
+"""Part of a stamp's distance by which the phase of the cycles follows it: a clock drifts, jitter does not last."""
 SKEW_NOTED_S: Final = 0.02
 """Less is the matter of the effect channel_delay."""
 SKEW_REFUSED_S: Final = 0.1
@@ -27,6 +34,8 @@ _SKEW_GAIN: Final = 0.3
 """Part of the residual energy that a shift must take away to be believed."""
 _SKEW_MATTERS: Final = 0.005
 """Part of the torque's variance that it must take away: where a regression leaves next to nothing, stiction bends that."""
+_TURN_PER_ROW: Final = 0.25
+"""Part of a turn from one row to the next up to which a roll-over is told from motion."""
 _POSITIONS: Final = ("motor_position_rad", "link_position_rad")
 
 
@@ -46,31 +55,78 @@ def check_rate(time_s: FloatArray, where: str) -> list[RunIssue]:
 
 
 def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
-    """Return the run on equal steps (the median's) where its own are uneven, and a note of it.
+    """Return the run on equal steps where its own are uneven, and a note of it.
 
     Values between two rows lie on a cubic through both with the slopes of a parabola through three rows: on straight lines
     every missing cycle would leave two blows in the acceleration. A run whose steps are equal but for jitter is returned
-    as it is.
+    as it is, if its stamps can be believed.
+
+    Stamps that a computer gives, or that were rounded, jitter where the samples do not: at their word a position would jump
+    by speed times jitter. What is believed, the stamps or equal steps with rows missing, is what leaves positions smoother.
     """
     steps = np.diff(table.time_s)
     median = float(np.median(steps))
-    uneven = int(np.count_nonzero(np.abs(steps - median) > UNEVEN * median))
-    if not uneven:
+    off = np.abs(steps - median)
+    if np.max(off) <= JITTER * median:
         return table, []
-    grid = np.arange(table.time_s[0], table.time_s[-1] + 1e-9, median)
+
+    def found(part: float) -> str:
+        count = int(np.count_nonzero(off > part * median))
+        return (
+            f"{where}: time_s: found {count} of {len(steps)} steps off the median of {median:.4g} s by more than "
+            f"{part:.0%} (up to {float(np.max(steps)):.4g} s)"
+        )
+
+    believed = _resampled(table, table.time_s, median)
+    equal = _resampled(table, *_equal_steps(table.time_s, median))
+    if _roughness(equal) < _SMOOTHER * _roughness(believed):
+        text = f"{found(JITTER)}, but positions that are smooth over equal steps: the stamps jitter, not the samples"
+        return equal, [RunIssue("time_jitter", f"{text}; equal steps used")]
+    if np.max(off) <= UNEVEN * median:
+        return table, []
+    return believed, [RunIssue("time_uneven", f"{found(UNEVEN)}: resampled to equal steps")]
+
+
+def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
+    """Return the run on steps of step_s, its rows being of these times [n]."""
+    grid = np.arange(time_s[0], time_s[-1] + 1e-9, step_s)
 
     def on_grid(column: FloatArray | None) -> FloatArray | None:
-        return None if column is None else _cubic(grid, table.time_s, column)
+        return None if column is None else _cubic(grid, time_s, column)
 
     joints = {
         number: JointColumns(**{name: on_grid(getattr(columns, name)) for name in COLUMN_NAMES})
         for number, columns in table.joints.items()
     }
-    note = (
-        f"{where}: time_s: found {uneven} of {len(steps)} steps off the median of {median:.4g} s by more than "
-        f"{UNEVEN:.0%} (up to {float(np.max(steps)):.4g} s): resampled to equal steps"
+    return RunTable(grid, joints)
+
+
+def _equal_steps(time_s: FloatArray, step_s: float) -> tuple[FloatArray, float]:
+    """Return times of the rows [n] that are whole steps from each other, and the step that ends where the stamps do.
+
+    A row is of the next cycle, or as many on as it and the rows after it are late of the others before, whose mean phase is
+    followed: jitter makes one row late, a lost row all that follow.
+    """
+    ahead = np.min(
+        [np.append(time_s[k:], np.full(k, np.inf)) - k * step_s for k in range(_ROWS_AHEAD)], axis=0
     )
-    return RunTable(grid, joints), [RunIssue("time_uneven", note)]
+    cycles = np.zeros(len(time_s))
+    phase = float(time_s[0])
+    for row, (stamp, late) in enumerate(zip(time_s.tolist(), ahead.tolist(), strict=True)):
+        if row:
+            steps = max(1, round((late - phase) / step_s))
+            cycles[row] = cycles[row - 1] + steps
+            phase += steps * step_s
+            phase += _FOLLOWED * (stamp - phase)
+    step = float(time_s[-1] - time_s[0]) / float(cycles[-1])
+    return time_s[0] + step * cycles, step
+
+
+def _roughness(table: RunTable) -> float:
+    """Return the geometric mean of the fourth differences of the positions that move; NaN without one."""
+    positions = [getattr(columns, name) for columns in table.joints.values() for name in _POSITIONS]
+    rough = [float(np.std(np.diff(x, 4))) for x in positions if x is not None and np.ptp(x) > 0.0]
+    return math.exp(float(np.mean(np.log(rough)))) if rough and min(rough) > 0.0 else math.nan
 
 
 def _cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -109,13 +165,13 @@ def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
 
 def _turn(position: FloatArray) -> float | None:
     """The period of a position that rolls over by 2 pi (or by 360, for what is still to be found in degrees), else None."""
-    steps = np.diff(position)
-    usual = float(np.quantile(np.abs(steps), 0.99))
-    jumps = np.abs(steps[np.abs(steps) > max(3.0, 20.0 * usual)])
-    if not len(jumps):
-        return None
+    steps = np.abs(np.diff(position))
     for period in (2.0 * math.pi, 360.0):
-        if np.all(np.abs(jumps - period) < 0.1 * period + usual):
+        jumps = steps > 0.5 * period
+        if not jumps.any() or jumps.all():
+            continue
+        usual = float(np.quantile(steps[~jumps], 0.99))
+        if usual < _TURN_PER_ROW * period and np.all(np.abs(steps[jumps] - period) < 0.1 * period + usual):
             return period
     return None
 

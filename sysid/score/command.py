@@ -26,6 +26,7 @@ from jtqd.sysid.score.score import (
     rows_of,
     table_lines,
     to_mapping,
+    visible_on,
 )
 
 BY: Final = "jtq score"
@@ -87,7 +88,8 @@ def _scored(
                 f"{run.name}: j{number}: found one encoder: method fused, which estimates from the torsion, is not scored"
             )
         try:
-            errors = [errors_on(run.name, checked.table, number, joint) for joint in joints]
+            visible = visible_on(run.name, checked.table, number, joints[0])
+            errors = [errors_on(run.name, checked.table, number, joint, visible) for joint in joints]
         except (SignalsError, ValueError) as error:
             refused.append(str(error))
             continue

@@ -1,7 +1,8 @@
 """Errors of a joint file on runs: what its simulation and its estimators get wrong, against the torque that was measured.
 
     simulation  residuals of the motor and the torsion balance with all effects of the file, averaged over
-                5 ms as there, rms in motion; the torsion's without its mean in each run, whose zero differs
+                5 ms and without what the resolution of the positions makes of the acceleration, both as in a diagnosis,
+                rms in motion; the torsion's without its mean in each run, whose zero differs
     free run    error of the simulated velocity and position in half a second alone (`jtqd.sysid.diagnosis.gain.free_run`)
     estimators  estimate less sensor, the sensor passed through the same low-pass, rms over the samples in motion
 
@@ -20,6 +21,8 @@ import numpy as np
 
 from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.effects.effect import MOTOR as BALANCE_MOTOR
+from jtqd.estimator.effects.effect import TORSION as BALANCE_TORSION
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import RunTable
@@ -28,6 +31,7 @@ from jtqd.sysid.diagnosis.dataset import without_known_effects
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.gain import free_run
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
+from jtqd.sysid.diagnosis.resolution import Smoother
 from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
 
 SCHEMA: Final = "jtq.score/1"
@@ -71,22 +75,37 @@ class Row:
         return last / first - 1.0 if len(self.errors) > 1 and first > 0.0 else math.nan
 
 
-def errors_on(name: str, table: RunTable, number: int, joint: Joint) -> RunErrors:
+def visible_on(name: str, table: RunTable, number: int, joint: Joint) -> Smoother:
+    """Return what of a balance of this joint the resolution of a run lets through. Raises SignalsError."""
+    return joint_signals(name, table, number, joint, BaseLoss(joint)).visible
+
+
+def errors_on(
+    name: str, table: RunTable, number: int, joint: Joint, visible: Smoother | None = None
+) -> RunErrors:
     """Return the errors of one joint file on one run.
+
+    visible: of the file that it is compared with, so that both are judged by the same part of the run; None: its own.
 
     Raises SignalsError for a run without what a simulation needs, ConfigError for a joint file that an estimator refuses.
     """
     plain = with_effects_applied(joint)
     base = BaseLoss(plain)
     raw = joint_signals(name, table, number, plain, base)
+    if visible is not None:
+        raw = replace(raw, visible=visible)
     [signals] = about_zero([raw], {number: base})
     signals = without_known_effects(signals)
     moving = signals.moving
     samples = bin_samples([signals])
-    whole = all_in_bin(moving, samples)
-    errors = {MOTOR: _rms(binned(signals.motor_nm, samples)[whole])}
+
+    def judged(balance: str, residual: FloatArray) -> FloatArray:
+        whole = all_in_bin(moving & signals.usable(balance), samples)
+        return binned(signals.seen(balance, residual), samples)[whole]
+
+    errors = {MOTOR: _rms(judged(BALANCE_MOTOR, signals.motor_nm))}
     if signals.torsion_nm is not None:
-        rest = binned(signals.torsion_nm, samples)[whole]
+        rest = judged(BALANCE_TORSION, signals.torsion_nm)
         errors[TORSION] = _rms(rest - rest.mean()) if len(rest) else math.nan
     errors[FREE] = errors[FREE_POSITION] = math.nan
     if moving.any():

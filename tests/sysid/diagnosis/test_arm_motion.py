@@ -55,10 +55,9 @@ def test_no_motion_leaves_its_room(kind: str, room: Room) -> None:
     for motion in made:
         assert motion.position_rad.min() >= room.low_rad - 1e-9
         assert motion.position_rad.max() <= room.high_rad + 1e-9
-        assert np.abs(motion.velocity_rad_s).max() <= room.velocity_rad_s * 1.02
+        assert np.abs(motion.velocity_rad_s).max() <= room.velocity_rad_s * (1.0 + 1e-9)
         steps = np.abs(np.diff(motion.velocity_rad_s)) * RATE_HZ
-        smallest = 2.0 / RATE_HZ  # a ramp is at least two samples
-        assert steps.max() <= max(1.05 * room.acceleration_rad_s2, room.velocity_rad_s / smallest)
+        assert steps.max() <= room.acceleration_rad_s2 * (1.0 + 1e-9)
         assert motion.velocity_rad_s[0] == motion.velocity_rad_s[-1] == 0.0
         turned = np.diff(motion.position_rad) * RATE_HZ
         between = 0.5 * (motion.velocity_rad_s[1:] + motion.velocity_rad_s[:-1])

@@ -317,6 +317,15 @@ def test_limits_beyond_those_of_the_file_are_said(tmp_path: Path, core: Core) ->
         assert made["next_experiment"]["why"] == f"w.{sentence}"
 
 
+def test_a_towing_plan_says_that_it_does_not_keep_the_travel(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path)
+    core.answer = findings("insufficient_data", next_experiment={"why": "w.", "plan": PLAN, "motion": None})
+    for asked, told in (("velocity_rad_s=0.5", False), ("travel_rad=-1:1", True)):
+        run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "o", "--force", "--limits", asked)
+        why = json.loads((tmp_path / "o" / "findings.json").read_text())["next_experiment"]["why"]
+        assert ("travel_rad of --limits is not kept" in why) == told
+
+
 def test_a_known_load_of_the_map_is_no_sensor(tmp_path: Path, core: Core) -> None:
     paths = write_runs(tmp_path, numbers=(1,))
     names = ("current_a", "motor_position_rad", "link_position_rad")

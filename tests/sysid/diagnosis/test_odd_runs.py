@@ -43,6 +43,11 @@ def current_gain(table: RunTable, c: JointColumns) -> JointColumns:
     return replace(c, current_a=1.08 * c.current_a)
 
 
+def backward_sensor(table: RunTable, c: JointColumns) -> JointColumns:
+    assert c.torque_nm is not None
+    return replace(c, torque_nm=-c.torque_nm)
+
+
 def sensor_zero(table: RunTable, c: JointColumns) -> JointColumns:
     assert c.torque_nm is not None
     return replace(c, torque_nm=c.torque_nm + 0.05 * PLAIN.rated_torque_nm)
@@ -79,6 +84,16 @@ def test_one_run_is_named_and_the_joint_is_not(
     assert (found["run"], found["what"], found["joint"]) == ("run2", what, odd.joint)
     assert odd.text in findings.channel_notes
     assert findings.used_runs == tuple(name for name in findings.runs if name != "run2")
+
+
+def test_a_gain_is_a_part_of_the_true_value_and_the_other_direction_is_said() -> None:
+    """What is regressed on is what was read: 8 % too much is 7.4 % of it, the other direction twice of it."""
+    (more,) = diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).odd_runs
+    assert more.value == pytest.approx(0.08, abs=0.003)
+    (back,) = diagnose(changed(runs(), [2], backward_sensor), {1: PLAIN}).odd_runs
+    assert (back.run, back.what, back.channel) == ("run2", "gain", "torque_nm")
+    assert back.value == pytest.approx(-2.0, abs=0.05)
+    assert "torque_nm has the opposite direction of that in the other runs, 1" in back.text
 
 
 def test_what_all_runs_share_is_an_effect_and_days_are_none() -> None:

@@ -206,10 +206,59 @@ def test_uneven_time_is_brought_to_equal_steps(run: RunTable, seed: int) -> None
     assert len(result.notes) == 1
 
 
-def test_jitter_of_stamps_is_left_alone(run: RunTable) -> None:
-    jitter = run.time_s + 1e-4 * np.sin(np.arange(len(run.time_s)))
-    table = RunTable(jitter, run.joints)
-    assert on_even_steps(table, "r") == (table, [])
+@pytest.mark.parametrize("speed", [40.0, 300.0])
+def test_a_fast_motor_rolls_over_in_many_rows(speed: float) -> None:
+    """At 250 Hz a motor at 300 rad/s has five rows to a turn: every fifth step is a jump."""
+    t = 0.004 * np.arange(3000)
+    position = speed * np.sin(t)
+    table = RunTable(t, {1: JointColumns(motor_position_rad=np.mod(position, 2.0 * math.pi))})
+    made, notes = unwrapped(table, "r")
+    again = made.joints[1].motor_position_rad
+    assert again is not None
+    assert np.allclose(again - again[0], position - position[0])
+    assert "found it rolling over by 6.283 rad" in notes[0].text
+    degrees = RunTable(t, {1: JointColumns(motor_position_rad=np.rad2deg(position))})
+    assert unwrapped(degrees, "r")[1] == []
+
+
+def swing(time_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> RunTable:
+    """A joint that swings, with an encoder's rounding, sampled at these times."""
+    position = np.round(80.0 * np.sin(2.0 * time_s) / 1e-4) * 1e-4
+    return RunTable(time_s, {1: JointColumns(motor_position_rad=position, current_a=np.cos(2.0 * time_s))})
+
+
+@pytest.mark.parametrize("jitter", [1e-4, 4e-4])
+def test_jitter_of_the_samples_is_no_jitter_of_stamps(jitter: float) -> None:
+    t = 1e-3 * np.arange(8000) + jitter * np.sin(np.arange(8000.0))
+    table, notes = on_even_steps(swing(t), "r")
+    if jitter < 2e-4:
+        assert (table.time_s.tolist(), notes) == (t.tolist(), [])
+    else:
+        assert "resampled to equal steps" in notes[0].text
+
+
+@pytest.mark.parametrize(
+    ("spread", "digits"), [(8e-5, 9), (4e-4, 9), (5e-4, 3)], ids=["small", "large", "ms"]
+)
+def test_stamps_that_jitter_where_the_samples_do_not_are_not_believed(spread: float, digits: int) -> None:
+    """As a computer gives them, or rounded to milliseconds: at their word a motor at 160 rad/s jumps by 0.1 rad."""
+    rng = np.random.default_rng(4)
+    step = 1e-3 if spread < 1e-4 else 4e-3
+    true = step * np.arange(6000)
+    kept = np.sort(rng.choice(6000, 5950, replace=False))  # and rows are missing
+    table = swing(true[kept])
+    stamps = np.round(true[kept] + spread * np.clip(rng.normal(size=len(kept)), -3.0, 3.0), digits)
+    even, notes = on_even_steps(RunTable(stamps, table.joints), "r")
+    assert "the stamps jitter, not the samples; equal steps used" in notes[0].text
+    position = even.joints[1].motor_position_rad
+    assert position is not None
+    assert len(position) == pytest.approx(6000, abs=3)
+    whole = 80.0 * np.sin(2.0 * (even.time_s - stamps[0] + true[kept][0]))
+    assert np.sqrt(np.mean((position - whole) ** 2)) < 160.0 * 1e-3, (
+        "the clock is known to a fraction of a step"
+    )
+    rough = float(np.std(np.diff(position, 4)))
+    assert rough < 0.1 * float(np.std(np.diff(80.0 * np.sin(2.0 * stamps), 4))) + 2e-3
 
 
 @pytest.mark.parametrize(
@@ -320,6 +369,15 @@ def test_a_run_in_which_nothing_changes_is_not_used(run: RunTable) -> None:
     assert constant.endswith("dead channel, or a command")
     beside = checked(changed(run, dead))  # the other joint moves
     assert (beside.refused, set(beside.notes)) == ((), set(result.refused))
+
+
+def test_a_sensor_that_reads_one_number_is_dead_where_the_joint_moves(run: RunTable) -> None:
+    one = np.ones(len(run.time_s))
+    [line] = checked(changed(run, lambda c: replace(c, torque_nm=7.5 * one))).refused
+    assert line == (
+        "r.csv: j1.torque_nm: found 7.5 Nm in the whole run while the joint moves, expected a measurement that changes: "
+        "dead channel"
+    )
 
 
 def test_one_value_of_current_or_motion_is_said(run: RunTable) -> None:

@@ -176,6 +176,37 @@ def test_one_wrong_stamp_is_no_other_run(tmp_path: Path) -> None:
             read_pieces(path)
 
 
+def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
+    t = 0.002 * np.arange(2000.0)
+    rows = np.sort(np.concatenate((np.arange(2000), [700, 900, 900])))
+    cells = {"time_s": t[rows], "j1.current_a": np.sin(t)[rows]}
+    path = _table(tmp_path / "twice.csv", cells)
+    [run] = read_pieces(path)
+    assert run.table.time_s.tolist() == t.tolist()
+    assert run.notes == ("3 of 2003 rows left out: they are the row before once more",)
+    with pytest.raises(RunError, match=r"line 703: found time 1\.4 s after 1\.4 s, expected rising time"):
+        read_run(path)
+    cells["j1.current_a"][701] += 0.1  # one of both has a wrong time
+    with pytest.raises(RunError, match=r"line 703: found time 1\.4 s after 1\.4 s, expected rising time"):
+        read_pieces(_table(tmp_path / "stamp.csv", cells))
+
+
+def test_a_row_that_a_recorder_did_not_finish_is_left_out_and_said(tmp_path: Path) -> None:
+    path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0, "j1.motor_position_rad": T})
+    whole = path.read_text()
+    path.write_text(whole + "5.0,6.")
+    [run] = read_pieces(path)
+    assert run.table.time_s.tolist() == T.tolist()
+    assert run.notes == ("the last row left out: it ends after '5.0,6.'",)
+    with pytest.raises(RunError, match="found 2 cells, expected 3"):
+        read_run(path)
+    path.write_text(whole.rstrip())  # whole, without its line's end
+    assert read_pieces(path)[0].notes == ()
+    path.write_text(whole + "5.0,6.0\n")
+    with pytest.raises(RunError, match="found 2 cells, expected 3"):
+        read_pieces(path)
+
+
 def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
     current = np.random.default_rng(1).normal(size=len(T))
     cells = {"time_s": T, "j1.current_a": current, "j1.motor_position_rad": np.cumsum(current)}
@@ -211,6 +242,18 @@ def test_what_a_load_is_computed_from_cannot_be_blank(tmp_path: Path) -> None:
 def test_a_comma_separates_wherever_the_header_has_one(tmp_path: Path) -> None:
     path = _file(tmp_path, '"t; x; y",i\n0.0,1\n0.1,2\n')
     assert read_run(path, _map(time_s="t; x; y", j1__current_a="i")).table.time_s.tolist() == [0.0, 0.1]
+
+
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_comma_in_a_name_separates_nothing_where_the_rows_have_none(tmp_path: Path, separator: str) -> None:
+    path = _table(tmp_path / "a.csv", {"Zeit, ms": 1e3 * T, "Strom, A": T + 1.0}, separator)
+    columns = _map(time_s={"column": "Zeit, ms", "scale": 1e-3}, j1__current_a="Strom, A")
+    assert np.allclose(read_run(path, columns).table.time_s, T)
+    path.write_text(path.read_text().replace(".", ","))
+    with pytest.raises(
+        RunError, match=r"column 'Zeit, ms': found '.*', expected a finite number with a decimal point"
+    ):
+        read_run(path, columns)
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])

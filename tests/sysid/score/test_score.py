@@ -15,7 +15,7 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.files import write_run
-from jtqd.sysid.score.score import FREE, MOTOR, errors_on, rows_of
+from jtqd.sysid.score.score import FREE, MOTOR, errors_on, rows_of, visible_on
 from tests.estimator.fused_helpers import fused_joint
 
 TRUE = Joint(
@@ -56,6 +56,23 @@ def test_a_true_file_has_no_error_and_a_wrong_one_what_is_wrong() -> None:
     assert right.errors["estimator tob"] < 0.6 * wrong.errors["estimator tob"]
     assert "estimator efficiency" not in right.errors
     assert "simulation, torsion balance" not in right.errors  # one encoder
+
+
+def test_what_rounding_makes_of_the_acceleration_is_no_error() -> None:
+    """Positions of the motor in steps of 50 mrad at 100 Hz: a second difference of them is newton metres of noise."""
+    table = swing(0.3, 12.0, 100.0)
+    columns = table.joints[1]
+    assert columns.motor_position_rad is not None
+    coarse = replace(columns, motor_position_rad=np.round(columns.motor_position_rad / 0.05) * 0.05)
+    table = RunTable(table.time_s, {1: coarse})
+    wrong = errors_on("r", table, 1, WRONG).errors[MOTOR]
+    assert wrong == pytest.approx(0.5, rel=0.02)
+    heavier = replace(TRUE, rotor_inertia_kgm2=6e-5)
+    visible = visible_on("r", table, 1, WRONG)
+    assert visible.highest_hz != visible_on("r", table, 1, heavier).highest_hz
+    assert errors_on("r", table, 1, WRONG, visible).errors[MOTOR] == wrong
+    own, shared = (errors_on("r", table, 1, heavier, each).errors[MOTOR] for each in (None, visible))
+    assert own != shared, "two files are judged by the same part of a run"
 
 
 def test_with_one_encoder_there_is_no_torsion_to_estimate_from(
