@@ -23,10 +23,10 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
-from jtqd.sysid.diagnosis.leftover import Leftover, less_nuisances
+from jtqd.sysid.diagnosis.leftover import Leftover, less_nuisances, own_changes
 from jtqd.sysid.diagnosis.passes import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.refine import Refined
-from jtqd.sysid.diagnosis.regressors import LINE, Index, RunData
+from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
@@ -124,10 +124,9 @@ def _floor(dataset: Dataset, refined: Refined, channel: Channel) -> tuple[float,
     noise = np.concatenate(dataset.unexplained[channel])
     square = float(np.nanmean(noise**2))
     drift, count = 0.0, 0
-    usual = np.array([g.name != LINE for g in dataset.families])
-    for run, u in zip(refined.runs, refined.nuisances, strict=True):
+    for run, u in zip(refined.runs, own_changes(dataset, refined), strict=True):
         d = run.channels[channel]
-        part = (d.nuisances @ (u * usual)[d.families])[d.valid]
+        part = (d.nuisances @ u[d.families])[d.valid]
         if channel.balance == "torsion" and len(part):
             part = part - part.mean()
         drift += float(part @ part)

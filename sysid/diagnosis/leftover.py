@@ -42,6 +42,10 @@ _JUMP: Final = 0.01
 """Part of the rated torque by which the residual must move for an event."""
 _WANDER: Final = 0.006
 """Part of the rated torque (rms of means over seconds) from which a residual is not noise."""
+SHARED: Final = 5.0
+"""Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
+_OF_A_DAY: Final = ("zero", "viscous", "coulomb")
+"""Families that are the joint's where all runs share them; a torsion's zero is nobody's, `smooth` is what is near rest."""
 _LINE_RATIO: Final = 25.0
 _HZ_RATIO: Final = 25.0
 
@@ -118,14 +122,27 @@ class Leftover:
         return out
 
 
+def own_changes(dataset: Dataset, refined: Refined) -> FloatArray:
+    """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
+    differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
+    left over where no cause says it.
+    """
+    changes = np.array(refined.nuisances)
+    changes[:, [g.name == LINE for g in dataset.families]] = 0.0
+    pieces = np.array(refined.mixed.pieces)
+    runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
+    sigma = np.array([np.inf if g.name not in _OF_A_DAY else g.sigma for g in dataset.families])
+    shared = runs.mean(axis=0)
+    shared[np.abs(shared) < SHARED * sigma / np.sqrt(len(runs))] = 0.0
+    return np.asarray(changes - shared)
+
+
 def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
     """Return what the causes leave, less the runs' own changes but not less strange lines, events with it [run][n]."""
-    use = np.array([g.name != LINE for g in dataset.families])
     out: dict[Channel, list[FloatArray]] = {}
-    for r, (run, u) in enumerate(zip(refined.runs, refined.nuisances, strict=True)):
+    for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
         for channel, d in run.channels.items():
-            weight = np.where(use[d.families], u[d.families], 0.0)
-            rest = d.residual - d.nuisances @ weight
+            rest = d.residual - d.nuisances @ u[d.families]
             out.setdefault(channel, []).append(np.where(dataset.valid_or_event(r, channel), rest, np.nan))
     return out
 

@@ -11,9 +11,10 @@ import pytest
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Findings, OddRun, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.odd_runs import Comparison, apart_from_others, own_deviations
+from jtqd.sysid.diagnosis.odd_runs import Comparison, Deviation, apart_from_others, echo, own_deviations
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 
 NOMINAL = load_joint(shipped("joint1.yaml"))
@@ -128,7 +129,7 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
     rows = [rng.normal(size=(2000, 3)) for _ in range(5)]  # an effect of all, a deviation, the residual
     for k, row in enumerate(rows):
         row[:, 2] = 0.7 * row[:, 0] + (own * row[:, 1] + strange * row[:, 2] if k == 2 else row[:, 2])
-    comparison = Comparison(np.array([row.T @ row for row in rows]), 1)
+    comparison = Comparison(np.array([row.T @ row for row in rows]), 1, np.zeros((5, 1)))
     assert comparison.drop([0], [(2, 0)], 2, 0) > 300.0, "certain in both cases"
     assert comparison.explains_what_is_apart([0], [(2, 0)], (2, 0), np.full(5, 2000.0)) == odd
 
@@ -136,6 +137,36 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
 def test_a_run_that_is_set_apart_by_something_else_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Comparison, "explains_what_is_apart", lambda *_: False)
     assert diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).odd_runs == ()
+
+
+def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
+    """A drive that is off in one run and shows noise: of that noise its own column says all, a gain of one more."""
+
+    def without_power(table: RunTable, c: JointColumns) -> JointColumns:
+        """Keep what the current has of the joint out of the sensor, too: the joint is towed."""
+        assert c.current_a is not None
+        assert c.torque_nm is not None
+        scale = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a
+        noise = 0.004 * PLAIN.rated_torque_nm / scale * np.random.default_rng(9).normal(size=len(c.current_a))
+        clean = rich_run(PLAIN, 22).joints[1].current_a
+        assert clean is not None
+        return replace(c, current_a=noise, torque_nm=c.torque_nm - scale * clean)
+
+    table = dict(changed(runs(), [2], without_power))["run2"]
+    (signals,), _ = usable_signals([("run2", table)], {1: PLAIN}, (1,))
+    gain, zero = Deviation("gain", "current_a", 1, 0.01, ""), Deviation("zero", "current_a", 1, 0.004, "")
+    assert 0.5 < echo(gain, signals, 5) < 2.0
+    assert echo(zero, signals, 5) == 0.0
+    (driven,), _ = usable_signals([("run1", dict(runs())["run1"])], {1: PLAIN}, (1,))
+    assert echo(gain, driven, 5) < 1e-3
+    rng = np.random.default_rng(4)
+    rows = [rng.normal(size=(2000, 3)) for _ in range(5)]
+    rows[2][:, 2] += rows[2][:, 1]
+    grams = np.array([row.T @ row for row in rows])
+    for own, far in ((0.0, True), (1.0, False)):
+        echoes = np.zeros((5, 1))
+        echoes[2] = own
+        assert (Comparison(grams, 1, echoes).far([0], (2, 0), [gain]) is not None) == far
 
 
 def test_text_says_what_run_and_channel() -> None:

@@ -27,7 +27,15 @@ from jtqd.sysid.diagnosis.gaps import _repeats
 from jtqd.sysid.diagnosis.guards import beyond_bounds, free_run_fall
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, Model
 from jtqd.sysid.diagnosis.noise import ORDER, Noise
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, free_names, parameter, present_effects, refine
+from jtqd.sysid.diagnosis.refine import (
+    PresentEffect,
+    Refined,
+    free_names,
+    parameter,
+    present_effects,
+    refine,
+    set_torsion,
+)
 from jtqd.sysid.diagnosis.regressors import contribution, families
 from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
@@ -151,6 +159,22 @@ def test_the_gain_is_that_of_the_truth(refined: tuple[Dataset, Refined]) -> None
     assert gain.free_run_after < gain.free_run_before
     assert gain.free_run_position_after < gain.free_run_position_before
     assert free_run_fall(dataset, result, 0) > 0.0
+
+
+def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for() -> None:
+    """Iterated, K d = tau - K3 d^3 swings out where 3 K3 d^2 is more than K."""
+    s = signals(rigid_run(PLAIN, 0.3))
+    stiffness = PLAIN.stiffness_nm_per_rad
+    twist = PLAIN.rated_torque_nm / stiffness
+    s.state.torque_nm = np.linspace(-1.3, 1.3, len(s.time_s)) * PLAIN.rated_torque_nm
+    for cubic in (1.5, 0.02, -0.05):
+        values = {"stiffness_nm_per_rad": 0.9 * stiffness, "cubic_nm_per_rad3": cubic * stiffness / twist**2}
+        set_torsion(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, values, tuple(values))])
+        d = s.state.torsion_rad
+        spring = values["stiffness_nm_per_rad"] * d + values["cubic_nm_per_rad3"] * d**3
+        assert spring == pytest.approx(s.state.torque_nm, abs=1e-3 * PLAIN.rated_torque_nm)
+    set_torsion(s, ())
+    assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / stiffness)
 
 
 def test_a_step_stays_in_range_and_is_not_too_long() -> None:

@@ -8,9 +8,12 @@ import pytest
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
+from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.file_values import file_values
+from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
 from jtqd.sysid.runs.joints import UsageError
+from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
 JOINT = load_joint(shipped("joint1.yaml"))
@@ -81,6 +84,24 @@ def test_an_effect_is_absent_or_given(without: str, given: str, refused: bool) -
             check_effects([without], [given])
     else:
         check_effects([without], [given])
+
+
+@pytest.mark.parametrize(("without", "given"), [("coulomb_friction", ""), ("", "coulomb_friction")])
+def test_what_all_runs_lack_is_no_noise_where_its_name_may_not_be_said(without: str, given: str) -> None:
+    """The runs' own changes took it: `no_gap`, with a noise floor as high as the gap."""
+    friction = JOINT.friction
+    plain = replace(JOINT, efficiency=None, friction=replace(friction, stribeck_nm=0.0))
+    more = replace(
+        plain, friction=replace(plain.friction, coulomb_nm=friction.coulomb_nm + 0.04 * plain.rated_torque_nm)
+    )
+    runs = [(f"run{k}", rich_run(more, 40 + k, noise=2e-3)) for k in range(4)]
+    scope = scope_of([without] if without else [], [given] if given else [], {1: plain})
+    found = diagnose(runs, {1: plain}, scope)
+    assert found.verdict == UNEXPLAINED
+    gap = next(g for g in found.gaps if g.balance == "motor")
+    assert gap.rmse_nm == pytest.approx(0.04 * plain.rated_torque_nm, rel=0.1)
+    assert gap.noise_floor_nm < 0.3 * gap.rmse_nm
+    assert diagnose(runs, {1: more}, scope).verdict == NO_GAP
 
 
 def test_given_is_what_the_file_has() -> None:
