@@ -11,7 +11,7 @@ cdef struct AgreementLaw:
     double gain
     double zero  # square [Nm^2]
     double relevant, lowered  # squares [Nm^2]
-    double level_square, gain_factor
+    double level_square, gain_factor, zero_square
     bint turned  # the file has what the views differ by over the motor's turn
     double own[TURN_WAVES][TURN_PARTS]
     double whitening[TURN_SUMS]  # W: covariance^-1 = W'W

@@ -12,11 +12,11 @@ states count beside them: the gain (stiffness against torque constant), and what
 taken off. The joint file has the level of each that the runs of the fit kept below, each run judged by a fit on others (section
 `fused.agreement`). Beyond it
 
-    doubt^2 = level^2 ([slow - slow_0]+ + [fast - fast_0]+) + [left^2 - left_0^2]+ + (gain [|g| - g_0]+ tau)^2
+    doubt^2 = level^2 ([slow - slow_0]+ + [fast - fast_0]+) + zero^2 [left^2 - left_0^2]+ + (gain [|g| - g_0]+ tau)^2
     sigma^2 = (as fused)^2 + (max(alpha, 1 - alpha) doubt)^2
 
-level, gain: `level_factor`, `gain_factor` of the section, above 1: errors that the slow states take for friction or for a zero,
-and a gain's prior, hide a part.
+level, gain, zero: `level_factor`, `gain_factor`, `zero_factor` of the section, above 1: errors that the slow states take for
+friction or for a zero, and the priors of gain and friction, which take a part of a zero, hide a part.
 
 The status is lowered by a doubt of LOWER_SIGMAS sigmas and LEAST_SHARE of the rated torque; where the file says what ordinary days
 have (`lowered_nm`), by more than that, counting of the gain only what is surely one, |g| - SURE_SIGMAS sigma_g: a joint that is
@@ -49,6 +49,7 @@ from jtqd.estimator.zeros cimport (
     ZerosLaw,
     ZerosState,
     completes,
+    early_factor,
     fill_zeros,
     known_nm2,
     left_behind_nm,
@@ -101,6 +102,7 @@ cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
     law.gain, law.zero = agreement.gain, agreement.zero_nm**2
     law.lowered = agreement.lowered_nm**2
     law.level_square, law.gain_factor = agreement.level_factor**2, agreement.gain_factor
+    law.zero_square = agreement.zero_factor**2
     if agreement.turn is not None:
         fill_turn(law, agreement.turn)
     return 0
@@ -140,7 +142,7 @@ cdef void follow_agreement(
     s.slow = _level(s.slow, s.trend * s.trend, dt)
     s.fast = _level(s.fast, rest * rest, dt)
     s.doubt = law.level_square * (fmax(0.0, s.slow - law.slow) + fmax(0.0, s.fast - law.fast))
-    s.doubt += fmax(0.0, left_nm * left_nm - law.zero)
+    s.doubt += law.zero_square * fmax(0.0, left_nm * left_nm - law.zero)
     s.gain_doubt = law.gain_factor * fmax(0.0, fabs(gain) - law.gain)
 
 
@@ -359,15 +361,15 @@ def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, to
 def followed(
     fused, rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness, bint tracked=True
 ):
-    """Return (torsion, current, known, doubt, gain) of a run from its start: what the service adds to values and sigma.
+    """Return (torsion, current, known, doubt, gain, early) of a run from its start: what the service adds to values and sigma.
 
     torsion, current: what tracked zeros add to both paths [Nm]; known: what they take off s_t^2 [Nm^2]; doubt [Nm^2] and its
-    gain, as of `doubt_of`. Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope:
+    gain, as of `doubt_of`; early: factor of the spread, 1 without zeros of the days. Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope:
     dL/draw of the loss; stiffness: d tau_t/d d of the spring [Nm/rad]. tracked: zeros are taken off.
     """
     columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness)
     cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
-    out = np.zeros((5, x.shape[0]))
+    out = np.zeros((6, x.shape[0]))
     cdef double[:, ::1] to = out
     cdef ZerosLaw law
     cdef ZerosState s
@@ -384,6 +386,7 @@ def followed(
         link, current = x[k, 7] * s.link_rad, -(1.0 - x[k, 6]) * s.current_a
         to[0, k], to[1, k], to[2, k] = link, current, known_nm2(&law, &s)
         to[3, k], to[4, k] = agreement.doubt, agreement.gain_doubt
+        to[5, k] = early_factor(&law, to[2, k])
         if completes(&s, x[k, 0], x[k, 1] + link - current, x[k, 2], x[k, 3], x[k, 4] + link, x[k, 5] - law.spread_nm):
             dt = s.block.dt
             innovation = update_zeros(&law, &s, x[k, 7], x[k, 6])

@@ -29,6 +29,9 @@ LOWERED: Final = 0.99
 LEVEL_FACTOR: Final = 2.8
 GAIN_FACTOR: Final = 4.0
 """Of `agreement.pyx`, chosen with QUANTILE: larger ones cover what has changed no better."""
+ZERO_FACTOR: Final = 1.3
+"""Of `agreement.pyx`: chosen on runs that no figure is reported on. Until the joint has moved both ways, the filter
+finds less of a zero than there is: friction takes a part."""
 _FEWEST: Final = 200
 """Blocks, 3 s of motion at 1 kHz: from less no level can be told."""
 _FLOOR_NM: Final = 1e-3
@@ -53,6 +56,7 @@ def fit_agreement(levels: Callable[[Agreement | None], Sequence[Levels]]) -> Agr
         zero_nm=level(left),
         level_factor=LEVEL_FACTOR,
         gain_factor=GAIN_FACTOR,
+        zero_factor=ZERO_FACTOR,
     )
     doubt = np.concatenate([run[-1] for run in levels(found)])
     return replace(found, lowered_nm=max(float(np.quantile(doubt, LOWERED)), _FLOOR_NM))

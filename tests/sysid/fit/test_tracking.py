@@ -14,7 +14,14 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.fit.fused import path_residuals, tracking_of_unseen
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.fit.torsion_signals import torsion_now, torsion_through
-from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S, fit_tracking, worth_it
+from jtqd.sysid.fit.tracking import (
+    SATURATION_RAD_S,
+    TRACKING_RAD_S,
+    WAVE_RAD_S,
+    by_speed,
+    fit_tracking,
+    worth_it,
+)
 from tests.estimator.fused_helpers import fused_joint, twisted
 from tests.estimator.test_torsion_bandwidth import SLIPPING, lossless
 
@@ -70,6 +77,16 @@ def test_what_an_estimate_of_now_errs_by_more_is_found_and_nothing_where_nothing
     assert (found.rate_rad_s, found.wave_rad_s) == (TRACKING_RAD_S, WAVE_RAD_S)
     assert found.sigma_nm == pytest.approx(0.08, rel=0.1)
     assert found.viscous_nms_per_rad == pytest.approx(0.06, rel=0.1)
+    assert found.saturation_rad_s == SATURATION_RAD_S[-1]
+    bent = [
+        e + rng.normal(0.0, 1.0, n) * np.sqrt(0.08**2 + 0.2**2 * v * v / (1.0 + (v / 0.8) ** 2))
+        for e, v in zip(errors, speed, strict=True)
+    ]
+    found = fit_tracking(errors, bent, speed)
+    assert found.saturation_rad_s == pytest.approx(0.8, rel=0.3)
+    v = np.array([0.0, 0.5, 1.0, 3.0])
+    missed = found.sigma_nm**2 + found.viscous_nms_per_rad**2 * by_speed(v, found.bend)
+    assert missed == pytest.approx(0.08**2 + 0.2**2 * v * v / (1.0 + (v / 0.8) ** 2), rel=0.15)
     same = fit_tracking(errors, errors, speed)
     assert (same.sigma_nm, same.viscous_nms_per_rad) == (0.0, 0.0)
 
