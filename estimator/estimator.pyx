@@ -469,7 +469,13 @@ cdef class FusedEstimator(Estimator):
             )
             if law.agreement.used:
                 follow_agreement(
-                    &law.agreement, &s.agreement, innovation, dt, s.zeros.x[4], left_behind_nm(&law.zeros, &s.zeros)
+                    &law.agreement,
+                    &s.agreement,
+                    innovation,
+                    dt,
+                    s.zeros.x[4],
+                    s.zeros.p[4][4],
+                    left_behind_nm(&law.zeros, &s.zeros),
                 )
 
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:

@@ -276,8 +276,9 @@ class Agreement:
 
     slow_nm, fast_nm: RMS levels of the difference's trend and of the rest; gain: of one path against the other; zero_nm: a
     link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status; 0: not
-    known; level_factor, gain_factor, zero_factor: how much larger an error is than its trace in the difference; turn: waves
-    over the motor's turn, None: not known. All: agreement.pyx.
+    known; level_factor, gain_factor, zero_factor: how much larger an error is than its trace in the difference; gain_sigmas:
+    of its own standard deviations, what of a gain is no doubt, in `gain` neither; turn: waves over the motor's turn, None:
+    not known. All: agreement.pyx.
     """
 
     slow_nm: Annotated[float, limits("Nm", gt=0.0)]
@@ -288,6 +289,7 @@ class Agreement:
     level_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 1.4
     gain_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 2.0
     zero_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 1.0
+    gain_sigmas: Annotated[float, limits(ge=0.0, le=10.0)] = 0.0
     turn: Turn | None = None
 
     def __post_init__(self) -> None:

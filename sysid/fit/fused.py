@@ -208,7 +208,7 @@ def _agreement(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -
     """Return how far the two paths differ on unseen runs; None for too little motion."""
     fusion = Fusion(fused.sigma, True)
 
-    def of_runs(agreement: Agreement | None) -> list[Levels]:
+    def of_runs(agreement: Agreement) -> list[Levels]:
         usual = replace(fused, agreement=agreement)
         return [
             levels(
