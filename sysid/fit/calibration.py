@@ -36,9 +36,10 @@ from jtqd.sysid.fit.residuals import PathResiduals
 from jtqd.sysid.fit.served import Served, served
 from jtqd.sysid.fit.tracking import by_speed
 
-OTHER_MOTIONS: Final = 0.01
-"""What runs of the campaign are covered more than COVERAGE where zeros of the days are learned: of motions of other kinds as
-much less is held. Chosen on runs that no figure is reported on."""
+OTHER_MOTIONS: Final = 0.02
+OTHER_MOTIONS_LEARNED: Final = 0.01
+"""What runs of the campaign are covered more than COVERAGE where zeros differ from day to day, not tracked and tracked: of
+days of other motions as much less is held. Chosen on runs that no figure is reported on."""
 HALF_KNOWN: Final = 0.5
 LATEST: Final = 2.0
 """Largest `early` that is believed."""
@@ -64,14 +65,15 @@ def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float | No
         return _beyond(each, zeros, doubt_nm, fused.tracking)
 
     each = seen(plain, tracked=fused.zeros is None)
-    sigma = replace(fused.sigma, scale=_scale(beyond(each), each, COVERAGE))
+    coverage = COVERAGE if fused.zeros is None else COVERAGE + OTHER_MOTIONS
+    sigma = replace(fused.sigma, scale=_scale(beyond(each), each, coverage))
     if fused.zeros is None:
         return replace(fused, sigma=sigma)
     days = replace(fused.zeros, early=1.0)
     each = seen(replace(fused, zeros=days), tracked=True)
     days = replace(days, early=early(beyond(each), each, days.spread_nm))
     each = seen(replace(fused, zeros=days), tracked=True)
-    scale = _scale(beyond(each), each, COVERAGE + OTHER_MOTIONS)
+    scale = _scale(beyond(each), each, COVERAGE + OTHER_MOTIONS_LEARNED)
     return replace(fused, sigma=sigma, zeros=replace(days, scale=scale))
 
 
