@@ -18,7 +18,7 @@ class ChannelDelay(Effect):
     name = "channel_delay"
     group = "measurement"
     equation = "reading(t) = truth(t - d): sensor = -d dtau/dt, current = -d di/dt, link = -d omega_l"
-    source = "first-order Taylor expansion of a shift in time"
+    source = "a shift in time; rates are means over it (age_s), in the loop its first-order Taylor expansion"
     tell_tale = "A loop between the channel and what it is compared with, whose area grows with frequency."
     confused_with = ("rotor_inertia", "hysteresis", "viscous_friction")
     experiment = "excitation"
@@ -46,13 +46,17 @@ class ChannelDelay(Effect):
             return full(0.0, s.link_velocity_rad_s)
         return -p["delay_s"] * s.link_velocity_rad_s
 
+    def age_s(self, p: Values) -> float:
+        """Return the delay: reading(t) - truth(t) = reading(t) - reading(t + d) is -d times the mean rate in between."""
+        return p["delay_s"]
+
     def at_sensor_of(self, p: Values) -> bool:
         """Return whether it is the sensor that is late."""
         return p["channel"] == SENSOR
 
     def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column per channel."""
-        return tuple(linear("delay_s", 1e-3, channel=channel) for channel in (SENSOR, CURRENT, LINK))
+        """Return one column per channel, of a delay so small that a mean rate is that of the moment."""
+        return tuple(linear("delay_s", 1e-5, channel=channel) for channel in (SENSOR, CURRENT, LINK))
 
 
 EFFECT = ChannelDelay()

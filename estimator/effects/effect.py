@@ -258,6 +258,10 @@ class Effect:
         """Return whether it belongs to the coupling's sensor with these parameters (see `at_sensor`)."""
         return self.at_sensor
 
+    def age_s(self, p: Values) -> float:
+        """Return how old a reading is with these parameters, s: rates that the hooks use are means over so long."""
+        return 0.0
+
     def at_motor_of(self, p: Values) -> bool:
         """Whether with these parameters it is the motor's encoder that reads wrong: by -G link_rad, motor side."""
         return False

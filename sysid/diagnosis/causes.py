@@ -18,9 +18,9 @@ from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.steadiness import steadiness
 from jtqd.sysid.fit.friction import student_975
 
-INACCURATE: Final = 0.06
-"""Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing, first
-order in a delay): no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
+INACCURATE: Final = 0.04
+"""Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing):
+no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
 """
 _OFFSET, _ASYMMETRY = "current_offset", "friction_asymmetry"
 

@@ -132,7 +132,8 @@ def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[Flo
 
 def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
     """Return what the rows of held channels (`runs.held`) are wrong by: rms over the run that has most of it [Nm], beyond
-    what is usual in the others; channels without such rows are left out.
+    what is usual in the others; at rest, where the balance is not known, against a straight line between the rows around
+    them. Channels without such rows are left out.
     """
     return {c: max(e / n for e, n in runs) ** 0.5 for c, runs in _held(dataset, refined).items()}
 
@@ -155,12 +156,14 @@ def _held(dataset: Dataset, refined: Refined) -> dict[Channel, list[tuple[float,
     out: dict[Channel, list[tuple[float, int]]] = {}
     for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):
         for channel, d in run.channels.items():
-            if d.held is None or not d.held.any():
+            if d.held is None or not (d.held.any() or len(d.at_rest_nm)):
                 continue
             rest = left.channels[channel].residual - d.nuisances @ u[d.families]
             usual = float(np.mean(rest[d.valid] ** 2)) if d.valid.any() else 0.0
-            excess = max(float(np.sum(rest[d.held] ** 2 - usual)), 0.0)
-            out.setdefault(channel, []).append((excess, int(np.sum(_measured_or_held(d)))))
+            excess = max(float(np.sum(rest[d.held] ** 2 - usual)), 0.0) + float(np.sum(d.at_rest_nm**2))
+            out.setdefault(channel, []).append(
+                (excess, int(np.sum(_measured_or_held(d))) + len(d.at_rest_nm))
+            )
     return out
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -139,7 +139,8 @@ Index = np.ndarray[tuple[int], np.dtype[np.intp]]
 @dataclass
 class ChannelData:
     """One channel of one run, binned: valid [n], residual [n], regressors [n, p] of columns `index` [p], nuisances
-    [n, q] of families `families` [q]. held [n]: bins that are not valid only because a channel is held (None: no such).
+    [n, q] of families `families` [q]. held [n]: bins that are not valid only because a channel is held (None: no such);
+    at_rest_nm: what a held channel is worth where the balance is not known anyway, one of each such bin.
     """
 
     valid: BoolArray
@@ -149,6 +150,7 @@ class ChannelData:
     nuisances: FloatArray
     families: Index
     held: BoolArray | None = None
+    at_rest_nm: FloatArray = field(default_factory=lambda: np.empty(0))
 
 
 @dataclass
@@ -269,10 +271,19 @@ def run_data(
                 np.column_stack([c for _, c in there]),
                 np.array([k for k, _ in there], np.intp),
                 all_in_bin(s.known(balance), samples) & ~valid if balance in s.held else None,
+                _held_at_rest(s, balance, samples),
             )
     _fill(channels, run, candidates, samples)
     axes = {s.number: _axes(s, samples) for s in run}
     return RunData(run[0].run, binned(run[0].time_s, samples), channels, axes)
+
+
+def _held_at_rest(s: JointSignals, balance: str, samples: int) -> FloatArray:
+    """Return what `ChannelData.at_rest_nm` is."""
+    if balance not in s.held_nm:
+        return np.empty(0)
+    worth = binned(s.held_nm[balance], samples)
+    return np.asarray(worth[(worth != 0.0) & ~all_in_bin(s.known(balance), samples)])
 
 
 def _fill(

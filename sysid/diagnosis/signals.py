@@ -174,6 +174,7 @@ class JointSignals:
     held: Mapping[str, BoolArray] = field(
         default_factory=dict
     )  # by balance: rows of a held channel (`runs.held`)
+    held_nm: Mapping[str, FloatArray] = field(default_factory=dict)  # by balance: what they are worth there
     of_position: bool = (
         True  # the acceleration is a second difference of the position, else one of the velocity
     )
@@ -210,12 +211,16 @@ class JointSignals:
 
     def state_of(self, effect: Effect, p: Values) -> State:
         """Return what the hooks of an effect with parameters p use: the one sensor has one temperature, for every joint's
-        balances.
+        balances; rates are means over the age of a reading.
         """
-        if self.sensor_temperature_c is None or not effect.at_sensor_of(p):
+        other: dict[str, FloatArray] = {}
+        if self.sensor_temperature_c is not None and effect.at_sensor_of(p):
+            other["temperature_c"] = self.sensor_temperature_c
+        if age := effect.age_s(p):
+            other |= {name: mean_ahead(self.time_s, getattr(self.state, name), age) for name in _RATES}
+        if not other:
             return self.state
-        fields = {name: getattr(self.state, name) for name in State.__slots__}
-        return State(**{**fields, "temperature_c": self.sensor_temperature_c})
+        return State(**{name: getattr(self.state, name) for name in State.__slots__} | other)
 
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
@@ -242,9 +247,20 @@ class JointSignals:
         return np.asarray(np.sin(turn) / turn)
 
 
+_RATES: Final = ("current_rate_a_s", "link_velocity_rad_s", "torque_rate_nm_s")
+"""What the hooks of an effect on a reading that is old use."""
+
+
+def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
+    """Return the mean of x from each time to span_s later [n], by Simpson's rule; the last value goes on after the end."""
+    middle, end = (np.interp(time_s + part * span_s, time_s, x) for part in (0.5, 1.0))
+    return np.asarray((x + 4.0 * middle + end) / 6.0)
+
+
 def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """Return the signals with the samples at which a column is held, and those that its smoothing reaches, not usable:
-    torque in both balances, current in the motor's.
+    torque in both balances, current in the motor's. `held_nm` is what they are from a straight line between those around
+    them: at rest nothing else says it.
     """
     if not held:
         return s
@@ -253,13 +269,19 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     reach = {TORSION: calmed, MOTOR: calmed}
     if s.visible.parts:
         reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
-    out = {}
+    out, worth = {}, {}
+    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
+    apart = {name: h.apart for name, h in held.items()}
     for balance, columns in ((TORSION, ("torque_nm",)), (MOTOR, ("torque_nm", "current_a"))):
         rows = [held[name].rows for name in columns if name in held]
         if rows:
+            units = [
+                (scale if name == "current_a" else -1.0, apart[name]) for name in columns if name in held
+            ]
+            worth[balance] = np.asarray(sum(unit * x for unit, x in units))
             wide = max(1, round(reach[balance] / step)) + 2  # and that of a second difference
             out[balance] = np.convolve(np.any(rows, axis=0), np.ones(2 * wide + 1), "same") > 0.5
-    return replace(s, held=out)
+    return replace(s, held=out, held_nm=worth)
 
 
 def with_one_sensor(run: Sequence[JointSignals]) -> list[JointSignals]:

@@ -7,6 +7,9 @@
   asks nothing of the partner: noise does not stop because the load is constant. A current of exactly zero, or without
   power, may be free of noise.
 
+Only a moving joint shows that a number is stuck: at rest a channel may have nothing to tell. What is stuck in motion stays
+so until the number changes, at rest or not.
+
 Such rows are left out of a diagnosis (`held_rows`), and a line says so (`check_held`).
 """
 
@@ -46,10 +49,13 @@ _MOMENTS: Final = 6
 
 @dataclass(frozen=True)
 class Held:
-    """clipped, stuck: rows of one channel [n]."""
+    """clipped, stuck: rows of one channel [n]; apart: what they are from the straight line between the rows before and
+    after, in the unit of the channel, 0 elsewhere [n].
+    """
 
     clipped: BoolArray
     stuck: BoolArray
+    apart: FloatArray
 
     @property
     def rows(self) -> BoolArray:
@@ -73,8 +79,8 @@ def clip_limits(tables: Iterable[RunTable], joints: Mapping[int, Joint]) -> dict
 def held_rows(
     time_s: FloatArray, run: JointColumns, joint: Joint, limits: Limits | None = None
 ) -> dict[str, Held]:
-    """Return per column what of it is held, asked of the moving joint; columns without such rows are left out. limits: those
-    of other runs.
+    """Return per column what of it is held, from where the joint moved on; columns without such rows are left out. limits:
+    those of other runs.
     """
     velocity = run.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
     if velocity is None or run.current_a is None or run.torque_nm is None:
@@ -86,19 +92,28 @@ def held_rows(
         powered &= run.enabled >= 0.5
     out = {}
     for name, values, partner, noisy in (
-        ("torque_nm", run.torque_nm, motor, moving),
-        ("current_a", run.current_a, run.torque_nm, moving & powered),
+        ("torque_nm", run.torque_nm, motor, np.ones_like(moving)),
+        ("current_a", run.current_a, run.torque_nm, powered),
     ):
         moved = _MOVED[name] * joint.rated_torque_nm
         stuck, clipped = _while_partner_moves(time_s, values, partner, moving, moved)
         for limit in (limits or {}).get(name, ()):
             clipped |= np.abs(values) == limit
-        noiseless = _without_noise(values, noisy)
+        noiseless = _without_noise(values, noisy, moving)
         ends = [v for v in (np.min(values), np.max(values)) if v != values[-1]]
         clipped |= np.isin(values, np.unique(values[noiseless & np.isin(values, ends)]))
         stuck |= noiseless
         if stuck.any() or clipped.any():
-            out[name] = Held(clipped, stuck & ~clipped)
+            out[name] = Held(clipped, stuck & ~clipped, _apart(values, stuck | clipped))
+    return out
+
+
+def _apart(values: FloatArray, rows: BoolArray) -> FloatArray:
+    """Return what `Held.apart` is."""
+    out = np.zeros(len(values))
+    if not rows.all():
+        at = np.arange(len(values))
+        out[rows] = values[rows] - np.interp(at[rows], at[~rows], values[~rows])
     return out
 
 
@@ -162,7 +177,7 @@ def _while_partner_moves(
             continue
         if max(_moved(partner[start:end]) for start, end in parts) > 0.2 * moved:
             limits.add(value)
-    return stuck & moving, np.isin(values, list(limits))
+    return stuck, np.isin(values, list(limits))
 
 
 def _stretches(values: FloatArray) -> tuple[list[int], list[int]]:
@@ -180,18 +195,21 @@ def _moved(partner: FloatArray) -> float:
     return float(np.ptp(partner[:whole].reshape(-1, width).mean(axis=1)))
 
 
-def _without_noise(values: FloatArray, asked: BoolArray) -> BoolArray:
-    """Return rows [n] of those asked that repeat one number where the rows around them have noise of several steps."""
+def _without_noise(values: FloatArray, noisy: BoolArray, moving: BoolArray) -> BoolArray:
+    """Return rows [n] that repeat one number where the rows around them have noise of several steps; noisy: rows that must
+    have noise, as far as the joint is moving.
+    """
     out = np.zeros(len(values), np.bool_)
     repeats = np.concatenate(([0, 0], np.cumsum(np.diff(values) == 0.0)))  # among rows before k
     for start, end in zip(*_stretches(values), strict=True):
-        if not asked[start:end].all():
+        seen = int(np.count_nonzero(moving[start:end]))
+        if not seen or not noisy[start:end].all():
             continue
         wide = max(_BESIDE, end - start)
         sides = [(max(0, start - wide), start), (end, min(len(values), end + wide))]
         sides = [(a, b) for a, b in sides if b - a >= _BESIDE // 2]
         shares = [(repeats[b] - repeats[a + 1] + 1.0) / (b - a + 1.0) for a, b in sides]
-        if not sides or (end - start - 1) * math.log(max(shares)) > math.log(_CHANCE / len(values)):
+        if not sides or (seen - 1) * math.log(max(shares)) > math.log(_CHANCE / len(values)):
             continue
         if all(_noise_in_steps(values[a:b]) > _NOISE for a, b in sides):
             out[start:end] = True

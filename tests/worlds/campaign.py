@@ -70,13 +70,19 @@ def jobs(bench: Bench, seed: int, counts: Counts) -> list[Job]:
     """Return all sets of a campaign in a mixed order; the same whatever the recorder."""
     out: list[Job] = []
     plain: list[int] = []
-    there = [name for name in bench.effects if hidden_size(bench.name, name, FULL) is not None]
+    usable = {
+        name: [v for v in bench.variants(name) if hidden_size(bench.name, name, FULL, v) is not None]
+        for name in bench.effects
+    }
+    there = [name for name in bench.effects if usable[name]]
 
     def effect(rng: np.random.Generator, name: str, factor: float) -> Hidden:
         places = bench.places(name)
-        size = hidden_size(bench.name, name, factor)
+        place = places[int(rng.integers(len(places)))]
+        variant = usable[name][int(rng.integers(len(usable[name])))]
+        size = hidden_size(bench.name, name, factor, variant)
         assert size is not None
-        return Hidden(name, places[int(rng.integers(len(places)))], size)
+        return Hidden(name, place, size, variant)
 
     def add(kind: str, label: str, hide: Any) -> None:
         number = len(out)
@@ -138,6 +144,13 @@ def run_job(bench_name: str, job: Job, recorder_name: str) -> dict[str, Any]:
         "draw_s": round(made - begin, 2),
         "diagnose_s": round(time.monotonic() - made, 2),
         "reasons": list(findings.reasons[:3]),
+        "intervals": [
+            [c.name, parameter, t["parameters"].get(parameter), found.value, *found.ci95]
+            for t in drawn.truth
+            for c in findings.causes
+            if (c.name, c.joint) == (t["name"], t["joint"])
+            for parameter, found in c.parameters.items()
+        ],
         **asdict(outcome),
     }
 
@@ -167,8 +180,8 @@ def read(path: Path) -> tuple[dict[str, Any], dict[str, Outcome]]:
                 break
             raise ValueError(f"{path}: line {number}: found no JSON, expected a set") from None
         key = values.pop("key")
-        for name in ("draw_s", "diagnose_s", "reasons"):
-            values.pop(name)
+        for name in ("draw_s", "diagnose_s", "reasons", "intervals"):
+            values.pop(name, None)
         outcomes[key] = Outcome(**values)
     return header, outcomes
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from tests.paths import ROOT
 from tests.worlds.sets import SENSOR, Array, Columns, Hidden, Set
-from tests.worlds.units import parameters, rated_nm
+from tests.worlds.units import CHANNELS, parameters, rated_nm
 
 FOLDER: Final = ROOT / "models" / "kinova_gen3"
 FILES: Final = ("opti_traj_testing1", "RunTrajectory1")
@@ -115,6 +115,10 @@ class MeasuredBench:
         )
         return (SENSOR,) if at_sensor else (1,)
 
+    def variants(self, name: str) -> Sequence[str]:
+        """Return the variants of an effect: there is no link encoder that could be late."""
+        return CHANNELS[:2] if name == "channel_delay" else ("",)
+
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
         """Return one set."""
         rng = np.random.default_rng([seed, _DRAW])
@@ -129,9 +133,7 @@ class MeasuredBench:
         for k, item in enumerate(hidden):
             own = np.random.default_rng([seed, _HIDDEN, k])
             if item.name in _PUT:
-                p = parameters(item.name, joint, item.size, own)
-                if item.name == "channel_delay":
-                    p["channel"] = float(p["channel"] > 0.5)
+                p = parameters(item.name, joint, item.size, own, item.variant)
                 late = item.name == "channel_delay" and p["channel"] == 0.0
                 for table in tables:
                     _PUT[item.name](table, joint, p)

@@ -12,7 +12,7 @@ from tests.worlds.motions import SHAPES, STEP_S, Motion, draw_motion
 from tests.worlds.mujoco_plant import JointPlant, Truth, Wave, integrate
 from tests.worlds.recorder import low_pass
 from tests.worlds.sets import SENSOR, Array, Columns, Hidden, Set
-from tests.worlds.units import UNITS, parameters, rated_a, rated_nm, reflected
+from tests.worlds.units import CHANNELS, UNITS, parameters, rated_a, rated_nm, reflected
 
 RUNS: Final = 6
 SECONDS: Final = 20.0
@@ -77,6 +77,10 @@ class MujocoBench:
             if name.startswith("sensor_") or name in ("clipping_sensor", "vibrating_frame")
             else (1, 2)
         )
+
+    def variants(self, name: str) -> Sequence[str]:
+        """Return the variants of an effect: all channels can be late."""
+        return CHANNELS if name == "channel_delay" else ("",)
 
     def unseen(self) -> MujocoBench:
         """Return the bench itself: nothing is fitted to its runs."""
@@ -197,7 +201,7 @@ def _hide(
 ) -> dict[str, Any]:
     """Put an effect of the library into all runs and return its truth."""
     j = 0 if item.joint == SENSOR else int(item.joint) - 1
-    p = parameters(item.name, joints[j], item.size, rng)
+    p = parameters(item.name, joints[j], item.size, rng, item.variant)
     joint: int | str = item.joint
     if item.name == "channel_delay" and p["channel"] == 0.0:
         joint = SENSOR

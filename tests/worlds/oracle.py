@@ -124,13 +124,13 @@ class Oracle:
         # the median: in a run at one speed zero, Coulomb and viscous friction are one, and their fits are anything
         self.own = {k: np.diag(np.median(np.square(x), axis=0) / 0.455) for k, x in rows.items()}
 
-    def visible(self, name: str) -> float:
+    def visible(self, name: str, variant: str = "") -> float:
         """Return the smallest visible relative size of an effect; inf where its trace is nothing."""
         amplitudes, traces = [], []
         start = UNITS[name].start
         for k, seed in enumerate(self.seeds):
             places = self.bench.places(name)
-            hidden = Hidden(name, places[k % len(places)], start)
+            hidden = Hidden(name, places[k % len(places)], start, variant)
             there = self._balances(self.bench.draw(seed, [hidden], quiet=True))
             top = bottom = 0.0
             squares: dict[int, list[Array]] = {}
@@ -175,9 +175,14 @@ def sizes(bench: str) -> dict[str, float]:
     return found
 
 
-def hidden_size(bench: str, name: str, factor: float) -> float | None:
+def key(name: str, variant: str = "") -> str:
+    """Return what an effect's size is kept under."""
+    return f"{name} of {variant}" if variant else name
+
+
+def hidden_size(bench: str, name: str, factor: float, variant: str = "") -> float | None:
     """Return `factor` times the visible size; None where a joint of that size would be broken, not badly modelled."""
-    size = sizes(bench).get(name)
+    size = sizes(bench).get(key(name, variant))
     if size is None or factor * size > UNITS[name].largest:
         return None
     return factor * size
@@ -196,13 +201,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     bench = BENCHES[options.bench]()
     oracle = Oracle(bench, options.sets)
     found = {}
-    for name in bench.effects:
-        size = oracle.visible(name)
+    for name, variant in [(each, v) for each in bench.effects for v in bench.variants(each)]:
+        size = oracle.visible(name, variant)
+        label = key(name, variant)
         if np.isfinite(size):
-            found[name] = float(f"{size:.3g}")
+            found[label] = float(f"{size:.3g}")
         unit = UNITS[name]
         note = "" if 3.0 * size <= unit.largest else "  three times this is out of range: not hidden"
-        print(f"{name:34} {size:10.3g}  of {unit.largest:g}{note}", flush=True)
+        print(f"{label:34} {size:10.3g}  of {unit.largest:g}{note}", flush=True)
     if options.write:
         everything = json.loads(FILE.read_text(encoding="utf-8")) if FILE.exists() else {}
         everything[options.bench] = found

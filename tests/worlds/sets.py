@@ -19,12 +19,14 @@ SENSOR = "sensor"
 class Hidden:
     """What is to be hidden: an effect of the library, or a kind that is in none; joint: 1, 2 or "sensor".
 
-    size: of the leading parameter, relative to the joint as `units.Unit` says; ignored for a foreign kind.
+    size: of the leading parameter, relative to the joint as `units.Unit` says; ignored for a foreign kind. variant: of an
+    effect that has some (`Bench.variants`): what is visible of them differs, so their sizes do.
     """
 
     name: str
     joint: int | str
     size: float = 0.0
+    variant: str = ""
 
 
 @dataclass(frozen=True)
@@ -61,3 +63,6 @@ class Bench(Protocol):
 
     def places(self, name: str) -> Sequence[int | str]:
         """Return where an effect can be: at joints, or at the sensor."""
+
+    def variants(self, name: str) -> Sequence[str]:
+        """Return the variants of an effect, one empty text where it has none."""

@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     visible = sizes(options.bench)
     for name, rows in sorted(found.items(), key=lambda item: float(np.median([r[1] for r in item[1]]))):
         size, torque = (float(np.median([r[k] for r in rows])) for k in (0, 1))
-        seen = f"{visible[name]:.2g}" if name in visible else "-"
+        seen = ", ".join(f"{x:.2g}" for k, x in visible.items() if k.split()[0] == name) or "-"
         text = [f"{x:.2g}" if math.isfinite(x) else "-" for x in (size, torque)]
         print(f"| {name} | {text[0]} | {text[1]} | {seen} | {UNITS[name].largest:g} |")
     return 0

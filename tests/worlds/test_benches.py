@@ -11,9 +11,9 @@ import pytest
 from tests.worlds.measured_bench import JOINTS, MeasuredBench, acceleration, recordings
 from tests.worlds.mujoco_bench import MujocoBench
 from tests.worlds.mujoco_plant import JointPlant, model_xml
-from tests.worlds.oracle import hidden_size, residuals, sizes
+from tests.worlds.oracle import hidden_size, key, residuals, sizes
 from tests.worlds.sets import SENSOR, Array, Bench, Hidden, Set
-from tests.worlds.units import UNITS, parameters
+from tests.worlds.units import CHANNELS, UNITS
 
 SEED = 11
 
@@ -214,19 +214,13 @@ def test_hysteresis_is_a_loop_of_its_torque(mujoco_bench: MujocoBench) -> None:
     assert np.quantile(left, 0.02) == pytest.approx(-torque, rel=0.1)
 
 
-@pytest.mark.parametrize("channel", [0.0, 1.0, 2.0])
-def test_a_late_channel_is_late(channel: float, mujoco_bench: MujocoBench, plain: Set) -> None:
-    seed = next(
-        s
-        for s in range(99)
-        if parameters("channel_delay", plain.joints[1], 0.004, np.random.default_rng([s, 4, 0]))["channel"]
-        == channel
-    )
-    there = mujoco_bench.draw(seed, [Hidden("channel_delay", 1, 0.004)], quiet=True)
-    without = mujoco_bench.draw(seed, quiet=True)
-    column = {0.0: "j1.torque_nm", 1.0: "j1.current_a", 2.0: "j1.link_position_rad"}[channel]
-    assert there.truth[0]["joint"] == (SENSOR if channel == 0.0 else 1)
-    for late, on_time in zip(there.runs, without.runs, strict=True):
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_a_late_channel_is_late(channel: str, mujoco_bench: MujocoBench, plain: Set) -> None:
+    there = mujoco_bench.draw(SEED, [Hidden("channel_delay", 1, 0.004, channel)], quiet=True)
+    column = {"sensor": "j1.torque_nm", "current": "j1.current_a", "link": "j1.link_position_rad"}[channel]
+    assert there.truth[0]["joint"] == (SENSOR if channel == "sensor" else 1)
+    assert there.truth[0]["parameters"]["channel"] == CHANNELS.index(channel)
+    for late, on_time in zip(there.runs, plain.runs, strict=True):
         assert np.allclose(late[column][4:], on_time[column][:-4], atol=1e-9)
 
 
@@ -312,7 +306,7 @@ def test_an_effect_of_nothing_changes_nothing_and_one_of_some_size_does(name: st
     place = bench.places(name)[0]
     plain = bench.draw(3)
     for size, changed in ((1e-12, False), (0.05, True)):
-        drawn = bench.draw(3, [Hidden(name, place, size)])
+        drawn = bench.draw(3, [Hidden(name, place, size, bench.variants(name)[0])])
         moved = max(
             rms(drawn.runs[k][column] - plain.runs[k][column]) / rms(plain.runs[k][column])
             for k in range(len(plain.runs))
@@ -351,10 +345,10 @@ def test_measured_foreign_kinds_have_places(kind: str) -> None:
 @pytest.mark.parametrize("bench", [MujocoBench, MeasuredBench])
 def test_every_effect_of_a_bench_has_a_frozen_size(bench: type[Bench]) -> None:
     frozen = sizes(bench.name)
-    assert set(frozen) == set(bench.effects)
+    assert set(frozen) == {key(name, v) for name in bench.effects for v in bench().variants(name)}
     assert all(size > 0.0 for size in frozen.values())
-    usable = [name for name in bench.effects if hidden_size(bench.name, name, 3.0) is not None]
-    assert len(usable) >= 0.9 * len(bench.effects)
+    usable = [name for name in frozen if 3.0 * frozen[name] <= UNITS[name.split()[0]].largest]
+    assert len(usable) >= 0.9 * len(frozen)
 
 
 def test_what_would_break_a_joint_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:

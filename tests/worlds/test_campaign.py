@@ -19,7 +19,7 @@ from tests.worlds.campaign import Counts, campaign, jobs, main, read
 from tests.worlds.figures import failures, figures, lost_to_wrong
 from tests.worlds.judge import REFUSED, judged, write
 from tests.worlds.measured_bench import MeasuredBench
-from tests.worlds.oracle import sizes
+from tests.worlds.oracle import key, sizes
 from tests.worlds.recorder import PRESETS, Recorder, record
 from tests.worlds.sets import SENSOR, Columns, Hidden
 
@@ -68,11 +68,13 @@ def test_a_campaign_has_all_kinds_in_their_sizes() -> None:
     for job in there:
         factor = {"single": 3.0, "half": 1.5, "pair": 3.0}.get(job.kind)
         if factor is not None:
-            assert all(h.size == pytest.approx(factor * visible[h.name]) for h in job.hidden)
+            assert all(h.size == pytest.approx(factor * visible[key(h.name, h.variant)]) for h in job.hidden)
         if job.kind == "pair":
             assert len({h.name for h in job.hidden}) == 2
         if job.kind in ("foreign", "beside"):
             assert job.hidden[0].name in bench.foreign
+    late = {h.variant for job in there for h in job.hidden if h.name == "channel_delay"}
+    assert late == {"sensor", "current"}
     plain = {job.seed for job in there if job.kind == "nothing"}
     assert len(plain) == 40
     assert {job.seed for job in there} == plain  # of a real bench

@@ -101,7 +101,13 @@ UNITS: Final[dict[str, Unit]] = {
 """Names, parameters and their meaning are the joint file's (docs/diagnosis.md, Effects)."""
 
 
-def parameters(name: str, joint: Joint, size: float, rng: np.random.Generator) -> dict[str, float]:
+CHANNELS: Final = ("sensor", "current", "link")
+"""Variants of `channel_delay`, by the number that the joint file gives them."""
+
+
+def parameters(
+    name: str, joint: Joint, size: float, rng: np.random.Generator, variant: str = ""
+) -> dict[str, float]:
     """Return all parameters of an effect of this relative size; sign, phase, order and the like are drawn."""
     unit = UNITS[name]
     sign = float(rng.choice([-1.0, 1.0])) if unit.both else float(np.sign(unit.start))
@@ -119,7 +125,7 @@ def parameters(name: str, joint: Joint, size: float, rng: np.random.Generator) -
         "sensor_drift": {"reference_c": 25.0, "rate_nm_per_s": 0.0},
         "sensor_crosstalk": {"phase_rad": phase, "share": 0.0},
         "encoder_eccentricity": {"phase_rad": phase, "motor_side": 0.0},
-        "channel_delay": {"channel": float(int(3 * share))},
+        "channel_delay": {"channel": float(CHANNELS.index(variant))} if variant else {},
         "unbalance": {"phase_rad": phase},
     }
     return {unit.parameter: carried, **others.get(name, {})}

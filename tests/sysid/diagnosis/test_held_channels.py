@@ -64,6 +64,37 @@ def test_clipped_samples_are_in_no_fit_however_few_and_count_by_what_they_cost()
     assert held_energies_nm2(cast("Any", data), cast("Any", fit))[TORSION1] == pytest.approx(energy, rel=0.2)
 
 
+def test_a_channel_that_is_held_at_rest_costs_what_it_jumps_by_afterwards() -> None:
+    """The current is stuck while the joint comes to rest, and on; the motor balance knows nothing of the rest."""
+    table = rigid_run(PLAIN, 0.2, seconds=5.0)
+    columns = table.joints[1]
+    assert columns.current_a is not None
+    assert columns.motor_position_rad is not None
+    speed = np.gradient(columns.motor_position_rad)
+    rated_a = PLAIN.rated_torque_nm / (PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a)
+    rng = np.random.default_rng(4)
+    current = columns.current_a + 1e-4 * rated_a * np.round(20.0 * rng.normal(size=len(table.time_s)))
+    begin = 1000 + int(np.argmin(np.abs(speed[1000:4000])))  # a reversal
+    after = begin + 60
+    current[begin - 60 : after] = current[begin - 61]
+    current[after:] += 0.5 * rated_a
+    runs, _ = usable_signals(
+        [(name, RunTable(table.time_s, {1: replace(columns, current_a=current)})) for name in ("a", "b")],
+        {1: PLAIN},
+        (1,),
+    )
+    binned = [run_data(run, [], 5, families(runs)) for run in runs]
+    data, none = SimpleNamespace(runs=binned), [np.zeros(len(families(runs)))] * 2
+    at_rest = binned[0].channels[MOTOR1].at_rest_nm
+    assert len(at_rest) > 5
+    line = np.interp(np.arange(begin - 60, after), [begin - 61, after], current[[begin - 61, after]])
+    worth = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a * (current[begin - 61] - line)
+    assert min(at_rest) >= min(worth) - 1e-9
+    assert max(at_rest) <= max(worth) + 1e-9
+    cost = held_nm(cast("Any", data), cast("Any", SimpleNamespace(runs=binned, nuisances=none)))[MOTOR1]
+    assert cost**2 > float(np.sum(at_rest**2)) / len(binned[0].channels[MOTOR1].valid)
+
+
 @pytest.mark.parametrize(("cost", "matters"), [(0.1, False), (0.3, True)])
 def test_a_held_channel_matters_by_its_size(cost: float, matters: bool) -> None:
     nothing = SimpleNamespace(worst_nm={})

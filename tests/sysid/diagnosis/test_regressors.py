@@ -56,7 +56,7 @@ def test_columns_are_the_hooks_in_the_balances_of_the_contract(name: str) -> Non
         for p in term.basis:
             if effect.at_motor_of({"motor_side": 0.0, **p}):
                 continue  # its acceleration is below
-            motor, torsion = balances(effect, p, s.state, BARE)
+            motor, torsion = balances(effect, p, s.state_of(effect, p), BARE)
             if "loss_nm" in effect.hooks and "order_per_motor_rev" in p:
                 motor = motor * s.visible_share(
                     p["order_per_motor_rev"] * BARE.gear_ratio * s.state.velocity_rad_s
@@ -214,6 +214,21 @@ def test_what_may_differ_from_run_to_run() -> None:
     assert column(MOTOR1, order) == pytest.approx(np.cos(3.5 * s.state.motor_position_rad))
     assert column(MOTOR1, order + 1) == pytest.approx(np.sin(3.5 * s.state.motor_position_rad))
     assert column(TORSION1, hertz) == pytest.approx(np.cos(2.0 * np.pi * 7.0 * s.state.time_s))
+
+
+@pytest.mark.parametrize("delay_s", [-0.004, 2e-5, 0.007, 0.015])
+def test_a_late_current_is_compared_with_itself_later(delay_s: float) -> None:
+    """A swing of 12 Hz: to first order in 15 ms it would be off by a third."""
+    s = made_up(PLAIN)
+    turn = 2.0 * np.pi * 12.0
+    s.state.current_a = np.sin(turn * s.time_s)
+    s.state.current_rate_a_s = turn * np.cos(turn * s.time_s)
+    late = {"delay_s": delay_s, "channel": 1.0}
+    found = contribution(EFFECTS["channel_delay"], late, s)["motor"]
+    more = s.state.current_a - np.sin(turn * (s.time_s + delay_s))
+    expected = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a * more
+    inner = (s.time_s > 0.02) & (s.time_s < s.time_s[-1] - 0.02)
+    assert found[inner] == pytest.approx(expected[inner], abs=0.01 * np.max(np.abs(expected)))
 
 
 def test_the_one_sensor_has_one_temperature() -> None:

@@ -58,6 +58,27 @@ def test_a_channel_without_its_own_noise_is_stuck_however_little_its_partner_mov
     assert list(held) == [column]
 
 
+@pytest.mark.parametrize("column", ["current_a", "torque_nm"])
+def test_what_is_stuck_in_motion_is_so_at_rest_too_and_at_rest_alone_nothing_is(column: str) -> None:
+    clean = run()
+    speed = clean.motor_velocity_rad_s
+    assert speed is not None
+    values = frozen(getattr(clean, column), 3000, 3100)
+    for stops, found in ((3040, range(3000, 3100)), (2990, range(0))):
+        still = np.where((stops <= T * 1e3) & (T < 3.2), 0.0, speed)
+        there = replace(
+            clean, motor_velocity_rad_s=still, motor_position_rad=np.cumsum(still) * 1e-3, **{column: values}
+        )
+        held = held_rows(T, there, JOINT)
+        assert [int(k) for h in held.values() for k in np.flatnonzero(h.rows)] == list(found)
+    line = np.linspace(values[2999], values[3100], 102)[1:-1]
+    there = replace(clean, **{column: values})
+    apart = held_rows(T, there, JOINT)[column].apart
+    assert apart[3000:3100] == pytest.approx(values[3000:3100] - line)
+    assert not apart[:3000].any()
+    assert not apart[3100:].any()
+
+
 def test_a_current_without_noise_anywhere_or_without_power_is_none() -> None:
     smooth = run(noise=0.0, swing=0.01)
     assert smooth.current_a is not None
