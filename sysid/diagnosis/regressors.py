@@ -97,7 +97,8 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
                 add(TORSION, joint.link_inertia_kgm2 * bent)
             if effect.geometric:
                 # the link's acceleration is taken from motor and torque (`signals`); an error of the teeth adds its own
-                bent = joint.link_inertia_kgm2 * second_difference(angle, s.time_s)
+                # as far as that of the torque is known: what is quicker turns the spring and not the link
+                bent = joint.link_inertia_kgm2 * second_difference(s.slow_torsion(angle), s.time_s)
                 add(MOTOR, s.per_torque * bent)
                 add(TORSION, bent)
     if s.torsion_nm is None:

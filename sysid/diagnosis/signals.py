@@ -222,6 +222,10 @@ class JointSignals:
             return self.state
         return State(**{name: getattr(self.state, name) for name in State.__slots__} | other)
 
+    def slow_torsion(self, angle: FloatArray) -> FloatArray:
+        """Return the part of a twist [n] that is slow enough for the acceleration of the torsion to hold it."""
+        return angle if self.torsion_nm is None else _slow(angle, float(np.median(np.diff(self.time_s))))
+
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
         if order_per_motor_rev not in self._shares:
@@ -354,9 +358,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     step = float(np.median(np.diff(time)))
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
-        torsion_acceleration = (
-            second_difference(smooth(sensor, _smoothed_samples(step)), time) / joint.stiffness_nm_per_rad
-        )
+        torsion_acceleration = second_difference(_slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     calm_torque, calm_current = calm(gear_torque, step), calm(columns.current_a, step)
@@ -532,6 +534,11 @@ def _sensor_rate(x: FloatArray, time: FloatArray) -> FloatArray:
         return np.asarray(np.gradient(smooth(x, wide), time))
     inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
     return np.pad(inner, 2, mode="edge")
+
+
+def _slow(x: FloatArray, step_s: float) -> FloatArray:
+    """Return x [n] without what is too quick for the second difference of a torque to be known."""
+    return smooth(x, _smoothed_samples(step_s))
 
 
 def smooth(x: FloatArray, samples: int) -> FloatArray:

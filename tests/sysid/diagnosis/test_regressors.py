@@ -93,6 +93,21 @@ def test_the_damper_feels_an_error_of_the_teeth_and_the_link_its_acceleration() 
     )
 
 
+def test_the_link_does_not_follow_an_error_of_the_teeth_that_is_quicker_than_its_acceleration_is_known() -> (
+    None
+):
+    """At 400 Hz, where the spring takes it; with one encoder the acceleration is the motor's alone and holds all of it."""
+    joint = replace(PLAIN, link_inertia_kgm2=0.5, damping_nms_per_rad=0.0)
+    s = replace(made_up(joint), time_s=1e-3 * np.arange(2000))
+    s.state.motor_position_rad = 2.0 * np.pi * 100.0 * s.time_s
+    p = {"amplitude_rad": 1e-4, "order_per_motor_rev": 4.0, "phase_rad": 0.4}
+    whole = joint.link_inertia_kgm2 * 1e-4 * (2.0 * np.pi * 400.0) ** 2
+    for signals, least, most in ((s, 0.0, 0.05), (replace(s, torsion_nm=None), 0.5, 1.0)):
+        full = contribution(EFFECTS["kinematic_error"], p, signals)["motor"]
+        bare = contribution(EFFECTS["kinematic_error"], p, replace(signals, joint=BARE))["motor"]
+        assert least * whole <= np.max(np.abs(full - bare)[10:-10]) <= most * whole
+
+
 @pytest.mark.parametrize("inertia", [0.0, 0.5])
 def test_an_eccentric_encoder_of_the_motor_is_in_both_balances(inertia: float) -> None:
     """The same run with that encoder true and eccentric: what is left over differs by the columns."""
