@@ -11,7 +11,7 @@ cdef struct AgreementLaw:
     double gain
     double zero  # square [Nm^2]
     double relevant, lowered  # squares [Nm^2]
-    double level_square, gain_factor
+    double level_square, gain_factor, zero_square, gain_sigmas
     bint turned  # the file has what the views differ by over the motor's turn
     double own[TURN_WAVES][TURN_PARTS]
     double whitening[TURN_SUMS]  # W: covariance^-1 = W'W
@@ -37,7 +37,13 @@ cdef struct AgreementState:
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
 cdef void restart_agreement(AgreementState *s) noexcept nogil
 cdef void follow_agreement(
-    const AgreementLaw *law, AgreementState *s, double innovation, double dt, double gain, double left_nm
+    const AgreementLaw *law,
+    AgreementState *s,
+    double innovation,
+    double dt,
+    double gain,
+    double gain_variance,
+    double left_nm,
 ) noexcept nogil
 cdef void pause_turn(AgreementState *s) noexcept nogil
 cdef void unsettle_turn(AgreementState *s) noexcept nogil

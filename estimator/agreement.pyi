@@ -41,7 +41,7 @@ def followed(
     slope: FloatArray,
     stiffness: FloatArray,
     tracked: bool = True,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...
 def turn_waves(
     turn: Turn,
     dt_s: FloatArray,

@@ -12,11 +12,12 @@ states count beside them: the gain (stiffness against torque constant), and what
 taken off. The joint file has the level of each that the runs of the fit kept below, each run judged by a fit on others (section
 `fused.agreement`). Beyond it
 
-    doubt^2 = level^2 ([slow - slow_0]+ + [fast - fast_0]+) + [left^2 - left_0^2]+ + (gain [|g| - g_0]+ tau)^2
+    doubt^2 = level^2 ([slow - slow_0]+ + [fast - fast_0]+) + zero^2 [left^2 - left_0^2]+ + (gain [|g| - n sigma_g - g_0]+ tau)^2
     sigma^2 = (as fused)^2 + (max(alpha, 1 - alpha) doubt)^2
 
-level, gain: `level_factor`, `gain_factor` of the section, above 1: errors that the slow states take for friction or for a zero,
-and a gain's prior, hide a part.
+level, gain, zero: `level_factor`, `gain_factor`, `zero_factor` of the section, above 1: errors that the slow states take for
+friction or for a zero, and the priors of gain and friction, which take a part of a zero, hide a part. n: `gain_sigmas`: a joint that
+is always driven shows friction and a gain alike, and what may be neither is on ordinary days no doubt.
 
 The status is lowered by a doubt of LOWER_SIGMAS sigmas and LEAST_SHARE of the rated torque; where the file says what ordinary days
 have (`lowered_nm`), by more than that, counting of the gain only what is surely one, |g| - SURE_SIGMAS sigma_g: a joint that is
@@ -49,6 +50,7 @@ from jtqd.estimator.zeros cimport (
     ZerosLaw,
     ZerosState,
     completes,
+    early_factor,
     fill_zeros,
     known_nm2,
     left_behind_nm,
@@ -101,6 +103,7 @@ cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
     law.gain, law.zero = agreement.gain, agreement.zero_nm**2
     law.lowered = agreement.lowered_nm**2
     law.level_square, law.gain_factor = agreement.level_factor**2, agreement.gain_factor
+    law.zero_square, law.gain_sigmas = agreement.zero_factor**2, agreement.gain_sigmas
     if agreement.turn is not None:
         fill_turn(law, agreement.turn)
     return 0
@@ -130,8 +133,19 @@ cdef double _level(double level, double square, double dt) noexcept nogil:
     return level + (square - level) * (1.0 - exp(-dt * (INVERSE_UP if square > level else INVERSE_DOWN)))
 
 
+cdef double _less(double gain, double gain_variance, double sigmas) noexcept nogil:
+    """Return what of a gain is beyond so many of its own standard deviations."""
+    return fmax(0.0, fabs(gain) - sigmas * sqrt(gain_variance))
+
+
 cdef void follow_agreement(
-    const AgreementLaw *law, AgreementState *s, double innovation, double dt, double gain, double left_nm
+    const AgreementLaw *law,
+    AgreementState *s,
+    double innovation,
+    double dt,
+    double gain,
+    double gain_variance,
+    double left_nm,
 ) noexcept nogil:
     """Take the innovation [Nm] of a block of length dt [s], the gain, and the zero that is not taken off [Nm]."""
     cdef double rest
@@ -140,8 +154,8 @@ cdef void follow_agreement(
     s.slow = _level(s.slow, s.trend * s.trend, dt)
     s.fast = _level(s.fast, rest * rest, dt)
     s.doubt = law.level_square * (fmax(0.0, s.slow - law.slow) + fmax(0.0, s.fast - law.fast))
-    s.doubt += fmax(0.0, left_nm * left_nm - law.zero)
-    s.gain_doubt = law.gain_factor * fmax(0.0, fabs(gain) - law.gain)
+    s.doubt += law.zero_square * fmax(0.0, left_nm * left_nm - law.zero)
+    s.gain_doubt = law.gain_factor * fmax(0.0, _less(gain, gain_variance, law.gain_sigmas) - law.gain)
 
 
 cdef void pause_turn(AgreementState *s) noexcept nogil:
@@ -323,9 +337,9 @@ cdef bint lowers(
 
 
 def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope):
-    """Return (slow, fast, |gain|, |left|, doubt) after each block of a run, arrays [blocks] in Nm^2, Nm^2, 1, Nm, Nm; zeros tracked.
+    """Return (slow, fast, gain, |left|, doubt) after each block of a run, arrays [blocks] in Nm^2, Nm^2, 1, Nm, Nm; zeros tracked.
 
-    doubt: of the torsion, with what is surely a gain, beyond the levels of `fused.agreement`; 0 where that is None.
+    gain: |g| less `gain_sigmas` of its standard deviations; doubt: of the torsion, with what is surely a gain, beyond the levels of `fused.agreement`; 0 where that is None.
     Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope: dL/draw of the loss.
     """
     columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope)
@@ -350,24 +364,25 @@ def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, to
             zeros.block.y += (1.0 - x[k, 6]) * zeros.current_a * zeros.block.samples
             innovation = update_zeros(&law, &zeros, law.stiffness, x[k, 6])
             left = left_behind_nm(&law, &zeros)
-            follow_agreement(&usual, &s, innovation, dt, zeros.x[4], left)
+            follow_agreement(&usual, &s, innovation, dt, zeros.x[4], zeros.p[4][4], left)
             doubt = sqrt(_sure(&usual, &s, zeros.x[4], zeros.p[4][4], torsion))
-            found.append((s.slow, s.fast, fabs(zeros.x[4]), fabs(left), doubt))
+            gain = _less(zeros.x[4], zeros.p[4][4], usual.gain_sigmas)
+            found.append((s.slow, s.fast, gain, fabs(left), doubt))
     return tuple(np.array(found, np.float64).reshape(-1, 5).T)
 
 
 def followed(
     fused, rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness, bint tracked=True
 ):
-    """Return (torsion, current, known, doubt, gain) of a run from its start: what the service adds to values and sigma.
+    """Return (torsion, current, known, doubt, gain, early) of a run from its start: what the service adds to values and sigma.
 
     torsion, current: what tracked zeros add to both paths [Nm]; known: what they take off s_t^2 [Nm^2]; doubt [Nm^2] and its
-    gain, as of `doubt_of`. Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope:
+    gain, as of `doubt_of`; early: factor of the spread, 1 without zeros of the days. Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope:
     dL/draw of the loss; stiffness: d tau_t/d d of the spring [Nm/rad]. tracked: zeros are taken off.
     """
     columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness)
     cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)
-    out = np.zeros((5, x.shape[0]))
+    out = np.zeros((6, x.shape[0]))
     cdef double[:, ::1] to = out
     cdef ZerosLaw law
     cdef ZerosState s
@@ -384,9 +399,10 @@ def followed(
         link, current = x[k, 7] * s.link_rad, -(1.0 - x[k, 6]) * s.current_a
         to[0, k], to[1, k], to[2, k] = link, current, known_nm2(&law, &s)
         to[3, k], to[4, k] = agreement.doubt, agreement.gain_doubt
+        to[5, k] = early_factor(&law, to[2, k])
         if completes(&s, x[k, 0], x[k, 1] + link - current, x[k, 2], x[k, 3], x[k, 4] + link, x[k, 5] - law.spread_nm):
             dt = s.block.dt
             innovation = update_zeros(&law, &s, x[k, 7], x[k, 6])
             if usual.used:
-                follow_agreement(&usual, &agreement, innovation, dt, s.x[4], left_behind_nm(&law, &s))
+                follow_agreement(&usual, &agreement, innovation, dt, s.x[4], s.p[4][4], left_behind_nm(&law, &s))
     return tuple(out)

@@ -54,7 +54,7 @@ cdef struct FusedLaw:
     AgreementLaw agreement
     LinkLaw link
     bint tracked  # the link: variances of what is quicker than the motor path
-    double tracking_noise, tracking_viscous
+    double tracking_noise, tracking_viscous, tracking_bend  # bend: of the viscous part [s^2/rad^2], 0: none
     double physics_scale[4]
     double network_scale[4]
     double stand_share, stand_floor, stand_sigmas, limit, network_limit, fade, inverse_fade

@@ -74,6 +74,7 @@ from jtqd.estimator.zeros cimport (
     beyond,
     completes,
     drop_block,
+    early_factor,
     fill_zeros,
     known_nm2,
     left_behind_nm,
@@ -313,6 +314,7 @@ cdef class FusedEstimator(Estimator):
         if self.law.tracked:
             self.law.tracking_noise = fused.tracking.sigma_nm**2
             self.law.tracking_viscous = fused.tracking.viscous_nms_per_rad**2
+            self.law.tracking_bend = fused.tracking.bend
         fill_zeros(&self.law.zeros, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, watched)
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
@@ -467,7 +469,13 @@ cdef class FusedEstimator(Estimator):
             )
             if law.agreement.used:
                 follow_agreement(
-                    &law.agreement, &s.agreement, innovation, dt, s.zeros.x[4], left_behind_nm(&law.zeros, &s.zeros)
+                    &law.agreement,
+                    &s.agreement,
+                    innovation,
+                    dt,
+                    s.zeros.x[4],
+                    s.zeros.p[4][4],
+                    left_behind_nm(&law.zeros, &s.zeros),
                 )
 
     cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:
@@ -507,6 +515,7 @@ cdef class FusedEstimator(Estimator):
         if law.zeros.spread > 0.0:
             known = known_nm2(&law.zeros, &s.zeros)
             sharpen(&physics, known)
+            physics.sigma *= early_factor(&law.zeros, known)
         out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
@@ -559,7 +568,11 @@ cdef class FusedEstimator(Estimator):
         elif out.status == STANDSTILL:
             out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider * wider + doubt, out.sigma_nm)
         if law.tracked and out.status != STANDSTILL:  # measured in motion
-            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + law.tracking_noise + law.tracking_viscous * v * v)
+            out.sigma_nm = sqrt(
+                out.sigma_nm * out.sigma_nm
+                + law.tracking_noise
+                + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v)
+            )
         publish_within(out, law.limit)
 
     cdef double half_interval(

@@ -276,8 +276,9 @@ class Agreement:
 
     slow_nm, fast_nm: RMS levels of the difference's trend and of the rest; gain: of one path against the other; zero_nm: a
     link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status; 0: not
-    known; level_factor, gain_factor: how much larger an error is than its trace in the difference; turn: waves over the
-    motor's turn, None: not known. All: agreement.pyx.
+    known; level_factor, gain_factor, zero_factor: how much larger an error is than its trace in the difference; gain_sigmas:
+    of its own standard deviations, what of a gain is no doubt, in `gain` neither; turn: waves over the motor's turn, None:
+    not known. All: agreement.pyx.
     """
 
     slow_nm: Annotated[float, limits("Nm", gt=0.0)]
@@ -287,6 +288,8 @@ class Agreement:
     lowered_nm: Annotated[float, limits("Nm", ge=0.0)] = 0.0
     level_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 1.4
     gain_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 2.0
+    zero_factor: Annotated[float, limits(ge=1.0, le=10.0)] = 1.0
+    gain_sigmas: Annotated[float, limits(ge=0.0, le=10.0)] = 0.0
     turn: Turn | None = None
 
     def __post_init__(self) -> None:
@@ -299,13 +302,15 @@ class DayZeros:
 
     spread_rad: standard deviation over the days of the fit; spread_nm: its part of sigma.torsion_nm, which what is learned
     takes away again; scale: in place of sigma.scale where zeros are tracked; correlation_s: so long the
-    difference of the two paths keeps what is no state of the day, None: `zeros.CORRELATION_S`.
+    difference of the two paths keeps what is no state of the day, None: `zeros.CORRELATION_S`; early: factor of the spread
+    where nothing is known of the day's zero.
     """
 
     spread_rad: Annotated[float, limits("rad", gt=0.0)]
     spread_nm: Annotated[float, limits("Nm", gt=0.0)]
     scale: Annotated[tuple[float, float, float, float], limits()]
     correlation_s: Annotated[float, limits("s", gt=0.0, le=10.0)] | None = None
+    early: Annotated[float, limits(ge=1.0, le=10.0)] = 1.0
 
     def __post_init__(self) -> None:
         check(self, "fused.zeros")
@@ -318,17 +323,24 @@ class Tracking:
     """How the torsion is tracked where the configuration has `track_torsion`, and what that adds to sigma, as squares.
 
     rate_rad_s, wave_rad_s: of the tracking filter: larger is noisier and follows quicker (observer.tracked); sigma_nm,
-    viscous_nms_per_rad |v|: of what is quicker than the motor path, found on runs that the fit had not seen. Without
-    wave_rad_s the section is of a filter that there no longer is, and counts for nothing.
+    viscous_nms_per_rad |v|: of what is quicker than the motor path, found on runs that the fit had not seen; that part
+    grows no more far above saturation_rad_s, None: without end. Without wave_rad_s the section is of a filter that there
+    no longer is, and counts for nothing.
     """
 
     rate_rad_s: Annotated[float, limits("rad/s", ge=10.0, le=5000.0)]
     sigma_nm: Annotated[float, limits("Nm", ge=0.0)]
     viscous_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)]
     wave_rad_s: Annotated[float, limits("rad/s", ge=0.0, le=5000.0)] | None = None
+    saturation_rad_s: Annotated[float, limits("rad/s", gt=0.0, le=1e6)] | None = None
 
     def __post_init__(self) -> None:
         check(self, "fused.tracking")
+
+    @property
+    def bend(self) -> float:
+        """By what the part in speed is bent, s^2/rad^2: divided by 1 + bend v^2."""
+        return 0.0 if self.saturation_rad_s is None else 1.0 / self.saturation_rad_s**2
 
 
 @dataclass(frozen=True, slots=True)

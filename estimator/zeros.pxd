@@ -18,6 +18,7 @@ cdef struct ZerosLaw:
     double known  # variance of the link zero [rad^2] below which it counts as learned
     double correlation  # [s]: of the noise on the days of the fit
     double spread, spread_nm  # variance of the link zero over the days [rad^2, Nm^2]; 0: the file does not say
+    double early  # [1/Nm^2]: what the spread of the estimate is wider by for each Nm^2 of that not known
 
 cdef struct Gathered:  # sums over the samples of a block
     double dt, y, direction, velocity, torsion, variance
@@ -45,6 +46,7 @@ cdef bint completes(
 cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
 cdef double update_zeros(const ZerosLaw *law, ZerosState *s, double stiffness, double slope) noexcept nogil
 cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil
+cdef double early_factor(const ZerosLaw *law, double known) noexcept nogil
 cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef bint beyond(const ZerosLaw *law, const ZerosState *s) noexcept nogil
 cdef void tell_zeros(const ZerosLaw *law, const ZerosState *s, Learned *out) noexcept nogil

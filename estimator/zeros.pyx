@@ -26,7 +26,9 @@ the estimate must not jump.
 Where the joint file says how far zeros differ from day to day (`fused.zeros`: S, and as a torque S_nm), the part
 k = S^2/(S^2 + sigma_d^2) of x_d is taken off in any case, the mean of what is then known of the day's zero (Wiener), w - k
 of x where that is above 0, and what is known leaves the variance of the torsion in the fusion: s_t^2 - k S_nm^2, with S as
-large as before where nothing is known. x_d, sigma_d: of a second filter with the noise that the states leave on the days of
+large as before where nothing is known. The spread of the fused value is then
+1 + (early - 1) (1 - known/S_nm^2) times as wide, known: what is taken off s_t^2: before a zero is known, more is unknown than
+the zero. x_d, sigma_d: of a second filter with the noise that the states leave on the days of
 the fit (`correlation_s` of the file). The variance of both paths holds the day's friction, which is a state here, and is no
 noise for so long: the first filter learns more slowly than an ordinary day allows. It judges what is beyond ordinary days,
 and the agreement of the views: a joint that has changed, or friction's law on a plateau, is no noise of the fit.
@@ -110,6 +112,7 @@ cdef int fill_zeros(
     if law.used and fused.zeros is not None:
         law.correlation = fused.zeros.correlation_s or CORRELATION_S
         law.spread, law.spread_nm = fused.zeros.spread_rad**2, fused.zeros.spread_nm**2
+        law.early = (fused.zeros.early - 1.0) / law.spread_nm
     law.prior[0] = (LARGEST_LINK * rated_nm / law.stiffness) ** 2
     law.prior[1] = (CURRENT_SHARE * sigma.current_nm / law.torque_per_ampere) ** 2
     law.prior[2] = sigma.current_nm**2 + (FRICTION_SHARE * constant) ** 2
@@ -269,6 +272,11 @@ cdef double known_nm2(const ZerosLaw *law, const ZerosState *s) noexcept nogil:
         return 0.0
     late = law.stiffness * (_link_used(law, s) - s.link_rad)
     return fmax(0.0, share * law.spread_nm - late * late)
+
+
+cdef double early_factor(const ZerosLaw *law, double known) noexcept nogil:
+    """Return what the spread of the estimate is wider by while only `known` [Nm^2], as of `known_nm2`, is: 1 to `early`."""
+    return 1.0 + law.early * (law.spread_nm - known)
 
 
 cdef double left_behind_nm(const ZerosLaw *law, const ZerosState *s) noexcept nogil:

@@ -29,6 +29,13 @@ LOWERED: Final = 0.99
 LEVEL_FACTOR: Final = 2.8
 GAIN_FACTOR: Final = 4.0
 """Of `agreement.pyx`, chosen with QUANTILE: larger ones cover what has changed no better."""
+ZERO_FACTOR: Final = 1.3
+"""Of `agreement.pyx`: chosen on runs that no figure is reported on. Until the joint has moved both ways, the filter
+finds less of a zero than there is: friction takes a part."""
+GAIN_SIGMAS: Final = 1.0
+"""Of `agreement.pyx`: chosen on runs that no figure is reported on. More hold a softer spring less; without, sigma is wider
+where a joint is always driven."""
+_START: Final = Agreement(1.0, 1.0, 0.0, 0.0, gain_sigmas=GAIN_SIGMAS)
 _FEWEST: Final = 200
 """Blocks, 3 s of motion at 1 kHz: from less no level can be told."""
 _FLOOR_NM: Final = 1e-3
@@ -37,9 +44,9 @@ Levels = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 """Of one run, as `estimator.agreement.levels` returns it."""
 
 
-def fit_agreement(levels: Callable[[Agreement | None], Sequence[Levels]]) -> Agreement | None:
+def fit_agreement(levels: Callable[[Agreement], Sequence[Levels]]) -> Agreement | None:
     """Return the levels of runs; None for too little motion. levels: of all runs, their doubt beyond a section."""
-    slow, fast, gain, left, _ = (np.concatenate(parts) for parts in zip(*levels(None), strict=True))
+    slow, fast, gain, left, _ = (np.concatenate(parts) for parts in zip(*levels(_START), strict=True))
     if len(slow) < _FEWEST:
         return None
 
@@ -53,6 +60,8 @@ def fit_agreement(levels: Callable[[Agreement | None], Sequence[Levels]]) -> Agr
         zero_nm=level(left),
         level_factor=LEVEL_FACTOR,
         gain_factor=GAIN_FACTOR,
+        zero_factor=ZERO_FACTOR,
+        gain_sigmas=GAIN_SIGMAS,
     )
     doubt = np.concatenate([run[-1] for run in levels(found)])
     return replace(found, lowered_nm=max(float(np.quantile(doubt, LOWERED)), _FLOOR_NM))

@@ -1,10 +1,16 @@
-"""Calibration of sigma, the last step of a fit: `scale` of sections `fused.sigma` and `fused.zeros`.
+"""Calibration of sigma, the last step of a fit: `scale` of `fused.sigma` and `fused.zeros`, and `early` of the latter.
 
-    |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in 92 % of the samples of a run left out, per quadrant q
+    |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in 90 % of the samples of a run left out, per quadrant q
 
 error: of the estimate that service gives against the torque; more: what service adds by itself (`served.py`; where the
 torsion is tracked, `fused.tracking`, too), so that it is not counted twice. scale_q is the conformal quantile of
 sqrt(error^2 - (1.645 more)^2) over the spread.
+
+Before the zero of the day is known the error is wider than what is taken off s_t^2 says. The ratio r of the conformal
+quantiles of the samples that know less than half of it and of the others, k and k' the means of what they know, is that of
+the factors of the spread (`zeros.pyx`):
+
+    (1 + (early - 1) (1 - k))/(1 + (early - 1) (1 - k')) = r
 
 The campaign has a sensor, not the torque. What both paths' run means share is the sensor's zero of that run, of standard
 deviation `reference_nm`: a normal prior, and two normal measurements of it whose variance is what each path's means have
@@ -25,34 +31,71 @@ from scipy.special import ndtri
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Fused, Tracking
-from jtqd.sysid.fit.conformal import COVERAGE, conformal_scale
+from jtqd.sysid.fit.conformal import COVERAGE, FEWEST, conformal_scale, quantile_by_runs
 from jtqd.sysid.fit.residuals import PathResiduals
 from jtqd.sysid.fit.served import Served, served
+from jtqd.sysid.fit.tracking import by_speed
 
 OTHER_MOTIONS: Final = 0.02
-"""What runs of the campaign are covered more than COVERAGE: motions of other kinds, and shorter ones, in which the zero of
-the day is unknown for a larger part, are held in as much less. Chosen on runs that no figure is reported on."""
+OTHER_MOTIONS_LEARNED: Final = 0.01
+"""What runs of the campaign are covered more than COVERAGE where zeros differ from day to day, not tracked and tracked: of
+days of other motions as much less is held. Chosen on runs that no figure is reported on."""
+HALF_KNOWN: Final = 0.5
+LATEST: Final = 2.0
+"""Largest `early` that is believed."""
+_FEWEST_RUNS: Final = 8
+"""That have samples of either kind, for `early`."""
 _QUANTILES: Final = 7
 _LEAST_NM2: Final = 1e-4
 """Variance of a path's run means beside the sensor's zero: no path is free of an error of its own."""
 
 
 def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float | None = None) -> Fused:
-    """Return a section with both scales found on runs left out; its other parts are final.
+    """Return a section with both scales and `early` found on runs left out; its other parts are final.
 
     Without section `fused.zeros` new configurations track zeros with the scale of sigma, which is then that of tracked ones.
     """
     zeros, doubt_nm = sensor_zeros(runs, fused.sigma.reference_nm)
     plain = replace(fused, zeros=None)
 
-    def scale(section: Fused, *, tracked: bool) -> tuple[float, float, float, float]:
-        each = [served(run, section, rated_nm, tracked=tracked) for run in runs]
-        return _scale(each, zeros, doubt_nm, fused.tracking)
+    def seen(section: Fused, *, tracked: bool) -> list[Served]:
+        return [served(run, section, rated_nm, tracked=tracked) for run in runs]
 
-    sigma = replace(fused.sigma, scale=scale(plain, tracked=fused.zeros is None))
+    def beyond(each: Sequence[Served]) -> list[FloatArray]:
+        return _beyond(each, zeros, doubt_nm, fused.tracking)
+
+    each = seen(plain, tracked=fused.zeros is None)
+    coverage = COVERAGE if fused.zeros is None else COVERAGE + OTHER_MOTIONS
+    sigma = replace(fused.sigma, scale=_scale(beyond(each), each, coverage))
     if fused.zeros is None:
         return replace(fused, sigma=sigma)
-    return replace(fused, sigma=sigma, zeros=replace(fused.zeros, scale=scale(fused, tracked=True)))
+    days = replace(fused.zeros, early=1.0)
+    each = seen(replace(fused, zeros=days), tracked=True)
+    days = replace(days, early=early(beyond(each), each, days.spread_nm))
+    each = seen(replace(fused, zeros=days), tracked=True)
+    scale = _scale(beyond(each), each, COVERAGE + OTHER_MOTIONS_LEARNED)
+    return replace(fused, sigma=sigma, zeros=replace(days, scale=scale))
+
+
+def early(beyond: Sequence[FloatArray], runs: Sequence[Served], spread_nm: float) -> float:
+    """Return the factor of the spread where nothing is known of the day's zero; runs: with a factor of 1.
+
+    beyond: what of each run's errors is to be covered by the spread [Nm]. 1 where too few runs tell.
+    """
+    known = [run.known_nm2 / spread_nm**2 for run in runs]
+    kinds = ([k < HALF_KNOWN for k in known], [k >= HALF_KNOWN for k in known])
+    quantiles, shares = [], []
+    for kind in kinds:
+        kept = [n for n, keep in enumerate(kind) if np.count_nonzero(keep) >= FEWEST]
+        if len(kept) < _FEWEST_RUNS:
+            return 1.0
+        quantiles.append(quantile_by_runs([(beyond[n] / runs[n].spread_nm)[kind[n]] for n in kept]))
+        shares.append(float(np.mean([known[n][kind[n]].mean() for n in kept])))
+    if not quantiles[0] > quantiles[1]:
+        return 1.0
+    more = quantiles[0] - quantiles[1]
+    less = (1.0 - shares[0]) * quantiles[1] - (1.0 - shares[1]) * quantiles[0]
+    return 1.0 + more / less if more < (LATEST - 1.0) * less else LATEST
 
 
 def sensor_zeros(runs: Sequence[PathResiduals], reference_nm: float) -> tuple[FloatArray, float]:
@@ -65,9 +108,10 @@ def sensor_zeros(runs: Sequence[PathResiduals], reference_nm: float) -> tuple[Fl
     return variance * (means @ precision), float(np.sqrt(variance + reference_nm**2 / len(runs)))
 
 
-def _scale(
+def _beyond(
     runs: Sequence[Served], zeros: FloatArray, doubt_nm: float, tracking: Tracking | None
-) -> tuple[float, float, float, float]:
+) -> list[FloatArray]:
+    """Return what of the errors of runs, against the torque, is to be covered by the spread [Nm]."""
     normal = ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
     normal *= doubt_nm / np.sqrt(np.mean(normal**2))
     left = []
@@ -75,9 +119,14 @@ def _scale(
         error, more = run.error_nm, run.more_nm2
         if tracking is not None:
             error = run.now_nm
-            more = more + tracking.sigma_nm**2 + (tracking.viscous_nms_per_rad * run.velocity_rad_s) ** 2
+            more = more + tracking.sigma_nm**2
+            more += tracking.viscous_nms_per_rad**2 * by_speed(run.velocity_rad_s, tracking.bend)
         error = error - zero + normal[np.arange(len(error)) % _QUANTILES]
         left.append(np.sqrt(np.maximum(error**2 - GAUSS**2 * more, 0.0)))
-    return conformal_scale(
-        left, [run.spread_nm for run in runs], [run.quadrant for run in runs], COVERAGE + OTHER_MOTIONS
-    )
+    return left
+
+
+def _scale(
+    beyond: Sequence[FloatArray], runs: Sequence[Served], coverage: float
+) -> tuple[float, float, float, float]:
+    return conformal_scale(beyond, [run.spread_nm for run in runs], [run.quadrant for run in runs], coverage)

@@ -521,7 +521,8 @@ def _lines(joint: Joint, fit: FusedFit) -> list[str]:
     if tracking is not None:
         lines.append(
             f"  with the torsion tracked, an estimate of now: {tracking.sigma_nm:.2f} Nm and "
-            f"{tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares"
+            f"{tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares, the latter bent above "
+            f"{tracking.saturation_rad_s:g} rad/s"
         )
     return lines
 

@@ -173,9 +173,6 @@ def fit_fused(
     envelope = None if rated_nm is None or torsion is None else _envelope(runs, fit.loss, torsion, rated_nm)
     fused = Fused(fit.loss, torsion, sigma, envelope=envelope)
     rmse = tuple(float(np.sqrt(np.mean(served(run, fused).error_nm ** 2))) for run in unseen)
-    if rated_nm is not None and torsion is not None:
-        fused = replace(fused, zeros=fit_zeros(unseen, fused, rated_nm))
-        fused = replace(fused, agreement=_agreement(unseen, fused, rated_nm))
     if torsion is not None:
         standing_errors = [_standing(*run, fused) for run in standing]
         fused = replace(
@@ -183,6 +180,11 @@ def fit_fused(
             tracking=tracking_of_unseen(unseen, fused),
             standstill=fit_standstill(standing_errors, sigma.reference_nm),
         )
+        if fused.tracking is not None:
+            unseen = [run.tracked() for run in unseen]
+    if rated_nm is not None and torsion is not None:
+        fused = replace(fused, zeros=fit_zeros(unseen, fused, rated_nm))
+        fused = replace(fused, agreement=_agreement(unseen, fused, rated_nm))
     fused = calibrated(unseen, fused, rated_nm)
     return FusedFit(fused, fit, rmse)
 
@@ -206,7 +208,7 @@ def _agreement(unseen: Sequence[PathResiduals], fused: Fused, rated_nm: float) -
     """Return how far the two paths differ on unseen runs; None for too little motion."""
     fusion = Fusion(fused.sigma, True)
 
-    def of_runs(agreement: Agreement | None) -> list[Levels]:
+    def of_runs(agreement: Agreement) -> list[Levels]:
         usual = replace(fused, agreement=agreement)
         return [
             levels(

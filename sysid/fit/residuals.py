@@ -43,3 +43,10 @@ class PathResiduals(NamedTuple):
     stiffness_nm_per_rad: FloatArray = NONE
     loss_nm: FloatArray = NONE
     turn: FloatArray = NONE
+
+    def tracked(self) -> PathResiduals:
+        """Return the run with the tracked torsion, made as old as the motor path: what service compares with the current."""
+        error = self.now.aged_nm
+        return self._replace(
+            torsion_nm=self.torsion_nm + error - self.torsion_error_nm, torsion_error_nm=error
+        )

@@ -1,11 +1,12 @@
 """A run that the fit had not seen, estimated as in service: error, standard deviation and what service adds to it.
 
     error = e_c + alpha (e_t - e_c)                      as old as the motor path
+    spread = early sqrt(s_c^2 s_t^2/(s_c^2 + s_t^2))     early: what is not yet known of the day's zero
     error now = e_tracked + (1 - alpha) (e_c - e_t')     e_t': of the tracked torsion, made as old as the motor path
     more^2 = (disagreement beyond DISAGREE_SIGMAS)^2 + doubt^2
 
-With zeros tracked, what is taken off both paths is in all of them (`zeros.pyx`). Definitions of disagreement and doubt:
-fusion.pyx, agreement.pyx.
+With zeros tracked, what is taken off both paths is in all of them (`zeros.pyx`, which defines early). Definitions of
+disagreement and doubt: fusion.pyx, agreement.pyx.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from jtqd.sysid.fit.residuals import PathResiduals
 
 
 class Served(NamedTuple):
-    """One run, arrays [n] of its samples in motion. spread: of the torque, scale 1; now: empty where it is not known."""
+    """One run, arrays [n] of its samples in motion. spread: of the torque, scale 1; now: empty where it is not known;
+    known: what is taken off the torsion's variance."""
 
     error_nm: FloatArray
     now_nm: FloatArray
@@ -32,6 +34,7 @@ class Served(NamedTuple):
     more_nm2: FloatArray
     velocity_rad_s: FloatArray
     quadrant: QuadrantArray
+    known_nm2: FloatArray
 
 
 def served(
@@ -46,8 +49,9 @@ def served(
     variance = fusion.variance_many(*seen)
     apart = run.torsion_error_nm - run.current_error_nm
     torsion, current, known, doubt, gain = np.zeros((5, len(run.raw_nm)))
+    early = np.ones(len(run.raw_nm))
     if rated_nm is not None and fused.torsion is not None and len(run.dt_s):
-        torsion, current, known, doubt, gain = followed(
+        torsion, current, known, doubt, gain, early = followed(
             fused,
             rated_nm,
             run.dt_s,
@@ -73,8 +77,9 @@ def served(
     return Served(
         e_c + alpha * (e_t - e_c),
         now,
-        spread,
+        spread * early,
         more,
         run.velocity_rad_s,
         quadrants(run.raw_nm, run.velocity_rad_s),
+        known,
     )

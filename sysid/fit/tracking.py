@@ -1,10 +1,12 @@
 """Fit section `fused.tracking` of a joint file: what an estimate of now errs by beyond one as old as the motor path.
 
-    sigma now^2 = sigma^2 + a^2 + (b v)^2
+    sigma now^2 = sigma^2 + a^2 + (b v)^2/(1 + (v/s)^2)
 
-sigma: of an estimate as old as the motor path, whose error is e; a, b: least squares of e_now^2 - e^2 over runs that the fit
-had not seen. The sensor is taken as it is: what it is older than the encoders is in a and b. That the interval of both
-together holds is up to the scale of sigma, found after (`sysid/fit/calibration.py`).
+sigma: of an estimate as old as the motor path, whose error is e; a, b, s: least squares of e_now^2 - e^2 over runs that the
+fit had not seen. Of a wave over the motor's turn that the filter does not carry it misses all from some speed on, and no
+more: a part that grows without end is too wide at rest and too narrow at the speeds of work. The sensor is taken as it is:
+what it is older than the encoders is in a and b. That the interval of both together holds is up to the scale of sigma, found
+after (`sysid/fit/calibration.py`).
 """
 
 from __future__ import annotations
@@ -24,14 +26,30 @@ WAVE_RAD_S: Final = 160.0
 docs/estimator.md."""
 
 
+SATURATION_RAD_S: Final = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 3.0, 5.0, 10.0)
+"""Speeds among which s is chosen."""
+
+
+def by_speed(velocity_rad_s: FloatArray, bend: float) -> FloatArray:
+    """Return the square of speeds [n], bent: `Tracking.bend`."""
+    square = velocity_rad_s * velocity_rad_s
+    result: FloatArray = square / (1.0 + bend * square)
+    return result
+
+
 def fit_tracking(
     errors: Sequence[FloatArray], errors_now: Sequence[FloatArray], velocity: Sequence[FloatArray]
 ) -> Tracking:
     """Return the section of runs left out, one array per run each: e, e_now [Nm], v [rad/s]."""
     more = np.concatenate([now * now - e * e for e, now in zip(errors, errors_now, strict=True)])
     v = np.concatenate(velocity)
-    (noise, viscous), _ = nnls(np.column_stack((np.ones_like(v), v * v)), more)
-    return Tracking(TRACKING_RAD_S, float(np.sqrt(noise)), float(np.sqrt(viscous)), WAVE_RAD_S)
+    found: list[tuple[float, Tracking]] = []
+    for saturation in SATURATION_RAD_S:
+        columns = np.column_stack((np.ones_like(v), by_speed(v, 1.0 / saturation**2)))
+        (noise, viscous), _ = nnls(columns.T @ columns, columns.T @ more)
+        one = Tracking(TRACKING_RAD_S, float(np.sqrt(noise)), float(np.sqrt(viscous)), WAVE_RAD_S, saturation)
+        found.append((float(np.sum((columns @ (noise, viscous) - more) ** 2)), one))
+    return min(found, key=lambda each: each[0])[1]
 
 
 def worth_it(errors_now: Sequence[FloatArray], errors_low_pass: Sequence[FloatArray]) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.agreement import DOWN_S, levels
+from jtqd.estimator.agreement import DOWN_S, followed, levels
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
@@ -187,8 +187,58 @@ def test_a_run_observed_before_is_estimated_alike() -> None:
         np.testing.assert_allclose(found.sigma_nm, whole.sigma_nm, rtol=1e-6, equal_nan=True)
 
 
+def test_of_a_gain_only_what_is_beyond_its_own_standard_deviations_is_doubt() -> None:
+    """Always driven, so that friction and a gain differ by little; `levels` says the gain that is left."""
+    fused = USUAL.fused
+    assert fused is not None
+    n = 6000
+    v, one = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4), np.ones(n)
+    torque = 20.0 * np.sign(v)
+    signals = (1e-3 * one, 0.05 * torque, np.sign(v), v, torque, 0.3 * one, 0.0 * one)
+    loud = replace(AGREEMENT, slow_nm=20.0, fast_nm=20.0, gain=0.002, zero_nm=20.0)
+    found = []
+    for sigmas in (0.0, 0.5, 1.0, 10.0):
+        of_file = replace(fused, agreement=replace(loud, gain_sigmas=sigmas))
+        *_, doubt, _ = followed(of_file, USUAL.rated_torque_nm, *signals, K * one, False)
+        gain = levels(of_file, USUAL.rated_torque_nm, *signals)[2][-1]
+        assert doubt[-1] == pytest.approx(loud.gain_factor * max(gain - 0.002, 0.0), rel=1e-9)
+        found.append(gain)
+    assert found[0] > 0.02
+    assert found[0] - found[1] == pytest.approx(found[1] - found[2], rel=1e-9)
+    assert found[0] > found[1] > found[2]
+    assert found[3] == 0.0
+
+
+def test_a_zero_that_is_not_taken_off_counts_by_its_factor() -> None:
+    fused = USUAL.fused
+    assert fused is not None
+    n = 4000
+    v, one = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4), np.ones(n)
+    signals = (1e-3 * one, -2.0 * one, np.sign(v), v, 5.0 * np.sin(v), 0.3 * one, 0.0 * one, K * one)
+    loud = replace(AGREEMENT, slow_nm=20.0, fast_nm=20.0, gain=1.0)
+    doubts = [
+        followed(
+            replace(fused, agreement=replace(loud, zero_factor=factor)),
+            USUAL.rated_torque_nm,
+            *signals,
+            False,
+        )[3]
+        for factor in (1.0, 1.5)
+    ]
+    assert doubts[0].max() > 1.0
+    np.testing.assert_allclose(doubts[1], 2.25 * doubts[0], rtol=1e-12)
+
+
 @pytest.mark.parametrize(
-    ("key", "value"), [("slow_nm", 0.0), ("fast_nm", -1.0), ("gain", -0.1), ("zero_nm", float("nan"))]
+    ("key", "value"),
+    [
+        ("slow_nm", 0.0),
+        ("fast_nm", -1.0),
+        ("gain", -0.1),
+        ("zero_nm", float("nan")),
+        ("zero_factor", 0.9),
+        ("gain_sigmas", -0.1),
+    ],
 )
 def test_levels_that_cannot_be_are_refused(key: str, value: float) -> None:
     with pytest.raises(ConfigError, match=key):

@@ -155,6 +155,36 @@ def test_its_scale_counts_where_zeros_are_tracked() -> None:
     np.testing.assert_allclose(other.sigma_nm[moving], 2.0 * one.sigma_nm[moving], rtol=1e-9)
 
 
+def test_before_the_zero_is_known_the_spread_is_wider_by_a_factor_that_fades() -> None:
+    columns, _ = driven(8.0, link_zero_rad=2e-5)
+    wary = replace(LEARNING, fused=replace(LEARNING.fused, zeros=replace(DAYS, early=1.8)))  # type: ignore[type-var]
+    one, other = (tracked(columns, each)[0] for each in (LEARNING, wary))
+    assert one.torque_nm.tobytes() == other.torque_nm.tobytes()
+    moving = (one.status == st.VALID) & (np.arange(len(one.status)) > 100)
+    factor = other.sigma_nm[moving] / one.sigma_nm[moving]
+    assert 1.65 < factor[0] <= factor.max() <= 1.8
+    assert 1.0 < factor[-1] < 1.4
+    off, wide = (FusedEstimator(joint, OFF).run(*columns) for joint in (LEARNING, wary))
+    assert off.sigma_nm.tobytes() == wide.sigma_nm.tobytes()
+
+
+def test_without_the_key_nothing_is_wider() -> None:
+    mapping = LEARNING.to_mapping()
+    del mapping["fused"]["zeros"]["early"]
+    old = Joint.from_mapping(mapping, "a.yaml")
+    assert old.fused is not None
+    assert old.fused.zeros is not None
+    assert old.fused.zeros.early == 1.0
+    columns, _ = driven(4.0, link_zero_rad=2e-5)
+    dt, _, motor, *_ = columns
+    on = np.full(len(dt), K)
+    v = np.gradient(motor / 100.0, 1e-3)
+    *_, early = followed(
+        old.fused, 40.0, dt, 0.1 * on / K, np.sign(v), v, 5.0 * on / K, 0.3 * on / K, 0.0 * on, on
+    )
+    assert np.array_equal(early, np.ones(len(dt)))
+
+
 def test_what_is_known_of_the_torsion_moves_the_weight_and_never_all_of_it() -> None:
     fusion = Fusion(SIGMA, True)
     one = np.ones(3)
@@ -173,7 +203,12 @@ def test_a_file_says_it_and_one_that_cannot_be_is_refused() -> None:
     mapping = LEARNING.to_mapping()
     assert mapping["fused"]["zeros"]["spread_nm"] == 0.3
     assert Joint.from_mapping(mapping, "a.yaml") == LEARNING
-    mapping["fused"]["zeros"]["spread_nm"] = 0.36
+    mapping["fused"]["zeros"]["early"] = 0.9
+    with pytest.raises(
+        ConfigError, match=r"a\.yaml.*fused\.zeros\.early.*found 0\.9, expected a number from 1"
+    ):
+        Joint.from_mapping(mapping, "a.yaml")
+    mapping["fused"]["zeros"] |= {"early": 1.0, "spread_nm": 0.36}
     with pytest.raises(
         ConfigError, match=r"a\.yaml.*spread_nm.*0\.36.*less than sigma\.torsion_nm \(0\.35 Nm\)"
     ):

@@ -8,6 +8,7 @@ from math import inf, isnan
 import numpy as np
 import pytest
 
+from jtqd.estimator import status as st
 from jtqd.estimator.age import age_ms, aligned, bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
@@ -286,12 +287,33 @@ def test_a_reference_of_now_is_the_sensor_itself() -> None:
     assert np.array_equal(found[1:], sensor[1:])
 
 
+def test_what_is_missed_by_speed_grows_no_more_far_above_its_saturation() -> None:
+    joint = fused_joint()
+    bare, endless, bent = (
+        FusedEstimator(following(joint, tracking), TRACKED)
+        for tracking in (
+            replace(TRACKING, sigma_nm=0.0, viscous_nms_per_rad=0.0),
+            replace(TRACKING, sigma_nm=0.0, viscous_nms_per_rad=0.5),
+            replace(TRACKING, sigma_nm=0.0, viscous_nms_per_rad=0.5, saturation_rad_s=0.4),
+        )
+    )
+    rows = twisted(21).rows()
+    seen = [[e.step(*row) for e in (bare, endless, bent)] for row in rows]
+    moving = [[each.sigma_nm**2 for each in one] for one in seen if one[0].status == st.VALID]
+    a, b, c = np.array(moving).T
+    square = (b - a) / 0.25
+    assert square.max() > 0.2
+    np.testing.assert_allclose(c - a, 0.25 * square / (1.0 + square / 0.16), atol=1e-9)
+
+
 def test_it_is_of_new_configurations_and_a_section_of_nonsense_is_refused() -> None:
     assert recommended("fused").track_torsion
     with pytest.raises(ConfigError, match=r"fused\.tracking.*rate_rad_s: found 5"):
         Tracking(5.0, 0.1, 0.1)
     with pytest.raises(ConfigError, match=r"fused\.tracking.*sigma_nm: found -1"):
         Tracking(200.0, -1.0, 0.1)
+    with pytest.raises(ConfigError, match=r"fused\.tracking.*saturation_rad_s: found 0"):
+        Tracking(200.0, 0.1, 0.1, 160.0, 0.0)
     with pytest.raises(ConfigError, match=r"fused\.tracking.*wave_rad_s: found -1"):
         Tracking(200.0, 0.1, 0.1, -1.0)
     joint = following(fused_joint())

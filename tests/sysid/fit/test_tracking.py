@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,13 +12,34 @@ from jtqd.estimator.estimator import observe_run
 from jtqd.estimator.joint import Tracking
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.sysid.fit import fused as fits
 from jtqd.sysid.fit.fused import path_residuals, tracking_of_unseen
+from jtqd.sysid.fit.residuals import NowErrors, PathResiduals
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.fit.torsion_signals import torsion_now, torsion_through
-from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S, fit_tracking, worth_it
+from jtqd.sysid.fit.tracking import (
+    SATURATION_RAD_S,
+    TRACKING_RAD_S,
+    WAVE_RAD_S,
+    by_speed,
+    fit_tracking,
+    worth_it,
+)
 from tests.estimator.fused_helpers import fused_joint, twisted
 from tests.estimator.test_torsion_bandwidth import SLIPPING, lossless
 
+AGED = np.full(400, 0.7)
+NONE = np.zeros(400)
+MADE = PathResiduals(
+    NONE + 5.0,
+    NONE + 1.0,
+    NONE,
+    NONE + 5.2,
+    NONE,
+    NONE + 0.1,
+    NONE + 0.2,
+    now=NowErrors(NONE + 0.6, AGED, NONE),
+)
 TORSION = replace(
     SLIPPING,
     orders_per_motor_rev=(2.0, 4.0, 1.0),
@@ -60,6 +82,28 @@ def test_the_torsion_of_now_is_that_of_the_estimator() -> None:
     np.testing.assert_allclose(late[300:], (seen.torsion_nm + seen.ahead_nm)[300:], atol=1e-6)
 
 
+def test_what_follows_in_a_fit_sees_the_tracked_torsion(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Zeros, agreement and calibration; without the section that of the fit's own filter."""
+    joint = lossless(0.3, 0.3)
+    assert joint.fused is not None
+    for section in (Tracking(TRACKING_RAD_S, 0.1, 0.1, WAVE_RAD_S), None):
+        seen: list[PathResiduals] = []
+        monkeypatch.setattr(fits, "_unseen", lambda *_, **__: ([MADE] * 6, []))
+        monkeypatch.setattr(fits, "tracking_of_unseen", lambda *_, made=section: made)
+        monkeypatch.setattr(fits, "fit_standstill", lambda *_: None)
+        monkeypatch.setattr(fits, "fit_loss", lambda *_: SimpleNamespace(loss=joint.fused.loss))  # type: ignore[union-attr]
+        monkeypatch.setattr(fits, "fit_torsion", lambda *_: joint.fused.torsion)  # type: ignore[union-attr]
+        monkeypatch.setattr(fits, "_envelope", lambda *_: None)
+        for name in ("fit_zeros", "_agreement"):
+            monkeypatch.setattr(fits, name, lambda runs, *_, to=seen: to.extend(runs))
+        monkeypatch.setattr(fits, "calibrated", lambda runs, fused, _, to=seen: (to.extend(runs), fused)[1])
+        fits.fit_fused([None] * 6, joint.friction, 40.0)  # type: ignore[list-item]
+        assert len(seen) == 18
+        for run in seen:
+            assert np.array_equal(run.torsion_error_nm, AGED if section else MADE.torsion_error_nm)
+            np.testing.assert_allclose(run.torsion_nm - run.torsion_error_nm, 5.0)  # the sensor
+
+
 def test_what_an_estimate_of_now_errs_by_more_is_found_and_nothing_where_nothing_is_missing() -> None:
     rng = np.random.default_rng(6)
     runs, n = 12, 4000
@@ -70,6 +114,16 @@ def test_what_an_estimate_of_now_errs_by_more_is_found_and_nothing_where_nothing
     assert (found.rate_rad_s, found.wave_rad_s) == (TRACKING_RAD_S, WAVE_RAD_S)
     assert found.sigma_nm == pytest.approx(0.08, rel=0.1)
     assert found.viscous_nms_per_rad == pytest.approx(0.06, rel=0.1)
+    assert found.saturation_rad_s == SATURATION_RAD_S[-1]
+    bent = [
+        e + rng.normal(0.0, 1.0, n) * np.sqrt(0.08**2 + 0.2**2 * v * v / (1.0 + (v / 0.8) ** 2))
+        for e, v in zip(errors, speed, strict=True)
+    ]
+    found = fit_tracking(errors, bent, speed)
+    assert found.saturation_rad_s == pytest.approx(0.8, rel=0.3)
+    v = np.array([0.0, 0.5, 1.0, 3.0])
+    missed = found.sigma_nm**2 + found.viscous_nms_per_rad**2 * by_speed(v, found.bend)
+    assert missed == pytest.approx(0.08**2 + 0.2**2 * v * v / (1.0 + (v / 0.8) ** 2), rel=0.15)
     same = fit_tracking(errors, errors, speed)
     assert (same.sigma_nm, same.viscous_nms_per_rad) == (0.0, 0.0)
 
