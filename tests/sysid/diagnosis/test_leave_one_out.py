@@ -131,7 +131,7 @@ def test_a_value_below_zero_is_no_cause_but_a_bound(measured: dict[int, Findings
         assert run.rmse_after_nm < 0.5 * run.rmse_before_nm
     assert bound.text in measured[7].reasons
     assert (
-        "viscous_friction of joint 7: at most 0.68 Nms/rad by these runs, 2 in the joint file" in bound.text
+        "viscous_friction of joint 7: at most 0.67 Nms/rad by these runs, 2 in the joint file" in bound.text
     )
     (written,) = to_mapping(measured[7])["bounded"]
     assert written["at_most"] == bound.at_most
