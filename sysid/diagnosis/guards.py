@@ -33,6 +33,8 @@ _AT_BOUND: Final = 1e-6
 """Part of a range within which a value lies at its end."""
 _FACTOR: Final = {"torque_constant_nm_per_a": 2.0, "gain": 2.0}
 """By how much a value may differ from the file's, either way: more is another motor or another unit, not an error."""
+_LEAST: Final = {"rotor_inertia_kgm2": 0.05}
+"""Part of the file's value below which it is none: every motor has a rotor."""
 _CANCELLED: Final = 0.3
 """Two effects whose sum is smaller than this part of each cancel each other."""
 
@@ -87,7 +89,8 @@ def beyond_bounds(p: PresentEffect, nothing: dict[str, float]) -> str:
         if not q.low + room < value < q.high - room:
             return f"{name} {value:.4g} {q.unit} is at the end of what is plausible ({q.low:g} to {q.high:g})"
         usual, factor = nothing.get(name, 0.0), _FACTOR.get(name, np.inf)
-        if usual > 0.0 and not usual / factor < value < usual * factor:
+        least = max(usual / factor, _LEAST.get(name, 0.0) * usual)
+        if usual > 0.0 and not least <= value < usual * factor:
             return f"{name} {value:.4g} {q.unit} is not physical: the file has {usual:.4g}"
     return ""
 
