@@ -23,7 +23,7 @@ def said(name: str, values: Mapping[str, float], nothing: Mapping[str, float]) -
     ("name", "value", "nothing", "why"),
     [
         ("rotor_inertia_kgm2", 1e-9, 6e-5, "rotor_inertia_kgm2 1e-09 kg m2 is at the end"),
-        ("rotor_inertia_kgm2", 2.2e-8, 6e-5, "not physical: the file has 6e-05"),
+        ("rotor_inertia_kgm2", 1e-6, 6e-5, "not physical: the file has 6e-05"),
         ("rotor_inertia_kgm2", 4e-6, 6e-5, ""),
         ("link_inertia_kgm2", -0.02, 0.1, "link_inertia_kgm2 -0.02 kg m2 is at the end"),
         ("torque_constant_nm_per_a", 0.00126, 0.0585, "not physical: the file has 0.0585"),
