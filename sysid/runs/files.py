@@ -50,6 +50,8 @@ BRIDGED_S: Final = 0.025
 SHORTEST_PIECE_S: Final = 1.0
 """Also the least by which the time must step back for a new run to begin there, and no stamp to be wrong."""
 GAP_NOTED: Final = 1.5
+_ROOM: Final = 0.9995
+"""Of the usual step, that the time has for each row at least if none is too many."""
 _BLANK: Final = ("", "nan")
 DEAD_ROWS: Final = 100
 """A channel without a single non-zero value over this many rows is dead, not quiet."""
@@ -271,7 +273,7 @@ def _scaled(
 def _checked(content: _Content, *, whole: bool) -> list[RunFile]:
     """Check time and columns of a file and make its run table, or one for each of its pieces."""
     if not whole:
-        content = _without_repeated_rows(content)
+        content = _with_rounded_stamps(_without_repeated_rows(content))
     time_s, path = content.values[TIME], content.path
     if len(time_s) < 2:
         raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
@@ -360,6 +362,24 @@ def _without_repeated_rows(content: _Content) -> _Content:
     note = f"{int(again.sum())} of {counted(len(again), 'row')} left out: they are the row before once more"
     values = {key: value[~again] for key, value in content.values.items()}
     return replace(content, values=values, lines=lines, notes=(*content.notes, note))
+
+
+def _with_rounded_stamps(content: _Content) -> _Content:
+    """Return the content with single stamps that equal the one before put in the middle of their neighbours, and a note,
+    where there are as many rows as the time has room for: stamps that were rounded, not rows that are too many.
+    """
+    time_s = content.values[TIME]
+    steps = np.diff(time_s)
+    if len(steps) < 2 or not np.all(steps >= 0.0) or np.all(steps > 0.0):
+        return content
+    same = np.flatnonzero(steps == 0.0)
+    single = same[-1] < len(steps) - 1 and np.all(np.diff(same) > 1)
+    if not single or np.mean(steps) < _ROOM * np.median(steps[steps > 0.0]):
+        return content
+    spread = time_s.copy()
+    spread[same + 1] = 0.5 * (time_s[same] + time_s[same + 2])
+    note = f"{counted(len(same), 'stamp')} like the one before: rounded, taken for the middle of those around"
+    return replace(content, values={**content.values, TIME: spread}, notes=(*content.notes, note))
 
 
 def _new_runs(time_s: FloatArray) -> list[int]:

@@ -191,6 +191,18 @@ def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
         read_pieces(_table(tmp_path / "stamp.csv", cells))
 
 
+def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path: Path) -> None:
+    """1 kHz and up to 0.7 ms late, rounded to ms: no row is too many, and the stamps then jitter."""
+    late = 1e-3 * np.random.default_rng(1).uniform(-0.1, 0.7, 3000)
+    t = np.round(0.001 * np.arange(3000.0) + late, 3)
+    assert np.any(np.diff(t) == 0.0)
+    [run] = read_pieces(_table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t + late)}))
+    assert np.all(np.diff(run.table.time_s) > 0.0)
+    assert run.table.time_s == pytest.approx(t, abs=1.01e-3)
+    count = np.count_nonzero(np.diff(t) == 0.0)
+    assert f"{count} stamps like the one before: rounded, taken for the middle of those around" in run.notes
+
+
 def test_a_row_that_a_recorder_did_not_finish_is_left_out_and_said(tmp_path: Path) -> None:
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0, "j1.motor_position_rad": T})
     whole = path.read_text()
