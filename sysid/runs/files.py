@@ -50,6 +50,8 @@ BRIDGED_S: Final = 0.025
 SHORTEST_PIECE_S: Final = 1.0
 """Also the least by which the time must step back for a new run to begin there, and no stamp to be wrong."""
 GAP_NOTED: Final = 1.5
+_MOST_ALIKE: Final = 3
+"""Stamps in a row that rounding makes one number of."""
 _ROOM: Final = 0.9995
 """Of the usual step, that the time has for each row at least if none is too many."""
 _BLANK: Final = ("", "nan")
@@ -365,20 +367,20 @@ def _without_repeated_rows(content: _Content) -> _Content:
 
 
 def _with_rounded_stamps(content: _Content) -> _Content:
-    """Return the content with single stamps that equal the one before put in the middle of their neighbours, and a note,
-    where there are as many rows as the time has room for: stamps that were rounded, not rows that are too many.
+    """Return the content with stamps that equal the one before put between their neighbours, and a note, where there are no
+    more rows than the time has room for: stamps that were rounded, not rows that are too many.
     """
     time_s = content.values[TIME]
     steps = np.diff(time_s)
     if len(steps) < 2 or not np.all(steps >= 0.0) or np.all(steps > 0.0):
         return content
-    same = np.flatnonzero(steps == 0.0)
-    single = same[-1] < len(steps) - 1 and np.all(np.diff(same) > 1)
-    if not single or np.mean(steps) < _ROOM * np.median(steps[steps > 0.0]):
+    new = np.concatenate(([True], steps > 0.0))
+    rows = np.flatnonzero(new)
+    many = np.max(np.diff(rows)) > _MOST_ALIKE or not new[-1]
+    if many or np.mean(steps) < _ROOM * np.median(steps[steps > 0.0]):
         return content
-    spread = time_s.copy()
-    spread[same + 1] = 0.5 * (time_s[same] + time_s[same + 2])
-    note = f"{counted(len(same), 'stamp')} like the one before: rounded, taken for the middle of those around"
+    spread = np.interp(np.arange(len(time_s)), rows, time_s[rows])
+    note = f"{counted(int(np.sum(~new)), 'stamp')} like the one before: rounded, spread between those around"
     return replace(content, values={**content.values, TIME: spread}, notes=(*content.notes, note))
 
 

@@ -200,7 +200,7 @@ def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path: Path) 
     assert np.all(np.diff(run.table.time_s) > 0.0)
     assert run.table.time_s == pytest.approx(t, abs=1.01e-3)
     count = np.count_nonzero(np.diff(t) == 0.0)
-    assert f"{count} stamps like the one before: rounded, taken for the middle of those around" in run.notes
+    assert f"{count} stamps like the one before: rounded, spread between those around" in run.notes
 
 
 def test_a_row_that_a_recorder_did_not_finish_is_left_out_and_said(tmp_path: Path) -> None:
