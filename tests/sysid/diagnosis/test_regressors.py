@@ -93,6 +93,21 @@ def test_the_damper_feels_an_error_of_the_teeth_and_the_link_its_acceleration() 
     )
 
 
+def test_the_link_follows_the_spring_as_it_is_and_not_as_the_file_has_it() -> None:
+    """A harder spring turns less, so the link's acceleration is less that of tau/K; with one encoder tau/K is in nothing."""
+    joint = replace(PLAIN, link_inertia_kgm2=0.5)
+    s = replace(made_up(joint), time_s=1e-3 * np.arange(2000))
+    turn = 2.0 * np.pi * 3.0
+    s.state.torsion_rad = 1e-3 * np.sin(turn * s.time_s)
+    p = {"stiffness_nm_per_rad": 1.2 * joint.stiffness_nm_per_rad, "cubic_nm_per_rad3": 0.0}
+    bent = -joint.link_inertia_kgm2 * 0.2 * turn**2 * s.state.torsion_rad
+    for signals, expected in ((s, bent), (replace(s, torsion_nm=None), 0.0 * bent)):
+        full = contribution(EFFECTS["nonlinear_stiffness"], p, signals)
+        bare = contribution(EFFECTS["nonlinear_stiffness"], p, replace(signals, joint=BARE))
+        more = full.get("motor", np.zeros(2000)) - bare.get("motor", np.zeros(2000))
+        assert more[20:-20] == pytest.approx(expected[20:-20], abs=0.01 * np.max(np.abs(bent)))
+
+
 def test_the_link_does_not_follow_an_error_of_the_teeth_that_is_quicker_than_its_acceleration_is_known() -> (
     None
 ):
