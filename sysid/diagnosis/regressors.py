@@ -95,9 +95,11 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
                 viscous = joint.friction.viscous_nms_per_rad * np.gradient(angle, s.time_s)
                 add(MOTOR, (inertia + s.per_torque * joint.link_inertia_kgm2) * bent + viscous)
                 add(TORSION, joint.link_inertia_kgm2 * bent)
-            if hook == "twist_rad" and (effect.geometric or s.torsion_nm is not None):
+            smooth = s.torsion_nm is not None and not effect.follows_torsion
+            if hook == "twist_rad" and (effect.geometric or smooth):
                 # the link's acceleration is that of the motor less tau/K (`signals`), so a twist beyond it adds its own, as
-                # far as that of the torque is known: what is quicker turns the spring and not the link
+                # far as that of the torque is known: what is quicker turns the spring and not the link. Where it slips with
+                # the encoders' difference, a second difference would be that of their noise
                 bent = joint.link_inertia_kgm2 * second_difference(s.slow_torsion(angle), s.time_s)
                 add(MOTOR, s.per_torque * bent)
                 add(TORSION, bent)
