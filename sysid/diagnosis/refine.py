@@ -196,9 +196,8 @@ def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     if not bent:
         return
     usual = s.joint.rated_torque_nm / stiffness
-    for _ in range(
-        _MOST_TORSION_STEPS
-    ):  # Newton: a spring that hardens by its own stiffness is no small change
+    # Newton: a spring that hardens by its own stiffness is no small change
+    for _ in range(_MOST_TORSION_STEPS):
         d = s.state.torsion_rad
         here = _torsion_sum(s, bent)
         s.state.torsion_rad = d + _TORSION_STEP * usual

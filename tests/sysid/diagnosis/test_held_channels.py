@@ -91,8 +91,15 @@ def test_a_channel_that_is_held_at_rest_costs_what_it_jumps_by_afterwards() -> N
     worth = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a * (current[begin - 61] - line)
     assert min(at_rest) >= min(worth) - 1e-9
     assert max(at_rest) <= max(worth) + 1e-9
-    cost = held_nm(cast("Any", data), cast("Any", SimpleNamespace(runs=binned, nuisances=none)))[MOTOR1]
-    assert cost**2 > float(np.sum(at_rest**2)) / len(binned[0].channels[MOTOR1].valid)
+    fit = cast("Any", SimpleNamespace(runs=binned, nuisances=none))
+    whole = held_nm(cast("Any", data), fit)[MOTOR1] ** 2
+    d = binned[0].channels[MOTOR1]
+    assert d.held is not None
+    count = int(np.sum(d.valid | d.held))
+    for run in binned:
+        run.channels[MOTOR1] = replace(run.channels[MOTOR1], at_rest_nm=np.empty(0))
+    moving = held_nm(cast("Any", data), fit)[MOTOR1] ** 2
+    assert whole * (count + len(at_rest)) - moving * count == pytest.approx(float(np.sum(at_rest**2)))
 
 
 @pytest.mark.parametrize(("cost", "matters"), [(0.1, False), (0.3, True)])

@@ -152,7 +152,12 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
         assert clean is not None
         return replace(c, current_a=noise, torque_nm=c.torque_nm - scale * clean)
 
-    table = dict(changed(runs(), [2], without_power))["run2"]
+    def one_encoder(table: RunTable, c: JointColumns) -> JointColumns:
+        return replace(c, link_position_rad=None)
+
+    idle = changed(changed(runs(), [2], without_power), list(range(COUNT)), one_encoder)
+    assert diagnose(idle, {1: PLAIN}).odd_runs == ()
+    table = dict(idle)["run2"]
     (signals,), _ = usable_signals([("run2", table)], {1: PLAIN}, (1,))
     gain, zero = Deviation("gain", "current_a", 1, 0.01, ""), Deviation("zero", "current_a", 1, 0.004, "")
     assert 0.5 < echo(gain, signals, 5) < 2.0
