@@ -339,7 +339,8 @@ cdef bint lowers(
 def levels(fused, double rated_nm, dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope):
     """Return (slow, fast, gain, |left|, doubt) after each block of a run, arrays [blocks] in Nm^2, Nm^2, 1, Nm, Nm; zeros tracked.
 
-    gain: |g| less `gain_sigmas` of its standard deviations; doubt: of the torsion, with what is surely a gain, beyond the levels of `fused.agreement`; 0 where that is None.
+    gain: |g| less `gain_sigmas` of its standard deviations; doubt: of the torsion, with what is surely a gain, beyond the
+    levels of `fused.agreement`; 0 where that is None.
     Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope: dL/draw of the loss.
     """
     columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope)
@@ -377,8 +378,9 @@ def followed(
     """Return (torsion, current, known, doubt, gain, early) of a run from its start: what the service adds to values and sigma.
 
     torsion, current: what tracked zeros add to both paths [Nm]; known: what they take off s_t^2 [Nm^2]; doubt [Nm^2] and its
-    gain, as of `doubt_of`; early: factor of the spread, 1 without zeros of the days. Arrays [n] of samples in motion: apart_nm: torsion less current path; variance_nm2: of that; slope:
-    dL/draw of the loss; stiffness: d tau_t/d d of the spring [Nm/rad]. tracked: zeros are taken off.
+    gain, as of `doubt_of`; early: factor of the spread, 1 without zeros of the days. Arrays [n] of samples in motion:
+    apart_nm: torsion less current path; variance_nm2: of that; slope: dL/draw of the loss; stiffness: d tau_t/d d of the
+    spring [Nm/rad]. tracked: zeros are taken off.
     """
     columns = (dt_s, apart_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope, stiffness)
     cdef const double[:, ::1] x = np.ascontiguousarray(np.column_stack(columns), np.float64)

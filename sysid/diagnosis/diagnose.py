@@ -106,6 +106,8 @@ def _diagnosed(
 
     findings = conclude(case, fit, names, numbers, anew)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
+    if findings.verdict == UNEXPLAINED:
+        findings = replace(findings, reasons=(*findings.reasons, *scope.told))
     used = tuple(run[0].run for run in usable)
     return replace(findings, channel_notes=notes, odd_runs=tuple(odd), used=used)
 

@@ -32,6 +32,12 @@ class Scope:
             return False
         return (None, name) not in self.out and (where, name) not in self.out
 
+    @property
+    def told(self) -> tuple[str, ...]:
+        """One line beside what is left over: which effects were not looked for; none where all were."""
+        names = ", ".join(sorted({name for _, name in self.out}))
+        return (f"not looked for, as asked: {names}; what is left over may be theirs",) if names else ()
+
 
 EVERYTHING: Final = Scope()
 
