@@ -55,6 +55,8 @@ _NOT_BESIDE: Final = frozenset({"sensor_gain"})
 _MOST: Final = 0.5
 """Part of what sets a run apart that its deviation must explain."""
 _MOST_COLUMNS: Final = 24
+_NOTHING: Final = 1e-6
+"""Part of what a channel reads that is nothing of the true value."""
 
 
 class Deviation(NamedTuple):
@@ -124,7 +126,8 @@ def of_truth(gain: float) -> float:
 
     The columns are made of what was read: g of the true value is g / (1 + g) of that; the other direction (-2) is 2 of it.
     """
-    return gain / (1.0 - gain)
+    left = 1.0 - gain
+    return gain / (left if abs(left) > _NOTHING else _NOTHING)
 
 
 @dataclass(frozen=True)

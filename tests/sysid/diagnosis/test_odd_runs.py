@@ -14,7 +14,14 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Findings, OddRun, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.odd_runs import Comparison, Deviation, apart_from_others, echo, own_deviations
+from jtqd.sysid.diagnosis.odd_runs import (
+    Comparison,
+    Deviation,
+    apart_from_others,
+    echo,
+    of_truth,
+    own_deviations,
+)
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 
 NOMINAL = load_joint(shipped("joint1.yaml"))
@@ -172,6 +179,12 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
         echoes = np.zeros((5, 1))
         echoes[2] = own
         assert (Comparison(grams, 1, echoes).far([0], (2, 0), [gain]) is not None) == far
+
+
+def test_a_gain_is_told_of_the_true_value() -> None:
+    assert of_truth(0.08 / 1.08) == pytest.approx(0.08)
+    assert of_truth(2.0) == pytest.approx(-2.0), "the other direction"
+    assert np.isfinite(of_truth(1.0)), "nothing of what is read is true"
 
 
 def test_text_says_what_run_and_channel() -> None:
