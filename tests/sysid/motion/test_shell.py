@@ -5,13 +5,14 @@ The times of the supervision are wide here, because a test machine may stand sti
 
 import json
 import os
+import queue
 import signal
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 import pytest
@@ -19,7 +20,7 @@ import yaml
 
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME
-from jtqd.drivers.frame_socket import open_frame_socket
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Timing
 from jtqd.sysid.motion.shell import play
 from tests.shipped_bench import shipped_bench
@@ -81,18 +82,25 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 class Listener:
-    """Collects what is said under some COB-IDs while it is open."""
+    """Collects what is said under some COB-IDs; a thread reads, for a full queue loses what comes last."""
 
     def __init__(self, bus: str, *identifiers: int) -> None:
         self.socket = open_frame_socket(bus, [exact(can_id) for can_id in identifiers])
+        self._found: queue.SimpleQueue[tuple[int, bytes]] = queue.SimpleQueue()
+        threading.Thread(target=self._read, daemon=True).start()
+
+    def _read(self) -> None:
+        with suppress(BusError):  # the bus ends
+            while True:
+                self.socket.wait(1.0)
+                for n in range(self.socket.receive()):
+                    can_id, length, data = FRAME.unpack_from(self.socket.frames, 16 * n)
+                    self._found.put((can_id, data[:length]))
 
     def frames(self) -> list[tuple[int, bytes]]:
-        found = []
-        while count := self.socket.receive():
-            for n in range(count):
-                can_id, length, data = FRAME.unpack_from(self.socket.frames, 16 * n)
-                found.append((can_id, data[:length]))
-        return found
+        """What was said since the last call."""
+        time.sleep(0.3)
+        return [self._found.get() for _ in range(self._found.qsize())]
 
 
 def test_a_motion_is_played_and_leaves_both_drives_off_and_unwatched(bus: str) -> None:
@@ -176,8 +184,8 @@ def test_a_second_commander_is_refused_before_it_touches_anything(bus: str) -> N
         target=lambda: results.append(play(bus, plateau(0.8, 1.0, hold_ms=1500), LIMITS, timing=PATIENT))
     )
     first.start()
-    listener = Listener(bus, 0x301)
-    listener.socket.wait(20.0)
+    with closing(open_frame_socket(bus, [exact(0x301)])) as commands:
+        commands.wait(20.0)
     with pytest.raises(MotionError, match=r"another commander is on the bus \(node 21h\)"):
         play(bus, plateau(1.0, 1.0), LIMITS, timing=PATIENT)
     first.join()
