@@ -9,8 +9,8 @@ for the spring, and makes the rotor seem to accelerate by G link_rad omega_m^2 (
 out): i' makes up for that inertia, + Jm G link_rad omega_m^2 / Kt.
 
 Current and link readings are corrected first; loss and twist see the corrected ones. A loss that depends on the torque
-takes the estimate of the sample before. Inertias replace the joint file's (`plain_joint`). Loads and the sensor's effects
-change nothing of the torque at the drive side.
+takes the estimate of the sample before. Inertias and the gear's damping replace the joint file's (`plain_joint`). Loads and
+the sensor's effects change nothing of the torque at the drive side.
 
 Derivatives of a noisy channel and the deflection that moves a slip pass a first-order filter; it starts at the first
 sample, and again after garbage or a gap.
@@ -78,7 +78,7 @@ def acting_effects(joint: Joint) -> Pairs:
 
 
 def plain_joint(joint: Joint) -> Joint:
-    """Return the joint without effects, inertias replaced."""
+    """Return the joint without effects, with the values that they replace."""
     plain = replace(joint, effects=()) if joint.effects else joint
     for entry in joint.effects:
         effect = EFFECTS[entry.name]

@@ -33,7 +33,7 @@ def effects_of(joint: Joint) -> list[tuple[Effect, Values]]:
 
 
 def changed_joint(joint: Joint) -> Joint:
-    """Return the joint with the values that its effects replace (inertias)."""
+    """Return the joint with the values that its effects replace (inertias, damping)."""
     for effect, values in effects_of(joint):
         joint = effect.joint(values, joint)
     return joint
@@ -44,7 +44,7 @@ def uses_temperature(joint: Joint) -> bool:
     cold, warm = _at(0.4, _PROBE_TORSION_RAD), _at(0.4, _PROBE_TORSION_RAD)
     for state, celsius in ((cold, 20.0), (warm, 40.0)):
         state.temperature_c = celsius
-        state.current_rate_a_s = state.torque_rate_nm_s = 1.0
+        state.current_rate_a_s = state.torque_rate_nm_s = state.torsion_rate_rad_s = 1.0
     for effect, values in effects_of(joint):
         for name in effect.hooks:
             call = getattr(effect, name)

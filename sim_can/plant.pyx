@@ -65,7 +65,7 @@ def _constants(side):
         side.torque_constant,
         side.rotor_inertia,
         side.stiffness,
-        side.joint.damping_nms_per_rad,
+        side.damping,
         d.ripple_nm,
         d.ripple_order_per_motor_rev,
         d.ripple_phase_rad,

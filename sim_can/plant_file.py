@@ -127,7 +127,7 @@ class JointPlant:
 
     @cached_property
     def true_joint(self) -> Joint:
-        """Return the joint with its true constants: its file's, the deviations, and inertias that effects replace.
+        """Return the joint with its true constants: its file's, the deviations, and what effects replace.
 
         An effect states the right value, whatever file and deviations say.
         """
@@ -154,6 +154,11 @@ class JointPlant:
     def stiffness(self) -> float:
         """True K, Nm/rad; effects on it are twists."""
         return self.true_joint.stiffness_nm_per_rad
+
+    @property
+    def damping(self) -> float:
+        """True damping of the gear, Nms/rad."""
+        return self.true_joint.damping_nms_per_rad
 
     @property
     def link_inertia(self) -> float:
@@ -252,7 +257,7 @@ def substep_limit(
     """
     one, two = parameters.joints
     link = one.link_inertia + two.link_inertia
-    damping = one.joint.damping_nms_per_rad + two.joint.damping_nms_per_rad
+    damping = one.damping + two.damping
     stiffness = [
         side.stiffness * factor + side.deviations.hysteresis_stiffness
         for side, factor in zip((one, two), stiffer, strict=True)
@@ -263,7 +268,7 @@ def substep_limit(
         steepest = 1.0 + side.joint.gear_ratio * side.deviations.kinematic_slope + bend
         inertia = side.rotor_inertia * (side.joint.gear_ratio / steepest) ** 2
         squares.append(2.0 * spring / inertia)
-        rates.append(side.joint.damping_nms_per_rad / inertia)
+        rates.append(side.damping / inertia)
     step = min(parameters.substep_s, 0.25 / math.sqrt(max(squares)))
     fastest = max(rates)
     return min(step, 0.25 / fastest) if fastest > 0.0 else step

@@ -74,6 +74,10 @@ class JointValues(Protocol):
         """Stiffness of the gear on the joint side, Nm/rad."""
 
     @property
+    def damping_nms_per_rad(self) -> float:
+        """Damping of the gear on the joint side, Nms/rad."""
+
+    @property
     def link_inertia_kgm2(self) -> float:
         """Inertia between gear and sensor, kg m2."""
 
@@ -115,8 +119,8 @@ class State:
 
     current_a as measured; velocity_rad_s = omega_m/G; direction: sign of velocity, between -1 and 1 near rest;
     motor_*: motor side; link_*: joint side; coupling_position_rad: link position of joint 1 (= - that of joint 2), the
-    sensor's angle; torque_nm: what the gear transmits; torsion_rad: theta_m/G - theta_l less its zero; time_s since
-    the run's first sample.
+    sensor's angle; torque_nm: what the gear transmits; torsion_rad: theta_m/G - theta_l less its zero, with its
+    rate; time_s since the run's first sample.
     """
 
     __slots__ = (
@@ -134,6 +138,7 @@ class State:
         "torque_nm",
         "torque_rate_nm_s",
         "torsion_rad",
+        "torsion_rate_rad_s",
         "velocity_rad_s",
     )
 
@@ -151,6 +156,7 @@ class State:
     torque_nm: Any
     torque_rate_nm_s: Any
     torsion_rad: Any
+    torsion_rate_rad_s: Any
     velocity_rad_s: Any
 
     def __init__(self, **fields: Any) -> None:
@@ -207,7 +213,7 @@ class Effect:
     geometric: its twist is one of the teeth, so the damper beside the spring feels its rate too (kinematic error), unlike
     a property of the spring itself.
     follows_torsion: its state follows the torsion itself (slip, play), for which tau/K is not good enough.
-    changes_joint: `joint()` says it all for plant and estimator, which then leave its hooks alone (inertias).
+    changes_joint: `joint()` says it all for plant and estimator, which then leave its hooks alone (inertias, damping).
     """
 
     name: ClassVar[str]

@@ -31,6 +31,7 @@ NAMES: Final = (
     "nonlinear_stiffness",
     "hysteresis",
     "lost_motion",
+    "gear_damping",
     "torque_constant",
     "torque_constant_saturation",
     "torque_constant_temperature",

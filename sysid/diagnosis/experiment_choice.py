@@ -56,6 +56,7 @@ _PAIR_TABLE: Final = {
         "hysteresis nonlinear_stiffness",
         "lost_motion nonlinear_stiffness",
         "hysteresis channel_delay",
+        "hysteresis gear_damping",
         "nonlinear_stiffness encoder_eccentricity",
     ),
     "full_turns": (
@@ -76,6 +77,8 @@ _PAIR_TABLE: Final = {
         "rotor_inertia channel_delay",
         "link_inertia channel_delay",
         "torque_ripple channel_delay",
+        "gear_damping channel_delay",
+        "gear_damping link_inertia",
     ),
     "warm_up": (
         "temperature_dependent_friction viscous_friction",
@@ -100,7 +103,7 @@ _VISIBLE: Final = {
     "load_at_both_directions": "load_dependent_friction torque_constant sensor_gain torque_constant_saturation",
     "load_ramp": "nonlinear_stiffness hysteresis lost_motion",
     "full_turns": "torque_ripple kinematic_error cogging sensor_crosstalk encoder_eccentricity unbalance",
-    "quick_changes": "rotor_inertia link_inertia channel_delay",
+    "quick_changes": "rotor_inertia link_inertia channel_delay gear_damping",
     "warm_up": "temperature_dependent_friction torque_constant_temperature sensor_drift",
     "zero_reading": "current_offset sensor_offset",
 }

@@ -182,6 +182,7 @@ _MEASURED: Final = (
     "time_s",
     "torque_rate_nm_s",
     "torsion_rad",
+    "torsion_rate_rad_s",
 )
 """Fields of the state that the windows take from the measurement; the others are simulated."""
 _NEARLY_ZERO_RAD_S: Final = 1e-9

@@ -6,7 +6,8 @@ averaged over equal bins, residual and regressors alike, so that noise of differ
 compared with something filtered in another way.
 
 The torsion that the effects see is tau/K, not the encoders' difference: the residual of the torsion balance is made of
-that difference, and a regressor made of it too would explain it by itself. For the same reason currents and torques in
+that difference, and a regressor made of it too would explain it by itself. Its rate is that of the difference, whose noise
+has no part in the noise of the difference itself. For the same reason currents and torques in
 regressors are smoothed over a few milliseconds (`calm`): their noise is also in the residual, and would be explained by
 itself at the frequencies where there is nothing else. Of samples so far apart that there is nothing to smooth over, each
 is what its neighbours say.
@@ -377,6 +378,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         torque_nm=calm_torque,
         torque_rate_nm_s=_sensor_rate(sensor, time),
         torsion_rad=calm_torque / joint.stiffness_nm_per_rad,
+        torsion_rate_rad_s=np.full(len(time), np.nan),
         velocity_rad_s=velocity,
         coupling_position_rad=link if number != 2 else -link,
     )
@@ -390,6 +392,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, calm_torque)
         torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate - gear_torque
         bent = calm(twist - zero, step)
+        state.torsion_rate_rad_s = first_difference(bent, time)
     return JointSignals(
         run,
         number,
@@ -484,6 +487,16 @@ def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
     return np.pad(inner, 2, mode="edge")
 
 
+def first_difference(x: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the first derivative [n], as `second_difference`."""
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    if len(x) < 5 or float(np.max(np.abs(steps - step))) > 0.05 * step:
+        return np.asarray(np.gradient(x, time))
+    inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
+    return np.pad(inner, 2, mode="edge")
+
+
 def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolArray:
     """Return True where the joint moves and has done so, and will, for _AFTER_REST_S, or as long as a filter remembers."""
     slow = np.abs(velocity) < SLOWEST_RAD_S
@@ -537,8 +550,7 @@ def _sensor_rate(x: FloatArray, time: FloatArray) -> FloatArray:
     wide = _smoothed_samples(step)
     if wide >= _ENOUGH or len(x) < 5:
         return np.asarray(np.gradient(smooth(x, wide), time))
-    inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
-    return np.pad(inner, 2, mode="edge")
+    return first_difference(x, time)
 
 
 def _slow(x: FloatArray, step_s: float) -> FloatArray:

@@ -277,6 +277,7 @@ ALL: dict[str, dict[str, float]] = {
     "channel_delay": {"delay_s": 2e-3, "channel": 1.0},
     "rotor_inertia": {"rotor_inertia_kgm2": 9e-5},
     "link_inertia": {"link_inertia_kgm2": 0.1},
+    "gear_damping": {"damping_nms_per_rad": 20.0},
     "unbalance": {"moment_nm": 1.0},
     "sensor_offset": {"offset_nm": 1.0},
     "sensor_gain": {"gain": 1.1},
@@ -347,7 +348,15 @@ def test_every_effect_was_there() -> None:
 
 
 def test_without_acting_effects_the_estimator_is_the_plain_one() -> None:
-    none = ("sensor_offset", "sensor_gain", "sensor_drift", "sensor_crosstalk", "unbalance", "link_inertia")
+    none = (
+        "sensor_offset",
+        "sensor_gain",
+        "sensor_drift",
+        "sensor_crosstalk",
+        "unbalance",
+        "link_inertia",
+        "gear_damping",
+    )
     late_sensor = ("channel_delay", {"delay_s": 1e-3, "channel": 0.0})
     joint = extended(PLAIN, *((name, ALL[name]) for name in none), late_sensor)
     assert acting_effects(joint) == ()

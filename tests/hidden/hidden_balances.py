@@ -134,6 +134,8 @@ def expected(
         twist = p["torque_nm"] / K * _slip(s.twist_rad, p["travel_rad"])
     elif name == "lost_motion":
         twist = -np.clip(s.twist_rad, -p["width_rad"] / 2, p["width_rad"] / 2)
+    elif name == "gear_damping":
+        damped = (p["damping_nms_per_rad"] - joint["damping_nms_per_rad"]) * slope(s.twist_rad, s.time_s)
     elif name == "torque_constant":
         loss = -G * (p["torque_constant_nm_per_a"] - Kt) * s.current_a
     elif name == "torque_constant_saturation":

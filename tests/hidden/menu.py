@@ -1,4 +1,4 @@
-"""The 25 effects: how a size becomes parameters of a joint file. Sizes are deviations of the leading parameter, SI.
+"""The effects: how a size becomes parameters of a joint file. Sizes are deviations of the leading parameter, SI.
 
 An effect that replaces a value of the joint file has absolute parameters: file value plus deviation.
 """
@@ -50,6 +50,9 @@ MENU: Final[dict[str, Entry]] = {
     ),
     "hysteresis": Entry("torque_nm", 0.5, 2.0, both=False),
     "lost_motion": Entry("width_rad", 4e-5, 2e-4, both=False),
+    "gear_damping": Entry(
+        "damping_nms_per_rad", 0.5, 2.0, both=False, relative=True, key="damping_nms_per_rad"
+    ),
     "torque_constant": Entry(
         "torque_constant_nm_per_a", 0.02, 0.08, relative=True, key="torque_constant_nm_per_a"
     ),

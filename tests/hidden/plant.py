@@ -119,6 +119,7 @@ _ARRAYS: Final[dict[str, dict[str, str]]] = {
     "nonlinear_stiffness": {"stiffness_nm_per_rad": "stiffness", "cubic_nm_per_rad3": "cubic"},
     "hysteresis": {"torque_nm": "hysteresis", "travel_rad": "travel"},
     "lost_motion": {"width_rad": "play"},
+    "gear_damping": {"damping_nms_per_rad": "damping"},
     "torque_constant": {"torque_constant_nm_per_a": "torque_constant"},
     "torque_constant_saturation": {"saturation_per_a": "saturation"},
     "torque_constant_temperature": {"per_k": "constant_per_k", "reference_c": "constant_reference"},

@@ -56,6 +56,7 @@ def nothing(joint):
         "encoder_eccentricity": {"amplitude_rad": 0.0},
         "channel_delay": {"delay_s": 0.0},
         "link_inertia": {"link_inertia_kgm2": joint.link_inertia_kgm2},
+        "gear_damping": {"damping_nms_per_rad": joint.damping_nms_per_rad},
         "unbalance": {"moment_nm": 0.0},
     }
 

@@ -59,6 +59,7 @@ CASES = [
     ("encoder_eccentricity", {"amplitude_rad": 1e-4, "phase_rad": 0.7}, "t"),
     ("encoder_eccentricity", {"amplitude_rad": 5e-3, "phase_rad": 0.7, "motor_side": 1.0}, "t"),
     ("link_inertia", {"link_inertia_kgm2": 2.5 * JOINT.link_inertia_kgm2}, "mt"),
+    ("gear_damping", {"damping_nms_per_rad": 3.0 * D}, "t"),
     ("unbalance", {"moment_nm": 1.5, "phase_rad": 0.5}, "mt"),
     ("channel_delay", {"delay_s": 0.002, "channel": 0.0}, "mt"),
     ("channel_delay", {"delay_s": 0.002, "channel": 1.0}, "m"),
@@ -156,6 +157,7 @@ def hooks(name, parameters, rows, number, h):
         torque_nm=tau,
         torque_rate_nm_s=np.gradient(truth, h),
         torsion_rad=angle / G - link,
+        torsion_rate_rad_s=speed / G - link_speed,
         temperature_c=np.full_like(tau, 22.0),
         time_s=rows[12, :-1],
     )

@@ -246,6 +246,7 @@ _PLANT: Final[dict[str, Callable[[JointPlant, Mapping[str, float]], None]]] = {
     "nonlinear_stiffness": _set(cubic="cubic_nm_per_rad3"),
     "hysteresis": _set(hysteresis_nm="torque_nm", hysteresis_rad="travel_rad"),
     "lost_motion": _set(play_rad="width_rad"),
+    "gear_damping": _set(damping="damping_nms_per_rad"),
     "torque_constant": _set(kt="torque_constant_nm_per_a"),
     "torque_constant_saturation": _set(saturation="saturation_per_a"),
     "torque_constant_temperature": _set(kt_per_k="per_k"),

@@ -109,6 +109,9 @@ def expected(  # noqa: PLR0911
     if name == "torque_constant_temperature":
         warm = p["per_k"] * (run[at + "temperature_c"] - 25.0)
         return -gear * j["torque_constant_nm_per_a"] * warm * i, None
+    if name == "gear_damping":
+        speed = run[at + "motor_velocity_rad_s"] / gear - run[at + "link_velocity_rad_s"]
+        return np.zeros_like(i), -(p["damping_nms_per_rad"] - j["damping_nms_per_rad"]) * speed
     assert name == "temperature_dependent_friction", name
     cooler = np.exp(-p["viscous_per_k"] * (run[at + "temperature_c"] - 25.0)) - 1.0
     return j["friction"]["viscous_nms_per_rad"] * v * cooler, None

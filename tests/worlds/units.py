@@ -61,6 +61,7 @@ _kt: Final = _of_file("torque_constant_nm_per_a")
 _rotor: Final = _of_file("rotor_inertia_kgm2")
 _coulomb: Final = _of_file("friction", "coulomb_nm")
 _viscous: Final = _of_file("friction", "viscous_nms_per_rad")
+_damping: Final = _of_file("damping_nms_per_rad")
 _link: Final = _of_file("link_inertia_kgm2")
 
 UNITS: Final[dict[str, Unit]] = {
@@ -81,6 +82,7 @@ UNITS: Final[dict[str, Unit]] = {
     ),
     "hysteresis": Unit("torque_nm", rated_nm, 0.02, 0.2, both=False),
     "lost_motion": Unit("width_rad", rated_twist, 0.03, 0.5, both=False),
+    "gear_damping": Unit("damping_nms_per_rad", _damping, 1.0, 20.0, both=False, base=_damping),
     "torque_constant": Unit("torque_constant_nm_per_a", _kt, 0.03, 0.3, base=_kt),
     "torque_constant_saturation": Unit(
         "saturation_per_a", lambda joint: 1.0 / rated_a(joint), 0.1, 0.4, both=False

@@ -58,6 +58,7 @@ def state(seed: int, count: int = 2000) -> State:
         torque_nm=torque,
         torque_rate_nm_s=np.gradient(torque, t),
         torsion_rad=torque / 12000.0 + rng.normal(0.0, 2e-6, count),
+        torsion_rate_rad_s=np.gradient(torque, t) / 12000.0,
         velocity_rad_s=v,
     )
 

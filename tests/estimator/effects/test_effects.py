@@ -148,6 +148,11 @@ LAWS: list[tuple[str, dict[str, float], Law]] = [
     ("channel_delay", {"delay_s": 2e-3, "channel": 1.0}, lambda s: (-G * KT * 2e-3 * s.current_rate_a_s, 0)),
     ("channel_delay", {"delay_s": 2e-3, "channel": 2.0}, lambda s: (0, K * 2e-3 * s.link_velocity_rad_s)),
     (
+        "gear_damping",
+        {"damping_nms_per_rad": 20.0},
+        lambda s: (0, -12.0 * s.torsion_rate_rad_s),
+    ),
+    (
         "link_inertia",
         {"link_inertia_kgm2": 0.04},
         lambda s: (0.03 * s.link_acceleration_rad_s2, 0.03 * s.link_acceleration_rad_s2),
@@ -184,7 +189,7 @@ def test_one_sample_and_whole_runs_agree(name: str, p: dict[str, float], law: La
 def test_every_effect_has_a_law_here_and_every_name_is_there() -> None:
     assert set(EFFECTS) == {name for name, *_ in LAWS}, "a new effect needs its law in LAWS"
     assert set(EFFECTS) >= set(NAMES)
-    assert len(NAMES) == len(set(NAMES)) == 25
+    assert len(NAMES) == len(set(NAMES)) == 26
 
 
 @pytest.mark.parametrize("effect", EFFECTS.values(), ids=lambda e: e.name)
@@ -259,10 +264,11 @@ def test_what_belongs_to_the_sensor() -> None:
     assert EFFECTS["sensor_gain"].at_sensor_of({"gain": 1.1})
 
 
-def test_inertias_change_the_joint() -> None:
+def test_inertias_and_the_damping_change_the_joint() -> None:
     for name, key, value in (
         ("rotor_inertia", "rotor_inertia_kgm2", 9e-5),
         ("link_inertia", "link_inertia_kgm2", 0.04),
+        ("gear_damping", "damping_nms_per_rad", 20.0),
     ):
         assert getattr(EFFECTS[name].joint({key: value}, PLAIN), key) == value
     assert EFFECTS["torque_constant"].joint({"torque_constant_nm_per_a": 1.0}, PLAIN) is PLAIN

@@ -99,6 +99,7 @@ def seen(case: Case) -> tuple[State, FloatArray, FloatArray, FloatArray]:
         torque_nm=torque,
         torque_rate_nm_s=slope(c.torque_nm, t),
         torsion_rad=torsion,
+        torsion_rate_rad_s=v - link_speed,
         velocity_rad_s=v,
     )
     weight = (np.convolve(np.abs(v) < 0.05, np.ones(101), "same") < 0.5).astype(float)

@@ -144,8 +144,10 @@ def rigid_run(
     stribeck_nm: float = 0.0,
     stribeck_velocity_rad_s: float = 0.1,
     stiffness: float = 1.0,
+    damping_nms_per_rad: float = 0.0,
 ) -> RunTable:
-    """Joint 1 by the equations, both encoders, every quadrant. stiffness: the truth as part of the file's value.
+    """Joint 1 by the equations, both encoders, every quadrant. stiffness: the truth as part of the file's value; the gear is
+    not damped, or as is said here.
 
     The motor's friction is that of the file and a Stribeck peak; noise: of the current, as torque at the joint [Nm].
     """
@@ -158,8 +160,11 @@ def rigid_run(
     gear = torque + joint.link_inertia_kgm2 * link_acceleration
     gear_bend = bend + joint.link_inertia_kgm2 * w[0] ** 4 * link
     K = stiffness * joint.stiffness_nm_per_rad
-    motor = link + gear / K
-    velocity = 0.7 * w[0] * np.cos(w[0] * t + phase) + np.gradient(gear, t) / K
+    twist = gear / K
+    if damping_nms_per_rad:  # to first order in the damper's time
+        twist = twist - damping_nms_per_rad * np.gradient(gear, t) / K**2
+    motor = link + twist
+    velocity = 0.7 * w[0] * np.cos(w[0] * t + phase) + np.gradient(twist, t)
     friction = joint.friction
     peak = stribeck_nm * np.exp(-((velocity / stribeck_velocity_rad_s) ** 2))
     loss = np.sign(velocity) * (friction.coulomb_nm + peak) + friction.viscous_nms_per_rad * velocity

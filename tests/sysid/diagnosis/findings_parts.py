@@ -32,6 +32,7 @@ JOINT_EFFECTS: Mapping[str, tuple[str, float, str]] = {
     "encoder_eccentricity": ("amplitude_rad", 6e-6, "rad"),
     "channel_delay": ("delay_s", 0.0004, "s"),
     "link_inertia": ("link_inertia_kgm2", 0.02, "kgm2"),
+    "gear_damping": ("damping_nms_per_rad", 3.0, "Nms/rad"),
     "unbalance": ("moment_nm", 0.05, "Nm"),
 }
 SENSOR_EFFECTS: Mapping[str, tuple[str, float, str]] = {

@@ -20,10 +20,12 @@ from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause
 from jtqd.sysid.diagnosis.noise import Sums
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
-from tests.estimator.effects.effect_signals import PLAIN
+from tests.estimator.effects import effect_signals
 from tests.sysid.diagnosis.diagnose_core_helpers import candidates, rigid_run
 
+PLAIN = replace(effect_signals.PLAIN, damping_nms_per_rad=0.0)  # as in the runs
 PER_A = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a
+ENCODER_RAD = 3e-6
 RATED_A = PLAIN.rated_torque_nm / PER_A
 
 
@@ -46,6 +48,8 @@ def bench_run(
         name: np.pad(getattr(one, name), (0, rest), mode="edge")
         for name in ("motor_position_rad", "link_position_rad", "torque_nm")
     }
+    encoder = np.random.default_rng(int(1000 * phase) + 2).normal(0.0, ENCODER_RAD, n + rest)
+    held["link_position_rad"] = held["link_position_rad"] + encoder
     enabled = np.where(np.arange(n + rest) < n, 1.0, 0.0) if marked else None
     time = 1e-3 * np.arange(n + rest)
     return RunTable(time, {1: replace(one, current_a=current, enabled=enabled, **held)})

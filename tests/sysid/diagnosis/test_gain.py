@@ -63,6 +63,7 @@ def signals_of(
         torque_nm=gear,
         torque_rate_nm_s=np.gradient(sensor, time),
         torsion_rad=gear / joint.stiffness_nm_per_rad,
+        torsion_rate_rad_s=np.gradient(gear, time) / joint.stiffness_nm_per_rad,
         velocity_rad_s=velocity,
         coupling_position_rad=link if number == 1 else -link,
     )

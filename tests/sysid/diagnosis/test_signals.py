@@ -105,6 +105,7 @@ def test_a_run_by_the_equations_leaves_nothing() -> None:
             "nonlinear_stiffness",
             {"stiffness_nm_per_rad": 10000.0, "cubic_nm_per_rad3": 0.0},
         ),
+        ({"damping_nms_per_rad": 80.0}, "gear_damping", {"damping_nms_per_rad": 80.0}),
         ({"friction": {"coulomb_nm": 5.0}}, "coulomb_friction", {"coulomb_nm": 5.0}),
         ({"friction": {"viscous_nms_per_rad": 4.0}}, "viscous_friction", {"viscous_nms_per_rad": 4.0}),
     ],
@@ -115,7 +116,8 @@ def test_what_is_wrong_in_the_file_is_what_its_effect_leaves(
     """The truth differs in one value; residuals with the nominal file are the columns of the effect of that name."""
     values = {k: replace(PLAIN.friction, **v) if isinstance(v, dict) else v for k, v in change.items()}
     truth = replace(PLAIN, **values)  # type: ignore[arg-type]
-    s = signals(rigid_run(truth))
+    damping = truth.damping_nms_per_rad if effect == "gear_damping" else 0.0
+    s = signals(rigid_run(truth, damping_nms_per_rad=damping))
     s.state.torsion_rad = (
         s.state.torque_nm / truth.stiffness_nm_per_rad
     )  # what the spring really does (`refine`)
