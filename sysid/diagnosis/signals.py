@@ -132,6 +132,8 @@ SLOWEST_RAD_S: Final = 0.03
 _AFTER_REST_S: Final = 0.03
 """So long after (and before) such a velocity the transients of sticking are still in the torque."""
 _SMOOTH_S: Final = 0.005
+_RATE_SMOOTH: Final = 0.4
+"""Part of _SMOOTH_S over which what a rate is taken of is smoothed."""
 _ENOUGH: Final = 5
 """Samples within _SMOOTH_S from which an average of them holds little of each one's own noise."""
 _NEAR_S: Final = 0.008
@@ -366,7 +368,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     calm_torque, calm_current = calm(gear_torque, step), calm(columns.current_a, step)
     state = State(
         current_a=calm_current,
-        current_rate_a_s=np.gradient(calm_current, time),
+        current_rate_a_s=_current_rate(columns.current_a, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
         link_acceleration_rad_s2=link_acceleration + (motion.shared - motion.acceleration) / joint.gear_ratio,
         link_position_rad=link,
@@ -540,17 +542,24 @@ def _neighbours(reach: int) -> FloatArray:
 
 
 def _sensor_rate(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative [n] of the sensor's torque as regressors have it (`calm`).
+    """Return the derivative [n] of the sensor's torque as regressors have it.
 
-    Of fourth order where samples are too far apart to be smoothed: a difference over 8 ms has 0.84 of what swings at 40 Hz,
-    and a delay would be found larger by as much. It holds nothing of its own sample's noise. A current has too much noise
-    for that (`calm` comes first there).
+    The noise of a difference has little part in that of the same sample, so less is smoothed than in the signal itself
+    (`calm`), which has 0.8 of what swings at 50 Hz: a delay would be found larger by as much. Samples that are too far apart
+    for that are not smoothed at all; a difference of second order over 8 ms would have 0.84 of 40 Hz.
+    """
+    wide = _smoothed_samples(float(np.median(np.diff(time))))
+    return first_difference(smooth(x, round(_RATE_SMOOTH * wide)) if wide >= _ENOUGH else x, time)
+
+
+def _current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
+    """Return the derivative [n] of a current as regressors have it: as that of the sensor's torque, but for samples that are
+    far apart, which have too much noise for that.
     """
     step = float(np.median(np.diff(time)))
-    wide = _smoothed_samples(step)
-    if wide >= _ENOUGH or len(x) < 5:
-        return np.asarray(np.gradient(smooth(x, wide), time))
-    return first_difference(x, time)
+    if _smoothed_samples(step) >= _ENOUGH:
+        return _sensor_rate(x, time)
+    return np.asarray(np.gradient(calm(x, step), time))
 
 
 def _slow(x: FloatArray, step_s: float) -> FloatArray:
