@@ -28,11 +28,12 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mapping
 from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals
+from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.fit.few_runs import PRIOR
 from jtqd.sysid.fit.friction import effective_samples
 from jtqd.sysid.report import figures as parts

@@ -19,7 +19,8 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint, MotionLimits
-from jtqd.sysid.diagnosis.signals import JointSignals, smooth
+from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.smoothing import smooth
 
 RATE_HZ: Final = 100.0
 NO_LIMIT: Final = 1e6

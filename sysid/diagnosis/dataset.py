@@ -19,6 +19,8 @@ from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
+from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.current_zero import Readings, readings
 from jtqd.sysid.diagnosis.events import Events
 from jtqd.sysid.diagnosis.findings import JointName
@@ -36,10 +38,7 @@ from jtqd.sysid.diagnosis.regressors import (
 )
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import (
-    BaseLoss,
-    Channel,
     JointSignals,
-    Line,
     SignalsError,
     about_zero,
     joint_signals,

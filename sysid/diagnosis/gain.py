@@ -16,11 +16,13 @@ from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
+from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gain, RunGain, shows_at
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, solve
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
-from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
+from jtqd.sysid.diagnosis.signals import JointSignals
 
 _BOOTSTRAPS: Final = 2000
 

@@ -17,14 +17,10 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
 from jtqd.estimator.effects.whole import Whole
+from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
-from jtqd.sysid.diagnosis.signals import (
-    SLOWEST_RAD_S,
-    Channel,
-    JointSignals,
-    Line,
-    second_difference,
-)
+from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, JointSignals
+from jtqd.sysid.diagnosis.smoothing import second_difference
 
 BIN_S: Final = 0.005
 LONG_S: Final = 600.0

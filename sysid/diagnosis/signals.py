@@ -1,143 +1,48 @@
 """What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks.
 
 The residuals are those of `jtqd.estimator.effects.effect`: what the simulation with the joint file leaves over. Derivatives
-are central differences of positions, which look one sample ahead: this is for recorded runs. All arrays are later
-averaged over equal bins, residual and regressors alike, so that noise of differences averages out and nothing is
-compared with something filtered in another way.
+are central differences of positions (`smoothing`). All arrays are later averaged over equal bins, residual and regressors
+alike, so that noise of differences averages out and nothing is compared with something filtered in another way.
 
 The torsion that the effects see is tau/K, not the encoders' difference: the residual of the torsion balance is made of
 that difference, and a regressor made of it too would explain it by itself. Its rate is that of the difference, whose noise
-has no part in the noise of the difference itself. For the same reason currents and torques in
-regressors are smoothed over a few milliseconds (`calm`): their noise is also in the residual, and would be explained by
-itself at the frequencies where there is nothing else. Of samples so far apart that there is nothing to smooth over, each
-is what its neighbours say.
+has no part in the noise of the difference itself.
 """
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, State, Values
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, LossModel
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
-from jtqd.sim_can.plant_file import plant_of_joint
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.resolution import Smoother, acceleration_noise, cutoff_hz, described, noise_of
+from jtqd.sysid.diagnosis.smoothing import (
+    calm,
+    current_rate,
+    first_difference,
+    mean_ahead,
+    reach_of_calm,
+    second_difference,
+    sensor_rate,
+    slow,
+)
 from jtqd.sysid.runs.held import Held
 
 _ALL_VISIBLE: Final = Smoother(1.0)
-
-
-class Channel(NamedTuple):
-    """One balance ("motor" or "torsion") of one joint."""
-
-    joint: int
-    balance: str
-
-
-@dataclass(frozen=True)
-class Line:
-    """A line in a residual: at `order` per motor revolution, or at `order` Hz where the unit says so; ratio: its power
-    against the median of the neighbourhood.
-    """
-
-    channel: Channel
-    order: float
-    amplitude_nm: float
-    ratio: float
-    unit: str = "1/rev"
-
-
-_SLOPE: Final = 0.0075
-"""Part of the rated torque over which the losses' slope is taken: as wide as zeros of torque sensors are."""
-
-
-class BaseLoss:
-    """Losses of one joint file as the simulation has them, loss0(tau, v), signed like the velocity [Nm, joint side].
-
-    The law of the emulated plant for this file (`jtqd.sim_can.plant_file.plant_of_joint`): with an efficiency the table of
-    `jtqd.sim_can.losses` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
-    near rest, where a simulation's smoothing would matter, are not used by the diagnosis.
-    """
-
-    def __init__(self, joint: Joint) -> None:
-        self._friction: Final = joint.friction
-        self._slope_nm: Final = _SLOPE * joint.rated_torque_nm
-        self._rows: tuple[FloatArray, FloatArray] | None = None
-        if joint.efficiency is not None:
-            highest = max(DRIVING_CURRENT_MAX_A, 9.0)
-            table = LossTable(
-                LossModel(joint).loss, joint.gear_ratio, joint.torque_constant_nm_per_a, highest
-            )
-            self._rows = (np.array(table.forward), np.array(table.reverse))
-            self._limit = table.torque_limit
-            self._per_torque = table.per_torque_step
-            self._per_velocity = table.per_velocity_step
-            self._last = table.last_row
-            true = plant_of_joint(joint).joints[0].deviations
-            self._peak = true.stribeck_nm, true.stribeck_velocity_rad_s
-
-    @property
-    def depends_on_load(self) -> bool:
-        """Whether the joint file has an efficiency."""
-        return self._rows is not None
-
-    def loss(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
-        """Return the loss [n] at torque_nm [n] and velocity_rad_s [n]."""
-        v = velocity_rad_s
-        if self._rows is None:
-            f = self._friction
-            peak = f.stribeck_nm * np.exp(-((v / f.stribeck_velocity_rad_s) ** 2))
-            result: FloatArray = np.sign(v) * (f.coulomb_nm + peak) + f.viscous_nms_per_rad * v
-            return result
-        x = np.minimum(np.abs(v) * self._per_velocity, self._last + 1.0)
-        k = np.minimum(x.astype(np.intp), self._last)
-        y = np.clip((torque_nm + self._limit) * self._per_torque, 0.0, TORQUE_STEPS - 1e-9)
-        m = y.astype(np.intp)
-        x, y = x - k, y - m
-        out = np.empty_like(v)
-        for rows, here in ((self._rows[0], v >= 0.0), (self._rows[1], v < 0.0)):
-            a, b, p, q = k[here], m[here], x[here], y[here]
-            low = rows[a, b] + q * (rows[a, b + 1] - rows[a, b])
-            high = rows[a + 1, b] + q * (rows[a + 1, b + 1] - rows[a + 1, b])
-            out[here] = low + p * (high - low)
-        height, vs = self._peak
-        signed: FloatArray = np.sign(v) * (out + height * np.exp(-((v / vs) ** 2)))
-        return signed
-
-    def slope(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
-        """Return d loss / d torque [n]: torque that is wrong by e leaves a loss wrong by slope times e.
-
-        Zero without efficiency: such losses know no load. Taken over +-_SLOPE of the rated torque, so that the grid of the
-        table does not show.
-        """
-        if self._rows is None:
-            return np.zeros_like(velocity_rad_s)
-        wide = self._slope_nm
-        ahead = self.loss(torque_nm + wide, velocity_rad_s)
-        behind = self.loss(torque_nm - wide, velocity_rad_s)
-        return (ahead - behind) / (2.0 * wide)
 
 
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
 _AFTER_REST_S: Final = 0.03
 """So long after (and before) such a velocity the transients of sticking are still in the torque."""
-_SMOOTH_S: Final = 0.005
-_RATE_SMOOTH: Final = 0.4
-"""Part of _SMOOTH_S over which what a rate is taken of is smoothed."""
-_ENOUGH: Final = 5
-"""Samples within _SMOOTH_S from which an average of them holds little of each one's own noise."""
-_NEAR_S: Final = 0.008
-"""So far away are the neighbours that tell what a sample is, where there are fewer; two on either side at least."""
 _COARSE: Final = 3.0
 """A position whose difference is noisier by this factor than the velocity channel is not used for it."""
 _VISIBLE: Final = 1e-3
@@ -228,7 +133,7 @@ class JointSignals:
 
     def slow_torsion(self, angle: FloatArray) -> FloatArray:
         """Return the part of a twist [n] that is slow enough for the acceleration of the torsion to hold it."""
-        return angle if self.torsion_nm is None else _slow(angle, float(np.median(np.diff(self.time_s))))
+        return angle if self.torsion_nm is None else slow(angle, float(np.median(np.diff(self.time_s))))
 
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
@@ -259,12 +164,6 @@ _RATES: Final = ("current_rate_a_s", "link_velocity_rad_s", "torque_rate_nm_s")
 """What the hooks of an effect on a reading that is old use."""
 
 
-def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
-    """Return the mean of x from each time to span_s later [n], by Simpson's rule; the last value goes on after the end."""
-    middle, end = (np.interp(time_s + part * span_s, time_s, x) for part in (0.5, 1.0))
-    return np.asarray((x + 4.0 * middle + end) / 6.0)
-
-
 def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """Return the signals with the samples at which a column is held, and those that its smoothing reaches, not usable:
     torque in both balances, current in the motor's. `held_nm` is what they are from a straight line between those around
@@ -273,7 +172,7 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     if not held:
         return s
     step = float(np.median(np.diff(s.time_s)))
-    calmed = _SMOOTH_S if _smoothed_samples(step) >= _ENOUGH else max(_NEAR_S, 2.0 * step)
+    calmed = reach_of_calm(step)
     reach = {TORSION: calmed, MOTOR: calmed}
     if s.visible.parts:
         reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
@@ -362,13 +261,13 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     step = float(np.median(np.diff(time)))
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
-        torsion_acceleration = second_difference(_slow(sensor, step), time) / joint.stiffness_nm_per_rad
+        torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     calm_torque, calm_current = calm(gear_torque, step), calm(columns.current_a, step)
     state = State(
         current_a=calm_current,
-        current_rate_a_s=_current_rate(columns.current_a, time),
+        current_rate_a_s=current_rate(columns.current_a, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
         link_acceleration_rad_s2=link_acceleration + (motion.shared - motion.acceleration) / joint.gear_ratio,
         link_position_rad=link,
@@ -378,7 +277,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         temperature_c=_or_nan(columns.temperature_c, len(time)),
         time_s=time - time[0],
         torque_nm=calm_torque,
-        torque_rate_nm_s=_sensor_rate(sensor, time),
+        torque_rate_nm_s=sensor_rate(sensor, time),
         torsion_rad=calm_torque / joint.stiffness_nm_per_rad,
         torsion_rate_rad_s=np.full(len(time), np.nan),
         velocity_rad_s=velocity,
@@ -477,28 +376,6 @@ def _motor_speed(time: FloatArray, raw: JointColumns, columns: JointColumns, joi
     return derived if noise[0] <= _COARSE * max(noise[1], 1e-9) else raw.motor_velocity_rad_s
 
 
-def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the second derivative [n]: fourth order on even steps, so that a ripple of 80 Hz at 1 kHz keeps its size
-    (two central differences would take 8 % of it); plain differences where steps are uneven; ends held.
-    """
-    steps = np.diff(time)
-    step = float(np.median(steps))
-    if len(x) < 5 or float(np.max(np.abs(steps - step))) > 0.05 * step:
-        return np.asarray(np.gradient(np.gradient(x, time), time))
-    inner = (16.0 * (x[3:-1] + x[1:-3]) - x[4:] - x[:-4] - 30.0 * x[2:-2]) / (12.0 * step * step)
-    return np.pad(inner, 2, mode="edge")
-
-
-def first_difference(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the first derivative [n], as `second_difference`."""
-    steps = np.diff(time)
-    step = float(np.median(steps))
-    if len(x) < 5 or float(np.max(np.abs(steps - step))) > 0.05 * step:
-        return np.asarray(np.gradient(x, time))
-    inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
-    return np.pad(inner, 2, mode="edge")
-
-
 def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolArray:
     """Return True where the joint moves and has done so, and will, for _AFTER_REST_S, or as long as a filter remembers."""
     slow = np.abs(velocity) < SLOWEST_RAD_S
@@ -506,75 +383,6 @@ def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolAr
     wide = max(1, round(apart / max(float(np.median(np.diff(time))), 1e-9)))
     near = np.convolve(slow, np.ones(2 * wide + 1), "same") > 0.5
     result: BoolArray = ~near
-    return result
-
-
-def calm(x: FloatArray, step_s: float) -> FloatArray:
-    """Return x [n], sampled every step_s, as regressors have it: with little of the noise that the same sample has in a
-    residual.
-
-    Smoothed over _SMOOTH_S where that is enough samples. An average of fewer keeps half of each sample's own noise and more,
-    at 250 Hz all of it: a gain of that channel is then found by the noise beside the signal, and noise of a torsion moves
-    what slips with it. There each sample is what the cubic through its neighbours says, with none of its own noise. That
-    keeps 0.98 of what swings at 25 Hz and 0.7 of 50 Hz, at 250 Hz as at 500. The noise of the neighbours is in residuals as
-    well, but of both signs: where all frequencies count alike it adds up to nothing.
-    """
-    wide = _smoothed_samples(step_s)
-    if wide >= _ENOUGH:
-        return smooth(x, wide)
-    weights = _neighbours(max(2, round(_NEAR_S / step_s)))
-    result: FloatArray = np.convolve(np.pad(x, len(weights) // 2, mode="edge"), weights, "valid")
-    return result
-
-
-def _smoothed_samples(step_s: float) -> int:
-    return max(1, round(_SMOOTH_S / max(step_s, 1e-9)))
-
-
-@functools.lru_cache(maxsize=16)
-def _neighbours(reach: int) -> FloatArray:
-    """Return the weights [2 reach + 1] that give the middle of a cubic through the others (least squares)."""
-    at = np.arange(-reach, reach + 1)
-    others = at[at != 0]
-    weights = np.zeros(len(at))
-    weights[at != 0] = np.linalg.pinv(np.vander(others / reach, 4, increasing=True))[0]
-    return weights
-
-
-def _sensor_rate(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative [n] of the sensor's torque as regressors have it.
-
-    The noise of a difference has little part in that of the same sample, so less is smoothed than in the signal itself
-    (`calm`), which has 0.8 of what swings at 50 Hz: a delay would be found larger by as much. Samples that are too far apart
-    for that are not smoothed at all; a difference of second order over 8 ms would have 0.84 of 40 Hz.
-    """
-    wide = _smoothed_samples(float(np.median(np.diff(time))))
-    return first_difference(smooth(x, round(_RATE_SMOOTH * wide)) if wide >= _ENOUGH else x, time)
-
-
-def _current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative [n] of a current as regressors have it: as that of the sensor's torque, but for samples that are
-    far apart, which have too much noise for that.
-    """
-    step = float(np.median(np.diff(time)))
-    if _smoothed_samples(step) >= _ENOUGH:
-        return _sensor_rate(x, time)
-    return np.asarray(np.gradient(calm(x, step), time))
-
-
-def _slow(x: FloatArray, step_s: float) -> FloatArray:
-    """Return x [n] without what is too quick for the second difference of a torque to be known."""
-    return smooth(x, _smoothed_samples(step_s))
-
-
-def smooth(x: FloatArray, samples: int) -> FloatArray:
-    """Return x twice averaged over `samples` (odd or even, centred together), ends held."""
-    out = x
-    for before in (samples // 2, samples - 1 - samples // 2):
-        padded = np.pad(out, (before, samples - 1 - before), mode="edge")
-        total = np.cumsum(np.concatenate(([0.0], padded)))
-        out = (total[samples:] - total[:-samples]) / samples
-    result: FloatArray = out
     return result
 
 

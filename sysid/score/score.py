@@ -27,12 +27,13 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import recommended
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import without_known_effects
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.gain import free_run
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
 from jtqd.sysid.diagnosis.resolution import Smoother
-from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
+from jtqd.sysid.diagnosis.signals import about_zero, joint_signals
 
 SCHEMA: Final = "jtq.score/1"
 MOTOR: Final = "simulation, motor balance"

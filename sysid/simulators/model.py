@@ -21,8 +21,8 @@ import numpy as np
 
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied
-from jtqd.sysid.diagnosis.signals import BaseLoss
 
 _SPEEDS_RAD_S: Final = np.linspace(0.05, 2.0, 200)
 """Over which losses of an efficiency are made a straight line."""

@@ -16,10 +16,11 @@ from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.sysid.campaign.plan import Plan, check_plan
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
-from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
+from jtqd.sysid.diagnosis.signals import joint_signals
 from tests.hidden.case import Case, draw_many, follow_up
 from tests.hidden.menu import MENU, SENSOR, base_value, scaled
 from tests.hidden.order import Hidden, Order

@@ -27,11 +27,12 @@ import numpy as np
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause, Findings, joint_text
 from jtqd.sysid.diagnosis.leave_one_out import FALL
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
-from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
+from jtqd.sysid.diagnosis.signals import joint_signals
 from tests.hidden.case import draw_many
 from tests.hidden.order import Order
 from tests.hidden.trials import joint_files, orders_of, tables

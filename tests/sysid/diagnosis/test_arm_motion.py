@@ -9,9 +9,10 @@ from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.arm_motion import KINDS, RATE_HZ, Room, csv_text, motions, room_of
+from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
-from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+from jtqd.sysid.diagnosis.signals import JointSignals, joint_signals
 from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 

@@ -12,6 +12,7 @@ import pytest
 
 from jtqd.sysid.diagnosis import fewer_runs, named
 from jtqd.sysid.diagnosis.case import Case, Fit
+from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _borne_out, with_fewer
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
@@ -21,7 +22,6 @@ from jtqd.sysid.diagnosis.named import UNSTEADY, Found
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.steadiness import Steadiness
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, Dense, search_of
 from tests.sysid.diagnosis.test_search import LIBRARY, problem

@@ -17,6 +17,7 @@ from jtqd.sysid.diagnosis import dataset
 from jtqd.sysid.diagnosis import diagnose as module
 from jtqd.sysid.diagnosis.case import Case as Judged
 from jtqd.sysid.diagnosis.case import Fit
+from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
@@ -26,7 +27,6 @@ from jtqd.sysid.diagnosis.named import Found
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.verdict import _remaining
 from tests.hidden.case import Case, draw_many
 from tests.hidden.order import Hidden, Order
