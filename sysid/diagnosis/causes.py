@@ -7,6 +7,7 @@ from typing import Final
 
 import numpy as np
 
+from jtqd.estimator.effects.effect import Effect
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.current_zero import offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.findings import Cause, Value, joint_text
@@ -18,10 +19,15 @@ from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.steadiness import steadiness
 from jtqd.sysid.fit.friction import student_975
 
-INACCURATE: Final = 0.04
-"""Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify (smoothing):
-no interval is narrower. Judged by its coverage of known truths (docs/diagnosis.md).
+_INACCURATE: Final = 0.015
+"""Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify: no interval is
+narrower. Judged by its coverage of known truths (docs/diagnosis.md).
 """
+_INACCURATE_RATE: Final = 0.04
+"""The same of what is known by a derivative of measured angles or torques, smoothed as it is."""
+_INACCURATE_TWIST: Final = 0.05
+"""The same of what the teeth or the torsion do within a few tens of microradians, where encoders round."""
+_RATES: Final = ("channel_delay", "gear_damping", "link_inertia")
 _OFFSET, _ASYMMETRY = "current_offset", "friction_asymmetry"
 
 Classes = Sequence[tuple[EffectCandidate, ...]]
@@ -63,7 +69,7 @@ def _names(candidate: EffectCandidate, rivals: Sequence[EffectCandidate]) -> tup
 
 def values_of(fit: Fit, k: int) -> dict[str, Value]:
     """Return the parameters of an effect with their 95 % intervals: Student's t by how much of the uncertainty is the runs'
-    own changes, no narrower than INACCURATE, and with few runs than what the runs say one without the other.
+    own changes, no narrower than `inaccurate`, and with few runs than what the runs say one without the other.
     """
     candidate, refined = fit.chosen[k], fit.refined
     present, runs = refined.present[k], refined.mixed.runs
@@ -79,7 +85,7 @@ def values_of(fit: Fit, k: int) -> dict[str, Value]:
             half = student_975(freedom) * float(np.sqrt(refined.covariance[place, place]))
             # a phase has no size of its own: an angle of the same part of the wave
             size = 1.0 if name == "phase_rad" else abs(value - nothing.get(name, 0.0))
-            half = float(np.hypot(half, INACCURATE * size))
+            half = float(np.hypot(half, inaccurate(present.effect) * size))
             if runs < ENOUGH_RUNS:
                 half = max(half, *(abs(float(step[place])) for step in left_out_steps(refined)))
             low, high = value - half, value + half
@@ -89,6 +95,13 @@ def values_of(fit: Fit, k: int) -> dict[str, Value]:
         elif p.fixed:
             values[name] = Value(value, (value, value), p.unit)
     return values
+
+
+def inaccurate(effect: Effect) -> float:
+    """Return the least half width of a 95 % interval, as part of the effect's size."""
+    if effect.follows_torsion or effect.geometric:
+        return _INACCURATE_TWIST
+    return _INACCURATE_RATE if effect.name in _RATES else _INACCURATE
 
 
 def _of_nothing(candidate: EffectCandidate) -> dict[str, float]:

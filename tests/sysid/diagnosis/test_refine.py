@@ -18,7 +18,7 @@ from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.case import Fit
-from jtqd.sysid.diagnosis.causes import INACCURATE, _normal_phase, values_of
+from jtqd.sysid.diagnosis.causes import _normal_phase, inaccurate, values_of
 from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import combined, one_sensor, with_effects_applied
@@ -379,7 +379,7 @@ def test_no_interval_is_narrower_than_a_part_of_the_size(name: str, values: dict
     found = values_of(Fit(Hypothesis((one,), model, 0.0), certain), 0)
     base = {"torque_constant_nm_per_a": 0.08}
     for key, true in values.items():
-        half = INACCURATE * (true - base.get(key, 0.0))
+        half = inaccurate(one.effect) * (true - base.get(key, 0.0))
         assert found[key].ci95 == pytest.approx((true - half, true + half))
 
 
