@@ -48,7 +48,9 @@ from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.measured.bus import published_torque, reference_torque, sync_time
 from jtqd.sysid.report.figures import STYLE, check_picture
 from jtqd.sysid.report.page import LIGHT
-from jtqd.sysid.runs.files import RunError, read_run, write_run
+from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.runs.run_file import RunError
+from jtqd.sysid.runs.write import write_run
 
 NUMBERS: Final = (1, 2)
 SECRET_JOINT: Final = 1

@@ -39,7 +39,8 @@ from jtqd.sysid.fit.friction import effective_samples
 from jtqd.sysid.report import figures as parts
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, RunFile, read_run
+from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.runs.run_file import RunError, RunFile
 
 mpl.use("Agg")  # files only; a display is not needed
 

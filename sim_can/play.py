@@ -25,7 +25,8 @@ from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.source import ChannelSignal, DriveRatings, DriveSignals
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, RunFile, read_run
+from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.runs.run_file import RunError, RunFile
 
 COLUMN_MAP_NAME = "columns.yaml"
 

@@ -27,8 +27,8 @@ from jtqd.sim_can.plants import AnyPlant, load_any_plant
 from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.plans import KINDS, Scale, make_plan
 from jtqd.sysid.progress import progress
-from jtqd.sysid.runs.files import write_run
 from jtqd.sysid.runs.truth import write_truth
+from jtqd.sysid.runs.write import write_run
 
 PLANT: Final = "campaign_plant.yaml"
 _RECIPE: Final = "emulated_runs.json"

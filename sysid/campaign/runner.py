@@ -30,8 +30,8 @@ from jtqd.sysid.campaign.reporter import Reporter
 from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, PENDING, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints
 from jtqd.sysid.runs.checks import check_run
-from jtqd.sysid.runs.files import write_run
 from jtqd.sysid.runs.logs import LoggedRun, log_to_run
+from jtqd.sysid.runs.write import write_run
 
 _BUS_WAS_LATE: Final = re.compile(
     r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
@@ -39,7 +39,7 @@ _BUS_WAS_LATE: Final = re.compile(
 _SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
 LONGEST_GAP: Final = 9.5
 """In periods of SYNC. A longer step, of 10 cycles or more: the table would be refused by whoever reads it
-(jtqd.sysid.runs.files)."""
+(jtqd.sysid.runs.time_steps)."""
 LOST_SHARE: Final = 0.01
 LOST_FINDING: Final = "cycles:"
 """How the finding begins that more than that are missing."""

@@ -29,8 +29,9 @@ from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_o
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, RunFile, read_runs
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of, named_joints
+from jtqd.sysid.runs.run_file import RunError, RunFile
 
 BY: Final = "jtq diagnose"
 _NEEDED: Final = ("matplotlib", "jinja2", "scipy")

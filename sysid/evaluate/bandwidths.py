@@ -29,7 +29,8 @@ from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S, EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.evaluate.methods import OURS, SETTLE_S, load_models
 from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S
-from jtqd.sysid.runs.files import RunError, read_runs
+from jtqd.sysid.runs.files import read_runs
+from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.truth import read_truth
 
 BANDWIDTHS_RAD_S: Final = (200.0, 300.0, 400.0, 600.0, 800.0, 1200.0, 1600.0)

@@ -22,7 +22,7 @@ from jtqd.sysid.evaluate.methods import JointModels, load_models, take_samples
 from jtqd.sysid.evaluate.report import as_mapping, text_lines
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue
-from jtqd.sysid.runs.files import RunError
+from jtqd.sysid.runs.run_file import RunError
 
 BY: Final = "jtq evaluate"
 

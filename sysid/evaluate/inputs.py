@@ -24,7 +24,8 @@ from jtqd.sysid.evaluate.methods import JointModels, run_hashes
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import RunIssue, check_channels
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, RunFile, read_run, run_paths
+from jtqd.sysid.runs.files import read_run, run_paths
+from jtqd.sysid.runs.run_file import RunError, RunFile
 from jtqd.sysid.runs.truth import read_truth
 
 _CELL_S: Final = 0.01

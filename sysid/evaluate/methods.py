@@ -39,7 +39,7 @@ from jtqd.models.files import load_joint
 
 KEY: Final = "runs"
 _COMPRESSION: Final = 6
-"""Of run files as this toolbox writes them (jtqd.sysid.runs.files)."""
+"""Of run files as this toolbox writes them (jtqd.sysid.runs.write)."""
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,9 @@ from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
 from jtqd.sysid.report.figures import check_picture
 from jtqd.sysid.runs.checks import channel_findings
-from jtqd.sysid.runs.files import RunError, RunFile, read_runs
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import joint_number, only, with_joint
+from jtqd.sysid.runs.run_file import RunError, RunFile
 
 
 def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:

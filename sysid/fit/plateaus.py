@@ -29,7 +29,7 @@ from jtqd.estimator.run import JointColumns
 from jtqd.sysid.fit.friction import effective_samples
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.channels import integral
-from jtqd.sysid.runs.files import RunFile
+from jtqd.sysid.runs.run_file import RunFile
 
 RIPPLE_ORDERS: Final = (1.0, 2.0, 4.0)
 """Orders per motor revolution that are removed from the samples before their noise is estimated."""

@@ -20,7 +20,8 @@ from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.goals.two_runs import INSIDE, METHODS, Case, Row, Run, one_encoder, rows_of, titles
 from jtqd.sysid.measured.offline import JOINTS, RUNS
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, read_run
+from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.runs.run_file import RunError
 
 BY: Final = "python -m jtqd.sysid.goals.kinova"
 TWO_RUNS: Final = range(2, 8)

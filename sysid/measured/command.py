@@ -20,7 +20,7 @@ from jtqd.estimator.checked import ConfigError, make_directory
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.measured import bus, offline
-from jtqd.sysid.runs.files import RunError
+from jtqd.sysid.runs.run_file import RunError
 
 
 def main(arguments: list[str] | None = None) -> int:

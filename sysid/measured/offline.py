@@ -26,7 +26,8 @@ from jtqd.sysid.fit.few_runs import FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, RunFile, read_run
+from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.runs.run_file import RunError, RunFile
 
 Array = NDArray[np.float64]
 

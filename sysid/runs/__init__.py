@@ -16,16 +16,10 @@ Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are impo
 
 from jtqd.sysid.runs.checks import CheckedRun, CheckedRuns, RunIssue, check_run, check_runs
 from jtqd.sysid.runs.column_map import Column, ColumnMap
-from jtqd.sysid.runs.files import (
-    RunError,
-    RunFile,
-    read_pieces,
-    read_run,
-    read_runs,
-    run_paths,
-    write_run,
-)
+from jtqd.sysid.runs.files import read_pieces, read_run, read_runs, run_paths
 from jtqd.sysid.runs.joints import joint_files, joint_number, joints_of, named_joints, only
+from jtqd.sysid.runs.run_file import RunError, RunFile
+from jtqd.sysid.runs.write import write_run
 
 __all__ = [
     "CheckedRun",

@@ -11,7 +11,7 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunFile
+from jtqd.sysid.runs.run_file import RunFile
 
 ALL_JOINTS: Final = 0
 """Key of the joint file that serves every joint of the runs."""

@@ -17,8 +17,9 @@ from jtqd.sysid.diagnosis.signals import SignalsError
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import RunError, RunFile, read_runs
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import joint_number, only, with_joint
+from jtqd.sysid.runs.run_file import RunError, RunFile
 from jtqd.sysid.score.score import (
     RunErrors,
     errors_on,

@@ -15,8 +15,9 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import Findings
-from jtqd.sysid.runs.files import RunError, read_runs
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import joints_of
+from jtqd.sysid.runs.run_file import RunError
 from tests.worlds.recorder import Recorder, csv_text, record
 from tests.worlds.sets import Columns
 

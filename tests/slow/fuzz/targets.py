@@ -108,7 +108,8 @@ def targets(directory: Path) -> list[Target]:
     from jtqd.sysid.campaign.plan import load_plan
     from jtqd.sysid.campaign.plans import Scale, make_plan
     from jtqd.sysid.runs.column_map import ColumnMap
-    from jtqd.sysid.runs.files import RunError, read_run
+    from jtqd.sysid.runs.files import read_run
+    from jtqd.sysid.runs.run_file import RunError
 
     configuration = _configuration(directory)
     request = directory / "request.json"

@@ -46,9 +46,10 @@ from jtqd.sysid.motion.setpoints import (
     path,
     way,
 )
-from jtqd.sysid.runs.files import read_runs, write_run
+from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import with_joint
 from jtqd.sysid.runs.logs import LoggedRun
+from jtqd.sysid.runs.write import write_run
 
 LIMITS = MotionLimits((-1.0, 2.0), 1.5, 6.0, 25.0)
 JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=LIMITS)

@@ -19,7 +19,7 @@ from jtqd.sysid.campaign.plan import load_plan
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import VERDICTS
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.runs.files import write_run
+from jtqd.sysid.runs.write import write_run
 from tests.daemon.logs.campaign_log import Joint as LogJoint
 from tests.daemon.logs.campaign_log import regular, write_log
 from tests.sysid.diagnosis.diagnose_helpers import (

@@ -7,7 +7,8 @@ import pytest
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.sysid.runs.column_map import ColumnMap, KnownLoad, motion_of
-from jtqd.sysid.runs.files import RunError, read_pieces, read_run
+from jtqd.sysid.runs.files import read_pieces, read_run
+from jtqd.sysid.runs.run_file import RunError
 
 T = np.arange(0.0, 6.0, 0.004)
 Q = 0.8 * np.sin(2.0 * T) + 0.2 * np.sin(5.0 * T)
