@@ -142,7 +142,7 @@ def test_effects_are_carried_and_only_known_names_pass() -> None:
     ]
     joint = Joint.from_mapping(change, "my.yaml")
     assert joint.effects == (Effect("torque_ripple", {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0}),)
-    assert len(EFFECT_NAMES) == 25
+    assert len(EFFECT_NAMES) == 26
     change["effects"][0]["name"] = "magic"
     assert "effects[0].name': found 'magic'" in refused(change)
     change["effects"][0] = {"name": "cogging", "parameters": {"amplitude_nm": "big"}}
