@@ -166,16 +166,43 @@ def usable_signals(
                 reasons.append(str(error))
         if mine:
             out.append([without_known_effects(s) for s in about_zero(mine, bases)])
-    common = {tuple(s.number for s in run) for run in out}
-    if len(common) > 1:  # only what every run has can be stacked
-        keep = set.intersection(*(set(c) for c in common))
-        out = [[s for s in run if s.number in keep] for run in out]
-        out = [run for run in out if run]
+    out, apart = with_the_same_joints(out)
+    reasons += apart
     _same_balances(out)
     out = [with_one_sensor(run) for run in out]
     if not out:
         return [], reasons or ["found no usable run"]
     return out, reasons
+
+
+def with_the_same_joints(
+    runs: Sequence[Sequence[JointSignals]],
+) -> tuple[list[list[JointSignals]], list[str]]:
+    """Return the runs with the joints that all of them have, since only these can be stacked, and what is left out for that:
+    runs without a joint that the others have, or a joint that few runs have, whichever leaves more of both.
+    """
+    each = [frozenset(s.number for s in run) for run in runs]
+    if len(set(each)) <= 1:
+        return [list(run) for run in runs], []
+    choices = {a & b for a in each for b in each} - {frozenset()}
+
+    def kept(joints: frozenset[int]) -> tuple[int, int]:
+        return len(joints) * sum(joints <= one for one in each), len(joints)
+
+    joints = max(sorted(choices, key=sorted), key=kept)
+    stacked, reasons = [], []
+    for run, there in zip(runs, each, strict=True):
+        if joints <= there:
+            stacked.append([s for s in run if s.number in joints])
+        else:
+            lacking = " and ".join(str(n) for n in sorted(joints - there))
+            reasons.append(
+                f"{run[0].run}: left out, because joint {lacking} of it cannot be used as in the others"
+            )
+    for n in sorted(frozenset().union(*each) - joints):
+        usable = sum(n in there for there in each)
+        reasons.append(f"joint {n}: left out, because only {usable} of {len(runs)} runs of it can be used")
+    return stacked, reasons
 
 
 def too_little(signals: Sequence[Sequence[JointSignals]]) -> str | None:

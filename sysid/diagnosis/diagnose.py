@@ -94,6 +94,7 @@ def _diagnosed(
         seen = [run[0] for run in usable]
         plan = next_experiment([], there, "; ".join(reasons), signals=seen) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
+    numbers = tuple(s.number for s in usable[0])
     usable, dataset, odd = without_odd_runs(usable, joints, scope)
     case, fit = search_case(dataset, relevance)
     pieces = recordings(usable)

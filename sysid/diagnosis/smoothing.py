@@ -11,12 +11,15 @@ import functools
 from typing import Final
 
 import numpy as np
+from scipy import signal
 
 from jtqd.estimator.arrays import FloatArray
 
 _SMOOTH_S: Final = 0.005
 _RATE_SMOOTH: Final = 0.4
-"""Part of _SMOOTH_S over which what a rate is taken of is smoothed."""
+"""Part of _SMOOTH_S over which a torque is smoothed before its rate is taken."""
+_CUBIC_S: Final = 0.014
+"""So long is the part of a current that is taken for a cubic before its rate is taken."""
 _ENOUGH: Final = 5
 """Samples within _SMOOTH_S from which an average of them holds little of each one's own noise."""
 _NEAR_S: Final = 0.008
@@ -72,13 +75,19 @@ def sensor_rate(x: FloatArray, time: FloatArray) -> FloatArray:
 
 
 def current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative [n] of a current as regressors have it: as that of the sensor's torque, but for samples that are
-    far apart, which have too much noise for that.
+    """Return the derivative [n] of a current as regressors have it.
+
+    Its noise is a tenth and more of its rate, and makes a delay smaller than it is, where little is smoothed: by a third on
+    a bench with slow motions. Cubics through _CUBIC_S of samples take as much of the noise as `calm` does and leave 0.9 of
+    what swings at 50 Hz. Of samples that are far apart each is what its neighbours say.
     """
     step = float(np.median(np.diff(time)))
-    if _smoothed_samples(step) >= _ENOUGH:
-        return sensor_rate(x, time)
-    return np.asarray(np.gradient(calm(x, step), time))
+    if _smoothed_samples(step) < _ENOUGH:
+        return np.asarray(np.gradient(calm(x, step), time))
+    wide = 2 * round(0.5 * _CUBIC_S / step) + 1
+    if len(x) < wide:
+        return first_difference(x, time)
+    return first_difference(signal.savgol_filter(x, wide, 3, mode="nearest"), time)
 
 
 def slow(x: FloatArray, step_s: float) -> FloatArray:
@@ -98,9 +107,21 @@ def smooth(x: FloatArray, samples: int) -> FloatArray:
 
 
 def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
-    """Return the mean of x from each time to span_s later [n], by Simpson's rule; the last value goes on after the end."""
-    middle, end = (np.interp(time_s + part * span_s, time_s, x) for part in (0.5, 1.0))
-    return np.asarray((x + 4.0 * middle + end) / 6.0)
+    """Return the mean of x from each time to span_s later [n]; the last value goes on after the end, the first before.
+
+    All samples between are in it, so that it has the noise of a difference over the span where x is a rate.
+    """
+    steps = np.diff(time_s)
+    sums = np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * steps)))
+    later = time_s + span_s
+    inside = np.clip(later, time_s[0], time_s[-1])
+    k = np.clip(np.searchsorted(time_s, inside, "right") - 1, 0, len(steps) - 1)
+    u = inside - time_s[k]
+    ahead = sums[k] + u * (
+        x[k] + 0.5 * u * (x[k + 1] - x[k]) / steps[k]
+    )  # straight lines from sample to sample
+    ahead += np.maximum(later - time_s[-1], 0.0) * x[-1] - np.maximum(time_s[0] - later, 0.0) * x[0]
+    return np.asarray((ahead - sums) / span_s)
 
 
 def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:

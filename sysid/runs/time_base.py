@@ -30,7 +30,7 @@ SKEW_NOTED_S: Final = 0.02
 SKEW_REFUSED_S: Final = 0.1
 _SKEW_LONGEST_S: Final = 0.6
 _SKEW_STEP_S: Final = 0.005
-_SKEW_GAIN: Final = 0.3
+_SKEW_GAIN: Final = 0.5
 """Part of the residual energy that a shift must take away to be believed."""
 _SKEW_MATTERS: Final = 0.005
 """Part of the torque's variance that it must take away: where a regression leaves next to nothing, stiction bends that."""
