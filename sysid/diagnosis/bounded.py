@@ -7,6 +7,8 @@ lies below zero by less than its interval, and the value of the other runs, held
 `LARGE_FALL` of the squared error of every run left out. Source of values with such a limit: the restricted least squares
 of Judge and Takayama 1966, J. Am. Stat. Assoc. 61.
 
+An effect that a guard has refused at its limit is looked at again: the guard says that it is no cause, this what is certain.
+
 What is proven is the value at its limit, and nothing else changed. So the extended joint file takes a friction there if it
 is the only bound of a joint of which nothing is named (`in_the_file`).
 """
@@ -66,7 +68,7 @@ def _bounded(
     """Return what may be said of one effect, None for nothing."""
     search, joint = found.case.search, candidate.joint
     name = next((p.name for p in candidate.effect.parameters if p.key and p.low == _LEAST), None)
-    if name is None or candidate.size > 1 or not search.fits_beside(candidate, best.chosen):
+    if name is None or candidate.size > 1 or not search.fits_beside(candidate, best.chosen, again=True):
         return None
     file = candidate.term.combine([0.0])[name]
     limit = (_LEAST - file) / (candidate.term.combine([1.0])[name] - file)

@@ -168,9 +168,11 @@ class Search:
                 read[where] = read.get(where, 0.0) + amperes * float(beta.get(column, 0.0))
         return reading_misfit(self._readings, read)
 
-    def fits_beside(self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate]) -> bool:
-        """Return whether a candidate may be added: an effect is there once, waves once per order, one rejected never."""
-        if candidate.key in self.rejected or not pinned([*chosen, candidate], self.joints):
+    def fits_beside(
+        self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate], *, again: bool = False
+    ) -> bool:
+        """Return whether a candidate may be added: an effect is there once, waves once per order, rejected ones if `again`."""
+        if (candidate.key in self.rejected and not again) or not pinned([*chosen, candidate], self.joints):
             return False
         for one in chosen:
             if one.key == candidate.key and (

@@ -83,11 +83,13 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     causes.sort(key=lambda c: -c.rms_nm)
     gaps = channel_gaps(case.dataset, shown.refined, left if found.left_matters else None)
     gaps = _below_bounds(gaps, bounded)
+    said = tuple(f"{b.name} of {joint_text(b.joint)} " for b in bounded)  # once, as a bound
+    refused = [line for line in found.refused if not line.startswith(said)]
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
         verdict,
-        (*reasons, *(b.text for b in bounded), *found.refused, *became),
+        (*reasons, *(b.text for b in bounded), *refused, *became),
         names,
         numbers,
         gaps,

@@ -16,17 +16,23 @@ from tests.sysid.diagnosis.diagnose_core_helpers import candidates, dense, searc
 from tests.sysid.diagnosis.diagnose_helpers import COULOMB, OFFSET
 
 
+@pytest.mark.parametrize("refused", [False, True])
 @pytest.mark.parametrize(("of_file", "said"), [(-0.05, True), (0.05, False), (0.3, False)])
 def test_only_a_best_value_that_is_not_possible_is_said_as_a_bound(
-    monkeypatch: pytest.MonkeyPatch, of_file: float, said: bool
+    monkeypatch: pytest.MonkeyPatch, of_file: float, said: bool, refused: bool
 ) -> None:
-    """All else speaks for a bound: it falls on every run left out, the interval ends between zero and the file's value."""
+    """All else speaks for a bound: it falls on every run left out, the interval ends between zero and the file's value. That
+    a guard refused the value as a cause, because it is at its limit, is no objection.
+    """
     joint = load_joint(shipped("joint1.yaml"))
     [viscous] = candidates(joint, ("viscous_friction", 1, 0))
     file, one = (viscous.term.combine([x])["viscous_nms_per_rad"] for x in (0.0, 1.0))
     best = (of_file * file - file) / (one - file)
     x = 500.0 * np.random.default_rng(5).normal(size=(5, 60, 1))
     search = search_of(dense(5, [best], [0.1], columns=x), [viscous])
+
+    if refused:
+        search.rejected.add(viscous.key)
 
     class Falling:
         def __init__(self, *_: object) -> None:
