@@ -171,7 +171,7 @@ class Search:
     def fits_beside(
         self, candidate: EffectCandidate, chosen: Sequence[EffectCandidate], *, again: bool = False
     ) -> bool:
-        """Return whether a candidate may be added: an effect is there once, waves once per order, rejected ones if `again`."""
+        """Return whether a candidate may be added: effects once, waves once per order, rejected ones only `again`."""
         if (candidate.key in self.rejected and not again) or not pinned([*chosen, candidate], self.joints):
             return False
         for one in chosen:
