@@ -218,7 +218,7 @@ def test_the_evidence_names_every_effect_chosen_first_then_class_then_by_evidenc
         ("channel delay", "class"),
         ("torque constant", ""),
     ]
-    assert len(rows) == len(findings.candidates) == 47
+    assert len(rows) == len(findings.candidates) == 49
     numbers = {(c.name, c.joint): c.delta_bic for c in findings.candidates}
     table = re.findall(
         r'<tr(?: class="\w+")?><th scope="row">([^<]+)</th><td>([^<]+)</td><td class="bic"',
