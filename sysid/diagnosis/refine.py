@@ -38,7 +38,7 @@ _MOST_TORSION_STEPS: Final = 8
 _TORSION_STEP: Final = 1e-4
 """Of the twist at the rated torque: smaller steps of the torsion are none."""
 _SOFTEST: Final = 0.1
-"""Of the file's stiffness: less is taken for no spring."""
+"""Of the file's stiffness: less is taken for no spring, nor is a twist as under so little of it."""
 _LARGEST_STEP: Final = 0.5
 """Of a parameter's own size or a tenth of its plausible range, whichever is more."""
 
@@ -197,14 +197,15 @@ def set_torsion(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     if not bent:
         return
     usual = s.joint.rated_torque_nm / stiffness
-    # Newton: a spring that hardens by its own stiffness is no small change
+    # Newton: a spring that hardens by its own stiffness is no small change, and one that softens may hold no such torque
+    widest = max(usual, float(np.max(np.abs(total))) / stiffness) / _SOFTEST
     for _ in range(_MOST_TORSION_STEPS):
         d = s.state.torsion_rad
         here = _torsion_sum(s, bent)
         s.state.torsion_rad = d + _TORSION_STEP * usual
         slope = (_torsion_sum(s, bent) - here) / (_TORSION_STEP * usual)
         step = (total + here - stiffness * d) / np.maximum(stiffness - slope, _SOFTEST * stiffness)
-        s.state.torsion_rad = d + step
+        s.state.torsion_rad = np.clip(d + step, -widest, widest)
         if float(np.max(np.abs(step))) < _TORSION_STEP * usual:
             return
 

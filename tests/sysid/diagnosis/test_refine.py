@@ -178,6 +178,21 @@ def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for
     assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / stiffness)
 
 
+@pytest.mark.filterwarnings("error")
+def test_the_torsion_of_a_spring_that_cannot_hold_the_torque_stays_finite() -> None:
+    """A softening spring holds no more than its peak; the search tries such values, and steps to them overflowed."""
+    s = signals(rigid_run(PLAIN, 0.3))
+    stiffness = PLAIN.stiffness_nm_per_rad
+    twist = PLAIN.rated_torque_nm / stiffness
+    for stiff, cubic in ((0.9, -2.0), (2.4, -40.0), (0.1, -1e4), (1.0, -1e9)):
+        values = {
+            "stiffness_nm_per_rad": stiff * stiffness,
+            "cubic_nm_per_rad3": cubic * stiffness / twist**2,
+        }
+        set_torsion(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, values, tuple(values))])
+        assert np.max(np.abs(s.state.torsion_rad)) < 15.0 * twist
+
+
 def test_a_step_stays_in_range_and_is_not_too_long() -> None:
     one = start(stribeck_nm=1.0, stribeck_velocity_rad_s=0.1)
     low, high = (getattr(parameter(STRIBECK, "stribeck_nm"), end) for end in ("low", "high"))
