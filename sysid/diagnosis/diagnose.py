@@ -94,7 +94,7 @@ def _diagnosed(
         seen = [run[0] for run in usable]
         plan = next_experiment([], there, "; ".join(reasons), signals=seen) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
-    numbers = tuple(s.number for s in usable[0])
+    judged = tuple(s.number for s in usable[0])
     usable, dataset, odd = without_odd_runs(usable, joints, scope)
     case, fit = search_case(dataset, relevance)
     pieces = recordings(usable)
@@ -105,8 +105,13 @@ def _diagnosed(
             set_torsion(s, ())  # it is as the last fit left it
         return named_in(*search_case(build_dataset(part, joints, scope), relevance))
 
-    findings = conclude(case, fit, names, numbers, anew)
+    findings = conclude(case, fit, names, judged, anew)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
+    left_out = tuple(f"joint {n}: left out" for n in numbers if n not in judged)
+    unjudged = [line for line in reasons if line.startswith(left_out)]
+    if unjudged and findings.verdict == NO_GAP:  # no proof for a joint that nobody looked at
+        findings = replace(findings, verdict=INSUFFICIENT)
+    findings = replace(findings, reasons=(*unjudged, *findings.reasons))
     if findings.verdict == UNEXPLAINED:
         findings = replace(findings, reasons=(*findings.reasons, *scope.told))
     used = tuple(run[0].run for run in usable)
