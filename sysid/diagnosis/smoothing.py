@@ -117,9 +117,8 @@ def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
     inside = np.clip(later, time_s[0], time_s[-1])
     k = np.clip(np.searchsorted(time_s, inside, "right") - 1, 0, len(steps) - 1)
     u = inside - time_s[k]
-    ahead = sums[k] + u * (
-        x[k] + 0.5 * u * (x[k + 1] - x[k]) / steps[k]
-    )  # straight lines from sample to sample
+    # x in straight lines from sample to sample
+    ahead = sums[k] + u * (x[k] + 0.5 * u * (x[k + 1] - x[k]) / steps[k])
     ahead += np.maximum(later - time_s[-1], 0.0) * x[-1] - np.maximum(time_s[0] - later, 0.0) * x[0]
     return np.asarray((ahead - sums) / span_s)
 
