@@ -129,11 +129,7 @@ def program(filters: Sequence[CanFilter], error_frames: bool) -> list[tuple[int,
 
 def attach(sock: socket.socket, filters: Sequence[CanFilter], error_frames: bool) -> None:
     """Attach the program for `filters` to `sock`; it replaces the one before. Raises OSError."""
-    attach_program(sock, program(filters, error_frames))
-
-
-def attach_program(sock: socket.socket, code: Sequence[tuple[int, int, int, int]]) -> None:
-    """Attach instructions (code, jump if true, jump if false, constant) to `sock`. Raises OSError."""
+    code = program(filters, error_frames)
     memory = ctypes.create_string_buffer(b"".join(_INSTRUCTION.pack(*each) for each in code))
     # The kernel copies the program within setsockopt; `memory` outlives the call by being a local name.
     sock.setsockopt(socket.SOL_SOCKET, SO_ATTACH_FILTER, bytes(_Program(len(code), ctypes.addressof(memory))))

@@ -275,12 +275,9 @@ class BusSurvey:
         except SdoTimeout:
             return None
 
-    def access(self, node: int, patience_s: float | None = None) -> SdoClient:
-        """Return the SDO client of one node, which asks again as the boot does; with `patience_s` it asks once and waits."""
-        channel = FrameChannel(self._socket, node)
-        if patience_s is None:
-            return SdoClient(channel, _SILENCES * ANSWER_S)
-        return SdoClient(channel, patience_s, patience_s)
+    def access(self, node: int) -> SdoClient:
+        """Return the SDO client of one node, which repeats a request as the boot does."""
+        return SdoClient(FrameChannel(self._socket, node), _SILENCES * ANSWER_S)
 
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
         """Read further numbers of one node; those that it does not have are left out. Raises SurveyError."""

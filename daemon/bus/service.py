@@ -37,7 +37,6 @@ from jtqd.drivers.emcy import describe, name_of
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
-from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
 
@@ -91,7 +90,6 @@ def content(service: BusService) -> dict[str, Any]:
     return {
         "state": STATE_NAMES[service.bus.state],
         "counts": {name: value for name, value in service.bus.counts.items() if name != "state"},
-        "long_frames": service.long_frames,
         "foreign_nmt": service.foreign_nmt,
         "malformed_heartbeats": service.heartbeats.malformed,
         "nodes": nodes,
@@ -160,7 +158,6 @@ class BusService:
         conditions: take what is observed here; each change of one that has a code is an EMCY.
         log: takes topic, node and line of an event.
         directory: where `bus.json` is kept up to date; None: nowhere.
-        long_frames: counter of CAN FD and CAN XL frames, where there is one.
     """
 
     def __init__(
@@ -175,7 +172,6 @@ class BusService:
         conditions: Conditions,
         log: LogEvent,
         directory: Path | None = None,
-        long_frames: LongFrames | None = None,
     ) -> None:
         self.socket = socket
         self._config, self._log, self._conditions = config, log, conditions
@@ -206,8 +202,6 @@ class BusService:
         self._refused_calls = 0
         self._report = None if directory is None else BusReport(directory)
         self._first = report
-        self._long_frames = long_frames
-        self.long_frames = 0
 
     def begin(self, now_s: float) -> None:
         """Start the service when the nodes are operational; drop frames of the boot except EMCY and own requests."""
@@ -253,7 +247,6 @@ class BusService:
                     self.socket.send(pack(0x080 + self._config.node_id, message))
         if now_s >= self._report_due:
             self._report_due = now_s + _REPORT_S
-            self._count_long_frames(now_s)
             if self._report is not None:
                 self._report.write(self)
 
@@ -293,16 +286,6 @@ class BusService:
             self._on_nmt(data, now_s)
         else:
             self._on_emergency(can_id - 0x080, data, now_s)
-
-    def _count_long_frames(self, now_s: float) -> None:
-        """Report CAN FD and CAN XL frames, which no socket of jtqd receives."""
-        if self._long_frames is None:
-            return
-        before, self.long_frames = self.long_frames, self._long_frames.poll()
-        if self.long_frames > before and self._limit.admit("long frames", now_s) is not None:
-            self._log(
-                "bus", 0, f"CAN FD or CAN XL frames on the bus: not read, {self.long_frames} since the start"
-            )
 
     def _on_request(self, data: bytes) -> None:
         answer = self.own.answer(data)

@@ -9,8 +9,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli import store
-from jtqd.daemon.cli.init import node_id
 from jtqd.daemon.cli.reading import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
 from jtqd.drivers.bus_socket import reachable
@@ -21,9 +19,8 @@ _EXAMPLES = """examples:
   jtq control reload --bus can0        reload joint files, networks and estimator settings, no cycle missed
   jtq control reset                    release latched faults
   jtq control save --json              write the flight recording now
-  jtq control store --bus can0 --node 5    let a device keep its parameters (1010h); while no jtqd runs on the bus
 
-exit status: 0 done, 1 refused or no daemon (reason on standard error), 2 usage or not confirmed"""
+exit status: 0 done, 1 refused or no daemon (reason on standard error), 2 usage"""
 _DONE = {
     "ping": "jtqd on {bus} answers, process {pid}, cycle {cycle}",
     "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {cycles} missed",
@@ -36,31 +33,19 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq control`."""
     result = argparse.ArgumentParser(
         prog="jtq control",
-        description=(
-            "Send an order to a running jtqd. Only its own user and root are permitted. "
-            "store goes to a device of a bus without a master, and asks first."
-        ),
+        description="Send an order to a running jtqd. Only its own user and root are permitted.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("verb", choices=(*VERBS, store.VERB), help="order")
+    result.add_argument("verb", choices=VERBS, help="order")
     result.add_argument("--bus", help="daemon on this bus (default: the only running one)")
-    result.add_argument("--node", type=node_id, metavar="N", help="of store: node-ID of the device")
-    result.add_argument("--yes", action="store_true", help="of store: do not ask")
     result.add_argument("--json", action="store_true", help="print the reply as JSON")
     return result
 
 
 def main(argv: list[str]) -> int:
     """Send the order and print the reply; returns the exit status."""
-    made = parser()
-    arguments = made.parse_args(argv)
-    if arguments.verb == store.VERB:
-        if arguments.bus is None or arguments.node is None:
-            made.error("store: give --bus and --node")
-        return store.store(arguments.bus, arguments.node, yes=arguments.yes, as_json=arguments.json)
-    if arguments.node is not None or arguments.yes:
-        made.error("--node and --yes belong to store")
+    arguments = parser().parse_args(argv)
     try:
         daemon = choose_daemon(arguments.bus)
         reply = ask(daemon.directory / FILE, {"verb": arguments.verb}, _TIMEOUT_S.get(arguments.verb, 10.0))

@@ -270,7 +270,7 @@ def _bus(about: About, view: View, earlier: View) -> RenderableType:
 
 
 def _frames(reading: Reading) -> Iterator[RenderableType]:
-    """What is on the bus beside jtqd's frames: errors of the controller, and frames that no socket of jtqd receives."""
+    """State and error frames of the CAN controller."""
     state = reading.bus.get("state")
     if state is None:
         return
@@ -278,10 +278,7 @@ def _frames(reading: Reading) -> Iterator[RenderableType]:
     errors = sum(
         counts.get(name, 0) for name in ("protocol_errors", "no_acknowledge", "overruns", "bus_offs")
     )
-    text = f"{state}, {counted(errors, 'error frame')}"
-    if long_frames := reading.bus.get("long_frames", 0):
-        text += f", {counted(long_frames, 'CAN FD or XL frame')} not read"
-    yield line("bus state", text)
+    yield line("bus state", f"{state}, {counted(errors, 'error frame')}")
 
 
 def _nodes(about: About, view: View) -> Columns:

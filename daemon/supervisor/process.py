@@ -43,7 +43,6 @@ from jtqd.daemon.supervisor.table import Display
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
-from jtqd.drivers.long_frames import LongFrames
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
@@ -359,7 +358,6 @@ class Supervisor:
             conditions=self._conditions,
             log=self._log_event,
             directory=self._directory,
-            long_frames=LongFrames(self._bus),
         )
         self._node = node = self._bus_service.own
         self._bus_service.begin(time.monotonic())

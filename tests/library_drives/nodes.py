@@ -3,7 +3,7 @@
 What the library leaves to the device is added here, as strictly as drives have been seen to be:
 
     mapping      only in pre-operational, only while bit 31 of the COB-ID is set, entries only while their number is 0
-    1010h        what was stored is there after a reset; everything else written is lost, 1019h too
+    reset        everything written is lost, 1019h too, but for what `keep` has stored
     1016h        counts from the first heartbeat; without it, or at a boot-up message, 8130h, and no start before it is over
     1019h        SYNC of another length than it tells is 8240h until a reset; not to be written while 1006h is set
     SYNC         a TPDO of type 1 is sent at each, with the values of that moment
@@ -38,12 +38,11 @@ from canopen.objectdictionary import (
 
 MASTER = 0x20
 PRE_OPERATIONAL, OPERATIONAL = 127, 5
-SAVE = b"save"
 MOTOR_COUNTS, LINK_COUNTS, GEAR = 65536, 524288, 100
 RATED_MNM, TORQUE_CONSTANT = 100, 0.062
 """Of the drive that tells torque as well as current: 1 A at the top of its swing."""
 _WRONG_STATE, _UNSUPPORTED, _NOT_MAPPABLE, _TOO_LONG = 0x08000022, 0x06010000, 0x06040041, 0x06040042
-_RANGE, _NOT_STORED = 0x06090030, 0x08000020
+_RANGE = 0x06090030
 _SIZES = {UNSIGNED8: "B", UNSIGNED16: "H", UNSIGNED32: "I", INTEGER16: "h", INTEGER32: "i"}
 
 
@@ -122,7 +121,7 @@ def dictionary(
         if list(members) == [0]:
             result.add_object(variable(index, 0, *members[0]))
             continue
-        group = ODArray if index in (0x1003, 0x1010, 0x1016) else ODRecord
+        group = ODArray if index in (0x1003, 0x1016) else ODRecord
         record = group(f"{index:04X}h", index)
         for sub, value in sorted(members.items()):
             record.add_member(variable(index, sub, *value))
@@ -140,8 +139,6 @@ def _common(device_type: int, serial: int) -> dict[tuple[int, int], tuple[int, A
         (0x1005, 0): (u32, 0x80, "rw"),
         (0x1006, 0): (u32, 0, "rw"),
         (0x1008, 0): (VISIBLE_STRING, "library drive of another make", "const"),
-        (0x1010, 0): (u8, 1, "const"),
-        (0x1010, 1): (u32, 1, "rw"),
         (0x1014, 0): (u32, 0x80 + serial, "rw"),
         (0x1016, 0): (u8, 2, "const"),
         (0x1016, 1): (u32, 0, "rw"),
@@ -281,7 +278,7 @@ class StrictNode:
         threading.Thread(target=self._start, daemon=True).start()
 
     def keep(self, index: int, subindex: int) -> None:
-        """Store one object, as 1010h does all."""
+        """Store one object: it is there after a reset."""
         self._stored.setdefault(index, {})[subindex] = self.node.get_data(index, subindex)
 
     def number_of(self, index: int, subindex: int = 0) -> int:
@@ -418,8 +415,6 @@ class StrictNode:
                 self._check_mapping(index, value)
         elif index == 0x1019 and 0x1006 not in self.manners.without and self.number_of(0x1006):
             raise canopen.SdoAbortedError(_WRONG_STATE)
-        elif index == 0x1010 and bytes(data) != SAVE:
-            raise canopen.SdoAbortedError(_NOT_STORED)
         elif index == 0x1016:
             self._master_due = math.inf
 
@@ -434,15 +429,6 @@ class StrictNode:
             bits += word & 0xFF
         if bits > 64:
             raise canopen.SdoAbortedError(_TOO_LONG)
-
-    def written(self, index: int) -> None:
-        if index == 0x1010:
-            self._stored = {
-                at: dict(members)
-                for at, members in self.node.data_store.items()
-                if at != 0x1010 and at > 0x1003
-            }
-            self.node.data_store.pop(0x1010)
 
     def _compiled(self) -> Any:
         for number in range(4):
@@ -485,7 +471,6 @@ class _Local(canopen.LocalNode):  # type: ignore[misc]
             self._find_object(index, subindex)
             self._device.check_write(index, subindex, data)
         super().set_data(index, subindex, data, check_writable)
-        self._device.written(index)
 
     def _later(self, response: bytes) -> None:
         if self._device.manners.sdo_s:

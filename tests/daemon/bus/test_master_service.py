@@ -6,7 +6,6 @@ import json
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -199,19 +198,3 @@ def test_a_storm_of_requests_is_answered_a_part_at_a_time(bench: MasterBench) ->
         bench.send(0x580 + 1, data)
     bench.pause(0.2)
     assert bench.sdo(0x1000, 0) == 0
-
-
-def test_frames_of_can_fd_are_a_line_and_a_count(bench: MasterBench) -> None:
-    """Their count comes from the kernel (tests/drivers/test_socketcan.py)."""
-    counter = SimpleNamespace(count=0)
-    counter.poll = lambda: counter.count
-    bench.service._long_frames = counter
-    bench.pause(0.6)
-    assert not bench.said("CAN FD")
-    counter.count = 12
-    assert bench.run(lambda: bench.said("CAN FD or CAN XL frames on the bus: not read, 12 since the start"))
-    report = Path(bench.path).parent / "bus.json"
-    assert bench.run(lambda: json.loads(report.read_text())["long_frames"] == 12)
-    counter.count = 13
-    bench.pause(0.6)
-    assert sum("CAN FD" in line for line in bench.lines) == 1, "a storm is one line in a while"

@@ -259,17 +259,11 @@ def test_what_is_wrong_now_is_shown_with_its_age(tmp_path: Path, status: Status)
     }
 
 
-def test_the_controller_and_frames_that_jtqd_does_not_read_are_shown(tmp_path: Path, status: Status) -> None:
+def test_the_controller_is_shown(tmp_path: Path) -> None:
     daemon = running(tmp_path)
     assert "bus state" not in picture(daemon, 80)
     counts = {"protocol_errors": 2, "no_acknowledge": 1, "overruns": 0, "bus_offs": 0}
-    content = {"state": "error passive", "counts": counts, "long_frames": 0}
+    content = {"state": "error passive", "counts": counts}
     (daemon.directory / "bus.json").write_text(json.dumps(content))
     text = " ".join(picture(daemon, 80).split())
     assert "bus state error passive, 3 error frames" in text
-    assert "not read" not in text
-    (daemon.directory / "bus.json").write_text(json.dumps(content | {"long_frames": 7}))
-    assert "7 CAN FD or XL frames not read" in " ".join(picture(daemon, 80).split())
-    code, out, _ = status("--json")
-    assert code == 0
-    assert json.loads(out)["bus_state"]["long_frames"] == 7
