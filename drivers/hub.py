@@ -130,8 +130,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         hub = Hub(options.bus.removeprefix(PREFIX), options.bitrate)
         print(f"hub: {options.bus} is up", flush=True)
-        while True:
-            hub.run_once(None)
+        while True:  # bounded: a signal that comes just before the wait does not end it
+            hub.run_once(0.5)
     except _StopError:
         return 0
     except BusError as error:
