@@ -34,7 +34,6 @@ from jtqd.sysid.goals.figures import (
 )
 from jtqd.sysid.goals.identify import FIT_SEED, JUDGE_SEED, Driven, Identified, Range, drive, nominal_joints
 from jtqd.sysid.goals.judge import OWN, TITLES, ZEROS, Judged, Result, judge
-from jtqd.sysid.goals.network_study import Part, made_of, outcome, shares_of_error
 from jtqd.sysid.goals.plants import CHANGES, the_three
 from jtqd.sysid.goals.table import goal_lines, goal_rows, markdown
 from tests.estimator.fused_helpers import fused
@@ -218,27 +217,3 @@ def test_driven_runs_have_the_truth_of_both_joints() -> None:
     run: Driven = drive(the_three()[0].bench(), [short_run()], 5)[0]
     assert run.true_nm.shape == (len(run.table.time_s), 2)
     assert run.columns(2, nominal_joints(the_three()[0])[1]).torque_nm is not None
-
-
-@pytest.mark.campaign
-def test_a_network_finds_a_ripple_that_physics_leaves_and_no_zero_of_a_run() -> None:
-    """A wave of the motor's turn in proportion to the load is in every run; each run's zero is its own."""
-    rng = np.random.default_rng(8)
-
-    def part(zero_nm: float) -> Part:
-        n = 4000
-        angle = np.cumsum(rng.uniform(0.0, 0.4, n))
-        core = np.column_stack((rng.normal(size=n), 10.0 * rng.normal(size=n), rng.normal(size=n)))
-        waves = np.column_stack([wave(k * angle) for k in (1, 2, 3, 4) for wave in (np.cos, np.sin)])
-        ripple = 0.05 * core[:, 1] * waves[:, 2]
-        return Part(core, rng.normal(size=(n, 3)), waves, ripple - zero_nm, zero_nm - ripple)
-
-    known, other = ([part(rng.uniform(-0.2, 0.2)) for _ in range(6)] for _ in range(2))
-    made = made_of("waves", known, 40)
-    found = outcome(made, 1.0, other)
-    every, mean, slow, quick = shares_of_error(other)
-    assert every == pytest.approx(mean + slow + quick, rel=0.05)
-    assert found.physics_nm2 == pytest.approx(every)
-    assert mean < found.mse_nm2 < mean + 0.1 * (every - mean)
-    assert found.worse == 0
-    assert outcome(made, 0.0, other).off_percent == 0.0
