@@ -25,7 +25,7 @@ hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated ben
 test: lint ## everything but the tests marked campaign
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
-	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests
+	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
 	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-here test-guest test-hidden || status=$$?; \
 	$(MAKE) --no-print-directory test-native || status=$$?; \
@@ -34,7 +34,7 @@ test: lint ## everything but the tests marked campaign
 # Two at a time, each with one thread: the bench kernel keeps a time of its own, so neither feels the other.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # In the lane of the guest, which is the shorter one.
-HIDDEN := tests/hidden tests/examples tests/sysid/batch
+HIDDEN := tests/validation tests/examples tests/sysid/batch
 HERE := not (campaign or socketcan or boots or native)
 SLOWEST := --durations=20 --durations-min=2
 
@@ -91,7 +91,7 @@ dist: $(VENV)/.installed-dev ## wheel and sdist into dist/
 	$(BIN)/python -m build --outdir dist .
 
 deb: $(VENV)/.installed ## Debian package into dist/: jtqd in /opt/jtqd, units, user, configuration
-	$(BIN)/python packaging/deb.py --out dist
+	$(BIN)/python tools/deb.py --out dist
 
 clean: ## remove what make made here; the cached bench kernel stays
 	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis

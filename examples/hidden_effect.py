@@ -31,6 +31,7 @@ import numpy as np
 import yaml
 
 from jtqd.daemon.logs import LogError, read_topics
+from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Effect, Joint
@@ -45,7 +46,6 @@ from jtqd.sysid.campaign.emulated import emulated
 from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.campaign.plans import variable_runs
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.measured.bus import published_torque, reference_torque, sync_time
 from jtqd.sysid.report.figures import STYLE, check_picture
 from jtqd.sysid.report.page import LIGHT
 from jtqd.sysid.runs.files import read_run

@@ -16,9 +16,9 @@ from tests.paths import ROOT
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 IDS = [page.name for page in PAGES]
 FILE = re.compile(
-    r"`((?:daemon|drivers|estimator|examples|models|sim_can|sysid|systemd|tests)/[\w./-]*\.(?:py|pyx|pxd|yaml|sh|c|md|csv|csv\.gz|service))[:`]"
+    r"`((?:daemon|drivers|estimator|examples|models|sim_can|sysid|systemd|tests|tools|validation)/[\w./-]*\.(?:py|pyx|pxd|yaml|sh|c|md|csv|csv\.gz|service))[:`]"
 )
-MODULE = re.compile(r"python -m ((?:jtqd|examples|tests)[\w.]*)")
+MODULE = re.compile(r"python -m ((?:jtqd|examples|tests|tools|validation)[\w.]*)")
 LINK = re.compile(r"\]\((?!https?:|mailto:)([^)#]*)(#[^)]*)?\)")
 IMPORT = re.compile(
     r"^ *(from (?:jtqd|examples)[\w.]* import (?:\([^)]*\)|[^\n]+)|import jtqd[\w.]*)", re.MULTILINE

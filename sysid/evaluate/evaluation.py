@@ -451,7 +451,7 @@ def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
             "not evaluated (--outside)" if flagged is None else f"{100.0 * flagged:.2f} %",
             None,
             (
-                "by definition: 'python -m jtqd.sysid.goals' counts flags outside of what a campaign has driven",
+                "by definition: 'python -m validation goals' counts flags outside of what a campaign has driven",
             ),
         ),
     )

@@ -16,7 +16,7 @@ from tests.paths import ROOT
 from tests.systemd.systemd_wheels import make_wheels
 from tests.systemd.test_systemd_boot import PYTHON, needs
 
-SCRIPT = ROOT / "packaging" / "deb.py"
+SCRIPT = ROOT / "tools" / "deb.py"
 DRIVER = Path(__file__).with_name("deb_driver.py")
 
 

@@ -25,11 +25,11 @@ from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.steadiness import Steadiness
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, Dense, search_of
 from tests.sysid.diagnosis.test_search import LIBRARY, problem
-from tests.worlds.judge import judged
-from tests.worlds.measured_bench import MeasuredBench
-from tests.worlds.oracle import hidden_size
-from tests.worlds.recorder import Recorder
-from tests.worlds.sets import Hidden
+from validation.worlds.judge import judged
+from validation.worlds.measured_bench import MeasuredBench
+from validation.worlds.oracle import hidden_size
+from validation.worlds.recorder import Recorder
+from validation.worlds.sets import Hidden
 
 
 def test_a_search_without_a_run_is_the_search_of_the_others() -> None:

@@ -1,6 +1,6 @@
 """Whole diagnoses of small sets with something hidden, of which the truth is known, and of data that cannot serve.
 
-The large campaign with sets drawn afresh is `tests.hidden.campaign`; here one seed, so that changes show.
+The large campaign with sets drawn afresh is `validation.hidden.campaign`; here one seed, so that changes show.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.verdict import _remaining
-from tests.hidden.case import Case, draw_many
-from tests.hidden.order import Hidden, Order
-from tests.hidden.scores import score
-from tests.hidden.trials import joint_files, tables
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, search_of
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, findings
 from tests.sysid.diagnosis.test_search import LIBRARY, problem
+from validation.hidden.case import Case, draw_many
+from validation.hidden.order import Hidden, Order
+from validation.hidden.scores import score
+from validation.hidden.trials import joint_files, tables
 
 SEED = 3
 KINDS = {

@@ -18,11 +18,11 @@ from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals
 from jtqd.sysid.fit.torsion import fit_torsion
 from jtqd.sysid.fit.torsion_extensions import WORTH, extended
 from jtqd.sysid.fit.torsion_signals import torsion_torque
-from jtqd.sysid.goals.sources import true_torsion
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
 from tests.sim_can.towing.benches import TYPICAL
 from tests.sysid.fit.fused_signals import FUSED
+from validation.goals.sources import true_torsion
 
 RICH = replace(
     TORSION,

@@ -1,0 +1,219 @@
+"""The goals' table: its figures against closed forms, changes of the plants, baselines, and the command in small."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.run import ObservedRun
+from jtqd.estimator.status import DEGRADED, VALID
+from jtqd.sim_can.plant_file import PlantParameters
+from jtqd.sysid.campaign.plan import Plateau, Rest, Run
+from jtqd.sysid.evaluate.methods import OURS, PAPERS
+from tests.estimator.fused_helpers import fused
+from validation.goals.__main__ import main
+from validation.goals.baselines import BASELINES, Example, fit_baseline
+from validation.goals.figures import (
+    REGRESSION,
+    Column,
+    Figure,
+    _beyond,
+    _outside,
+    _worse,
+    interval,
+    ratio,
+    root,
+    share,
+    standstill,
+)
+from validation.goals.identify import FIT_SEED, JUDGE_SEED, Driven, Identified, Range, drive, nominal_joints
+from validation.goals.judge import OWN, TITLES, ZEROS, Judged, Result, judge
+from validation.goals.plants import CHANGES, the_three
+from validation.goals.table import goal_lines, goal_rows, markdown
+
+N = 1000
+YES, NO = np.ones(N, np.bool_), np.zeros(N, np.bool_)
+
+
+def judged(run: str = "a", number: int = 1, error_nm: float = 0.0, **changes: object) -> Judged:
+    """A joint of 40 Nm at 10 Nm whose estimate is off by error_nm with a sigma of 1 Nm; least squares is off by 1 Nm."""
+    true = np.full(N, 10.0)
+    ours = Result(true + error_nm, true, np.ones(N), np.full(N, VALID, np.uint8))
+    results: Mapping[str, Result] = {OURS: ours, ZEROS: ours, REGRESSION: Result(true + 1.0, true)}
+    one = Judged(run, number, 40.0, true, YES, NO, NO, np.zeros(N, np.intp), results)
+    return replace(one, **changes)  # type: ignore[arg-type]
+
+
+def test_errors_of_figures_are_from_run_to_run() -> None:
+    """Two joints of one run are one run; sqrt(p (1-p)/n) of 4000 samples would be 0.008."""
+    found = share([("a", YES, YES), ("a", YES, YES), ("b", NO, YES), ("b", NO, YES)])
+    assert found.value == 50.0
+    assert found.se == pytest.approx(50.0)
+    assert math.isnan(share([("a", YES, YES)]).se)
+    assert math.isnan(share([("a", YES, NO)]).value)
+    assert ratio([("a", 8.0, 2.0)]).value == 4.0
+    rooted = root(Figure(4.0, 0.4))
+    assert rooted.value == 2.0
+    assert rooted.se == pytest.approx(0.1)
+
+
+def test_interval_takes_the_worst_cell_and_standstill_leaves_out_what_is_degraded() -> None:
+    runs = [judged("a", 1), judged("b", 1), judged("a", 2, 1.6), judged("b", 2, 1.7)]
+    found = interval(runs, OURS)
+    assert (found.low.value, found.high.value, found.all.value) == (50.0, 100.0, 75.0)
+    resting = judged("a", standing=YES, moving=NO)
+    status = np.full(N, VALID, np.uint8)
+    status[: N // 2] = DEGRADED
+    torque = np.where(status == DEGRADED, 99.0, 10.5)
+    half = Result(torque, np.full(N, 10.0), np.ones(N), status)
+    rest = standstill([replace(resting, results={OURS: half})], OURS)
+    assert rest.inside.value == 100.0
+    assert rest.half_nm == 1.0
+
+
+def test_outside_counts_missed_and_false_flags() -> None:
+    flags = np.full(N, VALID, np.uint8)
+    flags[:900] = DEGRADED
+    true = np.full(N, 10.0)
+    told = {OURS: Result(true, true, np.ones(N), flags)}
+    beyond = judged(beyond=YES, results=told)
+    within = judged(results={OURS: Result(true, true, np.ones(N), np.roll(flags, 1))})
+    found = _outside([within], {"load": [beyond], "speed": [judged(beyond=NO)]}, OURS)
+    assert found.flagged["load"].value == found.falsely.value == 90.0
+    assert math.isnan(found.flagged["speed"].value)
+
+
+def test_worse_than_least_squares_is_counted_by_joint_and_run() -> None:
+    assert (
+        _worse(
+            [judged("a", 1, 2.0), judged("a", 2, 0.5), judged("b", 1, 0.5), judged("b", 2, 0.5)], OURS
+        ).value
+        == 25.0
+    )
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_a_baseline_finds_the_coefficients_it_is_made_of(name: str) -> None:
+    rng = np.random.default_rng(3)
+    v, raw, d = rng.normal(size=N), 10.0 * rng.normal(size=N), 1e-3 * rng.normal(size=N)
+    seen = ObservedRun(
+        np.full(N, VALID, np.uint8), raw, v, 0.7 * d, np.zeros((N, 4)), v, np.tanh(v / 0.1), v, v, 0.3 * d
+    )
+    baseline = BASELINES[name]
+    truth: FloatArray = np.linspace(0.5, 1.5, baseline.regressors(seen).shape[1])
+    wanted = baseline.estimate(seen, truth)
+    old = np.full(N, np.nan)
+    young, slow = (wanted, old) if baseline.young else (old, wanted)
+    found = fit_baseline(baseline, [Example(seen, slow, young, YES)])
+    assert found == pytest.approx(truth, rel=1e-4)
+    with pytest.raises(ValueError, match="no samples in motion"):
+        fit_baseline(baseline, [Example(seen, slow, young, NO)])
+
+
+def test_every_change_is_one_of_the_plant_or_of_what_is_measured() -> None:
+    """The plant itself stays as it is; what a kind of plant does not have is left out."""
+    table_i, typical, _ = the_three()
+    assert isinstance(table_i.bench(), PlantParameters)
+    for plant in (table_i, typical):
+        before = plant.bench()
+        for change in CHANGES:
+            if change.possible(plant):
+                assert (change.bench(plant) == before) == (change.link is not None), change.name
+        assert plant.bench() == before
+    assert [c.name for c in CHANGES if not c.possible(table_i)] == ["friction by load, exponent +0.15"]
+    assert all(c.possible(typical) for c in CHANGES)
+
+
+def short_run() -> Run:
+    return Run("short", 1, (Rest(0.2, 0.0), Plateau(0.6, 2.0, 0.4, 0.2), Rest(0.2, 0.2)))
+
+
+def test_a_change_of_the_link_reaches_the_estimate_and_not_the_truth() -> None:
+    """100 urad are K 100 urad of torque in the torsion; the true torque is the plant's."""
+    plant = the_three()[1]
+    joints = nominal_joints(plant)
+    run = drive(plant.bench(), [short_run()], 5)[0]
+    joint = replace(joints[0], fused=fused())
+    one = Identified(1, joint, b"", {}, Range(1000.0, 1000.0, (-50.0, 200.0)))
+    zero = next(change for change in CHANGES if change.name == "link zero 100 urad")
+    plain, changed = (judge(run, one, link, (OURS,)) for link in (None, zero.link))
+    assert plain.moving.sum() > 200
+    assert plain.standing.sum() > 20
+    assert np.array_equal(plain.true_nm, changed.true_nm)
+    moved = (changed.results[OURS].torque_nm - plain.results[OURS].torque_nm)[plain.moving]
+    assert -1.5 < np.median(moved) < -0.2
+    assert not plain.beyond.any()
+    slow = replace(one, driven=Range(1000.0, 0.1, (-50.0, 200.0)))
+    beyond = _beyond({"speed": [run]}, [slow])["speed"][0]
+    assert beyond.beyond[600]
+    assert not beyond.beyond[100]
+
+
+def test_days_that_judge_are_of_no_fit() -> None:
+    plant = the_three()[2]
+    days = [plant.bench().run_to_run.day(seed, 0) for seed in (FIT_SEED, JUDGE_SEED)]
+    assert days[0] != days[1]
+
+
+def test_the_same_seed_for_both_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["--seed", "3", "--fit-seed", "3"])
+    assert caught.value.code == 2
+    assert "found 3 for both" in capsys.readouterr().err
+
+
+def column(name: str) -> Column:
+    one = Figure(1.0, 0.1)
+    whole = interval([judged("a"), judged("b")], OURS)
+    rest = standstill([judged(standing=YES)], OURS)
+    from validation.goals.figures import Changed, Outside
+
+    return Column(
+        name,
+        3,
+        dict.fromkeys(TITLES, one),
+        {**dict.fromkeys(TITLES, one), PAPERS: Figure(10.0)},
+        dict.fromkeys(OWN, whole),
+        dict.fromkeys(OWN, rest),
+        {m: {"nothing": Changed(one, Figure(90.0), one)} for m in (*OWN, REGRESSION)},
+        dict.fromkeys(OWN, Outside({"load": Figure(96.0), "speed": Figure(94.0)}, Figure(1.0))),
+        dict.fromkeys(OWN, one),
+    )
+
+
+def test_the_table_says_what_is_reached() -> None:
+    lines = goal_lines([column(name) for name in ("Table I", "typical", "bad day")])
+    by_name = {cells[0]: cells[1:] for cells in lines[1:]}
+    assert len(lines) == 1 + len(goal_rows())
+    now = by_name["RMSE in motion against the true torque now, % of rated: ours"]
+    assert now == ["1.00 ± 0.10", "0.5 missed", "1.00 ± 0.10", "1 ok", "1.00 ± 0.10", "1.5 ok"]
+    chain = by_name["MSE to that of the paper's chain identified on the same runs: ours"]
+    assert chain[0:2] == ["0.100", "0.15 ok"]
+    outside = by_name["outside, flagged, %; inside, falsely flagged, %: ours"]
+    assert outside[1] == "95; 2 missed", "the kind that is flagged least counts"
+    assert {len(line) for line in markdown(lines)} == {len(markdown(lines)[0])}
+
+
+@pytest.mark.campaign
+def test_the_command_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "goals.json"
+    assert main(["--tiny", "--seed", "11", "--json", str(file)]) == 0
+    assert "| figure" in capsys.readouterr().out
+    made = json.loads(file.read_text())
+    assert [each["name"] for each in made["columns"]] == ["Table I", "typical", "bad day"]
+    for each in made["columns"]:
+        mse = each["mse_nm2"]
+        assert mse[OURS]["value"] < mse[REGRESSION]["value"] < mse["tob"]["value"]
+
+
+def test_driven_runs_have_the_truth_of_both_joints() -> None:
+    run: Driven = drive(the_three()[0].bench(), [short_run()], 5)[0]
+    assert run.true_nm.shape == (len(run.table.time_s), 2)
+    assert run.columns(2, nominal_joints(the_three()[0])[1]).torque_nm is not None

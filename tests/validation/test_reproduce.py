@@ -1,0 +1,275 @@
+"""Study `reproduce`: the commands, their order, what ends it, the configuration it leaves; the shipped models fit theirs."""
+
+import hashlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import yaml
+
+from jtqd.daemon.config import load_config
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.campaign import command as campaign_command
+from jtqd.sysid.campaign.plan import check_plan, load_plan
+from tests.estimator.fused_configuration import networks
+from validation import reproduce as reproduce_command
+from validation.reproduce import Step, steps, write_config
+
+
+def test_every_step_comes_after_what_it_reads(tmp_path):
+    made = {str(shipped(f"joint{n}.yaml")) for n in (1, 2)} | {str(shipped("campaign_plant_outside.yaml"))}
+    made |= {str(tmp_path / "outside.plan.yaml")}
+    names = []
+    for step in steps(tmp_path, "sim", True, 0):
+        names.append(step.text.split()[2 if step.module != "jtqd.daemon.jtq" else 1])
+        paths = [word for word in step.arguments if "/" in word and not word.startswith("-")]
+        out = step.arguments[step.arguments.index("--out") + 1]
+        for path in paths:
+            assert path in made or path == out or path.endswith(".png"), (step.arguments, path)
+        made.add(out)
+    assert names == [
+        "campaign",
+        "campaign",
+        *["fit"] * 4,
+        "train",
+        "train",
+        "campaign",
+        "campaign",
+        "evaluate",
+        "jtqd.sysid.campaign.emulated",
+        "evaluate",
+    ]
+
+
+@pytest.mark.parametrize("kind", ["efficiency", "excitation", "validate"])
+def test_quick_campaigns_are_plans_that_can_be_driven(tmp_path, capsys, kind):
+    (step,) = (s for s in steps(tmp_path, "sim", True, 0) if s.arguments[:2] == ("campaign", kind))
+    size = [word for word in step.arguments[2:] if word != "160"]
+    if "--evaluations" in size:
+        size.insert(size.index("--evaluations") + 1, "1")
+    assert campaign_command.main([kind, *size, "--dry-run"]) == 0, capsys.readouterr().err
+
+
+def test_nothing_is_trained_on_what_judges(tmp_path):
+    for step in steps(tmp_path, "sim", False, 0):
+        if step.arguments[0] in ("fit", "train"):
+            assert not any(
+                part in word for word in step.arguments for part in ("validate", "outside", "days")
+            )
+
+
+@pytest.fixture
+def scripted(monkeypatch):
+    """Return what puts a function of command and call number in the place of the commands; the list is what ran."""
+
+    def put(answer):
+        called = []
+
+        def run(self, name, command):
+            called.append(command[3])
+            return answer(command[3], len(called))
+
+        monkeypatch.setattr(reproduce_command.Commands, "run", run)
+        monkeypatch.setattr(reproduce_command, "check_installed", lambda *_: None)  # nothing is trained here
+        return called
+
+    return put
+
+
+def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, scripted, capsys):
+    called = scripted(lambda name, _: 3 if name == "campaign" else 1)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick", "--jobs", "1"]) == 1
+    assert called == ["campaign", "campaign", "fit"]
+    assert "jtq fit ended with status 1" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("done", "calls"), [([1, 2, 2], 3), ([0, 0], 2), ([], 1)])
+def test_campaign_that_ended_early_goes_on_while_runs_get_done(tmp_path, scripted, capsys, done, calls):
+    """Each number is how many runs are done after an attempt that ended early; without a state nothing was begun."""
+
+    def answer(name, number):
+        state = tmp_path / "campaigns" / "excitation" / "campaign.json"
+        if done:
+            state.parent.mkdir(parents=True, exist_ok=True)
+            count = done[number - 1]
+            runs = [{"name": f"run{n}", "status": "done" if n < count else "pending"} for n in range(3)]
+            state.write_text(json.dumps({"runs": runs}))
+        return 1
+
+    called = scripted(answer)
+    assert reproduce_command.main(["--out", str(tmp_path), "--quick", "--jobs", "1"]) == 1
+    assert called == ["campaign"] * calls
+    assert "jtq campaign ended with status 1" in capsys.readouterr().err
+
+
+def step(out, *reads, words="pass", **options):
+    """A step that runs Python; what it reads are arguments that Python does not look at."""
+    return Step(("-c", words, *map(str, reads), "--out", str(out)), module="ignored", **options)
+
+
+@pytest.fixture
+def python(monkeypatch):
+    """Steps are what `python -c` makes of them: `-m MODULE` is left out."""
+    started = subprocess.Popen
+    monkeypatch.setattr(
+        reproduce_command.subprocess,
+        "Popen",
+        lambda command, **more: started([command[0], *command[3:]], **more),
+    )
+
+
+def test_steps_run_at_once_unless_one_reads_what_another_writes(tmp_path, python, capfd):
+    """a and b wait for each other, so neither ends alone; c reads both, one by its file and one by its directory."""
+    meet = (
+        "import pathlib, sys, time; end = time.monotonic() + 60; pathlib.Path(sys.argv[-1]).touch()\n"
+        "while not pathlib.Path('{other}').exists():\n"
+        "    if time.monotonic() > end: sys.exit(1)\n"
+        "    time.sleep(0.01)"
+    )
+    a, b, c, d = (tmp_path / name for name in ("a", "models/b", "c", "d"))
+    b.parent.mkdir()
+    one = step(a, words=meet.format(other=b))
+    two = step(b, words=meet.format(other=a))
+    three = step(c, a, b.parent)
+    assert reproduce_command.run_steps((one, two, three, step(d, words="print('said', flush=True)")), 2) == 0
+    told = capfd.readouterr()
+    assert "said" in told.out
+    assert told.err.count("$ ") == 4
+    assert [three.reads(one), three.reads(two), two.reads(one), one.reads(three)] == [
+        True,
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_step_waits_for_what_it_reads_although_there_is_room(tmp_path, python):
+    late = "import pathlib, sys, time; time.sleep(0.5); pathlib.Path(sys.argv[-1]).touch()"
+    check = "import pathlib, sys; sys.exit(0 if pathlib.Path(sys.argv[1]).exists() else 1)"
+    writer = step(tmp_path / "a", words=late)
+    reader = step(tmp_path / "b", tmp_path / "a", words=check)
+    assert reproduce_command.run_steps((writer, reader), 2) == 0
+
+
+def test_a_step_that_fails_ends_those_beside_it(tmp_path, python, capfd):
+    forever = step(tmp_path / "a", words="import time; time.sleep(600)")
+    fails = step(tmp_path / "b", words="import sys; print('no', file=sys.stderr); sys.exit(2)")
+    after = step(tmp_path / "c", tmp_path / "a")
+    begun = time.monotonic()
+    assert reproduce_command.run_steps((forever, fails, after), 2) == 1
+    assert time.monotonic() - begun < 60
+    told = capfd.readouterr().err
+    assert "[b] no\n" in told
+    assert "ended with status 2" in told
+    assert f"--out {tmp_path / 'c'}" not in told
+
+
+def test_sigterm_ends_the_steps(tmp_path, python):
+    before = signal.getsignal(signal.SIGTERM)
+    tells = f"import os, signal, time; os.kill({os.getpid()}, signal.SIGTERM); time.sleep(600)"
+    begun = time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        reproduce_command.run_steps((step(tmp_path / "a", words=tells),), 1)
+    assert time.monotonic() - begun < 60
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_nothing_waits_for_what_it_writes_itself(tmp_path):
+    """Else two steps that write into one directory would wait for each other's files."""
+    made = list(steps(tmp_path, "sim", True, 0))
+    paper, ours = (each for each in made if each.arguments[0] == "train")
+    assert not ours.reads(paper)
+    judged = made[-1]
+    assert judged.reads(ours)
+    assert judged.reads(paper)
+
+
+def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):
+    file = tmp_path / "file"
+    file.touch()
+    assert reproduce_command.main(["--out", str(file)]) == 1
+    assert capsys.readouterr().err == f"reproduce: --out {file}: cannot be created: it is a file\n"
+    assert reproduce_command.main(["--out", str(file / "below")]) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_packages_that_training_needs_are_asked_for_before_the_first_campaign(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torch", None)
+    assert reproduce_command.main(["--quick", "--out", str(tmp_path / "out")]) == 1
+    assert capsys.readouterr().err == "reproduce: torch is not installed: pip install 'jtqd[train]'\n"
+
+
+def test_outside_plan_has_half_as_much_load_again_and_is_within_its_limits(tmp_path):
+    path = tmp_path / "outside.plan.yaml"
+    reproduce_command._write_outside_plan(path, 0, 2)
+    plan = load_plan(path)
+    peaks = [np.abs(points.current_a).max() for points in check_plan(plan).values()]
+    assert max(peaks) > 1.3 * 5.0  # the peak of every other campaign is 5 A
+
+
+def trained(directory):
+    """Copy the shipped models to `directory`."""
+    for file in shipped("trained/joint1.yaml").parent.iterdir():
+        (directory / file.name).write_bytes(file.read_bytes())
+
+
+def test_configuration_written_beside_the_models_is_one_that_jtqd_takes(tmp_path):
+    trained(tmp_path)
+    write_config(tmp_path / "bench_paper.yaml", "bench_paper.yaml")
+    config = load_config(tmp_path / "bench_paper.yaml")
+    for joint in config.joints:
+        assert joint.network is not None
+        assert joint.network.path.parent == tmp_path
+        assert hashlib.sha256(joint.network.path.read_bytes()).hexdigest() == joint.network.sha256
+
+
+def test_the_configuration_has_those_networks_that_the_gate_let_through(tmp_path):
+    trained(tmp_path)
+    (tmp_path / "joint2.fused.onnx").write_bytes(networks()[2])
+    write_config(tmp_path / "bench.yaml", "bench.yaml")
+    config = load_config(tmp_path / "bench.yaml")
+    assert [joint.network and joint.network.path.name for joint in config.joints] == [
+        None,
+        "joint2.fused.onnx",
+    ]
+    for joint in config.joints:
+        assert joint.temperature
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_shipped_models_come_from_the_same_runs(number):
+    import onnx
+
+    joint = load_joint(shipped(f"trained/joint{number}.yaml"))
+    trained_on = joint.provenance["fused"]["sha256"]
+    model = onnx.load(str(shipped(f"trained/joint{number}.onnx")))
+    metadata = {item.key: yaml.safe_load(item.value) for item in model.metadata_props}
+    assert metadata["runs"] == trained_on
+    assert metadata["joint"] == joint.name
+
+
+@pytest.mark.campaign
+def test_quick_reproduction_from_nothing(tmp_path):
+    command = [sys.executable, "-m", "validation", "reproduce", "--quick", "--out", str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1500, check=False)
+    assert done.returncode in (0, 3), done.stderr[-2000:]
+    assert (tmp_path / "report" / "evaluation.html").stat().st_size > 10_000
+    assert (tmp_path / "report_days" / "evaluation.html").stat().st_size > 10_000
+    assert load_config(tmp_path / "models" / "bench.yaml").estimator.method == "fused"
+
+
+def test_another_plant_needs_no_bus_and_is_judged_on_other_days(tmp_path):
+    plant = shipped("plants/typical.yaml")
+    made = list(steps(tmp_path, "sim", True, 3, plant))
+    assert not any(step.arguments[0] == "campaign" for step in made)
+    emulated = [step.arguments for step in made if step.module == "jtqd.sysid.campaign.emulated"]
+    assert all(str(plant) in arguments for arguments in emulated)
+    seeds = [arguments[arguments.index("--seed") + 1] for arguments in emulated]
+    assert len(emulated) == 4
+    assert seeds[0] == seeds[1]
+    assert len({*seeds}) == 3

@@ -1,0 +1,5 @@
+"""Tools of the project that no installation has: packaging and counters of lines and words.
+
+`python tools/deb.py`, `python -m tools.count`.
+Nothing of the product imports them.
+"""

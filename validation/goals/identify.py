@@ -1,0 +1,266 @@
+"""Identify both joints of a plant as its user would, and drive the runs that judge.
+
+All runs are emulated in memory; those that judge have days and motions of other seeds and are drawn, not designed. The true
+torque goes into no fit.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.estimator import observe_run
+from jtqd.estimator.joint import CONVENTIONS, Joint
+from jtqd.estimator.observer import low_pass
+from jtqd.estimator.run import JointColumns, ObservedRun, RunTable
+from jtqd.estimator.settings import EstimatorSettings, recommended
+from jtqd.models.files import load_joint
+from jtqd.sim_can.plants import AnyPlant
+from jtqd.sysid.campaign.emulated import emulated_with_truth
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Run
+from jtqd.sysid.campaign.plans import Scale, make_plan, outside_runs
+from jtqd.sysid.fit.efficiency import default_current_min, eta_points, fit_efficiency
+from jtqd.sysid.fit.fused import fit_fused
+from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
+from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
+from jtqd.sysid.train.paper import paper_block, train_paper
+from validation.goals.baselines import BASELINES, Example, fit_baseline
+from validation.goals.plants import SIDES, Mapped, PlantFile
+
+FIT_SEED: Final = 1
+JUDGE_SEED: Final = 7020
+"""Days and motions that nothing was chosen on (docs/evaluation.md); a new choice takes a new seed."""
+WARMER_K: Final = 30.0
+FASTER_RAD_S: Final = 4.5
+NUMBERS: Final = (1, 2)
+
+
+class Sizes(NamedTuple):
+    """How much is driven: counts of runs, lengths of one and of its holds [s], iterations of the paper's network."""
+
+    fit_runs: int
+    fit_s: float
+    evaluations: int
+    efficiency_hold_s: float
+    iterations: int
+    judge_runs: int
+    judge_s: float
+    judge_hold_s: float
+    changed_runs: int
+    outside_runs: int
+
+
+FULL: Final = Sizes(96, 12.0, 400, 1.2, 1000, 192, 8.0, 1.6, 48, 24)
+QUICK: Final = Sizes(32, 12.0, 160, 1.2, 150, 24, 8.0, 1.0, 8, 4)
+TINY: Final = Sizes(8, 8.0, 2, 0.8, 2, 2, 5.0, 0.6, 1, 1)
+"""For tests of the steps."""
+
+
+class Driven(NamedTuple):
+    """A run as measured, and what no instrument knows: the true torques [n, 2] of the gears."""
+
+    name: str
+    table: RunTable
+    true_nm: FloatArray
+
+    def columns(self, number: int, joint: Joint) -> JointColumns:
+        """Return the columns of a joint."""
+        return self.table.joint(number, joint.gear_ratio)
+
+
+def drive(bench: AnyPlant, runs: Sequence[Run], seed: int) -> list[Driven]:
+    """Return the runs on a plant, each on a day of its own of this seed."""
+    made = []
+    for day, run in enumerate(runs):
+        emulated = emulated_with_truth(bench, seed, day, run)
+        made.append(Driven(run.name, emulated.table, emulated.joint_torque_nm))
+    return made
+
+
+class Range(NamedTuple):
+    """What the campaign that a joint was identified on has driven: largest true torque and speed, temperatures."""
+
+    torque_nm: float
+    velocity_rad_s: float
+    temperature_c: tuple[float, float]
+
+    @classmethod
+    def of(cls, runs: Sequence[Driven], number: int, joint: Joint) -> Range:
+        """Return the range of runs."""
+        columns = [run.columns(number, joint) for run in runs]
+        known = np.concatenate([_present(each.temperature_c) for each in columns])
+        return cls(
+            max(float(np.abs(run.true_nm[:, number - 1]).max()) for run in runs),
+            max(float(np.abs(_present(each.motor_velocity_rad_s)).max()) for each in columns)
+            / joint.gear_ratio,
+            (float(known.min()), float(known.max())),
+        )
+
+
+def _present(column: FloatArray | None) -> FloatArray:
+    if column is None:
+        raise ValueError("found a run without a column that an emulated run has")
+    return column
+
+
+@dataclass(frozen=True)
+class Identified:
+    """One joint of a plant: its file, the paper's network (ONNX), coefficients by baseline, what was driven."""
+
+    number: int
+    joint: Joint
+    network: bytes
+    baselines: Mapping[str, FloatArray]
+    driven: Range
+
+
+def scale_of(sizes: Sizes, joints: tuple[Joint, Joint], seed: int, part: str) -> Scale:
+    """Return the scale of a campaign: `excitation`, `efficiency` or `validate`."""
+    if part == "validate":
+        return Scale(sizes.judge_runs, sizes.judge_s, sizes.judge_hold_s, seed, joints=joints)
+    return Scale(sizes.fit_runs, sizes.fit_s, sizes.efficiency_hold_s, seed, sizes.evaluations, joints=joints)
+
+
+def nominal_joints(plant: PlantFile) -> tuple[Joint, Joint]:
+    """Return what a user of the plant knows before: its joint files. Raises ConfigError."""
+    one, two = (load_joint(plant.directory / plant.mapping[side]["joint"]) for side in SIDES)
+    return one, two
+
+
+def identify(plant: PlantFile, sizes: Sizes, seed: int = FIT_SEED) -> tuple[Identified, ...]:
+    """Return both joints of a plant as the toolbox identifies them from campaigns of this seed.
+
+    Raises:
+        ConfigError, LossFitError, TorsionError, ValueError: as the fits, where the runs are too few.
+    """
+    physics, excitation = identify_physics(plant, sizes, seed)
+    plan = make_plan("efficiency", scale_of(sizes, nominal_joints(plant), seed, "efficiency"))
+    efficiency = drive(plant.bench(), plan.runs, seed)
+    return tuple(_with_others(one, excitation, efficiency, sizes.iterations, seed) for one in physics)
+
+
+def identify_physics(
+    plant: PlantFile, sizes: Sizes, seed: int = FIT_SEED
+) -> tuple[tuple[Identified, ...], list[Driven]]:
+    """Return both joints with section `fused` alone, and the runs that they were fitted to. Raises as `identify`."""
+    joints = nominal_joints(plant)
+    plan = make_plan("excitation", scale_of(sizes, joints, seed, "excitation"))
+    excitation = drive(plant.bench(), plan.runs, seed)
+    return fit_physics(joints, excitation), excitation
+
+
+def fit_physics(joints: tuple[Joint, Joint], excitation: Sequence[Driven]) -> tuple[Identified, ...]:
+    """Return both joints with section `fused` fitted to these runs. Raises as `identify`."""
+    settings = EstimatorSettings(method="fused")  # as `jtq fit losses`
+    found = []
+    for number, joint in zip(NUMBERS, joints, strict=True):
+        signals = [
+            run_signals(run.name, joint, settings, run.table.time_s, run.columns(number, joint))
+            for run in excitation
+        ]
+        fused = fit_fused(signals, joint.friction, joint.rated_torque_nm).fused
+        found.append(
+            Identified(number, replace(joint, fused=fused), b"", {}, Range.of(excitation, number, joint))
+        )
+    return tuple(found)
+
+
+def with_efficiency(joint: Joint, number: int, runs: Sequence[Driven]) -> Joint:
+    """Return the joint with the paper's efficiency, fitted to the plateaus of runs, as `jtq fit efficiency` does it."""
+    plateaus: list[Plateau] = []
+    for run in runs:
+        try:
+            plateaus += find_plateaus(run.table.time_s, run.columns(number, joint), joint, run.name)
+        except PlateauError:
+            continue
+    points, _ = eta_points(plateaus, joint, default_current_min(joint))
+    fit = fit_efficiency(points, CONVENTIONS[0], joint)
+    return replace(joint, efficiency=fit.efficiency(joint.efficiency))
+
+
+def _with_others(
+    one: Identified, excitation: Sequence[Driven], efficiency: Sequence[Driven], iterations: int, seed: int
+) -> Identified:
+    """Return the joint with the paper's chain and the baselines."""
+    number, joint = one.number, with_efficiency(one.joint, one.number, efficiency)
+    blocks = [
+        paper_block(run.name, joint, run.table.time_s, run.columns(number, joint)) for run in excitation
+    ]
+    names = {run.name: hashlib.sha256(run.table.time_s.tobytes()).hexdigest() for run in excitation}
+    network = train_paper(
+        blocks, joint, names, iterations=iterations, seed=seed, progress=lambda n, loss: None
+    )
+    examples = [example(run, number, joint) for run in excitation]
+    baselines = {name: fit_baseline(baseline, examples) for name, baseline in BASELINES.items()}
+    return replace(one, joint=joint, network=network.data, baselines=baselines)
+
+
+OF_BASELINES: Final = replace(recommended("fused"), track_torsion=False)
+"""What is least squares on torsion and current has the torsion through its low pass."""
+
+
+def observed(run: Driven, columns: JointColumns, joint: Joint) -> ObservedRun:
+    """Return what the observer of ours sees of a run with a torsion of 1 Nm/rad."""
+    dt = np.diff(run.table.time_s, prepend=run.table.time_s[0])
+    return observe_run(
+        joint,
+        OF_BASELINES,
+        UNIT_TORSION,
+        dt,
+        _present(columns.current_a),
+        _present(columns.motor_position_rad),
+        _present(columns.motor_velocity_rad_s),
+        _present(columns.link_position_rad),
+        columns.temperature_c,
+    )
+
+
+def example(run: Driven, number: int, joint: Joint) -> Example:
+    """Return a run for the baselines."""
+    columns = run.columns(number, joint)
+    settings = OF_BASELINES
+    dt = np.diff(run.table.time_s, prepend=run.table.time_s[0])
+    sensor = _present(columns.torque_nm)
+    signals = run_signals(run.name, joint, settings, run.table.time_s, columns)
+    young = low_pass(sensor, dt, settings.own_torsion_bandwidth_rad_s)
+    return Example(observed(run, columns, joint), signals.sensor_nm, young, signals.moving)
+
+
+def judging_runs(sizes: Sizes, joints: tuple[Joint, Joint], seed: int = JUDGE_SEED) -> tuple[Run, ...]:
+    """Return the motions that judge: constant and variable velocity, as of `jtq campaign validate`."""
+    return make_plan("validate", scale_of(sizes, joints, seed, "validate")).runs
+
+
+def _stronger(mapping: Mapped) -> None:
+    for side in SIDES:
+        mapping[side]["drive"] |= {"current_limit_a": 14.0, "trip_current_a": 16.0}
+
+
+def _warmer(mapping: Mapped) -> None:
+    for side in SIDES:
+        warmth = mapping[side]["warmth" if "warmth" in mapping[side] else "thermal"]
+        warmth["ambient_c"] = warmth.get("ambient_c", warmth["reference_c"]) + WARMER_K
+
+
+def outside(
+    plant: PlantFile, sizes: Sizes, joints: tuple[Joint, Joint], seed: int = JUDGE_SEED
+) -> dict[str, list[Driven]]:
+    """Return runs that no campaign has driven, by what is beyond it: half as much load again, speed, temperature."""
+    limits = replace(DEFAULT_LIMITS, current_a=16.0, torque_nm=90.0, velocity_rad_s=6.0)
+    count, seconds = sizes.outside_runs, sizes.judge_s
+    load = outside_runs(limits, count, seconds, seed=seed, joints=joints)
+    fast = outside_runs(
+        limits, count, seconds, seed=seed, joints=joints, load=1.0, velocity_rad_s=FASTER_RAD_S
+    )
+    warm = outside_runs(DEFAULT_LIMITS, count, seconds, seed=seed, joints=joints, load=1.0)
+    parts: dict[str, tuple[Callable[[Mapped], None], tuple[Run, ...]]] = {
+        "load": (_stronger, load),
+        "speed": (_stronger, fast),
+        "temperature": (_warmer, warm),
+    }
+    return {name: drive(plant.changed(change).bench(), runs, seed) for name, (change, runs) in parts.items()}

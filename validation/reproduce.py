@@ -1,0 +1,317 @@
+"""`python -m validation reproduce`: run the paper's whole procedure and ours: campaigns, fits, training, evaluation, report.
+
+Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. A step begins when all
+that it reads is there; with --jobs several are at work at once. Campaigns go on where they were interrupted; fits and
+training give the same files from the same runs. With `--plant` the bench is another one
+(docs/benches.md), and its campaigns are emulated without a bus, with the true torques beside the runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+from types import FrameType
+from typing import Final, NamedTuple, NoReturn
+
+import yaml
+
+from jtqd.estimator.checked import ConfigError, check_installed, count, make_directory, natural
+from jtqd.models.files import shipped
+from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
+from jtqd.sysid.campaign.plans import outside_runs
+from jtqd.sysid.campaign.state import DONE, STATE_FILE
+
+_OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
+_FINDINGS: Final = 3
+_OTHER_DAYS: Final = 7
+"""Added to the seed: days and trajectories that no campaign has."""
+_NEEDED: Final = ("torch", "onnx", "scipy", "matplotlib", "jinja2")
+_QUICK_JOBS: Final = 2
+"""Campaigns mostly wait, fits and training mostly compute."""
+_WRITTEN: Final = ("--out", "--plot")
+_VALIDATION_DAYS: Final = 1000
+"""Added to the seed of emulated runs that judge."""
+_EMULATED: Final = "jtqd.sysid.campaign.emulated"
+TRAINED: Final = "trained"
+"""Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
+_EXAMPLES: Final = """examples:
+  python -m validation reproduce --out reproduction            everything, about 85 minutes, 41 of them motion of the bench
+  python -m validation reproduce --out /tmp/quick --quick      the same steps with shorter runs, too few for good figures
+  python -m validation reproduce --plant models/plants/typical.yaml --out typical     another bench, without a bus"""
+
+
+class Step(NamedTuple):
+    """A command of the toolbox, and whether findings (exit status 3) are a result to go on with."""
+
+    arguments: tuple[str, ...]
+    findings_are_fine: bool = False
+    module: str = "jtqd.daemon.jtq"
+
+    @property
+    def text(self) -> str:
+        """The command as one would type it."""
+        name = "jtq" if self.module == "jtqd.daemon.jtq" else f"python -m {self.module}"
+        return " ".join((name, *self.arguments))
+
+    @property
+    def name(self) -> str:
+        """Its first words: "jtq fit"."""
+        return " ".join(self.text.split()[: 2 if self.module == "jtqd.daemon.jtq" else 3])
+
+    @property
+    def out(self) -> Path:
+        """What it writes: a file, or a directory."""
+        return Path(self.arguments[self.arguments.index("--out") + 1])
+
+    def reads(self, earlier: Step) -> bool:
+        """Return whether it needs what an earlier step writes: that very file or directory, or a file in a directory."""
+        pairs = zip(("", *self.arguments), self.arguments, strict=False)
+        return any(earlier.out.is_relative_to(word) for before, word in pairs if before not in _WRITTEN)
+
+
+def main(argv: list[str]) -> int:
+    """Run all steps; exit status 0 done, 1 a step failed, 2 usage, 3 done with findings."""
+    options = parser().parse_args(argv)
+    out: Path = options.out
+    jobs = options.jobs or (_QUICK_JOBS if options.quick else 1)
+    try:
+        make_directory(out)
+        check_installed("train", *_NEEDED)  # a step asks for it only after an hour of campaigns
+        (out / "models").mkdir(parents=True, exist_ok=True)
+        _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
+        worst = run_steps(tuple(steps(out, options.bus, options.quick, options.seed, options.plant)), jobs)
+        if worst == 1:
+            return 1
+        for name in ("bench.yaml", "bench_paper.yaml"):
+            write_config(out / "models" / name, name)
+    except ConfigError as error:
+        print(f"reproduce: {error}", file=sys.stderr)
+        return 1
+    except OSError as error:
+        print(f"reproduce: {error.filename or out}: {error.strerror or error}", file=sys.stderr)
+        return 1
+    print(
+        f"report: {out / 'report' / 'evaluation.html'}, of many days {out / 'report_days' / 'evaluation.html'}\n"
+        f"configuration for jtqd: {out / 'models' / 'bench.yaml'}"
+    )
+    return worst
+
+
+class Commands:
+    """Commands of the steps that are at work, up to `jobs` at once.
+
+    Several have no terminal of their own: each line that they tell begins with their name.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        self.jobs = jobs
+        self.ended = False
+        self._lock = Lock()
+        self._processes: list[subprocess.Popen[str]] = []
+
+    def run(self, name: str, command: Sequence[str]) -> int:
+        """Return the exit status of a command; 1 without running it once all were ended."""
+        told = None if self.jobs == 1 else subprocess.PIPE
+        with self._lock:
+            if self.ended:
+                return 1
+            process = subprocess.Popen(command, stderr=told, text=True, errors="replace")
+            self._processes.append(process)
+        for line in process.stderr or ():
+            print(f"[{name}] {line}", end="", file=sys.stderr, flush=True)
+        return process.wait()
+
+    def end(self) -> None:
+        """End what is at work; nothing begins any more."""
+        with self._lock:
+            self.ended = True
+            for process in self._processes:
+                process.terminate()
+
+
+def run_steps(wanted: Sequence[Step], jobs: int) -> int:
+    """Run steps, up to `jobs` at once, each when the earlier ones that it reads are done.
+
+    Returns the worst status; 1 when one failed: the others are ended then.
+    """
+    commands, worst = Commands(jobs), 0
+    before = signal.signal(signal.SIGTERM, _terminated)
+    left, under_way = dict(enumerate(wanted)), dict[Future[int], int]()
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            while left or under_way:
+                unfinished = {*left, *under_way.values()}
+                for at, step in list(left.items()):
+                    waits = any(step.reads(wanted[one]) for one in unfinished if one < at)
+                    if len(under_way) < jobs and not waits:
+                        print(f"$ {step.text}", file=sys.stderr, flush=True)
+                        under_way[pool.submit(_run, left.pop(at), commands)] = at
+                for done in wait(under_way, return_when=FIRST_COMPLETED).done:
+                    step, status = wanted[under_way.pop(done)], done.result()
+                    if status and not (status == _FINDINGS and step.findings_are_fine):
+                        print(f"reproduce: {step.name} ended with status {status}", file=sys.stderr)
+                        return 1
+                    worst = max(worst, status)
+        finally:
+            commands.end()
+            signal.signal(signal.SIGTERM, before)
+    return worst
+
+
+def _terminated(number: int, frame: FrameType | None) -> NoReturn:
+    """SIGTERM ends the steps as Ctrl-C does."""
+    raise KeyboardInterrupt
+
+
+def _run(step: Step, commands: Commands) -> int:
+    """Run a step; a campaign that ended early goes on for as long as each attempt gets at least one more run done."""
+    done = -1
+    while True:
+        status = commands.run(step.out.name, [sys.executable, "-m", step.module, *step.arguments])
+        if status != 1 or step.arguments[0] != "campaign" or commands.ended:
+            return status
+        now = _runs_done(step.out)
+        if now <= done:
+            return status
+        done = now
+        print(f"reproduce: runs done: {now}; the campaign continues", file=sys.stderr, flush=True)
+
+
+def _runs_done(campaign: Path) -> int:
+    """Return how many runs of a campaign are done; -1 where no campaign was begun."""
+    try:
+        runs = json.loads((campaign / STATE_FILE).read_text(encoding="utf-8"))["runs"]
+    except (OSError, ValueError, KeyError):
+        return -1
+    return sum(run["status"] == DONE for run in runs)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `python -m validation reproduce`."""
+    parser = argparse.ArgumentParser(
+        prog="python -m validation reproduce",
+        description="Run all campaigns, fits, training and evaluation on the emulated bench, over the bus.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
+    )
+    parser.add_argument(
+        "--bus",
+        default="sim",
+        metavar="BUS",
+        help="sim, sim:vcan0: the emulated bench on SocketCAN, or exact: in exact time (default sim)",
+    )
+    parser.add_argument(
+        "--plant",
+        type=Path,
+        metavar="FILE",
+        help="plant or bench file: every campaign is emulated on it without a bus, none outside its range",
+    )
+    parser.add_argument(
+        "--quick", action="store_true", help="small campaigns and short training, to test the steps"
+    )
+    parser.add_argument(
+        "--jobs", type=count, metavar="N", help="steps at work at once (default 1, with --quick 2)"
+    )
+    parser.add_argument(
+        "--seed", type=natural, default=0, help="of trajectories, days and weights (default 0)"
+    )
+    return parser
+
+
+def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None) -> Iterator[Step]:
+    """Yield the commands in their order; plant: another bench than the shipped one, without a bus."""
+    runs, models, work = out / "campaigns", out / "models", out / "work"
+    work.mkdir(exist_ok=True)
+    common = ("--bus", bus, "--seed", str(seed))
+    sizes = {
+        "efficiency": ("--quick",) if quick else ("--hold", "1.2"),
+        "excitation": ("--runs", "8", "--seconds", "8", "--evaluations", "160")
+        if quick
+        else ("--runs", "96", "--seconds", "12", "--evaluations", "400"),
+        "validate": ("--runs", "2", "--seconds", "6", "--hold", "1.0")
+        if quick
+        else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
+    }
+
+    def campaign(kind: str) -> Step:
+        where = ("--out", str(runs / kind), *sizes[kind])
+        if plant is None:
+            return Step(("campaign", kind, *common, *where), True)
+        # runs that judge are of days that no fit has seen
+        days = seed + (_VALIDATION_DAYS if kind == "validate" else 0)
+        arguments = ("--kind", kind, "--plant", str(plant), "--seed", str(days), *where)
+        return Step(arguments, module=_EMULATED)
+
+    for kind in ("excitation", "efficiency"):
+        yield campaign(kind)
+    for n in ("1", "2"):
+        first, fitted, last = shipped(f"joint{n}.yaml"), work / f"joint{n}.yaml", models / f"joint{n}.yaml"
+        number = ("--number", n)
+        yield Step(("fit", "efficiency", str(runs / "efficiency"), "--joint", str(first), *number, "--out", str(fitted),
+                    "--plot", str(out / f"efficiency_joint{n}.png")))  # fmt: skip
+        yield Step(
+            ("fit", "losses", str(runs / "excitation"), "--joint", str(fitted), *number, "--out", str(last))
+        )
+    joints = ("--joint", str(models / "joint1.yaml"), "--joint", str(models / "joint2.yaml"))
+    short = ("--iterations", "30") if quick else ()
+    for network in ("paper", "ours"):
+        yield Step(
+            ("train", str(runs / "excitation"), *joints, "--network", network, "--seed", str(seed),
+             "--out", str(models), *short),
+            network == "ours",  # one that its gate refuses is a result: the configuration then has none
+        )  # fmt: skip
+    yield campaign("validate")
+    outside: tuple[str, ...] = ()
+    if plant is None:
+        plan, stronger = str(out / "outside.plan.yaml"), str(shipped(_OUTSIDE_PLANT))
+        outside = ("--outside", str(runs / "outside"))
+        yield Step(("campaign", plan, *common, "--plant", stronger, "--out", outside[1]), True)
+    yield Step(
+        ("evaluate", str(runs / "validate"), *outside, "--models", str(models), "--out", str(out / "report")),
+        True,
+    )
+    # How often an interval covers takes more days than a bus has time for.
+    days = ("2", "6", "1.0") if quick else ("384", "8", "1.6")
+    size = tuple(x for pair in zip(("--runs", "--seconds", "--hold"), days, strict=True) for x in pair)
+    other = ("--seed", str(seed + _OTHER_DAYS))
+    bench = () if plant is None else ("--plant", str(plant))
+    yield Step(("--out", str(out / "days"), *bench, *size, *other), module=_EMULATED)
+    yield Step(
+        ("evaluate", str(out / "days"), "--models", str(models), "--out", str(out / "report_days")), True
+    )
+
+
+def _write_outside_plan(path: Path, seed: int, count: int) -> None:
+    """Write the plan of runs with half as much load again as any that is trained on."""
+    limits = replace(DEFAULT_LIMITS, current_a=16.0, torque_nm=90.0)
+    plan = Plan("outside", limits, outside_runs(limits, count, 9.0, seed=seed))
+    path.write_text(yaml.safe_dump(plan.to_mapping(), sort_keys=False, width=140), encoding="utf-8")
+
+
+def write_config(path: Path, name: str) -> None:
+    """Write a shipped configuration beside the models that are there, with the networks of its method, if there are some."""
+    text = shipped(name).read_text(encoding="utf-8").replace(f" {TRAINED}/", " ")
+    text = re.sub(r"  network:\n    file: .*\n    sha256: .*\n", "", text)
+    ending = ".fused.onnx" if "  method: fused" in text else ".onnx"
+
+    def with_network(joint: re.Match[str]) -> str:
+        file = path.parent / f"{joint[1]}{ending}"
+        if not file.exists():
+            return joint[0]
+        digest = hashlib.sha256(file.read_bytes()).hexdigest()
+        return f"{joint[0]}  network:\n    file: {file.name}\n    sha256: {digest}\n"
+
+    path.write_text(re.sub(r"  file: (joint\d)\.yaml\n", with_network, text), encoding="utf-8")
