@@ -63,11 +63,6 @@ GROUPS = {
             "jtqd.sysid.simulators.command",
             "write a joint file for other simulators: MJCF, URDF",
         ),
-        "reproduce": ("jtqd.sysid.reproduce", "repeat all campaigns, fits, training and evaluation"),
-        "measured": (
-            "jtqd.sysid.measured.command",
-            "score the observer on the shipped measured runs of a Kinova arm",
-        ),
     },
     "shell: this terminal": {
         "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish"),
