@@ -16,7 +16,7 @@ GROUPS = {
     "run: the bus, the daemon and this machine": {
         "sim": ("jtqd.sim_can.command", "emulate the bench on a bus, or play a measured run"),
         "status": ("jtqd.daemon.cli.status", "show the state of a running jtqd, live"),
-        "control": ("jtqd.daemon.cli.control", "send an order: ping, reload, reset, save"),
+        "control": ("jtqd.daemon.cli.control", "send an order: ping, reset, save"),
         "init": ("jtqd.daemon.cli.init", "write a first configuration for the devices on a bus"),
         "probe": ("jtqd.daemon.cli.probe", "read a device on a bus: identity, scaling, TPDOs"),
         "check": ("jtqd.daemon.cli.check", "measure and rate a bus and the timing of this machine"),

@@ -178,7 +178,7 @@ class OwnNode:
         return min(count, 0xFF) << 24 | register << 16 | code
 
     def set_parameters(self, config: Config) -> None:
-        """Write a configuration to the objects that show it; call it again after a reload."""
+        """Write the configuration to the objects that show it."""
         store = self._store
         store.set_text(0x100A, 0, VERSION)
         store.set_number(0x1006, 0, config.period_ns // 1000)

@@ -13,17 +13,15 @@ from jtqd.daemon.cli.reading import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
 from jtqd.drivers.bus_socket import reachable
 
-_TIMEOUT_S = {"reload": 120.0}
+_TIMEOUT_S = 10.0
 _EXAMPLES = """examples:
   jtq control ping                     check that the daemon and its supervisor answer
-  jtq control reload --bus can0        reload joint files, networks and estimator settings, no cycle missed
   jtq control reset                    release latched faults
   jtq control save --json              write the flight recording now
 
 exit status: 0 done, 1 refused or no daemon (reason on standard error), 2 usage"""
 _DONE = {
     "ping": "jtqd on {bus} answers, process {pid}, cycle {cycle}",
-    "reload": "jtqd on {bus} has taken over the new files at cycle {cycle}, {cycles} missed",
     "reset": "jtqd on {bus} has released its latched faults: {released}",
     "save": "jtqd on {bus} writes the flight recording",
 }
@@ -48,7 +46,7 @@ def main(argv: list[str]) -> int:
     arguments = parser().parse_args(argv)
     try:
         daemon = choose_daemon(arguments.bus)
-        reply = ask(daemon.directory / FILE, {"verb": arguments.verb}, _TIMEOUT_S.get(arguments.verb, 10.0))
+        reply = ask(daemon.directory / FILE, {"verb": arguments.verb}, _TIMEOUT_S)
     except (FileNotFoundError, ConnectionRefusedError):
         reply = {"ok": False, "error": "jtqd accepts no orders now: it is starting or ending"}
         daemon = None
@@ -61,8 +59,7 @@ def main(argv: list[str]) -> int:
     if arguments.json:
         print(json.dumps(reply))
     elif reply["ok"] and daemon is not None:
-        cycles = "1 cycle" if reply.get("missed") == 1 else f"{reply.get('missed')} cycles"
-        print(_DONE[arguments.verb].format(**{"bus": daemon.about.bus, "cycles": cycles} | reply))
+        print(_DONE[arguments.verb].format(**{"bus": daemon.about.bus} | reply))
     if not reply["ok"]:
         print(f"jtq control: {arguments.verb}: {reply['error']}", file=sys.stderr)
     return 0 if reply["ok"] else 1

@@ -196,11 +196,11 @@ cdef class Cycle:
     def sent_ns(self):
         return self.now.sent_ns
 
-    def go_on(self, int slots, int64_t end_ns, after_sync=None):
+    def go_on(self, int slots, int64_t end_ns):
         """Go through up to `slots` > 0 slots, from that of the grid on; return CYCLE_ENDED, SLOT_PASSED or RUN_ENDED.
 
         A slot that cannot be begun in time is missed, one that the intake asks for passes without SYNC. No cycle begins from
-        end_ns on (CLOCK_MONOTONIC; 0: without end). after_sync: called when a SYNC has been sent and nobody waits yet.
+        end_ns on (CLOCK_MONOTONIC; 0: without end).
         """
         cdef int outcome = PASSED
         cdef int64_t at_ns
@@ -221,8 +221,6 @@ cdef class Cycle:
                 self.grid.advance(at_ns)
             else:
                 self.begin()
-                if after_sync is not None:
-                    after_sync()
                 self.gather()
                 self.observe()
                 self.publish()

@@ -181,11 +181,6 @@ cdef class JointCycle:
         """SYNC of the last cycle with inputs, CLOCK_MONOTONIC; 0 where there was none."""
         return self.now.last_ns
 
-    def use(self, estimator, safety):
-        """Use this estimator with these limits; latched faults stay latched."""
-        self.estimator, self.limits = estimator, safety
-        self.rules.use(safety, estimator.with_network)
-
     def begin_again(self):
         """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
         self.motor, self.link = Unwrap(), Unwrap()

@@ -117,7 +117,8 @@ cdef class JointStatus:
     """
 
     def __init__(self, settings):
-        self.use(settings)
+        limit = settings.stale_latch_cycles
+        self.latching, self.stale_limit = settings.latch, -1 if limit is None else limit
         self.now.held = STARTING
         self.now.asked = VALID
         self.now.needed = WAITS[STARTING]
@@ -142,11 +143,6 @@ cdef class JointStatus:
     @property
     def latches(self):
         return self.now.latches
-
-    def use(self, settings):
-        """Latch these faults from now on; held and latched states stay."""
-        limit = settings.stale_latch_cycles
-        self.latching, self.stale_limit = settings.latch, -1 if limit is None else limit
 
     def update(self, int status, int found=0):
         """Return the status to publish for the requested `status` and the faults `found` (`shared/cycle_record.py`)."""
@@ -337,21 +333,13 @@ cdef class JointRules:
         self.tally = JointTally(number, tally)
         restart_reference(&self.seen)
         self.status = JointStatus(safety.settings)
-        self.use(safety, with_network)
-
-    def use(self, safety, bint with_network):
-        """Use these limits; held and latched states stay."""
         self.with_network = with_network
         self.plausibility, self.is_checked = safety.plausibility, safety.plausibility is not None
         self.torque_limit_nm, self.network_limit_nm = safety.torque_limit_nm, safety.network_limit_nm
         self.deviation_cycles, self.deviation_sigmas = safety.deviation_cycles, safety.settings.deviation_sigmas
         self.sensor_variance = safety.sensor_zero_nm**2
-        self.deviates = 0
-        if safety.bandwidth_rad_s != self.bandwidth:
-            restart_reference(&self.seen)
         self.bandwidth, self.max_gap = safety.bandwidth_rad_s, safety.max_gap_s
         self.age_ms = 1e3 / self.bandwidth if self.bandwidth else NAN
-        self.status.use(safety.settings)
 
     def begin_again(self):
         """Restart after a restart of the drive: earlier encoder positions are invalid."""

@@ -3,8 +3,7 @@
 Started by the supervisor as `python -m jtqd.daemon.loop.process` with a JSON request as its only argument. It answers on
 standard output with one JSON line when it is ready, reads the boot report as one JSON line from standard input, runs, and
 ends with one JSON line of results. It has no second thread, logs nothing while it runs, and shares only memory with
-other processes. After SIGUSR2 it reads an order to swap its estimators, and answers it, each as one JSON line
-(`daemon/reload/swap.py`).
+other processes.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import Any, TextIO
+from typing import Any
 
 from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
 from jtqd.daemon.core.contact import ContactWatch
@@ -37,8 +36,6 @@ from jtqd.daemon.loop.input_pdos import (
     sensor_index,
 )
 from jtqd.daemon.loop.referee import judged
-from jtqd.daemon.reload.order import Order
-from jtqd.daemon.reload.swap import Swap
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -54,42 +51,28 @@ from jtqd.estimator.onnx_graph import NetworkError, Verdict
 
 _PATIENCE_S = 1.0
 """The supervisor turns twenty times a second; after so long without a turn the watchdog is fed no more."""
-_SLOTS = 8
-"""Slots that pass without the interpreter: so late at most are signals, orders and the watchdog."""
+SLOTS = 8
+"""Slots that pass without the interpreter: so late at most are signals, requests and the watchdog."""
 
 
 class Duties:
-    """Duties in the pauses of the loop: the watchdog, orders of the supervisor, new estimators.
+    """Duties in the pauses of the loop: the watchdog, and requests of the supervisor.
 
     The watchdog is fed only while the supervisor turns as well: a stopped one serves no node, no order and no log.
 
-    Call it in the pause after every `slots()` cycles. Costs one look at shared memory and now and then a datagram
+    Call it in the pause after every `SLOTS` cycles. Costs one look at shared memory and now and then a datagram
     (docs/deployment.md).
 
     Args:
         cycle: the loop's.
         watchdog: to be fed.
-        swap: loads new estimators when SIGUSR2 has announced an order.
-        orders: where the supervisor writes orders, one JSON line each.
     """
 
-    def __init__(self, cycle: Cycle, watchdog: LoopWatchdog, swap: Swap, orders: TextIO = sys.stdin) -> None:
+    def __init__(self, cycle: Cycle, watchdog: LoopWatchdog) -> None:
         self._cycle, self._orders = cycle, cycle.snapshot.orders
         self._advanced, self._index = watchdog.advanced, cycle.index
         self._turn, self._turned = self._orders[4], self._index
         self._patience = round(_PATIENCE_S * 1e9 / cycle.grid.period_ns)
-        self._swap, self._ordered_from = swap, orders
-        self._announced = False
-        signal.signal(signal.SIGUSR2, self._on_signal)
-
-    def slots(self) -> int:
-        """Return how many slots may pass before the next call: a swap wants each pause."""
-        return 1 if self._announced or self._swap.active else _SLOTS
-
-    @property
-    def after_sync(self) -> Callable[[], None] | None:
-        """Return what wants the pause between SYNC and the wake-up for the inputs."""
-        return self._swap.after_sync if self._swap.active else None
 
     def __call__(self) -> None:
         """Run the duties after some cycles."""
@@ -104,11 +87,6 @@ class Duties:
             self._reset()
         if orders[2] != orders[3]:
             self._doubt()
-        if self._swap.active:
-            self._swap.after_cycle()
-        elif self._announced:
-            self._announced = False
-            self._take_order()
 
     def _reset(self) -> None:
         number = self._orders[0]
@@ -119,16 +97,6 @@ class Duties:
         number = self._orders[2]
         self._cycle.configured_nodes.doubt()
         self._orders[3] = number
-
-    def _take_order(self) -> None:
-        if not select.select([self._ordered_from], [], [], 0)[0]:
-            return  # somebody else's signal
-        line = self._ordered_from.readline()
-        if line:  # else the supervisor has gone
-            self._swap.begin(Order.from_mapping(json.loads(line)))
-
-    def _on_signal(self, number: int, frame: FrameType | None) -> None:
-        self._announced = True
 
 
 _WARM_UP_STEPS = 300
@@ -248,7 +216,7 @@ def run(
     grid: Grid,
     stop: Callable[[], bool],
     end_ns: int | None = None,
-    duties: Duties | None = None,
+    duties: Callable[[], None] | None = None,
 ) -> None:
     """Cycle until `stop()` or `end_ns`.
 
@@ -256,12 +224,11 @@ def run(
         cycle, grid: state of the loop; the first cycle is that of the grid's slot.
         stop: asked before a cycle.
         end_ns: no cycle begins from here on (CLOCK_MONOTONIC); None: without end.
-        duties: called in the pause after a cycle, and asked how many slots may pass before the next time.
+        duties: called in the pause after every `SLOTS` slots.
     """
     passed = False
     while not stop():
-        slots = 1 if passed or duties is None else duties.slots()
-        outcome = cycle.go_on(slots, end_ns or 0, None if duties is None else duties.after_sync)
+        outcome = cycle.go_on(1 if passed or duties is None else SLOTS, end_ns or 0)
         if outcome == RUN_ENDED:
             break
         passed = outcome == SLOT_PASSED  # then the duties wait for the very next cycle
@@ -348,9 +315,7 @@ def serve(request: dict[str, Any]) -> int:
     socket = open_frame_socket(request["bus"], loop_filters(config), receive_own=True)
     cycle, grid = build_cycle(config, request, report, socket, estimators)
     refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
-    swap = Swap(cycle, Path(request["ring"]), config.safety, answer)
-    swap.rehearse(estimators)  # which stay as they are until the end: to free a runtime's session takes long
-    duties = Duties(cycle, LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds()), swap)
+    duties = Duties(cycle, LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds()))
     realtime.freeze()
     answer(running=True, refused=refused)
     grid.slot_ns = time.monotonic_ns() + 2 * config.period_ns
@@ -374,10 +339,10 @@ def read_line(stop: Stop) -> str | None:
     return None
 
 
-def main(argv: list[str], go: Callable[[dict[str, Any]], int] = serve) -> int:
+def main(argv: list[str]) -> int:
     """Run the process; every foreseeable failure is one JSON line and exit status 1."""
     try:
-        return go(json.loads(argv[0]))
+        return serve(json.loads(argv[0]))
     except (ConfigError, NetworkError, BusError) as error:
         answer(failed=str(error), configuration=not isinstance(error, BusError))
         return 1

@@ -1,7 +1,7 @@
 """Logs as runs: the parts of one run of jtqd in their order, with where they come from.
 
 Two logs are parts of one run when their configuration, joint files and networks are the same and their cycles lie on one
-grid: cycle numbers and the monotonic clock advance together. After a change of models (`jtq control reload`) a run is two.
+grid: cycle numbers and the monotonic clock advance together. Files with other models are a run of their own.
 
 The time step that a joint used (`Steps`) is the time since its last inputs. A step of 0 says that it began anew: from there
 on everything about it is known. A step that is not the time since the last inputs *in the log* says that inputs are missing

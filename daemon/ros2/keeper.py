@@ -44,15 +44,6 @@ class Ros2Keeper(SideProcess):
             )
         self._run()
 
-    def renew(self, config: Config) -> None:
-        """Restart the publisher where a configuration that has come into force means other messages: other gear ratios."""
-        request = self._request_of(config)
-        if self._child is None or request == self._request:
-            return
-        self._request = request
-        self._child.end()
-        self._run()
-
     def _request_of(self, config: Config) -> dict[str, object]:
         settings = self._settings
         return {

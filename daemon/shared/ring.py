@@ -119,10 +119,6 @@ class RingReader:
         """Return the number of records written and not yet read."""
         return self._count() - self.position
 
-    def seek(self, position: int) -> None:
-        """Go on with the record that was the position-th to be written, from 0 on."""
-        self.position, self._newest = position, -1
-
     def read(self, limit: int = 1024) -> Batch:
         """Copy at most `limit` records; count those that were overwritten before they could be copied."""
         count = self._count()

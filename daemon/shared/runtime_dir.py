@@ -4,7 +4,7 @@ The directory is open to the daemon's group (0750): the snapshot, `about.json` a
 members (`jtq status`); what only the daemon's own processes need (`ring`, `lock`, `control`) stays with its user.
 
 `about.json` is what a running jtqd is, for tools that look at it: written by the supervisor at its start, before the nodes
-are booted, and when another configuration has come into force. Numbers that change are in the snapshot, not here.
+are booted, and again where a drive has other TPDOs than the configuration. Numbers that change are in the snapshot.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 `control` in the runtime directory, AF_UNIX SOCK_SEQPACKET, mode 0600. One connection is one request and one reply:
 
-    {"verb": "ping" | "reload" | "reset" | "save"}   ->   {"ok": true, ...}  or  {"ok": false, "error": "one line"}
+    {"verb": "ping" | "reset" | "save"}   ->   {"ok": true, ...}  or  {"ok": false, "error": "one line"}
 
 Served by the supervisor between its other duties, without a thread: nobody who connects can delay a cycle of the loop, and
 nobody can keep it busy: few connections, short messages, limited waiting.
@@ -24,7 +24,7 @@ from jtqd.drivers.bus_socket import reachable
 
 FILE = "control"
 """Name of the socket in the runtime directory."""
-VERBS = ("ping", "reload", "reset", "save")
+VERBS = ("ping", "reset", "save")
 REQUEST_BYTES, REPLY_BYTES = 4096, 65_536
 MOST_CONNECTIONS = 8
 PATIENCE_S = 5.0

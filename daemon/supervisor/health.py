@@ -210,7 +210,7 @@ class Health:
     """Call `observe` with each reading of the snapshot.
 
     Args:
-        config: in force; nodes and PDOs are those of the start.
+        config: in force.
         conditions: the set to be kept up to date.
     """
 
@@ -236,10 +236,6 @@ class Health:
         self._pdos = PdoWatch(pdo_subjects(config))
         self._counters: dict[str, tuple[int, float]] = {}
         self._cycle, self._advanced_s = -1, -inf
-        self.use(config)
-
-    def use(self, config: Config) -> None:
-        """Take the limits of a configuration that has come into force."""
         limit = config.estimator.network_limit
         self._network_limits_nm = [
             None if joint.network is None else limit * joint.joint.rated_torque_nm for joint in config.joints

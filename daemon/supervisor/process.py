@@ -26,11 +26,10 @@ from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.recording.keeper import Keeper, recording_request
-from jtqd.daemon.reload.files import Reload, ReloadError
 from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
-from jtqd.daemon.shared.log_lines import ERROR, INFO, WARNING, EventLog, OperatorLog
+from jtqd.daemon.shared.log_lines import ERROR, INFO, NOTICE, WARNING, EventLog, OperatorLog
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notices
 from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
@@ -185,6 +184,9 @@ def put_back(config: Config, send: Callable[[bytes], bool]) -> None:
 
 
 _LOOP_END_S = 3.0
+_ON_HANGUP = (
+    "SIGHUP ignored: a changed file takes effect at a restart; `jtq check --config FILE` judges it before"
+)
 _STOLEN_PERIOD_S = 1.0
 
 
@@ -239,7 +241,7 @@ class Supervisor:
         self._config = config
         self._config_path = config_path
         self._duration_s = duration_s
-        self._stop = False
+        self._stop = self._hung_up = False
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)
         self._bus_gone = False
@@ -273,10 +275,9 @@ class Supervisor:
             self._instance,
             self._log,
             save=self._recorder.save,
-            renew=self._renew,
             conditions=self._conditions,
         )
-        signal.signal(signal.SIGHUP, self._on_reload)
+        signal.signal(signal.SIGHUP, self._on_hangup)
 
     def stop(self) -> None:
         """End in order, as for SIGTERM."""
@@ -362,7 +363,7 @@ class Supervisor:
         self._node = node = self._bus_service.own
         self._bus_service.begin(time.monotonic())
         self._report = report
-        self._service.open(reader, Reload(self._loop_request(), self._child, self._check_reloaded))
+        self._service.open(reader)
         began_s, self._stolen = time.monotonic(), StolenTime(self._conditions)
         result = self._watch(loop, node, reader, bench)
         stolen = self._stolen.total_s()
@@ -449,8 +450,6 @@ class Supervisor:
                 answer = loop.poll_answer()
                 if answer is not None and answer.get("done"):
                     return answer
-                if answer is not None:
-                    self._service.swapped(answer)
                 if not loop.alive():
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
@@ -465,6 +464,9 @@ class Supervisor:
                 if stopping and time.monotonic() - stopping > _LOOP_END_S:
                     loop.process.kill()
                     return {"error": f"the loop did not end within {_LOOP_END_S:g} s"}
+                if self._hung_up:
+                    self._hung_up = False
+                    self._log(_ON_HANGUP, NOTICE, "SIGHUP")
                 self._recorder.watch()
                 if self._live is not None:
                     self._live.watch()
@@ -479,7 +481,7 @@ class Supervisor:
                 self._stolen.observe(now)
                 self._serve(view, now)
                 self._report_conditions(now)
-                self._service.serve(loop, view, node.recorder_lost)
+                self._service.serve(view, node.recorder_lost)
                 display.turn(now)
 
     def _report_conditions(self, now: float) -> None:
@@ -509,23 +511,8 @@ class Supervisor:
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         self.stop()
 
-    def _on_reload(self, number: int, frame: FrameType | None) -> None:
-        self._service.want_reload()
-
-    def _check_reloaded(self, config: Config) -> None:
-        wrong = check_gears(config, self._report)
-        if wrong is not None:
-            raise ReloadError(wrong)
-
-    def _renew(self, config: Config) -> None:
-        """Show another configuration, which has come into force, wherever it shows."""
-        self._config = config = as_booted(config, self._report["nodes"])
-        self._health.use(config)
-        self._node.set_parameters(config)
-        write_about(self._directory, replace(self._own_description(), started=self._about.started))
-        self._record(self._report, again=True)
-        if self._ros2 is not None:
-            self._ros2.renew(config)
+    def _on_hangup(self, number: int, frame: FrameType | None) -> None:
+        self._hung_up = True
 
     # End -----------------------------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""Service to those who look after a daemon: systemd, the control socket, reloads, the metrics file.
+"""Service to those who look after a daemon: systemd, the control socket, the metrics file.
 
 Nothing here touches the loop but through shared memory and signals. The metrics are a Prometheus text file for a node
 exporter's textfile collector: off unless the configuration has `metrics: {file: PATH}`; a name without a directory lies in
@@ -16,15 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.reload.files import Reload, ReloadError
-from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
-from jtqd.daemon.shared.log_lines import ERROR, NOTICE, WARNING, OperatorLog
+from jtqd.daemon.shared.log_lines import NOTICE, WARNING, OperatorLog
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
-from jtqd.estimator.learned import KEPT
 
 _GAUGES = frozenset(("work_max_ns", "late_max_ns"))
 _SHARES = (0.5, 0.99, 1.0)
@@ -119,15 +116,14 @@ others switch it on, and perhaps only when we are ready."""
 
 
 class Service:
-    """Services of one run: systemd, orders, reloads, metrics.
+    """Services of one run: systemd, orders, metrics.
 
     Args:
-        config: in force at the start.
+        config: in force.
         directory: runtime directory.
         bus: name for the metrics.
         log: of the operator.
         save: has the flight recording written; False where there is no recorder.
-        renew: called with a new configuration that has come into force.
         conditions: for the metrics.
     """
 
@@ -139,26 +135,22 @@ class Service:
         log: OperatorLog,
         *,
         save: Callable[[], bool],
-        renew: Callable[[Config], None],
         conditions: Conditions,
     ) -> None:
         self._config, self._bus, self._log = config, bus, log
         self._conditions = conditions
-        self._directory, self._save, self._renew = directory, save, renew
+        self._directory, self._save = directory, save
         self._notifier = Notifier()
         self._control: ControlServer | None = None
-        self._reload: Reload | None = None
         self._reader: SnapshotReader | None = None
-        self._outcome: list[Reply] = []
-        self._ready = self._reload_wanted = False
+        self._ready = False
         self._status_due = self._metrics_due = 0.0
 
-    def open(self, reader: SnapshotReader, reload: Reload) -> None:
+    def open(self, reader: SnapshotReader) -> None:
         """Accept orders when the loop runs. Raises OSError."""
-        self._reader, self._reload = reader, reload
+        self._reader = reader
         handlers: dict[str, Callable[[Reply], Reply | Answer]] = {
             "ping": self._ping,
-            "reload": self._ask_reload,
             "reset": self._reset,
             "save": self._ask_save,
         }
@@ -167,22 +159,10 @@ class Service:
     @property
     def descriptors(self) -> list[int]:
         """For select."""
-        control = self._control.descriptors if self._control is not None else []
-        return [*control, *(self._reload.outputs if self._reload is not None else [])]
+        return [] if self._control is None else self._control.descriptors
 
-    def want_reload(self) -> None:
-        """Request a reload (SIGHUP). During a reload another one follows, as the files may have changed."""
-        self._reload_wanted = True
-
-    def serve(self, loop: Child, view: View, recorder_lost: int) -> None:
+    def serve(self, view: View, recorder_lost: int) -> None:
         """Run the due services."""
-        if self._reload_wanted and not self.reloading:
-            self._reload_wanted = False
-            try:
-                self._start_reload()
-            except ReloadError as error:
-                self._reload_failed(error)
-        self._poll_reload(loop)
         if self._control is not None:
             self._control.serve()
         now = time.monotonic()
@@ -197,22 +177,6 @@ class Service:
             self._metrics_due = now + _METRICS_PERIOD_S
             self._write_metrics(view, recorder_lost)
 
-    @property
-    def reloading(self) -> bool:
-        """Return whether a reload is running."""
-        return self._reload is not None and self._reload.running
-
-    def swapped(self, answer: dict[str, Any]) -> None:
-        """Take the loop's answer to the order to swap its estimators."""
-        if self._reload is None or not self._reload.running:
-            return
-        try:
-            self._config, about = self._reload.answered(answer)
-        except ReloadError as error:
-            self._reload_failed(error)
-        else:
-            self._reloaded(about)
-
     def stopping(self, why: str = "") -> None:
         """Report the begin of the shutdown."""
         self._notifier.send(
@@ -225,8 +189,6 @@ class Service:
 
     def close(self) -> None:
         """Stop accepting orders."""
-        if self._reload is not None:
-            self._reload.abandon()
         if self._control is not None:
             self._control.close()
 
@@ -259,70 +221,6 @@ class Service:
 
         return answer
 
-    def _ask_reload(self, request: Reply) -> Answer:
-        if self.reloading:
-            raise ControlError("another reload is under way")
-        try:
-            self._start_reload()
-        except ReloadError as error:
-            self._reload_failed(error)
-            raise ControlError(str(error)) from None
-        outcome = self._outcome  # of this reload, whatever is asked after it
-        return lambda: outcome[0] if outcome else None
-
-    # Reload --------------------------------------------------------------------------------------------------------------
-
-    def _start_reload(self) -> None:
-        if self._reload is None:
-            raise ReloadError("jtqd is still starting")
-        self._outcome = []
-        self._reload.start(self._config, self._config.path)
-        self._notifier.send("RELOADING=1", f"MONOTONIC_USEC={time.monotonic_ns() // 1000}")
-
-    def _poll_reload(self, loop: Child) -> None:
-        if self._reload is None:
-            return
-        try:
-            self._reload.poll(loop)
-        except ReloadError as error:
-            self._reload_failed(error)
-
-    def _reloaded(self, about: dict[str, Any]) -> None:
-        try:
-            self._renew(self._config)
-        except OSError as error:  # the loop has new estimators all the same
-            self._log(f"reloaded, but the runtime directory is not writable: {error.strerror}", ERROR)
-        cycle, missed, cycles = about["cycle"], about["missed"], about["cycles"]
-        self._outcome.append(
-            {
-                "ok": True,
-                "cycle": cycle,
-                "missed": missed,
-                "shadowed_cycles": cycles,
-                "changes": about["changes"],
-                "zeros": about.get("zeros", {}),
-            }
-        )
-        changes = ", ".join(
-            f"{name.replace('_', ' ')} by {change['rms_change_nm']:.3f} Nm (RMS)"
-            for name, change in about["changes"].items()
-            if change["rms_change_nm"] is not None
-        )
-        zeros = about.get("zeros", {})
-        self._log(
-            f"reloaded {self._config.path}: in force from cycle {cycle} on, "
-            f"{missed} cycle{'s' if missed != 1 else ''} missed; "
-            f"on the last {cycles} cycles the estimates change: {changes or 'nothing to compare'}"
-            + "".join(_of_zeros(name, became) for name, became in zeros.items()),
-            NOTICE,
-        )
-        self._notifier.send("READY=1")
-
-    def _reload_failed(self, error: ReloadError) -> None:
-        self._outcome.append({"ok": False, "error": str(error)})
-        self._log(f"not reloaded, the old files remain in force: {error}", ERROR)
-        self._notifier.send("READY=1")
-
     # State ---------------------------------------------------------------------------------------------------------------
 
     def _estimating(self, view: View) -> bool:
@@ -343,14 +241,6 @@ class Service:
             write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost, present))
         except OSError as error:
             self._log(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
-
-
-def _of_zeros(name: str, became: str) -> str:
-    """Return what a reload has done to the zeros of a joint (`jtqd.estimator.learned`)."""
-    joint = name.replace("_", " ")
-    if became == KEPT:
-        return f"; {joint}: its learned zeros are kept"
-    return f"; {joint}: its learned zeros are forgotten, what they were learned with has changed"
 
 
 def _status(view: View) -> str:

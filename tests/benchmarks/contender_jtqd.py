@@ -69,7 +69,7 @@ class Measured:
     def __getattr__(self, name: str) -> Any:
         return getattr(self.cycle, name)
 
-    def go_on(self, slots: int, end_ns: int, after_sync: None = None) -> int:
+    def go_on(self, slots: int, end_ns: int) -> int:
         """Go through one slot, whatever is asked for."""
         cycle, meter = self.cycle, self._meter
         outcome = cycle.go_on(1, end_ns)

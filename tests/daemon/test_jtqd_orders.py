@@ -1,8 +1,7 @@
-"""Orders to a daemon at awkward moments: while it starts, twice at once, where memory is short. Real processes."""
+"""Signals and requests to a daemon while it starts, and where memory is short. Real processes."""
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -80,9 +79,6 @@ def loaded(process: subprocess.Popen[str], library: str) -> bool:
     return library in Path(f"/proc/{process.pid}/maps").read_text()
 
 
-PREPARE = b"jtqd.daemon.reload.prepare"
-
-
 def child_of(process: subprocess.Popen[str], module: bytes) -> int | None:
     """Process-ID of the daemon's child that runs this module, if there is one."""
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
@@ -111,15 +107,22 @@ def test_told_to_end_while_it_starts(
     assert ended(process, run_directory) == (0, "jtqd: stopped before it ran\n")
 
 
-def test_sighup_before_it_runs_is_no_reason_to_end(
-    bench: str, run_directory: Path, configuration: Path
-) -> None:
+def test_sighup_is_ignored_with_a_line(bench: str, run_directory: Path, configuration: Path) -> None:
+    """While its modules are loaded, and while it runs; the loop outlives the signals that its recorder takes."""
     process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
     until(lambda: loaded(process, "msgspec"))
     process.send_signal(signal.SIGHUP)
     until(lambda: list(run_directory.glob("*/control")))
+    loop = child_of(process, b"jtqd.daemon.loop.process")
+    assert loop is not None
+    process.send_signal(signal.SIGHUP)
+    for number in (signal.SIGHUP, signal.SIGUSR1, signal.SIGUSR2):
+        os.kill(loop, number)
+    out, _ = control("ping", bench, run_directory).communicate(timeout=30)
+    assert json.loads(out)["loop"] == loop
     process.terminate()
-    assert ended(process, run_directory)[0] == 0
+    status, err = ended(process, run_directory)
+    assert (status, err.count("SIGHUP ignored")) == (0, 1)
 
 
 def test_nodes_are_put_back_where_the_start_fails_after_their_boot(
@@ -162,68 +165,11 @@ def test_an_order_while_it_starts_is_refused_in_plain_words(
     process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
     until(lambda: list(run_directory.glob("*/about.json")))
     process.send_signal(signal.SIGSTOP)  # it stays where it is
-    _, err = control("reload", bench, run_directory).communicate(timeout=30)
+    _, err = control("ping", bench, run_directory).communicate(timeout=30)
     process.send_signal(signal.SIGCONT)
-    assert err == "jtq control: reload: jtqd accepts no orders now: it is starting or ending\n"
+    assert err == "jtq control: ping: jtqd accepts no orders now: it is starting or ending\n"
     process.terminate()
     assert ended(process, run_directory)[0] == 0
-
-
-def test_reloads_at_once(bench: str, run_directory: Path, configuration: Path) -> None:
-    """Each asker gets the outcome of its own reload; SIGHUPs meanwhile make one more, not one each."""
-    deep = run_directory / ("d" * 100) / "e"  # longer than the address of a socket may be
-    deep.mkdir(parents=True)
-    process = started("--bus", bench, "--config", str(configuration), directory=deep)
-    until(lambda: list(deep.glob("*/control")))
-    time.sleep(1.0)
-    told = []
-    first = control("reload", bench, deep)
-    until(lambda: first.poll() is not None or child_of(process, PREPARE))
-    for _ in range(30):
-        process.send_signal(signal.SIGHUP)
-    second = control("reload", bench, deep)
-    for asker in (first, second):
-        out, _ = asker.communicate(timeout=60)
-        told.append(json.loads(out))
-    assert told[0]["ok"], told
-    assert told[1] == {"ok": False, "error": "another reload is under way"} or told[1]["ok"], told
-    time.sleep(4.0)
-    process.terminate()
-    _, err = process.communicate(timeout=30)
-    assert process.returncode == 0, err
-    assert "Traceback" not in err
-    reloads = len(re.findall("in force from cycle", err)) + len(re.findall("not reloaded", err))
-    assert 2 <= reloads <= 3, err
-
-
-def test_a_reload_whose_preparation_is_killed_is_refused_and_the_next_one_is_not(
-    bench: str, run_directory: Path, configuration: Path
-) -> None:
-    process = started("--bus", bench, "--config", str(configuration), directory=run_directory)
-    until(lambda: list(run_directory.glob("*/control")))
-    loop = child_of(process, b"jtqd.daemon.loop.process")
-    time.sleep(1.0)
-    asker = control("reload", bench, run_directory)
-    until(lambda: child_of(process, PREPARE))
-    pid = child_of(process, PREPARE)
-    assert pid is not None
-    os.kill(pid, signal.SIGKILL)
-    out, _ = asker.communicate(timeout=60)
-    assert json.loads(out) == {
-        "ok": False,
-        "error": "the preparation of estimators ended with exit status -9",
-    }
-    out, _ = control("reload", bench, run_directory).communicate(timeout=60)
-    assert json.loads(out)["ok"], out
-    assert json.loads(out)["missed"] == 0
-    assert child_of(process, b"jtqd.daemon.loop.process") == loop, "it is the loop that goes on"
-    assert not list(run_directory.glob("*/estimators"))
-    process.send_signal(signal.SIGHUP)
-    os.kill(loop or 0, signal.SIGUSR2)  # somebody else's: there is no order
-    time.sleep(3.0)
-    process.terminate()
-    status, err = ended(process, run_directory)
-    assert (status, err.count("in force from cycle"), err.count("not reloaded")) == (0, 2, 1), err
 
 
 def test_a_child_is_not_waited_for_when_we_are_told_to_end() -> None:

@@ -26,16 +26,6 @@ def answer(monkeypatch: pytest.MonkeyPatch, reply: dict[str, Any] | Exception) -
     ("verb", "reply", "line"),
     [
         ("ping", {"pid": 7, "cycle": 12, "bus": "can0"}, "jtqd on can0 answers, process 7, cycle 12"),
-        (
-            "reload",
-            {"cycle": 9, "missed": 0},
-            "jtqd on can0 has taken over the new files at cycle 9, 0 cycles missed",
-        ),
-        (
-            "reload",
-            {"cycle": 9, "missed": 1},
-            "jtqd on can0 has taken over the new files at cycle 9, 1 cycle missed",
-        ),
         ("reset", {"released": "joint 1"}, "jtqd on can0 has released its latched faults: joint 1"),
         ("save", {}, "jtqd on can0 writes the flight recording"),
     ],
@@ -71,5 +61,5 @@ def test_a_refusal_is_one_line_on_standard_error(
     reason: str,
 ) -> None:
     answer(monkeypatch, reply)
-    assert control.main(["reload"]) == 1
-    assert capsys.readouterr() == ("", f"jtq control: reload: {reason}\n")
+    assert control.main(["reset"]) == 1
+    assert capsys.readouterr() == ("", f"jtq control: reset: {reason}\n")

@@ -12,13 +12,12 @@ from typing import Any
 import pytest
 
 from jtqd.daemon.bus.boot import ReturningNodes
-from jtqd.daemon.config import SafetySettings, load_config
+from jtqd.daemon.config import load_config
 from jtqd.daemon.core.configured_nodes import ConfiguredNodes
 from jtqd.daemon.core.counters import LoopCounters
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop.process import Duties
-from jtqd.daemon.reload.swap import Swap
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from tests.daemon.loop.cycle_helpers import I32, PDOS, ExactTime, ScriptedSocket, frame, inputs, make, turn
 
@@ -133,9 +132,9 @@ def test_the_scaling_of_a_node_that_was_absent_comes_with_its_configuration(loop
     assert loop.cycle.joints[1].inputs.ampere_per_unit == 0.01
 
 
-def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop, tmp_path: Path) -> None:
+def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop) -> None:
     """Its PDOs come in time and with the right length all the while."""
-    duties = Duties(loop.cycle, Fed(), Swap(loop.cycle, tmp_path / "ring", SafetySettings(), print))  # type: ignore[arg-type]
+    duties = Duties(loop.cycle, Fed())  # type: ignore[arg-type]
     loop.supervisor.note_doubt(1)
     for _ in range(16):
         turn(loop.cycle)
@@ -172,7 +171,7 @@ def test_the_watchdog_is_fed_only_while_the_supervisor_turns(loop: Loop) -> None
             fed.append(cycles)
 
     cycle = SimpleNamespace(index=0, grid=loop.cycle.grid, snapshot=loop.cycle.snapshot)
-    duties = Duties(cycle, Counting(), SimpleNamespace(active=False))  # type: ignore[arg-type]
+    duties = Duties(cycle, Counting())  # type: ignore[arg-type]
     patience = round(1e9 / cycle.grid.period_ns)
     for _ in range(3):
         loop.supervisor.note_alive()

@@ -9,7 +9,6 @@ import signal
 import sys
 import time
 from contextlib import suppress
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -248,18 +247,6 @@ def test_an_interface_that_others_reach_is_said(tmp_path, capfd):
         "jtqd: ROS 2: torques, positions and diagnostics go to every host that is reached by eth77\n" in said
     )
     made.end()
-
-
-def test_other_gear_ratios_restart_it(kept):
-    kept.until("jtqd: ROS 2 publisher: /joint_states")
-    config = load_config(None)
-    kept.keeper.renew(config)
-    assert len(kept.children) == 1
-    joint = config.joints[0]
-    geared = replace(joint, joint=replace(joint.joint, gear_ratio=77.0))
-    kept.keeper.renew(replace(config, joints=(geared, *config.joints[1:])))
-    kept.until("jtqd: ROS 2 publisher: /joint_states")
-    assert len(kept.children) == 2
 
 
 def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys, tmp_path):

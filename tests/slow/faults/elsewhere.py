@@ -101,7 +101,7 @@ ELSEWHERE = (
         38,
         "loop stopped permanently",
         "the watchdog of systemd restarts the service",
-        ("tests/systemd/test_systemd_boot.py::test_installed_started_reloaded_hung_and_stopped",),
+        ("tests/systemd/test_systemd_boot.py::test_installed_started_restarted_hung_and_stopped",),
     ),
     Shown(
         39,
