@@ -35,7 +35,7 @@ from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Value, to_mappin
 from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.fit.few_runs import PRIOR
-from jtqd.sysid.fit.friction import effective_samples
+from jtqd.sysid.fit.plateaus import effective_samples
 from jtqd.sysid.report import figures as parts
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap

@@ -42,7 +42,7 @@ from jtqd.sysid.evaluate.scores import (
     standstill,
 )
 from jtqd.sysid.evaluate.truth import TruthTables, for_intervals, truth_tables
-from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
+from jtqd.sysid.fit.efficiency import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.checks import RunIssue
 

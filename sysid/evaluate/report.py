@@ -15,7 +15,7 @@ from jtqd.sysid.evaluate.evaluation import Evaluation, RunRecord, Target, mse, w
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels
 from jtqd.sysid.evaluate.scores import PAPER_MSE_NM2, Coverage, ErrorTables, IntervalTables, Row, ratio
 from jtqd.sysid.evaluate.truth import TruthTables
-from jtqd.sysid.fit.efficiency_report import TITLES as QUADRANT_TITLES
+from jtqd.sysid.fit.efficiency import TITLES as QUADRANT_TITLES
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import page_svg
 from jtqd.sysid.report.numbers import DASH

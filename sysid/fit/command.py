@@ -22,19 +22,21 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.efficiency import (
     EfficiencyFit,
+    EfficiencyResult,
+    as_mapping,
     default_current_min,
     efficiency_findings,
     eta_points,
     fit_efficiency,
+    plateau_mapping,
+    report_lines,
     written_findings,
 )
-from jtqd.sysid.fit.efficiency_report import EfficiencyResult, as_mapping, plateau_mapping, report_lines
 from jtqd.sysid.fit.few_runs import MOST_RUNS, FewRunsFit, fit_few_runs
-from jtqd.sysid.fit.friction import FitError
+from jtqd.sysid.fit.friction import FitError, NoLoadFit, fit_no_load, no_load
 from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
 from jtqd.sysid.fit.losses import PER_K_PRIOR, LossFitError
-from jtqd.sysid.fit.no_load import NoLoadFit, fit_no_load, no_load
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, plateaus_of
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TorsionError
@@ -246,7 +248,7 @@ def _refuse(result: EfficiencyResult, options: argparse.Namespace) -> int:
 
 
 def _draw(joint: Joint, result: EfficiencyResult, path: Path) -> None:
-    from jtqd.sysid.fit.efficiency_report import draw_fit
+    from jtqd.sysid.fit.efficiency import draw_fit
 
     title = f"{joint.name}: measured efficiency and Eq. (8), convention {result.fits[0].convention}"
     try:

@@ -9,8 +9,14 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.envelope import MAX_CELLS, Envelope
+from jtqd.estimator.joint import (
+    AdditiveLoss,
+    Torsion,
+)
 from jtqd.estimator.validity import FusedTrust
+from jtqd.sysid.fit.residuals import path_residuals
+from jtqd.sysid.fit.signals import RunSignals
 
 VELOCITY_STEP_RAD_S: Final = 0.25
 VELOCITY_STEP_SHARE: Final = 1.0 / 12.0
@@ -122,3 +128,24 @@ def filled(known: Table) -> Table:
 
     result: Table = known | (between(0) & between(1))
     return result
+
+
+def fit_envelope(
+    runs: Sequence[RunSignals], loss: AdditiveLoss, torsion: Torsion, rated_nm: float
+) -> Envelope | None:
+    """Return what the runs covered; None where that takes a larger map than an envelope may have."""
+    seen = [path_residuals(run, loss, torsion) for run in runs if run.moving.any()]
+    velocity = np.concatenate([run.velocity_rad_s for run in seen])
+    made = envelope_of(
+        velocity,
+        np.concatenate([run.raw_nm for run in seen]),
+        np.concatenate([run.torsion_error_nm - run.current_error_nm for run in seen]),
+        [run.temperature_c for run in runs],
+        velocity_step_rad_s=velocity_step(velocity),
+        torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
+        room_k=FIT_ROOM_K,
+    )
+    if max(len(made.known), len(made.known[0])) > MAX_CELLS - 2 * MOST_WIDER:
+        return None
+    load = max(float(np.abs(run.torsion_nm).max()) for run in seen)
+    return replace(widened(made, [(run.velocity_rad_s, run.raw_nm) for run in seen]), load_nm=load)

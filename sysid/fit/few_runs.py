@@ -34,8 +34,8 @@ from scipy.optimize import nnls
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import quadrants
 from jtqd.estimator.joint import AdditiveLoss, Friction, Fused, FusedSigma, Joint, LossSide
-from jtqd.sysid.fit.friction import effective_samples
 from jtqd.sysid.fit.losses import PER_K_PRIOR, LossFitError, bounded
+from jtqd.sysid.fit.plateaus import effective_samples
 from jtqd.sysid.fit.signals import RunSignals
 
 MOST_RUNS: Final = 5

@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.fit.friction import effective_samples
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.channels import integral
 from jtqd.sysid.runs.run_file import RunFile
@@ -171,6 +170,20 @@ def standard_error(samples: FloatArray, motor_angle_rad: FloatArray) -> float:
     # the mean is taken from the same samples: of n_eff independent ones n_eff - 1 are left to judge by
     independent = max(effective_samples(residual) - 1.0, 1.0)
     return max(float(np.std(residual)) / math.sqrt(independent), _resolution_error(samples))
+
+
+def effective_samples(residual: FloatArray) -> float:
+    """Independent samples in a residual [n]: n / (1 + 2 sum rho_k), up to the first rho_k < 0.05."""
+    centred = residual - residual.mean()
+    count = len(centred)
+    spectrum = np.fft.rfft(centred, 2 * count)
+    correlation = np.fft.irfft(spectrum * np.conj(spectrum))[:count]
+    if correlation[0] <= 0.0:
+        return float(count)
+    rho = correlation / correlation[0]
+    below = np.flatnonzero(rho < 0.05)
+    end = int(below[0]) if len(below) else count
+    return max(1.0, count / (1.0 + 2.0 * float(np.sum(rho[1:end]))))
 
 
 def _resolution_error(samples: FloatArray) -> float:

@@ -25,13 +25,13 @@ from jtqd.estimator.fusion import Fusion, turning
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.sysid.fit.conformal import conformal_scale
+from jtqd.sysid.fit.calibration import conformal_scale
 from jtqd.sysid.fit.envelope import envelope_of
-from jtqd.sysid.fit.fused import folds, loss_and_width
+from jtqd.sysid.fit.fused import folds
 from jtqd.sysid.fit.losses import fit_loss
+from jtqd.sysid.fit.residuals import loss_and_width
 from jtqd.sysid.fit.signals import RunSignals
-from jtqd.sysid.fit.torsion import fit_torsion
-from jtqd.sysid.fit.torsion_signals import torsion_torque
+from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
 from jtqd.sysid.train.gate import judge
 from jtqd.sysid.train.network import IR_VERSION, OPSET, Trained, folded_layers, hidden_output, train
 from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned

@@ -13,7 +13,7 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate
 from jtqd.sim_can.towing.bench_file import TowingBench
 from jtqd.sysid.fit.signals import run_signals
-from jtqd.sysid.fit.torsion_signals import deflection
+from jtqd.sysid.fit.torsion import deflection
 from tests.sysid.fit.fused_signals import FUSED
 from validation.goals.plants import plant_file
 from validation.goals.sources import PARTS, SOURCES, day_zeros, main, parts_of, true_torsion

@@ -34,12 +34,12 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.towing.bench_file import AngleWave, TowedJoint, TowingBench
 from jtqd.sysid.campaign.plan import Run
 from jtqd.sysid.campaign.plans import make_plan
-from jtqd.sysid.fit.calibration import calibrated
-from jtqd.sysid.fit.fused import fit_sigma, path_residuals
+from jtqd.sysid.fit.calibration import calibrated, fit_sigma
 from jtqd.sysid.fit.losses import LossFitError
+from jtqd.sysid.fit.repeatability import fit_zeros
+from jtqd.sysid.fit.residuals import path_residuals
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.fit.torsion import TorsionError
-from jtqd.sysid.fit.zeros import fit_zeros
 from validation.goals.identify import (
     QUICK,
     TINY,

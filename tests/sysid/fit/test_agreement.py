@@ -12,8 +12,8 @@ from jtqd.estimator.agreement import turn_waves
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Agreement
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.agreement import LOWERED, QUANTILE, Levels, TurnRun, fit_agreement, fit_turn
 from jtqd.sysid.fit.fused import fit_fused
+from jtqd.sysid.fit.repeatability import LOWERED, QUANTILE, Levels, TurnRun, fit_agreement, fit_turn
 from tests.sysid.fit.test_fused import emulated
 
 

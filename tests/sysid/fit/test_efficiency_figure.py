@@ -22,7 +22,7 @@ def test_texts_do_not_overlap(close: bool) -> None:
     mpl.use("Agg")
     from matplotlib import pyplot as plt
 
-    from jtqd.sysid.fit.efficiency_report import fit_figure
+    from jtqd.sysid.fit.efficiency import fit_figure
 
     points = grid(JOINT)
     if close:

@@ -10,7 +10,8 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.fit.friction import FitError, effective_samples, fit_friction, student_975
+from jtqd.sysid.fit.friction import FitError, fit_friction, student_975
+from jtqd.sysid.fit.plateaus import effective_samples
 
 Array = NDArray[np.float64]
 DT_S = 0.001

@@ -19,18 +19,10 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.days import Day
 from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run
 from jtqd.sim_can.plant import joint_friction
-from jtqd.sysid.fit.conformal import conformal_scale, unbiased_level
-from jtqd.sysid.fit.fused import (
-    FOLDS,
-    FusedFit,
-    fit_fused,
-    fit_sigma,
-    folds,
-    path_residuals,
-)
+from jtqd.sysid.fit.calibration import conformal_scale, fit_sigma, unbiased_level
+from jtqd.sysid.fit.fused import FOLDS, FusedFit, fit_fused, folds
 from jtqd.sysid.fit.losses import PER_K_PRIOR, fit_loss
-from jtqd.sysid.fit.residuals import PathResiduals
-from jtqd.sysid.fit.served import served
+from jtqd.sysid.fit.residuals import PathResiduals, path_residuals, served
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
 from tests.estimator.fused_helpers import fused_joint

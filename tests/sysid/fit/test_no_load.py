@@ -9,8 +9,7 @@ import pytest
 
 from jtqd.estimator.joint import Friction
 from jtqd.estimator.losses import FrictionModel
-from jtqd.sysid.fit.friction import FitError
-from jtqd.sysid.fit.no_load import fit_no_load, no_load
+from jtqd.sysid.fit.friction import FitError, fit_no_load, no_load
 from jtqd.sysid.fit.plateaus import Mean, Plateau
 from tests.estimator.estimator_helpers import joint1
 

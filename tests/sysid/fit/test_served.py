@@ -14,20 +14,26 @@ from jtqd.estimator.joint import Tracking
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.fit.calibration import (
+    COVERAGE,
     LATEST,
     OTHER_MOTIONS,
     OTHER_MOTIONS_LEARNED,
+    by_speed,
     calibrated,
     early,
     sensor_zeros,
 )
-from jtqd.sysid.fit.conformal import COVERAGE
-from jtqd.sysid.fit.fused import path_residuals
-from jtqd.sysid.fit.residuals import NowErrors, PathResiduals
-from jtqd.sysid.fit.served import Served, served
+from jtqd.sysid.fit.repeatability import fit_zeros
+from jtqd.sysid.fit.residuals import (
+    TRACKING_RAD_S,
+    WAVE_RAD_S,
+    NowErrors,
+    PathResiduals,
+    Served,
+    path_residuals,
+    served,
+)
 from jtqd.sysid.fit.signals import run_signals
-from jtqd.sysid.fit.tracking import TRACKING_RAD_S, WAVE_RAD_S, by_speed
-from jtqd.sysid.fit.zeros import fit_zeros
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_day_zeros import DAYS, LEARNING
 from tests.estimator.test_zeros import driven

@@ -17,9 +17,9 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
+from jtqd.sysid.fit.calibration import FEWEST_RUNS, Standing, beyond_normal, fit_standstill
 from jtqd.sysid.fit.fused import fit_fused
 from jtqd.sysid.fit.signals import run_signals
-from jtqd.sysid.fit.standstill import FEWEST_RUNS, Standing, beyond_normal, fit_standstill
 from tests.sysid.fit.fused_signals import FUSED, campaign_plant
 
 Draw = Callable[[np.random.Generator], float]

@@ -13,8 +13,7 @@ from jtqd.estimator.observer import first_order_hold, low_pass, slipped
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.status import STANDSTILL
 from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals
-from jtqd.sysid.fit.torsion import TorsionError, fit_torsion
-from jtqd.sysid.fit.torsion_signals import torsion_torque
+from jtqd.sysid.fit.torsion import TorsionError, fit_torsion, torsion_torque
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
 from tests.sysid.fit.fused_signals import FUSED, STIFF, Nuisance, made_run, one_way, smooth_loss

@@ -15,9 +15,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plants import AnyPlant, load_any_plant
 from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals
-from jtqd.sysid.fit.torsion import fit_torsion
-from jtqd.sysid.fit.torsion_extensions import WORTH, extended
-from jtqd.sysid.fit.torsion_signals import torsion_torque
+from jtqd.sysid.fit.torsion import WORTH, extended, fit_torsion, torsion_torque
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
 from tests.sim_can.towing.benches import TYPICAL

@@ -13,18 +13,10 @@ from jtqd.estimator.joint import Tracking
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.fit import fused as fits
-from jtqd.sysid.fit.fused import path_residuals, tracking_of_unseen
-from jtqd.sysid.fit.residuals import NowErrors, PathResiduals
+from jtqd.sysid.fit.calibration import SATURATION_RAD_S, by_speed, fit_tracking, tracking_of_unseen, worth_it
+from jtqd.sysid.fit.residuals import TRACKING_RAD_S, WAVE_RAD_S, NowErrors, PathResiduals, path_residuals
 from jtqd.sysid.fit.signals import run_signals
-from jtqd.sysid.fit.torsion_signals import torsion_now, torsion_through
-from jtqd.sysid.fit.tracking import (
-    SATURATION_RAD_S,
-    TRACKING_RAD_S,
-    WAVE_RAD_S,
-    by_speed,
-    fit_tracking,
-    worth_it,
-)
+from jtqd.sysid.fit.torsion import torsion_now, torsion_through
 from tests.estimator.fused_helpers import fused_joint, twisted
 from tests.estimator.test_torsion_bandwidth import SLIPPING, lossless
 
@@ -93,8 +85,8 @@ def test_what_follows_in_a_fit_sees_the_tracked_torsion(monkeypatch: pytest.Monk
         monkeypatch.setattr(fits, "fit_standstill", lambda *_: None)
         monkeypatch.setattr(fits, "fit_loss", lambda *_: SimpleNamespace(loss=joint.fused.loss))  # type: ignore[union-attr]
         monkeypatch.setattr(fits, "fit_torsion", lambda *_: joint.fused.torsion)  # type: ignore[union-attr]
-        monkeypatch.setattr(fits, "_envelope", lambda *_: None)
-        for name in ("fit_zeros", "_agreement"):
+        monkeypatch.setattr(fits, "fit_envelope", lambda *_: None)
+        for name in ("fit_zeros", "agreement_of_held_out"):
             monkeypatch.setattr(fits, name, lambda runs, *_, to=seen: to.extend(runs))
         monkeypatch.setattr(fits, "calibrated", lambda runs, fused, _, to=seen: (to.extend(runs), fused)[1])
         fits.fit_fused([None] * 6, joint.friction, 40.0)  # type: ignore[list-item]

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.joint import DayZeros, Fused, FusedSigma
-from jtqd.sysid.fit.residuals import PathResiduals
-from jtqd.sysid.fit.served import Served, served
-from jtqd.sysid.fit.zeros import correlation, fit_zeros
+from jtqd.sysid.fit.repeatability import correlation, fit_zeros
+from jtqd.sysid.fit.residuals import PathResiduals, Served, served
 from tests.estimator.test_fused_estimator import NARROW
 
 K, RATED, DAYS = 12000.0, 40.0, 24
