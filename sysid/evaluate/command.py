@@ -15,9 +15,8 @@ from typing import Final
 from jtqd.estimator.checked import ConfigError, check_installed, make_directory
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.evaluate.card import BASELINE, Card, make_card, method_of
-from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate
+from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate, loop_time
 from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
-from jtqd.sysid.evaluate.loop_time import loop_time
 from jtqd.sysid.evaluate.methods import JointModels, load_models, take_samples
 from jtqd.sysid.evaluate.report import as_mapping, text_lines
 from jtqd.sysid.progress import progress
@@ -149,8 +148,7 @@ def _silent(models: tuple[JointModels, ...]) -> list[RunIssue]:
 
 def _card(options: argparse.Namespace, models: tuple[JointModels, ...], inputs: Inputs) -> int:
     """Write card.json, card.html and a picture per joint; the card on standard output. Returns the exit status."""
-    from jtqd.sysid.evaluate.card_figure import write_png
-    from jtqd.sysid.evaluate.card_page import card_html, card_lines, card_mapping
+    from jtqd.sysid.evaluate.card import card_html, card_lines, card_mapping, write_png
 
     cards: list[Card] = []
     findings = [*_silent(models), *inputs.findings]

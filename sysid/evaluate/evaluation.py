@@ -1,50 +1,134 @@
 """Evaluate all methods on all runs: samples of every run and joint, every table of the report, and the targets.
 
 No file and no clock: a pure function of runs and models.
+
+Measure the time of one step of each method on samples of an evaluated run: its part of jtqd's loop.
+
+Every step is timed alone, as the loop would call it, with the loop's own estimators and networks; the methods take turns
+in short blocks, so that a busy machine affects all alike, and the median leaves out the steps in which the machine did
+something else. One process in a tight loop: caches are warmer than in a loop that sleeps between its cycles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from time import perf_counter_ns
 from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
 from jtqd.estimator.checked import counted
 from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
-from jtqd.sysid.evaluate import constant, scores
-from jtqd.sysid.evaluate.constant import (
-    Outside,
-    PlateauScore,
-    is_constant,
-    outside_scores,
-    plateau_scores,
-    plateaus_of,
-)
+from jtqd.estimator.settings import recommended
 from jtqd.sysid.evaluate.inputs import JudgedRun
-from jtqd.sysid.evaluate.loop_time import LoopTime
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples, take_samples
 from jtqd.sysid.evaluate.scores import (
+    ALLOWED,
     LIMIT_NM,
     PAPER_MSE_NM2,
+    PAPER_WORST_PERCENT,
     ErrorTables,
     IntervalTables,
     Jump,
+    Outside,
+    PlateauScore,
     Row,
     Standstill,
+    TruthTables,
     error_tables,
+    for_intervals,
+    hardest_plateaus,
     interval_tables,
+    is_constant,
     largest_jump,
     median_run,
+    outside_scores,
+    plateau_scores,
+    plateaus_of,
     ratio,
     standstill,
+    truth_tables,
+    worst_plateau,
 )
-from jtqd.sysid.evaluate.truth import TruthTables, for_intervals, truth_tables
 from jtqd.sysid.fit.efficiency import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.checks import RunIssue
+
+METHODS: Final = ("tob", PAPERS, OURS)
+SAMPLES: Final = 3000
+"""Steps per joint and method, from the middle of the run: it moves there."""
+_BLOCK: Final = 100
+
+
+class LoopTime(NamedTuple):
+    """Median cost of a step [us] by method, summed over the joints that have all of METHODS; run: of the samples."""
+
+    step_us: Mapping[str, float]
+    joints: int
+    samples: int
+    run: str
+
+    def extra_us(self, over: str) -> float:
+        """Return what ours costs more than another method [us], all joints together."""
+        return self.step_us[OURS] - self.step_us[over]
+
+
+def loop_time(
+    runs: Sequence[JudgedRun],
+    models: Sequence[JointModels],
+    clock_ns: Callable[[], int] = perf_counter_ns,
+) -> LoopTime | None:
+    """Return what steps cost on the first run that holds every such joint; None where no joint has all of METHODS."""
+    whole = [each for each in models if set(METHODS) <= set(each.methods)]
+    run = next((run for run in runs if whole and all(each.number in run.columns for each in whole)), None)
+    if run is None:
+        return None
+    total = dict.fromkeys(METHODS, 0.0)
+    for each in whole:
+        rows = _rows(run, each)
+        for method, cost in _costs_us(each, rows, clock_ns).items():
+            total[method] += cost
+    return LoopTime(total, len(whole), len(rows), run.name)
+
+
+_Row = tuple[float, float, float, float, float]
+
+
+def _rows(run: JudgedRun, models: JointModels) -> list[tuple[_Row, float]]:
+    """Return ((dt, current, motor position, motor velocity, link position), temperature) of the middle of the run."""
+    columns = run.columns[models.number]
+    time_s = run.table.time_s
+    begin = max((len(time_s) - SAMPLES) // 2, 1)
+    at = slice(begin, begin + SAMPLES)
+    names = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+    values = [np.asarray(getattr(columns, name))[at].tolist() for name in names]
+    warm = columns.temperature_c
+    known = np.full(len(time_s), np.nan) if warm is None else np.asarray(warm)
+    rows = zip(np.diff(time_s)[begin - 1 : begin - 1 + SAMPLES].tolist(), *values, strict=True)
+    return list(zip(rows, known[at].tolist(), strict=True))
+
+
+def _costs_us(
+    models: JointModels, rows: list[tuple[_Row, float]], clock_ns: Callable[[], int]
+) -> dict[str, float]:
+    """Return the median cost of a step [us] by method."""
+    steps = {
+        method: make_estimator(models.joint, recommended(method), models.networks.get(method)).step
+        for method in METHODS
+    }
+    took: dict[str, list[int]] = {method: [] for method in METHODS}
+    for begin in range(0, len(rows), _BLOCK):
+        for method, step in steps.items():
+            times = took[method]
+            for row, temperature_c in rows[begin : begin + _BLOCK]:
+                began = clock_ns()
+                step(*row, temperature_c)
+                times.append(clock_ns() - began)
+    return {method: float(np.median(times)) * 1e-3 for method, times in took.items()}
+
 
 SILENT_SHARE: Final = 0.01
 """Share of the moving samples that a method may leave without a value and not be named for it."""
@@ -373,10 +457,10 @@ def _every_run(runs: Mapping[tuple[str, int], Row]) -> Target:
     )
 
 
-def _back_drive(plateaus: Sequence[constant.PlateauScore]) -> Target:
-    hard = constant.hardest(plateaus)
-    ours = constant.worst(hard, OURS, constant.PlateauScore.rated_percent)
-    tob = constant.worst(hard, "tob", constant.PlateauScore.percent)
+def _back_drive(plateaus: Sequence[PlateauScore]) -> Target:
+    hard = hardest_plateaus(plateaus)
+    ours = worst_plateau(hard, OURS, PlateauScore.rated_percent)
+    tob = worst_plateau(hard, "tob", PlateauScore.percent)
     details = [f"{counted(len(hard), 'plateau')} at 2.4 to 2.6 rad/s and 25 to 35 Nm, back-driven"]
     if tob is not None:
         details.append(f"classical TOB {tob[0]:.1f} % of the torque, {_place(tob[1])}")
@@ -385,7 +469,7 @@ def _back_drive(plateaus: Sequence[constant.PlateauScore]) -> Target:
     return Target(
         "back_drive",
         "worst error at 2.5 rad/s, 30 Nm, back drive",
-        f"{constant.PAPER_WORST_PERCENT:g} % of torque (TOB)",
+        f"{PAPER_WORST_PERCENT:g} % of torque (TOB)",
         f"at most {BACK_DRIVE_PERCENT:g} % of rated",
         "not known" if ours is None else f"{ours[0]:.2f} % of rated",
         None if ours is None else ours[0] <= BACK_DRIVE_PERCENT,
@@ -393,8 +477,8 @@ def _back_drive(plateaus: Sequence[constant.PlateauScore]) -> Target:
     )
 
 
-def _coverage(variable: scores.IntervalTables | None, every: scores.IntervalTables | None) -> Target:
-    low, high = (100.0 * share for share in scores.ALLOWED)
+def _coverage(variable: IntervalTables | None, every: IntervalTables | None) -> Target:
+    low, high = (100.0 * share for share in ALLOWED)
     cells = (
         {}
         if variable is None
@@ -421,7 +505,7 @@ def _coverage(variable: scores.IntervalTables | None, every: scores.IntervalTabl
     )
 
 
-def _outside(found: Sequence[constant.Outside]) -> tuple[Target, Target]:
+def _outside(found: Sequence[Outside]) -> tuple[Target, Target]:
     ratios = [each.ours.rmse_nm / each.physics.rmse_nm for each in found if each.physics is not None]
     flagged = min((each.flagged for each in found), default=None)
     return (
@@ -501,7 +585,7 @@ def _loop_time(found: LoopTime | None) -> Target:
     )
 
 
-def _place(plateau: constant.PlateauScore) -> str:
+def _place(plateau: PlateauScore) -> str:
     return f"{plateau.run} j{plateau.number} at {plateau.velocity_rad_s:.2f} rad/s and {plateau.torque_nm:.1f} Nm"
 
 

@@ -8,11 +8,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.sysid.evaluate.constant import Outside, PlateauScore, Range
-from jtqd.sysid.evaluate.evaluation import Evaluation, Target, targets
-from jtqd.sysid.evaluate.loop_time import LoopTime
+from jtqd.sysid.evaluate.evaluation import Evaluation, LoopTime, Target, targets
 from jtqd.sysid.evaluate.methods import Samples
-from jtqd.sysid.evaluate.scores import Block, Jump, Score, error_tables, interval_tables, score
+from jtqd.sysid.evaluate.scores import (
+    Block,
+    Jump,
+    Outside,
+    PlateauScore,
+    Range,
+    Score,
+    error_tables,
+    interval_tables,
+    score,
+)
 from tests.sysid.evaluate.evaluate_helpers import samples
 
 EMPTY = Evaluation(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from jtqd.sysid.evaluate.evaluation import METHODS, LoopTime, loop_time
 from jtqd.sysid.evaluate.inputs import JudgedRun, read_inputs
-from jtqd.sysid.evaluate.loop_time import METHODS, LoopTime, loop_time
 from jtqd.sysid.evaluate.methods import JointModels, load_models
 from tests.sysid.evaluate.evaluate_helpers import make_bench
 

@@ -11,33 +11,31 @@ from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
-from jtqd.sysid.evaluate.constant import (
-    PlateauScore,
-    hardest,
-    is_constant,
-    outside_scores,
-    plateau_scores,
-    training_range,
-    worst,
-)
 from jtqd.sysid.evaluate.evaluation import worse_runs
 from jtqd.sysid.evaluate.inputs import by_data, by_marks
 from jtqd.sysid.evaluate.methods import Samples
 from jtqd.sysid.evaluate.scores import (
     LEVELS,
     Block,
+    PlateauScore,
     coverage,
     covered,
     crossings,
     error_tables,
+    hardest_plateaus,
     interval_tables,
+    is_constant,
     jumps_around,
     largest_jump,
     median_run,
+    outside_scores,
+    plateau_scores,
     row,
     score,
     standstill,
+    training_range,
     velocity_bins,
+    worst_plateau,
 )
 from jtqd.sysid.fit.plateaus import Mean, Plateau
 from jtqd.sysid.report.figures import thinned
@@ -197,12 +195,12 @@ def test_the_hardest_plateaus_are_back_driven_fast_and_heavy() -> None:
 
     right = [one("back", 2.5, -30.0, 0.3), one("back", -2.45, 34.0, -0.6)]
     wrong = [one("forward", 2.5, 30.0, 9.0), one("back", 1.5, 30.0, 9.0), one("back", 2.5, 20.0, 9.0)]
-    assert hardest(right + wrong) == right
-    found = worst(right, "fused", PlateauScore.rated_percent)
+    assert hardest_plateaus(right + wrong) == right
+    found = worst_plateau(right, "fused", PlateauScore.rated_percent)
     assert found is not None
     assert found[0] == pytest.approx(1.5)
     assert found[1] is right[1]
-    assert worst(right, "tob", PlateauScore.percent) is None
+    assert worst_plateau(right, "tob", PlateauScore.percent) is None
 
 
 def test_a_run_is_at_constant_velocity_when_plateaus_fill_it() -> None:

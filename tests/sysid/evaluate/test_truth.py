@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.sysid.evaluate.truth import truth_tables
+from jtqd.sysid.evaluate.scores import truth_tables
 from jtqd.sysid.runs.truth import read_truth, truth_path, write_truth
 from tests.sysid.evaluate.evaluate_helpers import samples
 
