@@ -5,9 +5,9 @@
     python -m validation.frozen --store           store the results of this tree as the reference
     python -m validation.frozen --out DIR         also keep full dumps, for a diff between two trees
 
-A restructuring must not change a result. Each section runs the product's commands on inputs drawn from fixed seeds and prints
-one line per result: numbers with all their digits, or a SHA-256 over them. Sentences are left out; verdicts, names, order and
-numbers stay in.
+A restructuring must not change a result. Each section runs the product's commands on inputs drawn from fixed seeds and
+prints one line per result: numbers with all their digits, or a SHA-256 over them. Sentences are left out; verdicts, names,
+order and numbers stay in.
 """
 
 from __future__ import annotations
@@ -197,9 +197,8 @@ def kinova(out: Path) -> Iterator[str]:
     """Diagnose the seven joints of the measured arm."""
     with tempfile.TemporaryDirectory() as scratch:
         content = json.loads(run("examples.kinova_diagnosis", "--out", scratch, "--json"))
-        for number, each in enumerate(content if isinstance(content, list) else content.values(), 1):
-            one = each.get("findings", each)
-            yield from findings_lines(f"kinova_{number}", json.dumps(one), out)
+        for each in content["joints"]:
+            yield from findings_lines(f"kinova_{each['joint']}", json.dumps(each["findings"]), out)
 
 
 def goals(out: Path) -> Iterator[str]:
