@@ -12,6 +12,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: one process 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 STUDIES: Final = {
+    "frozen": ("validation.frozen", "results that a restructuring must not change, beside the stored ones"),
     "goals": ("validation.goals.__main__", "three plants: error and interval against the true torque"),
     "sources": ("validation.goals.sources", "what the error of the estimate is made of on a bench"),
     "other_plant": ("validation.goals.other_plant", "joint files of another plant: how soon it is flagged"),

@@ -1,9 +1,9 @@
 """Compare the results of this tree, number by number, with the ones stored in frozen.txt.
 
-    python -m validation.frozen                   compare; exit status 1 where a line differs
-    python -m validation.frozen findings replay   some sections only
-    python -m validation.frozen --store           store the results of this tree as the reference
-    python -m validation.frozen --out DIR         also keep full dumps, for a diff between two trees
+    python -m validation frozen                   compare; exit status 1 where a line differs
+    python -m validation frozen findings replay   some sections only
+    python -m validation frozen --store           store the results of this tree as the reference
+    python -m validation frozen --out DIR         also keep full dumps, for a diff between two trees
 
 A restructuring must not change a result. Each section runs the product's commands on inputs drawn from fixed seeds and
 prints one line per result: numbers with all their digits, or a SHA-256 over them. Sentences are left out; verdicts, names,
@@ -21,7 +21,7 @@ import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -81,11 +81,11 @@ def findings_lines(label: str, text: str, out: Path) -> Iterator[str]:
 
 def _trials(directory: Path) -> Iterator[Path]:
     """Write the runs and joint files of the trials; yield the folder of each."""
-    from tests.hidden import Hidden, draw, write
-    from tests.worlds.benches import BENCHES
-    from tests.worlds.campaign import Counts, jobs
-    from tests.worlds.judge import write as write_set
-    from tests.worlds.recorder import PRESETS
+    from validation.hidden import Hidden, draw, write
+    from validation.worlds.benches import BENCHES
+    from validation.worlds.campaign import Counts, jobs
+    from validation.worlds.judge import write as write_set
+    from validation.worlds.recorder import PRESETS
 
     hidden = (
         (),
@@ -205,7 +205,7 @@ def goals(out: Path) -> Iterator[str]:
     """Compute the goals' table on few days: campaign, fits, every method, beside its baselines."""
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / "goals.json"
-        run("jtqd.sysid.goals", "--quick", "--json", str(file))
+        run("validation", "goals", "--quick", "--json", str(file))
         full = "\n".join(numbers(json.loads(file.read_text(encoding="utf-8"))))
         (out / "goals.txt").write_text(full + "\n", encoding="utf-8")
         yield f"goals --quick: {len(full.splitlines())} numbers, {digest(full)}"
@@ -247,7 +247,7 @@ def stored_sections() -> dict[str, list[str]]:
     return sections
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Compare or store; see the module."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -255,7 +255,7 @@ def main() -> int:
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}")
     parser.add_argument("--store", action="store_true", help="store the results as the reference")
     parser.add_argument("--out", type=Path, metavar="DIR", help="keep full dumps")
-    options = parser.parse_args()
+    options = parser.parse_args(arguments)
     unknown = set(options.sections) - set(SECTIONS)
     if unknown:
         parser.error(f"found {', '.join(sorted(unknown))}, expected {', '.join(SECTIONS)}")
@@ -279,7 +279,7 @@ def main() -> int:
             for line in difference[2:]:
                 print(f"  {line}")
     if options.store:
-        head = f"# {(__doc__ or '').splitlines()[0]} Written by `python -m validation.frozen --store`.\n"
+        head = f"# {(__doc__ or '').splitlines()[0]} Written by `python -m validation frozen --store`.\n"
         body = "".join(
             f"[{name}]\n" + "".join(f"{line}\n" for line in reference[name])
             for name in SECTIONS
@@ -287,7 +287,3 @@ def main() -> int:
         )
         STORED.write_text(head + body, encoding="utf-8")
     return status
-
-
-if __name__ == "__main__":
-    sys.exit(main())
