@@ -80,7 +80,7 @@ def reciprocal_efficiency(joint: Joint) -> Efficiency:
         target = np.array([1.0 / source.value(a, b) for a, b in zip(i.tolist(), v.tolist(), strict=True)])
         regressors = np.column_stack((np.ones_like(i), i, v, i * i, i * v, v * v))
         p = np.linalg.lstsq(regressors, target, rcond=None)[0].tolist()
-        quadrants[name] = QuadrantPolynomial(*p, rmse=source.rmse)
+        quadrants[name] = replace(QuadrantPolynomial(*p), rmse=source.rmse)
     return Efficiency("motor_over_joint", **quadrants)
 
 
