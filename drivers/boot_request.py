@@ -1,7 +1,7 @@
 """Request and report of the boot process as JSON; the request is checked into frozen profiles.
 
     {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
-     "own_eds": "jtqd.eds", "error_behaviour": 0, "reset": true,
+     "error_behaviour": 0, "reset": true,
      "sync": {"cob_id": 128, "counter_overflow": 0, "check_foreign": true},
      "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
                {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true, "sdo_timeout_ms": 1000},
@@ -44,7 +44,6 @@ _TOP = {
     "bus",
     "nodes",
     "master_node",
-    "own_eds",
     "sync",
     "heartbeat_ms",
     "master_timeout_ms",
@@ -71,8 +70,6 @@ class BootRequest:
         bus: CAN interface or unix:PATH.
         check_foreign_sync: refuse a bus with another SYNC producer; off when jtqd's own SYNC already runs.
         answer_timeout_s: longest wait for the answer of a mandatory node.
-        own_eds: data sheet to be read for the caller, who then does without the parser: its entries are in the report as
-            "own_entries".
         optional: nodes that may be absent.
         reset: begin with NMT reset communication.
         sdo_answer_s: silence of a node after which a request is repeated, by node; ANSWER_S for the others.
@@ -83,7 +80,6 @@ class BootRequest:
     settings: BusSettings
     check_foreign_sync: bool = True
     answer_timeout_s: float = 0.5
-    own_eds: str | None = None
     optional: frozenset[int] = frozenset()
     reset: bool = True
     sdo_answer_s: Mapping[int, float] = field(default_factory=dict)
@@ -124,9 +120,6 @@ def parse_request(raw: object) -> BootRequest:
     timeout = top.get("answer_timeout_s", 0.5)
     if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
         raise RequestError(f"answer_timeout_s: found {timeout!r}, expected seconds above 0 and at most 60")
-    own_eds = top.get("own_eds")
-    if own_eds is not None and not isinstance(own_eds, str):
-        raise RequestError(f"own_eds: found {own_eds!r}, expected a path")
     optional = frozenset(
         profile.node_id
         for profile, node in zip(profiles, nodes, strict=True)
@@ -140,7 +133,7 @@ def parse_request(raw: object) -> BootRequest:
     }
     reset = _boolean(top, "reset", default=True, where="request")
     return BootRequest(
-        bus, profiles, settings, foreign, float(timeout), own_eds, optional, reset=reset, sdo_answer_s=answers
+        bus, profiles, settings, foreign, float(timeout), optional, reset=reset, sdo_answer_s=answers
     )
 
 

@@ -1,17 +1,16 @@
-"""SDO client of one node that blocks until it has its answer: over a frame socket, or over canopen's Network.
+"""SDO client of one node that blocks until it has its answer.
 
-    SdoClient      read and write of objects as bytes, over a channel
+    SdoClient      read and write of objects as bytes, over a frame socket
     NodeObjects    read and write of numbers, every failure a BootError with node and object in its line
 
-The protocol is `jtqd.drivers.sdo.Exchange` in either case. canopen's own client is not used: it repeats nothing
+The protocol is `jtqd.drivers.sdo.Exchange`. canopen's own client is not used: it repeats nothing
 (MAX_RETRIES = 1 means one try), takes frames of any length, and does not compare the answer to a download with its request.
 """
 
 from __future__ import annotations
 
-import queue
 import time
-from typing import Any, Protocol
+from typing import Protocol
 
 from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
@@ -28,22 +27,9 @@ from jtqd.drivers.sdo import (
     label,
 )
 
-_MAX_QUEUED = 64
-"""Answers that wait to be looked at: a flood of them must not fill the memory."""
-
-
-class Channel(Protocol):
-    """Requests to one node, and its answers."""
-
-    def send(self, request: bytes) -> None:
-        """Send 8 bytes to 600h+n; one that is lost is repeated by the exchange."""
-
-    def receive(self, timeout_s: float) -> list[bytes]:
-        """Return the frames of 580h+n that have come, after `timeout_s` seconds at the latest."""
-
 
 class Socket(Protocol):
-    """What `FrameChannel` needs of `jtqd.drivers.frame_socket.FrameSocket`."""
+    """What `SdoClient` needs of `jtqd.drivers.frame_socket.FrameSocket`."""
 
     frames: bytearray
 
@@ -55,59 +41,6 @@ class Socket(Protocol):
 
     def receive(self) -> int:
         """Take what has arrived."""
-
-
-class FrameChannel:
-    """Channel over a frame socket whose filters let 580h+n through; other frames that come meanwhile are dropped."""
-
-    def __init__(self, socket: Socket, node: int) -> None:
-        self._socket = socket
-        self._request_id, self._response_id = REQUEST_ID + node, RESPONSE_ID + node
-
-    def send(self, request: bytes) -> None:
-        """Send one request. Raises BusError."""
-        self._socket.send(pack(self._request_id, request))
-
-    def receive(self, timeout_s: float) -> list[bytes]:
-        """Return the node's frames among what has come. Raises BusError."""
-        socket = self._socket
-        socket.wait(timeout_s)
-        replies = []
-        for position in range(socket.receive()):
-            can_id, length, data = FRAME.unpack_from(socket.frames, FRAME_SIZE * position)
-            if can_id == self._response_id:
-                replies.append(data[:length])
-        return replies
-
-
-class NetworkChannel:
-    """Channel over a `canopen.Network`, whose thread brings the answers; at most 64 of them wait."""
-
-    def __init__(self, network: Any, node: int) -> None:
-        self._network, self._node = network, node
-        self._replies: queue.Queue[bytes] = queue.Queue(_MAX_QUEUED)
-        network.subscribe(RESPONSE_ID + node, self._on_response)
-
-    def _on_response(self, _can_id: int, data: bytes, _timestamp: float) -> None:
-        try:
-            self._replies.put_nowait(bytes(data))
-        except queue.Full:
-            return
-
-    def send(self, request: bytes) -> None:
-        """Send one request. Raises can.CanError."""
-        self._network.send_message(REQUEST_ID + self._node, request)
-
-    def receive(self, timeout_s: float) -> list[bytes]:
-        """Return the frames that have come."""
-        replies: list[bytes] = []
-        try:
-            replies.append(self._replies.get(block=timeout_s > 0.0, timeout=timeout_s))
-            while len(replies) < _MAX_QUEUED:
-                replies.append(self._replies.get_nowait())
-        except queue.Empty:
-            pass
-        return replies
 
 
 class SdoTimeout(Exception):  # noqa: N818  (the node's fault, not one of this side)
@@ -131,11 +64,13 @@ class SdoAccess(Protocol):
 class SdoClient:
     """One exchange at a time with one node; each may take `timeout_s` seconds, and is repeated after `answer_s` of silence.
 
-    Both methods raise SdoAbort (the node refuses), SdoTimeout, and what the channel raises.
+    The filters of the socket let 580h+n through; other frames that come meanwhile are dropped. `read` and `write` raise
+    SdoAbort (the node refuses), SdoTimeout, and BusError.
     """
 
-    def __init__(self, channel: Channel, timeout_s: float = 0.5, answer_s: float = ANSWER_S) -> None:
-        self._channel, self._timeout_s, self._answer_s = channel, timeout_s, answer_s
+    def __init__(self, socket: Socket, node: int, timeout_s: float = 0.5, answer_s: float = ANSWER_S) -> None:
+        self._socket, self._timeout_s, self._answer_s = socket, timeout_s, answer_s
+        self._request_id, self._response_id = REQUEST_ID + node, RESPONSE_ID + node
 
     def wait_longer(self, timeout_s: float) -> None:
         """Wait at least so long for an answer from here on: the node has given its first one."""
@@ -150,12 +85,12 @@ class SdoClient:
         self._exchange(index, subindex, data)
 
     def _exchange(self, index: int, subindex: int, data: bytes | None) -> bytes:
-        self._channel.receive(0.0)  # answers to a request that was given up
+        self._replies(0.0)  # to a request that was given up
         now, timeout_s = time.monotonic(), self._timeout_s
         exchange = Exchange(index, subindex, data, now=now, timeout_s=timeout_s, answer_s=self._answer_s)
         self._send(exchange.begin())
         while not exchange.ended:
-            for reply in self._channel.receive(max(exchange.due - time.monotonic(), 1e-4)):
+            for reply in self._replies(max(exchange.due - time.monotonic(), 1e-4)):
                 self._send(exchange.on_reply(reply, time.monotonic()))
             self._send(exchange.tick(time.monotonic()))  # also in a flood of foreign answers
         if exchange.refusal is not None:
@@ -165,8 +100,16 @@ class SdoClient:
         return exchange.value
 
     def _send(self, requests: list[bytes]) -> None:
+        """Send requests; one that is lost is repeated by the exchange."""
         for request in requests:
-            self._channel.send(request)
+            self._socket.send(pack(self._request_id, request))
+
+    def _replies(self, timeout_s: float) -> list[bytes]:
+        """Return the node's frames that have come, after `timeout_s` at the latest."""
+        socket = self._socket
+        socket.wait(timeout_s)
+        frames = [FRAME.unpack_from(socket.frames, FRAME_SIZE * n) for n in range(socket.receive())]
+        return [data[:length] for can_id, length, data in frames if can_id == self._response_id]
 
 
 class NodeObjects:

@@ -28,7 +28,7 @@ from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
 from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID
 from jtqd.drivers.sdo import ANSWER_S, REQUEST_ID, RESPONSE_ID, Key, SdoAbort, Transfer, label
-from jtqd.drivers.sdo_client import FrameChannel, SdoAccess, SdoClient, SdoTimeout
+from jtqd.drivers.sdo_client import SdoAccess, SdoClient, SdoTimeout
 from jtqd.drivers.units import OTHER_SCALING_OBJECTS
 
 DRIVE, SENSOR = 402, 404
@@ -277,7 +277,7 @@ class BusSurvey:
 
     def access(self, node: int) -> SdoClient:
         """Return the SDO client of one node, which repeats a request as the boot does."""
-        return SdoClient(FrameChannel(self._socket, node), _SILENCES * ANSWER_S)
+        return SdoClient(self._socket, node, _SILENCES * ANSWER_S)
 
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
         """Read further numbers of one node; those that it does not have are left out. Raises SurveyError."""

@@ -23,6 +23,11 @@ from jtqd.drivers.layout import tpdos_as_json
 _EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 
 
+def own_eds(config: Config) -> list[str]:
+    """Return the arguments by which the boot process reads jtqd's own EDS: its path, and the node-ID."""
+    return [str(_EDS / own_sheet(len(config.joints))), str(config.node_id)]
+
+
 def boot_request(
     config: Config, bus: str, only: int | None = None, *, reset: bool | None = None
 ) -> dict[str, Any]:
@@ -64,7 +69,6 @@ def boot_request(
         "bus": bus,
         "nodes": [node for node in nodes if only in (None, node["node"])],
         "master_node": config.node_id,
-        "own_eds": str(_EDS / own_sheet(len(config.joints))),
         "heartbeat_ms": config.heartbeat_ms,
         "error_behaviour": config.error_behaviour,
         "reset": config.reset_communication if reset is None else reset,

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error
+from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error, own_eds
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
 from jtqd.daemon.config import Config, Ros2Settings, as_booted
@@ -314,7 +314,7 @@ class Supervisor:
         # A bus that is not there starts nothing; the emulated one comes up while the others load.
         socket = None if bench is not None else self._open_bus()
         loop = self._child("jtqd.daemon.loop.process", [json.dumps(self._loop_request())], "the loop")
-        boot = self._child("jtqd.drivers.boot", [], "the boot")
+        boot = self._child("jtqd.drivers.boot", own_eds(self._config), "the boot")
         if bench is not None:
             await_bench(self._config, self._bus, bench)
         socket = self._open_bus() if socket is None else socket

@@ -42,7 +42,7 @@ from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.layout import EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, INVALID, PdoError, PdoMap, split_word
 from jtqd.drivers.sdo import RESPONSE_ID, Key
-from jtqd.drivers.sdo_client import FrameChannel, NodeObjects, SdoAccess, SdoClient
+from jtqd.drivers.sdo_client import NodeObjects, SdoAccess, SdoClient
 from jtqd.sysid.motion.cia402 import (
     CST,
     CSV,
@@ -322,7 +322,7 @@ class BenchSetup:
         )
         self._drives, self._sensor, self._timing = tuple(drives), sensor, timing
         self._beating = False
-        self._access = {node: SdoClient(FrameChannel(self._socket, node)) for node in nodes}
+        self._access = {node: SdoClient(self._socket, node) for node in nodes}
 
     def prepare(
         self, setpoints: Setpoints, limits: Limits

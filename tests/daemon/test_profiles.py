@@ -24,10 +24,9 @@ from jtqd.daemon.cli import init, probe
 from jtqd.daemon.config import load_config
 from jtqd.daemon.recording import keeper
 from jtqd.daemon.replay.origin import CONFIGURATION, PROVENANCE, open_origin
-from jtqd.drivers.boot import boot
-from jtqd.drivers.boot_request import parse_request
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import shipped
+from tests.drivers.canopen_nodes import booted
 from tests.library_drives.families import PULSES, RATED_MA
 from tests.library_drives.motion import moves_as_it_should, quantities
 from tests.library_drives.nodes import GEAR, LINK_COUNTS
@@ -243,10 +242,8 @@ def test_init_finds_the_family_and_its_drive_is_scaled_as_the_one_beside_it(
     assert any(f"profile {family}" in note for note in json.loads(printed.out)["notes"])
     config = load_config(path)
     assert [joint.profile for joint in config.joints] == [family, None]
-    found: list[dict[str, float]] = []
-    boot(
-        parse_request(boot_request(config, name)), hold=lambda report: found.extend(quantities(name, report))
-    )
+    with booted(boot_request(config, name)) as report:
+        found = quantities(name, report)
     for each in found:
         moves_as_it_should(each)
     first, second = found

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from typing import Self
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Self
 
-import can
-
-from jtqd.drivers.frame import FRAME, pack
+from jtqd.drivers.boot import BootBus, BootReport, boot
+from jtqd.drivers.boot_request import parse_request
+from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME, pack
+from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.pdo import PdoParameters
@@ -103,47 +106,83 @@ class _Running:
         raise NotImplementedError
 
 
-class Responder(_Running):
-    """Test nodes on a python-can bus. Context manager."""
+class _Answering(_Running):
+    """Test nodes that answer what arrives; `extra` gives frames that somebody else sends."""
 
-    def __init__(self, bus: can.BusABC, nodes: list[TestNode]) -> None:
+    def __init__(self, nodes: list[TestNode]) -> None:
         super().__init__()
-        self.bus, self.nodes = bus, nodes
+        self.nodes = nodes
         self.extra: Callable[[], list[tuple[int, bytes]]] = list
 
-    def turn(self) -> None:
-        message = self.bus.recv(0.002)
-        out = self.extra()
+    def send(self, frame16: bytes) -> None:
+        raise NotImplementedError
+
+    def answer(self, frame16: bytes) -> None:
+        can_id, length, data = FRAME.unpack(frame16)
         for node in self.nodes:
-            if message is not None and not message.is_extended_id:
-                out += node.frames(message.arbitration_id, bytes(message.data))
-            out += node.beat(time.monotonic())
-        for can_id, data in out:
-            self.bus.send(can.Message(arbitration_id=can_id, data=data, is_extended_id=False))
+            for reply in node.frames(can_id, data[:length]):
+                self.send(pack(*reply))
 
-    def close(self) -> None:
-        self.bus.shutdown()
+    def beat(self) -> None:
+        frames = self.extra()
+        for node in self.nodes:
+            frames += node.beat(time.monotonic())
+        for frame in frames:
+            self.send(pack(*frame))
 
 
-class HubResponder(_Running):
+class Responder(_Answering):
+    """Test nodes on a bus. Context manager."""
+
+    def __init__(self, bus: str, nodes: list[TestNode]) -> None:
+        super().__init__(nodes)
+        self._socket = open_frame_socket(bus, [CanFilter(0, CAN_EFF_FLAG)])
+        self.close = self._socket.close  # type: ignore[method-assign]
+
+    def send(self, frame16: bytes) -> None:
+        self._socket.send(frame16)
+
+    def turn(self) -> None:
+        self._socket.wait(0.002)
+        for n in range(self._socket.receive()):
+            self.answer(bytes(self._socket.frames[16 * n : 16 * n + 16]))
+        self.beat()
+
+
+class HubResponder(_Answering):
     """The same nodes inside a hub on a unix socket. Context manager."""
 
     def __init__(self, path: str, nodes: list[TestNode]) -> None:
-        super().__init__()
-        self.hub, self.nodes = Hub(path), nodes
-        self._port = self.hub.attach(self._on_frame)
+        super().__init__(nodes)
+        self.hub = Hub(path)
+        self._port = self.hub.attach(lambda frame16, _stamp_ns: self.answer(frame16))
+        self.close = self.hub.close  # type: ignore[method-assign]
 
-    def _on_frame(self, frame16: bytes, _stamp_ns: int) -> None:
-        can_id, length, data = FRAME.unpack(frame16)
-        for node in self.nodes:
-            for reply_id, reply in node.frames(can_id, data[:length]):
-                self._port.send(pack(reply_id, reply))
+    def send(self, frame16: bytes) -> None:
+        self._port.send(frame16)
 
     def turn(self) -> None:
         self.hub.run_once(0.002)
-        for node in self.nodes:
-            for can_id, data in node.beat(time.monotonic()):
-                self._port.send(pack(can_id, data))
+        self.beat()
 
-    def close(self) -> None:
-        self.hub.close()
+
+@contextmanager
+def booted(request: dict[str, Any]) -> Iterator[BootReport]:
+    """Boot, and send jtqd's heartbeat as long as the context lasts. Raises BootError."""
+    parsed = parse_request(request)
+    ended = threading.Event()
+    with BootBus(parsed) as bus:
+        report = boot(parsed, bus)
+        thread = threading.Thread(target=bus.run, args=(60.0, ended.is_set))
+        thread.start()
+        try:
+            yield report
+        finally:
+            ended.set()
+            thread.join()
+
+
+def boot_all(request: dict[str, Any]) -> BootReport:
+    """Boot the nodes of a request. Raises BootError."""
+    with booted(request) as report:
+        return report

@@ -5,12 +5,9 @@ import json
 import subprocess
 import sys
 import time
-import uuid
 
-import can
 import pytest
 
-from jtqd.drivers.boot import boot
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
 from jtqd.drivers.boot_request import RequestError, parse_request
@@ -26,7 +23,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo2,
 )
 from jtqd.drivers.pdo import PdoParameters
-from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, drive_store, sensor_store
+from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, boot_all, drive_store, sensor_store
 from tests.paths import ROOT
 
 NODES = [
@@ -44,9 +41,10 @@ REQUEST = {
 
 
 class Bench:
-    """Three nodes on a virtual bus."""
+    """Three nodes in a hub."""
 
-    def __init__(self):
+    def __init__(self, directory):
+        self._path = str(directory / "hub")
         self.drive1, self.drive2 = TestNode(drive_store(1)), TestNode(drive_store(2))
         self.sensor = TestNode(sensor_store(3))
         self.nodes = [self.drive1, self.drive2, self.sensor]
@@ -54,12 +52,10 @@ class Bench:
         self.extra = list
 
     def boot(self, **changes):
-        channel = uuid.uuid4().hex
-        responder = Responder(can.Bus(interface="virtual", channel=channel), self.nodes)
+        responder = HubResponder(self._path, self.nodes)
         responder.extra = self.extra
         with responder:
-            request = parse_request({**REQUEST, **changes})
-            return boot(request, can.Bus(interface="virtual", channel=channel))
+            return boot_all({**REQUEST, "bus": f"unix:{self._path}", **changes})
 
     def fails(self, **changes):
         with pytest.raises(BootError) as caught:
@@ -68,8 +64,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench():
-    return Bench()
+def bench(tmp_path):
+    return Bench(tmp_path)
 
 
 def test_three_nodes_end_operational_and_mapped(bench):
@@ -464,11 +460,10 @@ class WatchingDrive(TestNode):
         return out
 
 
-def test_a_drive_that_leaves_operational_once_is_started_again() -> None:
-    drive, channel = WatchingDrive(), uuid.uuid4().hex
-    request = parse_request({"bus": "virtual", "heartbeat_ms": 30, "nodes": [{"node": 1, "kind": "drive"}]})
-    with Responder(can.Bus(interface="virtual", channel=channel), [drive]):
-        boot(request, can.Bus(interface="virtual", channel=channel))
+def test_a_drive_that_leaves_operational_once_is_started_again(bench) -> None:
+    drive = WatchingDrive()
+    bench.nodes[:] = [drive]
+    bench.boot(nodes=[{"node": 1, "kind": "drive"}])
     assert (drive.state, drive.starts) == (5, 2)
     # It watches its master all the same: one that dies stops it.
     assert drive.store.number(0x1016, 1) == 0x20 << 16 | 500
@@ -586,8 +581,8 @@ def test_process_with_a_broken_request(text):
 
 @pytest.mark.socketcan
 def test_boot_over_socketcan(bench):
-    with Responder(can.Bus(interface="socketcan", channel="vcan0"), bench.nodes):
-        report = boot(parse_request({**REQUEST, "bus": "vcan0"}))
+    with Responder("vcan0", bench.nodes):
+        report = boot_all({**REQUEST, "bus": "vcan0"})
     assert sorted(report.nodes) == [1, 2, 3]
     assert [node.state for node in bench.nodes] == [5, 5, 5]
 

@@ -14,14 +14,12 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.conditions import Conditions
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from jtqd.drivers.boot import boot
-from jtqd.drivers.boot_request import parse_request
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.models.files import shipped
-from tests.drivers.canopen_nodes import EDS, HubResponder, TestNode, drive_store, sensor_store
+from tests.drivers.canopen_nodes import EDS, HubResponder, TestNode, boot_all, drive_store, sensor_store
 
 OWN = 0x20
 
@@ -61,7 +59,7 @@ class MasterBench:
     def __enter__(self) -> Self:
         self.responder.__enter__()
         socket = open_frame_socket(self.bus, service_filters(self.config), error_frames=True)
-        booted = boot(parse_request(boot_request(self.config, self.bus)))
+        booted = boot_all(boot_request(self.config, self.bus))
         self.report = json.loads(json.dumps(booted.as_json()))  # as the supervisor gets it
         for node in (1, 2, 3):
             self.snapshot.node_states[node] = 5

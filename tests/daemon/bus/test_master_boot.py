@@ -1,18 +1,18 @@
 """Boot by CiA 302-2: signature 1020h, error behaviour 1029h, optional nodes, other masters, status letters G, H, L."""
 
-import uuid
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
-import can
 import pytest
 
-from jtqd.drivers.boot import BootReport, boot
+from jtqd.drivers.boot import BootReport
 from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.boot_procedure import signature
 from jtqd.drivers.boot_request import RequestError, parse_request
 from jtqd.drivers.devices import drive_tpdo1
-from tests.drivers.canopen_nodes import Responder, TestNode, drive_store, sensor_store
+from jtqd.drivers.frame import FRAME
+from tests.drivers.canopen_nodes import HubResponder, TestNode, boot_all, drive_store, sensor_store
 
 REQUEST: dict[str, Any] = {
     "bus": "virtual",
@@ -30,7 +30,8 @@ REQUEST: dict[str, Any] = {
 class Bus:
     """Two drives and a sensor; `extra` frames come beside theirs."""
 
-    def __init__(self) -> None:
+    def __init__(self, directory: Path) -> None:
+        self._path = str(directory / "hub")
         self.one, self.two, self.sensor = (
             TestNode(drive_store(1)),
             TestNode(drive_store(2)),
@@ -41,18 +42,15 @@ class Bus:
         self.heard: list[tuple[int, bytes]] = []
 
     def boot(self, **changes: Any) -> BootReport:
-        channel = uuid.uuid4().hex
-        listener = can.Bus(interface="virtual", channel=channel)
-        responder = Responder(can.Bus(interface="virtual", channel=channel), self.nodes)
+        responder = HubResponder(self._path, self.nodes)
         responder.extra = self.extra
-        try:
-            with responder:
-                request = parse_request({**REQUEST, **changes})
-                return boot(request, can.Bus(interface="virtual", channel=channel))
-        finally:
-            while message := listener.recv(0):
-                self.heard.append((message.arbitration_id, bytes(message.data)))
-            listener.shutdown()
+        responder.hub.attach(self._hear)
+        with responder:
+            return boot_all({**REQUEST, "bus": f"unix:{self._path}", **changes})
+
+    def _hear(self, frame16: bytes, _stamp_ns: int) -> None:
+        can_id, length, data = FRAME.unpack(frame16)
+        self.heard.append((can_id, data[:length]))
 
     def fails(self, **changes: Any) -> BootError:
         with pytest.raises(BootError) as caught:
@@ -61,8 +59,8 @@ class Bus:
 
 
 @pytest.fixture
-def bus() -> Bus:
-    return Bus()
+def bus(tmp_path: Path) -> Bus:
+    return Bus(tmp_path)
 
 
 def test_the_configuration_is_signed_where_the_device_has_1020h(bus: Bus) -> None:

@@ -21,10 +21,9 @@ from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.as_told import layout_told, unit_problems, units_told
 from jtqd.daemon.cli.draft import Wanted, draft_joint, drive_lines
 from jtqd.daemon.config import load_config
-from jtqd.drivers.boot import BootReport, boot
-from jtqd.drivers.boot_request import parse_request
 from jtqd.drivers.devices import CIA_402, DriveProfile, drive_scaling
 from jtqd.drivers.survey import Survey, Tpdo, survey_of_eds
+from tests.drivers.canopen_nodes import booted
 from tests.library_drives.bench import LibraryBench
 from tests.library_drives.motion import moves_as_it_should, quantities
 from tests.library_drives.nodes import GEAR
@@ -272,12 +271,8 @@ def test_units_of_a_drive_on_the_bus(family: str, tmp_path: Path, capsys: pytest
         config = load_config(tmp_path / "jtqd.yaml")
         assert config.joints[0].objects.motor_position.by == by
         assert config.joints[1].objects == CIA_402
-        found: list[dict[str, float]] = []
-
-        def hold(report: BootReport) -> None:
-            found.extend(quantities(bench.bus, report))
-
-        boot(parse_request(boot_request(config, bench.bus)), hold=hold)
+        with booted(boot_request(config, bench.bus)) as report:
+            found = quantities(bench.bus, report)
     assert len(found) == 2
     for each in found:
         moves_as_it_should(each)
@@ -294,14 +289,8 @@ def test_the_mapping_of_a_drive_on_the_bus(tmp_path: Path, capsys: pytest.Captur
         assert "joint 1: tpdos: 3 TPDOs of the drive (as they are, by the bus)" in capsys.readouterr().out
         config = load_config(tmp_path / "jtqd.yaml")
         assert [pdo.cob_id for pdo in config.joints[0].tpdos] == [0x181, 0x381, 0x481]
-        found: list[dict[str, float]] = []
-        reports: list[BootReport] = []
-
-        def hold(report: BootReport) -> None:
-            reports.append(report)
-            found.extend(quantities(bench.bus, report))
-
-        boot(parse_request(boot_request(config, bench.bus)), hold=hold)
-    assert reports[0].nodes[1].tpdos == config.joints[0].tpdos
+        with booted(boot_request(config, bench.bus)) as report:
+            found = quantities(bench.bus, report)
+    assert report.nodes[1].tpdos == config.joints[0].tpdos
     for each in found:
         moves_as_it_should(each)
