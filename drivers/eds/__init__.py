@@ -1,5 +1,4 @@
 """Electronic data sheets (CiA 306): the .eds files of the bench's drive and torque sensor and of jtqd's own node.
 
-`generate` writes them from its tables; `own_objects` names the sub-indices of jtqd's objects for the daemon. Imports
-`drivers` only, and nothing at all on `import jtqd.drivers.eds`.
+`python -m tools.eds` writes them from its tables; `own_objects` names the sub-indices of jtqd's objects for the daemon.
 """

@@ -6,10 +6,9 @@ import re
 import pytest
 from canopen import import_od
 
-from jtqd.drivers.eds.generate import SHEETS, drive, jtqd
 from jtqd.drivers.eds.own_objects import COUNTERS
-from jtqd.drivers.eds.sheet import U8, Var, render
-from tests.drivers.canopen_nodes import EDS
+from tests.paths import EDS
+from tools.eds import SHEETS, U8, Var, drive, jtqd_node, render
 
 FILES = ("drive.eds", "torque_sensor.eds", "jtqd.eds")
 TYPES = {0x02: 8, 0x03: 16, 0x04: 32, 0x05: 8, 0x06: 16, 0x07: 32, 0x08: 32, 0x09: 0}
@@ -298,4 +297,4 @@ def test_jtqd_publishes_the_estimate_and_its_counters():
     assert [eds[f"2200sub{n:X}"]["ParameterName"] for n in range(1, len(COUNTERS) + 1)] == list(COUNTERS)
     assert number(eds["1005"]["DefaultValue"]) == 0x40000080  # bit 30: producer
     assert number(eds["1019"]["DefaultValue"]) == 240
-    assert jtqd().objects[0x2102].data_type == U8
+    assert jtqd_node().objects[0x2102].data_type == U8
