@@ -33,7 +33,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from jtqd.estimator.checked import ConfigError
     from jtqd.estimator.joint import Effect, Joint
-    from jtqd.estimator.methods import estimate_columns, load_network, make_estimator
+    from jtqd.estimator.methods import estimate_columns, make_estimator
+    from jtqd.estimator.network import load_network
     from jtqd.estimator.onnx_graph import NetworkError
     from jtqd.estimator.run import EstimateRun, JointColumns, RunTable, RunTableError
     from jtqd.estimator.settings import METHODS, EstimatorSettings
@@ -69,7 +70,7 @@ _MODULES = {
     "RunTable": "run",
     "RunTableError": "run",
     "estimate_columns": "methods",
-    "load_network": "methods",
+    "load_network": "network",
     "make_estimator": "methods",
 }
 

@@ -4,7 +4,7 @@ from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.joint import Joint, Torsion
 from jtqd.estimator.learned import Zeros
-from jtqd.estimator.network import FusedNetworkModel, NetworkModel
+from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
@@ -17,7 +17,7 @@ def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: 
 
 class JointEstimator(Estimator):
     def __init__(
-        self, joint: Joint, settings: EstimatorSettings, network: NetworkModel | None = None
+        self, joint: Joint, settings: EstimatorSettings, network: TorqueNetwork | None = None
     ) -> None: ...
     def blocks(self) -> tuple[bytes, bytes]: ...
     @classmethod
@@ -27,7 +27,7 @@ class JointEstimator(Estimator):
 
 class FusedEstimator(Estimator):
     def __init__(
-        self, joint: Joint, settings: EstimatorSettings, network: FusedNetworkModel | None = None
+        self, joint: Joint, settings: EstimatorSettings, network: FusedNetwork | None = None
     ) -> None: ...
     def blocks(self) -> tuple[bytes, bytes]: ...
     @classmethod

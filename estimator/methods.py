@@ -13,24 +13,12 @@ from jtqd.estimator.corrections import acting_effects, plain_joint
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
-from jtqd.estimator.onnx_graph import Verdict
 from jtqd.estimator.run import EstimateRun, JointColumns
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
 
 AnyEstimator = Estimator
 AnyNetwork = TorqueNetwork | FusedNetwork
-
-
-def load_network(
-    method: str, source: bytes | str, sha256: str | None = None, verdict: Verdict | None = None
-) -> AnyNetwork:
-    """Return the network of a method from a file or bytes. Raises NetworkError.
-
-    verdict: of ONNX Runtime in another process (`AnyNetwork.verdict`); None: it judges here.
-    """
-    kind = FusedNetwork if method == "fused" else TorqueNetwork
-    return kind(source, sha256, verdict)
 
 
 def make_estimator(

@@ -1,17 +1,18 @@
-"""An ONNX graph run by ONNX Runtime: one thread, float64, checked before its first use. The only file that imports it.
+"""An ONNX file of a network: its bytes, hash, metadata and weights, and its graph run by ONNX Runtime.
 
-The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm]. Its
-metadata hold one JSON value per key; the caller names the keys that must be there.
+The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm], float64. The
+metadata hold one JSON value per key; the caller names the keys that must be there. Key `perceptron` holds the weights
+(`perceptron_content`), so that the graph can be evaluated natively. The package onnx, where it is installed, reads them
+from the graph of a file without that key.
 
-    OnnxGraph       opened here: the referee of every graph, and what runs one that is not ours
-    RefereedGraph   one of ours that ONNX Runtime has judged in another process (`Verdict`): runs natively, without the
-                    40 MB of the runtime
-
-A single sample goes through an I/O binding on two preallocated numpy buffers: no array is made per call.
+    OnnxGraph     checked here by ONNX Runtime, which also evaluates every graph without known weights
+    NativeGraph   checked by ONNX Runtime in another process (`RuntimeCheck`), evaluated natively without the runtime's 40 MB
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
 import math
 import os
@@ -19,8 +20,10 @@ import stat
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -28,28 +31,32 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.envelope import finite
-from jtqd.estimator.onnx_weights import fault_of, read_perceptron
+from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.sha256 import sha256_hex
 
-_PROBES: Final = (0.25, -0.5)  # two different inputs: the binding must see the second one
+PERCEPTRON: Final = "perceptron"
+"""Key of the metadata that holds the weights."""
 _WARM_UP: Final = 50
 _LONGEST_S: Final = 5.0
-"""Of this process's own processor time for each step before the first use: a busy machine is no endless loop."""
+"""Processor time of this process for each step before the first use: a busy machine is no endless loop."""
 _TIMES_BY_THE_CLOCK: Final = 6.0
-"""So many times as long by the clock: a step that waits for ever takes no processor time."""
+"""Limit by the clock in units of _LONGEST_S: a step that blocks takes no processor time."""
 _POLL_S: Final = 0.1
-_NATIVE_PROBES: Final = 256
+_PROBES: Final = 256
 """Inputs at which native evaluation is compared: in the range of the training data, and a quarter of it beyond."""
+_SAME: Final = 1e-9
+"""Relative and absolute difference [Nm] up to which weights read from a graph are those that it evaluates."""
 
 
 class NetworkError(ValueError):
     """The network file cannot be used; one line that names file, found and expected."""
 
 
-class Verdict(NamedTuple):
-    """What ONNX Runtime has found in a file that it accepts.
+class RuntimeCheck(NamedTuple):
+    """What ONNX Runtime found in a file that it accepts.
 
-    native_error_nm: largest difference of native evaluation at the probes; None for a graph that is not one of ours.
+    metadata: with the weights under PERCEPTRON where they are known; native_error_nm: largest difference of native
+    evaluation at the probes, None where the weights are not known.
     """
 
     sha256: str
@@ -57,14 +64,54 @@ class Verdict(NamedTuple):
     native_error_nm: float | None
 
 
+def perceptron_content(
+    layers: Sequence[tuple[FloatArray, FloatArray]], gate: Sequence[int] | None = None
+) -> dict[str, Any]:
+    """Return the JSON-able value of the metadata key PERCEPTRON; layers, gate: as `Perceptron` takes them.
+
+    numbers: per layer weights [inputs][outputs], then biases [outputs]; little-endian float64 in base64.
+    """
+    numbers = [np.concatenate((w.ravel(), b)).astype("<f8").tobytes() for w, b in layers]
+    return {
+        "widths": [layers[0][0].shape[0], *(len(b) for _, b in layers)],
+        "numbers": [base64.b64encode(each).decode() for each in numbers],
+        "gate": None if gate is None else list(gate),
+    }
+
+
+def perceptron_of(content: Any) -> Perceptron:
+    """Return the network of a metadata value as `perceptron_content` writes it. Raises ValueError."""
+    try:
+        widths, numbers, gate = (content[key] for key in ("widths", "numbers", "gate"))
+        if len(widths) < 2 or not all(isinstance(each, int) and each > 0 for each in widths):
+            raise ValueError(f"found widths {str(widths)[:40]}, expected at least 2 whole numbers > 0")
+        if len(numbers) != len(widths) - 1:
+            raise ValueError(f"found numbers of {len(numbers)} layers, expected {len(widths) - 1}")
+        layers = []
+        for text, (inputs, outputs) in zip(numbers, pairwise(widths), strict=True):
+            values = np.frombuffer(base64.b64decode(text, validate=True), "<f8").astype(np.float64)
+            if not np.isfinite(values).all():
+                raise ValueError("found a value that is not finite")
+            layers.append((values[:-outputs].reshape(inputs, outputs), values[-outputs:]))
+        return Perceptron(layers, gate)
+    except (TypeError, KeyError, IndexError, OverflowError, binascii.Error) as error:
+        raise ValueError(f"found no layers as 'jtq train' writes them ({error})") from None
+
+
 class GraphFile:
-    """Bytes of a network file with their hash, and what the metadata say.
+    """Bytes of a network file with their hash, and access to its metadata.
 
     source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None.
-    Raises NetworkError for an unreadable file or another hash. Public: `name`, `sha256`, `metadata`.
+    Raises NetworkError for an unreadable file or another hash. Public: `name`, `sha256`, `metadata`, `perceptron` (None
+    where the weights are not known), `native_error_nm` (of `RuntimeCheck`), `run_one(*x)` torque of one sample [Nm],
+    `run_many([n, features])` of many.
     """
 
     metadata: dict[str, Any]
+    perceptron: Perceptron | None
+    native_error_nm: float | None
+    run_one: Callable[..., float]
+    run_many: Callable[[FloatArray], FloatArray]
 
     def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None) -> None:
         self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
@@ -72,6 +119,11 @@ class GraphFile:
         self.sha256: Final = sha256_hex(self._data)
         if sha256 is not None and sha256.lower() != self.sha256:
             raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
+
+    @property
+    def check(self) -> RuntimeCheck:
+        """What a `NativeGraph` of the same bytes needs."""
+        return RuntimeCheck(self.sha256, self.metadata, self.native_error_nm)
 
     def error(self, text: str) -> NetworkError:
         """Return the error to raise, with the file's name."""
@@ -102,51 +154,46 @@ class GraphFile:
             reason = str(error)
         raise self.error(f"cannot be read: {reason}")
 
+    def _perceptron(self) -> Perceptron | None:
+        """Return the network of the metadata; None without key PERCEPTRON."""
+        if PERCEPTRON not in self.metadata:
+            return None
+        try:
+            return perceptron_of(self.metadata[PERCEPTRON])
+        except ValueError as error:
+            raise self.error(f"metadata '{PERCEPTRON}': {error}") from None
 
-class RefereedGraph(GraphFile):
-    """A graph of ours that ONNX Runtime has judged in another process; runs natively.
 
-    source, sha256, errors: as `GraphFile`; verdict: on the very bytes that are read here. NetworkError for a verdict on
-    other bytes, or on a graph that is not one of ours.
+class NativeGraph(GraphFile):
+    """A graph with known weights that ONNX Runtime has checked in another process.
+
+    source, sha256, errors: as `GraphFile`; check: of the very bytes that are read here. NetworkError for a check of other
+    bytes.
     """
 
-    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None, verdict: Verdict) -> None:
+    def __init__(
+        self, source: bytes | str | os.PathLike[str], sha256: str | None, check: RuntimeCheck
+    ) -> None:
         super().__init__(source, sha256)
-        if self.sha256 != verdict.sha256:
+        if self.sha256 != check.sha256:
             raise self.error(
-                f"was changed while it was checked: found SHA-256 {self.sha256}, checked {verdict.sha256}"
+                f"was changed while it was checked: found SHA-256 {self.sha256}, checked {check.sha256}"
             )
-        perceptron = read_perceptron(self._data)
-        if perceptron is None or verdict.native_error_nm is None:
-            raise self.error("found a graph that needs ONNX Runtime, expected one of ours")
-        self.metadata = verdict.metadata
-        self.perceptron: Final = perceptron
-        self.bound: Final = False
-        self.run_one: Final = perceptron.run_one
-        self.run_many: Final = perceptron.run_many
-        self._verdict: Final = verdict
-
-    def prepare(self, low: FloatArray, high: FloatArray) -> None:
-        """Return at once: what needs preparation is the runtime."""
-
-    def verdict(self) -> Verdict:
-        """Return the verdict."""
-        return self._verdict
-
-    def native_error_nm(self) -> float:
-        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
-        assert self._verdict.native_error_nm is not None
-        return self._verdict.native_error_nm
+        self.metadata = check.metadata
+        self.native_error_nm = check.native_error_nm
+        self.perceptron = perceptron = self._perceptron()
+        if perceptron is None:
+            raise self.error(f"metadata '{PERCEPTRON}': missing, expected the weights of the network")
+        self.run_one, self.run_many = perceptron.run_one, perceptron.run_many
 
 
 class OnnxGraph(GraphFile):
-    """A loaded graph with `features` inputs.
+    """A graph loaded and checked by ONNX Runtime.
 
-    source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys:
-    metadata that must be there. Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or
-    missing metadata, weights that are not finite or stand in another file, and no answer or several to one input. Public:
-    `run_one`, `bound` (after `prepare`: samples go through the binding, not through run()), `perceptron` (the same graph for
-    native evaluation, None for a graph that is not one of ours).
+    source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys: metadata
+    that must be there, the first two of them the lowest and highest value per feature in the training data. Raises
+    NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata, constants that are not
+    finite or stand in another file, and no finite answer or several to one input.
     """
 
     def __init__(
@@ -158,52 +205,47 @@ class OnnxGraph(GraphFile):
     ) -> None:
         super().__init__(source, sha256)
         self._width: Final = len(features)
-        readable = self._check_weights()
-        self._session: Final = self._open(self._data)
-        if not readable:
-            raise self.error("found a file whose weights cannot be checked")
-        self.perceptron: Final = read_perceptron(self._data)
-        self._output: Final = self._check_graph()
+        self._session: Final = self._open()
+        self._check_graph()
         self.metadata = self._read_metadata(features, keys)
+        low, high = (np.array(self.numbers(key, self._width)) for key in keys[:2])
+        for name, lowest, highest in zip(features, low, high, strict=True):
+            if lowest > highest:
+                raise self.error(
+                    f"metadata range of {name}: found {keys[0]} {lowest:g} above {keys[1]} {highest:g}"
+                )
+        weights = None if PERCEPTRON in self.metadata else self._read_weights()
         self._x: Final = np.zeros((1, self._width))
-        self._y: Final = np.zeros((1, 1))
         self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
-        self._y_view: Final[Any] = self._y.reshape(-1).data  # 3 times faster than numpy indexing
         self._pack: Final = struct.Struct(f"={self._width}d").pack_into
-        self.bound = False
-        self.run_one: Callable[..., float] = self._run_plain
-        """Torque [Nm] of one sample; the arguments are the features in their order. Take it after `prepare`."""
+        self.run_one, self.run_many = self._run_one, self._run_many
+        self._answered(partial(self._warm_up, (low + high) / 2))
+        share = np.random.default_rng(0).uniform(-0.25, 1.25, (_PROBES, self._width))
+        probes = low + share * (high - low)
+        answers = self._run_many(probes)
+        with suppress(ValueError):  # weights that do not fit together, or into the block
+            if weights is not None and np.allclose(
+                perceptron_of(weights).run_many(probes), answers, rtol=_SAME, atol=_SAME
+            ):
+                self.metadata[PERCEPTRON] = weights
+        self.perceptron, self.native_error_nm = self._perceptron(), None
+        if self.perceptron is not None:
+            inputs = self.metadata[PERCEPTRON]["widths"][0]
+            if inputs != self._width:
+                raise self.error(f"metadata '{PERCEPTRON}': found {inputs} inputs, expected {self._width}")
+            self.native_error_nm = float(np.max(np.abs(self.perceptron.run_many(probes) - answers)))
 
-    def _run_plain(self, *x: float) -> float:
+    def _run_one(self, *x: float) -> float:
         self._pack(self._x_bytes, 0, *x)
         return float(self._session.run(None, {"x": self._x})[0][0, 0])
 
-    def run_many(self, features: FloatArray) -> FloatArray:
-        """Return torques [n] of samples [n, features]; equal to run_one to rounding."""
+    def _run_many(self, features: FloatArray) -> FloatArray:
         if features.ndim != 2 or features.shape[1] != self._width:
             raise ValueError(f"found features of shape {features.shape}, expected [n, {self._width}]")
         if len(features) == 0:
             return np.zeros(0)
         result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
         return result[:, 0]
-
-    def verdict(self) -> Verdict:
-        """Return what a `RefereedGraph` of the same bytes needs; after `prepare`."""
-        return Verdict(
-            self.sha256, self.metadata, None if self.perceptron is None else self.native_error_nm()
-        )
-
-    def native_error_nm(self) -> float:
-        """Return the largest difference [Nm] between native evaluation and ONNX Runtime over the probes."""
-        assert self.perceptron is not None
-        return float(np.max(np.abs(self.perceptron.run_many(self._probes) - self.run_many(self._probes))))
-
-    def prepare(self, low: FloatArray, high: FloatArray) -> None:
-        """Bind and warm up between `low` and `high` [features], where the graph must give finite torques."""
-        self._answered(partial(self._bind, low, high))
-        self._answered(partial(self._warm_up, (low + high) / 2))
-        share = np.random.default_rng(0).uniform(-0.25, 1.25, (_NATIVE_PROBES, self._width))
-        self._probes = low + share * (high - low)
 
     def _answered(self, step: Callable[[], Any]) -> Any:
         """Return what `step` returns; NetworkError when it has not after _LONGEST_S: it may loop for ever, or block.
@@ -231,7 +273,7 @@ class OnnxGraph(GraphFile):
             raise self.error(f"found no answer within {_LONGEST_S:g} s, expected one: it is not used")
         return results[0]
 
-    def _open(self, data: bytes) -> Any:
+    def _open(self) -> Any:
         os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read once, when the library is loaded
         import onnxruntime as ort
 
@@ -241,30 +283,20 @@ class OnnxGraph(GraphFile):
         options.inter_op_num_threads = 1
         options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        options.log_severity_level = 4  # what is wrong comes as an exception; nothing else on stderr
+        # weights in another file, which the SHA-256 is not of, are looked for where no file can be
+        options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+        options.log_severity_level = 4  # faults come as exceptions; nothing else on stderr
         try:
             return self._answered(
-                partial(ort.InferenceSession, data, options, providers=["CPUExecutionProvider"])
+                partial(ort.InferenceSession, self._data, options, providers=["CPUExecutionProvider"])
             )
         except NetworkError:
             raise
         except Exception as error:  # onnxruntime raises its own types, without a common base
-            lines = str(error).strip().splitlines()
-            reason = lines[0][:160] if lines else type(error).__name__
-            raise self.error(f"not a usable ONNX model: {reason}") from None
+            raise self.error(f"not a usable ONNX model: {_first_line(error)}") from None
 
-    def _check_weights(self) -> bool:
-        """Raises NetworkError for weights not finite or in another file. False where only the runtime can tell."""
-        try:
-            fault = fault_of(self._data)
-        except ValueError:
-            return False
-        if fault is not None:
-            raise self.error(fault)
-        return True
-
-    def _check_graph(self) -> str:
-        """Return the output's name; NetworkError unless there is one input "x" [N, features] and one output [N, 1]."""
+    def _check_graph(self) -> None:
+        """NetworkError unless there is one input "x" [N, features] and one output [N, 1]."""
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if [i.name for i in inputs] != ["x"]:
             raise self.error(f"found inputs {[i.name for i in inputs]}, expected one, 'x'")
@@ -276,7 +308,6 @@ class OnnxGraph(GraphFile):
             shape = list(node.shape)
             if len(shape) != 2 or isinstance(shape[0], int) or shape[1] != width:
                 raise self.error(f"found {what} of shape {shape}, expected ['N', {width}]")
-        return str(outputs[0].name)
 
     def _read_metadata(self, features: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Any]:
         try:
@@ -284,7 +315,7 @@ class OnnxGraph(GraphFile):
         except UnicodeDecodeError as error:
             raise self.error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
         metadata: dict[str, Any] = {}
-        for key in ("features", *keys):
+        for key in ("features", *keys, *({PERCEPTRON} & raw.keys())):
             if key not in raw:
                 raise self.error(f"metadata '{key}': missing, found only {sorted(raw)}")
             try:
@@ -295,53 +326,77 @@ class OnnxGraph(GraphFile):
             raise self.error(f"metadata 'features': found {metadata['features']}, expected {list(features)}")
         return metadata
 
-    def _bind(self, low: FloatArray, high: FloatArray) -> None:
-        """Bind the buffers and prove that they are used in place; otherwise plain run() serves."""
-        import onnxruntime as ort
+    def _read_weights(self) -> dict[str, Any] | None:
+        """Return the weights of a graph as `jtq train` writes it, as `perceptron_content`, read by the package onnx.
 
+        None without the package, or for any other graph. Raises NetworkError for constants that are not finite.
+        """
         try:
-            self._held = ort.OrtValue.ortvalue_from_numpy(self._x), ort.OrtValue.ortvalue_from_numpy(self._y)
-            self._io = self._session.io_binding()
-            self._io.bind_ortvalue_input("x", self._held[0])
-            self._io.bind_ortvalue_output(self._output, self._held[1])
-            # the session's own method: the Python wrapper around it costs as much as a layer of the network
-            call, binding = self._session._sess.run_with_iobinding, self._io._iobinding
-            options = ort.RunOptions()  # None would make new ones for each sample, 0.7 us
-            options.log_severity_level = 4
-            self.bound = all(self._aliases(partial(call, binding, options), p, low, high) for p in _PROBES)
-        except (AttributeError, TypeError, RuntimeError):
-            self.bound = False
-        if self.bound:
-            self.run_one = self._bound_call(call, binding, options)
-
-    def _bound_call(self, call: Callable[..., None], binding: Any, options: Any) -> Callable[..., float]:
-        """Return `run_one` over the bound buffers; a closure, as each attribute costs time in the loop."""
-        pack, x_bytes, y = self._pack, self._x_bytes, self._y_view
-
-        def run_one(*x: float) -> float:
-            pack(x_bytes, 0, *x)
-            call(binding, options)
-            return y[0]  # type: ignore[no-any-return]
-
-        return run_one
-
-    def _aliases(self, run: Callable[[], None], probe: float, low: FloatArray, high: FloatArray) -> bool:
-        self._x[0] = (low + high) / 2 + probe * np.maximum(high - low, 1.0)
-        self._y[0, 0] = math.nan
-        run()
-        expected = self._session.run(None, {"x": self._x.copy()})[0][0, 0]
-        return bool(self._y[0, 0] == expected or (math.isnan(expected) and math.isnan(self._y[0, 0])))
+            import onnx
+        except ImportError:
+            return None
+        try:
+            model = onnx.load_model_from_string(self._data)
+            constants = dict(_constants(model.graph))
+            for function in model.functions:
+                constants |= dict(_constants(function))
+        except Exception as error:  # of onnx, numpy and protobuf
+            raise self.error(f"found constants that cannot be checked: {_first_line(error)}") from None
+        for name, values in constants.items():
+            if values.dtype.kind not in "OSU" and not np.isfinite(values.astype(np.complex128)).all():
+                raise self.error(f"found weights {ascii(name)[:60]} with a value that is not finite")
+        with suppress(ValueError, KeyError, IndexError):
+            return _perceptron_in(model.graph, constants)
+        return None
 
     def _warm_up(self, middle: FloatArray) -> None:
         """First calls allocate: they happen here, not in the loop. A network that fails to run is refused."""
         sample = middle.tolist()
         try:
-            values = [self.run_one(*sample) for _ in range(_WARM_UP)]
+            values = [self._run_one(*sample) for _ in range(_WARM_UP)]
         except Exception as error:  # as in _open
-            raise self.error(f"does not run: {str(error).strip().splitlines()[0][:160]}") from None
+            raise self.error(f"does not run: {_first_line(error)}") from None
         if not math.isfinite(values[-1]):
             raise self.error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
         if len(set(values)) > 1:
             raise self.error(
                 "found different answers to one input, expected the same: a log could not be replayed"
             )
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0][:160] if lines else type(error).__name__
+
+
+def _constants(graph: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of all constants of a graph or function of onnx, also of those in its loops and branches."""
+    from onnx import numpy_helper
+
+    tensors: list[Any] = []
+    if hasattr(graph, "initializer"):
+        tensors += [*graph.initializer, *(each.values for each in graph.sparse_initializer)]
+    for attribute in (each for node in graph.node for each in node.attribute):
+        sparse = (attribute.sparse_tensor, *attribute.sparse_tensors)
+        tensors += [attribute.t, *attribute.tensors, *(each.values for each in sparse)]
+        yield attribute.name, np.array([attribute.f, *attribute.floats])
+        for inner in (attribute.g, *attribute.graphs):
+            yield from _constants(inner)
+    yield from ((each.name, numpy_helper.to_array(each)) for each in tensors if each.data_type)
+
+
+def _perceptron_in(graph: Any, constants: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return `perceptron_content` of a graph with operators and names as `jtq train` writes them, None for any other.
+
+    Whether the constants are wired as there shows the comparison with ONNX Runtime.
+    """
+    operators = [node.op_type for node in graph.node]
+    count = operators.count("Gemm")
+    plain = ["Gemm", "Tanh"] * (count - 1) + ["Gemm"]
+    layers: Any = [(constants.get(f"W{n}"), constants.get(f"b{n}")) for n in range(count)]
+    if operators not in (plain, [*plain, "MatMul", "Mul", "MatMul"]) or not all(
+        isinstance(each, np.ndarray) and each.dtype == np.float64 for layer in layers for each in layer
+    ):
+        return None
+    gate = None if operators == plain else constants["pick"].argmax(axis=0).tolist()
+    return perceptron_content(layers, gate)

@@ -45,9 +45,9 @@ from jtqd.drivers.filters import CanFilter, look_alikes
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_estimator
-from jtqd.estimator.network import FusedNetwork
-from jtqd.estimator.onnx_graph import NetworkError, Verdict
+from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
+from jtqd.estimator.network import FusedNetwork, load_network
+from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
 
 _PATIENCE_S = 1.0
 """The supervisor turns twenty times a second; after so long without a turn the watchdog is fed no more."""
@@ -128,7 +128,7 @@ def physics_only(joint: JointConfig, network: AnyNetwork | None) -> str:
 def build_estimator(
     config: Config,
     joint: JointConfig,
-    verdict: Verdict | str | None = None,
+    verdict: RuntimeCheck | str | None = None,
     notes: list[str] | None = None,
 ) -> AnyEstimator:
     """Build the estimator of one joint as configured; raises ConfigError or NetworkError.

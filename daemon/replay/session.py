@@ -37,8 +37,8 @@ from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.learned import same_past
-from jtqd.estimator.methods import AnyEstimator, AnyNetwork, load_network, make_estimator
-from jtqd.estimator.network import NATIVE_LIMIT
+from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
+from jtqd.estimator.network import NATIVE_LIMIT, load_network
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.models.files import load_joint
 

@@ -30,7 +30,8 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, observe_run, quadrants
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network
+from jtqd.estimator.methods import AnyNetwork, estimate_columns
+from jtqd.estimator.network import load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings, recommended

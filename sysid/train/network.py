@@ -22,6 +22,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.onnx_graph import PERCEPTRON, perceptron_content
 
 Layer = tuple[FloatArray, FloatArray]
 
@@ -194,7 +195,15 @@ def export_network(  # noqa: PLR0917 - the quantities of the equation, in its or
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jtqd")
     model.ir_version = IR_VERSION
-    helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
+    return serialised(model, metadata, perceptron_content(folded))
+
+
+def serialised(model: Any, metadata: Mapping[str, Any], perceptron: Mapping[str, Any]) -> bytes:
+    """Return the ONNX file of a model with its metadata, the weights for native evaluation among them."""
+    from onnx import helper
+
+    values = {**metadata, PERCEPTRON: perceptron}
+    helper.set_model_props(model, {key: json.dumps(value) for key, value in values.items()})
     data: bytes = model.SerializeToString()
     return data
 

@@ -11,7 +11,6 @@ Whether a network is worth its risk: judged on runs left out, with a share that 
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
@@ -25,6 +24,7 @@ from jtqd.estimator.estimator import FusedEstimator, quadrants
 from jtqd.estimator.fusion import Fusion, turning
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
+from jtqd.estimator.onnx_graph import perceptron_content
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.fit.calibration import conformal_scale
 from jtqd.sysid.fit.envelope import envelope_of
@@ -33,7 +33,15 @@ from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.residuals import loss_and_width
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
-from jtqd.sysid.train.network import IR_VERSION, OPSET, Trained, folded_layers, hidden_output, train
+from jtqd.sysid.train.network import (
+    IR_VERSION,
+    OPSET,
+    Trained,
+    folded_layers,
+    hidden_output,
+    serialised,
+    train,
+)
 from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned
 
 LEAST_GAIN: Final = 0.30
@@ -155,9 +163,7 @@ def export_gated(trained: Trained, waves: int, metadata: Mapping[str, Any]) -> b
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jtqd")
     model.ir_version = IR_VERSION
-    helper.set_model_props(model, {key: json.dumps(value) for key, value in metadata.items()})
-    data: bytes = model.SerializeToString()
-    return data
+    return serialised(model, metadata, perceptron_content(layers, range(core, core + waves)))
 
 
 _SETTINGS: Final = EstimatorSettings(method="fused", track_zeros=False)

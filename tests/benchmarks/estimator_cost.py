@@ -15,8 +15,8 @@ from dataclasses import replace
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import LossModel
-from jtqd.estimator.methods import load_network, make_estimator
-from jtqd.estimator.network import FusedNetwork, TorqueNetwork
+from jtqd.estimator.methods import make_estimator
+from jtqd.estimator.network import FusedNetwork, TorqueNetwork, load_network
 from jtqd.estimator.settings import METHODS, EstimatorSettings, recommended
 from tests.benchmarks.measure import quantile
 from tests.benchmarks.table import mark

@@ -20,7 +20,8 @@ from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.methods import AnyNetwork, estimate_columns, load_network, make_estimator
+from jtqd.estimator.methods import AnyNetwork, estimate_columns, make_estimator
+from jtqd.estimator.network import load_network
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 from tests.estimator.effects.effect_signals import PLAIN, extended

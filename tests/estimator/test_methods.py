@@ -10,8 +10,8 @@ import pytest
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.methods import estimate_columns, load_network, make_estimator
-from jtqd.estimator.network import FusedNetwork, TorqueNetwork
+from jtqd.estimator.methods import estimate_columns, make_estimator
+from jtqd.estimator.network import FusedNetwork, TorqueNetwork, load_network
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.estimator_helpers import joint1, small_network

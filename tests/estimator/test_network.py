@@ -1,4 +1,4 @@
-"""Both networks: exported graph against numpy, one sample against many, and every way a file can be wrong."""
+"""Network files of both kinds: exported graph against numpy, weights in the metadata, and every way a file can be wrong."""
 
 from __future__ import annotations
 
@@ -17,43 +17,62 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from jtqd.estimator import onnx_graph
-from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork
-from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.estimator import FusedEstimator, JointEstimator
+from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork, native_of
+from jtqd.estimator.onnx_graph import PERCEPTRON, NetworkError
+from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.train.network import export_network
-from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, small_network
+from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, joint1, motion, small_network
 from tests.estimator.fused_helpers import HIGH as FUSED_HIGH
 from tests.estimator.fused_helpers import LOW as FUSED_LOW
-from tests.estimator.fused_helpers import everywhere, fused_network
+from tests.estimator.fused_helpers import everywhere, fused_joint, fused_network
 from tests.paths import ROOT
+
+Change = Callable[[onnx.ModelProto], None]
 
 
 def inputs(count: int, seed: int = 2) -> np.ndarray[Any, np.dtype[np.float64]]:
     return np.random.default_rng(seed).normal(size=(count, 6)) * 2.0 * np.array(HIGH)
 
 
-def edited(change: Callable[[onnx.ModelProto], None]) -> bytes:
-    model = onnx.load_from_string(small_network().data)
+def edited(change: Change, small: SmallNetwork | None = None, *, weights: bool = False) -> bytes:
+    """Return a changed file, without the weights in its metadata unless asked for."""
+    model = onnx.load_from_string((small or small_network(3, noise=0.3)).data)
+    if not weights:
+        model.metadata_props.remove(entry(model, PERCEPTRON))
     change(model)
     data: bytes = model.SerializeToString()
     return data
 
 
-def refused(source: bytes | Path, **options: Any) -> str:
+def entry(model: onnx.ModelProto, key: str) -> Any:
+    return next(each for each in model.metadata_props if each.key == key)
+
+
+def nothing(model: onnx.ModelProto) -> None:
+    pass
+
+
+def refused(source: bytes | Path, kind: Any = TorqueNetwork, **options: Any) -> str:
     with pytest.raises(NetworkError) as caught:
-        TorqueNetwork(source, **options)
+        kind(source, **options)
     message = str(caught.value)
     assert "\n" not in message
     return message
 
 
+# ---- values
+
+
 def test_the_graph_is_the_paper_s_network() -> None:
     """Weights well into saturation, so that tanh(x) instead of tanh(x/2) would be far off."""
-    wild = small_network(3, noise=0.9)
-    network = TorqueNetwork(wild.data)
+    saturated = small_network(3, noise=0.9)
+    network = TorqueNetwork(saturated.data)
     x = inputs(500)
-    expected = wild.numpy(x)
+    expected = saturated.numpy(x)
     assert np.ptp(expected) > 1.0
     assert np.max(np.abs(network.run_many(x) - expected)) < 1e-9 * np.max(np.abs(expected))
 
@@ -70,28 +89,23 @@ def test_a_network_by_hand() -> None:
     assert TorqueNetwork(data).run_one(2.0, 0.0, 0.0, 0.0, 0.0, 0.0) == pytest.approx(expected, abs=1e-12)
 
 
-def test_one_sample_and_many_agree() -> None:
-    network = TorqueNetwork(small_network(4, noise=0.3).data)
-    x = inputs(2000)
-    assert network.bound
+@pytest.mark.parametrize("kind", ["network", "fused"])
+def test_one_sample_and_many_agree(kind: str) -> None:
+    if kind == "network":
+        small, network = small_network(4, noise=0.3), TorqueNetwork(small_network(4, noise=0.3).data)
+        x = inputs(1500)
+    else:
+        small = fused_network(5, noise=0.8, size_nm=4.0)
+        network = FusedNetwork(small.data)
+        x = np.random.default_rng(6).uniform(FUSED_LOW, FUSED_HIGH, (1500, 7)) * 1.5
     many = network.run_many(x)
+    assert np.max(np.abs(many - small.numpy(x))) < 1e-9
     assert np.max(np.abs(many - [network.run_one(*row) for row in x.tolist()])) < 1e-11
-    assert network.run_many(np.zeros((0, 6))).shape == (0,)
+    assert network.run_many(x[:0]).shape == (0,)
     with pytest.raises(ValueError, match=r"\(4, 5\)"):
         network.run_many(np.zeros((4, 5)))
-    assert math.isnan(network.run_one(math.nan, 0.0, 0.0, 0.0, 0.0, 0.0))
+    assert math.isnan(network.run_one(math.nan, *x[0, 1:].tolist()))
     assert network.run_one(*x[0].tolist()) == many[0]  # NaN leaves nothing behind
-
-
-def test_without_aliasing_it_falls_back_to_plain_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    original = onnxruntime.OrtValue.ortvalue_from_numpy
-    monkeypatch.setattr(onnxruntime.OrtValue, "ortvalue_from_numpy", lambda x: original(x.copy()))
-    network = TorqueNetwork(small_network(4, noise=0.3).data)
-    assert not network.bound
-    x = inputs(20)
-    assert [network.run_one(*row) for row in x.tolist()] == pytest.approx(
-        network.run_many(x).tolist(), abs=1e-11
-    )
 
 
 def test_the_runtime_has_no_thread_of_its_own_and_writes_nothing(tmp_path: Path) -> None:
@@ -115,16 +129,165 @@ def test_the_runtime_is_of_a_version_in_which_that_was_tried() -> None:
     assert (1, 20) <= tuple(map(int, onnxruntime.__version__.split(".")[:2])) < (1, 33)
 
 
+# ---- native evaluation
+
+
+def test_weights_of_the_metadata_and_of_the_graph_are_those_that_onnx_runtime_evaluates() -> None:
+    for seed in range(4):
+        for kind, small, width in (
+            (TorqueNetwork, small_network(seed, noise=0.3), 6),
+            (FusedNetwork, fused_network(seed, size_nm=4.0), 7),
+        ):
+            x = np.random.default_rng(seed).normal(size=(500, width)) * 3.0
+            found = []
+            for network in (kind(small.data), kind(edited(nothing, small))):
+                assert network.perceptron is not None
+                assert network.native_error_nm < 1e-11
+                assert network.perceptron.run_many(x) == pytest.approx(network.run_many(x), abs=1e-11)
+                found.append(network.perceptron.run_many(x).tobytes())
+            assert found[0] == found[1]
+
+
+def test_a_gated_network_of_the_trainer_is_read_from_either() -> None:
+    from jtqd.sysid.train.network import Trained
+    from jtqd.sysid.train.ours import export_gated
+
+    rng = np.random.default_rng(9)
+    weights = [(rng.normal(size=(3, 5)), rng.normal(size=5)), (rng.normal(size=(5, 4)), rng.normal(size=4))]
+    trained = Trained(weights, np.zeros(3), np.ones(3), 0.0, 1.0, [])
+    data = export_gated(trained, 4, fused_network().metadata)
+    model = onnx.load_from_string(data)
+    model.metadata_props.remove(entry(model, PERCEPTRON))
+    one, other = FusedNetwork(data), FusedNetwork(model.SerializeToString())
+    assert one.check.metadata[PERCEPTRON] == other.check.metadata[PERCEPTRON]
+    assert one.check.metadata[PERCEPTRON]["gate"] == [3, 4, 5, 6]
+    assert one.native_error_nm < 1e-12
+
+
+def test_weights_as_a_list_of_doubles_are_read_too() -> None:
+    def change(model: onnx.ModelProto) -> None:
+        for each in model.graph.initializer:
+            values = numpy_helper.to_array(each)
+            each.CopyFrom(
+                helper.make_tensor(each.name, TensorProto.DOUBLE, values.shape, values.ravel().tolist())
+            )
+
+    assert TorqueNetwork(edited(change)).native_error_nm < 1e-11
+
+
+def test_without_the_package_onnx_a_file_without_weights_runs_by_onnx_runtime(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with_weights, without = small_network(3, noise=0.3).data, edited(nothing)
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    assert TorqueNetwork(with_weights).perceptron is not None
+    network = TorqueNetwork(without)
+    assert (network.perceptron, network.native_error_nm) == (None, None)
+    assert native_of(network, joint1()) is None
+    x = inputs(50)
+    assert network.run_many(x) == pytest.approx(TorqueNetwork(with_weights).run_many(x), abs=1e-11)
+
+
+def _last(model: onnx.ModelProto, *nodes: tuple[str, str, str]) -> None:
+    """Append nodes (operator, input, output); "before" is the answer so far."""
+    model.graph.node[-1].output[0] = "before"
+    model.graph.node.extend(helper.make_node(name, [x], [y]) for name, x, y in nodes)
+
+
+def _answer(model: onnx.ModelProto) -> str:
+    return str(model.graph.output[0].name)
+
+
+def other_operator(model: onnx.ModelProto) -> None:
+    model.graph.node[1].op_type = "Sigmoid"
+
+
+def attribute(model: onnx.ModelProto) -> None:
+    model.graph.node[0].attribute.append(helper.make_attribute("alpha", 0.5))
+
+
+def negated_twice(model: onnx.ModelProto) -> None:
+    _last(model, ("Neg", "before", "negative"), ("Neg", "negative", _answer(model)))
+
+
+def tanh_at_the_end(model: onnx.ModelProto) -> None:
+    _last(model, ("Tanh", "before", _answer(model)))
+
+
+def other_source(model: onnx.ModelProto) -> None:
+    model.graph.initializer.append(numpy_helper.from_array(np.eye(6), "eye"))
+    model.graph.node.insert(0, helper.make_node("MatMul", ["x", "eye"], ["same"]))
+    model.graph.node[1].input[0] = "same"
+
+
+@pytest.mark.parametrize("change", [other_operator, attribute, negated_twice, tanh_at_the_end, other_source])
+def test_another_graph_is_not_evaluated_natively(change: Change) -> None:
+    network = TorqueNetwork(edited(change))
+    assert (network.perceptron, network.native_error_nm) == (None, None)
+
+
+def test_a_foreign_graph_gives_the_same_estimates_through_onnx_runtime() -> None:
+    """The estimates of a run agree to rounding."""
+    native, foreign = TorqueNetwork(edited(nothing)), TorqueNetwork(edited(negated_twice))
+    runs = [
+        JointEstimator(joint1(), EstimatorSettings(), each).run(*motion(2, 2000).arrays())
+        for each in (native, foreign)
+    ]
+    assert np.isfinite(runs[0].network_nm).sum() > 500
+    for name in ("torque_nm", "sigma_nm", "network_nm", "physics_nm"):
+        assert getattr(runs[0], name) == pytest.approx(getattr(runs[1], name), abs=1e-9, nan_ok=True)
+    assert np.array_equal(runs[0].status, runs[1].status)
+
+
+def test_a_network_that_raises_is_physics_only() -> None:
+    class Raises:
+        joint, sigma_scale, name = "joint1", (1.0,) * 4, "raises"
+        envelope = FusedNetwork(fused_network().data).envelope
+
+        def run_one(self, *_: float) -> float:
+            raise RuntimeError("no memory")
+
+    joint, m = fused_joint(), motion(2, 2000)
+    run = FusedEstimator(joint, EstimatorSettings(method="fused"), Raises()).run(*m.arrays())  # type: ignore[arg-type]
+    alone = FusedEstimator(joint, EstimatorSettings(method="fused")).run(*m.arrays())
+    assert np.array_equal(run.torque_nm, alone.torque_nm, equal_nan=True)
+    assert not np.isfinite(run.network_nm).any()
+
+
+def with_weight(value: float, name: str = "W1") -> Change:
+    """Put a value into the middle of an initializer."""
+
+    def edit(model: onnx.ModelProto) -> None:
+        tensor = next(each for each in model.graph.initializer if each.name == name)
+        values = numpy_helper.to_array(tensor).copy()
+        values.flat[values.size // 2] = value
+        tensor.CopyFrom(numpy_helper.from_array(values, name))
+
+    return edit
+
+
+@pytest.mark.parametrize("value", [0.3, math.inf])
+def test_a_graph_that_is_not_that_of_its_weights_is_refused(value: float) -> None:
+    network = TorqueNetwork(edited(with_weight(value), small_network(), weights=True))
+    with pytest.raises(NetworkError, match="native evaluation and ONNX Runtime"):
+        JointEstimator(joint1(), EstimatorSettings(), network)
+
+
+# ---- refusals
+
+
 def test_metadata_and_hash(tmp_path: Path) -> None:
-    small = small_network()
-    path = tmp_path / "a.onnx"
-    path.write_bytes(small.data)
-    network = TorqueNetwork(path)
+    path, ours = tmp_path / "a.onnx", tmp_path / "ours.onnx"
+    path.write_bytes(small_network().data)
+    ours.write_bytes(fused_network().data)
+    network, fused = TorqueNetwork(path), FusedNetwork(ours)
     assert (network.envelope_low, network.envelope_high) == (LOW, HIGH)
     assert (network.sigma_nm, network.joint, network.data_sha256) == (0.31, "joint1", "ab" * 32)
     assert TorqueNetwork(path, sha256=network.sha256.upper()).sha256 == network.sha256
     message = refused(path, sha256="0" * 64)
     assert message.startswith(f"{path}: found SHA-256 {network.sha256}, expected 000")
+    assert (fused.joint, fused.data_sha256, fused.sigma_scale) == ("joint1", "cd" * 32, (0.5, 0.6, 0.7, 0.8))
+    assert (fused.envelope, fused.name, fused.corrects) == (everywhere(), str(ours), True)
 
 
 def test_unreadable_and_corrupt_files(tmp_path: Path) -> None:
@@ -137,11 +300,12 @@ def test_unreadable_and_corrupt_files(tmp_path: Path) -> None:
         assert refused(bad).startswith("network (bytes): ")
 
 
-def test_flipped_bytes_never_give_another_exception() -> None:
+@pytest.mark.parametrize("weights", [True, False], ids=["weights in the metadata", "weights in the graph"])
+def test_flipped_bytes_never_give_another_exception(weights: bool) -> None:
     seed = 99
     rng = np.random.default_rng(seed)
-    good = small_network().data
-    for round_ in range(150):
+    good = edited(nothing, weights=weights)
+    for round_ in range(100):
         data = bytearray(good)
         for _ in range(rng.integers(1, 6)):
             data[rng.integers(0, len(data))] = rng.integers(0, 256)
@@ -155,44 +319,111 @@ def test_flipped_bytes_never_give_another_exception() -> None:
         assert single_line, (seed, round_)
 
 
+FUSED_KEYS = fused_network().metadata
+
+
 @pytest.mark.parametrize(
-    ("key", "value", "words"),
+    ("kind", "key", "value", "words"),
     [
-        ("features", ..., "metadata 'features': missing"),
-        ("features", list(FEATURES)[::-1], "metadata 'features': found ['efficiency_torque_nm'"),
-        ("envelope_low", [0.0] * 5, "expected 6 finite numbers"),
-        ("envelope_high", [*HIGH[:5], math.nan], "expected 6 finite numbers"),
-        ("envelope_high", [-7.0, *HIGH[1:]], "envelope of current_a: found low -6 above high -7"),
-        ("sigma_nm", 0.0, "metadata 'sigma_nm': found 0.0, expected a number in Nm > 0"),
-        ("sigma_nm", "0.3", "metadata 'sigma_nm': found '0.3'"),
-        ("joint", "", "metadata 'joint': found ''"),
-        ("joint", ..., "metadata 'joint': missing"),
-        ("data_sha256", 5, "metadata 'data_sha256': found 5"),
+        ("network", "features", ..., "metadata 'features': missing"),
+        ("network", "features", list(FEATURES)[::-1], "metadata 'features': found ['efficiency_torque_nm'"),
+        ("network", "envelope_low", [0.0] * 5, "expected 6 finite numbers"),
+        ("network", "envelope_high", [*HIGH[:5], math.nan], "expected 6 finite numbers"),
+        (
+            "network",
+            "envelope_high",
+            [-7.0, *HIGH[1:]],
+            "range of current_a: found envelope_low -6 above envelope_high -7",
+        ),
+        ("network", "sigma_nm", 0.0, "metadata 'sigma_nm': found 0.0, expected a number in Nm > 0"),
+        ("network", "sigma_nm", "0.3", "metadata 'sigma_nm': found '0.3'"),
+        ("network", "joint", "", "metadata 'joint': found ''"),
+        ("network", "joint", ..., "metadata 'joint': missing"),
+        (
+            "network",
+            "joint",
+            "\x1b[31mjoint1",
+            "metadata 'joint': found '\\x1b[31mjoint1', expected a text of printable characters",
+        ),
+        ("network", "data_sha256", 5, "metadata 'data_sha256': found 5"),
+        *(("fused", key, ..., f"metadata '{key}': missing") for key in FUSED_KEYS),
+        ("fused", "features", list(FUSED_FEATURES)[::-1], "metadata 'features': found ['sin_4"),
+        (
+            "fused",
+            "envelope",
+            everywhere().to_mapping() | {"distance_nm": 0},
+            "metadata 'envelope': distance_nm: found 0",
+        ),
+        ("fused", "envelope", 7, "metadata 'envelope': found 7, expected the keys"),
+        ("fused", "sigma_scale", [1.0] * 3, "found [1.0, 1.0, 1.0], expected 4 finite numbers"),
+        ("fused", "sigma_scale", [1.0, 1.0, -0.1, 1.0], "found [1.0, 1.0, -0.1, 1.0], expected numbers"),
+        ("fused", "sigma_scale", [1.0, 1.0, math.nan, 1.0], "expected 4 finite numbers"),
+        ("fused", "input_low", [0.0] * 8, "metadata 'input_low': found"),
+        ("fused", "input_high", [*FUSED_HIGH[:8], math.inf], "metadata 'input_high': found"),
+        (
+            "fused",
+            "input_low",
+            [9.0, *FUSED_LOW[1:]],
+            "range of joint_velocity_rad_s: found input_low 9 above input_high 3.5",
+        ),
+        ("fused", "joint", 1, "metadata 'joint': found 1, expected a text"),
+        ("fused", "data_sha256", None, "metadata 'data_sha256': found None"),
     ],
 )
-def test_wrong_metadata(key: str, value: object, words: str) -> None:
-    assert words in refused(small_network().with_metadata(**{key: value}).data)
+def test_wrong_metadata(kind: str, key: str, value: object, words: str) -> None:
+    if kind == "network":
+        message = refused(small_network().with_metadata(**{key: value}).data)
+    else:
+        message = refused(fused_network(**{key: value}).data, FusedNetwork)
+    assert message.startswith("network (bytes): ")
+    assert words in message
 
 
-def test_metadata_that_is_not_json() -> None:
+@pytest.mark.parametrize(
+    ("key", "text", "words"),
+    [
+        ("sigma_nm", "0.3 Nm", "metadata 'sigma_nm': found '0.3 Nm', expected JSON"),
+        ("sigma_nm", "[" * 100_000, "metadata 'sigma_nm': found '[[["),
+        (PERCEPTRON, "7", "found no layers"),
+        (PERCEPTRON, "{}", "found no layers"),
+        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["?"], "gate": null}', "found no layers"),
+        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["AAAA"], "gate": null}', "buffer size"),
+        (
+            PERCEPTRON,
+            '{"widths": [6, 1], "numbers": [], "gate": null}',
+            "found numbers of 0 layers, expected 1",
+        ),
+        (PERCEPTRON, '{"widths": [], "numbers": [], "gate": null}', "at least 2 whole numbers"),
+        (PERCEPTRON, '{"widths": [6, -1], "numbers": [""], "gate": null}', "at least 2 whole numbers"),
+        (PERCEPTRON, '{"widths": [6, 1e9], "numbers": [""], "gate": null}', "at least 2 whole numbers"),
+        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["AAAAAAAA+H8="], "gate": null}', "not finite"),
+        (
+            PERCEPTRON,
+            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="], "gate": [1]}',
+            "found gate 1",
+        ),
+        (
+            PERCEPTRON,
+            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="], "gate": ["x"]}',
+            "found no layers",
+        ),
+        (
+            PERCEPTRON,
+            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="], "gate": null}',
+            "found 1 inputs, expected 6",
+        ),
+    ],
+)
+def test_metadata_that_cannot_be_read(key: str, text: str, words: str) -> None:
     def spoil(model: onnx.ModelProto) -> None:
-        next(p for p in model.metadata_props if p.key == "sigma_nm").value = "0.3 Nm"
+        entry(model, key).value = text
 
-    assert "metadata 'sigma_nm': found '0.3 Nm', expected JSON" in refused(edited(spoil))
-
-
-def test_metadata_nested_without_end_and_names_that_steer_a_terminal() -> None:
-    def nested(model: onnx.ModelProto) -> None:
-        next(p for p in model.metadata_props if p.key == "sigma_nm").value = "[" * 100_000
-
-    assert "metadata 'sigma_nm': found '[[[" in refused(edited(nested))
-    message = refused(small_network().with_metadata(joint="\x1b[31mjoint1").data)
-    assert "metadata 'joint': found '\\x1b[31mjoint1', expected a text of printable characters" in message
+    assert words in refused(edited(spoil, weights=True))
 
 
 def test_a_graph_that_does_not_answer_is_refused(tmp_path: Path) -> None:
     """It is well-formed, and has a loop of 10^15 turns inside; the process that refuses it can end."""
-    helper, kind = onnx.helper, onnx.TensorProto
+    kind = TensorProto
     one = helper.make_tensor("one", kind.DOUBLE, [], [1.0])
     body = helper.make_graph(
         [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Add", ["s", "one"], ["more"])],
@@ -210,12 +441,12 @@ def test_a_graph_that_does_not_answer_is_refused(tmp_path: Path) -> None:
     )
 
     def endless(model: onnx.ModelProto) -> None:
-        (out,) = model.graph.output
         model.graph.initializer.append(helper.make_tensor("turns", kind.INT64, [], [10**15]))
         model.graph.initializer.append(helper.make_tensor("true", kind.BOOL, [], [True]))
-        last = next(node for node in model.graph.node if out.name in node.output)
-        last.output[0] = "before"
-        model.graph.node.append(helper.make_node("Loop", ["turns", "true", "before"], [out.name], body=body))
+        _last(model)
+        model.graph.node.append(
+            helper.make_node("Loop", ["turns", "true", "before"], [_answer(model)], body=body)
+        )
 
     (tmp_path / "endless.onnx").write_bytes(edited(endless))
     program = f"""
@@ -240,91 +471,92 @@ def test_a_step_that_blocks_is_refused_although_it_takes_no_processor_time(
     monkeypatch.setattr(onnx_graph, "_LONGEST_S", 0.05)
     try:
         with pytest.raises(NetworkError, match=r"found no answer within 0\.05 s"):
-            graph._answered(lambda: released.wait(20.0))
+            graph._answered(lambda: released.wait(20.0))  # type: ignore[attr-defined]
     finally:
         released.set()
 
 
-def test_wrong_shapes_types_and_names() -> None:
-    def fixed_batch(model: onnx.ModelProto) -> None:
-        model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
+def fixed_batch(model: onnx.ModelProto) -> None:
+    model.graph.input[0].type.tensor_type.shape.dim[0].dim_value = 1
 
-    def renamed(model: onnx.ModelProto) -> None:
-        model.graph.input[0].name = model.graph.node[0].input[0] = "features"
 
-    assert "of shape [1, 6], expected ['N', 6]" in refused(edited(fixed_batch))
-    assert "found inputs ['features'], expected one, 'x'" in refused(edited(renamed))
+def renamed(model: onnx.ModelProto) -> None:
+    model.graph.input[0].name = model.graph.node[0].input[0] = "features"
+
+
+def drawn(model: onnx.ModelProto) -> None:
+    model.graph.node[-1].output[0] = "before"
+    like = helper.make_node("RandomNormalLike", ["before"], ["lot"], dtype=TensorProto.DOUBLE)
+    model.graph.node.extend((like, helper.make_node("Add", ["before", "lot"], [_answer(model)])))
+
+
+def root(model: onnx.ModelProto) -> None:
+    """Of minus the answer's size."""
+    _last(model, ("Abs", "before", "size"), ("Neg", "size", "less"), ("Sqrt", "less", _answer(model)))
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (fixed_batch, "of shape [1, 6], expected ['N', 6]"),
+        (renamed, "found inputs ['features'], expected one, 'x'"),
+        (drawn, "found different answers to one input"),
+        (root, "found nan at the centre of its envelope"),
+    ],
+)
+def test_graphs_that_cannot_be_used(change: Change, words: str) -> None:
+    assert words in refused(edited(change))
+
+
+def test_networks_of_another_width_or_type() -> None:
     meta = small_network().metadata
     seven = export_network([(np.ones((7, 1)), np.zeros(1))], np.zeros(7), np.ones(7), 0.0, 1.0, meta)
     assert "found input 'x' of shape ['N', 7], expected ['N', 6]" in refused(seven)
-
-
-def test_float32_is_refused() -> None:
-    helper = onnx.helper
-    kind = onnx.TensorProto.FLOAT
+    assert "expected ['N', 7]" in refused(small_network().data, FusedNetwork)
+    assert "expected ['N', 6]" in refused(fused_network().data)
     graph = helper.make_graph(
         [helper.make_node("ReduceSum", ["x", "axes"], ["y"])],
         "g",
-        [helper.make_tensor_value_info("x", kind, ["N", 6])],
-        [helper.make_tensor_value_info("y", kind, ["N", 1])],
-        [onnx.numpy_helper.from_array(np.array([1], np.int64), "axes")],
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["N", 6])],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, ["N", 1])],
+        [numpy_helper.from_array(np.array([1], np.int64), "axes")],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    helper.set_model_props(model, {k: json.dumps(v) for k, v in small_network().metadata.items()})
+    helper.set_model_props(model, {k: json.dumps(v) for k, v in meta.items()})
     message = refused(model.SerializeToString())
     assert "found input 'x' of type tensor(float), expected tensor(double)" in message
-
-
-def with_weight(value: float, name: str = "W1") -> Callable[[onnx.ModelProto], None]:
-    """Put a value into the middle of an initializer."""
-
-    def edit(model: onnx.ModelProto) -> None:
-        tensor = next(each for each in model.graph.initializer if each.name == name)
-        values = onnx.numpy_helper.to_array(tensor).copy()
-        values.flat[values.size // 2] = value
-        tensor.CopyFrom(onnx.numpy_helper.from_array(values, name))
-
-    return edit
-
-
-def with_last(model: onnx.ModelProto, *nodes: onnx.NodeProto) -> None:
-    """Append nodes that make the answer of "before", which is the answer so far."""
-    model.graph.node[-1].output[0] = "before"
-    model.graph.node.extend(nodes)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_weights_that_are_not_finite_are_refused_although_a_layer_hides_them(value: float) -> None:
     words = "found weights 'W1' with a value that is not finite"
     assert words in refused(edited(with_weight(value)))
-    kind, answer = onnx.TensorProto, onnx.load_from_string(small_network().data).graph.output[0].name
 
     def hidden(model: onnx.ModelProto) -> None:
         with_weight(value)(model)
-        model.graph.initializer.append(onnx.helper.make_tensor("zero", kind.DOUBLE, [], [0.0]))
-        with_last(model, onnx.helper.make_node("Mul", ["before", "zero"], [answer]))
+        model.graph.initializer.append(helper.make_tensor("zero", TensorProto.DOUBLE, [], [0.0]))
+        _last(model)
+        model.graph.node.append(helper.make_node("Mul", ["before", "zero"], [_answer(model)]))
 
     assert words in refused(edited(hidden))
 
 
-@pytest.mark.parametrize(
-    "kind", [onnx.TensorProto.FLOAT, onnx.TensorProto.FLOAT16, onnx.TensorProto.BFLOAT16]
-)
+@pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.FLOAT16, TensorProto.BFLOAT16])
 @pytest.mark.parametrize("raw", [True, False])
 def test_constants_of_a_node_are_looked_at_too(kind: int, raw: bool) -> None:
-    helper, answer = onnx.helper, onnx.load_from_string(small_network().data).graph.output[0].name
-
-    def constant(value: float) -> Callable[[onnx.ModelProto], None]:
+    def constant(value: float) -> Change:
         tensor = helper.make_tensor("c", kind, [], [value])
         if raw:
-            tensor = onnx.numpy_helper.from_array(onnx.numpy_helper.to_array(tensor), "c")
+            tensor = numpy_helper.from_array(numpy_helper.to_array(tensor), "c")
 
         def edit(model: onnx.ModelProto) -> None:
-            with_last(
-                model,
-                helper.make_node("Constant", [], ["small"], value=tensor),
-                helper.make_node("Cast", ["small"], ["wide"], to=onnx.TensorProto.DOUBLE),
-                helper.make_node("Min", ["before", "wide"], [answer]),
+            _last(model)
+            model.graph.node.extend(
+                (
+                    helper.make_node("Constant", [], ["small"], value=tensor),
+                    helper.make_node("Cast", ["small"], ["wide"], to=TensorProto.DOUBLE),
+                    helper.make_node("Min", ["before", "wide"], [_answer(model)]),
+                )
             )
 
         return edit
@@ -333,39 +565,23 @@ def test_constants_of_a_node_are_looked_at_too(kind: int, raw: bool) -> None:
     assert TorqueNetwork(edited(constant(1000.0))).perceptron is None
 
 
-def test_weights_in_another_file_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The SHA-256 is of the graph alone then: whoever changes the other file changes the network unseen."""
+@pytest.mark.parametrize("weights", [True, False])
+def test_weights_in_another_file_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, weights: bool
+) -> None:
+    """The SHA-256 is of the graph alone then: a change of the other file would change the network unseen."""
     monkeypatch.chdir(tmp_path)
 
     def external(model: onnx.ModelProto) -> None:
         tensor = model.graph.initializer[0]
         Path("weights.bin").write_bytes(tensor.raw_data)
         tensor.ClearField("raw_data")
-        tensor.data_location = onnx.TensorProto.EXTERNAL
+        tensor.data_location = TensorProto.EXTERNAL
         tensor.external_data.add(key="location", value="weights.bin")
 
-    assert "found weights 'W0' in another file, expected them in this one" in refused(edited(external))
-
-
-def test_a_network_that_gives_nan_is_refused() -> None:
-    answer = onnx.load_from_string(small_network().data).graph.output[0].name
-
-    def root(model: onnx.ModelProto) -> None:
-        """Of minus the answer's size."""
-        steps = (("Abs", "before", "size"), ("Neg", "size", "less"), ("Sqrt", "less", answer))
-        with_last(model, *(onnx.helper.make_node(name, [x], [y]) for name, x, y in steps))
-
-    assert "found nan at the centre of its envelope" in refused(edited(root))
-
-
-def test_a_graph_that_draws_lots_is_refused() -> None:
-    answer = onnx.load_from_string(small_network().data).graph.output[0].name
-
-    def drawn(model: onnx.ModelProto) -> None:
-        like = onnx.helper.make_node("RandomNormalLike", ["before"], ["lot"], dtype=onnx.TensorProto.DOUBLE)
-        with_last(model, like, onnx.helper.make_node("Add", ["before", "lot"], [answer]))
-
-    assert "found different answers to one input" in refused(edited(drawn))
+    message = refused(edited(external, weights=weights))
+    assert "not a usable ONNX model" in message
+    assert "W0" in message
 
 
 def test_the_writer_refuses_what_does_not_fit() -> None:
@@ -382,100 +598,3 @@ def test_the_writer_refuses_what_does_not_fit() -> None:
     ):
         with pytest.raises(ValueError, match="found"):
             export_network(weights, zero, std, 0.0, output_std, {})
-
-
-def fused_refused(data: bytes | Path) -> str:
-    with pytest.raises(NetworkError) as caught:
-        FusedNetwork(data)
-    message = str(caught.value)
-    assert "\n" not in message
-    return message
-
-
-def test_metadata_and_hash_of_a_fused_network(tmp_path: Path) -> None:
-    path = tmp_path / "ours.onnx"
-    path.write_bytes(fused_network().data)
-    network = FusedNetwork(path)
-    assert (network.joint, network.data_sha256, network.sigma_scale) == (
-        "joint1",
-        "cd" * 32,
-        (0.5, 0.6, 0.7, 0.8),
-    )
-    assert network.envelope == everywhere()
-    assert network.name == str(path)
-    assert FusedNetwork(path, network.sha256).sha256 == network.sha256
-    with pytest.raises(NetworkError, match="expected 0000"):
-        FusedNetwork(path, "0" * 64)
-
-
-def test_fused_sample_many_and_numpy_agree() -> None:
-    small = fused_network(5, noise=0.8, size_nm=4.0)
-    network = FusedNetwork(small.data)
-    x = np.random.default_rng(6).uniform(FUSED_LOW, FUSED_HIGH, (1500, 7)) * 1.5
-    expected = small.numpy(x)
-    assert np.ptp(expected) > 1.0
-    assert network.bound
-    assert np.max(np.abs(network.run_many(x) - expected)) < 1e-9
-    assert np.max(np.abs(expected - [network.run_one(*row) for row in x.tolist()])) < 1e-9
-    assert math.isnan(network.run_one(math.nan, *[0.0] * 6))
-    assert network.run_one(*x[0].tolist()) == pytest.approx(
-        expected[0], abs=1e-9
-    )  # NaN leaves nothing behind
-
-
-@pytest.mark.parametrize(
-    ("key", "value", "words"),
-    [
-        *((key, ..., f"metadata '{key}': missing") for key in fused_network().metadata),
-        ("features", list(FUSED_FEATURES)[::-1], "metadata 'features': found ['sin_4"),
-        (
-            "envelope",
-            everywhere().to_mapping() | {"distance_nm": 0},
-            "metadata 'envelope': distance_nm: found 0",
-        ),
-        ("envelope", 7, "metadata 'envelope': found 7, expected the keys"),
-        (
-            "sigma_scale",
-            [1.0] * 3,
-            "metadata 'sigma_scale': found [1.0, 1.0, 1.0], expected 4 finite numbers",
-        ),
-        (
-            "sigma_scale",
-            [1.0, 1.0, -0.1, 1.0],
-            "metadata 'sigma_scale': found [1.0, 1.0, -0.1, 1.0], expected numbers",
-        ),
-        ("sigma_scale", [1.0, 1.0, math.nan, 1.0], "expected 4 finite numbers"),
-        ("input_low", [0.0] * 8, "metadata 'input_low': found"),
-        ("input_high", [*FUSED_HIGH[:8], math.inf], "metadata 'input_high': found"),
-        (
-            "input_low",
-            [9.0, *FUSED_LOW[1:]],
-            "range of joint_velocity_rad_s: found input_low 9 above input_high 3.5",
-        ),
-        ("joint", "", "metadata 'joint': found ''"),
-        ("joint", 1, "metadata 'joint': found 1, expected a text"),
-        ("data_sha256", None, "metadata 'data_sha256': found None"),
-    ],
-)
-def test_wrong_metadata_of_a_fused_network(key: str, value: object, words: str) -> None:
-    message = fused_refused(fused_network(**{key: value}).data)
-    assert message.startswith("network (bytes): ")
-    assert words in message
-
-
-def test_wrong_graphs_of_a_fused_network() -> None:
-    assert "expected ['N', 7]" in fused_refused(
-        export_network(
-            [(np.ones((6, 1)), np.zeros(1))], np.zeros(6), np.ones(6), 0.0, 1.0, fused_network().metadata
-        )
-    )
-    small = fused_network()
-    w, b = small.layers[-1]
-    nan = SmallNetwork((*small.layers[:-1], (w * np.nan, b)), small.mean, small.std, 0.0, 1.0, small.metadata)
-    assert "with a value that is not finite" in fused_refused(nan.data)
-
-
-def test_the_two_kinds_are_not_mistaken_for_each_other() -> None:
-    assert "expected ['N', 7]" in fused_refused(small_network().data)
-    with pytest.raises(NetworkError, match=r"expected \['N', 6\]"):
-        TorqueNetwork(fused_network().data)

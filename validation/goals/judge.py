@@ -11,7 +11,8 @@ import numpy as np
 from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray, StatusArray
 from jtqd.estimator.estimator import quadrants
-from jtqd.estimator.methods import estimate_columns, load_network
+from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.network import load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings, recommended

@@ -16,7 +16,8 @@ from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.estimator.methods import AnyEstimator, load_network, make_estimator
+from jtqd.estimator.methods import AnyEstimator, make_estimator
+from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
 from tests.daemon.loop.cycle_helpers import I32, ExactTime, estimates, frame, inputs, make, turn
 from tests.estimator.fused_configuration import joint_of, network_of

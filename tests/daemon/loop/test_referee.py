@@ -16,7 +16,7 @@ from jtqd.daemon.loop import referee
 from jtqd.daemon.loop.process import build_estimator, build_estimators
 from jtqd.daemon.loop.referee import judged
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.onnx_graph import NetworkError, Verdict
+from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
 from tests.estimator.estimator_helpers import small_network
 from tests.estimator.fused_configuration import configured, networks
 
@@ -43,8 +43,9 @@ def loaded(path: Path) -> tuple[bool, list[list[float]]]:
 
 
 def foreign(data: bytes) -> bytes:
-    """The same network with the answer negated twice: none of our graphs."""
+    """The same network with the answer negated twice and without weights in its metadata: none of our graphs."""
     model = onnx.load_from_string(data)
+    model.metadata_props.remove(next(each for each in model.metadata_props if each.key == "perceptron"))
     last = model.graph.node[-1]
     answer, last.output[0] = last.output[0], "answer"
     model.graph.node.append(helper.make_node("Neg", ["answer"], ["negative"]))
@@ -112,7 +113,7 @@ def test_refusals_have_the_same_words(tmp_path: Path) -> None:
 def test_other_bytes_than_the_judged_ones_are_refused(tmp_path: Path) -> None:
     config = load_config(configured(tmp_path, "fused", networks()))
     verdict = judged(config)[0]
-    assert isinstance(verdict, Verdict)
+    assert isinstance(verdict, RuntimeCheck)
     with pytest.raises(NetworkError, match="was changed while it was checked"):
         build_estimator(config, config.joints[0], verdict._replace(sha256="0" * 64))
 
@@ -120,7 +121,7 @@ def test_other_bytes_than_the_judged_ones_are_refused(tmp_path: Path) -> None:
 def test_a_native_evaluation_that_differs_is_refused(tmp_path: Path) -> None:
     config = load_config(configured(tmp_path, "fused", networks()))
     verdict = judged(config)[0]
-    assert isinstance(verdict, Verdict)
+    assert isinstance(verdict, RuntimeCheck)
     with pytest.raises(NetworkError, match=r"native evaluation and ONNX Runtime 0\.001 Nm apart"):
         build_estimator(config, config.joints[0], verdict._replace(native_error_nm=1e-3))
 

@@ -23,8 +23,8 @@ from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
 from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.methods import load_network, make_estimator
-from jtqd.estimator.network import FusedNetwork
+from jtqd.estimator.methods import make_estimator
+from jtqd.estimator.network import FusedNetwork, load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STALE, VALID
 from jtqd.models.files import load_joint, shipped

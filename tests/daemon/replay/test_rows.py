@@ -16,7 +16,8 @@ from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared.snapshot import COUNTERS
-from jtqd.estimator.methods import load_network, make_estimator
+from jtqd.estimator.methods import make_estimator
+from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
 from tests.daemon.loop.cycle_helpers import ENABLED, PDOS, SCALE
 from tests.estimator.fused_configuration import joint_of, network_of

@@ -55,7 +55,8 @@ def _command(main: Callable[[list[str]], int], *arguments: str) -> Callable[[Pat
 
 def _network(method: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
-        from jtqd.estimator.methods import load_network, make_estimator
+        from jtqd.estimator.methods import make_estimator
+        from jtqd.estimator.network import load_network
         from jtqd.estimator.settings import EstimatorSettings
         from jtqd.models.files import load_joint
 
