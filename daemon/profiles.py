@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final
 import jtqd.drivers.profiles
 from jtqd.drivers.devices import parse_key
 from jtqd.drivers.sdo import Key, label
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
 from jtqd.models.files import read_yaml
 
@@ -173,7 +173,7 @@ def names() -> list[str]:
 
 def load(path: Path) -> Family:
     """Read a profile. Raises ConfigError."""
-    return decode(Family, Section(read_yaml(path)[0], str(path)), name=path.stem)
+    return decode(Family, read_yaml(path)[0], str(path), name=path.stem)
 
 
 def shipped() -> list[Family]:

@@ -1,7 +1,6 @@
-"""Errors of what an operator wrote: sections of a file read key by key, numbers of a command line, nouns in messages.
+"""Errors of what an operator wrote, numbers and outputs of a command line, nouns in messages.
 
-Every message names the file, the key, what was found and what was expected. Whole dataclasses are read by
-`jtqd.estimator.decoder`.
+Every message names the file, the key, what was found and what was expected. Files are read by `jtqd.estimator.decoder`.
 """
 
 from __future__ import annotations
@@ -10,18 +9,8 @@ import importlib.util
 import math
 import os
 import reprlib
-from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Final
-
-
-class Required:
-    """Type of the mark REQUIRED."""
-
-
-REQUIRED: Final = Required()
-"""Default of every reading method: the key must be there."""
-SECTION: Final = "a mapping of keys to values"
+from typing import Final
 
 
 class ConfigError(ValueError):
@@ -57,160 +46,6 @@ def number_as_text(value: object) -> str:
             return ""
         return " (YAML reads this as text: write 7.0e-5, not 7e-5, and no quotes)"
     return ""
-
-
-class Section:
-    """One mapping of a configuration; each key is read once with its type, unit and range.
-
-    mapping: what the parser gave; `where`: file name for the messages; `path`: dotted key of this mapping.
-    Raises ConfigError from every reading method. `finish()` refuses the keys that nobody asked for.
-    """
-
-    def __init__(self, mapping: object, where: str, path: str = "") -> None:
-        self.where: Final = where
-        self.path: Final = path
-        if not isinstance(mapping, Mapping):
-            at = f"key '{path}': " if path else ""
-            raise ConfigError(f"{where}: {at}found {shown(mapping)}, expected {SECTION}")
-        for key in mapping:
-            if not isinstance(key, str):
-                raise ConfigError(
-                    f"{where}: {self._at(str(key))}: found the key {key!r}, expected a text key"
-                )
-        self._mapping: Final[Mapping[str, Any]] = mapping
-        self._known: Final[dict[str, None]] = {}
-
-    def _at(self, key: str) -> str:
-        return f"key '{self.path}.{key}'" if self.path else f"key '{key}'"
-
-    def error(self, key: str, found: object, expected: str) -> ConfigError:
-        """Return (not raise) the error of one key, for checks that this class does not know."""
-        return ConfigError(f"{self.where}: {self._at(key)}: found {shown(found)}, expected {expected}")
-
-    def as_written(self, key: str, value: object) -> object:
-        """Return the value of a dotted key as it stands in the file when it equals `value` (1 for 1.0), else `value`."""
-        found: Any = self._mapping
-        for part in key.split("."):
-            found = found.get(part) if isinstance(found, Mapping) else None
-        return found if found == value else value
-
-    def _take(self, key: str, default: object, expected: str) -> Any:
-        self._known[key] = None
-        if key in self._mapping:
-            return self._mapping[key]
-        if isinstance(default, Required):
-            raise ConfigError(f"{self.where}: {self._at(key)}: missing, expected {expected}")
-        return default
-
-    def has(self, key: str) -> bool:
-        """Return whether the key is present (does not count as reading it)."""
-        return key in self._mapping
-
-    def names(self) -> tuple[str, ...]:
-        """Return all keys that are present, in file order."""
-        return tuple(self._mapping)
-
-    def raw(self, key: str, default: Any = REQUIRED, expected: str = "a value") -> Any:
-        """Return the value as parsed, marking the key as known; `expected` is for the message when it is missing."""
-        return self._take(key, default, expected)
-
-    def number(
-        self,
-        key: str,
-        unit: str = "",
-        low: float | None = None,
-        high: float | None = None,
-        default: Any = REQUIRED,
-        *,
-        above: float | None = None,
-    ) -> float:
-        """Return a finite float in [low, high], and > `above`; bool, text, NaN and infinity are refused."""
-        expected = range_text("a number" + in_unit(unit), low, high, above)
-        value = self._take(key, default, expected)
-        if key not in self._mapping:
-            return value  # type: ignore[no-any-return]  # the caller's own default, None included
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error(key, value, expected + number_as_text(value))
-        try:
-            number = float(value)
-        except OverflowError:
-            raise self.error(key, value, expected) from None
-        if not math.isfinite(number) or not _in_range(number, low, high, above):
-            raise self.error(key, value, expected)
-        return number
-
-    def integer(
-        self,
-        key: str,
-        unit: str = "",
-        low: int | None = None,
-        high: int | None = None,
-        default: Any = REQUIRED,
-    ) -> int:
-        """Return a whole number in [low, high]; 3.0, bool and text are refused."""
-        expected = range_text("a whole number" + in_unit(unit), low, high, None)
-        value = self._take(key, default, expected)
-        if key not in self._mapping:
-            return value  # type: ignore[no-any-return]
-        if isinstance(value, bool) or not isinstance(value, int) or not _in_range(value, low, high, None):
-            raise self.error(key, value, expected)
-        return value
-
-    def text(
-        self,
-        key: str,
-        choices: Iterable[str] | None = None,
-        default: Any = REQUIRED,
-    ) -> str:
-        """Return a non-empty text, one of `choices` where given."""
-        allowed = None if choices is None else tuple(choices)
-        expected = "a text" if allowed is None else "one of " + ", ".join(repr(c) for c in allowed)
-        value = self._take(key, default, expected)
-        if key not in self._mapping:
-            return value  # type: ignore[no-any-return]
-        if not isinstance(value, str) or not value.strip() or (allowed is not None and value not in allowed):
-            raise self.error(key, value, expected)
-        return value
-
-    def section(self, key: str, optional: bool = False) -> Section | None:
-        """Return the mapping under `key`; None when it is optional and missing (or empty in the file)."""
-        value = self._take(key, None if optional else REQUIRED, SECTION)
-        if value is None and optional:
-            return None
-        return Section(value, self.where, self._child(key))
-
-    def required(self, key: str) -> Section:
-        """Return the mapping under `key`, which must be there."""
-        return Section(self._take(key, REQUIRED, SECTION), self.where, self._child(key))
-
-    def sections(self, key: str) -> list[Section]:
-        """Return the list of mappings under `key`; a missing key or null is an empty list."""
-        value = self._take(key, None, "a list of mappings")
-        if value is None:
-            return []
-        if not isinstance(value, list | tuple):
-            raise self.error(key, value, "a list of mappings")
-        return [Section(item, self.where, f"{self._child(key)}[{n}]") for n, item in enumerate(value)]
-
-    def _child(self, key: str) -> str:
-        return f"{self.path}.{key}" if self.path else key
-
-    def finish(self, known: Iterable[str] = ()) -> None:
-        """Refuse keys that were not read yet and are not `known`, naming the nearest one."""
-        self._known.update(dict.fromkeys(known))
-        for key in self._mapping:
-            if key not in self._known:
-                import difflib  # seldom needed, and not small
-
-                near = difflib.get_close_matches(key, self._known, n=1)
-                hint = f"did you mean '{near[0]}'?" if near else "known keys: " + ", ".join(self._known)
-                raise ConfigError(f"{self.where}: {self._at(key)}: unknown key, {hint}")
-
-
-def _in_range(value: float, low: float | None, high: float | None, above: float | None) -> bool:
-    return (
-        (low is None or value >= low) and (high is None or value <= high) and (above is None or value > above)
-    )
 
 
 def range_text(kind: str, low: float | None, high: float | None, above: float | None) -> str:

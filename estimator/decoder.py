@@ -1,4 +1,4 @@
-"""Decode plain mappings (from YAML or JSON) into frozen dataclasses whose annotations state unit and range.
+"""Decode mappings (from YAML or JSON) into frozen dataclasses whose annotations state unit and range.
 
     @dataclass(frozen=True)
     class Friction:
@@ -8,15 +8,16 @@
         def __post_init__(self) -> None:
             check(self, "friction")          # values built in code keep the same ranges
 
-    friction = decode(Friction, Section(mapping, "joint.yaml", "friction"))
+    friction = decode(Friction, mapping, "joint.yaml", "friction")
 
 A range stands once, beside its field. msgspec holds the ranges and converts the values. Its errors have neither the
 value nor the unit, and it takes NaN, infinity and keys that no field has: keys, finiteness and messages are ours.
 
-A field is a value (float, int, bool, str or a tuple of numbers), a dataclass (a section), a tuple of dataclasses (a list
-of sections) or a Mapping from str to values (a section with free keys). A key may be left out where its field has a
-default or may be None; a section or list that is empty in the file counts as left out. A dataclass that differs in
-shape from its section has a class method `from_section(section)`.
+A field is a value (float, int, bool, str, a tuple of numbers, or what `parsed` makes), a dataclass (a section), a tuple
+of dataclasses or of mappings (a list of sections) or a Mapping from str to values (a section with free keys). A key may
+be left out where its field has a default or may be None; a section or list that is empty in the file counts as left out.
+`false` for a section that may be None and has another default is None. A dataclass whose section has another shape has
+a class method `from_file(value)`, which raises FieldError.
 """
 
 from __future__ import annotations
@@ -24,30 +25,22 @@ from __future__ import annotations
 import math
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from functools import cache
 from types import NoneType, UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Final, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 from msgspec import inspect
 
-from jtqd.estimator.checked import (
-    REQUIRED,
-    SECTION,
-    ConfigError,
-    Section,
-    Verbatim,
-    in_unit,
-    number_as_text,
-    range_text,
-    shown,
-)
+from jtqd.estimator.checked import ConfigError, Verbatim, in_unit, number_as_text, range_text, shown
 
 T = TypeVar("T")
 _LARGEST = 1e30
 """Of a number in a file: no quantity here is larger, and powers of it overflow."""
+_SECTION: Final = "a mapping of keys to values"
 
 
 def limits(
@@ -73,6 +66,11 @@ def choice(names: Iterable[str], expected: str = "") -> msgspec.Meta:
     return msgspec.Meta(pattern=rf"\A({pattern})\Z", extra={"choices": names, "expected": expected})
 
 
+def parsed(parse: Callable[[Any], Any], expected: str) -> msgspec.Meta:
+    """Return the annotation of a value that `parse` makes of what the file has; it raises ValueError or FieldError."""
+    return msgspec.Meta(extra={"parse": parse, "expected": expected})
+
+
 Text = Annotated[
     str,
     msgspec.Meta(
@@ -91,36 +89,117 @@ def numbers_text(count: int) -> Verbatim:
 class FieldError(ConfigError):
     """A value of a dataclass cannot be used: key (dotted below the dataclass), what was found, what was expected.
 
-    where: name of the dataclass in the message; `decode` puts file and path in its place.
+    where: name of the dataclass in the message; `decode` puts file and path in its place. found MISSING: the key is
+    not there. problem: what is wrong in other words.
     """
 
-    def __init__(self, where: str, key: str, found: object, expected: str) -> None:
-        super().__init__(f"{where}.{key}: found {shown(found)}, expected {expected}")
-        self.key, self.found, self.expected = key, found, expected
+    def __init__(self, where: str, key: str, found: object, expected: str, problem: str = "") -> None:
+        if not problem:
+            problem = "missing" if found is MISSING else f"found {shown(found)}"
+            problem += f", expected {expected}"
+        super().__init__(f"{where}.{key}: {problem}")
+        self.where, self.key, self.found, self.expected, self.problem = where, key, found, expected, problem
 
     def __reduce__(self) -> tuple[type[ConfigError], tuple[str]]:
         """Reach another process as a plain ConfigError."""
         return ConfigError, (str(self),)
 
 
-def decode(kind: type[T], section: Section, **given: Any) -> T:
+@contextmanager
+def below(key: str, where: str = "") -> Iterator[None]:
+    """Put a key before those of the FieldErrors that are raised inside; where: name of what the key belongs to."""
+    try:
+        yield
+    except FieldError as error:
+        path = _joined(key, error.key)
+        raise FieldError(where or error.where, path, error.found, error.expected, error.problem) from None
+
+
+@contextmanager
+def in_file(where: str, path: str = "") -> Iterator[None]:
+    """Raise the FieldErrors that are raised inside as a ConfigError that names file and key; path: of the section."""
+    try:
+        yield
+    except FieldError as error:
+        key = _joined(path, error.key)
+        at = f"key '{key}': " if key else ""
+        raise ConfigError(f"{where}: {at}{error.problem}") from None
+
+
+def _joined(path: str, key: str) -> str:
+    return f"{path}.{key}" if path and key else path or key
+
+
+def decode(kind: type[T], mapping: object, where: str, path: str = "", **given: Any) -> T:
     """Return the dataclass `kind` with the values of a section; `given` are fields that are no keys of it.
 
+    mapping: as the parser returned it; where: name of the file; path: dotted key of the section in it.
     Raises ConfigError naming file, key, what was found and what was expected, for an unknown or missing key, a wrong
     type, a number that is not finite or out of range, and what the dataclass itself refuses by FieldError.
     """
+    with in_file(where, path):
+        return read(kind, mapping, **given)
+
+
+def read(kind: type[T], mapping: object, **given: Any) -> T:
+    """Return the dataclass as `decode` does. Raises FieldError with the key below this section."""
     schema: Any = kind
-    keys = [field for field in _fields_of(schema) if field.name not in given]
-    section.finish(field.name for field in keys)
-    for field in keys:
-        value = field.read(section)
-        if value is not MISSING:
-            given[field.name] = value
+    section = _section(mapping)
+    values = given | read_values([each for each in _fields_of(schema) if each.name not in given], section)
     try:
-        return kind(**given)
+        return kind(**values)
     except FieldError as error:
-        found = section.as_written(error.key, error.found)
-        raise section.error(error.key, found, error.expected) from None
+        found = _as_written(section, error.key, error.found)
+        if found is error.found:
+            raise
+        raise FieldError(error.where, error.key, found, error.expected) from None
+
+
+def read_kind(kinds: Mapping[str, type], section: Mapping[str, Any]) -> Any:
+    """Return the dataclass that the key `kind` of a section names, with its other keys. Raises FieldError."""
+    kind, others = split(section, "kind", Annotated[str, choice(kinds)])
+    return read(kinds[kind], others)
+
+
+def split(section: Mapping[str, Any], key: str, hint: Any) -> tuple[Any, dict[str, Any]]:
+    """Return the value of a key of this annotation, and the section's other keys. Raises FieldError."""
+    value = field_of(key, hint).read(section)
+    return value, {name: each for name, each in section.items() if name != key}
+
+
+def read_values(known: Iterable[Field], mapping: object) -> dict[str, Any]:
+    """Return the values of a section's keys by name, without those left out that are optional. Raises FieldError."""
+    section, known = _section(mapping), tuple(known)
+    _check_known(section, [each.name for each in known])
+    values = ((each.name, each.read(section)) for each in known)
+    return {name: value for name, value in values if value is not MISSING}
+
+
+def _section(value: object) -> Mapping[str, Any]:
+    if not isinstance(value, Mapping):
+        raise FieldError("", "", value, _SECTION)
+    for key in value:
+        if not isinstance(key, str):
+            raise FieldError("", str(key), key, "a text key", f"found the key {key!r}, expected a text key")
+    return value
+
+
+def _check_known(section: Mapping[str, Any], known: list[str]) -> None:
+    for key in section:
+        if key not in known:
+            import difflib  # seldom needed, and not small
+
+            near = difflib.get_close_matches(key, known, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else "known keys: " + ", ".join(known)
+            raise FieldError("", key, section[key], hint, f"unknown key, {hint}")
+
+
+def _as_written(section: Mapping[str, Any], key: str, value: object) -> object:
+    """Return the value of a dotted key as it stands in the file when it equals `value` (1 for 1.0), else `value`."""
+    found: Any = section
+    for part in key.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return found if found == value else value
 
 
 def check(value: Any, where: str) -> None:
@@ -136,8 +215,8 @@ def check(value: Any, where: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Field:
-    """How one field is read. form: value (by msgspec), section, list (of sections) or mapping."""
+class Field:
+    """How one key is read. form: value (by msgspec or `parse`), section, list (of sections) or mapping."""
 
     name: str
     hint: Any
@@ -149,44 +228,61 @@ class _Field:
     node: Any = None
     """Of msgspec.inspect, without None and unit."""
     choices: tuple[str, ...] = ()
+    parse: Callable[[Any], Any] | None = None
+    none_by_false: bool = False
+    """Whether `false` in the file is None."""
 
-    def read(self, section: Section) -> Any:
-        """Return the value of the section's key; MISSING: the field takes its default. Raises ConfigError."""
-        default = MISSING if self.optional else None if self.nullable else REQUIRED
-        value = section.raw(self.name, default, self.expected)
-        if value is None and self.optional and self.form != "value":
-            value = MISSING
-        if value is MISSING or (value is None and self.nullable):
-            return value
-        if self.form == "value":
-            return self.convert(section, self.name, value)
+    def read(self, section: Mapping[str, Any]) -> Any:
+        """Return the value of the section's key; MISSING: the field takes its default. Raises FieldError."""
+        value = section.get(self.name, MISSING)
+        if value is MISSING or (value is None and self.form != "value"):
+            if self.optional:
+                return MISSING
+            value = None if self.nullable else value
+        if (value is None and self.nullable) or (value is False and self.none_by_false):
+            return None
+        if value is MISSING:
+            raise FieldError("", self.name, MISSING, self.expected)
+        return self.convert(self.name, value) if self.form == "value" else self._nested(value)
+
+    def _nested(self, value: object) -> Any:
+        """Return the section, list of sections or mapping. Raises FieldError."""
         if self.form == "list":
-            return tuple(_nested(self.inner, each) for each in section.sections(self.name))
-        inner = section.required(self.name)
+            if not isinstance(value, list | tuple):
+                raise FieldError("", self.name, value, self.expected)
+            return tuple(_nested(self.inner, each, f"{self.name}[{n}]") for n, each in enumerate(value))
         if self.form == "section":
-            return _nested(self.inner, inner)
-        take = (lambda _, __, value: value) if self.inner is None else self.inner.convert
-        return {key: take(inner, key, inner.raw(key)) for key in inner.names()}
+            return _nested(self.inner, value, self.name)
+        with below(self.name):
+            free = _section(value)
+            return (
+                dict(free) if self.inner is None else {k: self.inner.convert(k, v) for k, v in free.items()}
+            )
 
-    def convert(self, section: Section, key: str, value: object) -> Any:
-        """Return one value in the type of the field. Raises ConfigError."""
+    def convert(self, key: str, value: object) -> Any:
+        """Return one value in the type of the field. Raises FieldError."""
         many = isinstance(self.node, inspect.VarTupleType | inspect.TupleType)
-        if not many or isinstance(value, list | tuple):  # msgspec takes sets, whose order is none
-            try:
+        try:
+            if self.parse is not None:
+                return self.parse(value)
+            if not many or isinstance(value, list | tuple):  # msgspec takes sets, whose order is none
                 converted = msgspec.convert(_plain(value), self.hint)
-            except msgspec.ValidationError:
-                pass
-            else:
                 if _finite(converted):
                     return converted
+        except FieldError as error:
+            raise FieldError(
+                "", _joined(key, error.key), error.found, error.expected, error.problem
+            ) from None
+        except ValueError:  # of msgspec as well
+            pass
         found, expected = value, self.expected
-        if many and isinstance(value, list) and len(value) not in _lengths(self.node):
+        if many and self.parse is None and isinstance(value, list) and len(value) not in _lengths(self.node):
             found = numbers_text(len(value))
         if isinstance(self.node, inspect.FloatType):
             expected += number_as_text(value)
-            if isinstance(value, float) and math.isfinite(value) and abs(value) > _LARGEST:
+            if self.node.le is None and isinstance(value, float) and _LARGEST < abs(value) < math.inf:
                 expected += f" and at most {_LARGEST:g} in magnitude"
-        raise section.error(key, found, expected)
+        raise FieldError("", key, found, expected)
 
     def holds(self, value: Any) -> bool:
         """Return whether a number or choice keeps the annotation."""
@@ -206,10 +302,13 @@ class _Field:
         )
 
 
-def _nested(kind: Any, section: Section) -> Any:
-    """Return the dataclass of a section, by its own `from_section` where it has one."""
-    own = getattr(kind, "from_section", None)
-    return decode(kind, section) if own is None else own(section)
+def _nested(kind: Any, value: object, key: str) -> Any:
+    """Return the dataclass of a section, by its own `from_file` where it has one; kind None: the mapping itself."""
+    with below(key):
+        if kind is None:
+            return _section(value)
+        own = getattr(kind, "from_file", None)
+        return read(kind, value) if own is None else own(value)
 
 
 def _plain(value: object) -> object:
@@ -233,17 +332,22 @@ def _lengths(node: Any) -> range:
 
 
 @cache
-def _fields_of(kind: Any) -> tuple[_Field, ...]:
+def _fields_of(kind: Any) -> tuple[Field, ...]:
     """Return how the fields of a dataclass are read, in its order."""
     hints = get_type_hints(kind, include_extras=True)
     return tuple(
-        _field(each.name, hints[each.name], (each.default, each.default_factory) != (MISSING, MISSING))
+        field_of(
+            each.name,
+            hints[each.name],
+            optional=(each.default, each.default_factory) != (MISSING, MISSING),
+            none_by_false=each.default is not None,
+        )
         for each in fields(kind)
     )
 
 
 @cache
-def _checked_fields(kind: Any) -> tuple[_Field, ...]:
+def _checked_fields(kind: Any) -> tuple[Field, ...]:
     """Return the numbers and choices among the fields of a dataclass."""
     return tuple(
         each
@@ -252,25 +356,28 @@ def _checked_fields(kind: Any) -> tuple[_Field, ...]:
     )
 
 
-def _field(name: str, hint: Any, optional: bool) -> _Field:
-    """Return how a field of this annotation is read; optional: it has a default."""
+def field_of(name: str, hint: Any, *, optional: bool = False, none_by_false: bool = False) -> Field:
+    """Return how a key of this annotation is read; optional: it has a default."""
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     nullable = NoneType in options
     (core,) = (each for each in options if each is not NoneType)
     arguments = get_args(core)
     if is_dataclass(core):
-        return _Field(name, hint, "section", core, SECTION, nullable, optional)
-    if get_origin(core) is tuple and is_dataclass(arguments[0]):
-        return _Field(name, hint, "list", arguments[0], "a list of mappings", nullable, optional)
+        refusable = none_by_false and nullable and optional
+        return Field(name, hint, "section", core, _SECTION, nullable, optional, none_by_false=refusable)
+    if get_origin(core) is tuple and (is_dataclass(arguments[0]) or get_origin(arguments[0]) is Mapping):
+        inner = arguments[0] if is_dataclass(arguments[0]) else None
+        return Field(name, hint, "list", inner, "a list of mappings", nullable, optional)
     if get_origin(core) is Mapping:
-        inner = None if arguments[1] is Any else _field("", arguments[1], False)
-        return _Field(name, hint, "mapping", inner, SECTION, nullable, optional)
+        values = None if arguments[1] is Any else field_of("", arguments[1])
+        return Field(name, hint, "mapping", values, _SECTION, nullable, optional)
     node: Any = inspect.type_info(core)
     extra: dict[str, Any] = {}
     if isinstance(node, inspect.Metadata):
         node, extra = node.type, node.extra or {}
     expected = extra.get("expected") or _expected(node, extra.get("unit", ""))
-    return _Field(name, hint, "value", None, expected, nullable, optional, node, extra.get("choices", ()))
+    choices, parse = extra.get("choices", ()), extra.get("parse")
+    return Field(name, hint, "value", None, expected, nullable, optional, node, choices, parse)
 
 
 def _expected(node: Any, unit: str) -> str:
@@ -278,6 +385,8 @@ def _expected(node: Any, unit: str) -> str:
     if isinstance(node, inspect.FloatType | inspect.IntType):
         kind = "a number" if isinstance(node, inspect.FloatType) else "a whole number"
         return range_text(kind + in_unit(unit), node.ge, node.le, node.gt)
+    if isinstance(node, inspect.VarTupleType) and isinstance(node.item_type, inspect.StrType):
+        return "a list of texts"
     if isinstance(node, inspect.VarTupleType | inspect.TupleType):
         lengths = _lengths(node)
         count = f"{lengths[0]} " if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]} "

@@ -14,9 +14,9 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import Section, Verbatim
-from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits, numbers_text
-from jtqd.estimator.effects.library import EFFECTS, checked_parameters, read_parameters
+from jtqd.estimator.checked import Verbatim
+from jtqd.estimator.decoder import FieldError, Text, below, check, choice, decode, limits, numbers_text
+from jtqd.estimator.effects.library import EFFECTS, checked_parameters
 from jtqd.estimator.envelope import Envelope
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
@@ -412,26 +412,17 @@ class Effect:
     Defaults are filled in. Raises ConfigError for an unknown name, an unknown, missing or implausible parameter.
     """
 
-    name: str
-    parameters: Mapping[str, float]
+    name: Annotated[str, choice(EFFECTS)]
+    parameters: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        parameters = checked_parameters(self.name, self.parameters)
+        with below("parameters"):
+            parameters = checked_parameters(self.name, self.parameters)
         object.__setattr__(self, "parameters", MappingProxyType(parameters))
 
     def __reduce__(self) -> tuple[type[Effect], tuple[str, dict[str, float]]]:
         """Copy and pickle through plain dicts: a mapping proxy can do neither."""
         return Effect, (self.name, dict(self.parameters))
-
-    @classmethod
-    def from_section(cls, section: Section) -> Effect:
-        """Read one entry of the list `effects`."""
-        name = section.text("name", choices=sorted(EFFECT_NAMES))
-        inner = section.section("parameters", optional=True)
-        if inner is None:
-            inner = Section({}, section.where, f"{section.path}.parameters")
-        section.finish()
-        return cls(name, read_parameters(name, inner))
 
 
 @dataclass(frozen=True, slots=True)
@@ -482,7 +473,7 @@ class Joint:
     @classmethod
     def from_mapping(cls, mapping: object, where: str) -> Joint:
         """Build from what a YAML parser gave; `where` names the file in messages. Raises ConfigError."""
-        return decode(cls, Section(mapping, where))
+        return decode(cls, mapping, where)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists in file order; `from_mapping` of it gives an equal joint."""

@@ -10,11 +10,10 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple
 
-from jtqd.estimator.checked import Section
-from jtqd.estimator.decoder import decode, limits
+from jtqd.estimator.decoder import limits
 
 REFERENCE_C: Final = 25.0
 
@@ -23,7 +22,8 @@ REFERENCE_C: Final = 25.0
 class Thermal:
     """Thermal behaviour of a joint (`thermal` of a plant file); the defaults are one that stays as it is.
 
-    reference_c: where the joint file's friction holds; ambient_c: surroundings of the nominal day.
+    reference_c: where the joint file's friction holds; ambient_c: surroundings of the nominal day; left out: at the
+    reference.
     """
 
     reference_c: Annotated[float, limits("degC", ge=-40.0, le=100.0)] = REFERENCE_C
@@ -31,15 +31,11 @@ class Thermal:
     coulomb_per_k: Annotated[float, limits("1/K", ge=0.0, le=0.1)] = 0.0
     kelvin_per_w: Annotated[float, limits("K/W", ge=0.0, le=20.0)] = 0.0
     time_constant_s: Annotated[float, limits("s", ge=10.0, le=1.0e5)] = 600.0
-    ambient_c: Annotated[float, limits("degC", ge=-40.0, le=100.0)] = REFERENCE_C
+    ambient_c: Annotated[float, limits("degC", ge=-40.0, le=100.0)] = math.nan
 
-    @classmethod
-    def from_section(cls, section: Section) -> Thermal:
-        """Read `thermal` of a plant file; surroundings left out are at the reference. Raises ConfigError."""
-        thermal = decode(cls, section)
-        if section.has("ambient_c"):
-            return thermal
-        return replace(thermal, ambient_c=thermal.reference_c)
+    def __post_init__(self) -> None:
+        if math.isnan(self.ambient_c):
+            object.__setattr__(self, "ambient_c", self.reference_c)
 
 
 # α_j = frac(sqrt(prime)), in the order of `Day`'s values: viscous, temperature and link zero of both joints, sensor zero.

@@ -14,12 +14,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import Section
-from jtqd.estimator.decoder import choice, decode, limits
+from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, read
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, load_yaml
 from jtqd.sim_can.days import RunToRun, Thermal
-from jtqd.sim_can.drive_file import DriveParameters, SensorParameters
+from jtqd.sim_can.drive_file import USUAL_DRIVE, DriveParameters, SensorParameters
 from jtqd.sim_can.joint_effects import changed_joint, uses_temperature
 
 PROFILES: Final = ("demo", "rest")
@@ -28,14 +27,6 @@ STEEPEST_KINEMATIC_ERROR: Final = 0.5
 stand still, or go back, while the motor turns on."""
 WARMING_K_PER_W: Final = 0.6
 """Warming of a joint that comes as a joint file with effects of the temperature: that of campaign_plant.yaml."""
-_SCALES: Final = {
-    "friction_scale": 0.0,
-    "viscous_scale": 0.0,
-    "torque_constant_scale": 0.05,
-    "stiffness_scale": 0.05,
-    "rotor_inertia_scale": 0.05,
-}
-"""Scales of `deviations` and the least value of each."""
 
 
 @dataclass(frozen=True)
@@ -68,39 +59,73 @@ class Deviations:
         """Stiffness of the Maxwell-slip element while it sticks, Nm/rad."""
         return self.hysteresis_nm / self.hysteresis_travel_rad
 
-    @classmethod
-    def from_section(cls, section: Section) -> Deviations:
-        """Read `deviations` of a plant file, which keeps each deviation in a section of its own. Raises ConfigError."""
-        values = {key: section.number(key, "", low, 10.0, 1.0) for key, low in _SCALES.items()}
-        ripple = section.section("ripple", optional=True)
-        if ripple is not None:
-            values["ripple_nm"] = ripple.number("amplitude_nm", "Nm", 0.0)
-            values["ripple_order_per_motor_rev"], values["ripple_phase_rad"] = _order_and_phase(ripple)
-            ripple.finish()
-        stribeck = section.section("stribeck", optional=True)
-        if stribeck is not None:
-            values["stribeck_nm"] = stribeck.number("torque_nm", "Nm", 0.0)
-            # above 0.06 rad/s the peak would reach into Table I's range, which begins at 0.2 rad/s
-            values["stribeck_velocity_rad_s"] = stribeck.number("velocity_rad_s", "rad/s", 0.002, 0.06, 0.05)
-            stribeck.finish()
-        error = section.section("kinematic_error", optional=True)
-        if error is not None:
-            values["kinematic_error_rad"] = error.number("amplitude_rad", "rad", 0.0, 0.01)
-            order, phase = _order_and_phase(error)
-            values["kinematic_error_order_per_motor_rev"], values["kinematic_error_phase_rad"] = order, phase
-            error.finish()
-        hysteresis = section.section("hysteresis", optional=True)
-        if hysteresis is not None:
-            values["hysteresis_nm"] = hysteresis.number("torque_nm", "Nm", 0.0)
-            values["hysteresis_travel_rad"] = hysteresis.number("travel_rad", "rad", 1.0e-6, 0.1, 1.0e-4)
-            hysteresis.finish()
-        section.finish()
-        return cls(**values)
+
+_Amplitude = Annotated[float, limits("Nm", ge=0.0)]
+_Order = Annotated[float, limits("1/rev", ge=0.0)]
+_Phase = Annotated[float, limits("rad")]
+_Scale = Annotated[float, limits(ge=0.05, le=10.0)]
+_FrictionScale = Annotated[float, limits(ge=0.0, le=10.0)]
 
 
-def _order_and_phase(section: Section) -> tuple[float, float]:
-    order = section.number("order_per_motor_rev", "1/rev", 0.0, default=2.0)
-    return order, section.number("phase_rad", "rad", default=0.0)
+@dataclass(frozen=True)
+class _Ripple:
+    amplitude_nm: _Amplitude
+    order_per_motor_rev: _Order = 2.0
+    phase_rad: _Phase = 0.0
+
+
+@dataclass(frozen=True)
+class _Stribeck:
+    torque_nm: _Amplitude
+    # above 0.06 rad/s the peak would reach into Table I's range, which begins at 0.2 rad/s
+    velocity_rad_s: Annotated[float, limits("rad/s", ge=0.002, le=0.06)] = 0.05
+
+
+@dataclass(frozen=True)
+class _KinematicError:
+    amplitude_rad: Annotated[float, limits("rad", ge=0.0, le=0.01)]
+    order_per_motor_rev: _Order = 2.0
+    phase_rad: _Phase = 0.0
+
+
+@dataclass(frozen=True)
+class _Hysteresis:
+    torque_nm: _Amplitude
+    travel_rad: Annotated[float, limits("rad", ge=1.0e-6, le=0.1)] = 1.0e-4
+
+
+@dataclass(frozen=True)
+class _DeviationsFile:
+    """`deviations` of a plant file, which keeps each deviation in a section of its own."""
+
+    friction_scale: _FrictionScale = 1.0
+    viscous_scale: _FrictionScale = 1.0
+    torque_constant_scale: _Scale = 1.0
+    stiffness_scale: _Scale = 1.0
+    rotor_inertia_scale: _Scale = 1.0
+    ripple: _Ripple = _Ripple(0.0)
+    stribeck: _Stribeck = _Stribeck(0.0)
+    kinematic_error: _KinematicError = _KinematicError(0.0)
+    hysteresis: _Hysteresis = _Hysteresis(0.0)
+
+    def deviations(self) -> Deviations:
+        return Deviations(
+            self.friction_scale,
+            self.viscous_scale,
+            self.torque_constant_scale,
+            self.stiffness_scale,
+            self.rotor_inertia_scale,
+            self.ripple.amplitude_nm,
+            self.ripple.order_per_motor_rev,
+            self.ripple.phase_rad,
+            self.stribeck.torque_nm,
+            self.stribeck.velocity_rad_s,
+            self.kinematic_error.amplitude_rad,
+            self.kinematic_error.order_per_motor_rev,
+            self.kinematic_error.phase_rad,
+            self.hysteresis.torque_nm,
+            self.hysteresis.travel_rad,
+        )
 
 
 @dataclass(frozen=True)
@@ -121,7 +146,7 @@ class JointPlant:
 
     joint: Joint
     deviations: Deviations = field(default_factory=Deviations)
-    drive: DriveParameters = field(default_factory=DriveParameters)
+    drive: DriveParameters = USUAL_DRIVE
     measurement: MeasurementParameters = field(default_factory=MeasurementParameters)
     thermal: Thermal = field(default_factory=Thermal)
 
@@ -172,8 +197,8 @@ class PlantParameters:
 
     joints: tuple[JointPlant, JointPlant]
     sensor: SensorParameters = field(default_factory=SensorParameters)
-    profile: Annotated[str, choice(PROFILES)] = "demo"
-    substep_s: Annotated[float, limits("s", ge=10e-6, le=500e-6)] = 125e-6
+    profile: str = "demo"
+    substep_s: float = 125e-6
     run_to_run: RunToRun = field(default_factory=RunToRun)
 
     @property
@@ -207,21 +232,44 @@ def plant_from_mapping(
     Raises:
         ConfigError: as in `load_plant`.
     """
-    section = Section(mapping, where)
-    one, two = (_joint_plant(section.required(key), joint_of) for key in ("joint_1", "joint_2"))
-    return decode(PlantParameters, section, joints=(one, two))
+    with in_file(where):
+        file = read(_PlantFile, mapping)
+        sides = (
+            _joint_plant("joint_1", file.joint_1, joint_of),
+            _joint_plant("joint_2", file.joint_2, joint_of),
+        )
+    return PlantParameters(sides, file.sensor, file.profile, file.substep_s, file.run_to_run)
 
 
-def _joint_plant(section: Section, joint_of: Callable[[str], Joint]) -> JointPlant:
-    joint = joint_of(section.text("joint"))
-    side = decode(JointPlant, section, joint=joint)
+@dataclass(frozen=True)
+class _JointFile:
+    """`joint_1`, `joint_2` of a plant file."""
+
+    joint: Text
+    deviations: _DeviationsFile = _DeviationsFile()
+    drive: DriveParameters = USUAL_DRIVE
+    measurement: MeasurementParameters = MeasurementParameters()
+    thermal: Thermal = field(default_factory=Thermal)
+
+
+@dataclass(frozen=True)
+class _PlantFile:
+    joint_1: _JointFile
+    joint_2: _JointFile
+    sensor: SensorParameters = field(default_factory=SensorParameters)
+    profile: Annotated[str, choice(PROFILES)] = "demo"
+    substep_s: Annotated[float, limits("s", ge=10e-6, le=500e-6)] = 125e-6
+    run_to_run: RunToRun = field(default_factory=RunToRun)
+
+
+def _joint_plant(key: str, file: _JointFile, joint_of: Callable[[str], Joint]) -> JointPlant:
+    joint = joint_of(file.joint)
+    side = JointPlant(joint, file.deviations.deviations(), file.drive, file.measurement, file.thermal)
     steepest = STEEPEST_KINEMATIC_ERROR / joint.gear_ratio
     if side.deviations.kinematic_slope > steepest:
-        raise section.error(
-            "deviations.kinematic_error",
-            side.deviations.kinematic_slope,
-            f"amplitude_rad times order_per_motor_rev <= {steepest:g}, half of 1/gear_ratio",
-        )
+        expected = f"amplitude_rad times order_per_motor_rev <= {steepest:g}, half of 1/gear_ratio"
+        with below(key):
+            raise FieldError("plant", "deviations.kinematic_error", side.deviations.kinematic_slope, expected)
     return side
 
 

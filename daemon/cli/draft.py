@@ -39,7 +39,7 @@ from jtqd.drivers.survey import (
     Survey,
 )
 from jtqd.drivers.units import GEAR
-from jtqd.estimator.checked import Section
+from jtqd.estimator.decoder import decode
 
 EFFICIENCY = 0.7
 """Of a harmonic drive near its rated torque (catalogues: 0.6 to 0.8): joint torque of a motor's rated torque."""
@@ -248,7 +248,7 @@ def _objects(family: Family | None, instead: Mapping[str, Instead], own: Mapping
         section[quantity] = {**section.get(quantity, {}), name: value.number}
     for quantity, each in instead.items():
         section[quantity] = False if each.keys is None else {**section.get(quantity, {}), **each.keys}
-    return ObjectsSection.from_section(Section(section, "jtq init")).of_drive("joint_N", Path("jtq init"))
+    return decode(ObjectsSection, section, "jtq init").of_drive("joint_N", Path("jtq init"))
 
 
 def _filled(  # noqa: PLR0917

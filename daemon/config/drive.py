@@ -12,8 +12,8 @@ from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.units import AT_JOINT, BY_TORQUE, SCALES, SHAFTS
-from jtqd.estimator.checked import ConfigError, Section, Verbatim, range_text
-from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
+from jtqd.estimator.checked import ConfigError, Verbatim, range_text
+from jtqd.estimator.decoder import FieldError, Text, choice, limits
 
 _PDO_BITS: Final = 64
 _TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
@@ -91,13 +91,9 @@ class _Temperature:
     sub: _SubIndex = 0
 
 
-_OPTIONAL: Final = ("link_position", "motor_velocity")
-"""Quantities that a drive need not have."""
-
-
 @dataclass(frozen=True)
 class ObjectsSection:
-    """Section `joint_N.objects`."""
+    """Section `joint_N.objects`; None (in the file: `false`) for a quantity that the drive does not have."""
 
     motor_position: _Object = _Object()
     link_position: _Object | None = _Object()
@@ -105,12 +101,6 @@ class ObjectsSection:
     current: _Object = _Object()
     statusword: _Object = _Object()
     temperature: _Temperature | None = None
-
-    @classmethod
-    def from_section(cls, section: Section) -> ObjectsSection:
-        """Read the section; `false` for a quantity that the drive does not have. Raises ConfigError."""
-        absent = {name: None for name in _OPTIONAL if section.raw(name, None) is False}
-        return decode(cls, section, **absent)
 
     def of_drive(self, joint: str, path: Path) -> DriveObjects:
         """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""

@@ -32,7 +32,7 @@ from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.drivers.devices import DriveObjects, Temperature
 from jtqd.drivers.layout import chosen, maps_of_json
 from jtqd.drivers.pdo import PdoMap
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings
@@ -195,7 +195,7 @@ def load_config(path: Path | None) -> Config:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
     _check_one_sensor(path, mapping)
-    file = decode(ConfigFile, Section(with_profiles(mapping, path), str(path)))
+    file = decode(ConfigFile, with_profiles(mapping, path), str(path))
     joints = tuple(
         _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
         for number, section in enumerate(file.joints, start=1)

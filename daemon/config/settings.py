@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Any, Final
 
 from jtqd.daemon.shared import faults
-from jtqd.estimator.checked import Section
-from jtqd.estimator.decoder import FieldError, Text, check, decode, limits
+from jtqd.estimator.decoder import FieldError, Text, check, limits, parsed
 from jtqd.estimator.settings import CONTACT_THRESHOLD, PlausibilityLimits
 
 LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]
@@ -21,6 +20,18 @@ HIGHEST_DOMAIN: Final = 232
 _INTERFACE: Final = re.compile(r"[\w.@-]{1,15}", re.ASCII)
 
 
+_LATCHABLE: Final = tuple(name for name in faults.BITS if name != "stale")
+
+
+def _latch(names: Any) -> int:
+    """Return the bits of a list of names in the file."""
+    if names is None:
+        return LATCHED_BY_DEFAULT
+    if not isinstance(names, list) or not all(isinstance(name, str) and name in _LATCHABLE for name in names):
+        raise ValueError("found other names")
+    return sum({faults.BITS[name] for name in names})
+
+
 @dataclass(frozen=True, slots=True)
 class SafetySettings:
     """Section `safety`: how faults are found and which of them wait for a reset.
@@ -30,7 +41,9 @@ class SafetySettings:
     `deviation`; plausibility: None (in the file: false) for no checks.
     """
 
-    latch: int = LATCHED_BY_DEFAULT
+    latch: Annotated[int, parsed(_latch, f"a list of {', '.join(_LATCHABLE)}; [] for none")] = (
+        LATCHED_BY_DEFAULT
+    )
     stale_latch_cycles: Annotated[int, limits(ge=1, le=1_000_000)] | None = None
     deviation_sigmas: Annotated[float, limits(ge=1.0, le=100.0)] = 3.0
     deviation_s: Annotated[float, limits("s", ge=0.01, le=60.0)] = 1.0
@@ -38,27 +51,8 @@ class SafetySettings:
 
     def __post_init__(self) -> None:
         check(self, "safety")
-
-    @classmethod
-    def from_section(cls, section: Section) -> SafetySettings:
-        """Read the section of a configuration file; every key is optional. Raises ConfigError."""
-        given: dict[str, Any] = {"latch": _latch(section)}
-        if section.raw("plausibility", None) is False:
-            given["plausibility"] = None
-        settings = decode(cls, section, **given)
-        if settings.stale_latch_cycles is None:
-            return settings
-        return replace(settings, latch=settings.latch | faults.STALE)
-
-
-def _latch(section: Section) -> int:
-    names = [name for name in faults.BITS if name != "stale"]
-    value: Any = section.raw("latch", None)
-    if value is None:
-        return LATCHED_BY_DEFAULT
-    if not isinstance(value, list) or not all(isinstance(name, str) and name in names for name in value):
-        raise section.error("latch", value, f"a list of {', '.join(names)}; [] for none")
-    return sum({faults.BITS[name] for name in value})
+        if self.stale_latch_cycles is not None:
+            object.__setattr__(self, "latch", self.latch | faults.STALE)
 
 
 @dataclass(frozen=True)

@@ -5,15 +5,17 @@ A file that defines EFFECT is an effect and has its name; the others are what ef
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 import pkgutil
 import sys
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Annotated, Final
 
-from jtqd.estimator.checked import REQUIRED, ConfigError, Section
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.decoder import Field, FieldError, below, field_of, limits, read_values
 from jtqd.estimator.effects.effect import Effect
 
 HOOKS: Final = ("loss_nm", "twist_rad", "load_nm", "current_a", "link_rad", "sensor_nm")
@@ -107,18 +109,24 @@ def checked_parameters(name: str, given: Mapping[str, float]) -> dict[str, float
     A parameter that the joint file's own value stands for (default NaN) stays out unless given. Raises ConfigError for
     an unknown effect or parameter, a missing one, and a value that is no number or out of its plausible range.
     """
-    return read_parameters(name, Section(given, f"effect {name}"))
-
-
-def read_parameters(name: str, section: Section) -> dict[str, float]:
-    """Return the parameters of an effect from a section of a file, as `checked_parameters`."""
-    values: dict[str, float] = {}
-    for p in effect_of(name).parameters:
-        default: Any = REQUIRED if p.default is None else p.default
-        value = section.number(p.name, p.unit, p.low, p.high, default)
+    with below("", f"effect {name}"):
+        values = read_values(_fields(name), given)
+    found: dict[str, float] = {}
+    for p in EFFECTS[name].parameters:
+        value: float = values.get(p.name, math.nan if p.default is None else p.default)
         if p.whole and value != round(value):
-            raise section.error(p.name, value, f"a whole number from {p.low:g} to {p.high:g}")
+            raise FieldError(f"effect {name}", p.name, value, f"a whole number from {p.low:g} to {p.high:g}")
         if not math.isnan(value):
-            values[p.name] = value
-    section.finish()
-    return values
+            found[p.name] = value
+    return found
+
+
+@functools.cache
+def _fields(name: str) -> tuple[Field, ...]:
+    """Return how the parameters of an effect are read. Raises ConfigError for an unknown effect."""
+    return tuple(
+        field_of(
+            p.name, Annotated[float, limits(p.unit, ge=p.low, le=p.high)], optional=p.default is not None
+        )
+        for p in effect_of(name).parameters
+    )

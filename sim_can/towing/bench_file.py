@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import Section
-from jtqd.estimator.decoder import FieldError, decode, limits
+from jtqd.estimator.checked import Verbatim
+from jtqd.estimator.decoder import FieldError, Text, below, in_file, limits, parsed, read
 from jtqd.estimator.joint import Joint
-from jtqd.sim_can.drive_file import DriveParameters, SensorParameters
+from jtqd.sim_can.drive_file import USUAL_DRIVE, DriveParameters, SensorParameters
 from jtqd.sim_can.towing.days import DayWidths
 
 KEY: Final = "towing"
@@ -161,10 +161,10 @@ class TowedJoint:
     motor: Motor
     friction: Friction
     gear: Gear
-    link_inertia_kgm2: Annotated[float, limits("kgm2", gt=0.0)]
+    link_inertia_kgm2: float
     warmth: Warmth = field(default_factory=Warmth)
     measurement: Measurement = field(default_factory=Measurement)
-    drive: DriveParameters = field(default_factory=DriveParameters)
+    drive: DriveParameters = USUAL_DRIVE
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ class TowingBench:
     joints: tuple[TowedJoint, TowedJoint]
     sensor: SensorParameters = field(default_factory=SensorParameters)
     run_to_run: DayWidths = field(default_factory=DayWidths)
-    substep_s: Annotated[float, limits("s", ge=10e-6, le=500e-6)] = 125e-6
+    substep_s: float = 125e-6
 
     @property
     def profile(self) -> str:
@@ -203,33 +203,66 @@ def bench_from_mapping(
     mapping: Mapping[str, Any], where: str, joint_of: Callable[[str], Joint]
 ) -> TowingBench:
     """Return the checked bench of a file's mapping; joint_of(file name) -> Joint. Raises ConfigError."""
-    section = Section(mapping, where)
-    number = section.raw(KEY)
-    if number != 2 or isinstance(number, bool):
-        raise section.error(KEY, number, "2, the number of joints")
-    one, two = (_joint(section.required(key), joint_of) for key in ("joint_1", "joint_2"))
-    return decode(TowingBench, section, joints=(one, two))
+    with in_file(where):
+        file = read(_BenchFile, mapping)
+        sides = _joint("joint_1", file.joint_1, joint_of), _joint("joint_2", file.joint_2, joint_of)
+    return TowingBench(sides, file.sensor, file.run_to_run, file.substep_s)
 
 
-def _joint(section: Section, joint_of: Callable[[str], Joint]) -> TowedJoint:
-    joint = joint_of(section.text("joint"))
-    side = decode(TowedJoint, section, joint=joint)
-    for key, waves in (
-        ("motor.cogging", side.motor.cogging),
-        ("friction.angle", side.friction.angle),
-        ("gear.errors", side.gear.errors),
-        ("gear.slips", side.gear.slips),
-        ("measurement.motor_errors", side.measurement.motor_errors),
-        ("measurement.link_errors", side.measurement.link_errors),
-        ("measurement.current_ripple", side.measurement.current_ripple),
-    ):
-        most = 6 if key == "gear.slips" else _MOST
-        if len(waves) > most:
-            raise section.error(key, f"{len(waves)} entries", f"at most {most}")
-    if joint.gear_ratio * side.gear.steepest_error > STEEPEST_ERROR:
-        raise section.error(
-            "gear.errors",
-            side.gear.steepest_error,
-            f"the sum of amplitude_rad times order <= {STEEPEST_ERROR / joint.gear_ratio:g}, half of 1/gear_ratio",
-        )
-    return side
+@dataclass(frozen=True)
+class _JointFile:
+    """`joint_1`, `joint_2` of a bench file."""
+
+    joint: Text
+    motor: Motor
+    friction: Friction
+    gear: Gear
+    link_inertia_kgm2: Annotated[float, limits("kgm2", gt=0.0)]
+    warmth: Warmth = Warmth()
+    measurement: Measurement = Measurement()
+    drive: DriveParameters = USUAL_DRIVE
+
+    def __post_init__(self) -> None:
+        for key, waves in (
+            ("motor.cogging", self.motor.cogging),
+            ("friction.angle", self.friction.angle),
+            ("gear.errors", self.gear.errors),
+            ("gear.slips", self.gear.slips),
+            ("measurement.motor_errors", self.measurement.motor_errors),
+            ("measurement.link_errors", self.measurement.link_errors),
+            ("measurement.current_ripple", self.measurement.current_ripple),
+        ):
+            most = 6 if key == "gear.slips" else _MOST
+            if len(waves) > most:
+                raise FieldError("bench", key, Verbatim(f"{len(waves)} entries"), f"at most {most}")
+
+
+def _joints(value: object) -> int:
+    if value != 2 or isinstance(value, bool):
+        raise ValueError("found another number of joints")
+    return 2
+
+
+@dataclass(frozen=True)
+class _BenchFile:
+    towing: Annotated[int, parsed(_joints, "2, the number of joints")]
+    joint_1: _JointFile
+    joint_2: _JointFile
+    sensor: SensorParameters = field(default_factory=SensorParameters)
+    run_to_run: DayWidths = field(default_factory=DayWidths)
+    substep_s: Annotated[float, limits("s", ge=10e-6, le=500e-6)] = 125e-6
+
+
+def _joint(key: str, file: _JointFile, joint_of: Callable[[str], Joint]) -> TowedJoint:
+    joint = joint_of(file.joint)
+    steepest = file.gear.steepest_error
+    if joint.gear_ratio * steepest > STEEPEST_ERROR:
+        limit = STEEPEST_ERROR / joint.gear_ratio
+        with below(key):
+            raise FieldError(
+                "bench",
+                "gear.errors",
+                steepest,
+                f"the sum of amplitude_rad times order <= {limit:g}, half of 1/gear_ratio",
+            )
+    return TowedJoint(**vars(file) | {"joint": joint})

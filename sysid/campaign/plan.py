@@ -12,7 +12,7 @@ import json
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -20,10 +20,10 @@ import numpy as np
 import yaml
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, Section, finite
-from jtqd.estimator.decoder import decode, limits
+from jtqd.estimator.checked import ConfigError, Verbatim, finite
+from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, parsed, read, read_kind
 from jtqd.models.files import load_yaml
-from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.excitation.fourier import CurrentFile, FourierSeries, FourierTrajectory, SeriesFile
 from jtqd.sysid.motion.setpoints import (
     MOST_JOINTS,
     OTHER_ONE,
@@ -47,13 +47,6 @@ SHORTEST_OFF_S: Final = 1.5
 DEFAULT_LIMITS: Final = Limits(
     current_a=10.0, velocity_rad_s=3.3, torque_nm=60.0, travel_rad=60.0, temperature_c=70.0
 )
-_LIMIT_UNITS: Final = {
-    "current_a": "A",
-    "velocity_rad_s": "rad/s",
-    "torque_nm": "Nm",
-    "travel_rad": "rad",
-    "temperature_c": "degC",
-}
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 _RESERVED: Final = ("plan", "campaign")
 """The campaign's own files beside those of the runs."""
@@ -201,29 +194,15 @@ class Plan:
     @classmethod
     def from_mapping(cls, mapping: object, where: str) -> Plan:
         """Check a plan read from YAML; `where` is the file's name for the messages. Raises ConfigError."""
-        top = Section(mapping, where)
-        top.text("schema", (SCHEMA,))
-        name = top.text("name")
-        limits = _limits(top)
-        sections = top.sections("runs")
-        if not sections:
-            raise top.error("runs", top.raw("runs", None), "a list of at least one run")
-        runs = tuple(_run(section) for section in sections)
-        seen: set[str] = set()
-        for section, run in zip(sections, runs, strict=True):
-            if run.name in seen:
-                raise section.error("name", run.name, "a unique name")
-            seen.add(run.name)
-        alone = dict(_alone_limits(section, limits) for section in top.sections("alone"))
-        top.finish()
-        return cls(name, limits, runs, alone)
+        with in_file(where):
+            return read(_PlanFile, mapping).plan()
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values, ready for YAML."""
         return {
             "schema": SCHEMA,
             "name": self.name,
-            "limits": {name: finite(getattr(self.limits, name)) for name in _LIMIT_UNITS},
+            "limits": {each.name: finite(getattr(self.limits, each.name)) for each in fields(_LimitsFile)},
             **({"alone": [_of_joint(*each) for each in sorted(self.alone.items())]} if self.alone else {}),
             "runs": [run.to_mapping() for run in self.runs],
         }
@@ -260,29 +239,19 @@ def load_plan(path: Path) -> Plan:
     return Plan.from_mapping(mapping, str(path))
 
 
-def _limits(top: Section) -> Limits:
+@dataclass(frozen=True)
+class _LimitsFile:
     """`limits` of a plan; a key left out has its value in DEFAULT_LIMITS, temperature_c: null means no limit."""
-    section = top.section("limits", optional=True)
-    if section is None:
-        return DEFAULT_LIMITS
-    values = {
-        name: section.number(name, unit, above=0.0, default=getattr(DEFAULT_LIMITS, name))
-        for name, unit in _LIMIT_UNITS.items()
-        if name != "temperature_c" or section.raw(name, 0.0) is not None
-    }
-    section.finish()
-    return _limits_from(values)
 
+    current_a: Annotated[float, limits("A", gt=0.0)] = DEFAULT_LIMITS.current_a
+    velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)] = DEFAULT_LIMITS.velocity_rad_s
+    torque_nm: Annotated[float, limits("Nm", gt=0.0)] = DEFAULT_LIMITS.torque_nm
+    travel_rad: Annotated[float, limits("rad", gt=0.0)] = DEFAULT_LIMITS.travel_rad
+    temperature_c: Annotated[float, limits("degC", gt=0.0)] | None = DEFAULT_LIMITS.temperature_c
 
-def _limits_from(values: Mapping[str, float]) -> Limits:
-    """Return limits by their names; a temperature that is left out is not supervised."""
-    return Limits(
-        current_a=values["current_a"],
-        velocity_rad_s=values["velocity_rad_s"],
-        torque_nm=values["torque_nm"],
-        travel_rad=values["travel_rad"],
-        temperature_c=values.get("temperature_c", math.inf),
-    )
+    def limits(self) -> Limits:
+        temperature_c = math.inf if self.temperature_c is None else self.temperature_c
+        return Limits(self.current_a, self.velocity_rad_s, self.torque_nm, self.travel_rad, temperature_c)
 
 
 @dataclass(frozen=True)
@@ -295,6 +264,21 @@ class _AloneLimits:
     torque_nm: Annotated[float, limits("Nm", gt=0.0)]
     travel_rad: Annotated[tuple[float, float], limits("rad")]
 
+    def __post_init__(self) -> None:
+        if not self.travel_rad[0] < self.travel_rad[1]:
+            raise FieldError("alone", "travel_rad", list(self.travel_rad), "two rising numbers in rad")
+
+    def limits(self, plan: Limits) -> Limits:
+        low, high = self.travel_rad
+        return Limits(
+            current_a=self.current_a,
+            velocity_rad_s=self.velocity_rad_s,
+            torque_nm=self.torque_nm,
+            travel_rad=high - low,
+            temperature_c=plan.temperature_c,
+            position_rad=(low, high),
+        )
+
 
 def _of_joint(number: int, limits: Limits) -> dict[str, Any]:
     """Return limits of a joint that is moved alone, plain."""
@@ -302,53 +286,97 @@ def _of_joint(number: int, limits: Limits) -> dict[str, Any]:
     return {"joint": number, **values, "travel_rad": list(limits.position_rad)}
 
 
-def _alone_limits(section: Section, plan: Limits) -> tuple[int, Limits]:
-    found = decode(_AloneLimits, section)
-    low, high = found.travel_rad
-    if not low < high:
-        raise section.error("travel_rad", [low, high], "two rising numbers in rad")
-    return found.joint, Limits(
-        current_a=found.current_a,
-        velocity_rad_s=found.velocity_rad_s,
-        torque_nm=found.torque_nm,
-        travel_rad=high - low,
-        temperature_c=plan.temperature_c,
-        position_rad=(low, high),
-    )
+_Number = Annotated[int, limits(ge=1, le=MOST_JOINTS)]
 
 
-def _joints_of(section: Section) -> tuple[int, int | None]:
-    """Velocity joint and current joint of a run; None for one that is moved alone (`joint`)."""
-    if section.has("joint"):
-        return section.integer("joint", low=1, high=MOST_JOINTS), None
-    joint = section.integer("velocity_joint", low=1, high=MOST_JOINTS)
-    if joint <= 2 and not section.has("current_joint"):
-        return joint, OTHER_ONE
-    other = section.integer("current_joint", low=1, high=MOST_JOINTS)
-    if other == joint:
-        raise section.error("current_joint", other, "another joint than velocity_joint")
-    return joint, other
+def _run_name(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise FieldError("run", "", value, "a text")
+    if not _NAME.fullmatch(value) or value in _RESERVED:
+        raise ValueError("found another name")
+    return value
 
 
-def _run(section: Section) -> Run:
-    name = section.text("name")
-    if not _NAME.fullmatch(name) or name in _RESERVED:
-        raise section.error(
-            "name",
-            name,
-            "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
-        )
-    joint, other = _joints_of(section)
-    inner = section.sections("segments")
-    if not inner:
-        raise section.error("segments", section.raw("segments", None), "a list of at least one segment")
-    segments = tuple(_segment(each, alone=other is None) for each in inner)
-    for before, one, each in zip((None, *segments), segments, inner, strict=False):
-        if isinstance(one, Fourier | Off) and isinstance(before, Plateau) and before.moving:
-            kind = one.to_mapping()["kind"]
-            raise each.error("kind", kind, "a rest before it, because the plateau before it ends in motion")
-    section.finish()
-    return Run(name, joint, segments, other)
+_RunName = Annotated[
+    str,
+    parsed(
+        _run_name,
+        "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
+    ),
+]
+
+
+@dataclass(frozen=True)
+class _AloneRun:
+    """A run of a joint that is moved alone."""
+
+    name: _RunName
+    joint: _Number
+    segments: tuple[Mapping[str, Any], ...] = ()
+
+    @property
+    def joints(self) -> tuple[int, int | None]:
+        return self.joint, None
+
+
+@dataclass(frozen=True)
+class _PairRun:
+    """A run of two joints on a towing bench."""
+
+    name: _RunName
+    velocity_joint: _Number
+    segments: tuple[Mapping[str, Any], ...] = ()
+    current_joint: _Number | None = None
+
+    def __post_init__(self) -> None:
+        if self.current_joint is None and self.velocity_joint > 2:
+            raise FieldError("run", "current_joint", MISSING, f"a whole number from 1 to {MOST_JOINTS}")
+        if self.current_joint == self.velocity_joint:
+            raise FieldError("run", "current_joint", self.current_joint, "another joint than velocity_joint")
+
+    @property
+    def joints(self) -> tuple[int, int | None]:
+        return self.velocity_joint, OTHER_ONE if self.current_joint is None else self.current_joint
+
+
+def _run(mapping: Mapping[str, Any]) -> Run:
+    file = read(_AloneRun, mapping) if "joint" in mapping else read(_PairRun, mapping)
+    if not file.segments:
+        raise FieldError("run", "segments", Verbatim("none"), "a list of at least one segment")
+    segments: list[Segment] = []
+    for n, section in enumerate(file.segments):
+        with below(f"segments[{n}]"):
+            each = _segment(section, alone=isinstance(file, _AloneRun))
+            before = segments[-1] if segments else None
+            if isinstance(each, Fourier | Off) and isinstance(before, Plateau) and before.moving:
+                expected = "a rest before it, because the plateau before it ends in motion"
+                raise FieldError("run", "kind", section["kind"], expected)
+            segments.append(each)
+    joint, other = file.joints
+    return Run(file.name, joint, tuple(segments), other)
+
+
+@dataclass(frozen=True)
+class _PlanFile:
+    schema: Annotated[str, choice((SCHEMA,))]
+    name: Text
+    runs: tuple[Mapping[str, Any], ...] = ()
+    limits: _LimitsFile = _LimitsFile()
+    alone: tuple[_AloneLimits, ...] = ()
+
+    def plan(self) -> Plan:
+        """Return the plan. Raises FieldError."""
+        if not self.runs:
+            raise FieldError("plan", "runs", Verbatim("none"), "a list of at least one run")
+        runs: list[Run] = []
+        for n, section in enumerate(self.runs):
+            with below(f"runs[{n}]"):
+                run = _run(section)
+                if any(run.name == each.name for each in runs):
+                    raise FieldError("run", "name", run.name, "a unique name")
+                runs.append(run)
+        limits = self.limits.limits()
+        return Plan(self.name, limits, tuple(runs), {each.joint: each.limits(limits) for each in self.alone})
 
 
 @dataclass(frozen=True)
@@ -359,43 +387,51 @@ class _Turning:
     hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
     ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
 
+    def segment(self) -> Plateau:
+        return Plateau(self.velocity_rad_s, 0.0, self.hold_s, self.ramp_s)
 
-def _segment(section: Section, *, alone: bool) -> Segment:
+
+@dataclass(frozen=True)
+class _AloneFourier:
+    """A fourier segment of a joint that is moved alone."""
+
+    duration_s: Annotated[float, limits("s", ge=0.1, le=LONGEST_S)]
+    velocity: SeriesFile
+
+    def segment(self) -> Fourier:
+        one = self.velocity
+        trajectory = FourierTrajectory(one.omega_rad_s, one.a, one.b, self.duration_s)
+        return Fourier(trajectory, no_current(trajectory))
+
+
+@dataclass(frozen=True)
+class _PairFourier(_AloneFourier):
+    current: CurrentFile
+
+    def segment(self) -> Fourier:
+        one = self.current
+        series = FourierSeries(one.omega_rad_s, one.a, one.b, self.duration_s, one.offset_a)
+        return replace(super().segment(), current=series)
+
+
+_ALONE: Final[Mapping[str, type]] = {"plateau": _Turning, "rest": Rest, "fourier": _AloneFourier}
+_PAIR: Final[Mapping[str, type]] = {
+    "plateau": Plateau,
+    "rest": Rest,
+    "power_off": Off,
+    "fourier": _PairFourier,
+}
+
+
+def _segment(section: Mapping[str, Any], *, alone: bool) -> Segment:
     """`alone`: no segment has a current; without power a joint that carries a load would fall."""
-    kinds = ("plateau", "rest", "fourier") if alone else ("plateau", "rest", "power_off", "fourier")
-    kind = section.text("kind", kinds)
-    if kind == "fourier":
-        return _fourier(section, alone=alone)
-    if kind == "power_off":
-        return decode(Off, section)
-    if kind == "rest":
-        return decode(Rest, section)
-    if alone:
-        turning = decode(_Turning, section)
-        return Plateau(turning.velocity_rad_s, 0.0, turning.hold_s, turning.ramp_s)
-    return decode(Plateau, section)
+    found = read_kind(_ALONE if alone else _PAIR, section)
+    return found if isinstance(found, Plateau | Rest | Off) else found.segment()
 
 
 def no_current(velocity: FourierTrajectory) -> FourierSeries:
     """Return the current of a joint that nothing tows."""
     return FourierSeries(velocity.omega_rad_s, (0.0,), (0.0,), velocity.duration_s)
-
-
-def _fourier(section: Section, *, alone: bool) -> Fourier:
-    duration_s = section.number("duration_s", "s", low=0.1, high=LONGEST_S)
-    velocity = section.required("velocity")
-    current = None if alone else section.required("current")
-    section.finish()
-    try:
-        trajectory = FourierTrajectory.from_section(velocity, duration_s)
-        return Fourier(
-            trajectory,
-            no_current(trajectory) if current is None else FourierSeries.from_section(current, duration_s),
-        )
-    except ConfigError as error:
-        if str(error).startswith(section.where):
-            raise
-        raise ConfigError(f"{section.where}: key '{section.path}': {error}") from None
 
 
 def smooth_step(x: FloatArray) -> FloatArray:

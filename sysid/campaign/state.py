@@ -11,11 +11,12 @@ import os
 import re
 import shutil
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import REQUIRED, ConfigError, Section
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.decoder import Text, below, choice, in_file, read, split
 from jtqd.sysid.campaign.plan import Plan, load_plan
 
 SCHEMA: Final = "jtq.campaign/1"
@@ -48,7 +49,7 @@ class RunState:
         findings: what is wrong with the table, a line each. sha256: of NAME.csv.gz.
     """
 
-    status: str = PENDING
+    status: Annotated[str, choice(STATUSES)] = PENDING
     reason: str = ""
     attempts: int = 0
     played_s: float = 0.0
@@ -165,15 +166,13 @@ class CampaignDirectory:
         except FileNotFoundError:
             return
         try:
-            top = Section(json.loads(data), str(path))
-            top.text("schema", (SCHEMA,))
-            self.name, sha256 = top.text("name"), top.text("plan_sha256")
-            self.recipe = top.raw("recipe")
-            self.runs = {section.text("name"): _run_state(section) for section in top.sections("runs")}
+            with in_file(str(path)):
+                file = read(_StateFile, json.loads(data))
+                self.runs = dict(_run_state(n, each) for n, each in enumerate(file.runs))
         except (ValueError, ConfigError) as error:  # ConfigError names the file itself
             text = str(error) if isinstance(error, ConfigError) else f"{path}: not JSON: {error}"
             raise StateError(text) from None
-        self.plan_sha256 = sha256
+        self.name, self.plan_sha256, self.recipe = file.name, file.plan_sha256, file.recipe
 
     def _save(self) -> None:
         content = {
@@ -186,12 +185,19 @@ class CampaignDirectory:
         _write_whole(self.path / STATE_FILE, json.dumps(content, indent=1) + "\n")
 
 
-def _run_state(section: Section) -> RunState:
-    section.text("status", STATUSES)
-    newer = {"interpolated": 0, "pieces": 1}  # a campaign.json of before has no such keys
-    values = {item.name: section.raw(item.name, newer.get(item.name, REQUIRED)) for item in fields(RunState)}
-    values["findings"] = tuple(values["findings"])
-    return RunState(**values)
+@dataclass(frozen=True)
+class _StateFile:
+    schema: Annotated[str, choice((SCHEMA,))]
+    name: Text
+    plan_sha256: Text
+    recipe: Mapping[str, Any]
+    runs: tuple[Mapping[str, Any], ...] = ()
+
+
+def _run_state(n: int, section: Mapping[str, Any]) -> tuple[str, RunState]:
+    with below(f"runs[{n}]"):
+        name, state = split(section, "name", Text)
+        return name, read(RunState, state)
 
 
 def _files_of(directory: Path, run: str) -> list[Path]:

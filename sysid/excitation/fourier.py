@@ -11,14 +11,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyder, polyval
 from numpy.typing import ArrayLike
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.decoder import FieldError, limits, parsed
 
 RAMP_SHARE: Final = 0.1
 """Part of a current series' duration in which it rises from zero, and in which it falls back to zero."""
@@ -78,13 +79,6 @@ class FourierTrajectory:
 
     def __post_init__(self) -> None:
         _check("velocity", self.omega_rad_s, self.a, self.b, self.duration_s, *self.start, *self.end)
-
-    @classmethod
-    def from_section(cls, section: Section, duration_s: float) -> FourierTrajectory:
-        """Read `velocity` of a plan's fourier segment. Raises ConfigError naming file and key."""
-        omega, a, b = _read_series(section)
-        section.finish()
-        return cls(omega, a, b, duration_s)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the plan's `velocity`; the duration belongs to the segment."""
@@ -160,14 +154,6 @@ class FourierSeries:
     def __post_init__(self) -> None:
         _check("current", self.omega_rad_s, self.a, self.b, self.duration_s, self.offset_a)
 
-    @classmethod
-    def from_section(cls, section: Section, duration_s: float) -> FourierSeries:
-        """Read `current` of a plan's fourier segment. Raises ConfigError naming file and key."""
-        omega, a, b = _read_series(section)
-        offset = section.number("offset_a", "A", default=0.0)
-        section.finish()
-        return cls(omega, a, b, duration_s, offset)
-
     def to_mapping(self) -> dict[str, Any]:
         """Return the plan's `current`; the duration belongs to the segment."""
         return {**_plain(self.omega_rad_s, self.a, self.b), "offset_a": float(self.offset_a)}
@@ -188,23 +174,36 @@ def _plain(omega: float, a: tuple[float, ...], b: tuple[float, ...]) -> dict[str
     return {"omega_rad_s": float(omega), "a": [float(x) for x in a], "b": [float(x) for x in b]}
 
 
-def _read_series(section: Section) -> tuple[float, tuple[float, ...], tuple[float, ...]]:
-    omega = section.number("omega_rad_s", "rad/s", above=0.0)
-    a, b = _amplitudes(section, "a"), _amplitudes(section, "b")
-    if len(a) != len(b):
-        raise section.error("b", list(b), f"as many numbers as in 'a', {len(a)}")
-    return omega, a, b
-
-
-def _amplitudes(section: Section, key: str) -> tuple[float, ...]:
-    expected = f"a list of 1 to {MAX_HARMONICS} finite numbers"
-    value = section.raw(key)
+def _amplitudes(value: Any) -> tuple[float, ...]:
     if not isinstance(value, list | tuple) or not 1 <= len(value) <= MAX_HARMONICS:
-        raise section.error(key, value, expected)
+        raise ValueError("found another number of amplitudes")
     for item in value:
         if isinstance(item, bool) or not isinstance(item, int | float) or not math.isfinite(item):
-            raise section.error(key, item, expected)
+            raise FieldError("fourier", "", item, _AMPLITUDES)
     return tuple(float(item) for item in value)
+
+
+_AMPLITUDES: Final = f"a list of 1 to {MAX_HARMONICS} finite numbers"
+
+
+@dataclass(frozen=True)
+class SeriesFile:
+    """`velocity` and `current` of a plan's fourier segment: amplitudes in rad/s or A; offset_a of a current alone."""
+
+    omega_rad_s: Annotated[float, limits("rad/s", gt=0.0)]
+    a: Annotated[tuple[float, ...], parsed(_amplitudes, _AMPLITUDES)]
+    b: Annotated[tuple[float, ...], parsed(_amplitudes, _AMPLITUDES)]
+
+    def __post_init__(self) -> None:
+        if len(self.a) != len(self.b):
+            raise FieldError("fourier", "b", list(self.b), f"as many numbers as in 'a', {len(self.a)}")
+
+
+@dataclass(frozen=True)
+class CurrentFile(SeriesFile):
+    """`current` of a plan's fourier segment."""
+
+    offset_a: Annotated[float, limits("A")] = 0.0
 
 
 def _check(

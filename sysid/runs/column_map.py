@@ -21,14 +21,26 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import Verbatim
+from jtqd.estimator.decoder import (
+    Field,
+    FieldError,
+    Text,
+    field_of,
+    in_file,
+    limits,
+    parsed,
+    read,
+    read_values,
+)
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.models.files import load_yaml
 from jtqd.sysid.runs.expressions import Expression, ExpressionError, parse
@@ -84,9 +96,9 @@ class KnownLoad:
 class VoltageDrive:
     """A drive that gives its voltage [V] (a column or an expression) and no current; back EMF: motor side, Vs/rad."""
 
-    voltage_v: str
-    resistance_ohm: float
-    back_emf_vs_per_rad: float
+    voltage_v: Text
+    resistance_ohm: Annotated[float, limits("ohm", gt=0.0)]
+    back_emf_vs_per_rad: Annotated[float, limits("Vs/rad", ge=0.0)]
 
     def current(self, voltage_v: FloatArray, motor_velocity_rad_s: FloatArray) -> FloatArray:
         """Return the current of the winding [n, A]."""
@@ -112,26 +124,16 @@ class ColumnMap:
 
         `TARGET: NAME` is short for `TARGET: {column: NAME, scale: 1.0, offset: 0.0}`. Raises ConfigError.
         """
-        full = {
-            key: {"column": value} if isinstance(value, str) and key in targets() else value
-            for key, value in mapping.items()
-        }
-        section = Section(full, where)
-        columns: dict[str, Column] = {}
-        for key in targets():
-            value = section.raw(key, expected=_SOURCE) if key == TIME else section.raw(key, None)
-            if key in full:
-                if not isinstance(value, dict):
-                    raise section.error(key, value, _SOURCE)
-                columns[key] = _column(section.required(key))
-        files = {
-            joint: folder / section.text(f"j{joint}.joint_file")
-            for joint in JOINTS
-            if f"j{joint}.joint_file" in full
-        }
-        loads = {n: _load(section, n, columns) for n in JOINTS if f"j{n}.load" in full}
-        drives = {n: _drive(section, n, columns) for n in JOINTS if f"j{n}.drive" in full}
-        section.finish()
+        with in_file(where):
+            values = read_values(_keys(), mapping)
+            columns = {key: values[key] for key in targets() if key in values}
+            loads = {n: values[f"j{n}.load"] for n in JOINTS if f"j{n}.load" in values}
+            drives = {n: values[f"j{n}.drive"] for n in JOINTS if f"j{n}.drive" in values}
+            for n, load in loads.items():
+                _check_load(n, load, columns)
+            for n in drives:
+                _check_drive(n, columns)
+        files = {n: folder / values[f"j{n}.joint_file"] for n in JOINTS if f"j{n}.joint_file" in values}
         return cls(columns, files, loads, drives, where)
 
     @classmethod
@@ -249,69 +251,105 @@ def _weights(half: int, step: float) -> tuple[FloatArray, FloatArray]:
     return cubic[1], 2.0 * cubic[2]
 
 
-def _column(section: Section) -> Column:
-    scale = section.number("scale", unit="target units per cell unit", default=1.0)
-    if scale == 0.0:
-        raise section.error("scale", scale, "a number other than 0")
-    name = section.raw("column", expected="a column of the file, or an expression of columns")
-    if not isinstance(name, str):
-        raise section.error("column", name, "a column of the file, or an expression of columns")
-    column = Column(
-        name,
-        scale,
-        section.number("offset", unit="target units", default=0.0),
+def _name(value: Any) -> str:
+    if not isinstance(value, str):
+        raise ValueError("found no text")
+    return value
+
+
+@dataclass(frozen=True)
+class _ColumnFile:
+    column: Annotated[str, parsed(_name, "a column of the file, or an expression of columns")]
+    scale: Annotated[float, limits("target units per cell unit")] = 1.0
+    offset: Annotated[float, limits("target units")] = 0.0
+
+    def __post_init__(self) -> None:
+        if self.scale == 0.0:
+            raise FieldError("column", "scale", self.scale, "a number other than 0")
+
+
+def _column(value: Any) -> Column:
+    if isinstance(value, str):
+        return Column(value)
+    if not isinstance(value, dict):
+        raise ValueError("found neither a text nor a mapping")
+    file = read(_ColumnFile, value)
+    return Column(file.column, file.scale, file.offset)
+
+
+@dataclass(frozen=True)
+class _Model:
+    torque_nm: Text
+
+
+@dataclass(frozen=True)
+class _Turning:
+    """A load that only turns."""
+
+    inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)]
+    hangs_at_rad: Annotated[float, limits("rad")] = 0.0
+    gravity_m_s2: Annotated[float, limits("m/s2", ge=0.0, le=30.0)] = GRAVITY_M_S2
+
+
+@dataclass(frozen=True)
+class _Pendulum:
+    """A load that hangs; left out, its inertia is that of a point."""
+
+    mass_kg: Annotated[float, limits("kg", ge=0.0)]
+    lever_m: Annotated[float, limits("m", ge=0.0)]
+    inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)] = math.nan
+    hangs_at_rad: Annotated[float, limits("rad")] = 0.0
+    gravity_m_s2: Annotated[float, limits("m/s2", ge=0.0, le=30.0)] = GRAVITY_M_S2
+
+
+def _load(value: Any) -> KnownLoad:
+    keys = value if isinstance(value, dict) else {}
+    if "torque_nm" in keys:
+        return KnownLoad(read(_Model, value).torque_nm)
+    if "inertia_kgm2" in keys and "mass_kg" not in keys:
+        return KnownLoad(**vars(read(_Turning, value)))
+    load = KnownLoad(**vars(read(_Pendulum, value)))
+    return (
+        replace(load, inertia_kgm2=load.mass_kg * load.lever_m * load.lever_m)
+        if math.isnan(load.inertia_kgm2)
+        else load
     )
-    section.finish()
-    return column
 
 
-def _load(section: Section, joint: int, columns: Mapping[str, Column]) -> KnownLoad:
+@cache
+def _keys() -> tuple[Field, ...]:
+    """Return how every key of a column map is read."""
+    column = Annotated[Column, parsed(_column, _SOURCE)]
+    section = "a mapping of keys to values"
+    kinds = {
+        "joint_file": Text,
+        "load": Annotated[KnownLoad, parsed(_load, section)],
+        "drive": Annotated[VoltageDrive, parsed(lambda value: read(VoltageDrive, value), section)],
+    }
+    keys = [field_of(key, column, optional=key != TIME) for key in targets()]
+    for joint in JOINTS:
+        keys += [field_of(f"j{joint}.{key}", kind, optional=True) for key, kind in kinds.items()]
+    return tuple(keys)
+
+
+def _check_load(joint: int, load: KnownLoad, columns: Mapping[str, Column]) -> None:
     key = f"j{joint}.load"
     if f"j{joint}.torque_nm" in columns:
-        raise ConfigError(
-            f"{section.where}: key '{key}': found it beside 'j{joint}.torque_nm', expected one reference of joint {joint}"
-        )
-    inner = section.required(key)
-    if inner.has("torque_nm"):
-        load = KnownLoad(inner.text("torque_nm"))
-    else:
-        bare = inner.has("inertia_kgm2") and not inner.has("mass_kg")  # it only turns
-        mass = 0.0 if bare else inner.number("mass_kg", unit="kg", low=0.0)
-        lever = 0.0 if bare else inner.number("lever_m", unit="m", low=0.0)
-        inertia = inner.number("inertia_kgm2", unit="kg m2", low=0.0, default=mass * lever * lever)
-        load = KnownLoad(
-            None,
-            mass,
-            lever,
-            inertia,
-            inner.number("hangs_at_rad", unit="rad", default=0.0),
-            inner.number("gravity_m_s2", unit="m/s2", low=0.0, high=30.0, default=GRAVITY_M_S2),
-        )
-        if f"j{joint}.link_position_rad" not in columns:
-            raise ConfigError(
-                f"{section.where}: key '{key}': found no 'j{joint}.link_position_rad', expected the angle of the load "
-                "(from a motor encoder: its column with scale 1/gear_ratio)"
-            )
-    inner.finish()
-    return load
+        found = Verbatim(f"it beside 'j{joint}.torque_nm'")
+        raise FieldError("map", key, found, f"one reference of joint {joint}")
+    if load.torque_nm is None and f"j{joint}.link_position_rad" not in columns:
+        expected = "the angle of the load (from a motor encoder: its column with scale 1/gear_ratio)"
+        raise FieldError("map", key, Verbatim(f"no 'j{joint}.link_position_rad'"), expected)
 
 
-def _drive(section: Section, joint: int, columns: Mapping[str, Column]) -> VoltageDrive:
-    key = f"j{joint}.drive"
-    if f"j{joint}.current_a" in columns:
-        raise ConfigError(
-            f"{section.where}: key '{key}': found it beside 'j{joint}.current_a', expected one of them"
-        )
-    if not {f"j{joint}.motor_velocity_rad_s", f"j{joint}.motor_position_rad"} & set(columns):
-        raise ConfigError(
-            f"{section.where}: key '{key}': found neither 'j{joint}.motor_velocity_rad_s' nor "
-            f"'j{joint}.motor_position_rad', expected one: the back EMF needs the motor's speed"
-        )
-    inner = section.required(key)
-    drive = VoltageDrive(
-        inner.text("voltage_v"),
-        inner.number("resistance_ohm", unit="ohm", above=0.0),
-        inner.number("back_emf_vs_per_rad", unit="Vs/rad", low=0.0),
+def _check_drive(joint: int, columns: Mapping[str, Column]) -> None:
+    key, velocity, position = (
+        f"j{joint}.drive",
+        f"j{joint}.motor_velocity_rad_s",
+        f"j{joint}.motor_position_rad",
     )
-    inner.finish()
-    return drive
+    if f"j{joint}.current_a" in columns:
+        raise FieldError("map", key, Verbatim(f"it beside 'j{joint}.current_a'"), "one of them")
+    if not {velocity, position} & set(columns):
+        found = Verbatim(f"neither '{velocity}' nor '{position}'")
+        raise FieldError("map", key, found, "one: the back EMF needs the motor's speed")

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
 
 
@@ -46,7 +46,7 @@ LEAST: dict[str, Any] = {"name": "n", "inner": {"gain": 2}}
 
 
 def read(**change: Any) -> Outer:
-    return decode(Outer, Section(LEAST | change, "f.yaml", "top"))
+    return decode(Outer, LEAST | change, "f.yaml", "top")
 
 
 def test_defaults_and_every_kind_of_field() -> None:
@@ -120,14 +120,14 @@ def test_what_is_wrong_is_named_in_one_line(change: dict[str, Any], message: str
 
 def test_an_unknown_key_is_named_before_the_one_that_is_missing_for_it() -> None:
     with pytest.raises(ConfigError, match="did you mean 'name'"):
-        decode(Outer, Section({"nam": "n", "inner": {"gain": 1}}, "f.yaml"))
+        decode(Outer, {"nam": "n", "inner": {"gain": 1}}, "f.yaml")
 
 
 def test_given_values_are_no_keys() -> None:
     mapping = {"inner": {"gain": 1}}
-    assert decode(Outer, Section(mapping, "f.yaml"), name="given").name == "given"
+    assert decode(Outer, mapping, "f.yaml", name="given").name == "given"
     with pytest.raises(ConfigError, match="'name': unknown key"):
-        decode(Outer, Section(mapping | {"name": "n"}, "f.yaml"), name="given")
+        decode(Outer, mapping | {"name": "n"}, "f.yaml", name="given")
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ import pytest
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.joint_safety import safety_of
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.plausibility import FROZEN_RAD
 from jtqd.estimator.settings import PlausibilityLimits
@@ -192,7 +192,7 @@ def test_the_first_sample_and_a_wrong_time_step_conclude_nothing() -> None:
 )
 def test_limits_out_of_range_are_refused(mapping: dict[str, object], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        decode(PlausibilityLimits, Section(mapping, "c.yaml", "safety.plausibility"))
+        decode(PlausibilityLimits, mapping, "c.yaml", "safety.plausibility")
     assert message in str(caught.value)
 
 

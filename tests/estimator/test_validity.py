@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import RegularGridInterpolator
 
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.losses import FrictionModel, LossModel
@@ -118,12 +118,12 @@ def test_weight_against_its_formula_in_arrays() -> None:
 
 
 def test_settings_are_checked() -> None:
-    assert decode(EstimatorSettings, Section({}, "c.yaml", "estimator")) == EstimatorSettings()
-    settings = decode(EstimatorSettings, Section({"method": "tob", "bandwidth_rad_s": 80}, "c.yaml", "e"))
+    assert decode(EstimatorSettings, {}, "c.yaml", "estimator") == EstimatorSettings()
+    settings = decode(EstimatorSettings, {"method": "tob", "bandwidth_rad_s": 80}, "c.yaml", "e")
     assert (settings.method, settings.bandwidth_rad_s) == ("tob", 80.0)
     for bad in ({"method": "magic"}, {"bandwidth_rad_s": 0}, {"bandwith_rad_s": 80}, {"max_gap_s": math.nan}):
         with pytest.raises(ConfigError, match=r"^c\.yaml: key 'e\."):
-            decode(EstimatorSettings, Section(bad, "c.yaml", "e"))
+            decode(EstimatorSettings, bad, "c.yaml", "e")
     for wrong in ({"method": "x"}, {"sigma_floor": -1.0}, {"torque_limit": math.inf}):
         with pytest.raises(ConfigError):
             EstimatorSettings(**wrong)  # type: ignore[arg-type]

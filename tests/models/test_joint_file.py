@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.config import load_config
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError, range_text
 from jtqd.estimator.joint import EFFECT_NAMES, Effect, Friction, Joint
 from jtqd.models.files import load_joint, load_yaml, read_yaml, shipped
 from jtqd.sim_can.plant_file import load_plant
@@ -179,28 +179,6 @@ def test_random_garbage_never_gets_past_as_another_exception() -> None:
         assert message == "" or message.startswith("my.yaml: key"), (seed, round_)
 
 
-def test_section_reads_the_other_kinds() -> None:
-    section = Section({"n": 3, "b": True, "t": "x", 's': {}}, "f.yaml", "top")  # fmt: skip
-    assert section.integer("n", low=1, high=5) == 3
-    assert section.raw("b") is True
-    assert section.text("t", choices=("x", "y")) == "x"
-    assert section.number("missing", default=None) is None
-    assert section.section("s") is not None
-    assert section.section("absent", optional=True) is None
-    section.finish()
-    for read in (
-        lambda: section.integer("b"),
-        lambda: section.integer("n", high=2),
-        lambda: section.text("t", choices=("y",)),
-        lambda: section.section("n"),
-        lambda: section.required("absent"),
-        lambda: Section([1], "f.yaml"),
-        lambda: Section({1: 2}, "f.yaml"),
-    ):
-        with pytest.raises(ConfigError, match=r"^f\.yaml: "):
-            read()
-
-
 def test_files(tmp_path: Path) -> None:
     path = tmp_path / "a.yaml"
     path.write_bytes(b"a: 1\nb: {c: 2.5}\n")
@@ -281,17 +259,11 @@ def test_a_nul_in_a_name_is_one_line(load: Callable[[str], object]) -> None:
         load("a\0b.yaml")
 
 
-def test_whole_limits_are_told_as_whole_numbers() -> None:
-    def words(**limits: int) -> str:
-        with pytest.raises(ConfigError) as caught:
-            Section({"bits": "x"}, "c.yaml").integer("bits", "bit/s", **limits)
-        return str(caught.value).partition("expected ")[2]
-
-    assert words(low=10_000, high=1_000_000) == "a whole number in bit/s from 10000 to 1000000"
-    assert words(low=1_000_000) == "a whole number in bit/s >= 1000000"
-    assert words(high=0xFFFF_FFFF) == "a whole number in bit/s <= 4294967295"
-    with pytest.raises(ConfigError, match=r"a number in s from 0\.5 to 1e\+09$"):
-        Section({"x": -1}, "c.yaml").number("x", "s", 0.5, 1e9)
+def test_whole_limits_are_shown_as_whole_numbers() -> None:
+    assert range_text("a whole number", 10_000, 1_000_000, None) == "a whole number from 10000 to 1000000"
+    assert range_text("a whole number", 1_000_000, None, None) == "a whole number >= 1000000"
+    assert range_text("a whole number", None, 0xFFFF_FFFF, None) == "a whole number <= 4294967295"
+    assert range_text("a number", 0.5, 1e9, None) == "a number from 0.5 to 1e+09"
 
 
 def test_shipped_lists_what_ships() -> None:

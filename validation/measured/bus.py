@@ -22,7 +22,6 @@ from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
-from jtqd.estimator.checked import Section
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import make_estimator
@@ -94,14 +93,8 @@ class Played:
 def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
     """Joints and estimator of a configuration of jtqd. Raises ConfigError."""
     mapping = load_yaml(config)
-    top = Section(mapping, str(config))
-    sections = [top.section(f"joint_{number}") for number in (1, 2)]
-    one, two = (
-        load_joint(config.parent / section.text("file")) for section in sections if section is not None
-    )
-    estimator = top.section("estimator")
-    assert estimator is not None  # a missing section is a ConfigError
-    return (one, two), decode(EstimatorSettings, estimator)
+    one, two = (load_joint(config.parent / mapping[f"joint_{number}"]["file"]) for number in (1, 2))
+    return (one, two), decode(EstimatorSettings, mapping["estimator"], str(config), "estimator")
 
 
 def score_log(log: Path, index: int, played: Played) -> BusRun:

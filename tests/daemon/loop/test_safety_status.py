@@ -13,7 +13,8 @@ from hypothesis import strategies as some
 from jtqd.daemon.config import LATCHED_BY_DEFAULT, SafetySettings
 from jtqd.daemon.core.status import NEEDED, JointStatus
 from jtqd.daemon.shared import faults
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.decoder import decode
 from jtqd.estimator.status import (
     DEGRADED,
     DRIVE_FAULT,
@@ -238,7 +239,7 @@ def test_the_same_input_gives_the_same_output_again() -> None:
 
 
 def section(mapping: object) -> SafetySettings:
-    return SafetySettings.from_section(Section(mapping, "c.yaml", "safety"))
+    return decode(SafetySettings, mapping, "c.yaml", "safety")
 
 
 def test_the_configuration_says_what_is_latched() -> None:

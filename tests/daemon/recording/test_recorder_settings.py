@@ -11,14 +11,14 @@ import pytest
 from jtqd.daemon.config import RecordingSettings, load_config
 from jtqd.daemon.recording.keeper import recording_request
 from jtqd.daemon.recording.request import RecorderRequest
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
 from jtqd.models.files import shipped
 from tests.daemon.recording.test_dbc import SCALING
 
 
 def read(**keys):
-    return decode(RecordingSettings, Section(keys, "a.yaml", "recording"))
+    return decode(RecordingSettings, keys, "a.yaml", "recording")
 
 
 def test_defaults():

@@ -227,7 +227,7 @@ def loaded(change) -> None:
         ),
         (
             lambda m: m["joint_1"]["motor"].update(cogging=[{"order": 1.0, "amplitude_nm": 0.0}] * 9),
-            "key 'joint_1.motor.cogging': found '9 entries', expected at most 8",
+            "key 'joint_1.motor.cogging': found 9 entries, expected at most 8",
         ),
         (lambda m: m["joint_1"]["friction"].pop("load_nm"), "key 'joint_1.friction.load_nm': missing"),
         (

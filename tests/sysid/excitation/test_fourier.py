@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError, Section
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.decoder import decode
 from jtqd.sysid.excitation.fourier import (
     RAMP_SHARE,
+    CurrentFile,
     EndState,
     FourierSeries,
     FourierTrajectory,
+    SeriesFile,
     quintic_coefficients,
 )
 
@@ -135,12 +138,10 @@ def test_shapes_scalars_and_purity():
 def test_mapping_round_trip_through_yaml():
     one = random_trajectory(7)
     text = yaml.safe_dump(one.to_mapping())
-    assert FourierTrajectory.from_section(
-        Section(yaml.safe_load(text), "p"), one.duration_s
-    ) == FourierTrajectory(one.omega_rad_s, one.a, one.b, one.duration_s)
+    assert decode(SeriesFile, yaml.safe_load(text), "p") == SeriesFile(one.omega_rad_s, one.a, one.b)
     series = FourierSeries(1.0, (1.0, 2.0), (0.5, 1e-7), 4.0, -0.25)
     text = yaml.safe_dump(series.to_mapping())
-    assert FourierSeries.from_section(Section(yaml.safe_load(text), "p"), 4.0) == series
+    assert decode(CurrentFile, yaml.safe_load(text), "p") == CurrentFile(1.0, series.a, series.b, -0.25)
 
 
 GOOD = {"omega_rad_s": 1.0, "a": [1.0, 2.0], "b": [0.0, 1.0]}
@@ -161,7 +162,7 @@ GOOD = {"omega_rad_s": 1.0, "a": [1.0, 2.0], "b": [0.0, 1.0]}
 )
 def test_mapping_errors_name_file_and_key(change, message):
     with pytest.raises(ConfigError) as refused:
-        FourierTrajectory.from_section(Section(GOOD | change, "plan.yaml"), 10.0)
+        decode(SeriesFile, GOOD | change, "plan.yaml")
     assert str(refused.value).startswith("plan.yaml: ")
     assert message in str(refused.value)
     assert "\n" not in str(refused.value)

@@ -108,21 +108,24 @@ def test_the_window_follows_the_motion_and_not_the_noise() -> None:
     assert short[0].shape == short[1].shape == (3,)
 
 
+DRIVE = {"voltage_v": "v", "resistance_ohm": 1.0, "back_emf_vs_per_rad": 0.1}
+
+
 @pytest.mark.parametrize(
     ("more", "said"),
     [
         ({"j1.load": {"mass_kg": 1.0}}, "key 'j1.load.lever_m': missing"),
         ({"j1.load": {"mass_kg": -1.0, "lever_m": 1.0}}, "found -1.0, expected a number in kg >= 0"),
-        ({"j1.load": {"mass": 1.0, "lever_m": 1.0}}, "key 'j1.load.mass_kg': missing"),
+        ({"j1.load": {"mass": 1.0, "lever_m": 1.0}}, "'j1.load.mass': unknown key, did you mean 'mass_kg'"),
         ({"j1.load": {"torque_nm": "x", "mass_kg": 1.0}}, "key 'j1.load.mass_kg': unknown key"),
         ({"j1.load": LOAD, "j1.torque_nm": "i"}, "found it beside 'j1.torque_nm', expected one reference"),
         ({"j2.load": LOAD}, "found no 'j2.link_position_rad'"),
         ({"j1.load": 3}, "found 3, expected a mapping"),
         (
-            {"j1.current_a": "i", "j1.drive": {"voltage_v": "v"}},
+            {"j1.current_a": "i", "j1.drive": DRIVE},
             "found it beside 'j1.current_a', expected one of them",
         ),
-        ({"j1.drive": {"voltage_v": "v"}}, "found neither 'j1.motor_velocity_rad_s' nor"),
+        ({"j1.drive": DRIVE}, "found neither 'j1.motor_velocity_rad_s' nor"),
         (
             {"j1.motor_position_rad": "p", "j1.drive": {"voltage_v": "v", "resistance_ohm": 0.0}},
             "key 'j1.drive.resistance_ohm': found 0.0",
