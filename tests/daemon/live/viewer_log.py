@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
+from jtqd.daemon.recording import schemas
 from tests.daemon.recording.cdr_decoder import Definition
 from tests.paths import ROOT
 
@@ -39,20 +40,22 @@ def bench_log():
     return log
 
 
-class Log:
-    """What a viewer knows of a file: topics with their definitions, and messages."""
+class Topics:
+    """What a viewer knows of the topics: their definitions, by name."""
 
-    def __init__(self, path):
-        self.definitions, self.texts, self.messages = {}, {}, {}
-        with open(path, "rb") as file:
-            for schema, channel, message in make_reader(file).iter_messages():
-                if channel.topic not in self.definitions:
-                    self.texts[channel.topic] = schema.data.decode()
-                    self.definitions[channel.topic] = Definition(schema.name, self.texts[channel.topic])
-                self.messages.setdefault(channel.topic, []).append(message.data)
+    def __init__(self):
+        self.definitions, self.texts = {}, {}
 
-    def decoded(self, topic, number=-1):
-        return self.definitions[topic].decode(self.messages[topic][number])
+    @classmethod
+    def of_bus(cls, joints):
+        """Those in the log of a bus with so many joints."""
+        made, texts = cls(), schemas.schemas_of(joints)
+        for topic in schemas.topics_of(joints):
+            made.define(topic.name, topic.schema, texts[topic.schema])
+        return made
+
+    def define(self, topic, name, text):
+        self.texts[topic], self.definitions[topic] = text, Definition(name, text)
 
     def kind(self, path):
         """Type of what a message path selects, e.g. "float64"; ValueError where it selects nothing.
@@ -64,7 +67,7 @@ class Log:
             raise ValueError(f"{path}: not a message path")
         topic, rest = found.groups()
         if topic not in self.definitions:
-            raise ValueError(f"{path}: no message on {topic}")
+            raise ValueError(f"{path}: no topic {topic}")
         types = self.definitions[topic].types
         kind, array = None, False
         for part in re.findall(r"\.\w+|\[[^\]]*\]|\{[^}]*\}", rest):
@@ -103,3 +106,19 @@ class Log:
                 return constants
             constants = {}
         raise ValueError(f"{topic}: no field {field}")
+
+
+class Log(Topics):
+    """Topics and messages of a file."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.messages = {}
+        with open(path, "rb") as file:
+            for schema, channel, message in make_reader(file).iter_messages():
+                if channel.topic not in self.definitions:
+                    self.define(channel.topic, schema.name, schema.data.decode())
+                self.messages.setdefault(channel.topic, []).append(message.data)
+
+    def decoded(self, topic, number=-1):
+        return self.definitions[topic].decode(self.messages[topic][number])
