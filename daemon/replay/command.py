@@ -325,7 +325,6 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--method", choices=METHODS, help="another method of the estimator")
     made.add_argument("--compare", action="store_true", help="show differences also with the logged models")
-    made.add_argument("--exact", action="store_true", help="as without it: every replay is cycle by cycle")
     made.add_argument("--json", action="store_true", help="results as JSON")
     made.add_argument(
         "--out",

@@ -203,7 +203,6 @@ def parser() -> argparse.ArgumentParser:
     replay = _common(commands, REPLAY, "replay the estimator over each run, and compare")
     replay.add_argument("--model", type=Path, metavar="DIR", help="other models; see jtq replay --help")
     replay.add_argument("--method", choices=METHODS, help="another method of the estimator")
-    replay.add_argument("--exact", action="store_true", help="as without it: every replay is cycle by cycle")
     return result
 
 
