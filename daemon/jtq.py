@@ -36,7 +36,7 @@ GROUPS = {
             "write a log as CSV, Parquet or candump lines, or the bus as a DBC",
         ),
         "recover": (
-            "jtqd.daemon.logs.recover_command",
+            "jtqd.daemon.logs.recover",
             "repair unfinished or damaged logs",
         ),
         "replay": ("jtqd.daemon.replay.command", "run the estimator again over a log, and compare"),

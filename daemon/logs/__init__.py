@@ -4,8 +4,7 @@ In come MCAP files of jtqd, its python-can writer and others; out go numpy array
 May import numpy, mcap and the file format of `daemon.recording`; import `recover`, `export`, `can_frames`, `can_io` by name.
 """
 
-from jtqd.daemon.logs.container import LogError
-from jtqd.daemon.logs.log_file import LogFile
+from jtqd.daemon.logs.log_file import LogError, LogFile
 from jtqd.daemon.logs.read import (
     Messages,
     Records,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.container import LogError
+from jtqd.daemon.logs.log_file import LogError
 from jtqd.daemon.logs.read import Messages, Records, iter_messages, topics_of
 from jtqd.daemon.recording.schemas import FRAMES_NAMES
 

@@ -22,16 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs.can_frames import ERROR, EXTENDED, REMOTE, Frames, can_topics, iter_frames
-from jtqd.daemon.logs.container import LogError
-from jtqd.daemon.logs.log_file import LogFile
+from jtqd.daemon.logs.log_file import LogError, LogFile
 from jtqd.daemon.logs.read import (
-    Messages,
     Records,
     iter_messages,
     iter_topics,
     log_parts,
     read_attachments,
-    read_messages,
     topics_of,
 )
 from jtqd.daemon.recording.schemas import JOINTS
@@ -159,10 +156,7 @@ def _export(options: argparse.Namespace) -> dict[str, Any]:
     result: dict[str, int] = {}
     if options.topic is not None:
         _require_topic(logs, options.topic)
-        try:
-            size = write(options.out, topic_blocks(logs, options.topic, **span))
-        except ColumnsChangedError:
-            size = write(options.out, [topic_table(logs, options.topic, **span)])
+        size = write(options.out, topic_blocks(logs, options.topic, **span))
     else:
         table = RunTable(logs, all_cycles=options.all_cycles, **span)
         size = write(options.out, table.blocks())
@@ -268,10 +262,6 @@ _JOINT_TOPICS = {joint: topic.name for joint, topic in enumerate(JOINTS, start=1
 _ROW = np.dtype(
     [("cycle", "<u8"), ("sync_monotonic_ns", "<i8"), *((field, "<f8") for field in RUN_FIELDS.values())]
 )
-
-
-class ColumnsChangedError(Exception):
-    """A later chunk has other columns than the first: the table is to be made in one piece (`topic_table`)."""
 
 
 class RunTable:
@@ -388,33 +378,20 @@ def _picked(records: Records, topic: str) -> Records:
 def topic_blocks(
     path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Columns]:
-    """Yield all fields of a topic as columns, chunk by chunk; see `topic_table`. Raises ColumnsChangedError as well."""
-    first: Columns | None = None
+    """Yield all fields of a topic as columns, chunk by chunk: `log_time_ns`, then every field by its path.
+
+    A path is such as `header.stamp.sec`. Fixed arrays have one column for each element (`data[3]`). A sequence is one
+    column of its values as text.
+    """
+    found = False
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
-        columns = _columns(messages)
-        first = first or columns
-        if columns.keys() != first.keys() or any(columns[name].dtype != first[name].dtype for name in first):
-            raise ColumnsChangedError
+        columns: Columns = {"log_time_ns": messages.log_times}
+        _flatten("", messages.records, columns)
+        found = True
         yield columns
-    if first is None:
+    if not found:
         when = " in that time" if start_ns is not None or end_ns is not None else ""
         raise LogError(f"{_named(path)}: found no message on {topic}{when}, expected one at least")
-
-
-def topic_table(
-    path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
-) -> Columns:
-    """All fields of a topic as columns: `log_time_ns`, then every number and text by its path (`header.stamp.sec`).
-
-    Fixed arrays have one column for each element (`data[3]`). A sequence is one column of its values as text.
-    """
-    return _columns(read_messages(path, (topic,), start_ns=start_ns, end_ns=end_ns)[topic])
-
-
-def _columns(messages: Messages) -> Columns:
-    columns: Columns = {"log_time_ns": messages.log_times}
-    _flatten("", messages.records, columns)
-    return columns
 
 
 def _flatten(prefix: str, values: Records | NDArray[Any], columns: Columns) -> None:

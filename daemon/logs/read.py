@@ -1,15 +1,16 @@
-"""Read recorded messages: those of a topic of one or several MCAP files as one structured array.
+"""Recorded messages as structured arrays: those of a topic of one file, or of the parts of one run.
 
-The layout comes from the schema text in the file (ros2msg) and CDR's alignment rules, not from jtqd's code. Messages of
-jtqd's topics have one length each (`docs/recording.md`), so that a chunk is read as an array of rows, without a loop over
-messages. Where lengths change, as in other writers' files and in texts, every message is decoded on its own by the `mcap`
-project's ROS 2 decoder (extra `ros2`).
+The layout of a message follows from the ros2msg schema in the file and CDR's alignment, not from jtqd's code. Messages of
+equal form are copied as rows, without a loop. Messages whose texts or sequences change in length are decoded one by one by
+the `mcap` project's ROS 2 decoder (extra `ros2`).
 """
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict, deque
 from collections.abc import Iterable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,9 +18,7 @@ import numpy as np
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.container import MESSAGE_HEAD, LogError, pieces
-from jtqd.daemon.logs.layout import PRIMITIVES, Layout, Types, VariableLayoutError, message_layout, types_of
-from jtqd.daemon.logs.log_file import Batch, LogFile
+from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pieces
 from jtqd.daemon.recording.own_files import ACTIVE, PART_PATTERN
 
 Records = NDArray[np.void]
@@ -55,7 +54,7 @@ def read_topics(
 
     Args:
         path: a log, a directory with the parts of one run, or the parts themselves. A file that ends in `.active`
-            is read as far as it is there. Messages that two parts have come once.
+            is read as far as it is intact. Messages that two parts have come once.
         topics: names.
         start_ns, end_ns: log times from the first on, up to but without the second; None: no bound.
 
@@ -76,16 +75,14 @@ def read_messages(
 ) -> dict[str, Messages]:
     """Read like `read_topics`, with the log time of every message."""
     parts = log_parts(path)
-    collectors = {topic: _Collector(topic, parts[0]) for topic in topics}
-    for part in _pieces(parts, topics, start_ns, end_ns):
-        collector = collectors[part.topic]
-        collector.begin(part.path, part.schema, part.expected)
-        collector.add(part.batch)
+    tables = {topic: _Table(topic) for topic in topics}
+    for piece in _pieces(parts, topics, start_ns, end_ns):
+        tables[piece.topic].add(piece)
     span = "" if start_ns is None and end_ns is None else " in that time"
-    for topic, collector in collectors.items():
-        if not collector.count:
+    for topic, table in tables.items():
+        if not table.count:
             raise LogError(f"{parts[0]}: found no message on {topic}{span}, expected one per cycle")
-    return {topic: Messages(*collector.result()) for topic, collector in collectors.items()}
+    return {topic: table.messages() for topic, table in tables.items()}
 
 
 def iter_messages(
@@ -108,28 +105,29 @@ def iter_topics(
     Raises as `read_topics` does.
     """
     found: dict[str, Messages] = {}
-    for part in _pieces(log_parts(path), topics, start_ns, end_ns):
-        if part.topic in found:
+    for piece in _pieces(log_parts(path), topics, start_ns, end_ns):
+        if piece.topic in found:
             yield found
             found = {}
-        collector = _Collector(part.topic, part.path)
-        collector.begin(part.path, part.schema)
-        collector.add(part.batch)
-        if collector.count:
-            found[part.topic] = Messages(*collector.result())
+        table = _Table(piece.topic)
+        table.add(piece._replace(expected=0))
+        if table.count:
+            found[piece.topic] = table.messages()
     if found:
         yield found
 
 
 class _Piece(NamedTuple):
-    """Messages of one topic out of one chunk, with their file and schema."""
+    """Messages of one topic out of one chunk, with their file and schema.
+
+    expected: messages of the topic in the file, as its summary says.
+    """
 
     path: Path
     topic: str
     schema: Schema
     batch: Batch
     expected: int
-    """Messages of the topic in the file, as it says."""
 
 
 def _pieces(
@@ -141,14 +139,15 @@ def _pieces(
         with LogFile(path) as log:
             expected = log.expected if start_ns is None and end_ns is None else {}
             wanted = {
-                number: (channel.topic, _schema(log, path, channel), expected.get(number, 0))
+                number: (channel.topic, _schema(log, channel), expected.get(number, 0))
                 for number, channel in log.channels.items()
                 if channel.topic in topics
             }
-            for batch in log.batches(list(wanted), start_ns, end_ns):
-                topic, schema, promised = wanted[batch.channel]
+            for batch in log.batches(wanted, start_ns, end_ns):
+                topic, schema, count = wanted[batch.channel]
                 fresh = batch if filtered is None else filtered.new(topic, batch)
-                yield _Piece(path, topic, schema, fresh, promised)
+                if len(fresh.offsets):
+                    yield _Piece(path, topic, schema, fresh, count)
         if filtered is not None:
             filtered.next_part()
 
@@ -164,14 +163,15 @@ def topics_of(path: Path | Sequence[Path]) -> dict[str, str]:
     return found
 
 
-def _schema(log: LogFile, path: Path, channel: Channel) -> Schema:
+def _schema(log: LogFile, channel: Channel) -> Schema:
     """Schema of a channel whose messages can be decoded."""
     schema: Schema | None = log.schemas.get(channel.schema_id)
+    where = f"{log.path}: {channel.topic}"
     if schema is None or schema.encoding != "ros2msg":
         found = "no" if schema is None else schema.encoding or "no"
-        raise LogError(f"{path}: {channel.topic}: found {found} schema, expected ros2msg")
+        raise LogError(f"{where}: found {found} schema, expected ros2msg")
     if channel.message_encoding != "cdr":
-        raise LogError(f"{path}: {channel.topic}: found messages in {channel.message_encoding}, expected cdr")
+        raise LogError(f"{where}: found messages in {channel.message_encoding}, expected cdr")
     return schema
 
 
@@ -215,10 +215,9 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
     given = list(paths)
     if len(given) == 1:
         return given
-    named = [PART_PATTERN.fullmatch(each.name) for each in given]
-    if all(named) and len({found.group("prefix", "run") for found in named if found}) == 1:
-        numbers = [int(found["part"]) for found in named if found]
-        return [path for _, path in sorted(zip(numbers, given, strict=True))]
+    named = [found for each in given if (found := PART_PATTERN.fullmatch(each.name))]
+    if len(named) == len(given) and len({found.group("prefix", "run") for found in named}) == 1:
+        return [path for _, path in sorted(zip([int(n["part"]) for n in named], given, strict=True))]
     starts = []
     for n, path in enumerate(given):
         with LogFile(path) as log:
@@ -226,175 +225,280 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
     return [path for *_, path in sorted(starts)]
 
 
+# ---- schemas ----
+
+_PRIMITIVES = {
+    "bool": "?",
+    "byte": "u1",
+    "char": "u1",
+    **{f"{sign}int{8 * size}": f"<{sign or 'i'}{size}" for sign in ("u", "") for size in (1, 2, 4, 8)},
+    "float32": "<f4",
+    "float64": "<f8",
+}
+"""Type -> numpy's code."""
+_MAX_DEPTH = 32
+"""Levels of nested types."""
+_FIELD = re.compile(
+    r"(?P<kind>[\w/]+)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[a-z]\w*)(?:\s+[^\s=].*)?$"
+)
+"""Type, array, name, default value."""
+_CONSTANT = re.compile(r"[\w<=/]+\s+[A-Z]\w*\s*=")
+_NESTED = re.compile(r"^=+\s*\nMSG: (\S+)[^\n]*\n", re.MULTILINE)
+_TIME = "int32 sec\nuint32 nanosec\n"
+
+
+class _Field(NamedTuple):
+    """One field. `elements`: of a fixed array; `sequence`: as many as the message says."""
+
+    name: str
+    kind: str
+    elements: int | None
+    sequence: bool
+
+
+class _Types:
+    """Fields of the message ("") and of every type nested in it.
+
+    Raises:
+        LogError: a line that is no field, two fields of one name, or a type without a definition.
+    """
+
+    def __init__(self, text: str) -> None:
+        first, *rest = _NESTED.split(text.replace("\r\n", "\n"))
+        # Some writers leave the texts of builtin_interfaces out.
+        texts = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME, "": first}
+        texts |= {name.replace("/msg/", "/"): body for name, body in zip(rest[::2], rest[1::2], strict=True)}
+        self._fields = {name: _fields(body) for name, body in texts.items()}
+        self._by_last = {name.rsplit("/", 1)[-1]: fields for name, fields in self._fields.items()}
+
+    def fields(self, name: str) -> list[_Field]:
+        """Return the fields of a type."""
+        bare = name.replace("/msg/", "/")
+        found = self._fields.get(bare) or (None if "/" in bare else self._by_last.get(bare))
+        if found is None:
+            raise LogError(f"found type {name!r} in a schema, expected its definition")
+        return found
+
+
+def _fields(text: str) -> list[_Field]:
+    fields = []
+    for line in (line.partition("#")[0].strip() for line in text.splitlines()):
+        if not line or _CONSTANT.match(line):
+            continue
+        found = _FIELD.match(line)
+        if found is None:
+            raise LogError(f"found {line!r} in a schema, expected a field")
+        sequence = bool(found["array"]) and (found["bound"] is not None or not found["count"])
+        count = int(found["count"]) if found["array"] and not sequence else None
+        fields.append(_Field(found["name"], found["kind"], count, sequence))
+    if len({field.name for field in fields}) != len(fields):
+        raise LogError("found two fields of one name in a schema")
+    return fields or [_Field("structure_needs_at_least_one_member", "uint8", None, False)]
+
+
+@lru_cache(maxsize=16)
+def _types_of(text: str) -> _Types:
+    return _Types(text)
+
+
+class _VariableError(LogError):
+    """Messages of this type have no fixed rows."""
+
+
+class _Layout:
+    """Layout of messages of one form: their rows, and where the lengths of their texts stand.
+
+    Every primitive lies at a multiple of its own size, counted from the first byte behind the encapsulation. The lengths of
+    texts are those of an example; a message with others has another form.
+
+    Args:
+        types: of the schema.
+        example: payload of one message.
+
+    Raises:
+        _VariableError: a sequence, or texts in an array.
+        LogError: the example does not fit the schema.
+    """
+
+    def __init__(self, types: _Types, example: bytes) -> None:
+        self._types, self._example = types, example
+        self.size = len(example)
+        self.lengths: list[tuple[int, int]] = [(0, 0x0000_0100)]
+        """(offset, value) in every payload, unsigned 32 bit: the encapsulation is plain CDR, little endian."""
+        if example[:4] != b"\x00\x01\x00\x00":
+            raise _VariableError("found another encapsulation, expected little endian CDR")
+        names, formats, offsets, end = self._members("", 4, 0)
+        if not 0 <= self.size - end < 8:  # what is left can only be padding
+            raise LogError(f"found {self.size - 4} bytes, expected {end - 4} by the schema")
+        self.dtype = _struct(names, formats, offsets, self.size)
+
+    def _members(self, name: str, at: int, depth: int) -> tuple[list[str], list[Any], list[int], int]:
+        if depth > _MAX_DEPTH:
+            raise LogError(f"found types nested deeper than {_MAX_DEPTH} in a schema")
+        names, formats, offsets = [], [], []
+        for field in self._types.fields(name):
+            begin, kind = self._field(field, at, depth)
+            names.append(field.name)
+            formats.append(kind)
+            offsets.append(begin)
+            at = begin + kind.itemsize
+        return names, formats, offsets, at
+
+    def _field(self, field: _Field, at: int, depth: int) -> tuple[int, np.dtype[Any]]:
+        if field.sequence or (field.elements is not None and field.kind == "string"):
+            raise _VariableError(f"found {field.name}, a sequence or an array of texts")
+        begin, kind = self._one(field.kind, at, depth)
+        if field.elements is None:
+            return begin, kind
+        if field.elements * max(kind.itemsize, 1) > self.size:
+            raise LogError(
+                f"found an array of {field.elements} {field.kind} in a message of {self.size - 4} bytes"
+            )
+        known = len(self.lengths)
+        again = self._one(field.kind, begin + kind.itemsize, depth)
+        if again != (begin + kind.itemsize, kind) or len(self.lengths) != known:
+            raise _VariableError(f"found an array of {field.kind} whose elements differ in form")
+        return begin, np.dtype((kind, (field.elements,)))
+
+    def _one(self, kind: str, at: int, depth: int) -> tuple[int, np.dtype[Any]]:
+        """Return where a value that follows byte `at` begins, and its type."""
+        if kind in _PRIMITIVES:
+            layout: np.dtype[Any] = np.dtype(_PRIMITIVES[kind])
+            return at + -(at - 4) % layout.itemsize, layout
+        if kind == "string":
+            at += -at % 4
+            length = int.from_bytes(self._example[at : at + 4], "little")  # with the closing zero
+            if not 0 < length <= self.size - at - 4:
+                raise LogError(f"found a length of {length} in a message of {self.size - 4} bytes")
+            self.lengths.append((at, length))
+            return at + 4, np.dtype(f"S{length}")
+        names, formats, offsets, end = self._members(kind, at, depth + 1)
+        return at, _struct(names, formats, [offset - at for offset in offsets], end - at)
+
+
+def _struct(names: list[str], formats: list[Any], offsets: list[int], size: int) -> np.dtype[Any]:
+    made = {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
+    return np.dtype(made)  # type: ignore[call-overload,no-any-return]
+
+
 # ---- rows ----
 
-
-_ENCAPSULATION = 0x0100
-"""Plain CDR, little endian, as an unsigned 16 bit number."""
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIRST_ROWS = 4096
 
 
-class _Collector:
-    """Takes batches of one topic, of one file after the other."""
+class _Table:
+    """Messages of one topic, of one file after the other."""
 
-    def __init__(self, topic: str, path: Path) -> None:
-        self._topic, self._path = topic, path
-        self._file: Path | None = None
-        self._promised = _FIRST_ROWS
-        self._schema: Schema | None = None
-        self._types = Types("")
-        self._layout: Layout | None = None
-        self._length = 0
+    def __init__(self, topic: str) -> None:
+        self._topic = topic
+        self._first: _Piece | None = None
+        self._layout: _Layout | None = None
         self._decoder: _Decoder | None = None
-        self._rows: NDArray[Any] | None = None
+        self._rows: NDArray[Any] = np.empty(0, "V1")
         self._times = np.empty(0, np.uint64)
         self.count = 0
 
-    def begin(self, path: Path, schema: Schema, expected: int = 0) -> None:
-        """The next batches are from this file and of this schema. Raises LogError where it differs from that before.
-
-        expected: messages in the file, to make room for them at once.
-        """
-        if path != self._file:
-            self._file, self._promised = path, max(_FIRST_ROWS, self.count + expected)
-        if self._schema is not None:
-            if schema.data != self._schema.data:
-                raise LogError(
-                    f"{path}: {self._topic}: found another schema than in {self._path}, expected the same"
-                )
-            return
+    def add(self, piece: _Piece) -> None:
+        """Take messages in. Raises LogError, also for another schema than the first one's."""
+        first = self._first or piece
+        if piece.schema.data != first.schema.data:
+            raise LogError(
+                f"{piece.path}: {self._topic}: found another schema than in {first.path}, expected the same"
+            )
         try:
-            self._types = types_of(schema.data.decode())
-        except UnicodeDecodeError:
-            raise LogError(f"{path}: {self._topic}: found a schema that is no text") from None
-        self._path, self._schema = path, schema
-
-    def add(self, batch: Batch) -> None:
-        """Take messages in. Raises LogError."""
-        if not len(batch.offsets):
-            return
-        try:
-            if self._decoder is None and not self._take_rows(batch):
-                self._decode_singly()
-            if self._decoder is not None:
-                self._put(self._decoder.rows(_payloads(batch)), batch.log_times)
+            if self._first is None:
+                self._begin(piece)
+            rows = None if self._layout is None else self._rows_of(piece.batch, self._layout)
+            if rows is None:
+                if self._decoder is None:
+                    self._decode_singly(first.schema)
+                assert self._decoder is not None
+                rows = self._decoder.rows(_payloads(piece.batch))
         except LogError as error:
-            raise LogError(f"{self._path}: {self._topic}: {error}") from None
+            raise LogError(f"{piece.path}: {self._topic}: {error}") from None
+        self._put(rows, piece.batch.log_times, self.count + piece.expected)
 
-    def result(self) -> tuple[NDArray[np.uint64], Records]:
-        """Log times [n] and records [n]."""
-        rows: Records = np.empty(0, [("none", "u1")]) if self._rows is None else self._rows[: self.count]
-        if self._decoder is None and self._layout is not None:
-            rows = rows.view(_payload_dtype(self._layout.dtype, self._length))
-        return self._times[: self.count], rows
+    def _begin(self, piece: _Piece) -> None:
+        batch, self._first = piece.batch, piece
+        begin = int(batch.offsets[0]) + _PAYLOAD
+        try:
+            text = piece.schema.data.decode()
+            self._layout = _Layout(_types_of(text), batch.data[begin : begin + int(batch.lengths[0])])
+        except UnicodeDecodeError:
+            raise LogError("found a schema that is no text") from None
+        except _VariableError:
+            self._layout = None
 
-    def _take_rows(self, batch: Batch) -> bool:
-        """Copy the messages as rows; False where they are not of one form."""
-        if self._layout is None:
-            example = batch.data[int(batch.offsets[0]) + _PAYLOAD :][: int(batch.lengths[0])]
-            if len(example) < 4 or example[0] or example[1] != 1:
-                return False
-            try:
-                self._layout = message_layout(self._types, example[4:])
-            except VariableLayoutError:
-                return False
-            self._length = len(example)
-            left = len(example) - 4 - self._layout.dtype.itemsize
-            if not 0 <= left < 8:  # what is left can only be padding
-                raise LogError(
-                    f"found {len(example) - 4} bytes, expected {self._layout.dtype.itemsize} by the schema"
-                )
-        if (batch.lengths != self._length).any():
-            return False
-        # The row is the whole payload: its fields begin behind the encapsulation.
+    def messages(self) -> Messages:
+        """Return all messages so far."""
+        rows = self._rows[: self.count]
+        return Messages(
+            self._times[: self.count], rows if self._layout is None else rows.view(self._layout.dtype)
+        )
+
+    def _rows_of(self, batch: Batch, layout: _Layout) -> NDArray[np.void] | None:
+        """Return the payloads as rows of plain bytes; None where they are not all of the layout's form."""
+        if (batch.lengths != layout.size).any():
+            return None
         if batch.step:
-            begin = int(batch.offsets[0]) + _PAYLOAD
-            rows = np.ndarray((len(batch.offsets),), f"V{self._length}", batch.data, begin, (batch.step,))
+            begin, count = int(batch.offsets[0]) + _PAYLOAD, len(batch.offsets)
+            rows: NDArray[np.void] = np.ndarray((count,), f"V{layout.size}", batch.data, begin, (batch.step,))
         else:
-            rows = pieces(batch.data, batch.offsets + _PAYLOAD, self._length)
-        if (_column(rows, 0, "<u2") != _ENCAPSULATION).any():
-            return False
-        for place, length in self._layout.lengths:
-            if (_column(rows, 4 + place, "<u4") != length).any():
-                return False
-        self._put(rows, batch.log_times)
-        return True
+            rows = pieces(batch.data, batch.offsets + _PAYLOAD, layout.size)
+        for place, value in layout.lengths:
+            found = rows.view(_struct(["it"], ["<u4"], [place], layout.size))["it"]
+            if ((found & 0xFFFF if place == 0 else found) != value).any():
+                return None
+        return rows
 
-    def _decode_singly(self) -> None:
-        """Messages turn out to differ in form: decode these, those that are there and all that follow one by one."""
-        assert self._schema is not None
-        self._decoder = _Decoder(self._schema, self._types)
-        if self._rows is not None:
-            kept = np.empty(max(self.count, _FIRST_ROWS), self._decoder.dtype)
-            kept[: self.count] = self._decoder.rows([row.tobytes() for row in self._rows[: self.count]])
-            self._rows = kept
+    def _decode_singly(self, schema: Schema) -> None:
+        """Decode the messages so far, and all that follow, one by one: they differ in form."""
+        self._decoder = _Decoder(schema)
+        rows = self._decoder.rows([row.tobytes() for row in self._rows[: self.count]])
+        self._rows, self._layout = rows, None
 
-    def _put(self, rows: NDArray[Any], times: NDArray[np.uint64]) -> None:
+    def _put(self, rows: NDArray[Any], times: NDArray[np.uint64], expected: int) -> None:
         end = self.count + len(rows)
-        if self._rows is None:
-            self._rows = np.empty(max(self._promised, end), rows.dtype)
         if end > len(self._rows):
-            self._rows = _grown(self._rows, max(end, self._promised), self.count)
+            self._rows = _grown(self._rows, rows.dtype, max(end, expected, _FIRST_ROWS), self.count)
         if end > len(self._times):
-            self._times = _grown(self._times, max(end, self._promised), self.count)
+            self._times = _grown(self._times, self._times.dtype, len(self._rows), self.count)
         self._rows[self.count : end] = rows
         self._times[self.count : end] = times
         self.count = end
 
 
-def _grown(old: NDArray[Any], least: int, used: int) -> NDArray[Any]:
+def _grown(old: NDArray[Any], kind: np.dtype[Any], least: int, used: int) -> NDArray[Any]:
     """Return a longer array; what is not written yet takes no memory."""
-    new = np.empty(max(least, 2 * len(old)), old.dtype)
+    new = np.empty(max(least, 2 * len(old)), kind)
     new[:used] = old[:used]
     return new
 
 
-def _column(rows: NDArray[np.void], offset: int, kind: str) -> NDArray[Any]:
-    """Return one number of each row [n]."""
-    return rows.view(
-        np.dtype({"names": ["it"], "formats": [kind], "offsets": [offset], "itemsize": rows.itemsize})
-    )["it"]
-
-
-def _payload_dtype(fields: np.dtype[Any], length: int) -> np.dtype[Any]:
-    """Return a payload of that length whose fields lie behind the encapsulation."""
-    names, places = fields.names or (), dict(fields.fields or {})
-    made = {
-        "names": list(names),
-        "formats": [fields[name] for name in names],
-        "offsets": [4 + places[name][1] for name in names],
-        "itemsize": length,
-    }
-    return np.dtype(made)  # type: ignore[call-overload,no-any-return]
-
-
 def _payloads(batch: Batch) -> list[bytes]:
-    data = batch.data
     begins = (batch.offsets + _PAYLOAD).tolist()
-    return [
-        data[begin : begin + length] for begin, length in zip(begins, batch.lengths.tolist(), strict=True)
-    ]
+    return [batch.data[at : at + size] for at, size in zip(begins, batch.lengths.tolist(), strict=True)]
 
 
 class _Decoder:
     """Messages of one type as rows, each decoded on its own by the library.
 
     Numbers, and fixed arrays of them, are columns of their type; texts, and sequences, are objects (str, numpy array, list).
-    Nested messages are nested fields; within a sequence they are dictionaries.
+    Nested messages are nested fields; within an array they are dictionaries.
 
     Raises:
         LogError: the library is not installed, or does not take the schema.
     """
 
-    def __init__(self, schema: Schema, types: Types) -> None:
+    def __init__(self, schema: Schema) -> None:
         try:
             from mcap_ros2.decoder import DecoderFactory
         except ImportError:
             raise LogError(
                 "found messages of changing length, expected a decoder for them: pip install 'jtqd[ros2]'"
             ) from None
-        self._types = types
+        self._types = _types_of(schema.data.decode())
         self.dtype = self._columns("")
         try:
             self._decode: Any = DecoderFactory().decoder_for("cdr", schema)
@@ -416,39 +520,28 @@ class _Decoder:
         columns: list[tuple[str, Any]] = []
         for field in self._types.fields(name):
             kind: Any = object
-            if field.kind in PRIMITIVES and not field.sequence:
-                code = PRIMITIVES[field.kind]
+            if field.kind in _PRIMITIVES and not field.sequence:
+                code = _PRIMITIVES[field.kind]
                 kind = code if field.elements is None else (code, (field.elements,))
-            elif field.kind not in PRIMITIVES and field.kind != "string" and not field.is_array:
+            elif field.kind not in {*_PRIMITIVES, "string"} and not field.sequence and field.elements is None:
                 kind = self._columns(field.kind)
             columns.append((field.name, kind))
         return np.dtype(columns)
 
     def _row(self, name: str, message: Any) -> tuple[Any, ...]:
-        values: list[Any] = []
-        for field in self._types.fields(name):
-            value = getattr(message, field.name)
-            if field.kind in PRIMITIVES:
-                values.append(
-                    _numbers(value, PRIMITIVES[field.kind]) if field.is_array else _number(value, field.kind)
-                )
-            elif field.kind == "string":
-                values.append(value)
-            elif field.is_array:
-                values.append([_mapping(each) for each in value])
-            else:
-                values.append(self._row(field.kind, value))
-        return tuple(values)
+        return tuple(self._value(field, getattr(message, field.name)) for field in self._types.fields(name))
 
-
-def _number(value: Any, kind: str) -> Any:
-    return value % 256 if kind == "char" else value  # the library reads it with a sign
-
-
-def _numbers(value: Any, code: str) -> NDArray[Any]:
-    if isinstance(value, bytes | bytearray | memoryview):
-        return np.frombuffer(value, code)
-    return np.asarray(value, code)
+    def _value(self, field: _Field, value: Any) -> Any:
+        several = field.sequence or field.elements is not None
+        if field.kind in _PRIMITIVES and several:
+            code = _PRIMITIVES[field.kind]
+            is_bytes = isinstance(value, bytes | bytearray | memoryview)
+            return np.frombuffer(value, code) if is_bytes else np.asarray(value, code)
+        if field.kind == "char":  # the library reads it with a sign
+            return value % 256
+        if field.kind in {*_PRIMITIVES, "string"}:
+            return value
+        return _mapping(value) if several else self._row(field.kind, value)
 
 
 def _mapping(message: Any) -> Any:
@@ -461,7 +554,6 @@ def _mapping(message: Any) -> Any:
 
 # ---- parts ----
 
-
 _SEQUENCE = 11
 """[byte] offset of a record's sequence number, behind opcode, length and channel."""
 _TAIL_BATCHES, _TAIL_BYTES = 16, 64 << 20
@@ -471,9 +563,8 @@ _TAIL_BATCHES, _TAIL_BYTES = 16, 64 << 20
 class _DuplicateFilter:
     """Takes the batches of one part after the other, and gives back what is new in each.
 
-    After a crash of the recorder the next one goes on where the last one said that it was: a chunk that was written but not
-    yet reported is in two parts. Duplicates are recognised by their bytes, not by their time: clocks are set, and a run may
-    count its cycles anew.
+    A killed recorder may have written a chunk that it had not reported: the next recorder writes its cycles again, into the
+    next part. Duplicates are recognised by their bytes: clocks are set, and a run may count its cycles from 0 again.
     """
 
     def __init__(self) -> None:
@@ -501,13 +592,11 @@ class _DuplicateFilter:
         if fresh.all():
             del self._before[topic]  # no more of it is looked at: what follows costs nothing
             return batch
-        return Batch(
-            batch.channel, batch.data, batch.offsets[fresh], batch.log_times[fresh], batch.lengths[fresh]
-        )
+        return batch.only(fresh)
 
 
 def _records(batch: Batch) -> list[bytes]:
     """The records of a batch from their sequence numbers and times on; the channel's number is the file's own."""
-    begins = batch.offsets + _SEQUENCE
-    ends = (batch.offsets + MESSAGE_HEAD.itemsize + batch.lengths.astype(np.int64)).tolist()
-    return [batch.data[begin:end] for begin, end in zip(begins.tolist(), ends, strict=True)]
+    begins = (batch.offsets + _SEQUENCE).tolist()
+    ends = (batch.offsets + _PAYLOAD + batch.lengths.astype(np.int64)).tolist()
+    return [batch.data[begin:end] for begin, end in zip(begins, ends, strict=True)]

@@ -1,69 +1,49 @@
-"""Recover logs that a crash left unfinished, or that were damaged later.
+"""Recovery of logs that a crash left unfinished, or that were damaged later; `jtq recover`.
 
-A log of jtqd, and of its python-can writer, keeps every message in a chunk with a CRC. What of it is whole
-(`jtqd.daemon.logs.contents`) is copied, chunks as they are packed, into a new file beside it, under a new summary. The copy
-is read back, is on the disk, and only then takes the place of the file, in one step: an interrupted recovery leaves the file
-as it was and is simply repeated. Memory holds one chunk at a time.
+The intact contents of a log (`jtqd.daemon.logs.log_file.scan`) are written by the recorder's own writer to a copy beside it,
+chunks as they are packed. The copy is read back and synced, and replaces the file in one step: an interrupted recovery
+leaves the file as it was and is repeated. Memory holds some chunks at a time.
 
-The recorder runs `python -m jtqd.daemon.logs.recover DIRECTORY PREFIX RESERVE_BYTES` at the lowest priority for what an
-earlier run left: files with its own kind of name that nobody has locked. One JSON line for each: {"file", "text", "lossy"}.
+The recorder runs `python -m jtqd.daemon.logs.recover DIRECTORY PREFIX RESERVE_BYTES` at the lowest priority for the files
+of earlier runs: those with its own kind of name that nobody has locked. One JSON line for each: {"file", "text", "lossy"}.
 """
 
 from __future__ import annotations
 
+import argparse
 import errno
 import fcntl
 import json
 import os
-import struct
 import sys
+from bisect import bisect
+from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-from mcap.opcode import Opcode
-from mcap.records import (
-    ChunkIndex,
-    Header,
-    Statistics,
-)
+import msgspec
 
-from jtqd.daemon.logs.container import (
-    HEAD,
-    HEAD_SIZE,
-    LogError,
-    Source,
-    Summary,
-    chunk_head,
-    read_summary,
-    walk,
-)
-from jtqd.daemon.logs.contents import Contents, Gap, WholeChunk, chunk_content, index_entries, is_whole, scan
-from jtqd.daemon.recording.mcap_file import MAGIC, bytes_of
-from jtqd.daemon.recording.own_files import ACTIVE, OwnFile, own_files
+from jtqd.daemon.logs.log_file import Contents, LogError, Source, scan, sealed_chunk
+from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
+from jtqd.daemon.recording.own_files import ACTIVE, OwnFile, free_bytes, own_files
 from jtqd.estimator.checked import counted
 
 _PARTIAL = ".recovering"
 """Ending of the copy while it is written."""
+_WRITE_BYTES = 8 << 20
+"""Chunks are written and synced in pieces of this size."""
 _LONGEST_TORN_CHUNK_S = 600.0
 """A torn chunk whose head claims more than this is not believed."""
+_ENDINGS = (".mcap", ".mcap" + ACTIVE)
 
 
 class RecoverError(LogError):
     """The file cannot be recovered, and is as it was; one line."""
 
 
-class BeingWrittenError(RecoverError):
-    """Its writer holds a lock on it."""
-
-
-class OutsideChunksError(RecoverError):
-    """Its messages stand in no chunks, where nothing proves them; `ended`: the file has a proper end."""
-
-    def __init__(self, text: str, *, ended: bool) -> None:
-        super().__init__(text)
-        self.ended = ended
+class SkippedError(RecoverError):
+    """The file is being written, or another program's: in a directory it is left out."""
 
 
 @dataclass(frozen=True)
@@ -72,12 +52,12 @@ class Recovery:
 
     Attributes:
         path: the file as it is called now.
-        changed: it was written anew, or would have been (`dry_run`).
+        changed: it was rewritten, or would have been (`dry_run`).
         renamed: `.active` was taken off its name.
         lossy: something could not be read, or failed its CRC.
         messages, chunks, attachments: what the file holds now.
         seconds: from the first message to the last [s].
-        lost_bytes, lost_chunks: what could not be read.
+        lost_bytes, lost_chunks: what could not be kept.
         lost_s: estimate of the time that stood there [s]; None where nothing tells.
         findings: one line each.
     """
@@ -95,10 +75,6 @@ class Recovery:
     lost_s: float | None
     findings: tuple[str, ...]
 
-    def as_json(self) -> dict[str, Any]:
-        """Return the result for `json.dumps`."""
-        return asdict(self) | {"path": str(self.path), "findings": list(self.findings)}
-
 
 def recover(
     path: Path, *, dry_run: bool = False, keep_free: int = 0, attachments_are_enough: bool = False
@@ -111,41 +87,45 @@ def recover(
         path: `X.mcap.active` or `X.mcap`.
         dry_run: only report what would be done.
         keep_free: [byte] that must stay free on the disk beside the copy.
-        attachments_are_enough: write anew also what has lost every message, but not all attachments.
+        attachments_are_enough: rewrite also what has lost every message, but not all attachments.
 
     Raises:
-        RecoverError: it is being written (its writer holds an flock on it), nothing in it can be saved, its messages stand
-            in no chunks, or the new name is taken.
+        RecoverError: it is being written (its writer holds an flock on it), nothing in it can be saved, another program
+            wrote it, or the new name is taken.
         OSError: it cannot be read or written, or there is no room for the copy.
     """
     descriptor = os.open(path, (os.O_RDONLY if dry_run else os.O_RDWR) | os.O_CLOEXEC)
-    copy = -1
     try:
         _lock(descriptor, path, shared=dry_run)
         before = os.fstat(descriptor)
         source = Source(descriptor)
-        own = read_summary(source)
-        found = scan(source, own)
-        _refuse(path, found, own)
+        found = scan(source)
+        if found.foreign:
+            assert found.header is not None
+            library = found.header.library
+            raise SkippedError(
+                f"{path}: found a log of {library!r:.60}, expected one of jtqd (others: `mcap recover`)"
+            )
+        if not (found.header or found.chunks or _has_attachments(found)):
+            raise RecoverError(f"{path}: found no readable content, expected an MCAP file")
         now = os.fstat(descriptor)
         if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
-            raise RecoverError(f"{path}: found that it is being written, expected a closed file")
+            raise SkippedError(f"{path}: found that it is being written, expected a closed file")
         final = _final_name(path)
-        changed = not is_whole(found, own)
-        report = _report(source, found, own) if changed else _Report()
+        changed = not found.whole
+        report = _report(source, found) if changed else _Report()
         if report.lossy and not found.counts and not (attachments_are_enough and _has_attachments(found)):
             raise RecoverError(
                 f"{path}: found no message that can be read ({report.findings[0]}), expected one at least: left as it is"
             )
         if changed and not dry_run:
-            copy = _replace(path, source, found, keep_free)
+            _replace(path, source, found, keep_free)
         if final != path and not dry_run:
             os.rename(path, final)
             _sync_directory(path.parent)
     finally:
         os.close(descriptor)
-        if copy >= 0:
-            os.close(copy)
+    start_ns, end_ns = _times(found)
     return Recovery(
         path=path if dry_run else final,
         changed=changed,
@@ -153,29 +133,24 @@ def recover(
         lossy=report.lossy,
         messages=sum(found.counts.values()),
         chunks=len(found.chunks),
-        attachments=len(found.summary.attachments),
-        seconds=(found.end_ns - found.start_ns) * 1e-9,
-        lost_bytes=report.lost_bytes,
-        lost_chunks=report.lost_chunks,
+        attachments=len(found.attachments),
+        seconds=(end_ns - start_ns) * 1e-9,
+        lost_bytes=sum(gap.end - gap.start for gap in found.gaps),
+        lost_chunks=sum(gap.is_chunk for gap in found.gaps),
         lost_s=None if report.lost_s is None else round(report.lost_s, 3),
         findings=tuple(report.findings),
     )
 
 
-def _refuse(path: Path, found: Contents, own: Summary | None) -> None:
-    """Raise RecoverError for a file without readable content, or with messages that would be lost."""
-    foreign = found.header is not None and not found.header.library.startswith("jtqd")
-    if found.loose_messages and (foreign or not found.chunks):
-        raise OutsideChunksError(
-            f"{path}: found messages outside chunks, expected a log of jtqd: every message in a chunk",
-            ended=own is not None,
-        )
-    if not (found.header or found.chunks or _has_attachments(found)):
-        raise RecoverError(f"{path}: found no readable content, expected an MCAP file")
-
-
 def _has_attachments(found: Contents) -> bool:
-    return bool(found.summary.attachments or found.summary.metadata)
+    return bool(found.attachments or found.metadata)
+
+
+def _times(found: Contents) -> tuple[int, int]:
+    """First and last log time; 0 without messages."""
+    indexes = [chunk.index for chunk in found.chunks if chunk.counts]
+    first = min((index.message_start_time for index in indexes), default=0)
+    return first, max((index.message_end_time for index in indexes), default=0)
 
 
 # ---- what is lost ----
@@ -185,114 +160,86 @@ def _has_attachments(found: Contents) -> bool:
 class _Report:
     findings: list[str] = field(default_factory=list)
     lossy: bool = False
-    lost_bytes: int = 0
-    lost_chunks: int = 0
     lost_s: float | None = 0.0
 
 
-def _report(source: Source, found: Contents, own: Summary | None) -> _Report:
+def _report(source: Source, found: Contents) -> _Report:
     """Return the findings about a file that must be rewritten."""
-    report = _Report()
-    for gap in sorted(found.gaps, key=lambda each: each.start):
+    report = _Report(lossy=bool(found.gaps) or found.unproven, lost_s=_lost_s(found))
+    for gap in sorted(found.gaps):
         size = gap.end - gap.start
-        if gap.restored:
-            continue
-        at_end = gap.end == found.end and own is None
-        zeros = at_end and all(block.count(0) == len(block) for block in source.blocks(gap.start, gap.end))
-        if zeros:
+        if gap.end < found.end or found.tail is not None:
+            what = f"bytes {gap.start} to {gap.end} cannot be read{' (a chunk)' if gap.is_chunk else ''}"
+        elif _zeros(source, gap.start, gap.end):
             what = f"{counted(size, 'byte')} of zeros at the end"
-        elif at_end:
-            what = f"truncated at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
         else:
-            what = f"bytes {gap.start} to {gap.end} cannot be read{' (a chunk)' if gap.chunks else ''}"
+            what = f"truncated at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
         report.findings.append(what)
-        report.lost_bytes += size
-        report.lost_chunks += gap.chunks
-        seconds = _torn_seconds(source, gap, found) if at_end else _seconds(gap, found, own)
-        report.lost_s = None if report.lost_s is None or seconds is None else report.lost_s + seconds
-        report.lossy = True
-    if own is not None and not report.lossy and own.statistics is not None:
-        missing = own.statistics.message_count - sum(found.counts.values())
-        if missing > 0:
-            report.findings.append(f"{counted(missing, 'message')} of the summary are not in the file")
-            report.lossy, report.lost_s = True, None
+    statistics = None if found.tail is None else found.tail[0].statistics
+    missing = 0 if statistics is None else statistics.message_count - sum(found.counts.values())
+    if not report.lossy and missing > 0:
+        report.findings.append(f"{counted(missing, 'message')} of the summary are not in the file")
+        report.lossy, report.lost_s = True, None
     if found.undefined:
         report.findings.append(f"{counted(found.undefined, 'chunk')} with an undefined channel")
     if found.unproven:
         report.findings.append("no readable chunk has schemas and channels: taken from the head, unchecked")
-        report.lossy = True
     if found.contradicted:
         report.findings.append(
             "schemas or channels at the head are damaged: taken from a chunk or the summary"
         )
     if not found.magic or found.header is None:
         report.findings.append("magic bytes or header damaged: rewritten")
-    anew = sum(not chunk.indexed for chunk in found.chunks)
-    if anew:
-        report.findings.append(f"message indexes of {counted(anew, 'chunk')} rewritten")
-    report.findings.append("no summary: written" if own is None else "summary rewritten")
+    rebuilt = sum(not chunk.unchanged for chunk in found.chunks)
+    if rebuilt:
+        report.findings.append(f"head or message indexes of {counted(rebuilt, 'chunk')} rewritten")
+    report.findings.append("no summary: written" if found.tail is None else "summary rewritten")
     return report
 
 
-def _seconds(gap: Gap, found: Contents, own: Summary | None) -> float | None:
-    """Time for which a gap stands [s]: between its neighbours, else what the summary says of the first or last message."""
-    if gap.seconds is not None or own is None or own.statistics is None or not found.counts:
-        return gap.seconds
-    statistics = own.statistics
-    timed = [chunk.index for chunk in found.timed]
-    if gap.start < timed[0].chunk_start_offset:
-        return max(0, int(timed[0].message_start_time) - int(statistics.message_start_time)) * 1e-9
-    if gap.start > timed[-1].chunk_start_offset:
-        return max(0, int(statistics.message_end_time) - _last_ns(found)) * 1e-9
-    return None
+def _zeros(source: Source, start: int, end: int) -> bool:
+    return not any(any(source.read(at, min(end - at, 1 << 20))) for at in range(start, end, 1 << 20))
 
 
-def _last_ns(found: Contents) -> int:
-    """Log time of the last cycle; of the last message of another writer's log."""
-    return max(int(chunk.index.message_end_time) for chunk in found.timed)
+def _lost_s(found: Contents) -> float | None:
+    """Time for which the gaps stand [s]: between the chunks around each; None where one of them has no such neighbours.
 
-
-def _torn_seconds(source: Source, gap: Gap, found: Contents) -> float | None:
-    """Return the time for which the torn end of a file stood [s]: by the head of its chunk, else by the rate so far."""
-    if not found.counts:
-        return None
-    head = chunk_head(source.read(gap.start, HEAD_SIZE))
-    if gap.chunks and head is not None:
-        seconds = (head.end_ns - _last_ns(found)) * 1e-9
-        if 0.0 <= seconds < _LONGEST_TORN_CHUNK_S:
-            return seconds
-    data = gap.start - int(found.chunks[0].index.chunk_start_offset)
-    return (found.end_ns - found.start_ns) * 1e-9 * (gap.end - gap.start) / max(data, 1)
+    Before the first and behind the last chunk the summary tells, at a torn end the head of the torn chunk, else the rate of
+    bytes so far.
+    """
+    chunks = [chunk for chunk in found.chunks if not found.cycles.isdisjoint(chunk.counts)]
+    timed = [chunk.index for chunk in chunks or found.chunks if chunk.counts]
+    statistics = None if found.tail is None else found.tail[0].statistics
+    starts = [index.chunk_start_offset for index in timed]
+    total = 0.0
+    for place in {bisect(starts, gap.start) for gap in found.gaps}:
+        gaps = [gap for gap in found.gaps if bisect(starts, gap.start) == place]
+        if 0 < place < len(timed):
+            seconds = (timed[place].message_start_time - timed[place - 1].message_end_time) * 1e-9
+        elif not timed:
+            return None
+        elif statistics is not None:
+            first, last = timed[0].message_start_time, timed[-1].message_end_time
+            lost = statistics.message_end_time - last if place else first - statistics.message_start_time
+            seconds = lost * 1e-9
+        elif place == 0:
+            return None
+        else:
+            ends = [gap.end_ns for gap in gaps if gap.end_ns is not None]
+            seconds = (max(ends, default=0) - timed[-1].message_end_time) * 1e-9
+            if not 0.0 <= seconds < _LONGEST_TORN_CHUNK_S:
+                first, last = _times(found)
+                size = sum(gap.end - gap.start for gap in gaps)
+                seconds = (last - first) * 1e-9 * size / max(gaps[0].start - starts[0], 1)
+        total += max(0.0, seconds)
+    return total
 
 
 # ---- the copy ----
 
 
-class _Copy:
-    """A file that is being written."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._file = descriptor
-        self.at = 0
-
-    def write(self, data: bytes) -> int:
-        """Write all of it; returns where it begins."""
-        begin, view = self.at, memoryview(data)
-        while view:
-            written = os.write(self._file, view)
-            view, self.at = view[written:], self.at + written
-        return begin
-
-    def take(self, source: Source, start: int, end: int) -> int:
-        """Copy a stretch of another file; returns where it begins."""
-        begin = self.at
-        for block in source.blocks(start, end):
-            self.write(block)
-        return begin
-
-
-def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> int:
-    """Write the intact content beside the file, check it and replace the file; return its locked descriptor.
+def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> None:
+    """Write the intact contents beside the file, check the copy and replace the file.
 
     Raises:
         RecoverError: the copy does not read back.
@@ -302,95 +249,64 @@ def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> int
     partial = target.with_name(target.name + _PARTIAL)
     with suppress(FileNotFoundError):  # of a recovery that was interrupted
         partial.unlink()
-    copy = os.open(partial, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+    if free_bytes(target.parent) < found.end + keep_free:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+    before = os.stat(target)
     try:
+        _write(partial, source, found)
         with suppress(OSError):
-            fcntl.flock(copy, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        before = os.stat(target)
-        with suppress(OSError):
-            os.fchmod(copy, before.st_mode & 0o777)
-            os.fchown(copy, before.st_uid, before.st_gid)
-        disk = os.fstatvfs(copy)
-        if disk.f_bavail * disk.f_frsize < found.end + keep_free:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-        _write(_Copy(copy), source, found)
-        os.fsync(copy)
-        written = Source(copy)
-        own = read_summary(written)
-        again = scan(written, own)
-        if not is_whole(again, own) or again.counts != found.counts:
+            os.chmod(partial, before.st_mode & 0o777)
+            os.chown(partial, before.st_uid, before.st_gid)
+        with open(partial, "rb") as copy:
+            again = scan(Source(copy.fileno()))
+        if not again.whole or again.counts != found.counts:
             raise RecoverError(
                 f"{path}: found a copy that reads back differently, expected the written content"
             )
         os.replace(partial, target)
         _sync_directory(target.parent)
     except BaseException:
-        os.close(copy)
         with suppress(OSError):
             partial.unlink()
         raise
-    return copy
 
 
-def _write(copy: _Copy, source: Source, found: Contents) -> None:
-    """The whole file: header, metadata, attachments, definitions, chunks, summary."""
-    copy.write(MAGIC + bytes_of(found.header or Header("ros2", "jtqd")))
-    summary = Summary(dict(found.summary.schemas), dict(found.summary.channels))
-    for metadata in found.summary.metadata:
-        at = copy.take(source, metadata.offset, metadata.offset + metadata.length)
-        summary.metadata.append(replace(metadata, offset=at))
-    for attachment in found.summary.attachments:
-        at = copy.take(source, attachment.offset, attachment.offset + attachment.length)
-        summary.attachments.append(replace(attachment, offset=at))
-    copy.write(bytes_of(*summary.schemas.values(), *summary.channels.values()))
+def _write(path: Path, source: Source, found: Contents) -> None:
+    """Write the whole file: head, chunks as they are packed, and the summary."""
+    attachments = [NamedData(each.name, each.media_type, each.data) for each, _ in found.attachments]
+    head = Head([*found.schemas.values()], [*found.channels.values()], attachments)
+    metadata = found.metadata[0][0].metadata if found.metadata else None
+    time_ns = found.attachments[0][0].log_time if found.attachments else 0
+    file = McapFile(path, head, metadata, time_ns)
+    try:
+        for chunks in _sealed(source, found):
+            file.append(Span(tuple(chunks), 0))
+    except OSError:
+        file.abandon()
+        raise
+    file.finish(path.name)
+
+
+def _sealed(source: Source, found: Contents) -> Iterator[list[SealedChunk]]:
+    """Yield the intact chunks with their message indexes, some at a time."""
+    chunks: list[SealedChunk] = []
     for chunk in found.chunks:
-        summary.chunks.append(_copy_chunk(copy, source, chunk))
-    counts = found.counts
-    summary.statistics = Statistics(
-        attachment_count=len(summary.attachments),
-        channel_count=len(summary.channels),
-        channel_message_counts={number: counts[number] for number in summary.channels},
-        chunk_count=len(summary.chunks),
-        message_count=sum(counts.values()),
-        metadata_count=len(summary.metadata),
-        message_start_time=found.start_ns,
-        message_end_time=found.end_ns,
-        schema_count=len(summary.schemas),
-    )
-    copy.write(summary.to_bytes(copy.at))
-
-
-def _copy_chunk(copy: _Copy, source: Source, chunk: WholeChunk) -> ChunkIndex:
-    """Copy a chunk as it is packed, with the right times in its head, and its message indexes; returns its index entry."""
-    index = chunk.index
-    start = index.chunk_start_offset
-    at = copy.write(
-        source.read(start, HEAD.size) + struct.pack("<QQ", index.message_start_time, index.message_end_time)
-    )
-    copy.take(source, start + HEAD.size + 16, chunk.end)
-    behind = copy.at
-    if chunk.indexed:
-        copy.take(source, chunk.end, chunk.end + index.message_index_length)
-        offsets = {channel: place + at - start for channel, place in index.message_index_offsets.items()}
-    else:
-        offsets = {}
-        head = chunk_head(source.read(start, HEAD_SIZE))
-        data = None if head is None else chunk_content(source, start, head)
-        for channel, rows in index_entries(walk(data or b"")).items():
-            body = struct.pack("<HI", channel, rows.nbytes) + rows.astype("<u8").tobytes()
-            offsets[channel] = copy.write(HEAD.pack(Opcode.MESSAGE_INDEX, len(body)) + body)
-    return replace(
-        index, chunk_start_offset=at, message_index_offsets=offsets, message_index_length=copy.at - behind
-    )
+        made = sealed_chunk(source, chunk.index.chunk_start_offset)
+        assert made is not None, "the file changed while it was locked"
+        chunks.append(made[0])
+        if sum(len(each.data) for each in chunks) >= _WRITE_BYTES:
+            yield chunks
+            chunks = []
+    if chunks:
+        yield chunks
 
 
 def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
-    kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
     try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
     except OSError as error:
         if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            raise BeingWrittenError(
+            raise SkippedError(
                 f"{path}: found that a recorder is writing it, expected a closed file"
             ) from None
         # A file system without locks: what is left is the check that the file does not change meanwhile.
@@ -414,11 +330,11 @@ def _sync_directory(directory: Path) -> None:
             os.close(descriptor)
 
 
-# ---- what a crash of the recorder left ----
+# ---- files of earlier runs of the recorder ----
 
 
-def recover_leftover(file: OwnFile, keep_free: int = 0) -> tuple[str, bool] | None:
-    """Recover one file of an earlier run: what was done, and whether something was lost. None: somebody is writing it."""
+def recover_unfinished(file: OwnFile, keep_free: int = 0) -> tuple[str, bool] | None:
+    """Recover one file of an earlier run: what was done, and whether something was lost. None: it is being written."""
     path = file.path
     if _is_being_written(path):
         return None
@@ -447,7 +363,7 @@ def _is_being_written(path: Path) -> bool:
     return False
 
 
-def _leftovers(arguments: list[str]) -> int:
+def _recover_earlier_runs(arguments: list[str]) -> int:
     """Recover all files of earlier runs; exit status 0, or 2 for wrong use."""
     if len(arguments) != 3 or not arguments[2].isdigit():
         print("usage: python -m jtqd.daemon.logs.recover DIRECTORY PREFIX RESERVE_BYTES", file=sys.stderr)
@@ -455,11 +371,100 @@ def _leftovers(arguments: list[str]) -> int:
     with suppress(OSError):
         os.nice(19)
     for file in own_files(Path(arguments[0]), arguments[1]):
-        result = recover_leftover(file, int(arguments[2])) if file.active else None
+        result = recover_unfinished(file, int(arguments[2])) if file.active else None
         if result is not None:
             print(json.dumps({"file": str(file.path), "text": result[0], "lossy": result[1]}), flush=True)
     return 0
 
 
+# ---- jtq recover ----
+
+_EXAMPLES = """examples:
+  jtq recover /var/log/jtqd                       every damaged or unfinished file in the directory
+  jtq recover run.mcap.active                     becomes run.mcap
+  jtq recover --dry-run --json run.mcap           check every byte, change nothing
+
+Every file is checked completely; intact files of a directory (*.mcap, *.mcap.active) are not listed. Files that a
+recorder is writing, and logs of other programs, are refused (in a directory: left out). A file without a readable message
+stays as it is. The recovered file is written beside the old one and then replaces it: the free space must be at least the
+file's size.
+
+exit status: 0 nothing lost, 3 recovered with loss, 1 failure, 2 usage"""
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq recover`."""
+    result = argparse.ArgumentParser(
+        prog="jtq recover",
+        description="Recover truncated or damaged logs of jtqd; every intact chunk is kept.",
+        epilog=_EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    result.add_argument("logs", nargs="+", type=Path, metavar="FILE|DIR")
+    result.add_argument("--json", action="store_true", help="results as JSON on standard output")
+    result.add_argument("--dry-run", action="store_true", help="report only, change nothing")
+    return result
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `jtq recover`; returns its exit status."""
+    options = parser().parse_args(argv)
+    for path in options.logs:
+        if not path.is_dir() and not path.name.endswith(_ENDINGS):
+            parser().error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
+    results: list[Recovery] = []
+    failures: list[dict[str, str]] = []
+    for path, in_directory in _files(options.logs):
+        try:
+            found = recover(path, dry_run=in_directory or options.dry_run)
+            if in_directory and not (found.changed or found.renamed):
+                continue
+            results.append(found if options.dry_run or not in_directory else recover(path))
+        except (LogError, OSError) as error:
+            text = f"{path}: {error.strerror}" if isinstance(error, OSError) else str(error)
+            if in_directory and isinstance(error, SkippedError):
+                text = f"left out: {text}"
+            else:
+                failures.append({"path": str(path), "error": text})
+            print(f"jtq recover: {text}", file=sys.stderr)
+            continue
+        if not options.json:
+            print(_text(results[-1], options.dry_run), flush=True)
+    if options.json:
+        print(json.dumps(msgspec.to_builtins({"files": results, "failures": failures}, enc_hook=str)))
+    elif not results and not failures:
+        print("nothing to recover")
+    if failures:
+        return 1
+    return 3 if any(each.lossy for each in results) else 0
+
+
+def _files(paths: list[Path]) -> Iterator[tuple[Path, bool]]:
+    """Yield every file, and whether it was named by its directory only."""
+    for path in paths:
+        if not path.is_dir():
+            yield path, False
+            continue
+        for each in sorted(path.iterdir()):
+            if each.is_file() and each.name.endswith(_ENDINGS):
+                yield each, True
+
+
+def _text(result: Recovery, dry_run: bool) -> str:
+    would = "would be " if dry_run else ""
+    state = f"{would}repaired" if result.changed else f"{would}renamed" if result.renamed else "whole"
+    lines = [
+        f"{result.path}: {state}: {counted(result.messages, 'message')}, {counted(result.chunks, 'chunk')}, "
+        f"{counted(result.attachments, 'attachment')}, {result.seconds:.1f} s"
+    ]
+    lines += [f"  {finding}" for finding in result.findings]
+    if result.lossy:
+        time = "unknown time" if result.lost_s is None else f"about {result.lost_s:.2f} s"
+        lines.append(
+            f"  lost: {counted(result.lost_bytes, 'byte')}, {counted(result.lost_chunks, 'chunk')}, {time}"
+        )
+    return "\n".join(lines)
+
+
 if __name__ == "__main__":
-    sys.exit(_leftovers(sys.argv[1:]))
+    sys.exit(_recover_earlier_runs(sys.argv[1:]))

@@ -78,6 +78,19 @@ def tail_bytes(groups: Iterable[tuple[int, bytes]], data_end: int) -> bytes:
     return end + summary + bytes_of(Footer(start, offsets_at, zlib.crc32(summary + beginning))) + MAGIC
 
 
+def attachment_index(record: Attachment, at: int, length: int) -> AttachmentIndex:
+    """Index record of an attachment of `length` bytes that begins at byte `at` of the file."""
+    return AttachmentIndex(
+        offset=at,
+        length=length,
+        log_time=record.log_time,
+        create_time=record.create_time,
+        data_size=len(record.data),
+        name=record.name,
+        media_type=record.media_type,
+    )
+
+
 # ---- the file on the disk ----
 
 _STEP = 256 * 1024
@@ -350,7 +363,7 @@ class ChunkBuilder:
             _COMPRESSION.encode(),
             len(packed),
         )
-        indexes = {channel: _index_record(channel, each) for channel, each in indexed.items()}
+        indexes = {channel: index_record(channel, each) for channel, each in indexed.items()}
         offsets, position = {}, len(head) + len(packed)
         for channel, record in indexes.items():
             offsets[channel] = position
@@ -367,7 +380,7 @@ class ChunkBuilder:
         )
 
 
-def _index_record(channel: int, entries: Sequence[int]) -> bytes:
+def index_record(channel: int, entries: Sequence[int]) -> bytes:
     """Message Index record: `entries` are log times and offsets by turns."""
     size = 8 * len(entries)
     head = _MESSAGE_INDEX.pack(Opcode.MESSAGE_INDEX, 6 + size, channel, size)
@@ -404,14 +417,14 @@ class McapFile:
     Args:
         path: must not exist yet; its directory must.
         head: schemas, channels and attachments.
-        metadata: of this file.
+        metadata: of this file; None: without a record of it.
         time_ns: creation time of the attachments.
 
     Raises:
         OSError: the file cannot be created, or its head cannot be written (it is removed again then).
     """
 
-    def __init__(self, path: Path, head: Head, metadata: Mapping[str, str], time_ns: int) -> None:
+    def __init__(self, path: Path, head: Head, metadata: Mapping[str, str] | None, time_ns: int) -> None:
         self._head = head
         self._attachment_index: list[AttachmentIndex] = []
         self._metadata_index: list[MetadataIndex] = []
@@ -437,24 +450,16 @@ class McapFile:
             os.close(self._directory)
             raise
 
-    def _beginning(self, metadata: Mapping[str, str], time_ns: int) -> bytes:
+    def _beginning(self, metadata: Mapping[str, str] | None, time_ns: int) -> bytes:
         data = bytearray(MAGIC + bytes_of(Header(profile="ros2", library="jtqd")))
-        record = bytes_of(Metadata(METADATA, dict(metadata)))
-        self._metadata_index.append(MetadataIndex(len(data), len(record), METADATA))
-        data += record
+        if metadata is not None:
+            record = bytes_of(Metadata(METADATA, dict(metadata)))
+            self._metadata_index.append(MetadataIndex(len(data), len(record), METADATA))
+            data += record
         for item in self._head.attachments:
-            record = bytes_of(Attachment(time_ns, time_ns, item.name, item.media_type, item.data))
-            self._attachment_index.append(
-                AttachmentIndex(
-                    offset=len(data),
-                    length=len(record),
-                    log_time=time_ns,
-                    create_time=time_ns,
-                    data_size=len(item.data),
-                    name=item.name,
-                    media_type=item.media_type,
-                )
-            )
+            attachment = Attachment(time_ns, time_ns, item.name, item.media_type, item.data)
+            record = bytes_of(attachment)
+            self._attachment_index.append(attachment_index(attachment, len(data), len(record)))
             data += record
         # Everything of the summary that does not grow.
         self._constant_room = len(bytes_of(*self._attachment_index, *self._metadata_index))

@@ -1,9 +1,8 @@
 """`logs`: one joint of a log into arrays, by `jtqd.daemon.logs` and by the mcap library with its ROS 2 decoder.
 
 The file is written by the recorder's own code, with noise in every measured quantity and seven frames a cycle. Both read it
-in turns in one process; the figures are CPU times of this process, extrapolated to an hour. Beside them the same messages in
-the layout of before 0.2, where a chunk holds all topics, and what no reader can do without: each chunk of the joint unpacked
-(zstd) and its CRC, from memory.
+in turns in one process; the figures are CPU times of this process, extrapolated to an hour. Beside them the least that any
+reader must do: each chunk of the joint unpacked (zstd) and its CRC, from memory.
 """
 
 from __future__ import annotations
@@ -44,34 +43,26 @@ def run(directory: Path, *, minutes: float = 5.0, rounds: int = 3) -> dict[str, 
         raise RuntimeError("pip install mcap-ros2-support") from None
     path = directory / "log.mcap"
     cycles = int(minutes * 60 * _RATE_HZ)
-    before = directory / "before.mcap"
     write_log(path, _cycles(cycles))
-    write_log(before, _cycles(cycles), together=True)
-    ways: dict[str, tuple[Callable[[Path], np.ndarray[Any, Any]], Path]] = {
-        "ours": (_ours, path),
-        "before": (_ours, before),
-        "library": (_library, path),
-    }
-    packed = {"floor": _chunks(path), "floor before": _chunks(before)}
-    cpu_s: dict[str, list[float]] = {name: [] for name in (*ways, *packed)}
+    ways: dict[str, Callable[[Path], np.ndarray[Any, Any]]] = {"ours": _ours, "library": _library}
+    packed = _chunks(path)
+    cpu_s: dict[str, list[float]] = {name: [] for name in (*ways, "floor")}
     sums = {}
     for _ in range(rounds):
-        for name, (read, log) in ways.items():
+        for name, read in ways.items():
             start = time.process_time()
-            values = read(log)
+            values = read(path)
             cpu_s[name].append(time.process_time() - start)
             sums[name] = float(np.nansum(values)), values.shape
-        for name, chunks in packed.items():
-            start = time.process_time()
-            _unpack(chunks)
-            cpu_s[name].append(time.process_time() - start)
+        start = time.process_time()
+        _unpack(packed)
+        cpu_s["floor"].append(time.process_time() - start)
     if len(set(sums.values())) != 1:
         raise RuntimeError(f"the readers do not agree: {sums}")
     best = {name: min(times) for name, times in cpu_s.items()}
     return {
         "cycles": cycles,
         "bytes": path.stat().st_size,
-        "bytes_before": before.stat().st_size,
         "seed": _SEED,
         "cpu_s": cpu_s,
         "us_per_message": {name: 1e6 * seconds / cycles for name, seconds in best.items()},
@@ -149,17 +140,14 @@ def text(result: dict[str, Any]) -> str:
             ("jtqd.daemon.logs", "ours"),
             ("mcap + mcap-ros2-support", "library"),
             ("zstd and CRC of the joint's chunks", "floor"),
-            ("all topics in one chunk: jtqd.daemon.logs", "before"),
-            ("... zstd and CRC of the chunks", "floor before"),
         )
     ]
     head = ["one joint into arrays", "us a message", "s for an hour"]
-    size, before = (result[key] * _HOUR / result["cycles"] * 1e-9 for key in ("bytes", "bytes_before"))
+    size = result["bytes"] * _HOUR / result["cycles"] * 1e-9
     hour_s = result["hour_s"]["ours"]
     above = hour_s / result["hour_s"]["floor"]
     return (
-        f"logs: {result['cycles']} cycles, {size:.2f} GB an hour (all topics in one chunk: {before:.2f}), "
-        f"seed {result['seed']}, CPU time of the best round\n"
+        f"logs: {result['cycles']} cycles, {size:.2f} GB an hour, seed {result['seed']}, CPU time of the best round\n"
         f"{table(head, rows)}\n"
         f"ratio {result['ratio']:.1f}  {mark(result['ratio'], RATIO_LIMIT, at_least=True)}\n"
         f"an hour {hour_s:.1f} s  {mark(hour_s, HOUR_LIMIT_S)}, {above:.2f} times zstd and CRC alone"

@@ -4,11 +4,13 @@ import io
 import random
 import struct
 
+import can
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
+from jtqd.daemon.logs.can_io import McapCanWriter
 from jtqd.daemon.recording.journal import Journal
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import JointStateMessage
@@ -73,6 +75,16 @@ def foreign(compression="zstd", *, chunked=True, count=400, finish=True):
     return buffer.getvalue()
 
 
+def logger(path, count=400):
+    """A log of python-can's logger (`McapCanWriter`): a chunk for each half second of frames."""
+    with McapCanWriter(path) as writer:
+        for n in range(count):
+            writer.on_message_received(
+                can.Message(timestamp=0.02 * n, arbitration_id=n, data=bytes([n % 256]))
+            )
+    return path.read_bytes()
+
+
 def by_index(data):
     """(messages the library's seeking reader gets, its error)."""
     count = 0
@@ -107,4 +119,14 @@ def record_starts(data):
     return [*found, at]
 
 
-__all__ = ["ATTACHMENTS", "by_index", "cycles", "foreign", "in_order", "ours", "record_starts", "write_log"]
+__all__ = [
+    "ATTACHMENTS",
+    "by_index",
+    "cycles",
+    "foreign",
+    "in_order",
+    "logger",
+    "ours",
+    "record_starts",
+    "write_log",
+]

@@ -11,7 +11,7 @@ from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.logs.recover import recover_leftover
+from jtqd.daemon.logs.recover import recover_unfinished
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.journal import ERROR, WARN, Journal
 from jtqd.daemon.recording.keeper import Keeper, recording_request
@@ -180,9 +180,9 @@ def test_leftovers_that_are_being_written_or_empty(tmp_path):
     held, empty = own_files(tmp_path, "test")
     with open(held.path, "rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
-        assert recover_leftover(held) is None
+        assert recover_unfinished(held) is None
     assert held.path.exists()
-    assert recover_leftover(empty) == (f"{names[1]} was empty: removed", False)
+    assert recover_unfinished(empty) == (f"{names[1]} was empty: removed", False)
     assert not empty.path.exists()
 
 

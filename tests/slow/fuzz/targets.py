@@ -98,7 +98,7 @@ def targets(directory: Path) -> list[Target]:
     """All of them; good files are put into `directory`."""
     from jtqd.daemon.bus.boot import boot_request
     from jtqd.daemon.config import load_config
-    from jtqd.daemon.logs import LogError, export, recover_command
+    from jtqd.daemon.logs import LogError, export, recover
     from jtqd.daemon.replay import command as replay_command
     from jtqd.drivers.boot_request import RequestError
     from jtqd.drivers.object_dictionary import EdsError, read_eds
@@ -165,7 +165,7 @@ def targets(directory: Path) -> list[Target]:
             (NetworkError, ConfigError),
         ),
         Target("log, read", log, ".mcap", damage_bytes, _read_log, logs),
-        Target("log, recover", log, ".mcap", damage_bytes, _command(recover_command.main), ()),
+        Target("log, recover", log, ".mcap", damage_bytes, _command(recover.main), ()),
         Target("log, export", log, ".mcap", damage_bytes, _command(export.main, "candump"), ()),
         Target("log, replay", log, ".mcap", damage_bytes, _command(replay_command.main, "--json"), ()),
     ]
