@@ -14,13 +14,13 @@ from math import inf, isfinite, nan
 from jtqd.daemon.config import Config
 from jtqd.daemon.core import contact_pdo
 from jtqd.daemon.core.estimate_pdo import field
+from jtqd.daemon.shared.counters import OBJECT_2200, RECORDER_LOST
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader
 from jtqd.drivers.boot_procedure import signature
 from jtqd.drivers.devices import contact_tpdos
 from jtqd.drivers.eds.own_objects import (
     BUS_FIELDS,
-    COUNTERS,
     JOINT_PARAMETERS,
     PARAMETERS,
     VERSION,
@@ -98,7 +98,7 @@ class OwnNode:
         store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
         store.on_read(0x2110, 0, lambda: int(self._asked > self._reader.resets_done))
         store.on_write(0x2110, 0, self._reset)
-        for sub, name in enumerate(COUNTERS, start=1):
+        for sub, name in enumerate(OBJECT_2200, start=1):
             store.on_read(0x2200, sub, partial(self._counter, name))
         for sub, share in enumerate((0.5, 0.99, 1.0), start=1):
             store.on_read(0x2201, sub, partial(self._work_us, share))
@@ -159,7 +159,7 @@ class OwnNode:
             self._asked = self._reader.ask_reset()
 
     def _counter(self, name: str) -> int:
-        value = self.recorder_lost if name == "recorder_lost" else self._reader.read().counters[name]
+        value = self.recorder_lost if name == RECORDER_LOST.name else self._reader.read().counters[name]
         return value & 0xFFFF_FFFF if name == "bits_worst_case" else min(value, 0xFFFF_FFFF)
 
     def _work_us(self, share: float) -> int:

@@ -35,11 +35,11 @@ from jtqd.daemon.cli.status_json import content
 from jtqd.daemon.cli.terminal import HEAD, HEADING, Columns, Keys, line, paged
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
 from jtqd.daemon.shared.contacts import contact_line, contact_of
+from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import (
-    BUS_COUNTERS,
     LATE_BIN_NS,
     NMT_STATES,
     OPERATIONAL,
@@ -51,14 +51,7 @@ from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
 from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
 
-_FAULTS = (
-    "stale_inputs",
-    "published_late",
-    *BUS_COUNTERS,
-    "network_fallbacks",
-    "overruns",
-    "latches",
-)
+_FAULTS = shown_in(Shown.STATUS)
 """Counters shown when they are not zero."""
 _LAST_NOTICES = 4
 _EXAMPLES = """examples:

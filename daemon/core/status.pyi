@@ -11,7 +11,7 @@ class JointCounts(Protocol):
     """Where a joint counts: the loop's snapshot, or two arrays in a replay.
 
     Attributes:
-        counters: unsigned 64-bit words in the order of `jtqd.daemon.shared.snapshot.COUNTERS`.
+        counters: unsigned 64-bit words in the order of `jtqd.daemon.shared.counters.COUNTERS`.
         errors: sum of squared errors and number of samples of each joint, float64.
     """
 

@@ -31,7 +31,7 @@ from typing import Final
 from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
-from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.daemon.shared.counters import COUNTERS, word_of
 from jtqd.drivers.cia402 import STATES, TOLD
 from jtqd.estimator import status as st
 from jtqd.estimator.observer cimport follow_reference, restart_reference
@@ -234,15 +234,15 @@ cdef class JointStatus:
 
 # Counts ---------------------------------------------------------------------------------------------------------------
 
-cdef int FALLBACKS = COUNTERS.index("network_fallbacks"), LATCHES = COUNTERS.index("latches")
-cdef int NETWORK_NOT_FINITE = COUNTERS.index("network_not_finite"), NETWORK_FAR = COUNTERS.index("network_far")
-cdef int NETWORK_OUTSIDE = COUNTERS.index("network_outside"), NETWORK_NO_TIME = COUNTERS.index("network_no_time")
+cdef int FALLBACKS = word_of("network_fallbacks"), LATCHES = word_of("latches")
+cdef int NETWORK_NOT_FINITE = word_of("network_not_finite"), NETWORK_FAR = word_of("network_far")
+cdef int NETWORK_OUTSIDE = word_of("network_outside"), NETWORK_NO_TIME = word_of("network_no_time")
 cdef enum:
     LOW_BYTE = 8  # bits of the faults that a cycle can have besides its status
 cdef int COUNTER_OF[LOW_BYTE]
 cdef int _bit
 for _bit in range(LOW_BYTE):
-    COUNTER_OF[_bit] = COUNTERS.index(f"fault_{faults.NAMES[1 << _bit]}")
+    COUNTER_OF[_bit] = word_of(f"fault_{faults.NAMES[1 << _bit]}")
 if faults.COUNTED != tuple([1 << _bit for _bit in range(LOW_BYTE)]):
     raise ImportError("the faults that are counted are not those of the low byte")
 

@@ -16,10 +16,11 @@ from jtqd.daemon.recording.own_files import MEGABYTE
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.shared import notices
 from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, worst
-from jtqd.daemon.shared.snapshot import BUS_COUNTERS, NMT_STATES, OPERATIONAL, View
+from jtqd.daemon.shared.counters import Shown, shown_in
+from jtqd.daemon.shared.snapshot import NMT_STATES, OPERATIONAL, View
 
 OK, WARN, ERROR, STALE = range(4)
-_OF_THE_BUS = (*BUS_COUNTERS, "bits_worst_case")
+_OF_THE_BUS = shown_in(Shown.BUS)
 _JOINT_LEVELS = {"VALID": OK, "STANDSTILL": OK, "STALE": STALE, "DRIVE_FAULT": ERROR, "INVALID": ERROR}
 _LEVELS = {notices.INFO: OK, notices.WARNING: WARN, notices.ERROR: ERROR}
 """Of severities."""

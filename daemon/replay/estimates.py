@@ -27,8 +27,8 @@ from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED, FLAG_TEMPERATURE
-from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator.arrays import FloatArray, RecordArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.learned import learner_of

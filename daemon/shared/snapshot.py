@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.estimator.learned import Zeros
 
@@ -25,63 +26,6 @@ NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operationa
 """Heartbeat states of CiA 301."""
 OPERATIONAL, NOT_OPERATIONAL = 5, (4, 127)
 """Heartbeat states in which a node sends its PDOs, and in which it sends none."""
-
-COUNTERS = (
-    "cycles",
-    "missed",
-    "complete",
-    "published",
-    "published_late",
-    "stale_inputs",
-    "late_frames",
-    "duplicate_frames",
-    "rejected_frames",
-    "unknown_frames",
-    "foreign_sync",
-    "sync_errors",
-    "sync_gaps",
-    "boot_ups",
-    "temperatures_lost",
-    "tx_dropped",
-    "rx_dropped",
-    "bus_errors",
-    "network_fallbacks",
-    "bits_worst_case",
-    "work_max_ns",
-    "late_max_ns",
-    "network_not_finite",
-    "network_far",
-    "network_outside",
-    "network_no_time",
-    "overruns",
-    "fault_not_finite",
-    "fault_out_of_range",
-    "fault_motor_jump",
-    "fault_link_jump",
-    "fault_velocity_mismatch",
-    "fault_torsion",
-    "fault_current_frozen",
-    "fault_deviation",
-    "latches",
-    "latch_resets",
-    "contacts",
-)
-"""In the order of their words; docs/bus.md says what each one means."""
-
-BUS_COUNTERS = (
-    "late_frames",
-    "duplicate_frames",
-    "rejected_frames",
-    "unknown_frames",
-    "foreign_sync",
-    "sync_errors",
-    "sync_gaps",
-    "boot_ups",
-    "tx_dropped",
-    "rx_dropped",
-    "bus_errors",
-)
-"""Those of them that count what is wrong on the bus."""
 
 
 class JointView(NamedTuple):

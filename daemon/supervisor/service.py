@@ -17,13 +17,13 @@ from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
+from jtqd.daemon.shared.counters import RECORDER_LOST, TABLE
 from jtqd.daemon.shared.log_lines import NOTICE, WARNING, OperatorLog
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
 
-_GAUGES = frozenset(("work_max_ns", "late_max_ns"))
 _SHARES = (0.5, 0.99, 1.0)
 
 
@@ -42,15 +42,10 @@ def metrics_text(
         lines.extend((f"# HELP jtqd_{name} {text}", f"# TYPE jtqd_{name} {kind}"))
         lines.extend(f'jtqd_{name}{{bus="{label}"{more}}} {_number(value)}' for more, value in rows)
 
-    for name, value in view.counters.items():
-        kind = "gauge" if name in _GAUGES else "counter"
-        metric(
-            name if kind == "gauge" else f"{name}_total",
-            kind,
-            f"Counter {name} of the loop (docs/bus.md).",
-            [("", value)],
-        )
-    metric("recorder_lost_total", "counter", "Cycles missing in the log.", [("", recorder_lost)])
+    for each in (*TABLE, RECORDER_LOST):
+        value = recorder_lost if each is RECORDER_LOST else view.counters[each.name]
+        name, kind = (each.name, "gauge") if each.is_maximum else (f"{each.name}_total", "counter")
+        metric(name, kind, f"{each.text[0].upper()}{each.text[1:]} (docs/bus.md).", [("", value)])
     joints = [(f',joint="{number}"', joint) for number, joint in enumerate(view.joints, start=1)]
     metric(
         "torque_nm", "gauge", "Estimated torque, joint side.", [(at, each.torque_nm) for at, each in joints]

@@ -8,6 +8,7 @@ from math import isfinite
 from typing import Any
 
 from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
+from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.checked import finite
@@ -15,8 +16,6 @@ from jtqd.estimator.learned import Zeros
 
 _LOST = 0.05
 """Part of the slots that a machine on which something else runs may miss at most before it is said."""
-_REFUSED = ("overruns", "latches", "latch_resets")
-"""Counters beside those of the faults (docs/safety.md)."""
 
 
 @dataclass(frozen=True)
@@ -109,8 +108,7 @@ class Summary:
 
     def text(self) -> str:
         """Return the summary as text."""
-        counters = self.counters
-        lines = self._timing()
+        counters, lines = self.counters, self._timing()
         for joint, (rmse, now, age) in enumerate(
             zip(self.rmse_nm, self.rmse_now_nm, self.age_ms, strict=False), start=1
         ):
@@ -133,29 +131,14 @@ class Summary:
                 f"{'' if n else 'conditions':<13} {each.subject}: {each.name.replace('_', ' ')} {times}, "
                 f"{each.total_s:.1f} s in all, first after {each.first_s:.1f} s"
             )
-        refused = [
-            f"{name.removeprefix('fault_').replace('_', ' ')} {count}"
-            for name, count in counters.items()
-            if count and (name.startswith("fault_") or name in _REFUSED)
-        ]
-        if refused:
-            lines.append("no torque     " + ", ".join(refused))
-        faults = [
-            f"{name.replace('_', ' ')} {counters[name]}"
-            for name in (
-                "sync_gaps",
-                "sync_errors",
-                "late_frames",
-                "duplicate_frames",
-                "rejected_frames",
-                "foreign_sync",
-                "tx_dropped",
-                "rx_dropped",
-            )
-            if counters.get(name)
-        ]
-        if faults:
-            lines.append("bus           " + ", ".join(faults))
+        for title, view in (("no torque", Shown.SUMMARY_TORQUE), ("bus", Shown.SUMMARY_BUS)):
+            counted = [
+                f"{name.removeprefix('fault_').replace('_', ' ')} {counters[name]}"
+                for name in shown_in(view)
+                if counters[name]
+            ]
+            if counted:
+                lines.append(f"{title:<13} {', '.join(counted)}")
         for name, counts in self.inputs.items():
             shown = ", ".join(f"{kind} {count}" for kind, count in counts.items() if count)
             if shown:

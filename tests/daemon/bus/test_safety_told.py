@@ -12,7 +12,8 @@ from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared import faults
-from jtqd.daemon.shared.snapshot import COUNTERS, JointView, Snapshot, SnapshotReader, View
+from jtqd.daemon.shared.counters import COUNTERS
+from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader, View
 from jtqd.daemon.supervisor.summary import Summary
 from jtqd.drivers.eds.own_objects import COUNTERS as OWN_COUNTERS
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds

@@ -11,8 +11,9 @@ from jtqd.daemon.cli.reading import Daemon, Watch
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.counters import LastEstimate
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.runtime_dir import About, write_about
-from jtqd.daemon.shared.snapshot import COUNTERS, INPUT, Snapshot
+from jtqd.daemon.shared.snapshot import INPUT, Snapshot
 from jtqd.daemon.supervisor.description import about
 
 NAN = float("nan")

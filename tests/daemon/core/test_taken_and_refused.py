@@ -17,8 +17,8 @@ from jtqd.daemon.core.record import RecordRing
 from jtqd.daemon.core.status import JointRules
 from jtqd.daemon.loop.input_pdos import InputPdo
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.ring import Ring
-from jtqd.daemon.shared.snapshot import COUNTERS
 from jtqd.estimator.status import INVALID
 from tests.daemon.loop.cycle_helpers import I32, SENSOR, frame, inputs, make, turn
 

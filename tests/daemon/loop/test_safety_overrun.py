@@ -19,8 +19,9 @@ from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
-from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect
 from jtqd.estimator.methods import make_estimator

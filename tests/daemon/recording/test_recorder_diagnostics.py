@@ -9,8 +9,9 @@ from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.progress import Account
 from jtqd.daemon.shared.conditions import Condition
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.notices import ERROR, INFO, WARNING, Notices
-from jtqd.daemon.shared.snapshot import COUNTERS, JointView, Snapshot, SnapshotReader
+from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader
 from tests.daemon.recording.recorder_bench import DEFINITIONS, messages_of, session_on, statuses_of
 
 NAMES = ["loop", "bus", "joint 1", "joint 2", "node 1", "node 3", "recorder", "disk"]

@@ -11,8 +11,9 @@ from jtqd.daemon.recording import keeper as keeper_module
 from jtqd.daemon.recording.keeper import Keeper
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.ring import Ring
-from jtqd.daemon.shared.snapshot import COUNTERS, Snapshot
+from jtqd.daemon.shared.snapshot import Snapshot
 from tests.daemon.recording.recorder_bench import put, record_of
 
 _SLOTS = 256

@@ -15,7 +15,7 @@ from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.origin import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
-from jtqd.daemon.shared.snapshot import COUNTERS
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings

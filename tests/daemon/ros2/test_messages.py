@@ -9,7 +9,8 @@ from jtqd.daemon.recording.messages import Status
 from jtqd.daemon.ros2 import network
 from jtqd.daemon.ros2.messages import JointMessages, diagnostic_array
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.snapshot import COUNTERS, JointView, View
+from jtqd.daemon.shared.counters import COUNTERS
+from jtqd.daemon.shared.snapshot import JointView, View
 from jtqd.estimator import status as st
 from jtqd.estimator.checked import ConfigError
 from tests.daemon.recording.recorder_bench import START_NS, joint_values, record_of

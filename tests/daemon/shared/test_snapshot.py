@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.core.counters import LastEstimate
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import (
-    COUNTERS,
     INPUT,
     NMT_STATES,
     NOT_OPERATIONAL,

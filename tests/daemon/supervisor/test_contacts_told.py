@@ -17,8 +17,9 @@ from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.cli.status_json import content
 from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.core.counters import LastEstimate
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
-from jtqd.daemon.shared.snapshot import _COUNTERS_OFFSET, COUNTERS, Snapshot, SnapshotReader
+from jtqd.daemon.shared.snapshot import _COUNTERS_OFFSET, Snapshot, SnapshotReader
 from jtqd.daemon.supervisor.description import about
 from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import LiveTable, plain_line

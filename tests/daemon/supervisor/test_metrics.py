@@ -7,7 +7,8 @@ import pytest
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.conditions import WARNING, Condition
-from jtqd.daemon.shared.snapshot import COUNTERS, SnapshotReader
+from jtqd.daemon.shared.counters import COUNTERS
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.daemon.supervisor.service import metrics_text, write_metrics
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import shipped

@@ -4,7 +4,8 @@ from collections.abc import Collection
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.shared.conditions import Conditions
-from jtqd.daemon.shared.snapshot import COUNTERS, NO_ZEROS, JointView, View
+from jtqd.daemon.shared.counters import COUNTERS
+from jtqd.daemon.shared.snapshot import NO_ZEROS, JointView, View
 from jtqd.daemon.supervisor.health import Health
 from jtqd.estimator.learned import Zeros
 from jtqd.estimator.status import VALID
