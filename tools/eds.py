@@ -12,10 +12,10 @@ from functools import partial
 from pathlib import Path
 
 import jtqd.drivers.eds
+from jtqd.daemon.shared.counters import OBJECT_2200
 from jtqd.drivers.devices import CONTACT_BASES, ESTIMATE_BASES, contact_tpdos, estimate_tpdos
 from jtqd.drivers.eds.own_objects import (
     BUS_FIELDS,
-    COUNTERS,
     JOINT_PARAMETERS,
     PARAMETERS,
     ROOM,
@@ -430,7 +430,7 @@ def _sdo_objects(room: int) -> Objects:
     found: Objects = {
         0x2104: array("Latched faults", U16, "ro", joints),
         0x2110: reset,
-        0x2200: array("Counters", U32, "ro", [(name, 0) for name in COUNTERS]),
+        0x2200: array("Counters", U32, "ro", [(name, 0) for name in OBJECT_2200]),
         0x2201: array("Cycle time", U32, "ro", [("p50_us", 0), ("p99_us", 0), ("max_us", 0)]),
         0x2204: Var("Configuration hash", TEXT, "ro", ""),
         0x2205: array("Bus state", U32, "ro", [(name, 0) for name in BUS_FIELDS]),

@@ -1,45 +1,4 @@
-"""Sub-indices of jtqd's own objects 2200h..220Fh by name: one list for the data sheet and for the daemon."""
-
-COUNTERS = (
-    "cycles",
-    "missed",
-    "stale_inputs",
-    "late_frames",
-    "duplicate_frames",
-    "rejected_frames",
-    "foreign_sync",
-    "tx_dropped",
-    "rx_dropped",
-    "network_fallbacks",
-    "recorder_lost",
-    "complete",
-    "published",
-    "published_late",
-    "unknown_frames",
-    "sync_errors",
-    "sync_gaps",
-    "boot_ups",
-    "temperatures_lost",
-    "bus_errors",
-    "bits_worst_case",
-    "overruns",
-    "network_no_time",
-    "network_not_finite",
-    "network_far",
-    "network_outside",
-    "fault_not_finite",
-    "fault_out_of_range",
-    "fault_motor_jump",
-    "fault_link_jump",
-    "fault_velocity_mismatch",
-    "fault_torsion",
-    "fault_current_frozen",
-    "fault_deviation",
-    "latches",
-    "latch_resets",
-    "contacts",
-)
-"""Sub-indices 1.. of 2200h, in order: the loop's counters. New ones come last: receivers know them by number."""
+"""Sub-indices of jtqd's own objects 2201h..220Fh by name; those of 2200h stand in `jtqd.daemon.shared.counters`."""
 
 BUS_FIELDS = (
     "state",

@@ -6,7 +6,7 @@ import re
 import pytest
 from canopen import import_od
 
-from jtqd.drivers.eds.own_objects import COUNTERS
+from jtqd.daemon.shared.counters import OBJECT_2200
 from tests.paths import EDS
 from tools.eds import SHEETS, U8, Var, drive, jtqd_node, render
 
@@ -294,7 +294,7 @@ def test_jtqd_publishes_the_estimate_and_its_counters():
     eds = parse((EDS / "jtqd.eds").read_text())
     words = [number(eds[f"1A00sub{n}"]["DefaultValue"]) for n in range(1, 7)]
     assert words == [0x21000110, 0x21000210, 0x21010108, 0x21010208, 0x21020008, 0x21030008]
-    assert [eds[f"2200sub{n:X}"]["ParameterName"] for n in range(1, len(COUNTERS) + 1)] == list(COUNTERS)
+    assert [eds[f"2200sub{n:X}"]["ParameterName"] for n in range(1, len(OBJECT_2200) + 1)] == [*OBJECT_2200]
     assert number(eds["1005"]["DefaultValue"]) == 0x40000080  # bit 30: producer
     assert number(eds["1019"]["DefaultValue"]) == 240
     assert jtqd_node().objects[0x2102].data_type == U8

@@ -15,9 +15,8 @@ from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader, View
 from jtqd.daemon.supervisor.summary import Summary
-from jtqd.drivers.eds.own_objects import COUNTERS as OWN_COUNTERS
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
-from jtqd.estimator.status import INVALID, VALID
+from jtqd.estimator.status import INVALID
 from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import JTQD_EDS
 
@@ -115,15 +114,6 @@ def test_faults_and_latches_are_emcy_with_the_drives_node(
     assert told(faulty(JUMP, JUMP), faulty(TORSION)) == []
     assert told(faulty(JUMP), WELL) == ["00 00 81 02 ff 01 00 01", "00 00 81 01 ff 02 00 02"]
     assert told(WELL, WELL) == ["00 00 00 01 ff 01 00 01"]
-
-
-def test_every_fault_has_its_counter_and_its_object() -> None:
-    for bit in faults.COUNTED:
-        assert f"fault_{faults.NAMES[bit]}" in COUNTERS
-        assert f"fault_{faults.NAMES[bit]}" in OWN_COUNTERS
-    assert set(faults.MEANINGS) == set(faults.NAMES)
-    assert {*OWN_COUNTERS} <= {*COUNTERS, "recorder_lost"}
-    assert (WELL.status, WELL.latched) == (VALID, 0)
 
 
 def test_the_summary_says_why_there_was_no_torque() -> None:
