@@ -47,7 +47,7 @@ GROUPS = {
             "jtqd.sysid.campaign.command",
             "move the joints of a bus through a campaign of runs, and record them",
         ),
-        "excitation": ("jtqd.sysid.excitation.command", "design excitation trajectories"),
+        "excitation": ("jtqd.sysid.planner.command", "design excitation trajectories"),
         "fit": ("jtqd.sysid.fit.command", "fit efficiency, friction or losses of a joint file to runs"),
         "train": ("jtqd.sysid.train.command", "train a network per joint on runs (extra: train)"),
         "evaluate": (

@@ -1,7 +1,7 @@
 """The state of a drive in its statusword (6041h): CiA 402-2, table "statusword bits by state". Pure.
 
 What a state means is said where it matters: for an estimate in `jtqd.daemon.shared.faults`, for a motion in
-`jtqd.sysid.motion.cia402`, for a run in `jtqd.sysid.runs.logs`.
+`jtqd.sysid.motion.drives`, for a run in `jtqd.sysid.runs.logs`.
 
 >>> state_of(0x1637).value, state_of(0x0218).value
 ('operation enabled', 'fault')

@@ -43,14 +43,14 @@ from jtqd.estimator.status import VALID
 from jtqd.models.files import load_joint, load_yaml, shipped
 from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.campaign.emulated import emulated
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
-from jtqd.sysid.campaign.plans import variable_runs
 from jtqd.sysid.fit.joint_writer import write_joint
+from jtqd.sysid.planner.campaigns import variable_runs
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan
 from jtqd.sysid.report.figures import STYLE, check_picture
 from jtqd.sysid.report.page import LIGHT
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.run_file import RunError
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 
 NUMBERS: Final = (1, 2)
 SECRET_JOINT: Final = 1

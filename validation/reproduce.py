@@ -27,9 +27,9 @@ import yaml
 
 from jtqd.estimator.checked import ConfigError, check_installed, count, make_directory, natural
 from jtqd.models.files import shipped
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan
-from jtqd.sysid.campaign.plans import outside_runs
 from jtqd.sysid.campaign.state import DONE, STATE_FILE
+from jtqd.sysid.planner.campaigns import outside_runs
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan
 
 _OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
 _FINDINGS: Final = 3

@@ -23,9 +23,7 @@ from jtqd.drivers.pdo import PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.campaign.alone import allowed_torque
 from jtqd.sysid.campaign.processes import on_time
-from jtqd.sysid.excitation.model import current_at
 from jtqd.sysid.motion.setpoints import (
     Limits,
     MotionResult,
@@ -36,6 +34,8 @@ from jtqd.sysid.motion.setpoints import (
     approach,
 )
 from jtqd.sysid.motion.shell import Progress, play
+from jtqd.sysid.planner.design import current_at
+from jtqd.sysid.planner.single_joint import allowed_torque
 
 PERIOD_US: Final = 1000
 LONGEST_PERIOD_US: Final = 10_000

@@ -25,17 +25,26 @@ from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign import exact
-from jtqd.sysid.campaign.alone import parsed_limits, room_of, tightest, with_limits
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
-from jtqd.sysid.campaign.pieces import LONGEST_FILLED_S
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
-from jtqd.sysid.campaign.plans import KINDS, OnTried, Scale, make_plan_of, seed_of
 from jtqd.sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
 from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Designing, Reporter, clock_text
-from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
+from jtqd.sysid.campaign.runner import LONGEST_FILLED_S, Outcome, attempt, go_through
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
-from jtqd.sysid.campaign.units import Pair, Unit, check_joints, said_of, units_of
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
+from jtqd.sysid.planner.campaigns import (
+    KINDS,
+    OnTried,
+    Pair,
+    Scale,
+    Unit,
+    check_joints,
+    make_plan_of,
+    said_of,
+    seed_of,
+    units_of,
+)
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
+from jtqd.sysid.planner.single_joint import parsed_limits, room_of, tightest, with_limits
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"

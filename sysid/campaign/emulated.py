@@ -24,11 +24,10 @@ from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, TimeFunction, emulate
 from jtqd.sim_can.plants import AnyPlant, load_any_plant
-from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
-from jtqd.sysid.campaign.plans import KINDS, Scale, make_plan
+from jtqd.sysid.planner.campaigns import KINDS, Scale, make_plan
+from jtqd.sysid.planner.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.progress import progress
-from jtqd.sysid.runs.truth import write_truth
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run, write_truth
 
 PLANT: Final = "campaign_plant.yaml"
 _RECIPE: Final = "emulated_runs.json"

@@ -1,8 +1,9 @@
 """Runs of a campaign: play what is not done, record, check, keep the files, report the outcome.
 
-One attempt: jtqd is started, the motion played, jtqd ended, its log turned into the run's table and checked (`findings`).
-`go_through` does so for every run that is not done; a run against which was nothing but time is tried again, piece by piece
-where it can be cut (`pieces`).
+One attempt: jtqd is started, the motion played, jtqd ended, its log turned into the run table and checked (`findings`).
+`go_through` does so for every run that is not done. A run that was lost only because the machine was late is tried again.
+Where it can be cut, its pieces are driven one by one (NAME~1, NAME~2, ...) and stay separate tables: the joints stood
+elsewhere in between, and a table has no jump. Short gaps of lost cycles are interpolated (`fill`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import os
 import re
 import shutil
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -22,16 +23,144 @@ from jtqd.daemon.logs import LogError
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
-from jtqd.sysid.campaign.pieces import fill, gaps_of, pieces_of
-from jtqd.sysid.campaign.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
 from jtqd.sysid.campaign.reporter import Reporter
 from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, PENDING, STOPPED, CampaignDirectory, RunState
-from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints
+from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints, path
+from jtqd.sysid.planner.plan import (
+    Off,
+    Plan,
+    Plateau,
+    Rest,
+    Run,
+    Segment,
+    expand,
+    marks_of,
+    samples,
+    travel_rad,
+)
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.logs import LoggedRun, log_to_run
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
+
+LONGEST_FILLED_S: Final = 0.0505
+"""Longest time between two rows that is interpolated: 50 periods of 1 ms. The trajectories' harmonics lie below 1 Hz."""
+BACK_RAD: Final = 0.005
+"""A joint that is moved alone has come back where it is no further than this from where it began."""
+FILLED_SHARE: Final = 0.005
+"""Largest part of a table that may be interpolated."""
+
+
+def pieces_of(run: Run) -> tuple[Run, ...]:
+    """Return the pieces of a run, each from rest to rest; the run itself where it cannot be cut.
+
+    A run is cut in the middle of the rests between its motions; a joint that is moved alone must have come back there to
+    where it began. A run of one direction, which does not rest, is cut between its plateaus, each with the ramps of
+    the run's own ends. A piece never goes further from its start than the run does.
+    """
+    if any(isinstance(each, Off) for each in run.segments):
+        return (run,)
+    moving = [place for place, each in enumerate(run.segments) if not isinstance(each, Rest)]
+    if len(moving) < 2:
+        return (run,)
+    found = _of_one_direction(run, moving) or _between_rests(run)
+    pieces = [
+        replace(run, name=f"{run.name}~{number}", segments=tuple(each))
+        for number, each in enumerate(found, 1)
+    ]
+    far = travel_rad(expand(run)) + BACK_RAD
+    if len(pieces) < 2 or any(travel_rad(expand(piece)) > far for piece in pieces):
+        return (run,)
+    return tuple(pieces)
+
+
+def _between_rests(run: Run) -> list[list[Segment]]:
+    """Cut in the middle of each rest behind a motion that another one follows."""
+    pieces: list[list[Segment]] = [[]]
+    ends = _ends(run)
+    last = max(place for place, each in enumerate(run.segments) if not isinstance(each, Rest))
+    moved = False
+    for place, each in enumerate(run.segments):
+        home = run.current_joint is not None or abs(ends[place]) <= BACK_RAD
+        if isinstance(each, Rest) and moved and place < last and home:
+            before = isinstance(run.segments[place - 1], Plateau)  # which the rest ramps down
+            ramp_s = each.ramp_s if before else 0.0
+            half_s = 0.5 * (each.duration_s - ramp_s)
+            pieces[-1].append(Rest(half_s, ramp_s))
+            pieces.append([Rest(half_s, 0.0)])
+            moved = False
+            continue
+        moved = moved or not isinstance(each, Rest)
+        pieces[-1].append(each)
+    return pieces
+
+
+def _ends(run: Run) -> FloatArray:
+    """Return the position [rad] of the velocity joint at the end of each segment, from where the run begins."""
+    ends = np.cumsum([samples(each.duration_s) for each in run.segments])
+    whole = path(expand(run))
+    found: FloatArray = whole[np.minimum(ends, len(whole)) - 1]
+    return found
+
+
+def _of_one_direction(run: Run, moving: list[int]) -> list[list[Segment]]:
+    """Cut a run of plateaus of one direction on a towing bench; nothing for any other run."""
+    plateaus = [each for each in run.segments if isinstance(each, Plateau)]
+    first, last = run.segments[0], run.segments[-1]
+    if run.current_joint is None or len(plateaus) != len(moving) or moving[-1] - moving[0] + 1 != len(moving):
+        return []
+    if not isinstance(first, Rest) or not isinstance(last, Rest):
+        return []
+    if not (all(p.velocity_rad_s > 0.0 for p in plateaus) or all(p.velocity_rad_s < 0.0 for p in plateaus)):
+        return []
+    ramp_s = max(each.ramp_s for each in (plateaus[0], last))
+    ends = Rest(first.duration_s, 0.0), Rest(last.hold_s, ramp_s)
+    return [[ends[0], replace(each, ramp_s=max(ramp_s, each.ramp_s)), ends[1]] for each in plateaus]
+
+
+def gaps_of(time_s: FloatArray, longest_gap_s: float) -> list[list[float]]:
+    """Return the last row before and the first behind [s] of each step that is longer than longest_gap_s."""
+    places = np.flatnonzero(np.diff(time_s) > longest_gap_s)
+    return [[round(float(time_s[place]), 6), round(float(time_s[place + 1]), 6)] for place in places]
+
+
+def fill(logged: LoggedRun, longest_gap_s: float, period_s: float = PERIOD_S) -> tuple[LoggedRun, int]:
+    """Interpolate the gaps that are longer than readers bear; returns the run and the number of rows made, period_s apart.
+
+    The run as it was, and 0, where a gap is longer than LONGEST_FILLED_S, or more than FILLED_SHARE would be made.
+    Values between two rows are linear in time.
+    """
+    time_s = logged.table.time_s
+    steps = np.diff(time_s)
+    places = np.flatnonzero(steps > longest_gap_s)
+    if not len(places) or float(steps.max()) > LONGEST_FILLED_S:
+        return logged, 0
+    made = [
+        time_s[place] + period_s * np.arange(1, round(float(steps[place]) / period_s)) for place in places
+    ]
+    added = np.concatenate(made)
+    if len(added) > FILLED_SHARE * (len(added) + len(time_s)):
+        return logged, 0
+    whole: FloatArray = np.sort(np.concatenate((time_s, added)))
+    table = RunTable(
+        whole,
+        {number: _interpolated(columns, time_s, whole) for number, columns in logged.table.joints.items()},
+    )
+    return replace(logged, table=table, longest_gap_s=float(np.diff(whole).max())), len(added)
+
+
+def _interpolated(columns: JointColumns, time_s: FloatArray, whole: FloatArray) -> JointColumns:
+    def column(name: str) -> FloatArray | None:
+        values = getattr(columns, name)
+        if values is None:
+            return None
+        found: FloatArray = np.interp(whole, time_s, values)
+        return np.round(found) if name == "enabled" else found
+
+    return JointColumns(**{item.name: column(item.name) for item in fields(JointColumns)})
+
 
 _BUS_WAS_LATE: Final = re.compile(
     r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
@@ -39,7 +168,7 @@ _BUS_WAS_LATE: Final = re.compile(
 _SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
 LONGEST_GAP: Final = 9.5
 """In periods of SYNC. A longer step, of 10 cycles or more: the table would be refused by whoever reads it
-(jtqd.sysid.runs.time_steps)."""
+(jtqd.sysid.runs.segments)."""
 LOST_SHARE: Final = 0.01
 LOST_FINDING: Final = "cycles:"
 """How the finding begins that more than that are missing."""
@@ -178,9 +307,9 @@ def _keep(paths: Sequence[Path], out: Path, run: str, ending: str) -> None:
 
     The first becomes RUN.ENDING, the second RUN@2.ENDING and so on (no name has a @): a long run's log has several parts.
     """
-    for number, path in enumerate(paths, start=1):
-        if path.exists():
-            os.replace(path, out / (run + ("" if number == 1 else f"@{number}") + ending))
+    for number, file in enumerate(paths, start=1):
+        if file.exists():
+            os.replace(file, out / (run + ("" if number == 1 else f"@{number}") + ending))
 
 
 def ends_early(logged: LoggedRun, setpoints: Setpoints) -> str | None:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import Text, below, choice, in_file, read, split
-from jtqd.sysid.campaign.plan import Plan, load_plan
+from jtqd.sysid.planner.plan import Plan, load_plan
 
 SCHEMA: Final = "jtq.campaign/1"
 STATE_FILE: Final = "campaign.json"

@@ -46,7 +46,7 @@ from jtqd.sysid.diagnosis.signals import (
     without_held,
 )
 from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
-from jtqd.sysid.runs.held import clip_limits, held_rows
+from jtqd.sysid.runs.bad_samples import clip_limits, held_rows
 
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0

@@ -148,7 +148,7 @@ def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[Flo
 
 
 def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
-    """Return what the rows of held channels (`runs.held`) are wrong by: rms over the run that has most of it [Nm], beyond
+    """Return what the rows of held channels are wrong by: rms over the run that has most of it [Nm], beyond
     what is usual in the others; at rest, where the balance is not known, against a straight line between the rows around
     them. Channels without such rows are left out.
     """

@@ -13,11 +13,11 @@ import numpy as np
 
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.campaign.plan import Plan, check_plan, travel_rad
 from jtqd.sysid.diagnosis.arm_motion import KINDS, csv_text, described, motions, no_room, room_of
 from jtqd.sysid.diagnosis.experiment_choice import kinds_for
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS, VELOCITY_RAD_S, reach_of
+from jtqd.sysid.planner.plan import Plan, check_plan, travel_rad
 
 PLAN_FILE: Final = "next_experiment.plan.yaml"
 CONFIG: Final = "CONFIG"

@@ -34,7 +34,7 @@ from jtqd.sysid.diagnosis.smoothing import (
     sensor_rate,
     slow,
 )
-from jtqd.sysid.runs.held import Held
+from jtqd.sysid.runs.bad_samples import Held
 
 _ALL_VISIBLE: Final = Smoother(1.0)
 
@@ -81,7 +81,7 @@ class JointSignals:
     off: BoolArray | None = None
     held: Mapping[str, BoolArray] = field(
         default_factory=dict
-    )  # by balance: rows of a held channel (`runs.held`)
+    )  # by balance: rows of a held channel (`runs.bad_samples`)
     held_nm: Mapping[str, FloatArray] = field(default_factory=dict)  # by balance: what they are worth there
     of_position: bool = (
         True  # the acceleration is a second difference of the position, else one of the velocity

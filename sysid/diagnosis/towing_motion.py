@@ -15,12 +15,11 @@ import numpy as np
 
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
-from jtqd.sysid.campaign.plan import Fourier, Off, Plateau, Rest, Run, Segment
-from jtqd.sysid.campaign.plans import seed_of
-from jtqd.sysid.excitation.design import draw
-from jtqd.sysid.excitation.model import Bench as StaticBench
-from jtqd.sysid.excitation.model import ExcitationLimits, current_at, rounded_down
 from jtqd.sysid.motion.setpoints import Limits
+from jtqd.sysid.planner.campaigns import seed_of
+from jtqd.sysid.planner.design import Bench as StaticBench
+from jtqd.sysid.planner.design import ExcitationLimits, current_at, draw, rounded_down
+from jtqd.sysid.planner.plan import Fourier, Off, Plateau, Rest, Run, Segment
 
 VELOCITY_RAD_S: Final = 2.0
 """Fastest motion where nothing else is given; joint files have no rated velocity."""
@@ -118,7 +117,7 @@ def reach_of(
 
 _RAMP_S: Final = 0.4
 _STEEPEST: Final = 1.875
-"""Peak slope of the smooth step of `jtqd.sysid.campaign.plan`, in steps per ramp."""
+"""Peak slope of the smooth step of `jtqd.sysid.planner.plan`, in steps per ramp."""
 _GENTLE: Final = 0.5
 """Part of the acceleration that changes between plateaus use: nothing is to be learned there."""
 _EDGE_S: Final = 1.0
@@ -138,7 +137,7 @@ class Kind:
     """One kind of experiment. what: what is done and what that shows, for people; make: runs of one velocity joint,
     named after the prefix given.
 
-    Signs as in `jtqd.sysid.campaign.plans`: with equal signs of the velocity joint's velocity and the other joint's
+    Signs as in `jtqd.sysid.planner.campaigns`: with equal signs of the velocity joint's velocity and the other joint's
     current, the velocity joint drives and the other one is driven back. Every kind is done with either joint as the
     velocity joint, so that both joints drive and are driven, and there are always runs to leave out.
     """

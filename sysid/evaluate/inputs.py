@@ -26,7 +26,7 @@ from jtqd.sysid.runs.checks import RunIssue, check_channels
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run, run_paths
 from jtqd.sysid.runs.run_file import RunError, RunFile
-from jtqd.sysid.runs.truth import read_truth
+from jtqd.sysid.runs.tables import read_truth
 
 _CELL_S: Final = 0.01
 _CLEAR: Final = 3.0

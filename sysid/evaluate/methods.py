@@ -40,7 +40,7 @@ from jtqd.models.files import load_joint
 
 KEY: Final = "runs"
 _COMPRESSION: Final = 6
-"""Of run files as this toolbox writes them (jtqd.sysid.runs.write)."""
+"""Of run files as this toolbox writes them (jtqd.sysid.runs.tables)."""
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ and an estimate that follows it 2 ms late is late and does not jump. `unshifted_
 
 Score estimates against the true torque of emulated runs, which no instrument knows.
 
-Runs of `python -m jtqd.sysid.campaign.emulated` have the torque of each gear beside them (`sysid/runs/truth.py`). The sensor
+Runs of `python -m jtqd.sysid.campaign.emulated` have the torque of each gear beside them. The sensor
 has noise, a zero of the day and the links' inertia in it; an interval that holds the sensor may be too wide for the torque.
 
 `now`: the estimate against the torque at the same instant, with the estimate's own age as an error, as a controller sees it.

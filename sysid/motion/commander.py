@@ -16,8 +16,15 @@ from typing import Final
 
 from jtqd.drivers.cia402 import State, fast_state
 from jtqd.drivers.devices import COMMANDER_NODE, SYNC_COB_ID
-from jtqd.sysid.motion.cia402 import QUICK_STOP_WORD, describe, enabling_word
-from jtqd.sysid.motion.commands import Commands, Heartbeat
+from jtqd.sysid.motion.drives import (
+    QUICK_STOP_WORD,
+    Commands,
+    DriveUnits,
+    Heartbeat,
+    SensorUnits,
+    describe,
+    enabling_word,
+)
 from jtqd.sysid.motion.inputs import Inputs, Supervision
 from jtqd.sysid.motion.setpoints import (
     PERIOD_S,
@@ -30,7 +37,6 @@ from jtqd.sysid.motion.setpoints import (
     Violation,
     out_of_room,
 )
-from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 from jtqd.sysid.motion.stopping import Phase, PowerOff, Stopping
 
 UNPACED: Final = 2
@@ -126,7 +132,7 @@ Frame = tuple[int, bytes, int]
 
 
 class Commander:
-    """One motion of all drives of a bus, joints 1, 2, ..., which are set up already (`jtqd.sysid.motion.setup`).
+    """One motion of all drives of a bus, joints 1, 2, ..., which are set up already (`jtqd.sysid.motion.drives`).
 
     Those that the set-points do not name are held.
 

@@ -27,9 +27,8 @@ from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
 from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, OPERATIONAL, STATES
 from jtqd.drivers.sdo import RESPONSE_ID
-from jtqd.sysid.motion.cia402 import FAULTED, POWERED, describe
+from jtqd.sysid.motion.drives import FAULTED, POWERED, DriveUnits, SensorUnits, describe
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
-from jtqd.sysid.motion.setup import DriveUnits, SensorUnits
 
 _SENSOR: Final = (sensor_tpdo1(3).layout, sensor_tpdo2(3).layout)
 _TEMPERATURE: Final = drive_tpdo3(1).layout

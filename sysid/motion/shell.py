@@ -21,6 +21,7 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import CAPACITY, BusError, FrameSocket, open_frame_socket
 from jtqd.sysid.motion.commander import Commander, Frame
+from jtqd.sysid.motion.drives import BenchSetup
 from jtqd.sysid.motion.setpoints import (
     Limits,
     MotionError,
@@ -31,7 +32,6 @@ from jtqd.sysid.motion.setpoints import (
     Timing,
     check_setpoints,
 )
-from jtqd.sysid.motion.setup import BenchSetup
 
 Progress = Callable[[float, float], None]
 """Called with (played, total) seconds a few times per second, between two cycles: it must return at once."""

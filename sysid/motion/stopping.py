@@ -14,8 +14,14 @@ from enum import Enum
 from typing import Final
 
 from jtqd.drivers.cia402 import State, fast_state
-from jtqd.sysid.motion.cia402 import DISABLE_VOLTAGE, POWERED, QUICK_STOP_WORD, describe, enabling_word
-from jtqd.sysid.motion.commands import Commands
+from jtqd.sysid.motion.drives import (
+    DISABLE_VOLTAGE,
+    POWERED,
+    QUICK_STOP_WORD,
+    Commands,
+    describe,
+    enabling_word,
+)
 from jtqd.sysid.motion.inputs import Inputs, Supervision
 from jtqd.sysid.motion.setpoints import PERIOD_S, Timing, Violation
 

@@ -19,7 +19,7 @@ from jtqd.sysid.runs.column_map import Column, ColumnMap
 from jtqd.sysid.runs.files import read_pieces, read_run, read_runs, run_paths
 from jtqd.sysid.runs.joints import joint_files, joint_number, joints_of, named_joints, only
 from jtqd.sysid.runs.run_file import RunError, RunFile
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 
 __all__ = [
     "CheckedRun",

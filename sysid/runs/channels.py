@@ -1,20 +1,30 @@
-"""Channels of one joint against each other: dead, stuck, clipped, of the wrong sign or scale; and the gear ratio.
+"""Channels of a joint against each other: dead, stuck, saturated, wrong sign or scale, gear ratio, columns of another joint.
 
-Nothing here is a fit. Every check asks a question that physics answers whatever the friction may be:
+Nothing here is a fit of friction. Every check holds whatever the friction may be:
 
-- A torque or current that is the same number for a while although its partner moves is stuck; where the number is the
-  channel's largest or smallest, saturated. Only a moving joint is asked: in a standing one stiction can hold the torque.
-- The motor's velocity is the derivative of its position; motor and link turn by the gear ratio.
-- A motor that carries far more than its friction has a torque of its current's sign. Where it has not, the energy
-  lost on the way, the integral of (G Kt i - tau) v dt, shows which of the two is swapped: losses are positive.
+- A torque or current of a moving joint that is constant while its partner changes is stuck, or saturated where the number is
+  the channel's extreme. At standstill stiction can hold the torque.
+- The motor's velocity is the derivative of its position. Motor and link turn by the gear ratio.
+- A motor that carries far more than its friction has a torque of its current's sign. Where it has not, the energy lost,
+  the integral of (G Kt i - tau) v dt, shows which of the two is inverted: losses are positive.
 
-`check_channels` holds for every use of a run. The others (`check_energy`, `check_spikes`; `held`) are for a
-diagnosis, which takes every column at its word.
+`check_channels` holds for every use of a run. `check_energy` and `check_spikes` are for a diagnosis.
+
+Columns that were exchanged between two joints are found by the torque balance, with coefficients fitted to each run, so
+that a joint file with wrong friction does no harm:
+
+    G Kt i = g tau + c sign(v) + f v + J dv/dt + z        g in 0.5..2;  c, f, J not below zero
+
+Where an exchange leaves less than LESS of the error of both joints, and the error is more than MATTERS of the rated torque,
+the columns were exchanged. Where all columns of two joints were exchanged only the joint files show it: each joint must
+then fit the other's file better. Two joints with equal files and all columns exchanged are the same two joints.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from itertools import combinations
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,7 +34,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import FrictionModel, static_friction
-from jtqd.estimator.run import JointColumns
+from jtqd.estimator.run import JointColumns, RunTable
 
 
 class RunIssue(NamedTuple):
@@ -354,3 +364,127 @@ def check_spikes(run: JointColumns, joint: Joint, where: str) -> list[RunIssue]:
             "spikes or drop-outs",
         )
     ]
+
+
+LESS: Final = 0.5
+MATTERS: Final = 0.02
+_BIN_S: Final = 0.02
+_FEWEST: Final = 50
+_GAIN: Final = (0.5, 2.0)
+_PARTS: Final = {"current_a": (1, 0, 0), "torque_nm": (0, 0, 1), "position and velocity": (0, 1, 0)}
+"""What may be exchanged: which of current, motion and torque come from the other joint."""
+
+Signals = tuple[FloatArray, FloatArray, FloatArray]
+"""Current [A], velocity of the motor [rad/s], torque [Nm] in bins of _BIN_S."""
+
+
+def swapped_columns(
+    table: RunTable, joints: Mapping[int, Joint], where: str
+) -> list[tuple[int, int, RunIssue]]:
+    """Return the pairs of joints whose columns were exchanged in this run, and the line that says so."""
+    signals = {}
+    for number in sorted(set(joints) & set(table.joints)):
+        found = _signals(table.time_s, table.joints[number], joints[number])
+        if found is not None:
+            signals[number] = found
+    out: list[tuple[float, int, int, str]] = []
+    for a, b in combinations(signals, 2):
+        out += _exchanged(a, b, signals[a], signals[b], joints)
+    taken: set[int] = set()
+    issues = []
+    for _, a, b, text in sorted(out):
+        if not {a, b} & taken:
+            taken |= {a, b}
+            issues.append((a, b, RunIssue("columns_swapped", f"{where}: {text}" if where else text)))
+    return issues
+
+
+def _signals(time_s: FloatArray, columns: JointColumns, joint: Joint) -> Signals | None:
+    """Return the signals of one joint, None where one is missing or the joint hardly moves."""
+    velocity = columns.derived(time_s, joint.gear_ratio).motor_velocity_rad_s
+    if columns.current_a is None or columns.torque_nm is None or velocity is None:
+        return None
+    samples = max(1, round(_BIN_S / float(np.median(np.diff(time_s)))))
+    count = len(time_s) // samples
+    current, speed, torque = (
+        x[: count * samples].reshape(count, samples).mean(axis=1)
+        for x in (columns.current_a, velocity, columns.torque_nm)
+    )
+    if np.count_nonzero(np.abs(speed) > MOVING_RAD_S * joint.gear_ratio) < _FEWEST or not np.any(torque):
+        return None
+    return current, speed, torque
+
+
+def _exchanged(
+    a: int, b: int, one: Signals, two: Signals, joints: Mapping[int, Joint]
+) -> list[tuple[float, int, int, str]]:
+    """Return by how much the error falls, and the line, where an exchange between two joints explains both."""
+    least = MATTERS * float(np.hypot(joints[a].rated_torque_nm, joints[b].rated_torque_nm))
+    own = float(np.hypot(balance_error(one, joints[a]), balance_error(two, joints[b])))
+    errors = {}
+    for what, which in _PARTS.items():
+        mixed = tuple(y if other else x for x, y, other in zip(one, two, which, strict=True))
+        back = tuple(x if other else y for x, y, other in zip(one, two, which, strict=True))
+        errors[what] = float(np.hypot(balance_error(mixed, joints[a]), balance_error(back, joints[b])))  # type: ignore[arg-type]
+    best = min(errors, key=lambda what: errors[what])
+    if own > least and errors[best] < LESS * own:
+        what = f"j{a} and j{b}, {best}" if " " in best else f"j{a}.{best} and j{b}.{best}"
+        return [
+            (
+                errors[best] / own,
+                a,
+                b,
+                f"{what}: found the other joint's (the torque balances are off by {own:.3g} Nm rms, exchanged by "
+                f"{errors[best]:.3g} Nm), expected each joint's own: swapped columns",
+            )
+        ]
+    files = [[file_error(s, joints[n]) for n in (a, b)] for s in (one, two)]
+    better = max(files[0][1] / max(files[0][0], 1e-30), files[1][0] / max(files[1][1], 1e-30))
+    if better < LESS and min(files[0][0], files[1][1]) > MATTERS * min(
+        joints[n].rated_torque_nm for n in (a, b)
+    ):
+        return [
+            (
+                better,
+                a,
+                b,
+                f"j{a} and j{b}: found that each fits the other's joint file ({files[0][1]:.3g} and {files[1][0]:.3g} Nm "
+                f"rms) and not its own ({files[0][0]:.3g} and {files[1][1]:.3g} Nm): swapped columns or joint files",
+            )
+        ]
+    return []
+
+
+def balance_error(signals: Signals, joint: Joint) -> float:
+    """Return the rms of the torque balance with coefficients fitted to it [Nm], inside their bounds."""
+    current, turning, torque = signals
+    speed = turning / joint.gear_ratio
+    moving = np.abs(speed) > MOVING_RAD_S
+    motor = (joint.gear_ratio * joint.torque_constant_nm_per_a * current)[moving]
+    v = speed[moving]
+    acceleration = np.gradient(speed, _BIN_S)[moving]
+    ladder = np.column_stack((torque[moving], np.sign(v), v, acceleration, np.ones_like(v)))
+    low = np.array([_GAIN[0], 0.0, 0.0, 0.0, -np.inf])
+    high = np.array([_GAIN[1], *([np.inf] * 4)])
+    fixed: dict[int, float] = {}
+    while True:
+        free = [k for k in range(5) if k not in fixed]
+        rest = motor - ladder[:, list(fixed)] @ np.array(list(fixed.values()))
+        found, *_ = np.linalg.lstsq(ladder[:, free], rest, rcond=1e-9)
+        inside = np.clip(found, low[free], high[free])
+        beyond = np.abs(found - inside) * np.sqrt(np.mean(ladder[:, free] ** 2, axis=0))
+        worst = int(np.argmax(beyond))
+        if not beyond[worst] > 0.0:
+            return float(np.sqrt(np.mean((rest - ladder[:, free] @ found) ** 2)))
+        fixed[free[worst]] = float(inside[worst])
+
+
+def file_error(signals: Signals, joint: Joint) -> float:
+    """Return the standard deviation of the torque balance with the values of a joint file [Nm]."""
+    current, turning, torque = signals
+    speed = turning / joint.gear_ratio
+    moving = np.abs(speed) > MOVING_RAD_S
+    friction = joint.friction.coulomb_nm * np.sign(speed) + joint.friction.viscous_nms_per_rad * speed
+    inertia = joint.gear_ratio**2 * joint.rotor_inertia_kgm2
+    left = joint.gear_ratio * joint.torque_constant_nm_per_a * current - torque - friction
+    return float(np.std((left - inertia * np.gradient(speed, _BIN_S))[moving]))

@@ -19,10 +19,17 @@ import numpy as np
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.runs.channels import RunIssue, check_channels, check_energy, check_spikes, one_value
-from jtqd.sysid.runs.held import Limits, check_held, clip_limits
+from jtqd.sysid.runs.bad_samples import Limits, check_held, clip_limits, without_wild_samples
+from jtqd.sysid.runs.channels import (
+    RunIssue,
+    check_channels,
+    check_energy,
+    check_spikes,
+    one_value,
+    swapped_columns,
+)
 from jtqd.sysid.runs.run_file import RunFile
-from jtqd.sysid.runs.swapped import swapped_columns
+from jtqd.sysid.runs.segments import SHORTEST_PIECE_S
 from jtqd.sysid.runs.time_base import (
     SKEW_NOTED_S,
     SKEW_REFUSED_S,
@@ -31,9 +38,7 @@ from jtqd.sysid.runs.time_base import (
     skew_s,
     unwrapped,
 )
-from jtqd.sysid.runs.time_steps import SHORTEST_PIECE_S
 from jtqd.sysid.runs.units import temperature_issue, unit_issues
-from jtqd.sysid.runs.wild import without_wild_samples
 
 __all__ = [
     "CheckedRun",

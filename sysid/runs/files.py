@@ -1,35 +1,97 @@
-"""Run files: which are meant, which of them are one recording, and the runs in them. CSV, gzipped CSV and Parquet tables and
-jtqd's MCAP logs as run tables.
+"""Run files on disk: which files a command line names, which of them are one recording, and which are duplicates.
 
-A table has one header row; its columns are those of the run table (`time_s`, `j1.current_a`, ...) or, with a column map,
-whatever the map names. Only the columns asked for are parsed: garbage in the others cannot hurt. Anything wrong in the
-ones asked for is refused in one line that names file, line, column, found and expected. What is suspicious but usable is
-returned as notes; a torque channel that is exactly zero in every row is dead and comes back as None, never as zeros.
-`jN.enabled` (0: power stage off, else 1) is optional; without it nothing is known of the power stage.
+A table's columns are those of the run table (`time_s`, `j1.current_a`, ...) or, with a column map, those that the map names.
+Only these are parsed. An error names file, line, column, found and expected in one line. What is suspicious but usable is a
+note. A torque channel that is exactly zero in every row is dead and becomes None, never zeros. `jN.enabled` (0: power stage
+off, else 1) is optional.
 
-A file becomes `content.Content` by its kind (`csv_table`, `parquet_table`, `log_content`), that becomes runs in `pieces`.
+Two runs of one motion never agree in the noise of position and current over many samples in a row. Two files that do are
+the same run, e.g. a log and the table exported from it, or a part of it. Stamps are not compared: an export begins at zero.
+A joint at rest without noise is the same in every run, so equal windows count once, and a run with few different windows is
+not judged.
 
-Cheap to import: numpy and the estimator's values. Parquet (pyarrow) and MCAP (`jtqd.sysid.runs.logs`) are imported when a
-file of that kind is read.
+Cheap to import: Parquet (pyarrow) and MCAP (`jtqd.sysid.runs.logs`) are imported when such a file is read.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+import numpy.typing as npt
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.content import Content
-from jtqd.sysid.runs.csv_table import read_csv
-from jtqd.sysid.runs.log_content import read_log
-from jtqd.sysid.runs.parquet_table import read_parquet
-from jtqd.sysid.runs.pieces import runs_of
-from jtqd.sysid.runs.run_file import RunError, RunFile
-from jtqd.sysid.runs.same_run import Stretches, same_run, stretches
+from jtqd.sysid.runs.logs import read_log
+from jtqd.sysid.runs.run_file import Content, RunError, RunFile
+from jtqd.sysid.runs.segments import runs_of
+from jtqd.sysid.runs.tables import read_csv, read_parquet
+
+_ROWS: Final = 64
+"""Samples in a row that must agree."""
+_KEPT: Final = np.uint64(0xFFFF_FFF0_0000_0000)
+"""Bits of a number that are compared: five digits, as a table may have fewer than a log."""
+_LEAST: Final = 50
+_OF_ALL: Final = 0.2
+"""Different stretches that a run must have to be judged: their number, and part of all its stretches."""
+_SAMPLE: Final = 400
+_SHARE: Final = 0.5
+"""Part of the stretches of the shorter run that must be in the longer one."""
+_FACTOR: Final = 0x9E37_79B9_7F4A_7C15
+"""Odd, so that it has an inverse modulo 2^64; the fractional part of the golden ratio."""
+_INVERSE: Final = pow(_FACTOR, -1, 2**64)
+
+Stretches = Mapping[int, npt.NDArray[np.uint64]]
+
+
+def stretches(table: RunTable) -> Stretches:
+    """Return the different stretches of each joint as sorted numbers [n]; a joint that cannot be judged is left out."""
+    found = {number: _of_joint(columns) for number, columns in table.joints.items()}
+    return {number: each for number, each in found.items() if each is not None}
+
+
+def same_run(one: Stretches, two: Stretches) -> bool:
+    """Return whether most of the shorter run is in the other one, for every joint that both have."""
+    joints = one.keys() & two.keys()
+    return bool(joints) and all(_share(one[joint], two[joint]) > _SHARE for joint in joints)
+
+
+def _of_joint(columns: JointColumns) -> npt.NDArray[np.uint64] | None:
+    position, current = columns.motor_position_rad, columns.current_a
+    if position is None or current is None or len(position) < _ROWS + _LEAST:
+        return None
+    rows = _kept(position) * np.uint64(_FACTOR) ^ (_kept(current) >> np.uint64(7)) * np.uint64(_INVERSE)
+    # stretch i = sum of rows[i + j] FACTOR^j over j, by the difference of two sums from the beginning
+    powers = _powers(_FACTOR, len(rows))
+    sums = np.concatenate([np.zeros(1, np.uint64), np.cumsum(rows * powers, dtype=np.uint64)])
+    every = (sums[_ROWS:] - sums[:-_ROWS]) * _powers(_INVERSE, len(sums) - _ROWS)
+    different = np.unique(every)
+    return different if len(different) >= max(_LEAST, _OF_ALL * len(every)) else None
+
+
+def _kept(numbers: FloatArray) -> npt.NDArray[np.uint64]:
+    return (numbers + 0.0).view(np.uint64) & _KEPT  # + 0.0: no negative zero
+
+
+def _powers(factor: int, count: int) -> npt.NDArray[np.uint64]:
+    factors = np.full(count, factor, np.uint64)
+    factors[0] = 1
+    return np.cumprod(factors, dtype=np.uint64)
+
+
+def _share(one: npt.NDArray[np.uint64], two: npt.NDArray[np.uint64]) -> float:
+    """Of a sample of the shorter one: the first ones, as their order is no order in time."""
+    short, long = sorted((one, two), key=len)
+    sample = short[:_SAMPLE]
+    at = np.minimum(np.searchsorted(long, sample), len(long) - 1)
+    return float(np.mean(long[at] == sample))
+
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
 LOGS: Final = (".mcap",)

@@ -1,12 +1,13 @@
-"""jtqd's log of a run as a run table: what the estimator was given, cycle by cycle, and what is missing of it.
+"""Logs of jtqd as run tables: the inputs of the estimator cycle by cycle, and an account of the missing cycles.
 
-A log has one to four joints, and a reference for those that a channel of the torque sensor belongs to. The frames of the
-bus, which are most of a log, are looked through for temperatures chunk by chunk and not kept.
+A log has one to four joints, and a reference for those with a channel of the torque sensor. Drive temperatures are taken
+from the recorded frames chunk by chunk, so that the frames, which are most of a log, are not kept in memory.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -21,8 +22,10 @@ from jtqd.drivers.cia402 import STATES, TOLD, State
 from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, counted
-from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import parse_yaml
+from jtqd.sysid.runs.column_map import TIME
+from jtqd.sysid.runs.run_file import Content, RunError, file_bytes
 
 DRIVE_INPUTS: Final = 3
 """input_flags of the log: both PDOs of the drive are of this cycle."""
@@ -384,3 +387,39 @@ def _temperature(readings: Readings, span: slice) -> FloatArray | None:
     last = np.searchsorted(rows, cycles, side="right") - 1
     first = min(int(np.searchsorted(rows, cycles[0])), int(last[-1]))
     return np.asarray(values[np.maximum(last, max(first, 0))], np.float64)
+
+
+def read_log(path: Path, *parts: Path, joints: Sequence[int] | None = None) -> Content:
+    """Read a log, or all parts of one run; the hash is that of all files one after another."""
+    from jtqd.daemon.logs import LogError
+    from jtqd.sysid.runs.logs import log_to_run
+
+    sha256 = file_bytes(path)[1]
+    if parts:
+        sha256 = hashlib.sha256(b"".join(file_bytes(each)[0] for each in (path, *parts))).hexdigest()
+    try:
+        logged = log_to_run((path, *parts) if parts else path, joints=joints)
+    except LogError as error:
+        text = str(error)
+        raise RunError(text if text.startswith(str(path)) else f"{path}: {text}") from None
+    except OSError as error:
+        raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
+    notes = [f"{len(parts) + 1} parts of one run: {path.name} to {parts[-1].name}"] if parts else []
+    notes += [f"joint {number} left out: {why}" for number, why in logged.left_out.items()]
+    one = [n for n, columns in logged.table.joints.items() if columns.link_position_rad is None]
+    if one:
+        which = f"joint{'s' * (len(one) > 1)} {', '.join(map(str, one))}"
+        notes.append(f"{which}: one encoder, no link position: nothing is known of the torsion of the gear")
+    if logged.missed or logged.incomplete:
+        by = ", ".join(f"{count} of {name}" for name, count in logged.incomplete_by.items() if count)
+        notes.append(
+            f"{counted(logged.missed, 'cycle')} missed and {logged.incomplete} incomplete{f' ({by})' if by else ''}: "
+            f"{logged.lost_share:.2%} of the slots have no row"
+        )
+    values = {TIME: logged.table.time_s}
+    for number, columns in logged.table.joints.items():
+        for name in COLUMN_NAMES:
+            column = getattr(columns, name)
+            if column is not None:
+                values[f"j{number}.{name}"] = column
+    return Content(path, "mcap", sha256, values, notes=tuple(notes))

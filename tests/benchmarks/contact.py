@@ -30,9 +30,9 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
 from jtqd.sim_can.plants import AnyPlant, load_any_plant
 from jtqd.sysid.campaign import emulated as campaign
-from jtqd.sysid.campaign.plan import Run, expand
-from jtqd.sysid.campaign.plans import Scale, make_plan
 from jtqd.sysid.fit import command as fit
+from jtqd.sysid.planner.campaigns import Scale, make_plan
+from jtqd.sysid.planner.plan import Run, expand
 
 BENCHES = {
     "Table I": "campaign_plant.yaml",

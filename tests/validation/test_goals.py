@@ -15,8 +15,8 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import ObservedRun
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.sim_can.plant_file import PlantParameters
-from jtqd.sysid.campaign.plan import Plateau, Rest, Run
 from jtqd.sysid.evaluate.methods import OURS, PAPERS
+from jtqd.sysid.planner.plan import Plateau, Rest, Run
 from tests.estimator.fused_helpers import fused
 from validation.goals.__main__ import main
 from validation.goals.baselines import BASELINES, Example, fit_baseline

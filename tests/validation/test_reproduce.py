@@ -15,7 +15,7 @@ import yaml
 from jtqd.daemon.config import load_config
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.campaign import command as campaign_command
-from jtqd.sysid.campaign.plan import check_plan, load_plan
+from jtqd.sysid.planner.plan import check_plan, load_plan
 from tests.estimator.fused_configuration import networks
 from validation import reproduce as reproduce_command
 from validation.reproduce import Step, steps, write_config

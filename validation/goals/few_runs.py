@@ -22,10 +22,10 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS
-from jtqd.sysid.campaign.plans import variable_runs
 from jtqd.sysid.fit.few_runs import PRIOR, Prior
 from jtqd.sysid.fit.losses import LossFitError
+from jtqd.sysid.planner.campaigns import variable_runs
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS
 from validation.goals.identify import NUMBERS, drive, nominal_joints
 from validation.goals.plants import PlantFile, the_three
 from validation.goals.two_runs import Case, Run, errors_of_ours, one_encoder, rows_of, summary

@@ -16,9 +16,9 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS
-from jtqd.sysid.campaign.plan import Run
-from jtqd.sysid.campaign.plans import seed_of
 from jtqd.sysid.evaluate.methods import PAPERS
+from jtqd.sysid.planner.campaigns import seed_of
+from jtqd.sysid.planner.plan import Run
 from validation.goals.identify import (
     FIT_SEED,
     JUDGE_SEED,

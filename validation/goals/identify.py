@@ -22,12 +22,12 @@ from jtqd.estimator.settings import EstimatorSettings, recommended
 from jtqd.models.files import load_joint
 from jtqd.sim_can.plants import AnyPlant
 from jtqd.sysid.campaign.emulated import emulated_with_truth
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Run
-from jtqd.sysid.campaign.plans import Scale, make_plan, outside_runs
 from jtqd.sysid.fit.efficiency import default_current_min, eta_points, fit_efficiency
 from jtqd.sysid.fit.fused import fit_fused
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
+from jtqd.sysid.planner.campaigns import Scale, make_plan, outside_runs
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Run
 from jtqd.sysid.train.paper import paper_block, train_paper
 from validation.goals.baselines import BASELINES, Example, fit_baseline
 from validation.goals.plants import SIDES, Mapped, PlantFile

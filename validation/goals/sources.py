@@ -32,14 +32,14 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import shipped
 from jtqd.sim_can.towing.bench_file import AngleWave, TowedJoint, TowingBench
-from jtqd.sysid.campaign.plan import Run
-from jtqd.sysid.campaign.plans import make_plan
 from jtqd.sysid.fit.calibration import calibrated, fit_sigma
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.repeatability import fit_zeros
 from jtqd.sysid.fit.residuals import path_residuals
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.fit.torsion import TorsionError
+from jtqd.sysid.planner.campaigns import make_plan
+from jtqd.sysid.planner.plan import Run
 from validation.goals.identify import (
     QUICK,
     TINY,

@@ -15,12 +15,12 @@ import numpy as np
 from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
-from jtqd.sysid.campaign.plan import Plan, check_plan
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
 from jtqd.sysid.diagnosis.signals import joint_signals
+from jtqd.sysid.planner.plan import Plan, check_plan
 from validation.hidden.case import Case, draw_many, follow_up
 from validation.hidden.menu import MENU, SENSOR, base_value, scaled
 from validation.hidden.order import Hidden, Order

@@ -108,7 +108,7 @@ def _runs_of(motion: Mapping[str, Any]) -> list[tuple[str, str, str]]:
 
 def plan_amount(plan: Mapping[str, Any]) -> str:
     """Return how long a plan is, e.g. "4 runs, 12 minutes of motion"; "" for one that `jtq campaign` would refuse."""
-    from jtqd.sysid.campaign.plan import Plan
+    from jtqd.sysid.planner.plan import Plan
 
     try:
         runs = Plan.from_mapping(dict(plan), PLAN_FILE).runs

@@ -106,8 +106,8 @@ def targets(directory: Path) -> list[Target]:
     from jtqd.estimator.onnx_graph import NetworkError
     from jtqd.models.files import load_joint
     from jtqd.sim_can.plant_file import load_plant
-    from jtqd.sysid.campaign.plan import load_plan
-    from jtqd.sysid.campaign.plans import Scale, make_plan
+    from jtqd.sysid.planner.campaigns import Scale, make_plan
+    from jtqd.sysid.planner.plan import load_plan
     from jtqd.sysid.runs.column_map import ColumnMap
     from jtqd.sysid.runs.files import read_run
     from jtqd.sysid.runs.run_file import RunError

@@ -17,12 +17,21 @@ from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.campaign import bench as campaign_bench
-from jtqd.sysid.campaign.alone import SHARE, ladder_run, parsed_limits, room_of, tightest
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
 from jtqd.sysid.campaign.command import main
 from jtqd.sysid.campaign.emulated import PLANT, emulated_run
-from jtqd.sysid.campaign.pieces import pieces_of
-from jtqd.sysid.campaign.plan import (
+from jtqd.sysid.campaign.runner import findings, pieces_of
+from jtqd.sysid.motion.setpoints import (
+    Limits,
+    MotionResult,
+    OutOfPlaceError,
+    Setpoints,
+    Timing,
+    path,
+    way,
+)
+from jtqd.sysid.planner.campaigns import Scale, check_joints, efficiency_runs, make_plan_of, units_of
+from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Plan,
     Plateau,
@@ -34,22 +43,11 @@ from jtqd.sysid.campaign.plan import (
     load_plan,
     travel_rad,
 )
-from jtqd.sysid.campaign.plans import Scale, efficiency_runs, make_plan_of
-from jtqd.sysid.campaign.runner import findings
-from jtqd.sysid.campaign.units import check_joints, units_of
-from jtqd.sysid.motion.setpoints import (
-    Limits,
-    MotionResult,
-    OutOfPlaceError,
-    Setpoints,
-    Timing,
-    path,
-    way,
-)
+from jtqd.sysid.planner.single_joint import SHARE, ladder_run, parsed_limits, room_of, tightest
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import with_joint
 from jtqd.sysid.runs.logs import LoggedRun
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 
 LIMITS = MotionLimits((-1.0, 2.0), 1.5, 6.0, 25.0)
 JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=LIMITS)
@@ -210,7 +208,7 @@ def test_plateaus_are_there_in_both_directions_at_every_velocity() -> None:
 
 def test_searching_pays_more_information_than_drawing() -> None:
     """The velocities of a design cover more than those of a draw: it is the reason to search at all."""
-    from jtqd.sysid.campaign.alone import _log_det, _Trajectories, trajectories
+    from jtqd.sysid.planner.single_joint import _log_det, _Trajectories, trajectories
 
     def information(evaluations: int) -> float:
         task = _Trajectories(ROOM, 1.0, 3.0)

@@ -14,7 +14,7 @@ import pytest
 import yaml
 
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.campaign.plan import expand, load_plan
+from jtqd.sysid.planner.plan import expand, load_plan
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.logs import log_to_run
 from tests.shipped_bench import shipped_bench

@@ -14,7 +14,7 @@ from jtqd.models.files import shipped
 from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.campaign.command import main, parser, recipe, wanted_plan
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, RunState
-from jtqd.sysid.campaign.units import units_of
+from jtqd.sysid.planner.campaigns import units_of
 from tests.drivers.hub_helpers import until_it_listens
 
 SMALL = {
@@ -259,7 +259,7 @@ def test_a_plan_that_was_designed_once_is_not_designed_again(
     def never(*_: object, **__: object) -> None:
         raise AssertionError("designed again")
 
-    monkeypatch.setattr("jtqd.sysid.campaign.plans.design", never)
+    monkeypatch.setattr("jtqd.sysid.planner.campaigns.design", never)
     assert main([*arguments, "--bus", "x", "--out", str(tmp_path / "out")]) == 0
     capsys.readouterr()
 

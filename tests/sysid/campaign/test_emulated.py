@@ -9,8 +9,8 @@ import pytest
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.campaign.emulated import PLANT, emulated_run, main
-from jtqd.sysid.campaign.plan import expand
-from jtqd.sysid.campaign.plans import Scale, make_plan
+from jtqd.sysid.planner.campaigns import Scale, make_plan
+from jtqd.sysid.planner.plan import expand
 from jtqd.sysid.runs.files import read_run
 
 ARGUMENTS = ["--runs", "2", "--seconds", "4", "--hold", "0.3", "--seed", "5"]

@@ -15,8 +15,27 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.campaign.pieces import fill, pieces_of
-from jtqd.sysid.campaign.plan import (
+from jtqd.sysid.campaign.processes import Interrupted
+from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
+from jtqd.sysid.campaign.runner import (
+    ATTEMPTS,
+    LONGEST_GAP,
+    Attempt,
+    Outcome,
+    _stopped,
+    ends_early,
+    fill,
+    findings,
+    gap_too_long,
+    go_through,
+    pieces_of,
+)
+from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
+from jtqd.sysid.motion.commander import Pace
+from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
+from jtqd.sysid.planner.campaigns import ladder
+from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Fourier,
     Plan,
@@ -28,24 +47,6 @@ from jtqd.sysid.campaign.plan import (
     expand,
     marks_of,
 )
-from jtqd.sysid.campaign.plans import ladder
-from jtqd.sysid.campaign.processes import Interrupted
-from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
-from jtqd.sysid.campaign.runner import (
-    ATTEMPTS,
-    LONGEST_GAP,
-    Attempt,
-    Outcome,
-    _stopped,
-    ends_early,
-    findings,
-    gap_too_long,
-    go_through,
-)
-from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
-from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
-from jtqd.sysid.motion.commander import Pace
-from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
 from jtqd.sysid.runs.logs import LoggedRun
 
 GAP_S = 1e-3 * LONGEST_GAP

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Plan, Rest, Run
 from jtqd.sysid.campaign.state import DONE, FAILED, PENDING, STOPPED, CampaignDirectory, RunState, StateError
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, Rest, Run
 
 PLAN = Plan("p", DEFAULT_LIMITS, tuple(Run(name, 1, (Rest(1.0),)) for name in ("a", "b", "c")))
 OTHER = Plan("q", DEFAULT_LIMITS, PLAN.runs[:2])

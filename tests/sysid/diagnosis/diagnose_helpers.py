@@ -20,7 +20,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, Gap, Place, Value
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 
 JOINT_FILE = shipped("joint1.yaml")
 JOINT = load_joint(JOINT_FILE)

@@ -15,11 +15,11 @@ import yaml
 from jtqd.daemon import jtq as jtq_module
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.campaign.plan import load_plan
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import VERDICTS
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.planner.plan import load_plan
+from jtqd.sysid.runs.tables import write_run
 from tests.daemon.logs.campaign_log import Joint as LogJoint
 from tests.daemon.logs.campaign_log import regular, write_log
 from tests.sysid.diagnosis.diagnose_helpers import (

@@ -18,10 +18,10 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.campaign.plan import Plan, Plateau, Run, check_plan, expand
 from jtqd.sysid.diagnosis.experiment_choice import MOST_KINDS, PAIRS, kind_of, kinds_for
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS, reach_of
+from jtqd.sysid.planner.plan import Plan, Plateau, Run, check_plan, expand
 
 SEED = 20261121
 SHIPPED = {number: load_joint(shipped(f"joint{number}.yaml")) for number in (1, 2)}

@@ -18,7 +18,7 @@ from jtqd.sysid.diagnosis.noise import Sums
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
 
 JOINTS = {1: JOINT, 2: JOINT}

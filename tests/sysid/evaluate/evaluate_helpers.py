@@ -22,7 +22,7 @@ from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.evaluate.command import main
 from jtqd.sysid.evaluate.methods import Samples
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 from jtqd.sysid.train.network import export_network
 from tests.estimator.estimator_helpers import small_network
 

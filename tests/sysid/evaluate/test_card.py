@@ -15,7 +15,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.evaluate.card import Card, load_edges, make_card, speed_edges, temperature_edges
 from jtqd.sysid.evaluate.command import main
 from jtqd.sysid.evaluate.methods import Samples
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 from tests.sysid.evaluate.evaluate_helpers import emulated, samples, write_models
 
 JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=MotionLimits(velocity_rad_s=3.0))

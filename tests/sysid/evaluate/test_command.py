@@ -22,7 +22,7 @@ from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import load_joint
 from jtqd.sysid.evaluate.command import main
 from jtqd.sysid.runs.files import read_run
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 from tests.sysid.evaluate.evaluate_helpers import NO_PICTURES, evaluate, make_bench, report
 
 pytest.importorskip("jinja2")

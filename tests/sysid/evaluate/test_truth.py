@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jtqd.sysid.evaluate.scores import truth_tables
-from jtqd.sysid.runs.truth import read_truth, truth_path, write_truth
+from jtqd.sysid.runs.tables import read_truth, truth_path, write_truth
 from tests.sysid.evaluate.evaluate_helpers import samples
 
 TIME = np.arange(4000) * 1e-3

@@ -16,7 +16,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 from tests.estimator.estimator_helpers import joint1
 from tests.sysid.campaign_helpers import section_two_runs
 

@@ -18,12 +18,10 @@ from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.side_by_side import sources_of
-from jtqd.sysid.motion.cia402 import CST, CSV
 from jtqd.sysid.motion.commander import Commander
+from jtqd.sysid.motion.drives import CST, CSV, sensor_units, set_up, switch_off, turns
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Surroundings, Timing
-from jtqd.sysid.motion.setup import sensor_units, set_up, switch_off
 from jtqd.sysid.motion.stopping import Phase
-from jtqd.sysid.motion.turns import turns
 
 MS = 1_000_000
 PLANT = load_plant(shipped("plant.yaml"))

@@ -4,7 +4,7 @@ import pytest
 
 from jtqd.drivers.cia402 import State, fast_state, state_of
 from jtqd.sim_can import drive_node as cia402
-from jtqd.sysid.motion.cia402 import (
+from jtqd.sysid.motion.drives import (
     DISABLE_VOLTAGE,
     FAULT_RESET,
     FAULTED,

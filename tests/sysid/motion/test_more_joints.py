@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.drives import turns
 from jtqd.sysid.motion.setpoints import (
     HELD_RAD,
     Limits,
@@ -20,7 +21,6 @@ from jtqd.sysid.motion.setpoints import (
     way,
 )
 from jtqd.sysid.motion.stopping import Phase
-from jtqd.sysid.motion.turns import turns
 from tests.sysid.motion.lock_step import MS, Frames, LockStep, plateau, raised_cosine
 
 ALONE = Limits(current_a=9.0, velocity_rad_s=2.0, torque_nm=40.0, travel_rad=4.0, position_rad=(-2.0, 2.0))

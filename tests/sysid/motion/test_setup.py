@@ -6,8 +6,16 @@ from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import DriveProfile, SensorProfile
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoAbort
 from jtqd.sim_can import drive_node as cia402
-from jtqd.sysid.motion.cia402 import CST, CSV
-from jtqd.sysid.motion.setup import quick_stop, release, reset_fault, sensor_units, set_up, switch_off
+from jtqd.sysid.motion.drives import (
+    CST,
+    CSV,
+    quick_stop,
+    release,
+    reset_fault,
+    sensor_units,
+    set_up,
+    switch_off,
+)
 from tests.sysid.motion.lock_step import BenchAccess, LockStep
 
 

@@ -13,9 +13,9 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
+from jtqd.sysid.runs.bad_samples import wild_rows, without_wild_samples
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.time_base import on_even_steps, skew_s, unwrapped
-from jtqd.sysid.runs.wild import wild_rows, without_wild_samples
 from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     JOINTS,

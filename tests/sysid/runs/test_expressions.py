@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jtqd.sysid.runs.expressions import ExpressionError, parse
+from jtqd.sysid.runs.column_map import ExpressionError, parse
 
 CELLS = {
     "a": np.array([1.0, 2.0, 4.0]),

@@ -18,7 +18,7 @@ from jtqd.sysid import runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_pieces, read_run, read_runs
 from jtqd.sysid.runs.run_file import RunError
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
 GOOD = "time_s,j1.current_a,j1.torque_nm\n0.000,1.5,-2\n0.001,2.5,-3\n0.002,3.5,-4\n"

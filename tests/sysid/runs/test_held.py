@@ -10,7 +10,7 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.runs.held import LONGEST_HELD, check_held, clip_limits, held_rows
+from jtqd.sysid.runs.bad_samples import LONGEST_HELD, check_held, clip_limits, held_rows
 
 JOINT = load_joint(shipped("joint1.yaml"))
 SCALE = JOINT.gear_ratio * JOINT.torque_constant_nm_per_a

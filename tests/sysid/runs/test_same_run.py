@@ -11,8 +11,8 @@ from jtqd.daemon.logs import export
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import command as diagnose
 from jtqd.sysid.runs import RunError, read_runs
-from jtqd.sysid.runs.same_run import same_run, stretches
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.files import same_run, stretches
+from jtqd.sysid.runs.tables import write_run
 from tests.paths import ROOT
 
 LOG = ROOT / "tests" / "golden" / "network.mcap"

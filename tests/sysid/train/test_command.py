@@ -8,7 +8,7 @@ import pytest
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sysid.fit import command as loss_fit_command
-from jtqd.sysid.runs.write import write_run
+from jtqd.sysid.runs.tables import write_run
 from jtqd.sysid.train import command as train_command
 
 JOINT = str(shipped("joint1.yaml"))

@@ -12,10 +12,14 @@ from jtqd.estimator.losses import LossModel
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.excitation.design import (
+from jtqd.sysid.planner.design import (
+    GOLDEN,
     POLISHING,
     POPULATION,
     STARTS,
+    Bench,
+    Candidates,
+    ExcitationLimits,
     Information,
     Problem,
     condition,
@@ -25,7 +29,6 @@ from jtqd.sysid.excitation.design import (
     loss_regressor,
     minimise,
 )
-from jtqd.sysid.excitation.model import GOLDEN, Bench, Candidates, ExcitationLimits
 
 JOINTS = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
 LIMITS = ExcitationLimits()

@@ -1,12 +1,12 @@
-"""Runs of a joint that is on no towing bench: it is moved alone, all others are held. Pure.
+"""Runs of a joint that is moved alone, all others held.
 
-Nothing commands its load: that is what gravity and inertia make of it. Where and how fast it may go is said by
-`motion_limits` of its joint file, or by --limits; the torque by its rating. A run begins and ends where the joint stands
-and goes as far to either side; where that does not fit into its travel, it is brought to the middle before.
+No other joint commands its load: gravity and inertia do. Position, velocity and acceleration are limited by `motion_limits`
+of its joint file or by --limits, the torque by its rating. A run begins and ends where the joint stands and goes as far to
+either side. Where that does not fit into its travel, the joint is brought to the middle first.
 
     plateaus       constant velocities in both directions over the same positions: friction over velocity
     trajectories   Eq. (10), chosen for the information about friction, inertia and gravity:
-                   tau = Fc tanh(w / w0) + Fv w + J dw/dt + A sin q + B cos q + zero
+                   tau = Fc tanh(w / w0) + Fv w + J dw/dt + A sin q + B cos q + offset
 """
 
 from __future__ import annotations
@@ -20,11 +20,17 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint, MotionLimits
-from jtqd.sysid.campaign.plan import Fourier, Plateau, Rest, Run, Segment, no_current
-from jtqd.sysid.excitation.design import FINAL_RATE_HZ, SEARCH_RATE_HZ, minimise
-from jtqd.sysid.excitation.fourier import FourierTrajectory
-from jtqd.sysid.excitation.model import current_at, fundamentals, rounded_down
 from jtqd.sysid.motion.setpoints import Limits
+from jtqd.sysid.planner.design import (
+    FINAL_RATE_HZ,
+    SEARCH_RATE_HZ,
+    current_at,
+    fundamentals,
+    minimise,
+    rounded_down,
+)
+from jtqd.sysid.planner.fourier import FourierTrajectory
+from jtqd.sysid.planner.plan import Fourier, Plateau, Rest, Run, Segment, no_current
 
 NO_LIMIT: Final = 1e6
 """Values of `MotionLimits` that were left out."""

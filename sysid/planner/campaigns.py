@@ -1,18 +1,16 @@
-"""The campaigns that come with the toolbox: efficiency, excitation, validate; whole or scaled down.
+"""The campaigns that ship, efficiency, excitation and validate, for the joints of a bus that are moved together or alone.
 
-On a bus with other joints than one towing bench of joints 1 and 2 each unit has its runs one after the other: a pair the
-same ones as joints 1 and 2 have, a joint that is moved alone those of `jtqd.sysid.campaign.alone`.
+Two joints that share a channel of the torque sensor are on a towing bench, and so are those that --towing names. Every other
+joint is moved alone (`single_joint`). Each unit has its runs one after the other.
 
 Runs at constant velocity and load are those of section II of the paper (efficiency) and of its section IV.A (validation).
-Runs at varying velocity and load are Fourier trajectories (`jtqd.sysid.excitation.design`): those of `excitation_runs` are
-optimised for the information that they give about the losses; those of `variable_runs` are drawn, because runs to judge
-by must not be chosen by what they are to judge.
+Runs at varying velocity and load are Fourier trajectories (`design`). Those of `excitation_runs` are optimised for the
+information about the losses. Those of `variable_runs` are drawn: a validation must not depend on what it validates.
 
-Signs. Each joint has its own frame; the links turn oppositely, and a positive current of either joint gives a positive
-torque in the sensor. So with equal signs of the velocity joint's velocity and the other joint's current, the velocity
-joint drives forward (its own current and velocity have the same sign) and the other joint is driven back. "forward_1"
-means that joint 1 is the velocity joint, "back_1" that joint 2 is: for joint 2 the names read the other way round, and
-every run serves both.
+Signs. Each joint has its own frame. The links turn oppositely, and a positive current of either joint gives a positive
+torque in the sensor. With equal signs of the velocity joint's velocity and the other joint's current, the velocity joint
+drives forward (its own current and velocity have the same sign) and the other joint is driven back. "forward_1" means that
+joint 1 is the velocity joint, "back_1" that joint 2 is. For joint 2 the names read the other way round.
 """
 
 from __future__ import annotations
@@ -25,13 +23,149 @@ from typing import Any, Final
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.campaign import alone
-from jtqd.sysid.campaign.alone import Room, room_of
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Rest, Run, Segment
-from jtqd.sysid.campaign.units import Unit, said_of
-from jtqd.sysid.excitation.design import POPULATION, STARTS, Design, design, draw
-from jtqd.sysid.excitation.model import ExcitationLimits
 from jtqd.sysid.motion.setpoints import Limits
+from jtqd.sysid.planner import single_joint
+from jtqd.sysid.planner.design import POPULATION, STARTS, Design, ExcitationLimits, design, draw
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Rest, Run, Segment
+from jtqd.sysid.planner.single_joint import Room, room_of
+
+Pair = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Joints that are moved together, by number, rising; measured: each has a channel of the torque sensor."""
+
+    joints: tuple[int, ...]
+    measured: bool
+
+    @property
+    def name(self) -> str:
+        """Of its runs: "joint_3", "joints_3_4"."""
+        return f"joint{'s' if len(self.joints) > 1 else ''}_{'_'.join(map(str, self.joints))}"
+
+    @property
+    def who(self) -> str:
+        """For people: "joint 3", "joints 3 and 4"."""
+        return f"joint{'s' if len(self.joints) > 1 else ''} {' and '.join(map(str, self.joints))}"
+
+    def refused(self, kind: str) -> str:
+        """Return why a campaign of this kind has no runs of these joints; "" where it has."""
+        if kind == "efficiency" and len(self.joints) == 1:
+            return (
+                "no efficiency: a second joint on a towing bench must set the load (--towing A,B says that two are on one); "
+                "jtq campaign excitation moves a joint alone"
+            )
+        if kind != "excitation" and not self.measured:
+            what = "efficiency" if kind == "efficiency" else "validation"
+            reference = "without a channel of the torque sensor, which is the reference"
+            return f"no {what} {reference}; jtq campaign excitation needs none"
+        return ""
+
+    def serves(self) -> str:
+        """Return what its runs can identify."""
+        if not self.measured:
+            return (
+                "no torque sensor: current, motion and temperature are recorded; jtq fit and jtq diagnose need a known load "
+                "beside them (jN.load of a column map)"
+            )
+        if len(self.joints) == 1:
+            return (
+                "moved alone: losses and torsion under the loads of gravity and inertia (jtq fit losses, jtq diagnose); no "
+                "efficiency under other loads"
+            )
+        return "on a towing bench: efficiency, losses, torsion"
+
+
+def said_of(units: Iterable[Unit], say: Callable[[Unit], str]) -> list[str]:
+    """Return what is said of each unit, a line for all those of which the same is said; nothing where it is ""."""
+    of: dict[str, list[str]] = {}
+    for unit in units:
+        of.setdefault(say(unit), []).append(unit.who)
+    return [f"{'; '.join(who)}: {text}" for text, who in of.items() if text]
+
+
+def units_of(channels: Sequence[int | None], sensor: bool, towing: Iterable[Pair] = ()) -> tuple[Unit, ...]:
+    """Return the units of a bus in the order of their first joints.
+
+    channels: of the sensor, for joints 1, 2, ...; sensor: there is one. towing: pairs that are said to be coupled.
+
+    Raises:
+        ConfigError: a pair of joints that are not there, or of which one is in another pair.
+    """
+    pairs: dict[int, Pair] = {}
+    shared: dict[int, list[int]] = {}
+    for number, channel in enumerate(channels, 1):
+        if sensor and channel is not None:
+            shared.setdefault(channel, []).append(number)
+    given = [(min(pair), max(pair)) for pair in towing]
+    found = [*given, *((one, two) for one, two in _pairs(shared.values()))]
+    for pair in dict.fromkeys(found):
+        for number in pair:
+            if not 1 <= number <= len(channels):
+                raise ConfigError(
+                    f"--towing: found joint {number}, expected joints of the bus, 1 to {len(channels)}"
+                )
+            if number in pairs:
+                raise ConfigError(
+                    f"found joint {number} coupled with joints {_other(pairs[number], number)} and {_other(pair, number)}, "
+                    "expected one (sensor_channel, --towing)"
+                )
+        pairs |= dict.fromkeys(pair, pair)
+    made = []
+    for number in range(1, len(channels) + 1):
+        joints = pairs.get(number, (number,))
+        if joints[0] == number:
+            made.append(Unit(joints, sensor and all(channels[each - 1] is not None for each in joints)))
+    return tuple(made)
+
+
+def _pairs(groups: Iterable[list[int]]) -> Iterable[Pair]:
+    for group in groups:
+        if len(group) > 2:
+            raise ConfigError(
+                f"found one sensor_channel for joints {', '.join(map(str, group))}, expected two joints at most"
+            )
+        if len(group) == 2:
+            yield group[0], group[1]
+
+
+def _other(pair: Pair, number: int) -> int:
+    return pair[0] if pair[1] == number else pair[1]
+
+
+def check_joints(plan: Plan, units: Sequence[Unit]) -> None:
+    """Refuse a plan that moves joints as they are not coupled, or takes the power from a bus with others to hold.
+
+    Raises ConfigError naming the run.
+    """
+    of = {number: unit for unit in units for number in unit.joints}
+    for run in plan.runs:
+        for number in run.joints:
+            if number not in of:
+                raise ConfigError(
+                    f"run '{run.name}': found joint {number}, expected joints of the bus, 1 to {len(of)}"
+                )
+        unit = of[run.velocity_joint]
+        if run.joints == unit.joints:
+            if len(unit.joints) < len(of) and any(
+                each.to_mapping()["kind"] == "power_off" for each in run.segments
+            ):
+                raise ConfigError(
+                    f"run '{run.name}': found power_off, expected none beside joints that must be held"
+                )
+            continue
+        if run.current_joint is None:
+            raise ConfigError(
+                f"run '{run.name}': found joint {run.velocity_joint} moved alone, expected a run of {unit.who}: they are "
+                "coupled"
+            )
+        one, two = run.joints
+        raise ConfigError(
+            f"run '{run.name}': found joints {one} and {two} driven against each other, expected joints that share a channel"
+            f" of the torque sensor; --towing {one},{two} says that they are coupled on a bench"
+        )
+
 
 VELOCITIES_RAD_S: Final = (0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0)
 """Section II of the paper."""
@@ -448,13 +582,13 @@ def _alone(kind: str, number: int, room: Room, scale: Scale) -> tuple[Run, ...]:
     count: int = scale.or_else("runs", ALONE_RUNS, QUICK_ALONE_RUNS)
     seed = seed_of(f"alone/{kind}", float(number), scale.seed)
     if kind == "validate":
-        return alone.variable_runs(number, room, count, scale.or_else("seconds", 12.0, 6.0), seed=seed)
-    return alone.excitation_runs(
+        return single_joint.variable_runs(number, room, count, scale.or_else("seconds", 12.0, 6.0), seed=seed)
+    return single_joint.excitation_runs(
         number,
         room,
         count,
         scale.or_else("seconds", 24.0, 10.0),
         seed=seed,
         evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
-        ladder=alone.QUICK_LADDER if scale.quick else alone.LADDER,
+        ladder=single_joint.QUICK_LADDER if scale.quick else single_joint.LADDER,
     )

@@ -1,12 +1,16 @@
-"""Make all drives and the sensor ready for a motion, and put them back after it, by SDO.
+"""Drives from the commanding side: CiA 402 controlwords, set-up and release by SDO, and the RPDOs of a motion.
 
-jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are there. Here come mode of operation,
+jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are configured. Here come mode of operation,
 interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
 failure is a BootError: one line with node, object, expected and found.
 
     quick_stop, switch_off, reset_fault, set_up, release    one drive, over any `SdoAccess`: no bus, no clock
     sensor_units                                            the sensor
     BenchSetup                                              all of them, over a frame socket of its own
+    Commands, Heartbeat                                     the frames that the commander sends
+
+Controlwords: CiA 402-2, table "command coding". A drive is led one state at a time; each step waits until the statusword
+(`jtqd.drivers.cia402`) has confirmed the one before.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ from typing import Final
 from jtqd.drivers import nmt
 from jtqd.drivers.boot_error import BootError, mismatch
 from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
-from jtqd.drivers.cia402 import state_of
+from jtqd.drivers.cia402 import State, state_of
 from jtqd.drivers.devices import (
     COMMANDER_NODE,
     JTQD_NODE,
@@ -37,24 +41,61 @@ from jtqd.drivers.devices import (
     drive_tpdo3,
 )
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame import FRAME, FRAME_SIZE
+from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.layout import EVERY_SYNC, LayoutError, chosen, pdo_of_words
 from jtqd.drivers.pdo import CAN_ID, INVALID, PdoError, PdoMap, split_word
-from jtqd.drivers.sdo import RESPONSE_ID, Key
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, Transfer
 from jtqd.drivers.sdo_client import NodeObjects, SdoAccess, SdoClient
-from jtqd.sysid.motion.cia402 import (
-    CST,
-    CSV,
-    DISABLE_VOLTAGE,
-    FAULT_RESET,
-    FAULTED,
-    POWERED,
-    QUICK_STOP_WORD,
-    describe,
-)
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
-from jtqd.sysid.motion.turns import turns
+
+CSV: Final = 9
+"""6060h: cyclic synchronous velocity mode; target 60FFh."""
+CST: Final = 10
+"""6060h: cyclic synchronous torque mode; target 6071h."""
+
+DISABLE_VOLTAGE: Final = 0x0000
+QUICK_STOP_WORD: Final = 0x0002
+SHUTDOWN: Final = 0x0006
+SWITCH_ON: Final = 0x0007
+ENABLE_OPERATION: Final = 0x000F
+FAULT_RESET: Final = 0x0080
+
+_ENABLING: Final = {
+    State.SWITCH_ON_DISABLED: SHUTDOWN,
+    State.READY: SWITCH_ON,
+    State.SWITCHED_ON: ENABLE_OPERATION,
+    State.OPERATION_ENABLED: ENABLE_OPERATION,
+}
+POWERED: Final = frozenset({State.OPERATION_ENABLED, State.QUICK_STOP, State.FAULT_REACTION, State.UNKNOWN})
+"""States in which the motor is, or must be assumed to be, driven."""
+FAULTED: Final = frozenset({State.FAULT, State.FAULT_REACTION})
+
+
+def enabling_word(state: State) -> int | None:
+    """Return the next controlword (6040h) towards operation enabled; None where none leads there (fault, quick stop)."""
+    return _ENABLING.get(state)
+
+
+def describe(statusword: int) -> str:
+    """Return the state with its word: "fault (statusword 0218h)"."""
+    return f"{state_of(statusword).value} (statusword {statusword:04X}h)"
+
+
+def turns(moved: Sequence[int], drives: int) -> tuple[tuple[int, ...], int]:
+    """Return the drives (0, 1, ..) in the order of their set-points, and the cycles from one of a moved drive to its next.
+
+    moved: numbers (1, 2, ..) of the joints that are moved, among so many drives; the others are held. Those moved take
+    turns, and after each round comes one of those held:
+
+        two of two 0 1          one of one 0          one of three 0 1, 0 2          two of three 0 1 2
+    """
+    own = tuple(number - 1 for number in moved)
+    held = [drive for drive in range(drives) if drive not in own]
+    if not held:
+        return own, len(own)
+    return tuple(turn for drive in held for turn in (*own, drive)), len(own) + 1
+
 
 INTERPOLATION_MS: Final = 2
 """60C2h where two drives at 1 kHz take turns: each gets every second set-point."""
@@ -417,3 +458,81 @@ class BenchSetup:
     def close(self) -> None:
         """Leave the bus."""
         self._socket.close()
+
+
+_COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
+
+
+class Commands:
+    """RPDOs for drive `turn` (0, 1, ...); set-points are scaled to the drives' units once, beforehand.
+
+    A drive that is not moved is held: velocity zero. Raises MotionError for set-points that 60FFh (32 bits) or 6071h
+    (16 bits) cannot hold, and for a joint without a drive.
+
+    Attributes:
+        order: drives in the order in which they get set-points, one per cycle: those that are moved in turn, and one of
+            those that are held after each round.
+        round_cycles: cycles from one set-point of a moved drive to its next.
+    """
+
+    def __init__(self, setpoints: Setpoints, drives: Sequence[DriveUnits]) -> None:
+        if setpoints.joints[-1] > len(drives):
+            raise MotionError(f"plan: joint {setpoints.joints[-1]} is moved, the bus has {len(drives)}")
+        self.order, self.round_cycles = turns(setpoints.joints, len(drives))
+        self._leader = setpoints.velocity_joint - 1  # the drive in velocity mode
+        self._follower = -1 if setpoints.current_joint is None else setpoints.current_joint - 1
+        self._lead, self._follow = drives[self._leader], drives[self._follower]
+        self._velocities = [self._lead.velocity_units(v) for v in setpoints.velocity_rad_s.tolist()]
+        self._currents = [self._follow.current_units(i) for i in setpoints.current_a.tolist()]
+        for what, units, largest in (
+            (f"velocity of joint {setpoints.velocity_joint}", self._velocities, 0x7FFF_FFFF),
+            (f"current of joint {setpoints.current_joint}", self._currents, 0x7FFF),
+        ):
+            found = max(units, key=abs)
+            if abs(found) > largest:
+                raise MotionError(f"plan: {what} is {found} in units of the drive, limit {largest}")
+        self._nodes = [drive.node for drive in drives]
+        self._rpdo1 = [drive_rpdo1(drive.node).cob_id for drive in drives]
+        self._rpdo2 = [drive_rpdo2(drive.node).cob_id for drive in drives]
+
+    def control(self, turn: int, word: int) -> bytes:
+        """Return RPDO1 with a controlword and no torque."""
+        return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(word, 0))
+
+    def quick_stop_by_sdo(self, turn: int) -> bytes:
+        """Return the download of 6040h = 2; its answer is not waited for."""
+        download = Transfer(0x6040, 0, QUICK_STOP_WORD.to_bytes(2, "little"))
+        return pack(REQUEST_ID + self._nodes[turn], download.request)
+
+    def setpoint(self, turn: int, index: int) -> bytes:
+        """Return the RPDO of set-point number `index`."""
+        return self._target(turn, self._velocities[index], self._currents[index])
+
+    def target(self, turn: int, velocity_rad_s: float, current_a: float) -> bytes:
+        """Return the RPDO of any other set-point."""
+        velocity, current = self._lead.velocity_units(velocity_rad_s), self._follow.current_units(current_a)
+        return self._target(turn, velocity, current)
+
+    def _target(self, turn: int, velocity: int, current: int) -> bytes:
+        """Pack RPDO2 to a drive in velocity mode, RPDO1 to one in torque mode."""
+        if turn == self._follower:
+            return FRAME.pack(self._rpdo1[turn], _COMMAND.size, _COMMAND.pack(ENABLE_OPERATION, current))
+        velocity = velocity if turn == self._leader else 0
+        return FRAME.pack(self._rpdo2[turn], _VELOCITY.size, _VELOCITY.pack(velocity))
+
+
+class Heartbeat:
+    """Heartbeat of the commander (node 21h) on its own grid, next at `due_ns`; the first is the boot-up message."""
+
+    def __init__(self, period_s: float, now_ns: int) -> None:
+        self.due_ns = now_ns
+        self._period_ns = round(period_s * 1e9)
+        self._state = nmt.BOOT_UP
+
+    def frames(self, now_ns: int) -> list[bytes]:
+        """Return the heartbeat if it is due."""
+        if now_ns < self.due_ns:
+            return []
+        self.due_ns += self._period_ns * (1 + (now_ns - self.due_ns) // self._period_ns)
+        state, self._state = self._state, nmt.OPERATIONAL
+        return [nmt.heartbeat(COMMANDER_NODE, state)]

@@ -9,17 +9,7 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.campaign.plan import (
-    DEFAULT_LIMITS,
-    Fourier,
-    Plan,
-    Plateau,
-    Run,
-    check_plan,
-    expand,
-    travel_rad,
-)
-from jtqd.sysid.campaign.plans import (
+from jtqd.sysid.planner.campaigns import (
     KINDS,
     Scale,
     currents_of,
@@ -30,6 +20,16 @@ from jtqd.sysid.campaign.plans import (
     slow_and_fast,
     validation_runs,
     variable_runs,
+)
+from jtqd.sysid.planner.plan import (
+    DEFAULT_LIMITS,
+    Fourier,
+    Plan,
+    Plateau,
+    Run,
+    check_plan,
+    expand,
+    travel_rad,
 )
 
 SECTION_II = [(v, i) for v in (0.2, 0.6, 1.0, 1.4, 1.8) for i in range(6)] + [

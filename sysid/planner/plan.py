@@ -23,7 +23,6 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, Verbatim, finite
 from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, parsed, read, read_kind
 from jtqd.models.files import load_yaml
-from jtqd.sysid.excitation.fourier import CurrentFile, FourierSeries, FourierTrajectory, SeriesFile
 from jtqd.sysid.motion.setpoints import (
     MOST_JOINTS,
     OTHER_ONE,
@@ -36,6 +35,7 @@ from jtqd.sysid.motion.setpoints import (
     partner_of,
     path,
 )
+from jtqd.sysid.planner.fourier import CurrentFile, FourierSeries, FourierTrajectory, SeriesFile
 
 SCHEMA: Final = "jtq.plan/1"
 DEFAULT_RAMP_S: Final = 0.5

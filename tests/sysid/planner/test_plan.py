@@ -11,7 +11,9 @@ import pytest
 import yaml
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.sysid.campaign.plan import (
+from jtqd.sysid.motion.setpoints import Limits
+from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Fourier,
     Plan,
@@ -25,8 +27,6 @@ from jtqd.sysid.campaign.plan import (
     smooth_step,
     travel_rad,
 )
-from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
-from jtqd.sysid.motion.setpoints import Limits
 
 PLAN: dict[str, Any] = {
     "schema": "jtq.plan/1",

@@ -8,7 +8,7 @@ import yaml
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
-from jtqd.sysid.excitation.fourier import (
+from jtqd.sysid.planner.fourier import (
     RAMP_SHARE,
     CurrentFile,
     EndState,

@@ -8,11 +8,10 @@ import pytest
 import yaml
 
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.campaign.plan import Plan, expand, load_plan
-from jtqd.sysid.excitation import command as excitation_command
-from jtqd.sysid.excitation.design import draw
-from jtqd.sysid.excitation.fourier import FourierSeries, FourierTrajectory
-from jtqd.sysid.excitation.model import ExcitationLimits
+from jtqd.sysid.planner import command as excitation_command
+from jtqd.sysid.planner.design import ExcitationLimits, draw
+from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.planner.plan import Plan, expand, load_plan
 
 JOINTS = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
 LIMITS = ExcitationLimits()

@@ -17,9 +17,8 @@ import numpy as np
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.campaign.plan import DEFAULT_LIMITS, Fourier, Plan, Rest, Run, check_plan
-from jtqd.sysid.excitation.design import FINAL_RATE_HZ, STARTS, Design, design
-from jtqd.sysid.excitation.model import Bench, ExcitationLimits
+from jtqd.sysid.planner.design import FINAL_RATE_HZ, STARTS, Bench, Design, ExcitationLimits, design
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Fourier, Plan, Rest, Run, check_plan
 
 EVALUATIONS: Final = 2000
 _LARGEST: Final = 1e4
