@@ -49,16 +49,6 @@ class Smoothed(Scalar):
         self._d = 0.0
         self.share = 1.0
 
-    @property
-    def memory(self) -> tuple[float, ...]:
-        """What it remembers from sample to sample."""
-        return *super().memory, self._d, self.share
-
-    @memory.setter
-    def memory(self, values: tuple[float, ...]) -> None:
-        *slip, self._d, self.share = values
-        Scalar.memory.fset(self, tuple(slip))  # type: ignore[attr-defined]
-
     def slip(self, d: float, travel: float) -> float:
         """Return the state after the filtered deflection moved towards d [rad]."""
         self._d += self.share * (d - self._d)
@@ -117,10 +107,7 @@ def hooks_of(pairs: Pairs, name: str, functions: Any) -> tuple[Hook, ...]:
 
 
 class ExtendedInputs:
-    """Corrections of one joint's inputs, sample by sample, in one preallocated `State`.
-
-    zero_rad: of the torsion, None for the joint's own.
-    """
+    """Corrections of one joint's inputs, sample by sample, in one preallocated `State`."""
 
     __slots__ = (
         "_current",
@@ -143,7 +130,7 @@ class ExtendedInputs:
         "_zero",
     )
 
-    def __init__(self, joint: Joint, settings: EstimatorSettings, zero_rad: float | None = None) -> None:
+    def __init__(self, joint: Joint, settings: EstimatorSettings) -> None:
         pairs = acting_effects(joint)
         self._joint: Final = replace(joint, effects=())
         self._current: Final = hooks_of(pairs, "current_a", Scalar)
@@ -155,7 +142,7 @@ class ExtendedInputs:
         self._gear: Final = 1.0 / joint.gear_ratio
         self._inverse_gain: Final = 1.0 / (joint.gear_ratio * joint.torque_constant_nm_per_a)
         self._inertia_a: Final = seeming_inertia_a(joint)
-        self._zero: Final = torsion_zero(joint) if zero_rad is None else zero_rad
+        self._zero: Final = torsion_zero(joint)
         self._max_gap: Final = settings.max_gap_s
         self._rate_rad_s: Final = settings.link_bandwidth_rad_s
         self._slip_rad_s: Final = settings.bandwidth_rad_s
@@ -166,30 +153,6 @@ class ExtendedInputs:
     def restart(self) -> None:
         """Let the filters begin again at the next sample."""
         self._running = False
-
-    @property
-    def _functions(self) -> tuple[Any, ...]:
-        return tuple(
-            hook.x for hook in (*self._current, *self._link, *self._motor, *self._twist, *self._loss)
-        )
-
-    @property
-    def memory(self) -> tuple[float, ...]:
-        """What it remembers from sample to sample; ValueError for that of other effects."""
-        own = self._rate, self._last_current, float(self._running)
-        state = (getattr(self._state, name) for name in State.__slots__)
-        return *own, *state, *(value for x in self._functions for value in x.memory)
-
-    @memory.setter
-    def memory(self, values: tuple[float, ...]) -> None:
-        if len(values) != len(self.memory):
-            raise ValueError(f"found {len(values)} numbers, expected {len(self.memory)}")
-        rest = iter(values)
-        self._rate, self._last_current, self._running = next(rest), next(rest), bool(next(rest))
-        for name in State.__slots__:
-            setattr(self._state, name, next(rest))
-        for x in self._functions:
-            x.memory = tuple(next(rest) for _ in x.memory)
 
     def step(  # noqa: PLR0917 - a sample, positional for speed
         self,

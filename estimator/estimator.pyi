@@ -1,4 +1,4 @@
-from typing import Final, Self
+from typing import Final
 
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.corrections import ExtendedInputs
@@ -19,21 +19,11 @@ class JointEstimator(Estimator):
     def __init__(
         self, joint: Joint, settings: EstimatorSettings, network: TorqueNetwork | None = None
     ) -> None: ...
-    def blocks(self) -> tuple[bytes, bytes]: ...
-    @classmethod
-    def of_blocks(
-        cls, joint: Joint, settings: EstimatorSettings, law: bytes | memoryview, state: bytes | memoryview
-    ) -> Self: ...
 
 class FusedEstimator(Estimator):
     def __init__(
         self, joint: Joint, settings: EstimatorSettings, network: FusedNetwork | None = None
     ) -> None: ...
-    def blocks(self) -> tuple[bytes, bytes]: ...
-    @classmethod
-    def of_blocks(
-        cls, joint: Joint, settings: EstimatorSettings, law: bytes | memoryview, state: bytes | memoryview
-    ) -> Self: ...
     @property
     def zeros(self) -> Zeros | None: ...
     past: bytes | memoryview
@@ -43,13 +33,7 @@ class FusedEstimator(Estimator):
 class ExtendedEstimator(Estimator):
     corrected: tuple[float, float]
     torque: float
-    def __init__(
-        self,
-        joint: Joint,
-        settings: EstimatorSettings,
-        inner: Estimator,
-        inputs: ExtendedInputs | None = None,
-    ) -> None: ...
+    def __init__(self, joint: Joint, settings: EstimatorSettings, inner: Estimator) -> None: ...
     @property
     def inner(self) -> Estimator: ...
     @property

@@ -11,7 +11,7 @@ loss went through the same filter; how old the result is says `age`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
-from libc.string cimport memcmp
+from libc.string cimport memcmp, memcpy
 
 from jtqd.estimator.agreement cimport (
     TURN_WAVES,
@@ -25,7 +25,6 @@ from jtqd.estimator.agreement cimport (
     turns_otherwise,
     unsettle_turn,
 )
-from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
 from jtqd.estimator.fusion cimport (
     Fused,
@@ -132,13 +131,6 @@ cdef fill_network(NetworkLaw *law, network, joint):
     return None
 
 
-cdef int check_complete(const NetworkLaw *law) except -1:
-    """Raises ValueError where a network is used that is no part of the block."""
-    if law.used and not law.native:
-        raise ValueError("found a network that is evaluated by its file's runtime, expected one that is evaluated natively")
-    return 0
-
-
 # The paper's estimator ------------------------------------------------------------------------------------------------
 
 
@@ -186,27 +178,6 @@ cdef class JointEstimator(Estimator):
     def reset(self):
         """Forget the past: the next step starts."""
         restart_guard(&self.state.guard)
-
-    def blocks(self):
-        """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
-
-        Raises ValueError for a network that is not evaluated natively: it is no part of them.
-        """
-        check_complete(&self.law.network)
-        return copied(&self.law, sizeof(JointLaw)), copied(&self.state, sizeof(JointState))
-
-    @classmethod
-    def of_blocks(cls, joint, settings, law, state):
-        """Return an estimator of the `blocks` of one of this class; joint, settings: what it was made of.
-
-        Raises ValueError for blocks of another layout.
-        """
-        cdef JointEstimator made = cls.__new__(cls)
-        made.joint, made.settings, made.width = joint, settings, len(FEATURES)
-        put_back(&made.law, sizeof(JointLaw), law)
-        put_back(&made.state, sizeof(JointState), state)
-        check_complete(&made.law.network)
-        return made
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
@@ -371,11 +342,14 @@ cdef class FusedEstimator(Estimator):
 
         Raises ValueError for bytes of another length.
         """
-        return copied(&self.state, sizeof(FusedState))
+        return (<const char *> &self.state)[: sizeof(FusedState)]
 
     @past.setter
     def past(self, content):
-        put_back(&self.state, sizeof(FusedState), content)
+        cdef const unsigned char[::1] given = content
+        if <size_t> given.shape[0] != sizeof(FusedState):
+            raise ValueError(f"found a state of {given.shape[0]} bytes, expected {sizeof(FusedState)}")
+        memcpy(&self.state, &given[0], sizeof(FusedState))
 
     def shares_past(self, FusedEstimator other):
         """Return whether the past of `other` means the same here: nothing differs that the zeros were learned with.
@@ -388,27 +362,6 @@ cdef class FusedEstimator(Estimator):
             and memcmp(&self.law.observer, &other.law.observer, sizeof(FusedObserverLaw)) == 0
             and memcmp(&self.law.loss, &other.law.loss, sizeof(AdditiveLaw)) == 0
         )
-
-    def blocks(self):
-        """Return (parameters, state): one block each, of which `of_blocks` makes an estimator that goes on as this one would.
-
-        Raises ValueError for a network that is not evaluated natively: it is no part of them.
-        """
-        check_complete(&self.law.network)
-        return copied(&self.law, sizeof(FusedLaw)), copied(&self.state, sizeof(FusedState))
-
-    @classmethod
-    def of_blocks(cls, joint, settings, law, state):
-        """Return an estimator of the `blocks` of one of this class; joint, settings: what it was made of.
-
-        Raises ValueError for blocks of another layout.
-        """
-        cdef FusedEstimator made = cls.__new__(cls)
-        made.joint, made.settings, made.width = joint, settings, len(FUSED_FEATURES)
-        put_back(&made.law, sizeof(FusedLaw), law)
-        put_back(&made.state, sizeof(FusedState), state)
-        check_complete(&made.law.network)
-        return made
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
@@ -719,14 +672,14 @@ def observe_run(
 cdef class ExtendedEstimator(Estimator):
     """Estimator of a joint with effects: corrected inputs (`ExtendedInputs`) into the estimator of the plain joint.
 
-    joint: with its effects; inner: estimator of `plain_joint(joint)`; inputs: the corrections, None for new ones.
+    joint: with its effects; inner: estimator of `plain_joint(joint)`; `inputs`: the corrections.
     `corrected`: current [A] and link position [rad] that the inner one was given last; `torque`: its last estimate [Nm].
     """
 
-    def __init__(self, joint, settings, Estimator inner, inputs=None):
+    def __init__(self, joint, settings, Estimator inner):
         self.joint, self.settings, self.inner = joint, settings, inner
         self.width = inner.width
-        self.inputs = inputs or ExtendedInputs(joint, settings)
+        self.inputs = ExtendedInputs(joint, settings)
         self.corrected = (nan, nan)
         self.torque = NAN
 

@@ -81,9 +81,6 @@ PAST_LAYOUT: Final = 6
 """Number of the layout of `past`, which logs hold: another one where its fields, their order or their meaning change.
 `tests/estimator/test_learned.py` has the size that belongs to it."""
 
-KEPT, FORGOTTEN, NOTHING = "kept", "forgotten", ""
-"""What became of zeros that were learned; nothing: none were."""
-
 
 class Learner(Protocol):
     """An estimator that learns zeros; `jtqd.estimator.estimator.FusedEstimator` is one."""
@@ -109,20 +106,3 @@ def same_past(old: Any, new: Any) -> bool:
     one, other = learner_of(old), learner_of(new)
     same_effects = old.joint.effects == new.joint.effects
     return one is not None and other is not None and same_effects and bool(other.shares_past(one))
-
-
-def hand_over(old: Any, new: Any) -> str:
-    """Let `new`, which has seen the same last seconds, go on with all that `old` knows; return what became of the zeros.
-
-    KEPT: it goes on as `old` would with the new limits; FORGOTTEN: `old` had learned something that is not true for `new`;
-    NOTHING: there was nothing to lose.
-    """
-    one, other = learner_of(old), learner_of(new)
-    if one is None:
-        return NOTHING
-    if same_past(old, new):
-        other.past = one.past
-        if new is not other:  # with effects
-            new.inputs.memory, new.torque = old.inputs.memory, old.torque
-        return KEPT if one.zeros.learned else NOTHING
-    return FORGOTTEN if one.zeros.learned else NOTHING

@@ -19,15 +19,6 @@ class Scalar:
         self._z = 0.0
         self._last = math.nan
 
-    @property
-    def memory(self) -> tuple[float, ...]:
-        """What it remembers from sample to sample."""
-        return self._z, self._last
-
-    @memory.setter
-    def memory(self, values: tuple[float, ...]) -> None:
-        self._z, self._last = values
-
     sin: Final = staticmethod(math.sin)
     cos: Final = staticmethod(math.cos)
     tanh: Final = staticmethod(math.tanh)

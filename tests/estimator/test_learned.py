@@ -1,4 +1,4 @@
-"""What an estimator has learned goes on in another one where it is true, and is told for a reader."""
+"""The state of an estimator continues in another one where it is valid there; the offsets as text."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.shared.snapshot import PAST_WORDS
-from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator
+from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.estimator.learned import FORGOTTEN, KEPT, LEARNED, NOTHING, PAST_LAYOUT, TRACKED, Zeros, hand_over
+from jtqd.estimator.learned import LEARNED, PAST_LAYOUT, TRACKED, Zeros, same_past
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
@@ -34,26 +34,25 @@ def test_the_layout_of_the_past_is_the_one_of_its_number() -> None:
     assert size <= 8 * PAST_WORDS, "snapshot and log have room for it"
 
 
-@pytest.mark.parametrize("effects", [(), (EFFECT,)])
-def test_where_limits_and_sigmas_change_all_is_kept_and_the_estimate_goes_on(
-    effects: tuple[Effect, ...],
-) -> None:
-    joint = replace(NARROW, effects=effects)
-    old = learned(joint)
-    fused = replace(joint.fused, sigma=replace(joint.fused.sigma, torsion_nm=0.3))  # type: ignore[union-attr, type-var]
-    new = make_estimator(replace(joint, fused=fused), replace(ON, torque_limit=2.0))
-    assert hand_over(old, new) == KEPT
-    assert isinstance(new, FusedEstimator | ExtendedEstimator)
+def test_where_limits_and_sigmas_differ_the_state_is_valid_and_the_estimate_continues() -> None:
+    old = learned()
+    fused = replace(NARROW.fused, sigma=replace(NARROW.fused.sigma, torsion_nm=0.3))  # type: ignore[union-attr, type-var]
+    new = make_estimator(replace(NARROW, fused=fused), replace(ON, torque_limit=2.0))
+    assert same_past(old, new)
+    assert isinstance(old, FusedEstimator)
+    assert isinstance(new, FusedEstimator)
+    new.past = old.past
     assert new.zeros is not None
-    assert new.zeros.link_rad == old.zeros.link_rad  # type: ignore[attr-defined]
-    columns = driven(link_zero_rad=2e-4)[0]
-    row = [float(each[-1]) for each in columns]
+    assert old.zeros is not None
+    assert new.zeros.link_rad == old.zeros.link_rad
+    row = [float(each[-1]) for each in driven(link_zero_rad=2e-4)[0]]
     assert new.step(*row).physics_nm == pytest.approx(old.step(*row).physics_nm, abs=0.05)
 
 
-def test_a_network_alone_changes_nothing_bit_by_bit() -> None:
-    old, new = learned(), make_estimator(NARROW, ON)
-    assert hand_over(old, new) == KEPT
+def test_with_the_same_parameters_it_continues_bit_by_bit() -> None:
+    old, new = learned(), FusedEstimator(NARROW, ON)
+    assert same_past(old, new)
+    new.past = old.past  # type: ignore[attr-defined]
     columns = driven(link_zero_rad=2e-4)[0]
     assert new.run(*columns).torque_nm.tobytes() == old.run(*columns).torque_nm.tobytes()
 
@@ -78,23 +77,14 @@ def changed(name: str) -> tuple[Joint, EstimatorSettings]:
     "name",
     ["stiffness", "zero", "loss", "torque constant", "bandwidth", "effects", "not tracked", "another method"],
 )
-def test_where_what_it_was_learned_with_changes_it_is_forgotten(name: str) -> None:
-    new = make_estimator(*changed(name))
-    before = getattr(new, "zeros", None)
-    assert hand_over(learned(), new) == FORGOTTEN
-    assert getattr(new, "zeros", None) == before
-
-
-def test_where_nothing_was_learned_nothing_is_said() -> None:
-    fresh = make_estimator(NARROW, ON)
-    assert hand_over(fresh, make_estimator(NARROW, ON)) == NOTHING
-    assert hand_over(fresh, make_estimator(*changed("loss"))) == NOTHING
-    assert hand_over(make_estimator(*changed("not tracked")), make_estimator(NARROW, ON)) == NOTHING
+def test_where_the_parameters_of_the_learning_differ_the_state_is_not_valid(name: str) -> None:
+    assert not same_past(learned(), make_estimator(*changed(name)))
+    assert not same_past(make_estimator(*changed(name)), learned())
 
 
 def test_a_past_of_another_length_is_refused() -> None:
     estimator = FusedEstimator(NARROW, ON)
-    with pytest.raises(ValueError, match="found a block of 8 bytes"):
+    with pytest.raises(ValueError, match="found a state of 8 bytes"):
         estimator.past = bytes(8)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -12,7 +11,6 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.blocks import EstimatorBlocks, blocks_of, estimator_of, made_of
 from jtqd.estimator.estimator import FusedEstimator, observe_run
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.learned import Zeros
@@ -155,21 +153,6 @@ def test_reset_forgets_and_a_gap_does_not() -> None:
     e.reset()
     assert e.zeros is not None
     assert (e.zeros.link_rad, e.zeros.link_used_rad) == (0.0, 0.0)
-
-
-def test_what_is_known_is_handed_over_in_the_blocks() -> None:
-    columns, _ = driven(link_zero_rad=2e-4)
-    rows = list(zip(*(each.tolist() for each in columns), strict=True))
-    first = FusedEstimator(NARROW, ON)
-    for row in rows[:2503]:  # in the middle of a block
-        first.step(*row)
-    given = blocks_of(first)
-    plain = json.loads(json.dumps(given.plain))
-    second = estimator_of(EstimatorBlocks(plain, given.blocks), made_of(plain))
-    assert isinstance(second, FusedEstimator)
-    assert second.zeros == first.zeros
-    found, expected = ([each.step(*row) for row in rows[2503:]] for each in (second, first))
-    assert str(found) == str(expected)
 
 
 def test_without_torsion_or_where_it_is_not_wanted_there_are_none() -> None:
