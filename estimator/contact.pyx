@@ -34,8 +34,8 @@ from jtqd.estimator.observer cimport FusedObserved, GuardLaw, GuardState
 from jtqd.estimator.sample cimport Sample
 from jtqd.estimator.zeros cimport local_stiffness
 
-from jtqd.estimator.age import tracking_of
 from jtqd.estimator.sample import columns
+from jtqd.estimator.settings import tracking_of
 from jtqd.estimator.status import CONTACT_CODES
 
 OFF, UNKNOWN, NONE, CONTACT = CONTACT_CODES

@@ -90,12 +90,12 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator import status as st
-from jtqd.estimator.age import tracking_of
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.fusion import FOREIGN_SIGMAS
-from jtqd.estimator.network import FEATURES, FUSED_FEATURES, checked_fused, checked_network, native_of
+from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
+from jtqd.estimator.settings import METHODS, tracking_of
 from jtqd.estimator.validity import FADE_START
 from jtqd.estimator.learned import APART, LEFT
 
@@ -150,7 +150,8 @@ cdef class JointEstimator(Estimator):
     """
 
     def __init__(self, joint, settings, network=None):
-        used = checked_network(joint, settings, network)
+        check_fit(joint, settings, network, "JointEstimator")
+        used = network if METHODS[settings.method].network else None
         losses = LossModel(joint)
         self.joint, self.settings = joint, settings
         self.width = len(FEATURES)
@@ -263,7 +264,8 @@ cdef class FusedEstimator(Estimator):
     """
 
     def __init__(self, joint, settings, network=None):
-        fused = checked_fused(joint, settings, network)
+        check_fit(joint, settings, network, "FusedEstimator")
+        fused = joint.fused
         self.joint, self.settings = joint, settings
         self.width = len(FUSED_FEATURES)
         fill_guard(&self.law.guard, joint, settings)

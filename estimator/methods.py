@@ -7,15 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from jtqd.estimator import estimator
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.corrections import acting_effects, plain_joint
-from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.run import EstimateRun, JointColumns
 from jtqd.estimator.sample import Estimator
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import METHODS, EstimatorSettings
 
 AnyEstimator = Estimator
 AnyNetwork = TorqueNetwork | FusedNetwork
@@ -26,12 +25,8 @@ def make_estimator(
 ) -> AnyEstimator:
     """Return the estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
     plain = plain_joint(joint)
-    inner: JointEstimator | FusedEstimator
-    if settings.method == "fused":
-        inner = FusedEstimator(plain, settings, _fused(plain, network))
-    else:
-        inner = JointEstimator(plain, settings, _paper(plain, network))
-    return ExtendedEstimator(joint, settings, inner) if acting_effects(joint) else inner
+    inner = getattr(estimator, METHODS[settings.method].estimator)(plain, settings, network)
+    return estimator.ExtendedEstimator(joint, settings, inner) if acting_effects(joint) else inner
 
 
 def estimate_columns(
@@ -63,17 +58,3 @@ def _inputs(joint: Joint, columns: JointColumns) -> tuple[FloatArray, FloatArray
         raise ValueError(f"joint {joint.name}: the run has no {', '.join(missing)}")
     current, motor, velocity, link = needed.values()
     return current, motor, velocity, link
-
-
-def _fused(joint: Joint, network: AnyNetwork | None) -> FusedNetwork | None:
-    """Return the network if method `fused` can use it; ConfigError else."""
-    if isinstance(network, TorqueNetwork):
-        raise ConfigError(f"joint {joint.name}: found a network of method 'network', expected one of 'fused'")
-    return network
-
-
-def _paper(joint: Joint, network: AnyNetwork | None) -> TorqueNetwork | None:
-    """Return the network if the paper's methods can use it; ConfigError else."""
-    if isinstance(network, FusedNetwork):
-        raise ConfigError(f"joint {joint.name}: found a network of method 'fused', expected one of 'network'")
-    return network

@@ -19,10 +19,10 @@ import numpy as np
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.envelope import Envelope, finite
-from jtqd.estimator.joint import Fused, Joint
+from jtqd.estimator.joint import Joint
 from jtqd.estimator.onnx_graph import GraphFile, NativeGraph, NetworkError, OnnxGraph, RuntimeCheck
 from jtqd.estimator.perceptron import Perceptron
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import METHODS, EstimatorSettings
 
 FEATURES: Final = (
     "current_a",
@@ -145,15 +145,18 @@ class FusedNetwork(Network):
         self.corrects: Final = any(self.run_one(*probe) != 0.0 for probe in probes.tolist())
 
 
+Networks = TorqueNetwork | FusedNetwork
+_KINDS: Final[dict[str, type[Networks]]] = {kind.__name__: kind for kind in (TorqueNetwork, FusedNetwork)}
+
+
 def load_network(
     method: str,
     source: bytes | str | os.PathLike[str],
     sha256: str | None = None,
     check: RuntimeCheck | None = None,
-) -> TorqueNetwork | FusedNetwork:
-    """Return the network of a method from a file or bytes; arguments and errors as `Network`."""
-    kind = FusedNetwork if method == "fused" else TorqueNetwork
-    return kind(source, sha256, check)
+) -> Networks:
+    """Return the network of a method that uses one, from a file or bytes; arguments and errors as `Network`."""
+    return _KINDS[METHODS[method].network](source, sha256, check)
 
 
 def native_of(network: object, joint: Joint) -> Perceptron | None:
@@ -171,54 +174,39 @@ def native_of(network: object, joint: Joint) -> Perceptron | None:
     return network.perceptron
 
 
-def _check_plain(joint: Joint) -> None:
+def check_fit(joint: Joint, settings: EstimatorSettings, network: object, estimator: str) -> None:
+    """Raise ConfigError where joint, settings and network do not fit together in an estimator of this class name.
+
+    network: a `Network` or a stand-in, None for none; not looked at where the method uses none.
+    """
+    method = METHODS[settings.method]
+
+    def error(text: str) -> ConfigError:
+        return ConfigError(f"joint {joint.name}: {text}")
+
+    if method.estimator != estimator:
+        raise error(f"found method '{settings.method}', which {method.estimator} applies, not {estimator}")
     if joint.effects:
         names = ", ".join(effect.name for effect in joint.effects)
-        raise ConfigError(
-            f"joint {joint.name}: found effects ({names}), which `make_estimator` applies, not this class"
-        )
-
-
-def _check_joint(joint: Joint, network: TorqueNetwork | FusedNetwork | None) -> None:
-    if network is not None and network.joint != joint.name:
-        raise ConfigError(
-            f"joint {joint.name}: found a network of joint '{network.joint}', expected one of '{joint.name}'"
-        )
-
-
-def checked_network(
-    joint: Joint, settings: EstimatorSettings, network: TorqueNetwork | None
-) -> TorqueNetwork | None:
-    """Return the network that the method uses, if it uses one; ConfigError when the three do not fit."""
-    if settings.method == "fused":
-        raise ConfigError(
-            f"joint {joint.name}: found method 'fused', which FusedEstimator applies, not this one"
-        )
-    _check_plain(joint)
+        raise error(f"found effects ({names}), which `make_estimator` applies, not this class")
     if settings.method == "efficiency" and joint.efficiency is None:
-        raise ConfigError(
-            f"joint {joint.name}: found no efficiency, which method 'efficiency' needs; 'tob' does not need it"
+        raise error("found no efficiency, which method 'efficiency' needs; 'tob' does not need it")
+    if "fused" in method.sections and joint.fused is None:
+        raise error(
+            f"found no section 'fused', which method '{settings.method}' needs; 'jtq fit losses' makes one, "
+            "methods 'tob' and 'efficiency' do not need it"
         )
-    if settings.method != "network":
-        return None
+    if not method.network:
+        return
     if network is None:
-        raise ConfigError(f"joint {joint.name}: found no network, which method 'network' needs")
-    _check_joint(joint, network)
-    return network
-
-
-def checked_fused(joint: Joint, settings: EstimatorSettings, network: FusedNetwork | None) -> Fused:
-    """Return section `fused` of the joint; ConfigError when joint, method and network do not fit."""
-    if settings.method != "fused":
-        raise ConfigError(f"joint {joint.name}: found method '{settings.method}', expected 'fused'")
-    _check_plain(joint)
-    if joint.fused is None:
-        raise ConfigError(
-            f"joint {joint.name}: found no section 'fused', which method 'fused' needs; "
-            "'jtq fit losses' makes one, methods 'tob' and 'efficiency' do not need it"
-        )
-    _check_joint(joint, network)
-    return joint.fused
+        if method.network_required:
+            raise error(f"found no network, which method '{settings.method}' needs")
+        return
+    if isinstance(network, Network) and type(network).__name__ != method.network:
+        found = next(name for name, each in METHODS.items() if each.network == type(network).__name__)
+        raise error(f"found a network of method '{found}', expected one of '{settings.method}'")
+    if (name := getattr(network, "joint", "")) != joint.name:
+        raise error(f"found a network of joint '{name}', expected one of '{joint.name}'")
 
 
 def main() -> int:

@@ -1,11 +1,14 @@
-"""Settings of the estimator and of its plausibility checks: frozen values, read from a configuration or built in code."""
+"""Estimation methods (METHODS), their settings, and the limits of the plausibility checks, as frozen values."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Final
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import inf
+from typing import Annotated, Any, Final
 
 from jtqd.estimator.decoder import FieldError, check, choice, limits
+from jtqd.estimator.joint import Joint, Torsion, Tracking
 
 TORSION_BANDWIDTH_RAD_S: Final = 800.0
 """Of joints whose torsion is not tracked, in new configurations: chosen from a table, docs/estimator.md."""
@@ -13,8 +16,64 @@ TORSION_BANDWIDTH_RAD_S: Final = 800.0
 CONTACT_THRESHOLD: Final = 0.05
 """Torque from outside that is a contact, as a part of the rated torque."""
 
-METHODS: Final = ("tob", "efficiency", "network", "fused")
-"""tob: Eq. (4) with additive friction; efficiency: Eq. (7); network: the paper's section III on top; fused: ours."""
+
+@dataclass(frozen=True)
+class Method:
+    """One estimation method: what the product asks of it. A new method is a new entry of METHODS.
+
+    title: in tables; estimator: name of its class in `jtqd.estimator.estimator`; sections: of the joint file that a
+    configuration with it must have; network: name of its class in `jtqd.estimator.network`, "" where it uses none;
+    network_required: it estimates nothing without one; network_ending: of its file in a directory of models, after jointN;
+    with_torsion: it estimates from `fused.torsion` where the joint file has it; sigma_has_floor: sigma is never below
+    `sigma_floor`; settings: of a new configuration, where they are not the defaults.
+    """
+
+    title: str
+    estimator: str
+    sections: tuple[str, ...] = ()
+    network: str = ""
+    network_required: bool = False
+    network_ending: str = ""
+    with_torsion: bool = False
+    sigma_has_floor: bool = True
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def network_optional(self) -> bool:
+        """Whether it uses a network and estimates without one too."""
+        return bool(self.network) and not self.network_required
+
+    def torsion_of(self, joint: Joint) -> Torsion | None:
+        """Return the torsion that a joint is estimated from; None where it is not."""
+        return joint.fused.torsion if self.with_torsion and joint.fused is not None else None
+
+
+METHODS: Final[Mapping[str, Method]] = {
+    "tob": Method("classical TOB", "JointEstimator"),  # Eq. (4) with additive friction
+    "efficiency": Method("TOB with efficiency", "JointEstimator", ("efficiency",)),  # Eq. (7)
+    "network": Method(  # section III of the paper
+        "the paper's chain",
+        "JointEstimator",
+        ("efficiency",),
+        network="TorqueNetwork",
+        network_required=True,
+        network_ending=".onnx",
+    ),
+    "fused": Method(  # ours
+        "ours",
+        "FusedEstimator",
+        ("fused",),
+        network="FusedNetwork",
+        network_ending=".fused.onnx",
+        with_torsion=True,
+        sigma_has_floor=False,
+        settings={
+            "torsion_bandwidth_rad_s": TORSION_BANDWIDTH_RAD_S,
+            "track_zeros": True,
+            "track_torsion": True,
+        },
+    ),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +87,9 @@ class EstimatorSettings:
     sigma_floor, torque_limit: parts of the rated torque (largest trusted difference between network and
     physics, sigma that nothing undercuts, largest believable torque); friction_uncertainty: standard
     deviation of friction as a part of it; load_uncertainty: of the classical observer, which knows no
-    efficiency, as a part of the load; track_zeros: of link encoder and current, method fused (`zeros`); track_torsion: a
-    tracking filter, of now, in place of the torsion's low pass, method fused, for joint files with `fused.tracking`
-    (`age`). Without these two keys as before there were such.
+    efficiency, as a part of the load; track_zeros: estimate the offsets of link encoder and current, method fused (`zeros`);
+    track_torsion: a tracking filter without delay in place of the torsion's low pass, method fused, for joint files with
+    `fused.tracking`.
     """
 
     method: Annotated[str, choice(METHODS)] = "network"
@@ -62,20 +121,45 @@ class EstimatorSettings:
         return self.bandwidth_rad_s if own is None else own
 
     def sensor_zero_nm(self, rated_torque_nm: float) -> float:
-        """Return what a comparison with a torque sensor holds beside sigma, as a standard deviation: the sensor's zero.
+        """Return the standard deviation of the torque sensor's offset, which a comparison with it has besides sigma [Nm].
 
-        Of method fused; sigma of the others never falls below `sigma_floor` anyway.
+        0 for a method whose sigma has a floor.
         """
-        return self.sigma_floor * rated_torque_nm if self.method == "fused" else 0.0
+        return 0.0 if METHODS[self.method].sigma_has_floor else self.sigma_floor * rated_torque_nm
 
 
 def recommended(method: str) -> EstimatorSettings:
     """Return the settings of a new configuration with this method. Raises ConfigError for an unknown one."""
-    if method != "fused":
-        return EstimatorSettings(method=method)
-    return EstimatorSettings(
-        method=method, torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S, track_zeros=True, track_torsion=True
-    )
+    return EstimatorSettings(method=method, **(METHODS[method].settings if method in METHODS else {}))
+
+
+def tracking_of(joint: Joint, settings: EstimatorSettings) -> Tracking | None:
+    """Return the tracking filter of a joint's torsion; None where the torsion has a low pass.
+
+    It is tracked where the settings ask for it and the joint file has what that adds to sigma.
+    """
+    torsion = METHODS[settings.method].torsion_of(joint) if settings.track_torsion else None
+    tracking = None if joint.fused is None or torsion is None else joint.fused.tracking
+    return None if tracking is None or tracking.wave_rad_s is None else tracking
+
+
+def bandwidth_of(joint: Joint, settings: EstimatorSettings) -> float:
+    """Return the bandwidth of a joint's estimate [rad/s]; infinite where the torsion is tracked, without delay.
+
+    Every path of an estimator passes g/(s+g), whose group delay at low frequency is 1/g (`observer`). An estimate from
+    torsion is as old as its torsion path with bandwidth g_t, every other one as old as the motor path. The sensor is
+    compared through the same filter (`observer.low_pass`, `observer.reference_of`).
+    """
+    if tracking_of(joint, settings) is not None:
+        return inf
+    if METHODS[settings.method].torsion_of(joint) is not None:
+        return settings.own_torsion_bandwidth_rad_s
+    return settings.bandwidth_rad_s
+
+
+def age_ms(joint: Joint, settings: EstimatorSettings) -> float:
+    """Return the group delay of a joint's estimate at low frequency [ms]."""
+    return 1e3 / bandwidth_of(joint, settings)
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,15 +23,15 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import MOTOR as BALANCE_MOTOR
 from jtqd.estimator.effects.effect import TORSION as BALANCE_TORSION
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable, RunTableError
-from jtqd.estimator.settings import recommended
+from jtqd.estimator.settings import METHODS, bandwidth_of, recommended
 from jtqd.models.files import load_joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import without_known_effects
@@ -53,9 +53,9 @@ TORSION: Final = "simulation, torsion balance"
 FREE: Final = "simulation, free run"
 FREE_POSITION: Final = "simulation, free run, position"
 ESTIMATORS: Final = {
-    "tob": "estimator tob",
-    "efficiency": "estimator efficiency",
-    "fused": "estimator fused, without network",
+    name: f"estimator {name}{', without network' if method.network else ''}"
+    for name, method in METHODS.items()
+    if not method.network_required
 }
 """Method of jtqd -> name of its row. Networks are no part of a joint file (`jtq evaluate` scores them)."""
 UNITS: Final = {FREE: "rad/s", FREE_POSITION: "rad"}
@@ -129,14 +129,15 @@ def errors_on(
     settled = moving & (table.time_s - table.time_s[0] >= SETTLE_S)
     dt = table.dt_s
     for method, title in ESTIMATORS.items():
-        if (method == "efficiency" and joint.efficiency is None) or (
-            method == "fused" and (joint.fused is None or needs_torsion(table, number, joint))
+        kind = METHODS[method]
+        if any(getattr(joint, section) is None for section in kind.sections) or (
+            kind.with_torsion and needs_torsion(table, number, joint)
         ):
             continue
         # it is the joint file that is scored: one age for all files, also of before the torsion was tracked
         settings = replace(recommended(method), track_zeros=False, track_torsion=False)
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
-        sensor = aligned(columns.torque_nm, dt, joint, settings)
+        sensor = low_pass(columns.torque_nm, dt, bandwidth_of(joint, settings))
         errors[title] = _rms((estimate - sensor)[settled])
     return RunErrors(name, errors, int(np.count_nonzero(moving)))
 

@@ -32,7 +32,7 @@ from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
 from jtqd.drivers.sdo_server import SdoServer
-from jtqd.estimator.age import age_ms
+from jtqd.estimator.settings import age_ms
 from jtqd.estimator.status import CONTACT_CODES, OFF, STALE
 
 _NOT_WATCHED, _UNKNOWN, _NONE, _CONTACT = CONTACT_CODES

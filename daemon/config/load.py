@@ -35,7 +35,7 @@ from jtqd.drivers.pdo import PdoMap
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import METHODS, EstimatorSettings
 from jtqd.estimator.sha256 import sha256_hex
 from jtqd.models.files import read_regular, read_yaml, shipped
 
@@ -44,10 +44,6 @@ MAX_COUNTER: Final = 240
 """Of SYNC (CiA 301, 7.2.5.3)."""
 _LARGEST_NETWORK: Final = 64_000_000
 """Bytes; ours have 50 000."""
-_NEEDED: Final = {"tob": (), "efficiency": ("efficiency",), "network": ("efficiency",), "fused": ("fused",)}
-"""Sections of a joint file that a method cannot do without."""
-_WITH_NETWORK: Final = ("network", "fused")
-"""Methods that use one; `fused` is its physics alone without."""
 
 
 @dataclass(frozen=True)
@@ -261,12 +257,12 @@ def _joint(path: Path, number: int, section: JointSection, method: str, sdo_time
     profile_path = None if section.profile is None else path_of(section.profile, path.parent)
     mapping, data = read_yaml(joint_path)
     joint = Joint.from_mapping(mapping, str(joint_path))
-    if method == "network" and network is None:
+    if METHODS[method].network_required and network is None:
         key = f"joint_{number}.network"
         raise ConfigError(
-            f"{path}: key '{key}': missing, expected file and sha256 because estimator.method is network"
+            f"{path}: key '{key}': missing, expected file and sha256 because estimator.method is {method}"
         )
-    for needed in _NEEDED[method]:
+    for needed in METHODS[method].sections:
         if getattr(joint, needed) is None:
             raise ConfigError(
                 f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
@@ -278,7 +274,7 @@ def _joint(path: Path, number: int, section: JointSection, method: str, sdo_time
         given=_whole(section.given),
         joint_path=joint_path,
         joint=joint,
-        network=network if method in _WITH_NETWORK else None,
+        network=network if METHODS[method].network else None,
         sensor_channel=section.sensor_channel,
         temperature=section.objects.of_joint if section.temperature else None,
         mandatory=section.mandatory,
@@ -323,7 +319,7 @@ def _check_encoders(path: Path, number: int, joint: JointConfig, method: str) ->
     """Refuse what needs the link position of a drive that has none. Raises ConfigError."""
     if joint.objects.link_position is not None:
         return
-    torsion = method == "fused" and joint.joint.fused is not None and joint.joint.fused.torsion is not None
+    torsion = METHODS[method].torsion_of(joint.joint) is not None
     if torsion or joint.network is not None:
         what = (
             "estimates from the torsion of the gear" if torsion else "uses a network with the link position"

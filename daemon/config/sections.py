@@ -17,7 +17,7 @@ from jtqd.daemon.config.settings import (
 from jtqd.drivers.devices import EVERY_SCALING_OBJECT, SENSOR_SCALING_OBJECTS
 from jtqd.estimator.checked import Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, choice, limits
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import METHODS, EstimatorSettings
 
 MAX_NODE_ID: Final = 127
 LONGEST_CONTACT_PERIOD_US: Final = 5000
@@ -251,7 +251,7 @@ class ConfigFile:
     def _check_contact(self) -> None:
         if self.contact is None:
             return
-        if self.estimator.method != "fused":
+        if not METHODS[self.estimator.method].with_torsion:
             expected = "fused, whose torsion contacts are told by (section contact)"
             raise FieldError("configuration", "estimator.method", self.estimator.method, expected)
         if self.sync.period_us > LONGEST_CONTACT_PERIOD_US:

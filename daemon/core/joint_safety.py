@@ -7,10 +7,9 @@ from typing import Final
 
 from jtqd.daemon.config import Config, SafetySettings
 from jtqd.daemon.shared import faults
-from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.plausibility import Plausibility
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import EstimatorSettings, bandwidth_of
 
 TORQUE_RANGE_NM: Final = 327.67
 """Of the field of the estimate PDO."""

@@ -48,6 +48,7 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
 from jtqd.estimator.network import FusedNetwork, load_network
 from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
+from jtqd.estimator.settings import METHODS
 
 _PATIENCE_S = 1.0
 """The supervisor turns twenty times a second; after so long without a turn the watchdog is fed no more."""
@@ -116,7 +117,7 @@ class Stop:
 
 
 def physics_only(joint: JointConfig, network: AnyNetwork | None) -> str:
-    """Return the line for the operator where no network corrects the physics of method `fused`; "" where one does."""
+    """Return the line for the operator where no network corrects the physics; "" where one does."""
     if network is None or joint.network is None:
         return f"joint {joint.number}: no network, physics only"
     if isinstance(network, FusedNetwork) and not network.corrects:
@@ -142,7 +143,7 @@ def build_estimator(
             raise NetworkError(verdict)
         if joint.network is not None:
             network = load_network(method, str(joint.network.path), joint.network.sha256, verdict)
-        note = physics_only(joint, network) if method == "fused" else ""
+        note = physics_only(joint, network) if METHODS[method].network_optional else ""
         if note and notes is not None:
             notes.append(note)
         return make_estimator(joint.joint, config.estimator, network)

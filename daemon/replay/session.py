@@ -32,7 +32,6 @@ from jtqd.daemon.replay.runs import (
     read_pieces,
     stretches,
 )
-from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
@@ -40,12 +39,12 @@ from jtqd.estimator.learned import same_past
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
 from jtqd.estimator.network import NATIVE_LIMIT, load_network
 from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.settings import METHODS, bandwidth_of
 from jtqd.models.files import load_joint
 
 # ---- models: those that the log carries, or others from a directory ----
 
 AS_LOGGED = "as logged"
-_WITH_NETWORK = ("network", "fused")
 _ANY_JOINT = "extended.joint.yaml"
 
 
@@ -101,7 +100,7 @@ def other_models(origin: Origin, directory: Path | None, method: str | None) -> 
         if network_path is not None:
             network = load_network(settings.method, str(network_path))
             said.append(_named(network_path))
-        elif settings.method in _WITH_NETWORK:
+        elif METHODS[settings.method].network:
             network = _logged_network(origin, number, settings.method)
         taken += len(said)
         make_estimator(joint, settings, network)  # refused here, and not when the arrays are half done
@@ -146,9 +145,9 @@ def _joint_file(directory: Path, number: int, logged: Joint) -> Path | None:
 
 
 def _network_file(directory: Path, number: int, method: str) -> Path | None:
-    if method not in _WITH_NETWORK:
+    if not METHODS[method].network:
         return None
-    path = directory / (f"joint{number}.fused.onnx" if method == "fused" else f"joint{number}.onnx")
+    path = directory / f"joint{number}{METHODS[method].network_ending}"
     return path if path.is_file() else None
 
 

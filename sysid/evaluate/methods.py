@@ -25,7 +25,6 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, observe_run, quadrants
@@ -34,7 +33,7 @@ from jtqd.estimator.methods import AnyNetwork, estimate_columns
 from jtqd.estimator.network import load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
-from jtqd.estimator.settings import EstimatorSettings, recommended
+from jtqd.estimator.settings import METHODS, EstimatorSettings, bandwidth_of, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.models.files import load_joint
 
@@ -113,20 +112,16 @@ def _hashes(value: Any) -> set[str]:
     return {text.lower() for text in value if isinstance(text, str) and len(text) == 64}
 
 
+OURS: Final = "fused"
 TITLES: Final = MappingProxyType(
     {
-        "tob": "classical TOB",
-        "efficiency": "TOB with efficiency",
-        "network": "the paper's chain",
+        **{name: METHODS[name].title for name in METHODS if name != OURS},
         "physics": "our physics",
-        "fused": "ours",
+        OURS: METHODS[OURS].title,
     }
 )
-"""Methods in the order of every table. `physics` is `fused` without its network, where it has one; the others are jtqd's
-own names.
-"""
+"""Methods in the order of every table. `physics` is `fused` without its network, where it has one."""
 
-OURS: Final = "fused"
 PAPERS_BANDWIDTH: Final = EstimatorSettings().bandwidth_rad_s
 PAPERS: Final = "network"
 
@@ -204,6 +199,10 @@ def load_models(directory: Path, numbers: Sequence[int] = ()) -> tuple[JointMode
     return tuple(_joint_models(there[number], number) for number in sorted(set(numbers) or there))
 
 
+_ABSENT: Final = {"efficiency": "has no efficiency", "fused": "has no section fused (jtq fit losses)"}
+"""Section of a joint file -> why a method that needs it is missing."""
+
+
 def _joint_models(path: Path, number: int) -> JointModels:
     directory = path.parent
     joint = load_joint(path)
@@ -211,13 +210,21 @@ def _joint_models(path: Path, number: int) -> JointModels:
     training = joint_training_runs(path.name, joint)
     networks: dict[str, AnyNetwork] = {}
     missing: dict[str, str] = {}
-    for method, name in ((PAPERS, f"joint{number}.onnx"), (OURS, f"joint{number}.fused.onnx")):
+    for method, kind in METHODS.items():
+        absent = [section for section in kind.sections if getattr(joint, section) is None]
+        if absent:
+            missing[method] = f"{path.name} {_ABSENT[absent[0]]}"
+            if method == OURS:
+                missing["physics"] = missing[method]
+        name = f"joint{number}{kind.network_ending}"
         source = directory / name
+        if not kind.network:
+            continue
         if not source.exists():
-            if method == PAPERS:
-                missing[method] = f"no {name} in {directory}"
+            if kind.network_required:
+                missing.setdefault(method, f"no {name} in {directory}")
             else:  # as jtqd runs it
-                missing["physics"] = f"ours is its physics, since there is no {name} in {directory}"
+                missing.setdefault("physics", f"ours is its physics, since there is no {name} in {directory}")
             continue
         network = load_network(method, str(source))
         if network.joint != joint.name:
@@ -227,12 +234,6 @@ def _joint_models(path: Path, number: int) -> JointModels:
         networks[method] = network
         files[name] = network.sha256
         training = training.and_those_of(network_training_runs(source))
-    if joint.efficiency is None:
-        reason = f"{path.name} has no efficiency"
-        missing |= {"efficiency": reason, PAPERS: reason}
-    if joint.fused is None:
-        reason = f"{path.name} has no section fused (jtq fit losses)"
-        missing |= {"physics": reason, OURS: reason}
     methods = tuple(method for method in TITLES if method not in missing)
     ordered = {method: missing[method] for method in TITLES if method in missing}
     return JointModels(number, joint, networks, methods, ordered, training, files)

@@ -53,8 +53,9 @@ from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS, Joint
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
+from jtqd.estimator.settings import METHODS
 from jtqd.estimator.status import DEGRADED
-from jtqd.sysid.evaluate.methods import OURS, PAPERS_BANDWIDTH, TITLES, Samples
+from jtqd.sysid.evaluate.methods import OURS, PAPERS_BANDWIDTH, TITLES, Samples, settings_of
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 
 VELOCITY_EDGES_RAD_S: Final = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, math.inf)
@@ -442,10 +443,6 @@ def _all_crossings(samples: Samples) -> list[tuple[str, Crossing]]:
     ]
 
 
-_OURS: Final = ("physics", "fused")
-"""Methods whose sigma is that of the torque, without the sensor's zero."""
-
-
 def for_intervals(samples: Samples) -> Samples:
     """Return samples whose `sensor_of` an interval is to hold: the true torque, aligned, where the run has it.
 
@@ -461,7 +458,7 @@ def for_intervals(samples: Samples) -> Samples:
         return replace(samples, sensor_nm=low_pass(samples.true_nm, dt, PAPERS_BANDWIDTH), sensors_nm=young)
     wider = samples.reference_nm * np.where(samples.standing, samples.standstill_sigmas, 1.0)
     sigma = {
-        method: np.hypot(values, wider) if method in _OURS else values
+        method: values if METHODS[settings_of(method).method].sigma_has_floor else np.hypot(values, wider)
         for method, values in samples.sigma_nm.items()
     }
     return replace(samples, sigma_nm=sigma)

@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jtqd.estimator.age import age_ms, aligned, bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion
 from jtqd.estimator.observer import low_pass, reference_of
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import EstimatorSettings, age_ms, bandwidth_of
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, fused_joint, twisted
 
@@ -67,7 +66,7 @@ def test_a_step_is_seen_through_the_filter_of_the_torsion(current_nm: float, tor
     torque = np.where(np.arange(400) < 150, 0.0, 10.0)
     joint = lossless(current_nm, torsion_nm)
     found = estimated(joint, OWN, torque, dt)[1:]
-    assert found == pytest.approx(aligned(torque, dt, joint, OWN)[1:], abs=0.1)
+    assert found == pytest.approx(low_pass(torque, dt, bandwidth_of(joint, OWN))[1:], abs=0.1)
     assert np.max(np.abs(found - low_pass(torque, dt, 200.0)[1:])) > 3.0
 
 
@@ -86,7 +85,7 @@ def test_slow_errors_of_the_paths_count_with_the_weights() -> None:
             estimator.step(a, (x + 1.0) / gain, m, speed, q).torque_nm
             for a, x, m, q in zip(dt, torque, motor, link, strict=True)
         ]
-        error = (np.array(found) - aligned(torque, dt, joint, settings))[300:]
+        error = (np.array(found) - low_pass(torque, dt, bandwidth_of(joint, settings)))[300:]
         assert error == pytest.approx(np.full(300, 0.4**2 / (0.3**2 + 0.4**2)), abs=1e-4)
 
 

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.age import age_ms, aligned, bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.contact import link_loads
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Joint, Tracking
-from jtqd.estimator.observer import TRACKED_FADE_S, reference_of, tracked
-from jtqd.estimator.settings import EstimatorSettings, recommended
+from jtqd.estimator.observer import TRACKED_FADE_S, low_pass, reference_of, tracked
+from jtqd.estimator.settings import EstimatorSettings, age_ms, bandwidth_of, recommended
 from jtqd.estimator.status import STANDSTILL
 from jtqd.sysid.fit.residuals import TRACKING_RAD_S, WAVE_RAD_S
 from tests.estimator.fused_helpers import fused_joint, twisted
@@ -119,7 +118,7 @@ def test_the_estimate_is_of_now_whatever_the_weights(current_nm: float, torsion_
     found = estimated(joint, TRACKED, 20.0 * t, dt)
     assert found[t > 1.0] == pytest.approx(20.0 * t[t > 1.0], abs=1e-4)
     assert (bandwidth_of(joint, TRACKED), age_ms(joint, TRACKED)) == (inf, 0.0)
-    assert np.array_equal(aligned(t, dt, joint, TRACKED), t)
+    assert np.array_equal(low_pass(t, dt, bandwidth_of(joint, TRACKED)), t)
 
 
 def test_a_joint_that_moves_at_its_start_has_no_transient() -> None:

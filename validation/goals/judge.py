@@ -8,14 +8,13 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray, StatusArray
 from jtqd.estimator.estimator import quadrants
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.network import load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
-from jtqd.estimator.settings import EstimatorSettings, recommended
+from jtqd.estimator.settings import EstimatorSettings, bandwidth_of, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, SETTLE_S
 from validation.goals.baselines import BASELINES

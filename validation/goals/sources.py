@@ -24,12 +24,11 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.age import bandwidth_of
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, count
 from jtqd.estimator.joint import Fused, Torsion
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import EstimatorSettings, bandwidth_of
 from jtqd.models.files import shipped
 from jtqd.sim_can.towing.bench_file import AngleWave, TowedJoint, TowingBench
 from jtqd.sysid.fit.calibration import calibrated, fit_sigma

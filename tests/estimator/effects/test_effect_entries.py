@@ -23,15 +23,15 @@ K = PLAIN.stiffness_nm_per_rad
     ("name", "given", "message"),
     [
         ("magic", {}, "found 'magic', expected one of channel_delay"),
-        ("cogging", {"amplitude_nm": 0.1}, "key 'order_per_motor_rev': missing, expected a number in 1/rev"),
+        ("cogging", {"amplitude_nm": 0.1}, "order_per_motor_rev: missing, expected a number in 1/rev"),
         (
             "cogging",
             {"amplitude_nm": -0.1, "order_per_motor_rev": 6},
             "found -0.1, expected a number in Nm from 0",
         ),
-        ("sensor_gain", {"gain": 1.0, "offset_nm": 0.0}, "key 'offset_nm': unknown key"),
-        ("sensor_gain", {"gain": math.nan}, "key 'gain': found nan"),
-        ("sensor_gain", {"gain": True}, "key 'gain': found True"),
+        ("sensor_gain", {"gain": 1.0, "offset_nm": 0.0}, "offset_nm: unknown key"),
+        ("sensor_gain", {"gain": math.nan}, "gain: found nan"),
+        ("sensor_gain", {"gain": True}, "gain: found True"),
         (
             "channel_delay",
             {"delay_s": 1e-3, "channel": 0.5},

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.age import aligned
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.settings import recommended
+from jtqd.estimator.observer import low_pass
+from jtqd.estimator.settings import bandwidth_of, recommended
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
 from jtqd.sysid.fit.calibration import FEWEST_RUNS, Standing, beyond_normal, fit_standstill
@@ -149,7 +149,7 @@ def at_rest(joint: Joint, run: EmulatedRun, first: int = 0) -> tuple[FloatArray,
         dt, *inputs, None if temperature is None else temperature[first:]
     )
     rest = (got.status == st.STANDSTILL) & (table.time_s[first:] > STOP_S + 0.3)
-    error = got.torque_nm - aligned(truth, dt, joint, settings)
+    error = got.torque_nm - low_pass(truth, dt, bandwidth_of(joint, settings))
     inside: BoolArray = np.abs(error) <= got.sigma_nm
     return got.sigma_nm[rest], inside[rest], truth[rest]
 
