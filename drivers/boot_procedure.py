@@ -24,6 +24,7 @@ from jtqd.drivers.devices import (
 from jtqd.drivers.pdo import CAN_ID, INVALID, PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.sdo_client import NodeObjects, SdoAccess
+from jtqd.drivers.units import ScalingError
 
 _IDENTITY = (
     ("vendor", "vendor-ID", "D"),
@@ -260,11 +261,15 @@ class NodeBoot:
         """Read the scaling objects and check them for plausibility; return (scaling, gear ratio)."""
         profile = self._profile
         values = {key: self._objects.number(key, 4) for key in profile.scaling_objects}
-        if isinstance(profile, DriveProfile):
-            return drive_scaling(profile, values)
-        for channel in profile.channels:
-            self._check_channel((OPERATING_MODE_OBJECT, channel))
-        return sensor_scaling(profile, values), None
+        try:
+            if isinstance(profile, DriveProfile):
+                return drive_scaling(profile, values)
+            for channel in profile.channels:
+                self._check_channel((OPERATING_MODE_OBJECT, channel))
+            return sensor_scaling(profile, values), None
+        except ScalingError as error:
+            found = error.found
+            raise mismatch(self._node, error.key, error.name, expected=error.expected, found=found) from None
 
     def _check_channel(self, key: Key) -> None:
         found = self._objects.optional_number(key, 1)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from jtqd.drivers.boot_error import mismatch
 from jtqd.drivers.pdo import MappedObject, PdoMap
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.units import (
@@ -17,7 +16,7 @@ from jtqd.drivers.units import (
     GEAR,
     OTHER_SCALING_OBJECTS,
     SCALES,
-    UnitError,
+    ScalingError,
     scale_of,
     si_per_unit,
 )
@@ -326,13 +325,13 @@ def _estimate_tpdo(pair: int, cob_id: int) -> PdoMap:
 
 
 def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[DriveScaling, float]:
-    """Return (scaling, gear ratio) from the objects read and given. Raises BootError for an impossible value."""
+    """Return (scaling, gear ratio) from the objects read and given. Raises ScalingError."""
     values = {**read, **profile.given}
     objects = profile.objects
     used = profile.used_scaling
     for key, (name, highest) in EVERY_SCALING_OBJECT.items():
         if key in used and not 1 <= values[key] <= highest:
-            raise mismatch(profile.node_id, key, name, expected=f"1..{highest}", found=str(values[key]))
+            raise ScalingError(key, name, expected=f"1..{highest}", found=str(values[key]))
 
     def factor(name: str) -> float:
         each: DriveObject | None = getattr(objects, name)
@@ -340,13 +339,8 @@ def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[Drive
             return 0.0
         if each.factor is not None:
             return each.sign * each.factor
-        try:
-            constant = profile.torque_constant_nm_per_a
-            return each.sign * si_per_unit(name, each.by, each.shaft, values, constant)
-        except UnitError as error:
-            what = EVERY_SCALING_OBJECT[error.key][0]
-            found = error.found
-            raise mismatch(profile.node_id, error.key, what, expected=error.expected, found=found) from None
+        constant = profile.torque_constant_nm_per_a
+        return each.sign * si_per_unit(name, each.by, each.shaft, values, constant)
 
     scaling = DriveScaling(
         factor("motor_position"), factor("motor_velocity"), factor("link_position"), factor("current")
@@ -355,14 +349,14 @@ def drive_scaling(profile: DriveProfile, read: Mapping[Key, int]) -> tuple[Drive
 
 
 def sensor_scaling(profile: SensorProfile, read: Mapping[Key, int]) -> SensorScaling:
-    """Return Nm per unit of each used channel: unit word (CiA 303-2) over decimal digits. Raises BootError."""
+    """Return Nm per unit of each used channel: unit word (CiA 303-2) over decimal digits. Raises ScalingError."""
     values = {**read, **profile.given}
     factors = {}
     for channel in profile.channels:
         decimals = values[DECIMALS_OBJECT, channel]
         if not 0 <= decimals <= MAX_DECIMALS:
             key, expected = (DECIMALS_OBJECT, channel), f"0..{MAX_DECIMALS}"
-            raise mismatch(profile.node_id, key, "decimal digits", expected=expected, found=str(decimals))
+            raise ScalingError(key, "decimal digits", expected=expected, found=str(decimals))
         factors[channel] = _nm_of_unit(profile, channel, values[UNIT_OBJECT, channel]) / 10**decimals
     return SensorScaling(factors)
 
@@ -374,7 +368,7 @@ def _nm_of_unit(profile: SensorProfile, channel: int, word: int) -> float:
     if word & 0x00FF_FFFF != JOULE << 16:
         expected = "0xXX230000 (J = Nm) or a word given in the configuration"
         key = UNIT_OBJECT, channel
-        raise mismatch(profile.node_id, key, "physical unit", expected=expected, found=f"0x{word:08X}")
+        raise ScalingError(key, "physical unit", expected=expected, found=f"0x{word:08X}")
     exponent = int.from_bytes([word >> 24], signed=True)
     return 10.0**exponent
 

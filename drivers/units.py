@@ -52,12 +52,16 @@ _SPEED_TEXT = "0xXX10, 0xXX41 or 0xXXB4 (rad, degree, revolution), then 0300 or 
 Values = Mapping[Key, int]
 
 
-class UnitError(ValueError):
-    """A unit word that means no angle, or no speed: `key`, `expected`, `found`."""
+class ScalingError(ValueError):
+    """An object whose value scales nothing; `name`: the object in words."""
 
-    def __init__(self, key: Key, expected: str, found: int) -> None:
-        super().__init__(f"expected {expected}, found 0x{found:08X}")
-        self.key, self.expected, self.found = key, expected, f"0x{found:08X}"
+    def __init__(self, key: Key, name: str, *, expected: str, found: str) -> None:
+        super().__init__(f"expected {expected}, found {found}")
+        self.key, self.name, self.expected, self.found = key, name, expected, found
+
+
+def _unit_error(key: Key, expected: str, word: int) -> ScalingError:
+    return ScalingError(key, OTHER_SCALING_OBJECTS[key][0], expected=expected, found=f"0x{word:08X}")
 
 
 class Scale(NamedTuple):
@@ -69,17 +73,17 @@ class Scale(NamedTuple):
 
 
 def unit_of_position(word: int) -> float:
-    """Return rad per unit of 60A8h: prefix (signed exponent of ten), numerator, 0, 0. Raises UnitError."""
+    """Return rad per unit of 60A8h: prefix (signed exponent of ten), numerator, 0, 0. Raises ScalingError."""
     if word >> 16 & 0xFF not in _ANGLES or word & 0xFFFF:
-        raise UnitError((0x60A8, 0), _ANGLE_TEXT, word)
+        raise _unit_error((0x60A8, 0), _ANGLE_TEXT, word)
     return _prefix(word) * _ANGLES[word >> 16 & 0xFF]
 
 
 def unit_of_velocity(word: int) -> float:
-    """Return rad/s per unit of 60A9h: prefix, numerator, denominator, 0. Raises UnitError."""
+    """Return rad/s per unit of 60A9h: prefix, numerator, denominator, 0. Raises ScalingError."""
     angle, time = word >> 16 & 0xFF, word >> 8 & 0xFF
     if angle not in _ANGLES or time not in _TIMES or word & 0xFF:
-        raise UnitError((0x60A9, 0), _SPEED_TEXT, word)
+        raise _unit_error((0x60A9, 0), _SPEED_TEXT, word)
     return _prefix(word) * _ANGLES[angle] / _TIMES[time]
 
 
@@ -126,7 +130,7 @@ def scale_of(quantity: str, by: str) -> Scale:
 
 
 def si_per_unit(quantity: str, by: str, shaft: str, values: Values, torque_constant_nm_per_a: float) -> float:
-    """Return SI (rad, rad/s, A) per unit of a quantity. Raises UnitError.
+    """Return SI (rad, rad/s, A) per unit of a quantity. Raises ScalingError.
 
     shaft: where 6092h, 60A8h and 60A9h count. torque_constant_nm_per_a: of the motor, for a current by its torque.
     """

@@ -26,7 +26,7 @@ from jtqd.drivers.units import (
     AT_MOTOR,
     GEAR,
     SECOND,
-    UnitError,
+    ScalingError,
     is_increments,
     si_per_unit,
     unit_of_position,
@@ -84,7 +84,7 @@ def unit_problems(node: int, survey: Survey | None) -> list[str]:
     for key, told in ((_POSITION_UNIT, _position), (_VELOCITY_UNIT, _velocity)):
         try:
             told(survey)
-        except UnitError as error:
+        except ScalingError as error:
             found.append(
                 f"node {node} ({survey.title}): {label(*key)}, the unit of "
                 f"{'positions' if key == _POSITION_UNIT else 'velocities'}: {error}; "
@@ -94,7 +94,7 @@ def unit_problems(node: int, survey: Survey | None) -> list[str]:
 
 
 def _position(survey: Survey) -> str:
-    """Return which object tells the unit of positions: "60A8h", "6092h", or "608Fh" (counts). Raises UnitError."""
+    """Return which object tells the unit of positions: "60A8h", "6092h", or "608Fh" (counts). Raises ScalingError."""
     word = survey.number(_POSITION_UNIT)
     if word is not None:
         if is_increments(word):
@@ -106,7 +106,7 @@ def _position(survey: Survey) -> str:
 
 
 def _velocity(survey: Survey) -> str:
-    """Return which object tells the unit of velocities: "60A9h", "608Fh" (counts per second), "". Raises UnitError."""
+    """Return which object tells the unit of velocities: "60A9h", "608Fh" (counts per second), "". Raises ScalingError."""
     word = survey.number(_VELOCITY_UNIT)
     if word is None:
         return ""
@@ -127,7 +127,7 @@ def units_told(
     velocity = ""
     if survey is None:
         return found
-    with suppress(UnitError):
+    with suppress(ScalingError):
         position = _position(survey)
         if position != "608Fh" and not _is_counts(survey, position):
             found["motor_position"] = _scaled(survey, "motor_position", position, gear_ratio)
@@ -140,7 +140,7 @@ def units_told(
             )
             if survey.number(_VELOCITY_UNIT) is None:
                 found["motor_velocity"] = _per_second(survey, position, gear_ratio)
-    with suppress(UnitError):
+    with suppress(ScalingError):
         if velocity := _velocity(survey):
             found["motor_velocity"] = _scaled(survey, "motor_velocity", velocity, gear_ratio)
     unless = set(by_options)

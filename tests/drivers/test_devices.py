@@ -2,7 +2,6 @@ import math
 
 import pytest
 
-from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import (
     DriveObject,
     DriveObjects,
@@ -18,6 +17,7 @@ from jtqd.drivers.devices import (
     sensor_tpdo1,
     sensor_tpdo2,
 )
+from jtqd.drivers.units import ScalingError
 
 DRIVE = {
     (0x608F, 1): 65536,
@@ -75,10 +75,10 @@ def test_encoders_of_several_revolutions():
 
 @pytest.mark.parametrize("key", list(DRIVE))
 def test_zero_is_refused_by_name(key):
-    with pytest.raises(BootError) as caught:
+    with pytest.raises(ScalingError) as caught:
         drive_scaling(DriveProfile(2), {**DRIVE, key: 0})
     error = caught.value
-    assert (error.node, error.object, error.found) == (2, f"{key[0]:04X}h:{key[1]}", "0")
+    assert (error.key, error.found) == (key, "0")
     assert error.expected.startswith("1..")
 
 
@@ -105,8 +105,9 @@ def test_each_channel_has_its_own_decimals():
 
 @pytest.mark.parametrize("word", [0x004E0000, 0x00210000, 0x00230100, 0x00230001, 0])
 def test_other_units_are_refused(word):
-    with pytest.raises(BootError, match=f"node 3: 6131h:1 physical unit: expected .*, found 0x{word:08X}"):
+    with pytest.raises(ScalingError, match=f"expected .*, found 0x{word:08X}") as caught:
         sensor_scaling(SensorProfile(3), {**SENSOR, (0x6131, 1): word})
+    assert (caught.value.key, caught.value.name) == ((0x6131, 1), "physical unit")
 
 
 def test_a_vendor_word_is_accepted_when_given():
@@ -116,8 +117,9 @@ def test_a_vendor_word_is_accepted_when_given():
 
 
 def test_decimals_are_bounded():
-    with pytest.raises(BootError, match=r"6132h:1 decimal digits: expected 0\.\.9, found 10"):
+    with pytest.raises(ScalingError, match=r"expected 0\.\.9, found 10") as caught:
         sensor_scaling(SensorProfile(3), {**SENSOR, (0x6132, 1): 10})
+    assert (caught.value.key, caught.value.name) == ((0x6132, 1), "decimal digits")
 
 
 def test_keys():

@@ -4,8 +4,8 @@ import math
 
 import pytest
 
-from jtqd.drivers.boot_error import BootError
 from jtqd.drivers.devices import DriveObject, DriveObjects, DriveProfile, drive_scaling
+from jtqd.drivers.units import ScalingError
 
 READ = {
     (0x608F, 1): 4096,
@@ -74,23 +74,24 @@ def test_what_a_drive_does_not_have_is_not_scaled():
 
 
 @pytest.mark.parametrize(
-    ("key", "by", "word", "said"),
+    ("key", "by", "word", "text"),
     [
-        ((0x60A8, 0), "60A8h", 0x00B5_0000, "60A8h:0 SI unit position: expected 0xXX100000 (rad), "),
+        ((0x60A8, 0), "60A8h", 0x00B5_0000, "SI unit position: expected 0xXX100000 (rad), "),
         ((0x60A8, 0), "60A8h", 0x0041_0300, "found 0x00410300"),
-        ((0x60A9, 0), "60A9h", 0x00B4_4800, "60A9h:0 SI unit velocity: expected 0xXX10, 0xXX41 or 0xXXB4"),
-        ((0x60A8, 0), "60A8h", 0, "60A8h:0 SI unit position: expected 1..4294967295, found 0"),
+        ((0x60A9, 0), "60A9h", 0x00B4_4800, "SI unit velocity: expected 0xXX10, 0xXX41 or 0xXXB4"),
+        ((0x60A8, 0), "60A8h", 0, "SI unit position: expected 1..4294967295, found 0"),
         (
             (0x6092, 2),
             "6092h",
             0,
-            "6092h:2 feed constant, driving shaft revolutions: expected 1..2147483648, found 0",
+            "feed constant, driving shaft revolutions: expected 1..2147483648, found 0",
         ),
     ],
 )
-def test_a_unit_that_is_none_is_one_line(key, by, word, said):
+def test_a_value_that_scales_nothing_is_named(key, by, word, text):
     name = "motor_velocity" if by == "60A9h" else "motor_position"
     profile = DriveProfile(1, objects=DriveObjects(**{name: DriveObject(0x2000, by=by)}))
-    with pytest.raises(BootError) as caught:
+    with pytest.raises(ScalingError) as caught:
         drive_scaling(profile, READ | {key: word})
-    assert said in str(caught.value)
+    assert caught.value.key == key
+    assert text in f"{caught.value.name}: {caught.value}"
