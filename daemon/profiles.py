@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final
 
 import jtqd.drivers.profiles
-from jtqd.drivers.devices import parse_key
-from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
 from jtqd.models.files import read_yaml

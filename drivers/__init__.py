@@ -14,7 +14,7 @@ and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Impo
     boot_procedure, boot        one node by SDO (CiA 302-2); the whole bus, `python -m jtqd.drivers.boot`
     can_unix, eds               unix bus for python-can; data sheets
 
->>> from jtqd.drivers.devices import drive_tpdo2
+>>> from jtqd.drivers.drive import drive_tpdo2
 >>> pdo = drive_tpdo2(node=1)
 >>> f"{pdo.cob_id:X}h", pdo.names
 ('281h', ('motor_velocity', 'current', 'statusword'))

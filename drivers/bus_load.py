@@ -9,21 +9,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from jtqd.drivers.devices import (
-    EVENT_MS,
-    JTQD_NODE,
-    SYNC_COB_ID,
-    contact_tpdos,
-    drive_layout,
-    drive_tpdo3,
-    estimate_tpdos,
-    sensor_tpdo1,
-    sensor_tpdo2,
-)
+from jtqd.drivers.drive import EVENT_MS, drive_layout, drive_tpdo3
 from jtqd.drivers.frame import unstuffed_bits, worst_case_bits
-from jtqd.drivers.layout import BY_ITSELF
 from jtqd.drivers.nmt import HEARTBEAT_BASE
-from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap
+from jtqd.drivers.own_objects import JTQD_NODE, contact_tpdos, estimate_tpdos
+from jtqd.drivers.pdo import BY_ITSELF, LAST_SYNC_TYPE, SYNC_COB_ID, PdoMap
+from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
 LIMIT = 0.95
 BITRATE = 1_000_000

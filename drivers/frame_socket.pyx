@@ -16,25 +16,6 @@ from libc.stdint cimport INT64_MAX, int64_t, uint8_t, uint16_t
 from libc.string cimport memcpy, memset
 from posix.time cimport CLOCK_MONOTONIC, clock_gettime, timespec
 
-from jtqd.drivers.linux_socket cimport (
-    CMSG_DATA,
-    CMSG_FIRSTHDR,
-    CMSG_NXTHDR,
-    MSG_CONFIRM,
-    MSG_DONTWAIT,
-    MSG_NOSIGNAL,
-    MSG_TRUNC,
-    POLLIN,
-    SOL_SOCKET,
-    cmsghdr,
-    mmsghdr,
-    msghdr,
-    pollfd,
-    ppoll,
-    recvmmsg,
-    send,
-)
-
 import socket
 
 from jtqd.drivers import filters as bpf

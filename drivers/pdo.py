@@ -25,6 +25,16 @@ LOWEST_PDO_ID, HIGHEST_PDO_ID = (
 )  # CiA 301, 7.3.5: others are restricted or belong to other services
 LAST_SYNC_TYPE = 240  # transmission types 1..240: every n-th SYNC
 
+SYNC_COB_ID = 0x080
+TPDO_BASES = (0x180, 0x280, 0x380, 0x480)
+"""COB-IDs of a node's TPDOs 1 to 4 in the predefined connection set (CiA 301, 7.3.5), without the node-ID."""
+EVERY_SYNC = 1
+"""Transmission type of a TPDO that is sent at each SYNC."""
+BY_ITSELF = (0, 254, 255)
+"""Transmission types of a TPDO whose frames belong to no SYNC: sent on a change, at the next SYNC (0) or at once."""
+EVENT_DRIVEN = (254, 255)
+"""Transmission types of a PDO that its producer sends by itself."""
+
 _SIGNED_LETTERS = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
@@ -128,7 +138,6 @@ NO_RTR = 0x4000_0000  # COB-ID bit 30 of a TPDO
 CAN_ID = 0x7FF
 _RPDO, _TPDO = 0x1400, 0x1800
 _MAPPING_OFFSET = 0x200  # 1400h -> 1600h, 1800h -> 1A00h
-_EVENT_TYPES = (254, 255)
 _TPDO_ACCESS = ("ro", "rw", "rwr", "const")
 _RPDO_ACCESS = ("wo", "rw", "rww")
 # Sub-indices of the communication parameter that may change only while the PDO does not exist
@@ -220,7 +229,7 @@ class PdoParameters:
 
     def _check_transmission(self, value: int) -> None:
         if (
-            value > LAST_SYNC_TYPE and value not in _EVENT_TYPES
+            value > LAST_SYNC_TYPE and value not in EVENT_DRIVEN
         ):  # 252, 253 are RTR-only, which is not offered
             raise SdoAbort(VALUE_RANGE)
 

@@ -1,7 +1,7 @@
 import socket
 from collections.abc import Callable, Iterable
 
-from jtqd.drivers.wire import WireModel
+from jtqd.drivers.hub import WireModel
 
 MAX_CLIENTS: int
 BACKLOG: int

@@ -13,8 +13,16 @@ from libc.stdint cimport INT64_MAX, int64_t, uint8_t, uint16_t
 from libc.string cimport memset
 from posix.time cimport timespec
 
-from jtqd.drivers.frame_socket cimport Frame, FrameReceiver
-from jtqd.drivers.linux_socket cimport MSG_DONTWAIT, MSG_NOSIGNAL, POLLIN, pollfd, ppoll, send
+from jtqd.drivers.frame_socket cimport (
+    MSG_DONTWAIT,
+    MSG_NOSIGNAL,
+    POLLIN,
+    Frame,
+    FrameReceiver,
+    pollfd,
+    ppoll,
+    send,
+)
 
 import errno as errors
 import os

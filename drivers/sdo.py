@@ -8,15 +8,19 @@ CiA 301, 7.2.4.3: a client asks on 600h+n, the server of node n answers on 580h+
 
 Times are arguments, in seconds of one steady clock. An answer to another request is passed over and counted, never taken: a
 late one to a request that was given up, one with another index, a flood of them. Block transfer is not used: no object that
-is read here is long enough. `jtqd.drivers.sdo_client` blocks until an exchange has ended.
+is read here is long enough. `SdoClient` blocks until an exchange has ended.
 """
 
 from __future__ import annotations
 
 import struct
+import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
+
+from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 
 Key = tuple[int, int]
 """Index and sub-index of an object."""
@@ -25,6 +29,15 @@ Key = tuple[int, int]
 def label(index: int, subindex: int = 0) -> str:
     """Return an object as people write it: "1018h:2"."""
     return f"{index:04X}h:{subindex}"
+
+
+def parse_key(text: str) -> Key:
+    """Return (index, sub-index) of "608Fh:1" or "6075h". Raises ValueError."""
+    index, _, subindex = text.partition("h")
+    key = int(index, 16), int(subindex.removeprefix(":") or "0")
+    if text not in (label(*key), f"{key[0]:04X}h"):
+        raise ValueError(f"{text!r} is not an object like 608Fh:1")
+    return key
 
 
 # Abort codes (CiA 301, 7.2.4.3.17, table 22)
@@ -461,3 +474,90 @@ class SdoQueue:
             answer_s=self._answer_s,
         )
         return self._exchange.begin()
+
+
+# Client that waits
+
+
+class Socket(Protocol):
+    """What `SdoClient` needs of `jtqd.drivers.frame_socket.FrameSocket`."""
+
+    frames: bytearray
+
+    def send(self, frame16: bytes) -> bool:
+        """Send one frame."""
+
+    def wait(self, timeout_s: float | None) -> bool:
+        """Wait for frames."""
+
+    def receive(self) -> int:
+        """Take what has arrived."""
+
+
+class SdoTimeout(Exception):  # noqa: N818  (the node's fault, not one of this side)
+    """No answer within the waiting time."""
+
+    def __init__(self, waited_s: float) -> None:
+        super().__init__(f"no answer within {waited_s:g} s")
+        self.waited_s = waited_s
+
+
+class SdoAccess(Protocol):
+    """Objects of one node as bytes: an `SdoClient`, or a node in memory. Both raise SdoAbort and SdoTimeout."""
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """Upload an object."""
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Download an object."""
+
+
+class SdoClient:
+    """One exchange at a time with one node; each may take `timeout_s` seconds, and is repeated after `answer_s` of silence.
+
+    The filters of the socket let 580h+n through; other frames that come meanwhile are dropped. `read` and `write` raise
+    SdoAbort (the node refuses), SdoTimeout, and BusError.
+    """
+
+    def __init__(self, socket: Socket, node: int, timeout_s: float = 0.5, answer_s: float = ANSWER_S) -> None:
+        self._socket, self._timeout_s, self._answer_s = socket, timeout_s, answer_s
+        self._request_id, self._response_id = REQUEST_ID + node, RESPONSE_ID + node
+
+    def wait_longer(self, timeout_s: float) -> None:
+        """Wait at least so long for an answer from here on: the node has given its first one."""
+        self._timeout_s = max(self._timeout_s, timeout_s)
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """Upload an object, expedited or segmented."""
+        return self._exchange(index, subindex, None)
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """Download an object, expedited up to 4 bytes."""
+        self._exchange(index, subindex, data)
+
+    def _exchange(self, index: int, subindex: int, data: bytes | None) -> bytes:
+        self._replies(0.0)  # to a request that was given up
+        now, timeout_s = time.monotonic(), self._timeout_s
+        exchange = Exchange(index, subindex, data, now=now, timeout_s=timeout_s, answer_s=self._answer_s)
+        self._send(exchange.begin())
+        while not exchange.ended:
+            for reply in self._replies(max(exchange.due - time.monotonic(), 1e-4)):
+                self._send(exchange.on_reply(reply, time.monotonic()))
+            self._send(exchange.tick(time.monotonic()))  # also in a flood of foreign answers
+        if exchange.refusal is not None:
+            raise SdoAbort(exchange.refusal)
+        if exchange.value is None:
+            raise SdoTimeout(self._timeout_s)
+        return exchange.value
+
+    def _send(self, requests: list[bytes]) -> None:
+        """Send requests; one that is lost is repeated by the exchange."""
+        for request in requests:
+            self._socket.send(pack(self._request_id, request))
+
+    def _replies(self, timeout_s: float) -> list[bytes]:
+        """Return the node's frames that have come, after `timeout_s` at the latest."""
+        socket = self._socket
+        socket.wait(timeout_s)
+        frames = [FRAME.unpack_from(socket.frames, FRAME_SIZE * n) for n in range(socket.receive())]
+        return [data[:length] for can_id, length, data in frames if can_id == self._response_id]

@@ -13,23 +13,25 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from jtqd.drivers.devices import (
-    DECIMALS_OBJECT,
-    DRIVE_SCALING_OBJECTS,
-    SYNC_COB_ID,
-    UNIT_OBJECT,
-    drive_tpdo1,
-    drive_tpdo2,
-    sensor_tpdo1,
-)
+from jtqd.drivers.drive import DRIVE_SCALING_OBJECTS, OTHER_SCALING_OBJECTS, drive_tpdo1, drive_tpdo2
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import CAN_EFF_MASK, FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
-from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID
-from jtqd.drivers.sdo import ANSWER_S, REQUEST_ID, RESPONSE_ID, Key, SdoAbort, Transfer, label
-from jtqd.drivers.sdo_client import SdoAccess, SdoClient, SdoTimeout
-from jtqd.drivers.units import OTHER_SCALING_OBJECTS
+from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID, SYNC_COB_ID
+from jtqd.drivers.sdo import (
+    ANSWER_S,
+    REQUEST_ID,
+    RESPONSE_ID,
+    Key,
+    SdoAbort,
+    SdoAccess,
+    SdoClient,
+    SdoTimeout,
+    Transfer,
+    label,
+)
+from jtqd.drivers.sensor import DECIMALS_OBJECT, UNIT_OBJECT, sensor_tpdo1
 
 DRIVE, SENSOR = 402, 404
 """Device profiles: low 16 bits of 1000h."""

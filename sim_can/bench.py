@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jtqd.drivers.devices import COMMANDER_NODE, JTQD_NODE, SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.nmt import HEARTBEAT_BASE
+from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.drivers.sdo import REQUEST_ID
 from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.demo import demo_current, demo_velocity

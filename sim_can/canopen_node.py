@@ -15,10 +15,9 @@ from functools import partial
 from jtqd.drivers import nmt
 from jtqd.drivers.emcy import EMCY_BASE, ErrorHistory
 from jtqd.drivers.frame import pack
-from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.object_dictionary import ObjectStore, SdoServer
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap, PdoParameters
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, SdoAbort
-from jtqd.drivers.sdo_server import SdoServer
 from jtqd.sim_can.transmit import NEVER_NS, TransmitPdo
 
 _NS_PER_MS = 1_000_000

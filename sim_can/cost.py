@@ -6,9 +6,10 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from jtqd.drivers.devices import SYNC_COB_ID, drive_tpdo1, drive_tpdo2, sensor_tpdo1
-from jtqd.drivers.pdo import PdoMap
+from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2
+from jtqd.drivers.pdo import SYNC_COB_ID, PdoMap
 from jtqd.drivers.sdo import REQUEST_ID
+from jtqd.drivers.sensor import sensor_tpdo1
 from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.plants import AnyPlant

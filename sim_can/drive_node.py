@@ -11,7 +11,7 @@ from collections.abc import Callable
 from fractions import Fraction
 from typing import Final
 
-from jtqd.drivers.devices import TEMPERATURE_C_PER_UNIT
+from jtqd.drivers.drive import TEMPERATURE_C_PER_UNIT
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 from jtqd.sim_can.canopen_node import CURRENT as CURRENT_ERROR

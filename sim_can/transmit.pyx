@@ -11,7 +11,7 @@ from libc.string cimport memcpy, memset
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
 
-from jtqd.drivers import devices, pdo as pdos
+from jtqd.drivers import drive, pdo as pdos
 
 NEVER_NS = 1 << 62
 NOT_VALID, POSITIVE_OVERLOAD, NEGATIVE_OVERLOAD = 1, 2, 4
@@ -19,7 +19,7 @@ NOT_VALID, POSITIVE_OVERLOAD, NEGATIVE_OVERLOAD = 1, 2, 4
 MAX_16, MAX_32 = 0x7FFF, 0x7FFF_FFFF
 
 cdef int LAST_SYNC_TYPE = pdos.LAST_SYNC_TYPE
-cdef int64_t NS_PER_MS = 1_000_000, NEVER = NEVER_NS, NOT_MEASURED = devices.NOT_MEASURED
+cdef int64_t NS_PER_MS = 1_000_000, NEVER = NEVER_NS, NOT_MEASURED = drive.NOT_MEASURED
 cdef int INVALID = NOT_VALID, ABOVE = POSITIVE_OVERLOAD, BELOW = NEGATIVE_OVERLOAD
 
 

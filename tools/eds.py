@@ -13,15 +13,18 @@ from pathlib import Path
 
 import jtqd.drivers.eds
 from jtqd.daemon.shared.counters import OBJECT_2200
-from jtqd.drivers.devices import CONTACT_BASES, ESTIMATE_BASES, contact_tpdos, estimate_tpdos
-from jtqd.drivers.eds.own_objects import (
+from jtqd.drivers.own_objects import (
     BUS_FIELDS,
+    CONTACT_BASES,
+    ESTIMATE_BASES,
     JOINT_PARAMETERS,
     PARAMETERS,
     ROOM,
     VERSION,
     ZERO_FIELDS,
     ZEROS,
+    contact_tpdos,
+    estimate_tpdos,
     own_sheet,
 )
 from jtqd.drivers.pdo import INVALID as PDO_INVALID

@@ -16,9 +16,9 @@ from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
 from jtqd.drivers.bus_load import BusLoad, configured_load
-from jtqd.drivers.eds.own_objects import own_sheet
+from jtqd.drivers.drive import tpdos_as_json
 from jtqd.drivers.emcy import COMMUNICATION
-from jtqd.drivers.layout import tpdos_as_json
+from jtqd.drivers.own_objects import own_sheet
 
 _EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 from jtqd.daemon.shared.conditions import Change
 from jtqd.daemon.shared.log_lines import RateLimit
-from jtqd.drivers.eds.own_objects import BUS_FIELDS
 from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, Emergency, ErrorHistory, describe, parse
 from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.own_objects import BUS_FIELDS
 
 ACTIVE, WARNING, PASSIVE, BUS_OFF, DOWN = 0, 1, 2, 3, 4
 STATE_NAMES = ("error active", "error warning", "error passive", "bus-off", "interface down")

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
-from jtqd.drivers.boot_procedure import VERIFY_CONFIGURATION, signature
+from jtqd.drivers.boot_node import VERIFY_CONFIGURATION, signature
 from jtqd.drivers.nmt import STATES
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue, SdoResult
 
@@ -235,7 +235,7 @@ class ConfigurationWatch:
     A node with 1020h shows whether anybody has written to its configuration: the object holds the signature that the boot
     wrote, until somebody does (CiA 301). It need not cover the scaling, and a value may change by other ways than an SDO. So
     all objects are read, one after the other and again from the beginning, that the meaning of its PDOs depends on
-    (`jtqd.drivers.boot_procedure`): COB-ID, transmission type and mapping of the TPDOs, rated current, encoder resolutions,
+    (`jtqd.drivers.boot_node`): COB-ID, transmission type and mapping of the TPDOs, rated current, encoder resolutions,
     gear ratio, the sensor's unit and decimals. The signature is read between them, in every `SIGNATURE_EVERY`th reading.
 
     A signature that is gone while these are unchanged is somebody else's business (the commander maps RPDOs) and is logged

@@ -17,21 +17,20 @@ from jtqd.daemon.core.estimate_pdo import field
 from jtqd.daemon.shared.counters import OBJECT_2200, RECORDER_LOST
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader
-from jtqd.drivers.boot_procedure import signature
-from jtqd.drivers.devices import contact_tpdos
-from jtqd.drivers.eds.own_objects import (
+from jtqd.drivers.boot_node import signature
+from jtqd.drivers.object_dictionary import ObjectStore, SdoServer
+from jtqd.drivers.own_objects import (
     BUS_FIELDS,
     JOINT_PARAMETERS,
     PARAMETERS,
     VERSION,
     ZERO_FIELDS,
     ZEROS,
+    contact_tpdos,
     room_for,
 )
-from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
-from jtqd.drivers.sdo_server import SdoServer
 from jtqd.estimator.settings import age_ms
 from jtqd.estimator.status import CONTACT_CODES, OFF, STALE
 

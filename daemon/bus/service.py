@@ -32,12 +32,12 @@ from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy, nmt
-from jtqd.drivers.devices import COMMANDER_NODE
 from jtqd.drivers.emcy import describe, name_of
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.own_objects import COMMANDER_NODE
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
 
 FILE = "bus.json"

@@ -2,7 +2,7 @@
 
 Units (CiA 402-2): 60A8h and 60A9h name them, and 6092h says how many of them are one turn of the driving shaft. All count
 behind the gear that the drive knows (6091h); a drive whose 6091h is 1:1 counts at the motor's shaft. A word 0, and a feed
-constant of 1, are those of a drive that was not told any unit: then the objects of `devices.CIA_402` scale it.
+constant of 1, are those of a drive that was not told any unit: then the objects of `drive.CIA_402` scale it.
 
 TPDOs: those that are sent at each SYNC and carry every quantity were set up for that, and are kept. Those that an EDS says
 cannot be written are kept whatever they are.
@@ -16,22 +16,25 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.drivers.devices import DriveObjects, drive_layout
-from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
-from jtqd.drivers.pdo import PdoError
-from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.survey import Survey, Tpdo
-from jtqd.drivers.units import (
+from jtqd.drivers.drive import (
     AT_JOINT,
     AT_MOTOR,
     GEAR,
     SECOND,
+    DriveObjects,
+    LayoutError,
     ScalingError,
+    chosen,
+    drive_layout,
     is_increments,
+    pdo_of_words,
     si_per_unit,
     unit_of_position,
     unit_of_velocity,
 )
+from jtqd.drivers.pdo import BY_ITSELF, EVERY_SYNC, PdoError
+from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.survey import Survey, Tpdo
 
 _POSITION_UNIT, _VELOCITY_UNIT = (0x60A8, 0), (0x60A9, 0)
 _FEED: tuple[Key, Key] = ((0x6092, 1), (0x6092, 2))
@@ -119,7 +122,7 @@ def _velocity(survey: Survey) -> str:
 def units_told(
     survey: Survey | None, gear_ratio: float, quantities: Iterable[str], by_options: Iterable[str]
 ) -> dict[str, Instead]:
-    """Return by which objects a drive's positions and velocity are scaled, where not by those of `devices.CIA_402`.
+    """Return by which objects a drive's positions and velocity are scaled, where not by those of `drive.CIA_402`.
 
     gear_ratio: of the joint. quantities: those that the drive has. by_options: those that the operator has scaled.
     """

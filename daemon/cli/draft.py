@@ -18,16 +18,9 @@ from typing import Any
 from jtqd.daemon.cli.as_told import Instead, Layout, layout_told, tpdo_lines, unit_problems, units_told
 from jtqd.daemon.config import ObjectsSection
 from jtqd.daemon.profiles import INIT, Family
-from jtqd.drivers.devices import (
-    CIA_402,
-    COMMANDER_NODE,
-    EVERY_SCALING_OBJECT,
-    JTQD_NODE,
-    DriveObjects,
-    DriveProfile,
-    parse_key,
-)
-from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.drive import CIA_402, EVERY_SCALING_OBJECT, GEAR, DriveObjects, DriveProfile
+from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
+from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.drivers.survey import (
     DRIVE,
     IDENTITY,
@@ -38,7 +31,6 @@ from jtqd.drivers.survey import (
     TORQUE,
     Survey,
 )
-from jtqd.drivers.units import GEAR
 from jtqd.estimator.decoder import decode
 
 EFFICIENCY = 0.7

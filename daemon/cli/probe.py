@@ -29,15 +29,11 @@ from jtqd.daemon.cli.init import (
 )
 from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
-from jtqd.drivers.devices import (
-    EVERY_SCALING_OBJECT,
-    SENSOR_SCALING_OBJECTS,
-    drive_layout,
-    sensor_tpdo1,
-)
+from jtqd.drivers.drive import EVERY_SCALING_OBJECT, drive_layout
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.sensor import SENSOR_SCALING_OBJECTS, sensor_tpdo1
 from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, TORQUE, BusSurvey, Survey, SurveyError
 
 _EXAMPLES = """examples:

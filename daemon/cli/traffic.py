@@ -18,7 +18,6 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.input_pdos import input_pdos
 from jtqd.drivers import nmt
-from jtqd.drivers.devices import SYNC_COB_ID, estimate_tpdos
 from jtqd.drivers.emcy import EMCY_BASE
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
@@ -32,6 +31,8 @@ from jtqd.drivers.frame import (
     stuffed_bits,
 )
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
+from jtqd.drivers.own_objects import estimate_tpdos
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
 
 _BIN_NS = 2_000

@@ -7,11 +7,22 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.drivers.devices import CIA_402, DriveObject, DriveObjects, Temperature, drive_layout, parse_key
-from jtqd.drivers.layout import BY_ITSELF, LayoutError, chosen, pdo_of_words
-from jtqd.drivers.pdo import PdoError, PdoMap
-from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.units import AT_JOINT, BY_TORQUE, SCALES, SHAFTS
+from jtqd.drivers.drive import (
+    AT_JOINT,
+    BY_TORQUE,
+    CIA_402,
+    SCALES,
+    SHAFTS,
+    DriveObject,
+    DriveObjects,
+    LayoutError,
+    Temperature,
+    chosen,
+    drive_layout,
+    pdo_of_words,
+)
+from jtqd.drivers.pdo import BY_ITSELF, PdoError, PdoMap
+from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.estimator.checked import ConfigError, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, choice, limits
 
@@ -34,7 +45,7 @@ class _Object:
     factor: Annotated[float, limits(gt=0.0)] | None = None
     """SI units (rad, rad/s, A) per unit; without it the drive's scaling objects count."""
     by: Text | None = None
-    """Which scaling object; `drivers/units.py` has those of each quantity."""
+    """Which scaling object; `drivers/drive.py` has those of each quantity."""
     shaft: Annotated[str, choice(SHAFTS)] | None = None
     """Where the drive counts by 6092h, 60A8h, 60A9h."""
 

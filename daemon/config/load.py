@@ -29,8 +29,7 @@ from jtqd.daemon.config.settings import (
     SafetySettings,
 )
 from jtqd.daemon.profiles import path_of, with_profiles
-from jtqd.drivers.devices import DriveObjects, Temperature
-from jtqd.drivers.layout import chosen, maps_of_json
+from jtqd.drivers.drive import DriveObjects, Temperature, chosen, maps_of_json
 from jtqd.drivers.pdo import PdoMap
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode

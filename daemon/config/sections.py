@@ -14,7 +14,8 @@ from jtqd.daemon.config.settings import (
     Ros2Settings,
     SafetySettings,
 )
-from jtqd.drivers.devices import EVERY_SCALING_OBJECT, SENSOR_SCALING_OBJECTS
+from jtqd.drivers.drive import EVERY_SCALING_OBJECT
+from jtqd.drivers.sensor import SENSOR_SCALING_OBJECTS
 from jtqd.estimator.checked import Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, choice, limits
 from jtqd.estimator.settings import METHODS, EstimatorSettings

@@ -29,8 +29,9 @@ from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record cimport CycleFrames, Header, RecordRing
 from jtqd.daemon.core.schedule cimport Grid, NetworkBudget, WakeUp
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.drivers import devices, nmt
+from jtqd.drivers import nmt, own_objects
 from jtqd.drivers.frame_socket import BusDown
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator import status as st
 
 STARTING_CYCLES: Final = 20
@@ -55,15 +56,15 @@ cdef int ENDED = CYCLE_ENDED, PASSED = SLOT_PASSED, OVER = RUN_ENDED
 cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
 cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
 cdef uint32_t RESET = cr.FLAG_RESET
-cdef uint32_t SYNC = devices.SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
+cdef uint32_t SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
 cdef int STALE = st.STALE, OFF = st.OFF, LAST_NUMBER = _LAST_NUMBER
 cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
 
 cdef uint32_t ESTIMATE[MOST_ESTIMATES]
-ESTIMATE[:] = devices.ESTIMATE_BASES
+ESTIMATE[:] = own_objects.ESTIMATE_BASES
 cdef uint32_t CONTACT[MOST_ESTIMATES]
-CONTACT[:] = devices.CONTACT_BASES
+CONTACT[:] = own_objects.CONTACT_BASES
 
 clock = Clock()
 """Of all cycles that are made from here on; tests put another one in its place."""

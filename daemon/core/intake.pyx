@@ -40,8 +40,9 @@ from libc.string cimport memcmp, memcpy, memset
 from typing import Final
 
 from jtqd.drivers.frame_socket cimport Frame
-from jtqd.drivers import devices, nmt
+from jtqd.drivers import drive, nmt
 from jtqd.drivers import frame as can_frame
+from jtqd.drivers.pdo import SYNC_COB_ID
 
 _LONGEST: Final = 10
 """Slots; after that SYNC goes on and the debts stay."""
@@ -61,7 +62,7 @@ cdef int64_t BAND_MARGIN_NS = _BAND_MARGIN_NS, NARROW_NS = _NARROW_NS
 cdef double BAND_LEAK = _BAND_LEAK
 cdef int64_t NEVER = <int64_t> 1 << 62
 
-cdef uint32_t SYNC = devices.SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
+cdef uint32_t SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint32_t IDENTIFIER = can_frame.CAN_EFF_MASK, NOT_STANDARD = can_frame.CAN_EFF_FLAG | can_frame.CAN_RTR_FLAG
 cdef uint8_t BOOT_UP = nmt.BOOT_UP
 cdef enum:
@@ -74,7 +75,7 @@ if NOT_HEARD in nmt.STATES:
     raise ImportError("a heartbeat may say FFh, which stands for none")
 
 cdef int TEMPERATURE_BYTES = 2
-cdef int NOT_MEASURED = devices.NOT_MEASURED
+cdef int NOT_MEASURED = drive.NOT_MEASURED
 
 _SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4, "Q": 8}
 """Bytes of the objects that a PDO may carry, by their letters in `struct`; a small letter is a signed one."""
@@ -283,7 +284,7 @@ cdef class JointTemperature:
     """
 
     def __init__(
-        self, uint32_t cob_id, int node_id, name, int64_t life_cycles, double c_per_unit=devices.TEMPERATURE_C_PER_UNIT
+        self, uint32_t cob_id, int node_id, name, int64_t life_cycles, double c_per_unit=drive.TEMPERATURE_C_PER_UNIT
     ):
         self.name = name
         self.known.c_per_unit = c_per_unit

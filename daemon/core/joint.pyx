@@ -362,6 +362,6 @@ cdef Input *_input(Intake intake, int index, int count) except NULL:
 
 
 cdef const int64_t *_number_at(Intake intake, place) except NULL:
-    """Return where a number lies when its PDO has come (`drivers.layout.Place`); raises ValueError without such an entry."""
+    """Return where a number lies when its PDO has come (`drivers.drive.Place`); raises ValueError without such an entry."""
     cdef Input *state = _input(intake, place.pdo, place.entry + 1)
     return &state.values[<int> place.entry]

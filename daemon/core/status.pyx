@@ -32,7 +32,7 @@ from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.counters import COUNTERS, word_of
-from jtqd.drivers.cia402 import STATES, TOLD
+from jtqd.drivers.drive import STATES, TOLD
 from jtqd.estimator import status as st
 from jtqd.estimator.observer cimport follow_reference, restart_reference
 from jtqd.estimator.plausibility cimport Plausibility

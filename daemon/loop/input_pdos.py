@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from jtqd.daemon.config import Config
 from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
-from jtqd.drivers.devices import CIA_402, DriveObjects, drive_layout, drive_tpdo3, sensor_tpdo1, sensor_tpdo2
-from jtqd.drivers.layout import BY_ITSELF, Place, places
-from jtqd.drivers.pdo import PdoMap
+from jtqd.drivers.drive import CIA_402, DriveObjects, Place, drive_layout, drive_tpdo3, places
+from jtqd.drivers.pdo import BY_ITSELF, PdoMap
+from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
 POSITIONS = ("motor_position", "link_position")
 """Quantities whose PDOs are FLAG_POSITION of a record; the others are FLAG_MOTION."""
@@ -46,7 +46,7 @@ class JointInputs:
     """Where one joint's inputs lie among the intake's PDOs, and their scaling.
 
     Attributes:
-        places: of each quantity of the drive (`devices.DriveObjects`), its PDO and its entry there.
+        places: of each quantity of the drive (`drive.DriveObjects`), its PDO and its entry there.
         sensor: index of the sensor's PDO, None without reference.
         temperature: index among the intake's temperatures, None where the drive sends none.
         motor_rad_per_count, motor_rad_s_per_unit, link_rad_per_count, ampere_per_unit, sensor_nm_per_unit: scaling, SI.

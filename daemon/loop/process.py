@@ -40,10 +40,10 @@ from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
-from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.filters import CanFilter, look_alikes
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
 from jtqd.estimator.network import FusedNetwork, load_network

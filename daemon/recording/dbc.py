@@ -12,19 +12,12 @@ from typing import TYPE_CHECKING, Any
 from jtqd.daemon.core.contact_pdo import CODE_NAMES, NO_RATE, RATE_UNIT_NM_S
 from jtqd.daemon.core.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
 from jtqd.daemon.recording.schemas import STATUS_NAMES
-from jtqd.drivers.devices import (
-    NOT_MEASURED,
-    SYNC_COB_ID,
-    contact_tpdos,
-    drive_tpdo3,
-    estimate_tpdos,
-    sensor_tpdo1,
-    sensor_tpdo2,
-)
+from jtqd.drivers.drive import NOT_MEASURED, drive_tpdo3, places
 from jtqd.drivers.emcy import EMCY_BASE
-from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import HEARTBEAT_BASE, STATES
-from jtqd.drivers.pdo import PdoMap
+from jtqd.drivers.own_objects import contact_tpdos, estimate_tpdos
+from jtqd.drivers.pdo import SYNC_COB_ID, PdoMap
+from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
 if TYPE_CHECKING:
     from jtqd.daemon.config import Config

@@ -22,7 +22,7 @@ from jtqd.daemon.recording.progress import Account, ProgressFile
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.runtime_dir import versions
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.drivers.eds.own_objects import own_sheet
+from jtqd.drivers.own_objects import own_sheet
 
 _STARTS = 5
 """A recorder that has been started more often than this in a minute waits for `_LONG_PAUSE_S`."""

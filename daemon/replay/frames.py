@@ -17,7 +17,7 @@ import numpy.typing as npt
 from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, input_pdos, joint_temperatures
 from jtqd.daemon.replay.origin import Origin
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR
-from jtqd.drivers.devices import estimate_tpdos
+from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray
 
 _HALF, _FULL = 1 << 31, 1 << 32

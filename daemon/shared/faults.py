@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from jtqd.drivers.cia402 import State
+from jtqd.drivers.drive import State
 from jtqd.estimator import status as st
 from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 

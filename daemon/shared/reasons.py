@@ -16,7 +16,7 @@ from jtqd.daemon.shared.snapshot import (
     JointView,
     View,
 )
-from jtqd.drivers.cia402 import State, state_of
+from jtqd.drivers.drive import State, state_of
 from jtqd.estimator import status as st
 from jtqd.estimator.learned import APART, LEFT, Zeros
 

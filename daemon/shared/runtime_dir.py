@@ -169,7 +169,7 @@ class About:
     log_prefix: str
     versions: dict[str, str]
     tpdos: dict[str, Any] = field(default_factory=dict)
-    """TPDOs of the drives as they are in force, by node-ID (`layout.tpdos_as_json`)."""
+    """TPDOs of the drives as they are in force, by node-ID (`drive.tpdos_as_json`)."""
 
     @property
     def nodes(self) -> dict[int, str]:

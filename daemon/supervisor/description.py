@@ -10,7 +10,7 @@ from pathlib import Path
 from jtqd.daemon.config import Config, JointConfig
 from jtqd.daemon.loop.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint, start_ticks, versions
-from jtqd.drivers.layout import tpdos_as_json
+from jtqd.drivers.drive import tpdos_as_json
 
 
 def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:

@@ -10,17 +10,12 @@ from typing import Final
 
 from jtqd.daemon.config import JointConfig, load_config
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
-from jtqd.drivers.devices import (
-    CIA_402,
-    COMMANDER_NODE,
-    DriveProfile,
-    Identity,
-    SensorProfile,
-    Temperature,
-    parse_key,
-)
+from jtqd.drivers.drive import CIA_402, DriveProfile, Temperature
+from jtqd.drivers.object_dictionary import Identity
+from jtqd.drivers.own_objects import COMMANDER_NODE
 from jtqd.drivers.pdo import PdoMap
-from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.sdo import Key, label, parse_key
+from jtqd.drivers.sensor import SensorProfile
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.campaign.processes import on_time

@@ -14,8 +14,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from jtqd.drivers.cia402 import State, fast_state
-from jtqd.drivers.devices import COMMANDER_NODE, SYNC_COB_ID
+from jtqd.drivers.drive import State, fast_state
+from jtqd.drivers.own_objects import COMMANDER_NODE
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.sysid.motion.drives import (
     QUICK_STOP_WORD,
     Commands,

@@ -10,7 +10,7 @@ failure is a BootError: one line with node, object, expected and found.
     Commands, Heartbeat                                     the frames that the commander sends
 
 Controlwords: CiA 402-2, table "command coding". A drive is led one state at a time; each step waits until the statusword
-(`jtqd.drivers.cia402`) has confirmed the one before.
+(`jtqd.drivers.drive`) has confirmed the one before.
 """
 
 from __future__ import annotations
@@ -24,29 +24,27 @@ from dataclasses import dataclass
 from typing import Final
 
 from jtqd.drivers import nmt
-from jtqd.drivers.boot_error import BootError, mismatch
-from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
-from jtqd.drivers.cia402 import State, state_of
-from jtqd.drivers.devices import (
-    COMMANDER_NODE,
-    JTQD_NODE,
-    SYNC_COB_ID,
+from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot, NodeObjects, mismatch
+from jtqd.drivers.drive import (
     DriveObjects,
     DriveProfile,
     DriveScaling,
-    SensorProfile,
-    SensorScaling,
+    LayoutError,
+    State,
+    chosen,
     drive_rpdo1,
     drive_rpdo2,
     drive_tpdo3,
+    pdo_of_words,
+    state_of,
 )
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
-from jtqd.drivers.layout import EVERY_SYNC, LayoutError, chosen, pdo_of_words
-from jtqd.drivers.pdo import CAN_ID, INVALID, PdoError, PdoMap, split_word
-from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, Transfer
-from jtqd.drivers.sdo_client import NodeObjects, SdoAccess, SdoClient
+from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
+from jtqd.drivers.pdo import CAN_ID, EVERY_SYNC, INVALID, SYNC_COB_ID, PdoError, PdoMap, split_word
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, SdoAccess, SdoClient, Transfer
+from jtqd.drivers.sensor import SensorProfile, SensorScaling
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
 
 CSV: Final = 9

@@ -14,19 +14,12 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
-from jtqd.drivers.cia402 import State, fast_state
-from jtqd.drivers.devices import (
-    NOT_MEASURED,
-    SYNC_COB_ID,
-    TEMPERATURE_C_PER_UNIT,
-    drive_tpdo3,
-    sensor_tpdo1,
-    sensor_tpdo2,
-)
+from jtqd.drivers.drive import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, State, drive_tpdo3, fast_state, places
 from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
-from jtqd.drivers.layout import places
 from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, OPERATIONAL, STATES
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.drivers.sdo import RESPONSE_ID
+from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 from jtqd.sysid.motion.drives import FAULTED, POWERED, DriveUnits, SensorUnits, describe
 from jtqd.sysid.motion.setpoints import JointSample, Sample, Timing, Violation
 

@@ -16,10 +16,11 @@ from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Final
 
-from jtqd.drivers.devices import DriveProfile, SensorProfile
+from jtqd.drivers.drive import DriveProfile
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import CAPACITY, BusError, FrameSocket, open_frame_socket
+from jtqd.drivers.sensor import SensorProfile
 from jtqd.sysid.motion.commander import Commander, Frame
 from jtqd.sysid.motion.drives import BenchSetup
 from jtqd.sysid.motion.setpoints import (

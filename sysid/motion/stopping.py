@@ -13,7 +13,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import Final
 
-from jtqd.drivers.cia402 import State, fast_state
+from jtqd.drivers.drive import State, fast_state
 from jtqd.sysid.motion.drives import (
     DISABLE_VOLTAGE,
     POWERED,

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, LogFile, Records, iter_topics, log_parts, topics_of
-from jtqd.drivers.cia402 import STATES, TOLD, State
-from jtqd.drivers.devices import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, drive_tpdo3
+from jtqd.drivers.drive import NOT_MEASURED, STATES, TEMPERATURE_C_PER_UNIT, TOLD, State, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, counted
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable

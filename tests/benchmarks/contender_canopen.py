@@ -21,8 +21,9 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop import process as loop
 from jtqd.drivers.can_unix import UnixBus
-from jtqd.drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1
+from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2
 from jtqd.drivers.pdo import PdoMap
+from jtqd.drivers.sensor import sensor_tpdo1
 from jtqd.estimator.status import OFF, PUBLISHED, STALE
 from tests.benchmarks.contender import ROOT, Task, serve
 from tests.benchmarks.fixture import Fixture

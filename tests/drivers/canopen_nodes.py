@@ -8,15 +8,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
-from jtqd.drivers.boot import BootBus, BootReport, boot
-from jtqd.drivers.boot_request import parse_request
+from jtqd.drivers.boot import BootBus, BootReport, boot, parse_request
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
-from jtqd.drivers.object_dictionary import ObjectStore
+from jtqd.drivers.object_dictionary import ObjectStore, SdoServer
 from jtqd.drivers.pdo import PdoParameters
-from jtqd.drivers.sdo_server import SdoServer
 from tests.paths import EDS
 
 

@@ -8,21 +8,12 @@ import time
 
 import pytest
 
-from jtqd.drivers.boot_error import BootError
-from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
-from jtqd.drivers.boot_request import RequestError, parse_request
-from jtqd.drivers.devices import (
-    DriveProfile,
-    Identity,
-    SensorProfile,
-    Temperature,
-    drive_tpdo1,
-    drive_tpdo2,
-    drive_tpdo3,
-    sensor_tpdo1,
-    sensor_tpdo2,
-)
+from jtqd.drivers.boot import RequestError, parse_request
+from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot
+from jtqd.drivers.drive import DriveProfile, Temperature, drive_tpdo1, drive_tpdo2, drive_tpdo3
+from jtqd.drivers.object_dictionary import Identity
 from jtqd.drivers.pdo import PdoParameters
+from jtqd.drivers.sensor import SensorProfile, sensor_tpdo1, sensor_tpdo2
 from tests.drivers.canopen_nodes import HubResponder, Responder, TestNode, boot_all, drive_store, sensor_store
 from tests.paths import ROOT
 

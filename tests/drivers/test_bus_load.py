@@ -13,7 +13,8 @@ from jtqd.drivers.bus_load import (
     sync_row,
     temperature_row,
 )
-from jtqd.drivers.devices import drive_tpdo1, estimate_tpdos
+from jtqd.drivers.drive import drive_tpdo1
+from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.drivers.pdo import PdoMap
 from jtqd.models.files import shipped
 

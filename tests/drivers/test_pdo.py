@@ -8,7 +8,7 @@ import pytest
 
 from jtqd import drivers
 from jtqd.drivers import pdo as pdo_module
-from jtqd.drivers.devices import drive_tpdo1, drive_tpdo2, drive_tpdo3
+from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2, drive_tpdo3
 from jtqd.drivers.pdo import MappedObject, PdoError, PdoMap, PdoParameters, split_word
 from jtqd.drivers.sdo import SdoAbort
 from tests.drivers.canopen_nodes import drive_store, sensor_store

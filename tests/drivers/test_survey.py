@@ -9,10 +9,8 @@ import pytest
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
-from jtqd.drivers.object_dictionary import EdsError, ObjectStore, read_eds
-from jtqd.drivers.sdo import GENERAL_ERROR, REQUEST_ID, RESPONSE_ID, SdoAbort
-from jtqd.drivers.sdo_client import SdoTimeout
-from jtqd.drivers.sdo_server import SdoServer
+from jtqd.drivers.object_dictionary import EdsError, ObjectStore, SdoServer, read_eds
+from jtqd.drivers.sdo import GENERAL_ERROR, REQUEST_ID, RESPONSE_ID, SdoAbort, SdoTimeout
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, SurveyError, Tpdo, survey, survey_of_eds, tpdos
 from tests.paths import ROOT
 

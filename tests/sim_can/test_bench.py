@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.drivers.devices import COMMANDER_NODE
 from jtqd.drivers.frame import FRAME
 from jtqd.drivers.nmt import RESET_COMMUNICATION, RESET_NODE, START
+from jtqd.drivers.own_objects import COMMANDER_NODE
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import bench_filters
 from jtqd.sim_can.drive_control import DriveControl

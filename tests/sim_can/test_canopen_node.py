@@ -5,8 +5,8 @@ import struct
 
 import pytest
 
-from jtqd.drivers.devices import sensor_tpdo2
 from jtqd.drivers.nmt import ENTER_PRE_OPERATIONAL, RESET_COMMUNICATION, RESET_NODE, START, STOP
+from jtqd.drivers.sensor import sensor_tpdo2
 from jtqd.sim_can.source import CURRENT
 from tests.sim_can.bench_player import (
     MS,

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.drivers.devices import drive_tpdo1, drive_tpdo2, sensor_tpdo1
+from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
+from jtqd.drivers.sensor import sensor_tpdo1
 from jtqd.sim_can.command import main
 from jtqd.sim_can.cost import map_pdos
 

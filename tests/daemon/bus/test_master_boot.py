@@ -6,11 +6,9 @@ from typing import Any
 
 import pytest
 
-from jtqd.drivers.boot import BootReport
-from jtqd.drivers.boot_error import BootError
-from jtqd.drivers.boot_procedure import signature
-from jtqd.drivers.boot_request import RequestError, parse_request
-from jtqd.drivers.devices import drive_tpdo1
+from jtqd.drivers.boot import BootReport, RequestError, parse_request
+from jtqd.drivers.boot_node import BootError, signature
+from jtqd.drivers.drive import drive_tpdo1
 from jtqd.drivers.frame import FRAME
 from tests.drivers.canopen_nodes import HubResponder, TestNode, boot_all, drive_store, sensor_store
 

@@ -10,7 +10,7 @@ import pytest
 
 from jtqd.daemon.bus import nodes as node_care
 from jtqd.drivers.bus_load import LIMIT, configured_load
-from jtqd.drivers.devices import drive_tpdo1
+from jtqd.drivers.drive import drive_tpdo1
 from jtqd.drivers.frame import worst_case_bits
 from tests.daemon.bus.master_bench import MasterBench
 

@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from jtqd.daemon.bus.nodes import ACTIVE
-from jtqd.drivers.devices import drive_tpdo1, sensor_tpdo1
+from jtqd.drivers.drive import drive_tpdo1
 from jtqd.drivers.frame import CAN_ERR_FLAG
+from jtqd.drivers.sensor import sensor_tpdo1
 from tests.daemon.bus.master_bench import OWN, MasterBench
 
 pytestmark = pytest.mark.native

@@ -16,7 +16,7 @@ from jtqd.daemon.bus.nodes import (
     NodeWatch,
     checks_of,
 )
-from jtqd.drivers.boot_procedure import signature
+from jtqd.drivers.boot_node import signature
 
 
 def frame(text: str) -> bytes:

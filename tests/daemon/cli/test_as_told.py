@@ -21,7 +21,7 @@ from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.as_told import layout_told, unit_problems, units_told
 from jtqd.daemon.cli.draft import Wanted, draft_joint, drive_lines
 from jtqd.daemon.config import load_config
-from jtqd.drivers.devices import CIA_402, DriveProfile, drive_scaling
+from jtqd.drivers.drive import CIA_402, DriveProfile, drive_scaling
 from jtqd.drivers.survey import Survey, Tpdo, survey_of_eds
 from tests.drivers.canopen_nodes import booted
 from tests.library_drives.bench import LibraryBench

@@ -22,7 +22,7 @@ from jtqd.daemon.cli.draft import (
     plain,
 )
 from jtqd.daemon.config import load_config
-from jtqd.drivers.devices import DriveProfile, drive_scaling
+from jtqd.drivers.drive import DriveProfile, drive_scaling
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.drivers.survey import survey
 from tests.paths import ROOT

@@ -13,7 +13,7 @@ from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from jtqd.drivers.devices import estimate_tpdos
+from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped

@@ -8,7 +8,7 @@ import pytest
 
 from jtqd.daemon.core.estimate_pdo import encode
 from jtqd.daemon.recording.dbc import Quantity, dbc_of, dbc_text
-from jtqd.drivers.devices import CIA_402, Temperature, drive_layout
+from jtqd.drivers.drive import CIA_402, Temperature, drive_layout
 from jtqd.drivers.pdo import MappedObject, PdoMap
 
 TURN = 2 * math.pi

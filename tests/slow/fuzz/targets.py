@@ -78,7 +78,7 @@ def _read_log(path: Path) -> None:
 
 
 def _read_request(path: Path) -> None:
-    from jtqd.drivers.boot_request import parse_request
+    from jtqd.drivers.boot import parse_request
 
     parse_request(json.loads(path.read_bytes()))
 
@@ -100,7 +100,7 @@ def targets(directory: Path) -> list[Target]:
     from jtqd.daemon.config import load_config
     from jtqd.daemon.logs import LogError, export, recover
     from jtqd.daemon.replay import command as replay_command
-    from jtqd.drivers.boot_request import RequestError
+    from jtqd.drivers.boot import RequestError
     from jtqd.drivers.object_dictionary import EdsError, read_eds
     from jtqd.estimator.checked import ConfigError
     from jtqd.estimator.onnx_graph import NetworkError

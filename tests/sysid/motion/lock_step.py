@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.drivers.boot_procedure import BusSettings, NodeBoot
-from jtqd.drivers.devices import DriveProfile, SensorProfile
+from jtqd.drivers.boot_node import BusSettings, NodeBoot
+from jtqd.drivers.drive import DriveProfile
 from jtqd.drivers.frame import FRAME
 from jtqd.drivers.sdo import Transfer
+from jtqd.drivers.sensor import SensorProfile
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.eds_entries import sensor_node

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jtqd.drivers.cia402 import State, fast_state, state_of
+from jtqd.drivers.drive import State, fast_state, state_of
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.drives import (
     DISABLE_VOLTAGE,

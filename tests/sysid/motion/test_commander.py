@@ -7,9 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.drivers.boot_error import BootError
-from jtqd.drivers.devices import CIA_402, DriveObject, DriveProfile
-from jtqd.drivers.layout import pdo_of_words
+from jtqd.drivers.boot_node import BootError
+from jtqd.drivers.drive import CIA_402, DriveObject, DriveProfile, pdo_of_words
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
 from jtqd.sysid.motion.stopping import Phase

@@ -2,9 +2,10 @@
 
 import pytest
 
-from jtqd.drivers.boot_error import BootError
-from jtqd.drivers.devices import DriveProfile, SensorProfile
+from jtqd.drivers.boot_node import BootError
+from jtqd.drivers.drive import DriveProfile
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoAbort
+from jtqd.drivers.sensor import SensorProfile
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.drives import (
     CST,
