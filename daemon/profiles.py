@@ -3,7 +3,7 @@
 A profile is one of `drivers/profiles/` or a file beside the configuration. `with_profiles` puts its values below those of
 the configuration; `jtq init` and `jtq probe` recognise a family by its vendor-ID (1018h:1), read the objects that hold what
 differs from drive to drive, and compare those that the values rest on. `python -m jtqd.daemon.profiles` prints the tables
-of docs/profiles.md.
+of docs/bus.md.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def _has(mapping: Any, key: str) -> bool:
 
 
 def table(family: Family) -> Iterator[str]:
-    """Yield the lines of a family's table in docs/profiles.md."""
+    """Yield the lines of a family's table in docs/bus.md."""
     yield "| key | value | why | source | known |"
     yield "|---|---|---|---|---|"
     for line in family.lines:

@@ -1,4 +1,4 @@
-"""Contact: a sudden torque from outside on the link, told by the link's momentum. Why so, figures, limits: docs/contact.md.
+"""Contact: a sudden torque from outside on the link, told by the link's momentum. Why so, figures, limits: docs/estimator.md.
 
 Link side of one joint, own frame; neither current nor friction is in it. k: sample, T: step, q: link position:
 

@@ -41,7 +41,7 @@ CURRENT_FROZEN: Final = 0x40
 
 
 CONTACT_CODES: Final = (0, 1, 2, 3)
-"""Of a contact: not watched, not known, none, there (docs/contact.md)."""
+"""Of a contact: not watched, not known, none, there (docs/estimator.md)."""
 
 
 class Estimate(NamedTuple):

@@ -4,7 +4,7 @@
 
 Every joint is diagnosed by itself on both runs, with the joint file that one can write down without measuring
 (models/kinova_gen3). Printed are verdict, gap, causes with their classes, and the gain on the run left out; written are
-findings.json and report.html of each joint, and the figures of docs/measured_diagnosis.md.
+findings.json and report.html of each joint, and the figures of docs/results.md.
 """
 
 from __future__ import annotations

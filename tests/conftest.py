@@ -2,7 +2,7 @@
 
 In the second case the selected tests run in a pytest of their own inside the guest, and every report of that
 pytest (pass, failure with its traceback, skip, captured output) becomes the report of the same test here.
-See docs/bench_kernel.md.
+See docs/testing.md.
 """
 
 import json

@@ -82,21 +82,3 @@ def test_the_examples_of_docstrings_run(name: str) -> None:
     result = doctest.testmod(importlib.import_module(name))
     assert result.attempted
     assert not result.failed
-
-
-COMMAND = re.compile(r"`pytest (tests/[\w/]+\.py)(?: -m \w+)?(?: -k (\w+|\"[\w ]+\"))?`")
-
-
-def test_every_command_of_the_drives_page_names_tests_that_are_there() -> None:
-    """Each word behind -k, joined by "or", is part of the name of a test of that file."""
-    rows = [line for line in (ROOT / "docs" / "drives.md").read_text().splitlines() if line.startswith("| ")][
-        1:
-    ]
-    assert len(rows) > 20
-    for row in rows:
-        found = COMMAND.findall(row)
-        assert found, row
-        for path, words in found:
-            names = re.findall(r"^def (test_\w+)", (ROOT / path).read_text(), re.MULTILINE)
-            for word in words.strip('"').split(" or ") if words else ():
-                assert any(word in name for name in names), row

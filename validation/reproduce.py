@@ -3,7 +3,7 @@
 Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. A step begins when all
 that it reads is there; with --jobs several are at work at once. Campaigns go on where they were interrupted; fits and
 training give the same files from the same runs. With `--plant` the bench is another one
-(docs/benches.md), and its campaigns are emulated without a bus, with the true torques beside the runs.
+(docs/testing.md), and its campaigns are emulated without a bus, with the true torques beside the runs.
 """
 
 from __future__ import annotations

@@ -532,7 +532,7 @@ def drive_lines(joint: JointDraft) -> list[str]:
             entry = f'    "{label(*key)}": {round(value.number)}'
             lines.append(f"{entry:<25} # {'GUESS, ' * value.guess}{value.origin}")
     if joint.family is not None:
-        lines.append(f"  profile: {joint.family.name:<15}# docs/profiles.md")
+        lines.append(f"  profile: {joint.family.name:<15}# docs/bus.md")
     rest = "CiA 402" if joint.family is None else "the profile"
     if joint.own or joint.instead:
         lines.append(f"  objects:                # of this drive; all else is as in {rest}")

@@ -100,7 +100,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--profile",
         choices=[*profile_names(), "none"],
-        help="profile of the drives' family (default: by their vendor-ID; docs/profiles.md)",
+        help="profile of the drives' family (default: by their vendor-ID; docs/bus.md)",
     )
     made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
     made.add_argument("--force", action="store_true", help="replace files that are there")

@@ -59,7 +59,7 @@ def parser() -> argparse.ArgumentParser:
     made.add_argument(
         "--profile",
         choices=[*profile_names(), "none"],
-        help="profile of its family (default: by its vendor-ID; docs/profiles.md)",
+        help="profile of its family (default: by its vendor-ID; docs/bus.md)",
     )
     made.add_argument(
         "--joint",
@@ -239,7 +239,7 @@ def text(
     """Return everything for people."""
     lines = [f"node {survey.node}: {description(survey)}"]
     if family is not None:
-        lines.append(f"profile {family.name}: {family.title} (docs/profiles.md)")
+        lines.append(f"profile {family.name}: {family.title} (docs/bus.md)")
     lines += [_object(key, _value(key, value)) for key, value in sorted(survey.numbers.items())]
     lines += [_object(key, "not there") for key in sorted(survey.missing)]
     lines.append("TPDOs as they are now (jtqd writes its own mapping at its start, where the drive lets it)")

@@ -223,7 +223,9 @@ def load_config(path: Path | None) -> Config:
     )
 
 
-_ONE_SENSOR: Final = "one section 'sensor': a bus has one sensor node with 1 or 2 channels (docs/arm.md)"
+_ONE_SENSOR: Final = (
+    "one section 'sensor': a bus has one sensor node with 1 or 2 channels (docs/deployment.md)"
+)
 
 
 def _check_one_sensor(path: Path, mapping: Mapping[str, object]) -> None:

@@ -93,7 +93,7 @@ class Realtime:
 
 @dataclass(frozen=True, slots=True)
 class ContactSettings:
-    """Section `contact`: torque rate and contact of every joint (docs/contact.md); without the section nobody watches.
+    """Section `contact`: torque rate and contact of every joint (docs/estimator.md); without the section nobody watches.
 
     Attributes:
         threshold_nm: torque from outside that is a contact; None: 5 % of the joint's rated torque.

@@ -1,4 +1,4 @@
-"""The contact PDOs of node 20h: four bytes for two joints, so that they fit beside everything else at 1 kHz (docs/contact.md).
+"""The contact PDOs of node 20h: four bytes for two joints, so that they fit beside everything else at 1 kHz (docs/estimator.md).
 
 COB-ID 3A0h holds joints 1 and 2; 4A0h, of the same form, joints 3 and 4. A joint that there is not has code 0.
 

@@ -450,7 +450,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of the process."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if len(arguments) != 1 or arguments[0].startswith("-"):
-        _warn("usage: python -m jtqd.daemon.recording.recorder REQUEST.json (see docs/recording.md)")
+        _warn("usage: python -m jtqd.daemon.recording.recorder REQUEST.json (see docs/logs.md)")
         return 2
     try:
         path = Path(arguments[0])

@@ -1,4 +1,4 @@
-"""Contacts of a log beside those of its replay (docs/contact.md). Pure, in arrays."""
+"""Contacts of a log beside those of its replay (docs/estimator.md). Pure, in arrays."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a snapshot says of a joint's contact, in words. Pure; `docs/contact.md` says what it is worth."""
+"""What a snapshot says of a joint's contact, in words. Pure; `docs/estimator.md` says what it is worth."""
 
 from __future__ import annotations
 

@@ -134,7 +134,7 @@ class JointRecord(NamedTuple):
     age_ms: float
     """Group delay of the estimate at low frequency; NaN where no joint file is known."""
     torque_rate_nm_s: float
-    """Of the torsion, through its own filter (docs/contact.md); NaN without torsion."""
+    """Of the torsion, through its own filter (docs/estimator.md); NaN without torsion."""
     contact_nm: float
     """Torque from outside on the link that neither motion nor slow changes explain; NaN where contacts are not watched or
     not known in this cycle."""

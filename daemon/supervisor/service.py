@@ -66,7 +66,7 @@ def metrics_text(
     metric(
         "condition",
         "gauge",
-        "Number of joints, nodes, ... with this condition (docs/faults.md).",
+        "Number of joints, nodes, ... with this condition (docs/testing.md).",
         [(f',name="{name}"', present[name]) for name in CATALOGUE],
     )
     work = zip(_SHARES, reader.work_us(*_SHARES), strict=True)

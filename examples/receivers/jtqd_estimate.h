@@ -11,7 +11,7 @@
  * SYNC counter of the inputs. docs/bus.md describes it, docs/safety.md what a receiver must do.
  *
  * With section `contact` the contact PDO follows it, COB-ID 380h + node (joints 1 and 2) and 480h + node (3 and 4): torque
- * rate I8 and I8 [32 Nm/s], contact (low nibble: first joint), SYNC counter. docs/contact.md says what it can promise.
+ * rate I8 and I8 [32 Nm/s], contact (low nibble: first joint), SYNC counter. docs/estimator.md says what it can promise.
  *     jtqd_contact touched = jtqd_read_contact(&receiver, 1, now_ns);
  *     if (touched.code >= JTQD_CONTACT_POSITIVE) ... stop; else if (touched.code != JTQD_CONTACT_NONE) ... nothing is known
  *

@@ -2,7 +2,7 @@
  *
  *     cc -O2 -o receive_estimate receive_estimate.c && ./receive_estimate can0
  *     ./receive_estimate can0 --joint 2 --max-age-ms 3 --stop-after-ms 20 --max-sigma-nm 2
- *     ./receive_estimate can0 --on-contact stop             with section `contact` of jtqd (docs/contact.md)
+ *     ./receive_estimate can0 --on-contact stop             with section `contact` of jtqd (docs/estimator.md)
  *
  * A bus is a SocketCAN interface, or unix:PATH, the hub of an emulated bench. Replace `react` by your controller:
  *

@@ -20,7 +20,7 @@ import can
 COB_IDS = {0x1A0: (1, 2), 0x2A0: (3, 4)}
 """COB-ID of the estimate PDOs of node 20h, and their joints."""
 CONTACT_COB_IDS = {0x3A0: (1, 2), 0x4A0: (3, 4)}
-"""Of the contact PDOs, with section `contact` (docs/contact.md)."""
+"""Of the contact PDOs, with section `contact` (docs/estimator.md)."""
 LAYOUT = struct.Struct("<hhBBBB")  # torque 1, torque 2, sigma 1, sigma 2, status of both, SYNC counter
 CONTACT_LAYOUT = struct.Struct("<bbBB")  # torque rate 1, torque rate 2, contact of both, SYNC counter
 NO_RATE = -0x80

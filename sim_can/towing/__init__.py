@@ -1,4 +1,4 @@
-"""Towing benches with laws of their own, stand-ins for the real world (docs/benches.md).
+"""Towing benches with laws of their own, stand-ins for the real world (docs/testing.md).
 
 Nothing here comes from the estimator, the effect library or the simulation of a joint file, so that what is judged on these
 benches is not judged by its own equations. From a joint file: name, gear ratio, and the nominal values that a drive knows.

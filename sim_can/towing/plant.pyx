@@ -1,4 +1,4 @@
-"""Two harmonic-drive joints that face each other through a torque sensor: equations of docs/benches.md.
+"""Two harmonic-drive joints that face each other through a torque sensor: equations of docs/testing.md.
 
 Per joint, own frame, J = Jm G² and v = ω/G on the joint side:
 

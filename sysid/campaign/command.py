@@ -1,4 +1,4 @@
-"""`jtq campaign`: options, the plan that they ask for, dry run, and the campaign itself (docs/campaign.md)."""
+"""`jtq campaign`: options, the plan that they ask for, dry run, and the campaign itself (docs/fit.md)."""
 
 from __future__ import annotations
 

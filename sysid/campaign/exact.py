@@ -1,7 +1,7 @@
 """Exact time: a campaign on the emulated bench runs itself in the bench kernel, where computing takes no time.
 
 Real time needs a machine that is on time. Where it is not, and nothing real is on the bus, the clock waits instead: the same
-jtqd, commander and drives on SocketCAN, and no cycle is missed however busy the machine is (docs/bench_kernel.md).
+jtqd, commander and drives on SocketCAN, and no cycle is missed however busy the machine is (docs/testing.md).
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ VELOCITY_RAD_S: Final = 2.0
 """Fastest motion where nothing else is given; joint files have no rated velocity."""
 TEMPERATURE_C: Final = 70.0
 _TORQUE_SHARE: Final = 0.7
-"""Planned torque as a part of the rated one: it rings at a reversal under load (docs/excitation.md)."""
+"""Planned torque as a part of the rated one: it rings at a reversal under load (docs/fit.md)."""
 _CURRENT_SHARE: Final = 0.85
 _INERTIA_SHARE: Final = 0.25
 """Part of the rated torque that goes into accelerating both rotors."""

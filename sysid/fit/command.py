@@ -390,7 +390,7 @@ ONE_ENCODER: Final = (
 )
 FEW_RUNS: Final = (
     f"up to {MOST_RUNS} runs: what they do not tell stays near the joint file and widens sigma "
-    "(docs/measured_runs.md)"
+    "(docs/results.md)"
 )
 
 

@@ -46,7 +46,7 @@ class Prior(NamedTuple):
     """Standard deviations of the prior; `_rated`: parts of the rated torque (per rad/s where it is viscous).
 
     Those of catalogues where these have any, else estimates, settled on emulated joints; what depends on them:
-    docs/measured_runs.md (`python -m validation few_runs --priors`).
+    docs/results.md (`python -m validation few_runs --priors`).
     """
 
     coulomb_share: float = 0.5

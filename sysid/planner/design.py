@@ -320,7 +320,7 @@ POPULATION: Final = 40
 STRATEGY: Final = "randtobest1bin"
 MUTATION: Final = (0.3, 0.7)
 RECOMBINATION: Final = 0.9
-"""Of the differential evolution (docs/excitation.md has the comparison). scipy's own settings take four times as many
+"""Of the differential evolution (docs/fit.md has the comparison). scipy's own settings take four times as many
 evaluations for a design as good."""
 POLISHING: Final = 0.1
 """Share of the evaluations that is kept for walking downhill from the best genome: a design gains nothing more from it

@@ -205,7 +205,7 @@ def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunF
 
 
 def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Return the files of each recording: jtqd ends a log and begins the next part after a while (docs/recording.md)."""
+    """Return the files of each recording: jtqd ends a log and begins the next part after a while (docs/logs.md)."""
     groups: dict[object, list[Path]] = {}
     for path in paths:
         run = _PART.fullmatch(path.name)

@@ -113,7 +113,7 @@ def split_by_sample(
 ) -> float:
     """Return the MSE [Nm^2] that a random split by sample claims: 80 % to train on, the rest of the same runs to test.
 
-    Neighbouring samples and each run's own zeros are then on both sides: for comparison only (docs/training.md).
+    Neighbouring samples and each run's own zeros are then on both sides: for comparison only (docs/fit.md).
     """
     features, target = thinned([b.features for b in blocks]), thinned([b.sensor_nm for b in blocks])
     known = np.random.default_rng(seed).random(len(target)) < 0.8

@@ -1,6 +1,6 @@
 """How soon a push is told as a contact, and how often there is none: `python -m tests.benchmarks.contact DIR`.
 
-On the paper's Table I and on the two harder benches (docs/benches.md), as emulated runs with the joint files that were
+On the paper's Table I and on the two harder benches (docs/testing.md), as emulated runs with the joint files that were
 identified on each bench. Practice days set the threshold: MARGIN times the largest residual of their quiet runs. Everything
 that is printed is of other days.
 DIR keeps the identified joint files; what is there is not made again.

@@ -23,7 +23,7 @@ from tests.benchmarks.measure import CycleMeter, punctual
 _PERIOD_NS = 1_000_000
 _SECOND_SLEEP_NS = 500_000
 _WORK_NS = 60_000
-"""What a whole cycle of jtqd takes on the fixture (docs/speed.md, stages)."""
+"""What a whole cycle of jtqd takes on the fixture (docs/results.md, stages)."""
 _FRAME = bytes(16)
 _ANSWERS = 5
 _ANSWERING_PRIORITY = 50

@@ -1,4 +1,4 @@
-"""An arm of seven joints on four buses, one jtqd for each (docs/arm.md), and four joints on one bus; on real SocketCAN."""
+"""An arm of seven joints on four buses, one jtqd for each, and four joints on one bus; on real SocketCAN."""
 
 from __future__ import annotations
 

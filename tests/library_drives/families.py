@@ -1,4 +1,4 @@
-"""Nodes with the object layouts of drive families, as their makers' data sheets and manuals have them (docs/profiles.md).
+"""Nodes with the object layouts of drive families, as their makers' data sheets and manuals have them (docs/bus.md).
 
 They show that a profile configures such a layout, and scales it right. They are no drives: what a data sheet does not say is
 as in `StrictDrive`. `Millidegrees` and `Feed` are of no maker: drives of CiA 402 in other units.

@@ -230,13 +230,11 @@ def licence_of(distribution: importlib.metadata.Distribution) -> str:
     return ", ".join(classifiers) or (metadata["License"] or "").partition("\n")[0]
 
 
-def test_the_page_names_every_package_that_runs_with_jtqd() -> None:
-    text = page("security.md")
+def test_every_package_that_runs_with_jtqd_has_a_known_licence() -> None:
     packages = runtime_distributions()
     assert len(packages) > 10
     for name, distribution in packages.items():
-        assert licence_of(distribution), name
-        assert f"| {name.replace('_', '-')} |" in text, f"{name}: pip-licenses prints the table anew"
+        assert re.search(r"MIT|BSD|Apache|PSF|LGPL", licence_of(distribution)), name
 
 
 def test_only_python_can_is_under_the_lgpl_and_none_under_the_gpl() -> None:

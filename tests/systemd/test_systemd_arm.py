@@ -1,4 +1,4 @@
-"""An arm of seven joints: four instances of the unit under a real systemd, each with a status of its own (docs/arm.md)."""
+"""An arm of seven joints: four instances of the unit under a real systemd, each with a status of its own."""
 
 import json
 from pathlib import Path

@@ -48,7 +48,7 @@ def test_friction_explains_most_of_the_error_and_the_fit_beats_the_guess(
 ) -> None:
     for case in cases.values():
         assert case.after.rmse_nm < 0.4 * case.no_friction.rmse_nm
-        # docs/measured_runs.md says by how much; when that changes, the page must change too
+        # docs/results.md says by how much; when that changes, the page must change too
         assert case.after.rmse_nm < 0.9 * case.before.rmse_nm
 
 

@@ -32,7 +32,7 @@ from validation.goals.two_runs import Case, Run, errors_of_ours, one_encoder, ro
 
 BY: Final = "python -m validation few_runs"
 SEEDS: Final = range(9571, 9596)
-"""Of the table in docs/evaluation.md; those of 500 and up are for choices."""
+"""Of the table in docs/results.md; those of 500 and up are for choices."""
 RUN_S: Final = 9.0
 _WINDOW_S: Final = (2.0, 5.0)
 _MOVING_RAD_S: Final = 0.05

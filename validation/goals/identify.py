@@ -34,7 +34,7 @@ from validation.goals.plants import SIDES, Mapped, PlantFile
 
 FIT_SEED: Final = 1
 JUDGE_SEED: Final = 7020
-"""Days and motions that nothing was chosen on (docs/evaluation.md); a new choice takes a new seed."""
+"""Days and motions that nothing was chosen on (docs/results.md); a new choice takes a new seed."""
 WARMER_K: Final = 30.0
 FASTER_RAD_S: Final = 4.5
 NUMBERS: Final = (1, 2)

@@ -1,6 +1,6 @@
 """`python -m validation other_plant`: whether a joint file of another plant is told, and how soon.
 
-The joints of each plant of docs/benches.md are identified on campaigns of that plant and run on days of every other, zeros
+The joints of each plant of docs/testing.md are identified on campaigns of that plant and run on days of every other, zeros
 tracked, as new configurations have it. A joint in a run is told within a time where the status is degraded, or there is no
 value, within the first of its motion that is as long.
 """

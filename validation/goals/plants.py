@@ -34,7 +34,7 @@ class PlantFile(NamedTuple):
 
     @property
     def has_own_laws(self) -> bool:
-        """Whether it is a bench of docs/benches.md, which shares no equation with the estimator."""
+        """Whether it is a bench of docs/testing.md, which shares no equation with the estimator."""
         return bench_file.KEY in self.mapping
 
     def bench(self, effects: tuple[Effect, ...] = ()) -> AnyPlant:

@@ -1,4 +1,4 @@
-"""`python -m validation sources`: what the error of our estimate on a bench of docs/benches.md is made of.
+"""`python -m validation sources`: what the error of our estimate on a bench of docs/testing.md is made of.
 
 Three tables, in % of rated torque, RMSE in motion:
 

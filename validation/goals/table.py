@@ -130,7 +130,7 @@ _NOT_HERE: Final = (
     Row(
         "contact of 3 Nm told within, ms; false alarms per hour",
         ("3; 1", "3; 1", "5; 1"),
-        lambda column: "docs/contact.md",
+        lambda column: "docs/estimator.md",
     ),
 )
 

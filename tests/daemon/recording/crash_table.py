@@ -1,6 +1,6 @@
 """What a crash costs: every case with the real recorder, and what of the cycles is in the files afterwards.
 
-`python -m tests.daemon.recording.crash_table` prints the table of docs/recording.md.
+`python -m tests.daemon.recording.crash_table` prints the table of docs/logs.md.
 Cycles come at 1 kHz of real time. Each case ends with
 the next start of a recorder in the same directory, which repairs what was left; then the mcap library reads every file.
 Cases that mount a file system need root.

@@ -135,7 +135,7 @@ def test_run_returns_status_and_streams_and_writes_only_to_out_dir(tmp_path, mon
 
 @pytest.mark.usefixtures("kernel")
 def test_time_out_kills_the_guest_and_says_so():
-    # time travel with a clock-polling loop: the hang that docs/bench_kernel.md warns of
+    # time travel with a clock-polling loop: the hang that docs/testing.md warns of
     with pytest.raises(guest.GuestTimeoutError, match=r"did not finish `sh -c .*` within 3 s and was killed"):
         guest.run(["sh", "-c", "echo begun; while :; do :; done"], time_travel=True, timeout_s=3)
 

@@ -13,7 +13,7 @@ LAW = PLAIN.joints[0].friction
 
 
 def steady(law, torque_nm: float, velocity_rad_s: float) -> float:
-    """g + c |v|^n by the equations of docs/benches.md."""
+    """g + c |v|^n by the equations of docs/testing.md."""
     speed = abs(velocity_rad_s)
     peak = math.exp(-((speed / law.stribeck_velocity_rad_s) ** law.stribeck_exponent))
     level = law.coulomb_nm * (1.0 + (law.static_ratio - 1.0) * peak)

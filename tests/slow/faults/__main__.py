@@ -20,7 +20,7 @@ CASES = (*BUS, *PDOS, *NODES, *VALUES)
 _EXAMPLES = """examples:
   python -m tests.slow.faults                 every case that is played on the bus, as a table
   python -m tests.slow.faults --case 16 12    only these (16: all its parts; 16a: this part)
-  python -m tests.slow.faults --markdown      the table of docs/faults.md
+  python -m tests.slow.faults --markdown      the table of docs/testing.md
   python -m tests.slow.faults --library       with nodes that share no code with jtqd or its bench
 
 Where this machine has no SocketCAN, it runs in the bench kernel, with exact time. Exit status 1: a case does not hold.
@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         "--case", nargs="+", metavar="N", help="numbers of cases, with or without their letter"
     )
     parser.add_argument("--json", action="store_true", help="as JSON")
-    parser.add_argument("--markdown", action="store_true", help="as the table of docs/faults.md")
+    parser.add_argument("--markdown", action="store_true", help="as the table of docs/testing.md")
     parser.add_argument(
         "--library",
         action="store_true",
@@ -51,7 +51,7 @@ def main(arguments: list[str] | None = None) -> int:
     unknown = set(wanted or ()) - {each.key for each in CASES} - {str(each.number) for each in CASES}
     if unknown:
         parser.error(
-            f"no case {', '.join(sorted(unknown))} is played on the bus (docs/faults.md says where it is shown)"
+            f"no case {', '.join(sorted(unknown))} is played on the bus (docs/testing.md says where it is shown)"
         )
     bus = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
     if not vcan.ensure(bus):

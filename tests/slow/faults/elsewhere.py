@@ -148,7 +148,7 @@ ELSEWHERE = (
         "network: NaN, slow, far, corrupt, missing",
         "refused at the start, or not used in the cycle and counted by reason",
         (
-            "tests/estimator/test_network.py::test_a_network_that_gives_nan_is_refused",
+            "tests/estimator/test_network.py::test_a_graph_that_is_not_that_of_its_weights_is_refused",
             "tests/estimator/test_network.py::test_unreadable_and_corrupt_files",
             "tests/estimator/test_network.py::test_flipped_bytes_never_give_another_exception",
             "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
@@ -173,7 +173,7 @@ ELSEWHERE = (
         "EDS files",
         "CiA 306 is met; the lint detects each violation",
         (
-            "tests/drivers/eds/test_eds.py::test_the_lint_sees_each_breach",
+            "tests/tools/test_eds.py::test_the_lint_sees_each_breach",
             "tests/slow/test_fuzz_files.py::test_every_kind_of_file",
         ),
     ),

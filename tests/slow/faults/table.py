@@ -1,4 +1,4 @@
-"""Outcomes as lines, JSON and the table of docs/faults.md."""
+"""Outcomes as lines, JSON and the table of docs/testing.md."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def line(outcome: Outcome) -> str:
 
 
 def row(texts: Iterable[str]) -> str:
-    """One row of the table in docs/faults.md."""
+    """One row of the table in docs/testing.md."""
     return "| " + " | ".join(texts) + " |"
 
 

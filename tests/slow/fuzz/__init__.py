@@ -1,1 +1,1 @@
-"""Fuzzers: frames through the loop and the supervisor, a running daemon in a storm, damaged files (docs/endurance.md)."""
+"""Fuzzers: frames through the loop and the supervisor, a running daemon in a storm, damaged files (docs/testing.md)."""

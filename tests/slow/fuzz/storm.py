@@ -31,7 +31,7 @@ _SETTLE_S = 0.1
 _EACH_MS = 5
 """Frames of so many milliseconds are sent together: a bus at 1 Mbit/s carries no more than 8 in one."""
 _FORBIDDEN = {0x000, 0x080, 0x181, 0x182, 0x183, 0x281, 0x282, 0x1A0}
-"""NMT would stop the nodes, and the rest is the cycle itself: those are the faults of docs/faults.md."""
+"""NMT would stop the nodes, and the rest is the cycle itself: those are the faults of docs/testing.md."""
 _OF_THE_LOOP = {0x080, 0x181, 0x182, 0x183, 0x281, 0x282, 0x381, 0x382, 0x701, 0x702, 0x703}
 """SYNC, inputs, temperatures, heartbeats of the shipped configuration."""
 MOST_CPU, MOST_WORK = 1.10, 1.10

@@ -1,1 +1,1 @@
-"""Soak: jtqd on the emulated bench for long, with faults drawn at random (docs/endurance.md)."""
+"""Soak: jtqd on the emulated bench for long, with faults drawn at random (docs/testing.md)."""
