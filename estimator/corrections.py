@@ -22,10 +22,8 @@ from dataclasses import replace
 from math import expm1, isfinite, nan, tanh
 from typing import Any, Final, NamedTuple
 
-from jtqd.estimator.effects.channel_delay import SENSOR
-from jtqd.estimator.effects.effect import Effect, Functions, State, Values
-from jtqd.estimator.effects.library import EFFECTS
-from jtqd.estimator.effects.scalar import Scalar
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import Effect, Functions, ScalarFunctions, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S
 from jtqd.estimator.settings import EstimatorSettings
@@ -36,8 +34,8 @@ _INPUT_HOOKS: Final = ("current_a", "link_rad", "twist_rad", "loss_nm")
 INVERSE_W0: Final = 1.0 / DIRECTION_VELOCITY_RAD_S
 
 
-class Smoothed(Scalar):
-    """`Scalar` functions whose slip follows the filtered deflection: noise would wear the state away.
+class Smoothed(ScalarFunctions):
+    """`ScalarFunctions` functions whose slip follows the filtered deflection: noise would wear the state away.
 
     share: gain of the filter, the part of the way to a new deflection; 1 to start.
     """
@@ -52,7 +50,7 @@ class Smoothed(Scalar):
     def slip(self, d: float, travel: float) -> float:
         """Return the state after the filtered deflection moved towards d [rad]."""
         self._d += self.share * (d - self._d)
-        return Scalar.slip(self, self._d, travel)
+        return ScalarFunctions.slip(self, self._d, travel)
 
 
 def acting_effects(joint: Joint) -> Pairs:
@@ -63,7 +61,7 @@ def acting_effects(joint: Joint) -> Pairs:
         for effect, p in pairs
         if not effect.changes_joint
         and any(hook in _INPUT_HOOKS for hook in effect.hooks)
-        and not (effect.name == "channel_delay" and p["channel"] == SENSOR)
+        and not effect.at_sensor_of(p)
     )
 
 
@@ -133,11 +131,13 @@ class ExtendedInputs:
     def __init__(self, joint: Joint, settings: EstimatorSettings) -> None:
         pairs = acting_effects(joint)
         self._joint: Final = replace(joint, effects=())
-        self._current: Final = hooks_of(pairs, "current_a", Scalar)
-        self._motor: Final = hooks_of(at_motor(pairs), "link_rad", Scalar)
-        self._link: Final = hooks_of(tuple(p for p in pairs if p not in at_motor(pairs)), "link_rad", Scalar)
+        self._current: Final = hooks_of(pairs, "current_a", ScalarFunctions)
+        self._motor: Final = hooks_of(at_motor(pairs), "link_rad", ScalarFunctions)
+        self._link: Final = hooks_of(
+            tuple(p for p in pairs if p not in at_motor(pairs)), "link_rad", ScalarFunctions
+        )
         self._twist: Final = hooks_of(pairs, "twist_rad", Smoothed)
-        self._loss: Final = hooks_of(pairs, "loss_nm", Scalar)
+        self._loss: Final = hooks_of(pairs, "loss_nm", ScalarFunctions)
         self._slips: Final = tuple(hook.x for hook in self._twist)
         self._gear: Final = 1.0 / joint.gear_ratio
         self._inverse_gain: Final = 1.0 / (joint.gear_ratio * joint.torque_constant_nm_per_a)

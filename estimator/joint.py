@@ -16,7 +16,7 @@ from typing import Annotated, Any, Final
 
 from jtqd.estimator.checked import Verbatim
 from jtqd.estimator.decoder import FieldError, Text, below, check, choice, decode, limits, numbers_text
-from jtqd.estimator.effects.library import EFFECTS, checked_parameters
+from jtqd.estimator.effects import EFFECTS, checked_parameters
 from jtqd.estimator.envelope import Envelope
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
@@ -27,7 +27,6 @@ _CONVENTION_TEXT: Final = (
 )
 QUADRANTS: Final = ("i_pos_w_pos", "i_neg_w_neg", "i_neg_w_pos", "i_pos_w_neg")
 """Order of Table I: two driving quadrants, then two back-driving quadrants."""
-EFFECT_NAMES: Final = frozenset(EFFECTS)
 MAX_NODES: Final = 64
 """Most numbers of a list in section `fused`."""
 MAX_LINK_ORDERS: Final = 6

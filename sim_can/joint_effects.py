@@ -14,9 +14,8 @@ from collections.abc import Callable
 from typing import Any
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.effects.effect import Effect, Functions, State, Values
-from jtqd.estimator.effects.library import EFFECTS
-from jtqd.estimator.effects.scalar import Scalar
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import Effect, Functions, ScalarFunctions, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.losses import JointFriction
 
@@ -48,7 +47,7 @@ def uses_temperature(joint: Joint) -> bool:
     for effect, values in effects_of(joint):
         for name in effect.hooks:
             call = getattr(effect, name)
-            if call(values, cold, joint, Scalar()) != call(values, warm, joint, Scalar()):
+            if call(values, cold, joint, ScalarFunctions()) != call(values, warm, joint, ScalarFunctions()):
                 return True
     return False
 
@@ -106,7 +105,7 @@ class JointEffects:
                 if name in effect.hooks:
                     call = getattr(effect, name)
                     self._check(effect.name, call, values)
-                    self._place(effect, name, call, values).append((call, values, Scalar()))
+                    self._place(effect, name, call, values).append((call, values, ScalarFunctions()))
 
     def __bool__(self) -> bool:
         return any((self.friction, self.loss, self.bend, self.spring, self.load))
@@ -118,7 +117,9 @@ class JointEffects:
             return self.friction if effect.dissipative else self.loss
         by_place = set()
         for place in _PROBES:
-            functions = Scalar()  # the same for both: a hysteresis starts where it is evaluated first
+            functions = (
+                ScalarFunctions()
+            )  # the same for both: a hysteresis starts where it is evaluated first
             slack = call(values, _at(place), self.joint, functions)
             if call(values, _at(place, _PROBE_TORSION_RAD), self.joint, functions) != slack:
                 return self.spring
@@ -127,7 +128,7 @@ class JointEffects:
 
     def _check(self, name: str, call: Callable[..., Any], values: Values) -> None:
         for place in _PROBES:
-            value = call(values, _at(place, _PROBE_TORSION_RAD), self.joint, Scalar())
+            value = call(values, _at(place, _PROBE_TORSION_RAD), self.joint, ScalarFunctions())
             if not math.isfinite(value):
                 raise ConfigError(
                     f"joint {self.joint.name}: effect {name}: {call.__name__} is {value!r}, expected a finite number: "
@@ -159,7 +160,7 @@ class JointEffects:
         """
         if not self.spring:
             return 1.0
-        fresh: list[Hook] = [(call, values, Scalar()) for call, values, _ in self.spring]
+        fresh: list[Hook] = [(call, values, ScalarFunctions()) for call, values, _ in self.spring]
         rated = self.joint.rated_torque_nm / self.joint.stiffness_nm_per_rad
         grid = [0.0] + [3.0 * rated * 10.0 ** (-(400 - k) / 64.0) for k in range(401)]
         largest, before, at = 1.0, 0.0, 0.0

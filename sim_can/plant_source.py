@@ -12,8 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.scalar import Scalar
+from jtqd.estimator.effects.effect import Effect, ScalarFunctions, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.effect_plant import EffectPlant
 from jtqd.sim_can.instruments import Instruments
@@ -94,7 +93,7 @@ class _Reading:
         self._values = values
         self.joint = joint
         self._number = number
-        self._functions = Scalar()
+        self._functions = ScalarFunctions()
         self.state = State()
         self.delay_s = abs(values.get("delay_s", 0.0))
         self.at_motor = name == "link_rad" and effect.at_motor_of(values)

@@ -5,27 +5,33 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import full, linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, full, linear
 
 SENSOR, CURRENT, LINK = 0.0, 1.0, 2.0
 """Codes of `channel`."""
 
 
 class ChannelDelay(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "channel_delay"
     group = "measurement"
     equation = "reading(t) = truth(t - d): sensor = -d dtau/dt, current = -d di/dt, link = -d omega_l"
     source = "a shift in time; rates are means over it (age_s), in the loop its first-order Taylor expansion"
     tell_tale = "A loop between the channel and what it is compared with, whose area grows with frequency."
-    confused_with = ("rotor_inertia", "hysteresis", "viscous_friction")
-    experiment = "excitation"
+    confused_with = {
+        "viscous_friction": "speed_ladder",
+        "hysteresis": "load_ramp",
+        "rotor_inertia": "quick_changes",
+        "torque_ripple": "quick_changes",
+    }
+    experiment = "quick_changes"
     parameters = (
         Parameter("delay_s", "s", -0.02, 0.1),
-        Parameter("channel", "", 0.0, 2.0, default=0.0, fixed=True, whole=True),
+        Parameter("channel", "", 0.0, 2.0, default=0.0, fixed=True, whole=True, neutral=None),
     )
+    rate_based = True
     hooks = ("sensor_nm", "current_a", "link_rad")
 
     def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
@@ -57,6 +63,3 @@ class ChannelDelay(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per channel, of a delay so small that a mean rate is that of the moment."""
         return tuple(linear("delay_s", 1e-5, channel=channel) for channel in (SENSOR, CURRENT, LINK))
-
-
-EFFECT = ChannelDelay()

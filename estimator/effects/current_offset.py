@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import full, linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, full, linear
 
 
 class CurrentOffset(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "current_offset"
     group = "actuator"
@@ -19,7 +19,11 @@ class CurrentOffset(Effect):
     tell_tale = (
         "A constant of the motor balance of one joint, at rest too, whatever speed, direction and load."
     )
-    confused_with = ("sensor_offset", "friction_asymmetry")
+    confused_with = {
+        "sensor_offset": "load_at_both_directions",
+        "sensor_drift": "warm_up",
+        "friction_asymmetry": "zero_reading",
+    }
     experiment = "zero_reading"
     parameters = (Parameter("offset_a", "A", -5.0, 5.0),)
     hooks = ("current_a",)
@@ -31,6 +35,3 @@ class CurrentOffset(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("offset_a", 0.01),)
-
-
-EFFECT = CurrentOffset()

@@ -1,14 +1,14 @@
-"""What an effect of the library is: one physical deviation from the rigid textbook joint, written once.
+"""An effect: one physical deviation of a joint from the rigid textbook joint, for plant, estimator and diagnosis alike.
 
-Plant, estimator and diagnosis all read the same six hooks. With true values in capitals of what is measured
-(i, tau_s, theta_l) and K the stiffness, a joint with effects obeys, joint side,
+With true values in capitals of what is measured (i, tau_s, theta_l) and K the stiffness, a joint with effects obeys, joint
+side,
 
     tau_gear = G (Kt I - Jm alpha) - loss0 - loss_nm                 motor balance
     tau_gear = K (theta_m/G - THETA_L + twist_rad) + D (...)          torsion balance
     tau_gear = TAU_S + Jl alpha_l + load_nm                           link balance
     i = I + current_a      theta_l = THETA_L + link_rad      tau_s = TAU_S + sensor_nm
 
-so that what a simulation without the effect leaves over is, from what is measured,
+so that the residuals of a simulation without the effect are, from what is measured,
 
     G (Kt i - Jm alpha) - loss0 - tau_s - Jl alpha_l    =  G Kt current_a + loss_nm + load_nm - sensor_nm
     K (theta_m/G - theta_l) + D (...) - tau_s - Jl alpha_l  =  -K (twist_rad + link_rad) + load_nm - sensor_nm
@@ -24,12 +24,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
+from jtqd.estimator.effects.terms import Term
+
 Values = Mapping[str, float]
 """Parameters of an effect by name, SI units."""
 
 MOTOR: Final = "motor"
 TORSION: Final = "torsion"
 BALANCES: Final = (MOTOR, TORSION)
+HOOKS: Final = ("loss_nm", "twist_rad", "load_nm", "current_a", "link_rad", "sensor_nm")
+GROUPS: Final = ("friction", "transmission", "actuator", "measurement", "load")
 
 
 class FrictionValues(Protocol):
@@ -101,7 +105,8 @@ AnyJoint = TypeVar("AnyJoint", bound=JointValues)
 class Parameter:
     """One parameter: plausible range low..high in `unit`; default None: must be given, NaN: the joint file's own
     value; fixed: not refined by fits (an order, a channel); whole: a whole number, a code. key: key of the joint file
-    whose value it replaces, dotted, "" for none.
+    whose value it replaces, dotted, "" for none. neutral: value without the effect, of a parameter without a key; None where
+    it is where or how the effect acts (a phase, an order) and not how large it is.
     """
 
     name: str
@@ -112,8 +117,10 @@ class Parameter:
     fixed: bool = False
     key: str = ""
     whole: bool = False
+    neutral: float | None = 0.0
 
 
+@dataclass(slots=True, eq=False)
 class State:
     """What a hook may use, floats or arrays [n] of one joint in its own frame; NaN where it is not known.
 
@@ -123,52 +130,26 @@ class State:
     rate; time_s since the run's first sample.
     """
 
-    __slots__ = (
-        "coupling_position_rad",
-        "current_a",
-        "current_rate_a_s",
-        "direction",
-        "link_acceleration_rad_s2",
-        "link_position_rad",
-        "link_velocity_rad_s",
-        "motor_acceleration_rad_s2",
-        "motor_position_rad",
-        "temperature_c",
-        "time_s",
-        "torque_nm",
-        "torque_rate_nm_s",
-        "torsion_rad",
-        "torsion_rate_rad_s",
-        "velocity_rad_s",
-    )
-
-    current_a: Any
-    current_rate_a_s: Any
-    coupling_position_rad: Any
-    direction: Any
-    link_acceleration_rad_s2: Any
-    link_position_rad: Any
-    link_velocity_rad_s: Any
-    motor_acceleration_rad_s2: Any
-    motor_position_rad: Any
-    temperature_c: Any
-    time_s: Any
-    torque_nm: Any
-    torque_rate_nm_s: Any
-    torsion_rad: Any
-    torsion_rate_rad_s: Any
-    velocity_rad_s: Any
-
-    def __init__(self, **fields: Any) -> None:
-        nan = float("nan")
-        for name in self.__slots__:
-            setattr(self, name, fields.pop(name, nan))
-        if fields:
-            raise TypeError(f"found fields {sorted(fields)}, expected some of {self.__slots__}")
+    current_a: Any = math.nan
+    current_rate_a_s: Any = math.nan
+    coupling_position_rad: Any = math.nan
+    direction: Any = math.nan
+    link_acceleration_rad_s2: Any = math.nan
+    link_position_rad: Any = math.nan
+    link_velocity_rad_s: Any = math.nan
+    motor_acceleration_rad_s2: Any = math.nan
+    motor_position_rad: Any = math.nan
+    temperature_c: Any = math.nan
+    time_s: Any = math.nan
+    torque_nm: Any = math.nan
+    torque_rate_nm_s: Any = math.nan
+    torsion_rad: Any = math.nan
+    torsion_rate_rad_s: Any = math.nan
+    velocity_rad_s: Any = math.nan
 
 
 class Functions(Protocol):
-    """Elementwise functions for floats (`effects.scalar.Scalar`) or arrays (`effects.whole.Whole`).
+    """Elementwise functions for floats (`ScalarFunctions`) or arrays (`array_functions.ArrayFunctions`).
 
     slip(d, travel): Maxwell-slip state in -1..1, dz = dd/travel held within; it remembers, so every effect of every
     joint has `Functions` of its own in the loop, and an array is taken in order from z = 0.
@@ -193,27 +174,63 @@ class Functions(Protocol):
         """Return the Maxwell-slip state, -1 to 1."""
 
 
-@dataclass(frozen=True, slots=True)
-class Term:
-    """A way to look for an effect by linear regression: the hooks at each of `basis` (less the hooks at the joint
-    file's own values) are columns; `combine(coefficients)` of the columns gives the parameters.
+class ScalarFunctions:
+    """Functions of floats, sample by sample; one instance per effect and joint: `slip` has a state, 0 at the first d.
+
+    The Maxwell slip is the friction of one elastic contact (Al-Bender, Lampaert, Swevers 2005, IEEE Trans. Automatic
+    Control 50): z follows the deflection d, dz = dd/travel, and slips at -1 and 1.
     """
 
-    basis: tuple[Values, ...]
-    combine: Any  # Callable[[Sequence[float]], dict[str, float]]
+    __slots__ = ("_last", "_z")
+
+    def __init__(self) -> None:
+        self._z = 0.0
+        self._last = math.nan
+
+    sin: Final = staticmethod(math.sin)
+    cos: Final = staticmethod(math.cos)
+    tanh: Final = staticmethod(math.tanh)
+
+    @staticmethod
+    def exp(a: float) -> float:
+        """Return e^a, infinite where a float cannot hold it (as numpy)."""
+        return math.exp(a) if a < 709.0 else math.inf
+
+    @staticmethod
+    def clip(a: float, low: float, high: float) -> float:
+        """Return a held within low..high; NaN stays."""
+        return low if a < low else high if a > high else a
+
+    def slip(self, d: float, travel: float) -> float:
+        """Return the state, -1 to 1, after the deflection went on to d; NaN: it stays where it was."""
+        if d != d:  # noqa: PLR0124 - NaN, without a call
+            return self._z
+        step = (d - self._last) / travel
+        self._last = d
+        if step == step:  # noqa: PLR0124
+            z = self._z + step
+            self._z = 1.0 if z > 1.0 else -1.0 if z < -1.0 else z
+        return self._z
+
+
+REGISTERED: Final[dict[str, Effect]] = {}
+"""One instance of every subclass of `Effect`, by name."""
 
 
 class Effect:
-    """Base of all effects. One file of this package holds one subclass and an instance of it named EFFECT.
+    """Base of all effects. A file of this package holds one subclass, named in `name` as the file is.
 
-    equation, source: one line each; tell_tale: where it shows and how one recognises it; confused_with: names of effects
-    that can look the same on poor runs; experiment: kind of motion that separates it (see `EXPERIMENTS`);
-    hooks: names of the hooks it has; needs: fields of State without which it cannot be judged;
-    dissipative: loss_nm is a friction (opposes velocity); at_sensor: it belongs to the coupling's sensor, not to a joint.
+    equation, source: one line each; tell_tale: where it shows and how one recognises it.
+    experiment: kind of motion that shows it (`sysid.diagnosis.towing_motion.EXPERIMENTS`).
+    confused_with: effect that looks the same on poor runs -> kind of motion that separates the two; a pair stands in one of
+    both files. by_hand: such an effect -> what separates the two besides a motion.
+    hooks: names of the hooks it has; needs: fields of State without which it cannot be judged.
+    dissipative: loss_nm is a friction (opposes velocity). at_sensor: it belongs to the coupling's sensor, not to a joint.
     geometric: its twist is one of the teeth, so the damper beside the spring feels its rate too (kinematic error), unlike
-    a property of the spring itself.
-    follows_torsion: its state follows the torsion itself (slip, play), for which tau/K is not good enough.
-    changes_joint: `joint()` says it all for plant and estimator, which then leave its hooks alone (inertias, damping).
+    a property of the spring itself. follows_torsion: its state follows the torsion itself (slip, play), for which tau/K is
+    not good enough. rate_based: it is known by a derivative of measured angles or torques.
+    scales_all: it scales everything that the sensor reads. scales_balance: it scales the whole of this balance of a joint.
+    changes_joint: `joint()` is all of it for plant and estimator, which then leave its hooks alone (inertias, damping).
     """
 
     name: ClassVar[str]
@@ -221,8 +238,9 @@ class Effect:
     equation: ClassVar[str]
     source: ClassVar[str]
     tell_tale: ClassVar[str]
-    confused_with: ClassVar[tuple[str, ...]] = ()
     experiment: ClassVar[str] = "excitation"
+    confused_with: ClassVar[Mapping[str, str]] = {}
+    by_hand: ClassVar[Mapping[str, str]] = {}
     parameters: ClassVar[tuple[Parameter, ...]]
     hooks: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()
@@ -231,6 +249,21 @@ class Effect:
     changes_joint: ClassVar[bool] = False
     geometric: ClassVar[bool] = False
     follows_torsion: ClassVar[bool] = False
+    rate_based: ClassVar[bool] = False
+    scales_all: ClassVar[bool] = False
+    scales_balance: ClassVar[str] = ""
+
+    def __init_subclass__(cls) -> None:
+        """Register an instance. Raises TypeError for a name, hook or group that cannot be."""
+        file = cls.__module__.rpartition(".")[2]
+        for what, found, expected in (
+            ("name", {cls.name}, (file,)),
+            ("hooks", set(cls.hooks), HOOKS),
+            ("group", {cls.group}, GROUPS),
+        ):
+            if not found or not found <= {*expected}:
+                raise TypeError(f"effect {file}: found {what} {sorted(found)}, expected of {expected}")
+        REGISTERED[cls.name] = cls()
 
     def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Motor torque lost in addition to the joint file's losses, Nm joint side."""
@@ -283,5 +316,10 @@ class Effect:
         raise NotImplementedError
 
     def term_of_order(self, order: float) -> Term | None:
-        """The way to look for a wave of `order` per motor revolution; None for effects that are none."""
+        """Way to look for a wave of `order` per motor revolution; None for effects that are no waves."""
         return None
+
+    @property
+    def is_wave(self) -> bool:
+        """Whether it is a wave over the motor's angle, of which several orders may be present at once."""
+        return type(self).term_of_order is not Effect.term_of_order

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, Wave
 
 
 class EncoderEccentricity(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "encoder_eccentricity"
     group = "measurement"
@@ -21,11 +21,17 @@ class EncoderEccentricity(Effect):
         "The torsion swings once per revolution of the link (or of the motor), whatever the load. Of the link: nothing "
         "in the motor balance; of the motor: an acceleration there that grows with the square of the velocity."
     )
-    confused_with = ("kinematic_error", "unbalance", "sensor_crosstalk")
-    experiment = "excitation"
+    confused_with = {
+        "nonlinear_stiffness": "load_ramp",
+        "kinematic_error": "full_turns",
+        "torque_ripple": "full_turns",
+        "sensor_crosstalk": "full_turns",
+        "unbalance": "full_turns",
+    }
+    experiment = "full_turns"
     parameters = (
         Parameter("amplitude_rad", "rad", 0.0, 0.1),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
         Parameter("motor_side", "", 0.0, 1.0, default=0.0, fixed=True, whole=True),
     )
     hooks = ("link_rad",)
@@ -45,6 +51,3 @@ class EncoderEccentricity(Effect):
         """Return a wave of the link's encoder and one of the motor's."""
         link = Wave("amplitude_rad", 1e-5, {"motor_side": 0.0}).term()
         return link, Wave("amplitude_rad", 1e-3, {"motor_side": 1.0}).term()
-
-
-EFFECT = EncoderEccentricity()

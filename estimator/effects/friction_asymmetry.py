@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 
 class FrictionAsymmetry(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "friction_asymmetry"
     group = "friction"
@@ -20,11 +20,16 @@ class FrictionAsymmetry(Effect):
         "A constant of the motor balance that goes away at rest: a more in the positive, a less in the "
         "negative direction."
     )
-    confused_with = ("current_offset", "sensor_offset")
-    experiment = "zero_reading"
+    confused_with = {
+        "load_dependent_friction": "load_at_both_directions",
+        "lost_motion": "load_at_both_directions",
+        "sensor_offset": "load_at_both_directions",
+        "stribeck_friction": "slow_reversals",
+    }
+    experiment = "speed_ladder"
     parameters = (Parameter("asymmetry_nm", "Nm", -100.0, 100.0),)
     hooks = ("loss_nm",)
-    dissipative: ClassVar[bool] = True
+    dissipative = True
 
     def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
@@ -33,6 +38,3 @@ class FrictionAsymmetry(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("asymmetry_nm", 1.0),)
-
-
-EFFECT = FrictionAsymmetry()

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 TRAVELS_RAD = (3e-5, 5e-5, 1e-4, 2e-4, 3e-4)
 """Grid of the search; the fit refines it."""
 
 
 class Hysteresis(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "hysteresis"
     group = "transmission"
@@ -23,8 +23,11 @@ class Hysteresis(Effect):
         "The torsion balance changes after each reversal of the load, not of the velocity, over a fixed "
         "travel."
     )
-    confused_with = ("lost_motion", "nonlinear_stiffness", "channel_delay")
-    experiment = "slow_reversals"
+    confused_with = {
+        "lost_motion": "load_ramp",
+        "nonlinear_stiffness": "load_ramp",
+    }
+    experiment = "load_ramp"
     parameters = (
         Parameter("torque_nm", "Nm", 0.0, 50.0),
         Parameter("travel_rad", "rad", 1e-06, 0.01),
@@ -40,6 +43,3 @@ class Hysteresis(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per travel."""
         return tuple(linear("torque_nm", 1.0, travel_rad=travel) for travel in TRAVELS_RAD)
-
-
-EFFECT = Hysteresis()

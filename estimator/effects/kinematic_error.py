@@ -6,15 +6,15 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, Wave
 
 ORDERS = (1.0, 2.0, 4.0)
 """Shaft, the wave generator's two lobes, and their second harmonic."""
 
 
 class KinematicError(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "kinematic_error"
     group = "transmission"
@@ -26,12 +26,14 @@ class KinematicError(Effect):
         "A line of the torsion at 1, 2 or 4 cycles per motor revolution; in the motor balance only under "
         "load."
     )
-    confused_with = ("encoder_eccentricity", "torque_ripple")
-    experiment = "speed_ladder"
+    confused_with = {
+        "torque_ripple": "full_turns",
+    }
+    experiment = "full_turns"
     parameters = (
         Parameter("amplitude_rad", "rad", 0.0, 0.005),
-        Parameter("order_per_motor_rev", "1/rev", 0.1, 1000.0, default=2.0, fixed=True),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+        Parameter("order_per_motor_rev", "1/rev", 0.1, 1000.0, default=2.0, fixed=True, neutral=None),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
     )
     hooks = ("twist_rad", "loss_nm")
     needs = ("motor_position_rad", "torque_nm")
@@ -54,6 +56,3 @@ class KinematicError(Effect):
     def term_of_order(self, order: float) -> Term:
         """Return the wave (two columns) of any order per motor revolution."""
         return Wave("amplitude_rad", 1e-5, {"order_per_motor_rev": float(order)}).term()
-
-
-EFFECT = KinematicError()

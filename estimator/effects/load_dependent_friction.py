@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 
 class LoadDependentFriction(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "load_dependent_friction"
     group = "friction"
@@ -19,12 +19,17 @@ class LoadDependentFriction(Effect):
     tell_tale = (
         "Steps at reversals that grow with the load: half the difference of both directions at equal torque."
     )
-    confused_with = ("torque_constant", "torque_constant_saturation", "sensor_gain", "coulomb_friction")
+    confused_with = {
+        "torque_constant": "load_at_both_directions",
+        "sensor_gain": "load_at_both_directions",
+        "viscous_friction": "load_at_both_directions",
+        "torque_constant_saturation": "load_at_both_directions",
+    }
     experiment = "load_at_both_directions"
     parameters = (Parameter("load_coefficient", "", 0.0, 0.9),)
     hooks = ("loss_nm",)
     needs = ("torque_nm",)
-    dissipative: ClassVar[bool] = True
+    dissipative = True
 
     def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
@@ -33,6 +38,3 @@ class LoadDependentFriction(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("load_coefficient", 0.1),)
-
-
-EFFECT = LoadDependentFriction()

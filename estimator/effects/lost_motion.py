@@ -5,22 +5,25 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 WIDTHS_RAD = (3e-5, 1e-4, 3e-4, 1e-3)
 """Grid of the search; the fit refines it."""
 
 
 class LostMotion(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "lost_motion"
     group = "transmission"
     equation = "twist = -clip(d, -w/2, w/2), w the full width"
     source = "Nordin and Gutman 2002, Automatica 38 (dead zone)"
     tell_tale = "The torsion balance jumps by K w where the torque, not the velocity, changes its sign."
-    confused_with = ("hysteresis", "nonlinear_stiffness")
+    confused_with = {
+        "stribeck_friction": "slow_reversals",
+        "nonlinear_stiffness": "load_ramp",
+    }
     experiment = "load_ramp"
     parameters = (Parameter("width_rad", "rad", 0.0, 0.02),)
     hooks = ("twist_rad",)
@@ -35,6 +38,3 @@ class LostMotion(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column per width; the coefficient scales the width, exact beyond the play."""
         return tuple(linear("width_rad", width) for width in WIDTHS_RAD)
-
-
-EFFECT = LostMotion()

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Linear
+from jtqd.estimator.effects.effect import TORSION, Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Linear, Term
 
 
 class NonlinearStiffness(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "nonlinear_stiffness"
     group = "transmission"
@@ -20,7 +20,9 @@ class NonlinearStiffness(Effect):
     tell_tale = (
         "The torsion balance is an odd function of the torque alone: a slope, and a cubic at large loads."
     )
-    confused_with = ("hysteresis", "lost_motion", "sensor_gain")
+    confused_with = {
+        "sensor_gain": "load_at_both_directions",
+    }
     experiment = "load_ramp"
     parameters = (
         Parameter(
@@ -28,6 +30,7 @@ class NonlinearStiffness(Effect):
         ),
         Parameter("cubic_nm_per_rad3", "Nm/rad3", -100000000000.0, 1000000000000.0, default=0.0),
     )
+    scales_balance = TORSION
     hooks = ("twist_rad",)
     needs = ("torsion_rad",)
 
@@ -48,6 +51,3 @@ class NonlinearStiffness(Effect):
         hardening = Linear(("cubic_nm_per_rad3",), (0.0,), (cubic,), {"stiffness_nm_per_rad": own})
         both = Linear(("stiffness_nm_per_rad", "cubic_nm_per_rad3"), (own, 0.0), (0.1 * own, cubic))
         return slope.term(), hardening.term(), both.term()
-
-
-EFFECT = NonlinearStiffness()

@@ -4,35 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    AnyJoint,
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-)
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import AnyJoint, Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 
 class RotorInertia(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "rotor_inertia"
     group = "actuator"
     equation = "loss = G (Jm' - Jm) alpha"
     source = "Newton-Euler; Swevers, Verdonck, De Schutter 2007, IEEE Control Systems Magazine 27"
     tell_tale = "The motor balance is in phase with the motor's acceleration."
-    confused_with = ("link_inertia", "channel_delay", "viscous_friction")
-    experiment = "excitation"
+    confused_with = {
+        "viscous_friction": "speed_ladder",
+    }
+    experiment = "quick_changes"
     parameters = (Parameter("rotor_inertia_kgm2", "kg m2", 1e-09, 1.0, key="rotor_inertia_kgm2"),)
     hooks = ("loss_nm",)
     needs = ("motor_acceleration_rad_s2",)
-    changes_joint: ClassVar[bool] = True
+    changes_joint = True
 
     def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side."""
@@ -47,6 +40,3 @@ class RotorInertia(Effect):
         """Return one column."""
         own = joint.rotor_inertia_kgm2
         return (linear("rotor_inertia_kgm2", 0.1 * own, own),)
-
-
-EFFECT = RotorInertia()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, Wave
 
 
 class SensorCrosstalk(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "sensor_crosstalk"
     group = "measurement"
@@ -21,16 +21,23 @@ class SensorCrosstalk(Effect):
         "All balances of both joints swing once per revolution of the coupling; with the load where the "
         "load bends."
     )
-    confused_with = ("unbalance", "encoder_eccentricity")
-    experiment = "excitation"
+    confused_with = {
+        "unbalance": "full_turns",
+        "sensor_offset": "full_turns",
+    }
+    experiment = "full_turns"
+    by_hand = {
+        "unbalance": "If the class remains, turn the coupling by a quarter and repeat the campaign: crosstalk turns with "
+        "the sensor, unbalance does not."
+    }
     parameters = (
         Parameter("amplitude_nm", "Nm", 0.0, 20.0, default=0.0),
         Parameter("share", "", 0.0, 0.5, default=0.0),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
     )
     hooks = ("sensor_nm",)
     needs = ("coupling_position_rad", "torque_nm")
-    at_sensor: ClassVar[bool] = True
+    at_sensor = True
 
     def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
@@ -41,6 +48,3 @@ class SensorCrosstalk(Effect):
         """Return a wave of constant size and one in proportion to the load."""
         constant = Wave("amplitude_nm", 0.1, {"share": 0.0}).term()
         return constant, Wave("share", 0.01, {"amplitude_nm": 0.0}).term()
-
-
-EFFECT = SensorCrosstalk()

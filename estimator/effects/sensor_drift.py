@@ -3,30 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import FALLBACK_C, Slope, above, linear, reference_of
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import FALLBACK_C, Slope, Term, above, linear, reference_of
 
 
 class SensorDrift(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "sensor_drift"
     group = "measurement"
     equation = "tau_s = TAU_S + r t + k (T - T0), t since the run's first sample"
     source = "zero drift and temperature effect on zero, as in data sheets of torque transducers"
     tell_tale = "A constant of all balances of both joints that grows with time or temperature, at rest too."
-    confused_with = ("sensor_offset", "temperature_dependent_friction")
+    confused_with = {
+        "temperature_dependent_friction": "warm_up",
+        "torque_constant_temperature": "warm_up",
+        "sensor_offset": "warm_up",
+    }
     experiment = "warm_up"
     parameters = (
         Parameter("rate_nm_per_s", "Nm/s", -1.0, 1.0, default=0.0),
         Parameter("per_k_nm", "Nm/K", -5.0, 5.0, default=0.0),
-        Parameter("reference_c", "°C", -100.0, 200.0, default=FALLBACK_C),
+        Parameter("reference_c", "°C", -100.0, 200.0, default=FALLBACK_C, neutral=None),
     )
     hooks = ("sensor_nm",)
     needs = ("time_s",)
-    at_sensor: ClassVar[bool] = True
+    at_sensor = True
 
     def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
@@ -36,7 +40,4 @@ class SensorDrift(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return a drift with time, and one with temperature (two columns: slope and constant)."""
         time = linear("rate_nm_per_s", 1e-3, per_k_nm=0.0, reference_c=FALLBACK_C)
-        return time, Slope("per_k_nm", 0.01, reference_of(joint), {"rate_nm_per_s": 0.0}).term()
-
-
-EFFECT = SensorDrift()
+        return time, Slope("per_k_nm", 0.01, reference_of(joint.provenance), {"rate_nm_per_s": 0.0}).term()

@@ -9,9 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term
 
 STEP = 0.01
 """1 - 1/g of the column."""
@@ -28,7 +29,7 @@ class _Gain:
 
 
 class SensorGain(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "sensor_gain"
     group = "measurement"
@@ -38,12 +39,15 @@ class SensorGain(Effect):
         "All balances of both joints are proportional to the torque by the same factor, whatever the "
         "direction."
     )
-    confused_with = ("torque_constant", "nonlinear_stiffness", "load_dependent_friction")
+    confused_with = {
+        "torque_constant": "load_at_both_directions",
+    }
     experiment = "load_at_both_directions"
-    parameters = (Parameter("gain", "", 0.5, 2.0),)
+    parameters = (Parameter("gain", "", 0.5, 2.0, neutral=1.0),)
+    scales_all = True
     hooks = ("sensor_nm",)
     needs = ("torque_nm",)
-    at_sensor: ClassVar[bool] = True
+    at_sensor = True
 
     def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
@@ -52,6 +56,3 @@ class SensorGain(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (Term(({"gain": 1.0 / (1.0 - STEP)},), _Gain()),)
-
-
-EFFECT = SensorGain()

@@ -3,25 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import full, linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, full, linear
 
 
 class SensorOffset(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "sensor_offset"
     group = "measurement"
     equation = "tau_s = TAU_S + b"
     source = "zero signal of a torque transducer, as in DIN 51309"
     tell_tale = "A constant of all balances: both joints, motor and torsion, at rest too."
-    confused_with = ("current_offset", "friction_asymmetry", "sensor_drift")
+    confused_with = {
+        "unbalance": "full_turns",
+    }
     experiment = "zero_reading"
     parameters = (Parameter("offset_nm", "Nm", -100.0, 100.0),)
     hooks = ("sensor_nm",)
-    at_sensor: ClassVar[bool] = True
+    at_sensor = True
 
     def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
         """Return what the sensor reads above the truth, Nm."""
@@ -30,6 +32,3 @@ class SensorOffset(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("offset_nm", 0.1),)
-
-
-EFFECT = SensorOffset()

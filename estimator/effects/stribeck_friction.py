@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 VELOCITIES_RAD_S = (0.02, 0.035, 0.05, 0.08, 0.12, 0.2)
 """Grid of the search, the joint file's own beside it; the fit refines it."""
@@ -40,15 +40,18 @@ class _Merged:
 
 
 class StribeckFriction(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "stribeck_friction"
     group = "friction"
     equation = "loss = (Fs' exp(-(v/vs')^2) - Fs exp(-(v/vs)^2)) s"
     source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30"
     tell_tale = "A peak of the motor balance at small velocities, odd in velocity, gone beyond twice vs."
-    confused_with = ("hysteresis", "coulomb_friction")
-    experiment = "speed_ladder"
+    confused_with = {
+        "viscous_friction": "slow_reversals",
+        "hysteresis": "slow_reversals",
+    }
+    experiment = "slow_reversals"
     parameters = (
         Parameter("stribeck_nm", "Nm", 0.0, 200.0, key="friction.stribeck_nm"),
         Parameter(
@@ -101,6 +104,3 @@ class StribeckFriction(Effect):
                 for v in others
             ),
         )
-
-
-EFFECT = StribeckFriction()

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import SPAN_K, above, reference_of
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import SPAN_K, Term, above, reference_of
 
 RATES_PER_K = (0.003, 0.015, 0.03)
 """Grid of the search: how curved the fall over temperature is; the fit refines it."""
@@ -51,7 +51,7 @@ class _Exponential:
 
 
 class TemperatureDependentFriction(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "temperature_dependent_friction"
     group = "friction"
@@ -63,12 +63,15 @@ class TemperatureDependentFriction(Effect):
     tell_tale = (
         "The slope of the motor balance over velocity falls as the joint warms up; nothing changes at rest."
     )
-    confused_with = ("viscous_friction", "torque_constant_temperature", "sensor_drift")
+    confused_with = {
+        "viscous_friction": "warm_up",
+        "torque_constant_temperature": "warm_up",
+    }
     experiment = "warm_up"
     parameters = (
         Parameter("viscous_per_k", "1/K", -0.005, 0.2),
         Parameter("coulomb_per_k", "1/K", -0.05, 0.1, default=0.0),
-        Parameter("reference_c", "°C", -100.0, 200.0),
+        Parameter("reference_c", "°C", -100.0, 200.0, neutral=None),
     )
     hooks = ("loss_nm",)
     needs = ("temperature_c",)
@@ -87,7 +90,7 @@ class TemperatureDependentFriction(Effect):
 
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return two columns (slope over temperature, constant) per rate, of viscous and of Coulomb friction."""
-        reference = reference_of(joint)
+        reference = reference_of(joint.provenance)
         viscous, coulomb = "viscous_per_k", "coulomb_per_k"
         terms: list[Term] = []
         if joint.friction.viscous_nms_per_rad:
@@ -95,6 +98,3 @@ class TemperatureDependentFriction(Effect):
         if joint.friction.coulomb_nm:
             terms.append(_Exponential(coulomb, RATES_PER_K[0], reference, {viscous: 0.0}).term())
         return tuple(terms)
-
-
-EFFECT = TemperatureDependentFriction()

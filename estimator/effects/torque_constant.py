@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import MOTOR, Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 
 class TorqueConstant(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "torque_constant"
     group = "actuator"
@@ -20,16 +20,16 @@ class TorqueConstant(Effect):
         "The motor balance is proportional to the current, in both directions of motion alike; the other "
         "joint does not see it."
     )
-    confused_with = (
-        "sensor_gain",
-        "load_dependent_friction",
-        "torque_constant_saturation",
-        "torque_constant_temperature",
-    )
+    confused_with = {
+        "torque_constant_saturation": "load_at_both_directions",
+        "viscous_friction": "load_at_both_directions",
+        "torque_constant_temperature": "warm_up",
+    }
     experiment = "load_at_both_directions"
     parameters = (
         Parameter("torque_constant_nm_per_a", "Nm/A", 0.0001, 100.0, key="torque_constant_nm_per_a"),
     )
+    scales_balance = MOTOR
     hooks = ("loss_nm",)
 
     def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
@@ -42,6 +42,3 @@ class TorqueConstant(Effect):
         """Return one column."""
         own = joint.torque_constant_nm_per_a
         return (linear("torque_constant_nm_per_a", 0.01 * own, own),)
-
-
-EFFECT = TorqueConstant()

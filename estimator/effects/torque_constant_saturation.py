@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import linear
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, linear
 
 
 class TorqueConstantSaturation(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "torque_constant_saturation"
     group = "actuator"
@@ -20,7 +20,9 @@ class TorqueConstantSaturation(Effect):
         "The motor balance bends with the current: nothing at small currents, odd and quadratic at large "
         "ones."
     )
-    confused_with = ("torque_constant", "load_dependent_friction", "sensor_gain")
+    confused_with = {
+        "sensor_gain": "load_at_both_directions",
+    }
     experiment = "load_at_both_directions"
     parameters = (Parameter("saturation_per_a", "1/A", 0.0, 0.5),)
     hooks = ("loss_nm",)
@@ -33,6 +35,3 @@ class TorqueConstantSaturation(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one column."""
         return (linear("saturation_per_a", 0.01),)
-
-
-EFFECT = TorqueConstantSaturation()

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Slope, above, reference_of
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Slope, Term, above, reference_of
 
 
 class TorqueConstantTemperature(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "torque_constant_temperature"
     group = "actuator"
@@ -20,11 +20,13 @@ class TorqueConstantTemperature(Effect):
         "The gain of the motor balance over the current drifts with temperature; at equal temperature it "
         "is constant."
     )
-    confused_with = ("torque_constant", "temperature_dependent_friction", "sensor_gain")
+    confused_with = {
+        "sensor_gain": "warm_up",
+    }
     experiment = "warm_up"
     parameters = (
         Parameter("per_k", "1/K", -0.02, 0.02),
-        Parameter("reference_c", "°C", -100.0, 200.0),
+        Parameter("reference_c", "°C", -100.0, 200.0, neutral=None),
     )
     hooks = ("loss_nm",)
     needs = ("temperature_c",)
@@ -36,7 +38,4 @@ class TorqueConstantTemperature(Effect):
 
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return two columns: slope over temperature, and constant."""
-        return (Slope("per_k", 1e-3, reference_of(joint)).term(),)
-
-
-EFFECT = TorqueConstantTemperature()
+        return (Slope("per_k", 1e-3, reference_of(joint.provenance)).term(),)

@@ -6,15 +6,15 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, Wave
 
 ORDERS = (1.0, 2.0, 4.0)
 """Shaft, its two lobes, and their second harmonic."""
 
 
 class TorqueRipple(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "torque_ripple"
     group = "transmission"
@@ -24,12 +24,11 @@ class TorqueRipple(Effect):
         "A line of the motor balance at 1, 2 or 4 cycles per motor revolution whose frequency follows "
         "the speed; none in the torsion."
     )
-    confused_with = ("cogging", "kinematic_error")
-    experiment = "speed_ladder"
+    experiment = "full_turns"
     parameters = (
         Parameter("amplitude_nm", "Nm", 0.0, 20.0),
-        Parameter("order_per_motor_rev", "1/rev", 0.1, 1000.0, default=2.0, fixed=True),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+        Parameter("order_per_motor_rev", "1/rev", 0.1, 1000.0, default=2.0, fixed=True, neutral=None),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
     )
     hooks = ("loss_nm",)
     needs = ("motor_position_rad",)
@@ -45,6 +44,3 @@ class TorqueRipple(Effect):
     def term_of_order(self, order: float) -> Term:
         """Return the wave (two columns) of any order per motor revolution."""
         return Wave("amplitude_nm", 0.1, {"order_per_motor_rev": float(order)}).term()
-
-
-EFFECT = TorqueRipple()

@@ -6,12 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
-from jtqd.estimator.effects.regression import Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
+from jtqd.estimator.effects.terms import Term, Wave
 
 
 class Unbalance(Effect):
-    """See the equation; symbols as in `jtqd.estimator.effects.effect`."""
+    """Symbols as in `jtqd.estimator.effects.effect`."""
 
     name = "unbalance"
     group = "load"
@@ -21,11 +21,10 @@ class Unbalance(Effect):
         "Motor and torsion balance of one joint swing once per revolution of the link, whatever load and "
         "speed."
     )
-    confused_with = ("sensor_crosstalk", "encoder_eccentricity")
-    experiment = "excitation"
+    experiment = "full_turns"
     parameters = (
         Parameter("moment_nm", "Nm", 0.0, 100.0),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0),
+        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
     )
     hooks = ("load_nm",)
     needs = ("link_position_rad",)
@@ -37,6 +36,3 @@ class Unbalance(Effect):
     def terms(self, joint: JointValues) -> Sequence[Term]:
         """Return one wave (two columns)."""
         return (Wave("moment_nm", 0.1).term(),)
-
-
-EFFECT = Unbalance()

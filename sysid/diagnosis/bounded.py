@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.sysid.diagnosis.causes import values_of
 from jtqd.sysid.diagnosis.findings import BoundedValue, Cause, JointName, RunGain, shows_at
 from jtqd.sysid.diagnosis.leave_one_out import LARGE_FALL, LeaveOneOut

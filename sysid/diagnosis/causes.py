@@ -27,7 +27,6 @@ _INACCURATE_RATE: Final = 0.04
 """The same of what is known by a derivative of measured angles or torques, smoothed as it is."""
 _INACCURATE_TWIST: Final = 0.05
 """The same of what the teeth or the torsion do within a few tens of microradians, where encoders round."""
-_RATES: Final = ("channel_delay", "gear_damping", "link_inertia")
 _OFFSET, _ASYMMETRY = "current_offset", "friction_asymmetry"
 
 Classes = Sequence[tuple[EffectCandidate, ...]]
@@ -101,7 +100,7 @@ def inaccurate(effect: Effect) -> float:
     """Return the least half width of a 95 % interval, as part of the effect's size."""
     if effect.follows_torsion or effect.geometric:
         return _INACCURATE_TWIST
-    return _INACCURATE_RATE if effect.name in _RATES else _INACCURATE
+    return _INACCURATE_RATE if effect.rate_based else _INACCURATE
 
 
 def _of_nothing(candidate: EffectCandidate) -> dict[str, float]:

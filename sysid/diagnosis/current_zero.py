@@ -18,9 +18,8 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.library import EFFECTS
-from jtqd.estimator.effects.scalar import Scalar
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import Effect, ScalarFunctions, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.noise import Sums
@@ -151,7 +150,7 @@ def unpowered(effect: Effect, p: Values, joint: Joint) -> float:
     if "current_a" not in effect.hooks:
         return 0.0
     rest = State(**dict.fromkeys(State.__slots__, 0.0))
-    return float(effect.current_a(p, rest, joint, Scalar()))
+    return float(effect.current_a(p, rest, joint, ScalarFunctions()))
 
 
 def with_readings(

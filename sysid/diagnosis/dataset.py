@@ -15,8 +15,8 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.checked import counted
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import Effect
-from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.base_loss import BaseLoss

@@ -13,7 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.case import search_case

@@ -4,22 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
-
-_NEUTRAL: Final = {"gain": 1.0}
-"""Parameters whose value without the effect is not 0."""
-_SHAPES: Final = (
-    "phase_rad",
-    "_velocity_rad_s",
-    "_travel_rad",
-    "order_per_motor_rev",
-    "reference_c",
-    "channel",
-)
-"""Endings of parameters that say where or how an effect acts and not how large it is: without it they have no value."""
 
 
 class FileValue(NamedTuple):
@@ -50,18 +38,17 @@ def file_values(
     if joint is None or effect is None:
         return {}
     listed = next((item.parameters for item in joint.effects if item.name == effect_name), None)
-    keys = {parameter.name: parameter.key for parameter in effect.parameters}
+    known = {parameter.name: parameter for parameter in effect.parameters}
     found = {}
     for name in parameters:
-        key = keys.get(name, "")
+        parameter = known.get(name)
+        key = parameter.key if parameter else ""
         if listed is not None and name in listed:
             found[name] = FileValue(float(listed[name]), f"effects: {effect_name}.{name}")
         elif key:
             found[name] = FileValue(_value(joint, key), key)
-        elif name.endswith(_SHAPES):
-            found[name] = FileValue(None, "")
         else:
-            found[name] = FileValue(_NEUTRAL.get(name, 0.0), "")
+            found[name] = FileValue(parameter.neutral if parameter else 0.0, "")
     return found
 
 

@@ -11,9 +11,9 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.array_functions import ArrayFunctions
 from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.library import EFFECTS
-from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
@@ -270,7 +270,7 @@ def _inputs(signals: JointSignals, joint: Joint, terms: Sequence[Term]) -> tuple
     """Return (G Kt I - TAU_S, TAU_S) [n, Nm]: what was measured less what the effects say about the measuring."""
     state = signals.state
     current, sensor = state.current_a, signals.sensor_nm
-    whole = Whole()
+    whole = ArrayFunctions()
     for effect, p in terms:
         if "current_a" in effect.hooks:
             current = current - effect.current_a(p, state, joint, whole)
@@ -388,8 +388,8 @@ def _simulate(model: _Model, drive: FloatArray, sensor: FloatArray, index: Index
     return velocity
 
 
-class _Stepwise(Whole):
-    """Functions of arrays over windows [w], each call one instant later: `slip` remembers, as `Scalar`'s does."""
+class _Stepwise(ArrayFunctions):
+    """Functions of arrays over windows [w], each call one instant later: `slip` remembers its state."""
 
     __slots__ = ("_last", "_z")
 

@@ -12,6 +12,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.checked import counted
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.arm_motion import KINDS, csv_text, described, motions, no_room, room_of
 from jtqd.sysid.diagnosis.experiment_choice import kinds_for
@@ -24,10 +25,9 @@ CONFIG: Final = "CONFIG"
 """Stands in a command for a configuration of jtqd that is not known."""
 
 _BY_HAND: Final = {
-    frozenset(("sensor_crosstalk", "unbalance")): (
-        "If the class remains, turn the coupling by a quarter and repeat the campaign: crosstalk turns with the sensor, "
-        "unbalance does not."
-    ),
+    frozenset((name, other)): text
+    for name, effect in EFFECTS.items()
+    for other, text in effect.by_hand.items()
 }
 
 

@@ -51,8 +51,6 @@ _FREE: Final = 100.0
 _PASSES: Final = 2
 _AS_GOOD: Final = 0.8
 """Part of the drop of the squared error that another deviation of the same run must reach to be named beside."""
-_NOT_BESIDE: Final = frozenset({"sensor_gain"})
-"""With the sensor's gain free beside all else, everything can be scaled away (`noise.saturated_residuals`)."""
 _MOST: Final = 0.5
 """Part of what sets a run apart that its deviation must explain."""
 _MOST_COLUMNS: Final = 24
@@ -167,7 +165,7 @@ class Comparison:
         own = [(r, k) for r in range(len(self.runs)) for k in range(self.kinds)]
         price = log_n + 2.0 * math.log(len(own))
         blocks: list[tuple[list[int], EffectCandidate | tuple[int, int], float]] = [
-            (list(c.columns), c, c.size * log_n) for c in candidates if c.effect.name not in _NOT_BESIDE
+            (list(c.columns), c, c.size * log_n) for c in candidates if not c.effect.scales_all
         ]
         blocks += [([self.place(*at)], at, price) for at in own]
         here: list[int] = []

@@ -15,8 +15,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Term, Values
-from jtqd.estimator.effects.whole import Whole
+from jtqd.estimator.effects.array_functions import ArrayFunctions
+from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Values
+from jtqd.estimator.effects.terms import Term
 from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, JointSignals
@@ -57,7 +58,7 @@ class EffectCandidate:
 
 def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
     """Return what the effect with parameters p leaves in each balance of this joint [n], Nm; absent: nothing."""
-    joint, state, x = s.joint, s.state_of(effect, p), Whole()
+    joint, state, x = s.joint, s.state_of(effect, p), ArrayFunctions()
     out: dict[str, FloatArray] = {}
 
     def add(balance: str, value: FloatArray) -> None:
@@ -323,7 +324,7 @@ def _axes(s: JointSignals, samples: int) -> dict[str, FloatArray]:
 
 def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
     """Return the columns of the torque sensor's gain (see `noise.saturated_residuals`)."""
-    return {k for c in candidates if c.effect.name == "sensor_gain" for k in c.columns}
+    return {k for c in candidates if c.effect.scales_all for k in c.columns}
 
 
 def column_moments(runs: Sequence[RunData], columns: int) -> FloatArray:

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects import EFFECTS
 from jtqd.sysid.diagnosis.current_zero import Readings, UnpoweredColumn, reading_misfit
 from jtqd.sysid.diagnosis.mixed_model import Mixed, Model, explained_each, solve
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
@@ -26,9 +27,7 @@ HELD_OUT: Final = 0.3
 DEEPEST: Final = 6
 _BEAM: Final = 3
 _TRIED: Final = 8
-_WAVES: Final = frozenset({"torque_ripple", "cogging", "kinematic_error"})
-"""Effects of which several orders may be there at once."""
-_SCALED: Final = ("nonlinear_stiffness", "torque_constant")
+_SCALED: Final = tuple(name for name, effect in EFFECTS.items() if effect.scales_balance)
 _ONE_FACTOR: Final = 0.3
 """Changes that differ by less than this part of themselves are one."""
 
@@ -176,7 +175,7 @@ class Search:
             return False
         for one in chosen:
             if one.key == candidate.key and (
-                candidate.effect.name not in _WAVES or order_of(one) == order_of(candidate)
+                not candidate.effect.is_wave or order_of(one) == order_of(candidate)
             ):
                 return False
         return True
@@ -310,7 +309,7 @@ def pinned(chosen: Sequence[EffectCandidate], joints: int) -> bool:
     at least one joint is not. All of them times the same factor is a change of units, which shrinks the noise too.
     """
     names = [c.effect.name for c in chosen]
-    if "sensor_gain" not in names:
+    if not any(c.effect.scales_all for c in chosen):
         return True
     return all(names.count(name) < joints for name in _SCALED)
 

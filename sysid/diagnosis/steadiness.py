@@ -18,7 +18,7 @@ import numpy as np
 from scipy import stats
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.sysid.diagnosis.findings import shows_at
 from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.mixed_model import solve

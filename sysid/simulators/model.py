@@ -19,7 +19,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied

@@ -16,7 +16,7 @@ from jtqd.daemon.loop.process import build_estimator, warm_up
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.corrections import ExtendedInputs, acting_effects
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import FrictionModel

@@ -14,7 +14,8 @@ import pytest
 
 from jtqd.daemon.config import load_config
 from jtqd.estimator.checked import ConfigError, range_text
-from jtqd.estimator.joint import EFFECT_NAMES, Effect, Friction, Joint
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.models.files import load_joint, load_yaml, read_yaml, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.efficiency import TABLE_I
@@ -142,7 +143,7 @@ def test_effects_are_carried_and_only_known_names_pass() -> None:
     ]
     joint = Joint.from_mapping(change, "my.yaml")
     assert joint.effects == (Effect("torque_ripple", {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0}),)
-    assert len(EFFECT_NAMES) == 26
+    assert len(EFFECTS) == 26
     change["effects"][0]["name"] = "magic"
     assert "effects[0].name': found 'magic'" in refused(change)
     change["effects"][0] = {"name": "cogging", "parameters": {"amplitude_nm": "big"}}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.days import Day, Thermal

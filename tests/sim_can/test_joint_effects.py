@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import yaml
 
+from jtqd.estimator.effects import EFFECTS, checked_parameters
+from jtqd.estimator.effects.array_functions import ArrayFunctions
 from jtqd.estimator.effects.effect import State
-from jtqd.estimator.effects.library import EFFECTS, NAMES, checked_parameters
-from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.command import main
@@ -68,7 +68,7 @@ CASES = [
 
 
 def test_cases_are_the_whole_library():
-    assert {name for name, _, _ in CASES} == set(EFFECTS) == set(NAMES)
+    assert {name for name, _, _ in CASES} == set(EFFECTS)
 
 
 def bench_with(name, parameters, joint):
@@ -165,7 +165,7 @@ def hooks(name, parameters, rows, number, h):
     out = {}
     for hook in effect.hooks:
         state.torque_nm = rows[11, :-1] if hook == "sensor_nm" else tau
-        out[hook] = np.broadcast_to(getattr(effect, hook)(values, state, JOINT, Whole()), tau.shape)
+        out[hook] = np.broadcast_to(getattr(effect, hook)(values, state, JOINT, ArrayFunctions()), tau.shape)
     return out
 
 

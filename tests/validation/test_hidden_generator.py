@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.effects.library import EFFECTS, checked_parameters
+from jtqd.estimator.effects import EFFECTS, checked_parameters
 from jtqd.models.files import load_joint
 from tests.paths import ROOT
 from tests.validation.hidden_balances import Signals, binned, expected, signals, slow_enough

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.sysid.diagnosis.base_loss import BaseLoss

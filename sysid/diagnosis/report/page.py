@@ -62,7 +62,7 @@ def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | N
 
 def library() -> Mapping[str, Effect]:
     """Return the effects that ship, by name."""
-    from jtqd.estimator.effects.library import EFFECTS
+    from jtqd.estimator.effects import EFFECTS
 
     return EFFECTS
 

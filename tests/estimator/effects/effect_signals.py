@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.effect import Effect, State, Values
-from jtqd.estimator.effects.whole import Whole
+from jtqd.estimator.effects.array_functions import ArrayFunctions
+from jtqd.estimator.effects.effect import HOOKS, Effect, State, Values
 from jtqd.estimator.joint import Effect as Entry
 from jtqd.estimator.joint import Friction, Joint
 
@@ -27,8 +27,6 @@ PLAIN = Joint(
 )
 
 PEAKED = replace(PLAIN, friction=replace(PLAIN.friction, stribeck_nm=0.7, stribeck_velocity_rad_s=0.06))
-
-HOOKS = ("loss_nm", "twist_rad", "load_nm", "current_a", "link_rad", "sensor_nm")
 
 
 def state(seed: int, count: int = 2000) -> State:
@@ -74,7 +72,7 @@ def at(s: State, k: int) -> State:
 
 def balances(effect: Effect, p: Values, s: State, joint: Joint, x: Any = None) -> tuple[Any, Any]:
     """Return what the effect leaves in the motor and in the torsion balance, Nm (docstring of effect.py)."""
-    x = x or Whole()
+    x = x or ArrayFunctions()
     value = {h: getattr(effect, h)(p, s, joint, x) if h in effect.hooks else 0.0 for h in HOOKS}
     both = value["load_nm"] - value["sensor_nm"]
     motor = joint.gear_ratio * joint.torque_constant_nm_per_a * value["current_a"] + value["loss_nm"] + both

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects import EFFECTS, checked_parameters
+from jtqd.estimator.effects.array_functions import ArrayFunctions
 from jtqd.estimator.effects.effect import State
-from jtqd.estimator.effects.library import EFFECTS, checked_parameters
-from jtqd.estimator.effects.whole import Whole
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import first_order_hold
@@ -137,7 +137,7 @@ def test_the_hooks_say_what_the_hidden_effect_leaves(k: int) -> None:
     state, *before, weight = seen(case)
     _, *floor, _ = seen(cases()[0])
     weight = slow(p, state, weight)
-    explained = balances(effect, p, state, joint, Whole())
+    explained = balances(effect, p, state, joint, ArrayFunctions())
     added = [rms(left - np.mean(left), weight) for left in before]
     for left, none, hook, name in zip(before, floor, explained, ("motor", "torsion"), strict=True):
         rest = left - hook

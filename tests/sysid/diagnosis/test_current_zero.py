@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.base_loss import BaseLoss

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.sysid.diagnosis.gain import squares_beside
 from jtqd.sysid.diagnosis.guards import beyond_bounds
 from jtqd.sysid.diagnosis.refine import PresentEffect, free_names

@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run

@@ -8,7 +8,7 @@ from typing import Final
 import numpy as np
 import pytest
 
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import Dataset

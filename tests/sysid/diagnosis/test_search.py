@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.sysid.diagnosis.evidence import (
     candidate_table,
     class_beside,

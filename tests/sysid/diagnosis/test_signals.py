@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import State
-from jtqd.estimator.effects.library import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, FrictionModel, LossModel
 from jtqd.estimator.run import JointColumns, RunTable

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.library import EFFECTS
+from jtqd.estimator.effects import EFFECTS
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import ORDER, Noise, run_sums
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined

@@ -1,7 +1,7 @@
-"""Terms of the usual shapes: from coefficients of basis columns to parameters, exactly where the effect is linear.
+"""Terms of the effect library: how an effect is fitted by linear regression, from coefficients to parameters.
 
-The combinations are small frozen values rather than closures, so that terms can be sent to another process. numpy is
-loaded where an array comes: the supervisor checks joint files with this library and has none.
+Exact where the effect is linear. The combinations are small frozen values rather than closures, so that terms can be sent
+to another process. numpy is loaded where an array comes: the supervisor checks joint files with this library and has none.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from jtqd.estimator.effects.effect import JointValues, Term, Values
-
 FALLBACK_C: Final = 25.0
 """Reference temperature of a joint file that names none."""
 
@@ -21,6 +19,16 @@ SPAN_K: Final = 10.0
 
 _FLAT: Final = 1e-9
 """Slopes below this part of the constant say nothing about the reference temperature."""
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """A way to look for an effect by linear regression: the hooks at each of `basis` (less the hooks at the joint
+    file's own values) are columns; `combine(coefficients)` of the columns gives the parameters.
+    """
+
+    basis: tuple[Mapping[str, float], ...]
+    combine: Any  # Callable[[Sequence[float]], dict[str, float]]
 
 
 def full(value: float, like: Any) -> Any:
@@ -42,9 +50,9 @@ def above(temperature_c: Any, reference_c: float) -> Any:
     return np.where(np.isfinite(difference), difference, 0.0)
 
 
-def reference_of(joint: JointValues) -> float:
+def reference_of(provenance: Mapping[str, Any]) -> float:
     """Return the temperature [°C] of the joint file's values, from its provenance."""
-    value = joint.provenance.get("temperature_c")
+    value = provenance.get("temperature_c")
     good = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if good else FALLBACK_C  # type: ignore[arg-type]
 
@@ -129,6 +137,6 @@ class Slope:
             self,
         )
 
-    def basis(self, size: float, reference_c: float) -> Values:
+    def basis(self, size: float, reference_c: float) -> Mapping[str, float]:
         """Return the parameters of one column."""
         return {self.name: size, "reference_c": reference_c} | dict(self.fixed)

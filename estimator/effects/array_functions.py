@@ -1,4 +1,4 @@
-"""Elementwise functions for the hooks of effects, over runs: those of `scalar` for arrays."""
+"""Elementwise functions for the hooks of effects over whole runs: `effect.ScalarFunctions` for arrays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 
 
-class Whole:
+class ArrayFunctions:
     """Functions of arrays [n] in order of time. It remembers nothing: every array starts with z = 0."""
 
     __slots__ = ()
@@ -33,7 +33,7 @@ class Whole:
         last, z = math.nan, 0.0
         out: list[float] = []
         add = out.append
-        # a plain loop: 0.1 us per sample, and the very numbers of `Scalar`
+        # a plain loop: 0.1 us per sample, and the very numbers of `ScalarFunctions`
         for now in np.asarray(d, np.float64).tolist():
             step = (now - last) / travel
             if step == step:  # noqa: PLR0124
