@@ -11,7 +11,7 @@ loss went through the same filter; how old the result is says `age`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
-from libc.string cimport memcmp, memcpy
+from libc.string cimport memcmp
 
 from jtqd.estimator.agreement cimport (
     TURN_WAVES,
@@ -25,6 +25,7 @@ from jtqd.estimator.agreement cimport (
     turns_otherwise,
     unsettle_turn,
 )
+from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
 from jtqd.estimator.fusion cimport (
     Fused,
@@ -344,14 +345,11 @@ cdef class FusedEstimator(Estimator):
 
         Raises ValueError for bytes of another length.
         """
-        return (<const char *> &self.state)[: sizeof(FusedState)]
+        return copied(&self.state, sizeof(FusedState))
 
     @past.setter
     def past(self, content):
-        cdef const unsigned char[::1] given = content
-        if <size_t> given.shape[0] != sizeof(FusedState):
-            raise ValueError(f"found a state of {given.shape[0]} bytes, expected {sizeof(FusedState)}")
-        memcpy(&self.state, &given[0], sizeof(FusedState))
+        put_back(&self.state, sizeof(FusedState), content)
 
     def shares_past(self, FusedEstimator other):
         """Return whether the past of `other` means the same here: nothing differs that the zeros were learned with.

@@ -84,7 +84,7 @@ def test_where_the_parameters_of_the_learning_differ_the_state_is_not_valid(name
 
 def test_a_past_of_another_length_is_refused() -> None:
     estimator = FusedEstimator(NARROW, ON)
-    with pytest.raises(ValueError, match="found a state of 8 bytes"):
+    with pytest.raises(ValueError, match="found a block of 8 bytes"):
         estimator.past = bytes(8)
 
 
