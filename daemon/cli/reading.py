@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jtqd.daemon.recording.progress import Account, read_account
+from jtqd.daemon.recording.run_files import Account, read_account
 from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader

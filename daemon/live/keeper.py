@@ -6,7 +6,7 @@ from pathlib import Path
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.live.address import Address
-from jtqd.daemon.recording.keeper import nodes_of
+from jtqd.daemon.recording.launch import nodes_of
 from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.side_process import SideProcess, StartChild, say
 

@@ -19,7 +19,7 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pieces
-from jtqd.daemon.recording.own_files import ACTIVE, PART_PATTERN
+from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
 
 Records = NDArray[np.void]
 """Messages as rows of a structured array [n]."""

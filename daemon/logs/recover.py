@@ -26,7 +26,7 @@ import msgspec
 
 from jtqd.daemon.logs.log_file import Contents, LogError, Source, scan, sealed_chunk
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
-from jtqd.daemon.recording.own_files import ACTIVE, OwnFile, free_bytes, own_files
+from jtqd.daemon.recording.run_files import ACTIVE, OwnFile, free_bytes, own_files
 from jtqd.estimator.checked import counted
 
 _PARTIAL = ".recovering"

@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import Status
-from jtqd.daemon.recording.own_files import MEGABYTE
-from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.recording.run_files import MEGABYTE, Account
 from jtqd.daemon.shared import notices
 from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, worst
 from jtqd.daemon.shared.counters import Shown, shown_in

@@ -7,24 +7,25 @@ once, and another part is begun as soon as that is possible. Nothing here raises
 from __future__ import annotations
 
 import time
+from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, Span
-from jtqd.daemon.recording.own_files import (
+from jtqd.daemon.recording.recording import ERROR, INFO, WARN, Journal
+from jtqd.daemon.recording.run_files import (
     ACTIVE,
     MEGABYTE,
+    Account,
     free_bytes,
     own_files,
     part_name,
     sized,
     to_remove,
 )
-from jtqd.daemon.recording.progress import Account
 
 _RETRY_NS = 900_000_000
 """An attempt to begin a file costs little: at most this, and what was being collected, is lost when the disk is back."""
@@ -286,3 +287,84 @@ class Parts:
             text = "the budget is exceeded by files that are not removed; recording continues"
             self._journal.report(schemas.FILE_RETIRED, text, level=WARN)
         self._over_budget = over
+
+
+# ---- flight recorder ----
+
+AFTER_S = 5.0
+_NOTICED_S = 0.1
+"""An occurrence is noticed within one poll of the recorder."""
+_NS = 1_000_000_000
+
+
+class FlightRecorder:
+    """Flight recorder: keeps the last seconds in memory, as spans, and writes them on a trigger.
+
+    Around an occurrence: everything that memory holds before it, and `AFTER_S` behind it; another occurrence in that time
+    prolongs it. What falls out of memory unwritten counts as let go, and so does what memory holds.
+
+    Occurrences: a joint becomes DRIVE_FAULT or INVALID, or is STALE for longer than `STALE_S` (`FaultTrigger`), the loop
+    ends in an error, jtqd goes away without ending the recorder, or a request (SIGUSR1, `jtq control save`).
+
+    Args:
+        parts: writes the files.
+        keep_s: how much memory holds.
+    """
+
+    def __init__(self, parts: Parts, journal: Journal, account: Account, keep_s: float) -> None:
+        self._parts = parts
+        self._journal = journal
+        self._account = account
+        self._keep_ns = round((keep_s + _NOTICED_S) * _NS)
+        self._memory: deque[tuple[Span, int]] = deque()
+        self._until_ns: int | None = None
+        self._newest_ns = 0
+        self.saved = 0
+        """Recordings begun so far."""
+
+    @property
+    def saving(self) -> bool:
+        """Return whether a file is being written."""
+        return self._until_ns is not None
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the spans in memory."""
+        return sum(span.size for span, _ in self._memory)
+
+    @property
+    def memory_s(self) -> float:
+        """Recorded time in memory [s]."""
+        return (self._memory[-1][1] - self._memory[0][1]) / _NS if self._memory else 0.0
+
+    def write(self, span: Span, at_ns: int) -> None:
+        """Keep a span in memory, or write it while saving."""
+        self._newest_ns = max(self._newest_ns, at_ns)
+        if self._until_ns is not None:
+            self._parts.write(span, at_ns)
+            if at_ns >= self._until_ns:
+                self._until_ns = None
+                self._parts.end()
+            return
+        self._memory.append((span, at_ns))
+        self._account.let_go += span.cycles
+        while self._memory[0][1] < at_ns - self._keep_ns:
+            self._memory.popleft()
+
+    def save(self, why: str) -> None:
+        """Write what is in memory and what comes in the next `AFTER_S`."""
+        begun, self._until_ns = self._until_ns is None, self._newest_ns + round(AFTER_S * _NS)
+        if not begun:
+            return
+        self.saved += 1
+        self._journal.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
+        self._parts.open(why)
+        while self._memory:
+            span, at_ns = self._memory.popleft()
+            self._account.let_go -= span.cycles
+            self._parts.write(span, at_ns)
+
+    def finish(self) -> None:
+        """End the file if one is being written."""
+        self._until_ns = None
+        self._parts.end()

@@ -6,22 +6,76 @@ recorder, which keeps them in memory until something happens. Nothing raises for
 
 from __future__ import annotations
 
-from collections import deque
+from collections.abc import Callable
 from typing import Protocol
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.journal import ERROR, INFO, WARN, Journal
-from jtqd.daemon.recording.mcap_file import Span
-from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
-from jtqd.daemon.recording.parts import Parts
-from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Span
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, event, log
+from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record as cycle
 
-# ---- flight recorder ----
+# ---- events ----
 
-AFTER_S = 5.0
-_NOTICED_S = 0.1
-"""An occurrence is noticed within one poll of the recorder."""
+_PER_SPAN = 50
+"""A status that flaps every cycle must not fill the disk; what is left out is counted."""
+_BOUNDED = (schemas.STATUS_CHANGED, schemas.SLOTS_MISSED, schemas.NOTICE)
+INFO, WARN, ERROR = 20, 30, 40
+
+
+class Journal:
+    """Adds events to the span that is being collected.
+
+    Args:
+        builder: of the spans.
+        warn: called with one line for the operator.
+
+    Attributes:
+        newest: index and CLOCK_REALTIME of the newest cycle.
+        left_out: events for which there was no room.
+    """
+
+    def __init__(self, builder: ChunkBuilder, warn: Callable[[str], None]) -> None:
+        self.builder = builder
+        self.warn = warn
+        self.newest = (0, 0)
+        self.left_out = 0
+        self._in_span = 0
+
+    def new_span(self) -> None:
+        """Reset the number of events for a new span."""
+        self._in_span = 0
+
+    def note(
+        self,
+        kind: int,
+        text: str,
+        *,
+        level: int,
+        time_ns: int | None = None,
+        count: int = 0,
+        joint: int = 0,
+        change: tuple[int, int] = (0, 0),
+    ) -> None:
+        """Write an event, and its text to /log; the time is the newest cycle's unless one is given."""
+        self._in_span += 1
+        if self._in_span > _PER_SPAN and kind in _BOUNDED:
+            self.left_out += 1
+            return
+        index, newest = self.newest
+        when = newest if time_ns is None else time_ns
+        payload = event(when, kind, text, index=index, count=count, joint=joint, change=change)
+        self.builder.add(schemas.EVENTS.number, when, payload)
+        self.builder.add(schemas.LOG.number, when, log(when, level, text))
+
+    def report(self, kind: int, text: str, *, level: int, count: int = 0) -> None:
+        """Note an event and report its text to the operator."""
+        self.warn(text)
+        self.note(kind, text, level=level, count=count)
+
+
+# ---- faults ----
+
 STALE_S = 1.0
 _NS = 1_000_000_000
 _AT_ONCE = [code for code, name in schemas.STATUS_NAMES.items() if name in ("DRIVE_FAULT", "INVALID")]
@@ -56,79 +110,6 @@ class FaultTrigger:
                 self._stale_since[n] = None
                 return f"joint {n + 1}: STALE for more than {STALE_S:g} s"
         return ""
-
-
-class FlightRecorder:
-    """Flight recorder: keeps the last seconds in memory, as spans, and writes them on a trigger.
-
-    Around an occurrence: everything that memory holds before it, and `AFTER_S` behind it; another occurrence in that time
-    prolongs it. What falls out of memory unwritten counts as let go, and so does what memory holds.
-
-    Occurrences: a joint becomes DRIVE_FAULT or INVALID, or is STALE for longer than `STALE_S` (`FaultTrigger`), the loop
-    ends in an error, jtqd goes away without ending the recorder, or a request (SIGUSR1, `jtq control save`).
-
-    Args:
-        parts: writes the files.
-        keep_s: how much memory holds.
-    """
-
-    def __init__(self, parts: Parts, journal: Journal, account: Account, keep_s: float) -> None:
-        self._parts = parts
-        self._journal = journal
-        self._account = account
-        self._keep_ns = round((keep_s + _NOTICED_S) * _NS)
-        self._memory: deque[tuple[Span, int]] = deque()
-        self._until_ns: int | None = None
-        self._newest_ns = 0
-        self.saved = 0
-        """Recordings begun so far."""
-
-    @property
-    def saving(self) -> bool:
-        """Return whether a file is being written."""
-        return self._until_ns is not None
-
-    @property
-    def memory_bytes(self) -> int:
-        """Bytes of the spans in memory."""
-        return sum(span.size for span, _ in self._memory)
-
-    @property
-    def memory_s(self) -> float:
-        """Recorded time in memory [s]."""
-        return (self._memory[-1][1] - self._memory[0][1]) / _NS if self._memory else 0.0
-
-    def write(self, span: Span, at_ns: int) -> None:
-        """Keep a span in memory, or write it while saving."""
-        self._newest_ns = max(self._newest_ns, at_ns)
-        if self._until_ns is not None:
-            self._parts.write(span, at_ns)
-            if at_ns >= self._until_ns:
-                self._until_ns = None
-                self._parts.end()
-            return
-        self._memory.append((span, at_ns))
-        self._account.let_go += span.cycles
-        while self._memory[0][1] < at_ns - self._keep_ns:
-            self._memory.popleft()
-
-    def save(self, why: str) -> None:
-        """Write what is in memory and what comes in the next `AFTER_S`."""
-        begun, self._until_ns = self._until_ns is None, self._newest_ns + round(AFTER_S * _NS)
-        if not begun:
-            return
-        self.saved += 1
-        self._journal.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
-        self._parts.open(why)
-        while self._memory:
-            span, at_ns = self._memory.popleft()
-            self._account.let_go -= span.cycles
-            self._parts.write(span, at_ns)
-
-    def finish(self) -> None:
-        """End the file if one is being written."""
-        self._until_ns = None
-        self._parts.end()
 
 
 # ---- cycles ----

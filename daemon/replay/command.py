@@ -16,7 +16,7 @@ from mcap.records import Channel, Schema
 from jtqd.daemon.logs import LogError, read_attachments
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CDR_HEADER, JOINT_ESTIMATE_SIZE
-from jtqd.daemon.recording.own_files import ACTIVE
+from jtqd.daemon.recording.run_files import ACTIVE
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
 from jtqd.daemon.replay.contacts import Contacts

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from jtqd.daemon.config import LOOPBACK, Config, Ros2Settings
-from jtqd.daemon.recording.keeper import nodes_of
+from jtqd.daemon.recording.launch import nodes_of
 from jtqd.daemon.ros2.network import domain_id
 from jtqd.daemon.shared.side_process import SideProcess, StartChild, say
 

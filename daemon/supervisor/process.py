@@ -25,7 +25,7 @@ from jtqd.daemon.config import Config, Ros2Settings, as_booted
 from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.keeper import LiveKeeper
 from jtqd.daemon.loop.realtime import stolen_s
-from jtqd.daemon.recording.keeper import Keeper, recording_request
+from jtqd.daemon.recording.launch import Keeper, recording_request
 from jtqd.daemon.ros2.keeper import Ros2Keeper
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile

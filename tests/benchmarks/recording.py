@@ -23,9 +23,8 @@ from mcap.writer import CompressionType, Writer
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import BLOCK_PARTS, BLOCK_SIZE, cycle_block
-from jtqd.daemon.recording.progress import Account
-from jtqd.daemon.recording.recorder import Session
-from jtqd.daemon.recording.request import RecorderRequest
+from jtqd.daemon.recording.recorder import RecorderRequest, Session
+from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.ring import RingReader
 from tests.benchmarks.contender import ROOT

@@ -23,7 +23,7 @@ from jtqd.daemon import profiles
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.config import load_config
-from jtqd.daemon.recording import keeper
+from jtqd.daemon.recording import launch
 from jtqd.daemon.replay.origin import CONFIGURATION, PROVENANCE, open_origin
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import shipped
@@ -172,13 +172,13 @@ def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Pat
     profile = tmp_path / "mine.yaml"
     profile.write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
     config = load_config(configuration(tmp_path, profile="mine.yaml"))
-    attached = {name: data for name, _, data in keeper._attached_files(config)}
+    attached = {name: data for name, _, data in launch._attached_files(config)}
     assert attached["mine.yaml"] == profile.read_bytes()
     factors = dict.fromkeys(
         ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"), 1.0
     )
     factors["ampere_per_unit"] = -0.25  # a drive that counts backwards
-    provenance = keeper._provenance(config, {"nodes": {"1": {"scaling": factors, "gear_ratio": 100.0}}})
+    provenance = launch._provenance(config, {"nodes": {"1": {"scaling": factors, "gear_ratio": 100.0}}})
     attached |= {CONFIGURATION: config.text.encode(), PROVENANCE: json.dumps(provenance).encode()}
     profile.unlink()
     empty = tmp_path / "empty"

@@ -20,7 +20,7 @@ from jtqd.daemon.cli.reading import Watch, find_daemons
 from jtqd.daemon.cli.recent import Moment, Recent
 from jtqd.daemon.cli.status import StatusView, main
 from jtqd.daemon.cli.terminal import paged
-from jtqd.daemon.recording.progress import Account, ProgressFile
+from jtqd.daemon.recording.run_files import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notices
 from jtqd.daemon.shared.runtime_dir import start_ticks, write_about

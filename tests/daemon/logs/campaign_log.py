@@ -8,11 +8,10 @@ from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 
-from jtqd.daemon.recording.journal import Journal
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
-from jtqd.daemon.recording.progress import Account
-from jtqd.daemon.recording.recording import Recording
+from jtqd.daemon.recording.recording import Journal, Recording
+from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 

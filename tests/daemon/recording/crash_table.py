@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jtqd.daemon.recording.own_files import own_files
+from jtqd.daemon.recording.run_files import own_files
 from tests.daemon.recording.recorder_bench import START_NS, RecorderProcess, cycles_of, put, record_of
 from tests.paths import ROOT
 

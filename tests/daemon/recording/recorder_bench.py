@@ -12,13 +12,11 @@ from pathlib import Path
 from mcap.reader import make_reader
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.journal import Journal
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile
 from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
-from jtqd.daemon.recording.progress import Account
-from jtqd.daemon.recording.recorder import Session
-from jtqd.daemon.recording.recording import Recording
-from jtqd.daemon.recording.request import RecorderRequest
+from jtqd.daemon.recording.recorder import RecorderRequest, Session
+from jtqd.daemon.recording.recording import Journal, Recording
+from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring

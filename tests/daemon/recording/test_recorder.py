@@ -17,7 +17,7 @@ from mcap.reader import make_reader
 from mcap.records import Channel, Chunk, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 
-from jtqd.daemon.recording.request import RecorderRequest, RequestError
+from jtqd.daemon.recording.recorder import RecorderRequest, RequestError
 from jtqd.daemon.shared import cycle_record as cr
 from tests.daemon.recording.recorder_bench import (
     DEFINITIONS,

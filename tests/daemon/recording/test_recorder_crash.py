@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from jtqd.daemon.recording.own_files import own_files
+from jtqd.daemon.recording.run_files import own_files
 from tests.daemon.recording.crash_table import CASES, NEED_ROOT, Bench
 from tests.daemon.recording.recorder_bench import RecorderProcess, cycles_of, put, record_of, session_on
 

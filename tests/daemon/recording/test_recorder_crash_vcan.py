@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.recording.own_files import own_files
+from jtqd.daemon.recording.run_files import own_files
 from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.ring import RingReader
 from jtqd.models.files import shipped

@@ -13,12 +13,11 @@ from mcap.stream_reader import StreamReader
 from jtqd.daemon.config import load_config
 from jtqd.daemon.logs.recover import recover_unfinished
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.journal import ERROR, WARN, Journal
-from jtqd.daemon.recording.keeper import Keeper, recording_request
+from jtqd.daemon.recording.launch import Keeper, recording_request
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
-from jtqd.daemon.recording.own_files import own_files, parse
-from jtqd.daemon.recording.recorder import main
-from jtqd.daemon.recording.request import RecorderRequest
+from jtqd.daemon.recording.recorder import RecorderRequest, main
+from jtqd.daemon.recording.recording import ERROR, WARN, Journal
+from jtqd.daemon.recording.run_files import own_files, parse
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child

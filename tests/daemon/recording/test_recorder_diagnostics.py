@@ -7,7 +7,7 @@ import pytest
 from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
-from jtqd.daemon.recording.progress import Account
+from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.notices import ERROR, INFO, WARNING, Notices

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from jtqd.daemon.recording import keeper as keeper_module
-from jtqd.daemon.recording.keeper import Keeper
+from jtqd.daemon.recording import launch
+from jtqd.daemon.recording.launch import Keeper
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.counters import COUNTERS
@@ -68,8 +68,8 @@ def _open_files(pid):
 
 @pytest.fixture
 def kept(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(keeper_module, "_PAUSE_S", 0.0)
-    monkeypatch.setattr(keeper_module, "_STARTS", 2)
+    monkeypatch.setattr(launch, "_PAUSE_S", 0.0)
+    monkeypatch.setattr(launch, "_STARTS", 2)
     (tmp_path / "logs").mkdir()
     made = Kept(tmp_path, capfd)
     yield made
@@ -91,7 +91,7 @@ def test_one_that_dies_again_and_again_is_tried_again_after_a_long_pause_and_all
         kept.keeper.watch()
     assert kept.capfd.readouterr().err == "", "said once"
     assert len(kept.children) == started
-    monkeypatch.setattr(keeper_module, "_LONG_PAUSE_S", 0.0)
+    monkeypatch.setattr(launch, "_LONG_PAUSE_S", 0.0)
     kept.until("restarted, the loop")
     kept.wait()
     result = kept.keeper.end()

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from jtqd.daemon.recording import mcap_file as appender
 from jtqd.daemon.recording import parts
-from jtqd.daemon.recording.own_files import Sized, free_run, own_files, parse, part_name, to_remove
+from jtqd.daemon.recording.run_files import Sized, free_run, own_files, parse, part_name, to_remove
 from tests.daemon.recording.recorder_bench import (
     DEFINITIONS,
     RecorderProcess,

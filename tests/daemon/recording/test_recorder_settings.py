@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.config import RecordingSettings, load_config
-from jtqd.daemon.recording.keeper import recording_request
-from jtqd.daemon.recording.request import RecorderRequest
+from jtqd.daemon.recording.launch import recording_request
+from jtqd.daemon.recording.recorder import RecorderRequest
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
 from jtqd.models.files import shipped

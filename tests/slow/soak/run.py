@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from jtqd.daemon.recording.progress import read_account
+from jtqd.daemon.recording.run_files import read_account
 from jtqd.drivers.frame_socket import BusDown, FrameSocket, open_frame_socket
 from jtqd.estimator import status as st
 from tests.slow.faults.ears import Heard, joined

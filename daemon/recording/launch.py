@@ -17,8 +17,7 @@ from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.recording.dbc import dbc_text
-from jtqd.daemon.recording.own_files import free_run, own_files
-from jtqd.daemon.recording.progress import Account, ProgressFile
+from jtqd.daemon.recording.run_files import Account, ProgressFile, free_run, own_files
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.runtime_dir import versions
 from jtqd.daemon.shared.snapshot import SnapshotReader
