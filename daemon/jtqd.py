@@ -15,7 +15,7 @@ from typing import Any
 
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler installed, also in the first second.
 from jtqd import __version__
-from jtqd.daemon.live.address import NEEDED, Address, address, installed
+from jtqd.daemon.live.launch import NEEDED, Address, address, installed
 from jtqd.estimator.checked import seconds
 
 _EXAMPLES = """examples:
@@ -116,7 +116,7 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
         print(f"jtqd: {NEEDED}", file=sys.stderr)
         return 1
     from jtqd.daemon.config import load_config
-    from jtqd.daemon.ros2 import network as ros2
+    from jtqd.daemon.ros2 import launch as ros2
     from jtqd.daemon.supervisor.process import ConfigurationRefused, Supervisor, SupervisorError
     from jtqd.drivers.frame_socket import BusError
     from jtqd.estimator.checked import ConfigError

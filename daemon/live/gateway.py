@@ -12,7 +12,7 @@ import re
 import threading
 from contextlib import suppress
 
-from jtqd.daemon.live.address import Address
+from jtqd.daemon.live.launch import Address
 
 PROTOCOL, OLDER = "foxglove.sdk.v1", "foxglove.websocket.v1"
 _HEADER = re.compile(rb"^(sec-websocket-protocol: *)([^\r\n]*)", re.IGNORECASE | re.MULTILINE)

@@ -27,8 +27,8 @@ from typing import Any, NamedTuple
 
 import foxglove
 
-from jtqd.daemon.live.address import Address
 from jtqd.daemon.live.gateway import Gateway
+from jtqd.daemon.live.launch import Address
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node
 from jtqd.daemon.recording.messages import (

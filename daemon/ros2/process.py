@@ -25,7 +25,7 @@ import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
@@ -37,10 +37,17 @@ from cyclonedds.qos import Policy, Qos
 from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
+from jtqd.daemon.config import LOOPBACK
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node
-from jtqd.daemon.ros2.idl import TYPE_HASHES, DiagnosticArray, JointState, JointTorqueState, Message
-from jtqd.daemon.ros2.messages import JointMessages, diagnostic_array
-from jtqd.daemon.ros2.network import domain_xml
+from jtqd.daemon.ros2.messages import (
+    TYPE_HASHES,
+    DiagnosticArray,
+    JointMessages,
+    JointState,
+    JointTorqueState,
+    Message,
+    diagnostic_array,
+)
 from jtqd.daemon.shared import cycle_record as cycle
 from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.ring import RingError, RingReader
@@ -73,6 +80,36 @@ def own_addresses() -> list[str]:
                 request = struct.pack("256s", name.encode()[:15])
                 found.append(socket.inet_ntoa(fcntl.ioctl(asked, _SIOCGIFADDR, request)[20:24]))
     return found
+
+
+_ANNOUNCED_S = 2.0
+"""Between two announcements to the nodes of this machine: for so long a new node may have to wait."""
+
+
+def domain_xml(interface: str, addresses: Sequence[str]) -> str:
+    """Return Cyclone DDS's configuration for one network interface. CYCLONEDDS_URI, meant for other programs, is not read.
+
+    Each participant of a machine has a number of its own, and so ports of its own (`auto`), as in ROS 2, so that others find
+    it without multicast; 32 is rmw_cyclonedds's limit. On loopback this is how nodes are found that use other interfaces,
+    as they do in ROS 2 by default: announcements to this machine's own addresses never leave it. Cyclone DDS 11.0 ignores
+    announcements to 127.0.0.1 where it does not use that interface itself (its pull request 2457).
+
+    Args:
+        interface: its name.
+        addresses: of this machine's interfaces (IPv4).
+    """
+    discovery = (
+        "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
+    )
+    if interface == LOOPBACK:
+        peers = "".join(f'<Peer address="{address}" PruneDelay="inf"/>' for address in addresses)
+        discovery += f"<SPDPInterval>{_ANNOUNCED_S:g}s</SPDPInterval><Peers>{peers}</Peers>"
+    return (
+        '<CycloneDDS><Domain Id="any">'
+        f'<General><Interfaces><NetworkInterface name="{interface}"/></Interfaces></General>'
+        f"<Discovery>{discovery}</Discovery>"
+        "</Domain></CycloneDDS>"
+    )
 
 
 class Writers:

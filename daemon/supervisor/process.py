@@ -22,11 +22,10 @@ from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
 from jtqd.daemon.config import Config, Ros2Settings, as_booted
-from jtqd.daemon.live.address import Address
-from jtqd.daemon.live.keeper import LiveKeeper
+from jtqd.daemon.live.launch import Address, LiveView
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.recording.launch import Keeper, recording_request
-from jtqd.daemon.ros2.keeper import Ros2Keeper
+from jtqd.daemon.ros2.launch import Ros2Publisher
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.log_lines import ERROR, INFO, NOTICE, WARNING, EventLog, OperatorLog
@@ -249,7 +248,7 @@ class Supervisor:
         """Set as long as nodes that we have started are on the bus."""
         self._load = checked_load(config)
         self._log_directory = log_directory(record)
-        self._ros2 = Ros2Keeper(self._child, config.ros2 or Ros2Settings()) if ros2 else None
+        self._ros2 = Ros2Publisher(self._child, config.ros2 or Ros2Settings()) if ros2 else None
         try:
             self._directory, self._lock = claim(bus)
         except BlockingIOError as error:
@@ -263,7 +262,7 @@ class Supervisor:
         self._snapshot = self._directory / "snapshot"
         self._children: list[Child] = []
         self._recorder = Keeper(self._child, self._directory, self._snapshot)
-        self._live = None if live is None else LiveKeeper(self._child, live)
+        self._live = None if live is None else LiveView(self._child, live)
         self._log = OperatorLog()
         self._log_event = EventLog(self._log)
         self._conditions = Conditions()

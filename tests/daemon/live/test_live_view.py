@@ -8,8 +8,8 @@ import time
 
 import pytest
 
-from jtqd.daemon.live.address import Address, address
 from jtqd.daemon.live.gateway import OLDER, PROTOCOL
+from jtqd.daemon.live.launch import Address, address
 from jtqd.daemon.live.process import LiveStream
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import CAN_FRAMES_SIZE, JOINT_ESTIMATE_SIZE

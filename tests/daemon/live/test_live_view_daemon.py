@@ -14,8 +14,7 @@ import pytest
 
 from jtqd.daemon import jtqd
 from jtqd.daemon.config import load_config
-from jtqd.daemon.live.address import Address
-from jtqd.daemon.live.keeper import LiveKeeper
+from jtqd.daemon.live.launch import Address, LiveView
 from jtqd.daemon.shared import side_process
 from jtqd.daemon.shared.child_process import Child
 from tests.daemon.live.live_view_helpers import ROOT, Memory, Viewer
@@ -26,12 +25,12 @@ _LISTENING = re.compile(r"jtqd: live view: (ws://127\.0\.0\.1:\d+)\n")
 
 
 class Kept:
-    """A LiveKeeper with real children on memory without a loop."""
+    """A LiveView with real children on memory without a loop."""
 
     def __init__(self, directory, capfd, port=0):
         self.memory = Memory(directory)
         self.children, self.capfd, self.said = [], capfd, ""
-        self.keeper = LiveKeeper(self._child, Address(port=port))
+        self.keeper = LiveView(self._child, Address(port=port))
         self.keeper.start(load_config(None), directory, "vcan7")
 
     def _child(self, module, arguments, name):
@@ -101,8 +100,8 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
 
 
 def test_an_address_that_others_reach_is_said(tmp_path, capfd, monkeypatch):
-    monkeypatch.setattr(LiveKeeper, "_run", lambda self: None)
-    LiveKeeper(lambda *_: None, Address("0.0.0.0")).start(load_config(None), tmp_path, "can0")
+    monkeypatch.setattr(LiveView, "_run", lambda self: None)
+    LiveView(lambda *_: None, Address("0.0.0.0")).start(load_config(None), tmp_path, "can0")
     assert (
         "accepts connections from every host that can reach 0.0.0.0; it is read-only"
         in capfd.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 
 import jtqd
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.ros2 import idl
+from jtqd.daemon.ros2 import messages as idl
 from jtqd.daemon.ros2.messages import header
 from jtqd.daemon.shared import cycle_record, faults
 from jtqd.estimator import status as st

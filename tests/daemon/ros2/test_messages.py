@@ -6,8 +6,9 @@ import pytest
 
 from jtqd.daemon.config import Config, Ros2Settings, load_config
 from jtqd.daemon.recording.messages import Status
-from jtqd.daemon.ros2 import network
+from jtqd.daemon.ros2 import launch
 from jtqd.daemon.ros2.messages import JointMessages, diagnostic_array
+from jtqd.daemon.ros2.process import domain_xml
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import JointView, View
@@ -147,7 +148,7 @@ def test_diagnostics_name_the_bus_and_tell_faults_and_age_of_the_joints():
     ],
 )
 def test_the_domain_is_the_configured_one_else_that_of_ros(configured, environment, expected):
-    assert network.domain_id(configured, environment) == expected
+    assert launch.domain_id(configured, environment) == expected
 
 
 @pytest.mark.parametrize("text", ["x", "-1", "233", "1.5", "²"])
@@ -155,18 +156,16 @@ def test_a_domain_that_is_none_is_refused(text):
     with pytest.raises(
         ConfigError, match=r"ROS_DOMAIN_ID: found '.*', expected a whole number from 0 to 232"
     ):
-        network.domain_id(None, {"ROS_DOMAIN_ID": text})
+        launch.domain_id(None, {"ROS_DOMAIN_ID": text})
 
 
 def test_where_no_wheel_is_it_says_so():
-    assert network.needed("x86_64") == "the package cyclonedds: pip install 'jtqd[ros2]'"
-    assert "no wheel for aarch64: docs/ros2.md" in network.needed("aarch64")
+    assert launch.needed("x86_64") == "the package cyclonedds: pip install 'jtqd[ros2]'"
+    assert "no wheel for aarch64: docs/ros2.md" in launch.needed("aarch64")
 
 
 def test_announcements_to_single_addresses_are_for_the_loopback_alone():
-    on_loopback, on_ethernet = (
-        network.domain_xml(name, ["127.0.0.1", "192.0.2.2"]) for name in ("lo", "eth0")
-    )
+    on_loopback, on_ethernet = (domain_xml(name, ["127.0.0.1", "192.0.2.2"]) for name in ("lo", "eth0"))
     assert 'NetworkInterface name="lo"' in on_loopback
     assert '<Peer address="127.0.0.1"' in on_loopback
     assert '<Peer address="192.0.2.2"' in on_loopback

@@ -16,7 +16,7 @@ import pytest
 
 from jtqd.daemon import jtqd
 from jtqd.daemon.config import Ros2Settings, load_config
-from jtqd.daemon.ros2.keeper import Ros2Keeper
+from jtqd.daemon.ros2.launch import Ros2Publisher
 from jtqd.daemon.shared.child_process import Child
 from tests.daemon.live.live_view_helpers import Memory
 from tests.daemon.ros2.publisher_helpers import Process, Publisher, Reader, own_domain, request_of
@@ -192,12 +192,12 @@ def _request(memory, **changes):
 
 
 class Kept:
-    """A Ros2Keeper with real children on memory without a loop."""
+    """A Ros2Publisher with real children on memory without a loop."""
 
     def __init__(self, directory, capfd, **settings):
         Memory(directory)
         self.children, self.capfd, self.said = [], capfd, ""
-        self.keeper = Ros2Keeper(self._child, Ros2Settings(domain_id=own_domain(), **settings))
+        self.keeper = Ros2Publisher(self._child, Ros2Settings(domain_id=own_domain(), **settings))
         self.keeper.start(load_config(None), directory, "vcan7")
 
     def _child(self, module, arguments, name):

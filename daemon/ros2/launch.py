@@ -1,17 +1,50 @@
-"""The supervisor's side of the ROS 2 publisher: what its process is told; start and restart: `SideProcess`."""
+"""How jtqd starts the ROS 2 publisher: its package, its DDS domain and network interface, and the request to its process."""
 
 from __future__ import annotations
 
+import importlib.util
 import os
+from collections.abc import Mapping
 from pathlib import Path
 
-from jtqd.daemon.config import LOOPBACK, Config, Ros2Settings
+from jtqd.daemon.config import HIGHEST_DOMAIN, LOOPBACK, Config, Ros2Settings
 from jtqd.daemon.recording.launch import nodes_of
-from jtqd.daemon.ros2.network import domain_id
 from jtqd.daemon.shared.side_process import SideProcess, StartChild, say
+from jtqd.estimator.checked import ConfigError
+
+_WHEELS_FOR = "x86_64"
+_VARIABLE = "ROS_DOMAIN_ID"
 
 
-class Ros2Keeper(SideProcess):
+def installed() -> bool:
+    """Return whether the package that the publisher needs is installed."""
+    return importlib.util.find_spec("cyclonedds") is not None
+
+
+def needed(machine: str) -> str:
+    """Return what is missing and how it is installed, for a machine as `platform.machine` names it."""
+    if machine == _WHEELS_FOR:
+        return "the package cyclonedds: pip install 'jtqd[ros2]'"
+    return (
+        f"the package cyclonedds, of which there is no wheel for {machine}: docs/ros2.md says how it is built"
+    )
+
+
+def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:
+    """Return the DDS domain: as configured, else as the environment says (ROS_DOMAIN_ID), else 0.
+
+    Raises:
+        ConfigError: the environment says something else than a domain.
+    """
+    text = environment.get(_VARIABLE, "")
+    if configured is not None or not text:
+        return configured or 0
+    if not (text.isascii() and text.isdecimal()) or int(text) > HIGHEST_DOMAIN:
+        raise ConfigError(f"{_VARIABLE}: found {text!r}, expected a whole number from 0 to {HIGHEST_DOMAIN}")
+    return int(text)
+
+
+class Ros2Publisher(SideProcess):
     """ROS 2 publisher of one run of jtqd; its failures do not affect the loop.
 
     Args:

@@ -1,0 +1,98 @@
+"""How jtqd starts the live view: its address (HOST:PORT of `jtqd --live`), its package, and the request to its process."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import ipaddress
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+from jtqd.daemon.shared.notices import FILE as NOTICES
+from jtqd.daemon.shared.side_process import SideProcess, StartChild, say
+
+if TYPE_CHECKING:
+    from jtqd.daemon.config import Config
+
+DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8765
+_PACKAGE = "foxglove"
+NEEDED = "--live needs the package foxglove-sdk: pip install 'jtqd[live]'"
+
+
+def installed() -> bool:
+    """Return whether the package that the live view needs is installed."""
+    return importlib.util.find_spec(_PACKAGE) is not None
+
+
+class Address(NamedTuple):
+    """A host name or IP address, and a TCP port (0: any that is free)."""
+
+    host: str = DEFAULT_HOST
+    port: int = DEFAULT_PORT
+
+    @property
+    def url(self) -> str:
+        """URL for a viewer."""
+        return f"ws://[{self.host}]:{self.port}" if ":" in self.host else f"ws://{self.host}:{self.port}"
+
+    @property
+    def loopback(self) -> bool:
+        """Only this machine can reach it."""
+        try:
+            return ipaddress.ip_address(self.host).is_loopback
+        except ValueError:
+            return self.host == "localhost"
+
+
+def address(text: str) -> Address:
+    """HOST:PORT, HOST, PORT or [IPv6]:PORT; what is left out is the default. Raises argparse.ArgumentTypeError."""
+    problem = argparse.ArgumentTypeError(f"found {text!r}, expected HOST:PORT, HOST or PORT (0 to 65535)")
+    if text.isdecimal():
+        host, port = "", text
+    elif found := re.fullmatch(r"\[([0-9a-fA-F:.]+)\](?::(\d+))?|([\w.-]+)?(?::(\d+))?", text):
+        host, port = found[1] or found[3] or "", found[2] or found[4] or ""
+    else:
+        raise problem
+    if not text or int(port or 0) > 65535:
+        raise problem
+    return Address(host or DEFAULT_HOST, int(port) if port else DEFAULT_PORT)
+
+
+class LiveView(SideProcess):
+    """Live view of one run of jtqd; its failures do not affect the loop.
+
+    Args:
+        start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
+        address: where it listens.
+    """
+
+    def __init__(self, start_child: StartChild, address: Address) -> None:
+        super().__init__(start_child, "jtqd.daemon.live.process", "live view", "listening")
+        self._address = address
+
+    def start(self, config: Config, directory: Path, bus: str) -> None:
+        """Start the live view of the daemon's runtime directory.
+
+        Args:
+            config: in force.
+            directory: holds `ring`, `snapshot` and `notices`.
+            bus: name of the bus.
+        """
+        from jtqd.daemon.recording.launch import nodes_of
+
+        self._request = {
+            "ring": str(directory / "ring"),
+            "snapshot": str(directory / "snapshot"),
+            "notices": str(directory / NOTICES),
+            "host": self._address.host,
+            "port": self._address.port,
+            "bus": bus,
+            "nodes": nodes_of(config),
+            "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
+        }
+        if not self._address.loopback:
+            say(
+                f"the live view accepts connections from every host that can reach {self._address.host}; it is read-only"
+            )
+        self._run()
