@@ -18,9 +18,8 @@ from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedD
 from jtqd.daemon.recording.messages import CDR_HEADER, JOINT_ESTIMATE_SIZE
 from jtqd.daemon.recording.run_files import ACTIVE
 from jtqd.daemon.recording.schemas import SCHEMAS
-from jtqd.daemon.replay.compare import Comparison, Difference, Identity, Unknown
-from jtqd.daemon.replay.contacts import Contacts
-from jtqd.daemon.replay.origin import SAMPLE
+from jtqd.daemon.replay.compare import Comparison, Contacts, Difference, Identity, Unknown
+from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.session import ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError, check_output

@@ -32,8 +32,16 @@ from jtqd.daemon.logs import (
     read_topics,
 )
 from jtqd.daemon.recording.schemas import joint_topics
-from jtqd.daemon.replay.origin import FRAMES, JOINT, Origin, check_fields, open_origin
-from jtqd.daemon.replay.pasts import Pasts, joined, read_pasts
+from jtqd.daemon.replay.logged import (
+    FRAMES,
+    JOINT,
+    EstimatorStates,
+    Setup,
+    check_fields,
+    joined,
+    read_setup,
+    read_states,
+)
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION
 from jtqd.estimator.arrays import RecordArray
 
@@ -143,9 +151,9 @@ class Part:
     """One log, or a piece of a long one: its states of its joints, cycle by cycle, all of the same cycles."""
 
     path: Path
-    origin: Origin
+    setup: Setup
     joints: tuple[RecordArray, ...]
-    pasts: tuple[Pasts, ...] = ()
+    pasts: tuple[EstimatorStates, ...] = ()
     """States of the estimators that the log holds."""
     piece: bool = False
 
@@ -183,7 +191,7 @@ class Run:
     joints: tuple[RecordArray, ...]
     number: int = 0
     before: tuple[RecordArray, ...] | None = None
-    pasts: tuple[Pasts, ...] = ()
+    pasts: tuple[EstimatorStates, ...] = ()
 
     @classmethod
     def of(
@@ -191,7 +199,7 @@ class Run:
         parts: Sequence[Part],
         number: int = 0,
         before: tuple[RecordArray, ...] | None = None,
-        pasts: Sequence[Pasts] = (),
+        pasts: Sequence[EstimatorStates] = (),
     ) -> Run:
         """Run, or stretch, of parts that follow one another; `pasts`: of the stretch before."""
         joints = tuple(_joined(states) for states in zip(*(part.joints for part in parts), strict=True))
@@ -206,9 +214,9 @@ class Run:
         return cls(tuple(views), joints, number, before, tuple(merged))
 
     @property
-    def origin(self) -> Origin:
-        """Return the origin of the first part; the others have the same."""
-        return self.parts[0].origin
+    def setup(self) -> Setup:
+        """Return the setup of the first part; the others have the same."""
+        return self.parts[0].setup
 
     @property
     def cycles(self) -> int:
@@ -221,7 +229,7 @@ class Run:
         joints = tuple(
             _joined([old, new] if len(old) else [new]) for old, new in zip(kept, self.joints, strict=True)
         )
-        return joints, tuple(steps_of(each, self.origin.config) for each in joints), len(kept[0])
+        return joints, tuple(steps_of(each, self.setup.config) for each in joints), len(kept[0])
 
     def steps(self) -> tuple[Steps, ...]:
         """Return the time steps of all joints over all parts."""
@@ -229,9 +237,9 @@ class Run:
         return tuple(each.part(kept, len(records[0])) for each in steps)
 
 
-def topics_of(origin: Origin) -> tuple[str, ...]:
+def topics_of(setup: Setup) -> tuple[str, ...]:
     """Return the topics of the joints that a log has."""
-    return tuple(topic.name for topic in joint_topics(len(origin.config.joints)))
+    return tuple(topic.name for topic in joint_topics(len(setup.config.joints)))
 
 
 def _joined(every: Sequence[RecordArray]) -> RecordArray:
@@ -240,9 +248,9 @@ def _joined(every: Sequence[RecordArray]) -> RecordArray:
 
 def read_part(path: Path, directory: Path) -> Part:
     """Read one log; its files go to `directory`, which must be empty. Raises LogError, OSError."""
-    origin = open_origin(path, read_attachments(path), directory)
-    topics = topics_of(origin)
-    return _part(path, origin, read_topics(path, topics), read_pasts(path, len(topics)))
+    setup = read_setup(path, read_attachments(path), directory)
+    topics = topics_of(setup)
+    return _part(path, setup, read_topics(path, topics), read_states(path, len(topics)))
 
 
 def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Iterator[Part]:
@@ -250,20 +258,20 @@ def read_pieces(path: Path, directory: Path, limit: int = STRETCH_CYCLES) -> Ite
     if _most_cycles(path) <= limit:
         yield read_part(path, directory)
         return
-    origin = open_origin(path, read_attachments(path), directory)
-    topics = topics_of(origin)
+    setup = read_setup(path, read_attachments(path), directory)
+    topics = topics_of(setup)
     kept: dict[str, list[RecordArray]] = {topic: [] for topic in topics}
-    pasts = read_pasts(path, len(topics))
+    pasts = read_states(path, len(topics))
     count, made = 0, False
     for found in iter_topics(path, topics):
         for topic, messages in found.items():
             kept[topic].append(messages.records.copy())  # without the room for more
         count += len(found[FIRST_TOPIC].records) if FIRST_TOPIC in found else 0
         if count >= limit and all(kept.values()):
-            yield _piece(path, origin, kept, pasts)
+            yield _piece(path, setup, kept, pasts)
             count, made = 0, True
     if all(kept.values()) or not made:
-        yield _piece(path, origin, kept, pasts)
+        yield _piece(path, setup, kept, pasts)
 
 
 def _most_cycles(path: Path) -> int:
@@ -273,7 +281,9 @@ def _most_cycles(path: Path) -> int:
         return max(counts) if log.counts and counts else path.stat().st_size // _LEAST_BYTES
 
 
-def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]], pasts: tuple[Pasts, ...]) -> Part:
+def _piece(
+    path: Path, setup: Setup, kept: dict[str, list[RecordArray]], pasts: tuple[EstimatorStates, ...]
+) -> Part:
     """A part of what was kept; what one joint has of a cycle whose others are in the next chunk stays."""
     whole = {}
     for topic, chunks in kept.items():
@@ -286,7 +296,7 @@ def _piece(path: Path, origin: Origin, kept: dict[str, list[RecordArray]], pasts
         behind = records["cycle"] > last
         kept[topic] = [records[behind]] if behind.any() else []
         whole[topic] = records[~behind]
-    return replace(_part(path, origin, whole, pasts), piece=True)
+    return replace(_part(path, setup, whole, pasts), piece=True)
 
 
 def _frames_between(path: Path, first: int, last: int) -> RecordArray:
@@ -303,10 +313,12 @@ def _frames_between(path: Path, first: int, last: int) -> RecordArray:
     return _joined(found)
 
 
-def _part(path: Path, origin: Origin, found: dict[str, RecordArray], pasts: tuple[Pasts, ...]) -> Part:
+def _part(
+    path: Path, setup: Setup, found: dict[str, RecordArray], pasts: tuple[EstimatorStates, ...]
+) -> Part:
     for topic, records in found.items():
         check_fields(records, JOINT, path, topic)
-    joints = tuple(found[topic] for topic in topics_of(origin))
+    joints = tuple(found[topic] for topic in topics_of(setup))
     cycles = joints[0]["cycle"]
     if not all(np.array_equal(each["cycle"], cycles) for each in joints):
         shared = reduce(np.intersect1d, [each["cycle"] for each in joints])
@@ -316,7 +328,7 @@ def _part(path: Path, origin: Origin, found: dict[str, RecordArray], pasts: tupl
     if np.any(np.diff(joints[0]["cycle"].astype(np.int64)) <= 0):
         raise LogError(f"{path}: found cycles that do not increase, expected the order of the run")
     first, last = int(joints[0]["cycle"][0]), int(joints[0]["cycle"][-1])
-    return Part(path, origin, joints, tuple(each.within(first, last) for each in pasts))
+    return Part(path, setup, joints, tuple(each.within(first, last) for each in pasts))
 
 
 def in_order(logs: Sequence[Path]) -> list[Path]:
@@ -338,7 +350,7 @@ class _Open:
     number: int
     parts: list[Part]
     before: tuple[RecordArray, ...] | None = field(default=None)
-    pasts: tuple[Pasts, ...] = ()
+    pasts: tuple[EstimatorStates, ...] = ()
 
     def close(self, *following: Part) -> Run:
         """Return the stretch so far; the next one begins with `following`."""
@@ -377,10 +389,10 @@ def _goes_on(before: Part, part: Part) -> bool:
     """Return whether `part` is a later part of the run of `before`; the pieces of one log always are."""
     if part.piece and part.path == before.path:
         return True
-    if before.origin.hashes != part.origin.hashes or before.origin.inputs != part.origin.inputs:
+    if before.setup.hashes != part.setup.hashes or before.setup.inputs != part.setup.inputs:
         return False
     last, first = before.joints[0][-1], part.joints[0][0]
-    period_ns = before.origin.config.period_ns
+    period_ns = before.setup.config.period_ns
     begun = [int(row["sync_monotonic_ns"]) - int(row["cycle"]) * period_ns for row in (last, first)]
     return abs(begun[1] - begun[0]) <= period_ns
 

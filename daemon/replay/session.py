@@ -18,10 +18,8 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import LogError, log_parts
 from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity, with_states
-from jtqd.daemon.replay.estimates import ExactReplay, Model
-from jtqd.daemon.replay.frames import decode
-from jtqd.daemon.replay.origin import Origin
-from jtqd.daemon.replay.pasts import NO_PASTS, Pasts
+from jtqd.daemon.replay.logged import NO_STATES, EstimatorStates, Setup
+from jtqd.daemon.replay.replayer import Model, Replayer, decode
 from jtqd.daemon.replay.runs import (
     STRETCH_CYCLES,
     Part,
@@ -66,11 +64,11 @@ class Models:
         return [make_estimator(each.joint, each.settings, each.network) for each in self.joints]
 
 
-def logged_models(origin: Origin) -> Models:
+def logged_models(setup: Setup) -> Models:
     """Return the models of the log. Raises ConfigError, NetworkError."""
-    settings = origin.config.estimator
+    settings = setup.config.estimator
     made = []
-    for each in origin.config.joints:
+    for each in setup.config.joints:
         network = None
         if each.network is not None:
             network = load_network(settings.method, str(each.network.path), each.network.sha256)
@@ -79,18 +77,18 @@ def logged_models(origin: Origin) -> Models:
     return Models(tuple(made), (AS_LOGGED,) * len(made))
 
 
-def other_models(origin: Origin, directory: Path | None, method: str | None) -> Models:
+def other_models(setup: Setup, directory: Path | None, method: str | None) -> Models:
     """The log's models with what `directory` has in their place, and another method. Raises ConfigError, NetworkError.
 
     Joint files are `jointN.yaml` or `extended.jointN.yaml`, or `extended.joint.yaml` for the joint of that name;
     networks `jointN.fused.onnx` for method fused, `jointN.onnx` for network. What is not there stays as logged.
     """
-    settings = origin.config.estimator
+    settings = setup.config.estimator
     if method is not None:
         settings = replace(settings, method=method)
     taken = 0
     made, files = [], []
-    for number, each in enumerate(origin.config.joints, start=1):
+    for number, each in enumerate(setup.config.joints, start=1):
         joint, network, said = each.joint, None, []
         path = None if directory is None else _joint_file(directory, number, each.joint)
         if path is not None:
@@ -101,7 +99,7 @@ def other_models(origin: Origin, directory: Path | None, method: str | None) -> 
             network = load_network(settings.method, str(network_path))
             said.append(_named(network_path))
         elif METHODS[settings.method].network:
-            network = _logged_network(origin, number, settings.method)
+            network = _logged_network(setup, number, settings.method)
         taken += len(said)
         make_estimator(joint, settings, network)  # refused here, and not when the arrays are half done
         made.append(Model(joint, settings, network))
@@ -117,8 +115,8 @@ def other_models(origin: Origin, directory: Path | None, method: str | None) -> 
 
 def _bandwidths(run: Run, models: Models, number: int) -> tuple[float, float]:
     """Return what makes the age of joint `number`'s estimate, in the log and in the replay [rad/s]."""
-    logged, replayed = run.origin.config.joints[number - 1].joint, models.joints[number - 1]
-    return bandwidth_of(logged, run.origin.config.estimator), bandwidth_of(replayed.joint, replayed.settings)
+    logged, replayed = run.setup.config.joints[number - 1].joint, models.joints[number - 1]
+    return bandwidth_of(logged, run.setup.config.estimator), bandwidth_of(replayed.joint, replayed.settings)
 
 
 def _named(path: Path) -> str:
@@ -151,10 +149,10 @@ def _network_file(directory: Path, number: int, method: str) -> Path | None:
     return path if path.is_file() else None
 
 
-def _logged_network(origin: Origin, number: int, method: str) -> AnyNetwork | None:
+def _logged_network(setup: Setup, number: int, method: str) -> AnyNetwork | None:
     """Return the log's network where the method is still the same; another method cannot read it."""
-    file = origin.config.joints[number - 1].network
-    if file is None or method != origin.config.estimator.method:
+    file = setup.config.joints[number - 1].network
+    if file is None or method != setup.config.estimator.method:
         return None
     return load_network(method, str(file.path), file.sha256)
 
@@ -271,7 +269,7 @@ def replay_each(
     """
     with tempfile.TemporaryDirectory(prefix="jtq-replay-") as scratch:
         logs = in_order([log for path in paths for log in log_parts(path)])
-        replayers: dict[int, ExactReplay] = {}
+        replayers: dict[int, Replayer] = {}
         runs = stretches(_parts(logs, Path(scratch), progress, stretch), stretch)
         while True:
             begun = time.perf_counter()
@@ -293,8 +291,8 @@ def _parts(logs: Sequence[Path], scratch: Path, progress: Progress, stretch: int
 def _models(run: Run, options: ReplayOptions) -> Models:
     try:
         if options.other:
-            return other_models(run.origin, options.model, options.method)
-        return logged_models(run.origin)
+            return other_models(run.setup, options.model, options.method)
+        return logged_models(run.setup)
     except (ConfigError, NetworkError) as error:
         if options.other:
             raise
@@ -302,7 +300,7 @@ def _models(run: Run, options: ReplayOptions) -> Models:
 
 
 def _replay_run(
-    run: Run, options: ReplayOptions, progress: Progress, read_s: float, replayers: dict[int, ExactReplay]
+    run: Run, options: ReplayOptions, progress: Progress, read_s: float, replayers: dict[int, Replayer]
 ) -> Result:
     models = _models(run, options)
     logged = run.joints
@@ -310,8 +308,8 @@ def _replay_run(
     steps = run.steps()
     replayer = replayers.get(run.number)
     if replayer is None:
-        safety = models.safety(run.origin.config)
-        replayers[run.number] = replayer = ExactReplay(run.origin, models.estimators(), safety)
+        safety = models.safety(run.setup.config)
+        replayers[run.number] = replayer = Replayer(run.setup, models.estimators(), safety)
     found = _replayed(run, replayer, steps, progress, _known_pasts(run, models))
     estimate = (found.sent, found.made, found.recorded)
     replay_s = time.perf_counter() - begun
@@ -331,10 +329,10 @@ def _replay_run(
         run,
         models.files,
         models.joints[0].settings.method,
-        run.cycles * run.origin.config.period_ns * 1e-9,
+        run.cycles * run.setup.config.period_ns * 1e-9,
         read_s,
         replay_s,
-        lost_cycles(logged[0], run.origin.config),
+        lost_cycles(logged[0], run.setup.config),
         found.from_si,
         found.temperatures,
         same,
@@ -370,17 +368,17 @@ class _Replayed:
     pasts_differ: tuple[tuple[int, int], ...] = ()
 
 
-def _known_pasts(run: Run, models: Models) -> list[Pasts]:
+def _known_pasts(run: Run, models: Models) -> list[EstimatorStates]:
     """Return the states of the log for each model: none where something differs that the zeros were learned with."""
     if not any(len(each.cycle) for each in run.pasts):
-        return [NO_PASTS] * len(models.joints)
-    logged = logged_models(run.origin).estimators()
+        return [NO_STATES] * len(models.joints)
+    logged = logged_models(run.setup).estimators()
     pairs = zip(run.pasts, logged, models.estimators(), strict=True)
-    return [pasts if same_past(old, new) else NO_PASTS for pasts, old, new in pairs]
+    return [pasts if same_past(old, new) else NO_STATES for pasts, old, new in pairs]
 
 
 def _replayed(
-    run: Run, replayer: ExactReplay, steps: Sequence[Steps], progress: Progress, pasts: Sequence[Pasts]
+    run: Run, replayer: Replayer, steps: Sequence[Steps], progress: Progress, pasts: Sequence[EstimatorStates]
 ) -> _Replayed:
     """Cycle by cycle, part by part: the raw frames of only one part are in memory at a time.
 
@@ -391,7 +389,7 @@ def _replayed(
     joints, sent, made, recorded = [], [], [], []
     for part in run.parts:
         end = done + len(part.joints[0])
-        frames = decode(run.origin, part.frames(), part.joints)
+        frames = decode(run.setup, part.frames(), part.joints)
         here = [each.part(done, end) for each in steps]
         told = partial(_tell, progress, done, run.cycles)
         result = replayer.run(part.joints, frames, here, told, pasts)

@@ -9,8 +9,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.replay.estimates import ExactReplay
-from jtqd.daemon.replay.frames import decode
+from jtqd.daemon.replay.replayer import Replayer, decode
 from jtqd.daemon.replay.runs import read_part, steps_of
 from jtqd.daemon.replay.session import Models, other_models
 from tests.benchmarks.table import table
@@ -36,10 +35,10 @@ def _one(log: Path, method: str, scratch: Path) -> dict[str, Any]:
     """Times real time of one method."""
     begun = time.process_time()
     part = read_part(log, scratch)
-    frames = decode(part.origin, part.frames(), part.joints)
+    frames = decode(part.setup, part.frames(), part.joints)
     read_s = time.process_time() - begun
-    config = part.origin.config
-    models: Models = other_models(part.origin, None, method)
+    config = part.setup.config
+    models: Models = other_models(part.setup, None, method)
     safety = models.safety(config)
     steps = [steps_of(each, config) for each in part.joints]
 
@@ -48,7 +47,7 @@ def _one(log: Path, method: str, scratch: Path) -> dict[str, Any]:
     def exact() -> None:
         for each in estimators:
             each.reset()
-        ExactReplay(part.origin, estimators, safety).run(part.joints, frames, steps)
+        Replayer(part.setup, estimators, safety).run(part.joints, frames, steps)
 
     # 1 kHz is what counts, whatever the period of the log
     exact_us = 1e6 * _best(exact) / len(part.joints[0])

@@ -24,7 +24,7 @@ from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.config import load_config
 from jtqd.daemon.recording import launch
-from jtqd.daemon.replay.origin import CONFIGURATION, PROVENANCE, open_origin
+from jtqd.daemon.replay.logged import CONFIGURATION, PROVENANCE, read_setup
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import shipped
 from tests.drivers.canopen_nodes import booted
@@ -183,8 +183,8 @@ def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Pat
     profile.unlink()
     empty = tmp_path / "empty"
     empty.mkdir()
-    origin = open_origin(tmp_path / "a.mcap", attached, empty)
-    assert origin.config.joints[0].objects.current.factor == 0.25
+    setup = read_setup(tmp_path / "a.mcap", attached, empty)
+    assert setup.config.joints[0].objects.current.factor == 0.25
     changed = load_config(configuration(write_again(tmp_path, line), profile="mine.yaml"))
     assert changed.sha256 == config.sha256
     assert changed.files_sha256 != config.files_sha256

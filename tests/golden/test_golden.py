@@ -21,7 +21,7 @@ def test_all_scenes_are_there_and_small() -> None:
     assert {log.stem for log in HERE.glob("*.mcap")} == {case.log for case in CASES.values()} == set(SCENES)
     assert all(log.stat().st_size < MOST_BYTES for log in HERE.glob("*.mcap"))
     assert {
-        result.run.origin.config.estimator.method for result in (replayed(CASES[name])[1] for name in SCENES)
+        result.run.setup.config.estimator.method for result in (replayed(CASES[name])[1] for name in SCENES)
     } | {case.method for case in CASES.values() if case.method} == set(METHODS)
 
 

@@ -19,7 +19,7 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
-from jtqd.daemon.replay.origin import SAMPLE
+from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader

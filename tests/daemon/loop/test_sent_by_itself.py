@@ -11,7 +11,7 @@ import pytest
 
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.loop.input_pdos import InputPdo, input_pdos
-from jtqd.daemon.replay.frames import _held
+from jtqd.daemon.replay.replayer import _held
 from jtqd.estimator.checked import ConfigError
 from tests.daemon.loop.one_drive import config_with
 

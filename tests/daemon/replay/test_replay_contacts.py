@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.replay.command import _contacts
-from jtqd.daemon.replay.compare import identity
-from jtqd.daemon.replay.contacts import contacts
-from jtqd.daemon.replay.origin import SAMPLE
+from jtqd.daemon.replay.compare import contacts, identity
+from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.runs import BEGINS, Steps
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.estimator.arrays import RecordArray

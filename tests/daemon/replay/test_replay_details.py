@@ -10,7 +10,7 @@ import pytest
 
 from jtqd.daemon.logs import LogError
 from jtqd.daemon.replay.command import main
-from jtqd.daemon.replay.frames import decode
+from jtqd.daemon.replay.replayer import decode
 from jtqd.daemon.replay.runs import (
     LOST,
     lost_cycles,
@@ -50,18 +50,18 @@ def test_of_a_record_without_room_for_all_frames_the_si_values_count(tmp_path: P
     """The last frame in the record may be an older one: what the log says beside it is what was used."""
     part = read_part(LOG, tmp_path)
     frames = part.frames()
-    before = decode(part.origin, frames, part.joints)
+    before = decode(part.setup, frames, part.joints)
     assert before.from_si == 0
     rows = [300, 301, 700]
     frames["frames_left_out"][rows] = 1
     frames["frames"]["data"][rows] ^= 0x55
-    after = decode(part.origin, frames, part.joints)
+    after = decode(part.setup, frames, part.joints)
     assert after.from_si == sum(int(pdo.fresh[rows].sum()) for pdo in before.pdos) > 0
     for one, two in zip(before.pdos, after.pdos, strict=True):
         for old, new in zip(one.values, two.values, strict=True):
             assert (old == new)[one.fresh].all()
     frames["frames_left_out"][rows] = 0
-    spoilt = decode(part.origin, frames, part.joints)
+    spoilt = decode(part.setup, frames, part.joints)
     assert spoilt.from_si == 0
     assert any(
         (old != new)[rows].any()

@@ -9,8 +9,8 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.joint import Unwrap
 from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.compare import SETTLED_CYCLES, bits_equal, identity
-from jtqd.daemon.replay.frames import Pdo, offsets
-from jtqd.daemon.replay.origin import SAMPLE
+from jtqd.daemon.replay.logged import SAMPLE
+from jtqd.daemon.replay.replayer import Pdo, offsets
 from jtqd.daemon.replay.rows import fields
 from jtqd.daemon.replay.runs import BEGINS, LOST, lost_cycles, steps_of
 

@@ -27,7 +27,7 @@ from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CycleMessages, zeros_of
 from jtqd.daemon.recording.schemas import definitions
-from jtqd.daemon.replay.origin import Origin, open_origin
+from jtqd.daemon.replay.logged import Setup, read_setup
 from jtqd.daemon.replay.session import ReplayOptions, Result, logged_models, replay_each
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
@@ -61,12 +61,12 @@ def tracking(found: dict[str, bytes]) -> dict[str, bytes]:
         b"  bandwidth_rad_s: 200.0\n", b"  bandwidth_rad_s: 200.0\n  track_zeros: true\n"
     )
     assert text != found["configuration.yaml"]
-    origin = json.loads(found["provenance.json"])
-    origin["configuration"]["sha256"] = sha256(text).hexdigest()
-    return {**found, "configuration.yaml": text, "provenance.json": json.dumps(origin).encode()}
+    setup = json.loads(found["provenance.json"])
+    setup["configuration"]["sha256"] = sha256(text).hexdigest()
+    return {**found, "configuration.yaml": text, "provenance.json": json.dumps(setup).encode()}
 
 
-def frames_of(origin: Origin) -> list[list[bytes]]:
+def frames_of(setup: Setup) -> list[list[bytes]]:
     """The answers of the nodes to each SYNC: both joints go to and fro under a load, both link encoders are off."""
     commands = (
         JointCommand.velocity(lambda t: 0.9 * math.sin(2.6 * t)),
@@ -74,7 +74,7 @@ def frames_of(origin: Origin) -> list[list[bytes]]:
     )
     run = emulate(load_any_plant(shipped("campaign_plant.yaml")), commands, CYCLES * 1e-3, 5).table
     every = []
-    for number, inputs in enumerate(origin.inputs, start=1):
+    for number, inputs in enumerate(setup.inputs, start=1):
         columns = run.joints[number]
         assert columns.motor_velocity_rad_s is not None
         assert columns.link_position_rad is not None
@@ -109,14 +109,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
     attachments = tracking(read_attachments(GOLDEN))
     with pytest.MonkeyPatch.context() as patch:
         clock = ExactTime().install(patch)
-        origin = open_origin(GOLDEN, attachments, place)
-        config, models = origin.config, logged_models(origin)
-        answers = frames_of(origin)
+        setup = read_setup(GOLDEN, attachments, place)
+        config, models = setup.config, logged_models(setup)
+        answers = frames_of(setup)
         snapshot = place / "snapshot"
         cycle = Cycle(
             ScriptedSocket(lambda sync: answers[sync - 1]),  # type: ignore[arg-type]
             Intake(input_pdos(config), joint_temperatures(config)),
-            list(zip(origin.inputs, models.estimators(), strict=True)),
+            list(zip(setup.inputs, models.estimators(), strict=True)),
             Ring(place / "ring", 4096, cr.RECORD_SIZE),
             Snapshot(snapshot, config.period_ns * 1e-9, 0.8),
             safety=models.safety(config),

@@ -1,14 +1,14 @@
-"""Where a log comes from, out of the log itself: configuration, joint files, networks and scaling, hashes checked.
+"""What a replay takes from a log beside its messages: configuration, models, scaling, and states of the estimators.
 
-The files are written into a directory of the caller's, under names made here: nothing that a log says can name a place on
-this machine.
+The attached files are written into a directory of the caller's, under names made here: nothing that a log contains can name
+a place on this machine. Hashes are checked.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
@@ -19,13 +19,15 @@ import numpy.typing as npt
 import yaml
 
 from jtqd.daemon.config import Config, as_booted, load_config
-from jtqd.daemon.logs import LogError
+from jtqd.daemon.logs import LogError, LogFile, iter_messages
 from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
+from jtqd.daemon.recording.schemas import ZEROS
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.daemon.shared.snapshot import PAST_WORDS
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.learned import PAST_LAYOUT
 from jtqd.models.files import load_yaml
 
 # ---- names and types that a replay needs of a log's messages; another version may have others ----
@@ -88,7 +90,7 @@ CONFIGURATION, PROVENANCE = "configuration.yaml", "provenance.json"
 
 
 @dataclass(frozen=True)
-class Origin:
+class Setup:
     """Configuration, models and scaling of one log.
 
     Attributes:
@@ -106,7 +108,7 @@ class Origin:
     machine: str
 
 
-def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) -> Origin:
+def read_setup(log: Path, attachments: Mapping[str, bytes], directory: Path) -> Setup:
     """Read the attachments of `log`; files go to `directory`, which must be empty and nobody else's.
 
     Raises:
@@ -141,7 +143,7 @@ def open_origin(log: Path, attachments: Mapping[str, bytes], directory: Path) ->
             f"{log}: {PROVENANCE}: nodes: no usable scaling ({str(error) or type(error).__name__})"
         ) from None
     versions = provenance.get("versions")
-    return Origin(
+    return Setup(
         config,
         inputs,
         (sha256, *files),
@@ -245,3 +247,66 @@ def _check_scaling(inputs: JointInputs) -> None:
             raise ValueError(f"{name} is {factor}: the drive was absent at the start of the log")
     if not inputs.sensor_nm_per_unit >= 0.0:
         raise ValueError("sensor_nm_per_unit is below 0")
+
+
+# ---- states of the estimators ----
+
+
+@dataclass(frozen=True)
+class EstimatorStates:
+    """States of one joint's estimator.
+
+    Attributes:
+        cycle: after which each holds, increasing [n].
+        content: `FusedEstimator.past` of each [n].
+    """
+
+    cycle: npt.NDArray[np.uint64]
+    content: tuple[bytes, ...]
+
+    def within(self, first: int, last: int) -> EstimatorStates:
+        """Return those of the cycles `first` to `last`."""
+        here = (self.cycle >= first) & (self.cycle <= last)
+        return EstimatorStates(self.cycle[here], tuple(self.content[n] for n in np.flatnonzero(here)))
+
+    def rows(self, cycle: npt.NDArray[np.uint64]) -> dict[int, bytes]:
+        """Return the states by the row of `cycle` [n] before which they hold: the one behind that of their cycle."""
+        rows = np.searchsorted(cycle, self.cycle, side="right").tolist()
+        return {
+            row: content
+            for row, after, content in zip(rows, self.cycle.tolist(), self.content, strict=True)
+            if 0 < row < len(cycle) and int(cycle[row - 1]) == after
+        }
+
+
+NO_STATES = EstimatorStates(np.zeros(0, np.uint64), ())
+
+
+def joined(every: Sequence[EstimatorStates]) -> EstimatorStates:
+    """Return the states of several parts in the order of their cycles, each once."""
+    cycle, first = np.unique(np.concatenate([each.cycle for each in every]), return_index=True)
+    content = [state for each in every for state in each.content]
+    return EstimatorStates(cycle, tuple(content[n] for n in first.tolist()))
+
+
+def read_states(path: Path, joints: int) -> tuple[EstimatorStates, ...]:
+    """Return the states of each joint in a log. Raises LogError, OSError."""
+    with LogFile(path) as log:
+        there = {each.topic for n, each in log.channels.items() if not log.counts or log.counts.get(n)}
+    return tuple(_read(path, each.name) if each.name in there else NO_STATES for each in ZEROS[:joints])
+
+
+def _read(path: Path, topic: str) -> EstimatorStates:
+    cycles: list[int] = []
+    content: list[bytes] = []
+    for messages in iter_messages(path, topic):
+        records = messages.records
+        check_fields(records, PAST, path, topic)
+        records = records[records["past_layout"] == PAST_LAYOUT]
+        if len(records):
+            check_fields(records, STATE, path, topic)
+        for record in records:
+            cycles.append(int(record["cycle"]))
+            content.append(record["past"].tobytes()[: int(record["past_bytes"])])
+    order = np.argsort(np.array(cycles, np.uint64), kind="stable").tolist()
+    return EstimatorStates(np.array([cycles[n] for n in order], np.uint64), tuple(content[n] for n in order))
