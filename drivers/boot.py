@@ -15,7 +15,7 @@ drive (true: 3001h, or fields of `drive.Temperature`) asks for TPDO3; a node tha
 `sdo_timeout_ms`: silence of the node after which a request is repeated.
 `objects` of a drive: fields of `drive.DriveObjects`, each with those of `DriveObject`, or null; `tpdos`: TPDOs that
 shall carry them (`drive.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them. `torque_constant_nm_per_a`: for a
-current by its torque (6077h). `by_itself`: TPDOs of transmission types 0, 254 and 255 are accepted.
+current by its torque (6077h). `acyclic`: TPDOs of transmission types 0, 254 and 255 are accepted.
 
 The report is
     {"ok": true, "duration_s", "nodes": {"1": {...}}, "absent": {"3": error}}               exit status 0
@@ -78,7 +78,7 @@ _TOP = {
 }
 _SYNC = {"cob_id", "counter_overflow", "check_foreign"}
 _NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a", "by_itself"}
+_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a", "acyclic"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
 
@@ -173,7 +173,7 @@ def _profile(raw: object, where: str) -> Profile:
         objects = _objects(node.get("objects"), f"{where}.objects")
         layout = _layout(node.get("tpdos", []), number, objects, f"{where}.tpdos")
         constant = node.get("torque_constant_nm_per_a", 0.0)
-        itself = _boolean(node, "by_itself", default=False, where=where)
+        itself = _boolean(node, "acyclic", default=False, where=where)
         by_torque = objects.current.by == BY_TORQUE and not objects.current.factor
         if isinstance(constant, bool) or not isinstance(constant, int | float) or constant <= 0.0 < by_torque:
             raise RequestError(

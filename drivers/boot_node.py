@@ -5,8 +5,8 @@ compared; the values read make the node's configuration hash. No bus, no clock.
 
 TPDOs: what is as wanted is read and not written. The first write that the drive refuses (its mapping is fixed, or a part of
 it) ends the attempt: what was changed is put back, and all four TPDOs are read. Where they carry every quantity
-(`drive.chosen`) they are used as they are; of those jtqd writes COB-ID bit 31 (valid) and the transmission type, each only
-where it must. Order of the writes (CiA 301, 7.5.2.36): COB-ID with bit 31 set, number of entries 0, entries, their number,
+(`drive.select_tpdos`) they are used as they are; of those jtqd writes COB-ID bit 31 (valid) and the transmission type, where
+it must. Order of the writes (CiA 301, 7.5.2.36): COB-ID with bit 31 set, number of entries 0, entries, their number,
 transmission type, COB-ID. All of it is read back.
 """
 
@@ -23,21 +23,25 @@ from jtqd.drivers.drive import (
     DriveScaling,
     LayoutError,
     ScalingError,
-    chosen,
     drive_scaling,
-    pdo_of_words,
+    map_of,
+    select_tpdos,
 )
 from jtqd.drivers.pdo import (
-    BY_ITSELF,
+    ACYCLIC,
     CAN_ID,
     EVENT_DRIVEN,
     EVERY_SYNC,
-    EXTENDED,
     INVALID,
+    MAX_PDO_BYTES,
     NO_RTR,
     SYNC_COB_ID,
+    TPDO_COUNT,
     PdoError,
     PdoMap,
+    Tpdo,
+    read_tpdos,
+    tpdo_parameters,
 )
 from jtqd.drivers.sdo import (
     NO_OBJECT,
@@ -83,7 +87,7 @@ class BootError(Exception):
         super().__init__(f"{who}{text}{status}")
 
     def explained(self, by: str) -> BootError:
-        """Return the same error with what the node itself says about it; "" for nothing."""
+        """Return the same error with what the node itself reports about it; "" for nothing."""
         fields = {"expected": self.expected, "found": self.found, "letter": self.letter}
         return BootError(self.node, self.object, **fields, detail=f"{self.detail}; {by}") if by else self
 
@@ -257,18 +261,12 @@ class BootedNode:
 
 # TPDOs
 
-_TPDO_COUNT = 4
-"""TPDOs of the predefined connection set: those not used are switched off."""
-_MAPPING = 0x200
-"""1800h -> 1A00h."""
 _INHIBIT_TIME, _EVENT_TIMER = 3, 5
 """Sub-indices of a PDO's communication parameter."""
-_MOST_ENTRIES = 8
-"""Whole objects in a frame."""
 
 
 class _Change(NamedTuple):
-    """One write, and what the object had before it."""
+    """One write, and the value that the object had."""
 
     key: Key
     before: int
@@ -280,23 +278,20 @@ class TpdoSetup:
 
     Args:
         objects: of the node; the values in force are in its `values` afterwards.
-        profile: says which TPDOs are wanted.
+        profile: which TPDOs are wanted.
         notes: takes what the operator should know although nothing is wrong.
     """
 
     def __init__(self, objects: NodeObjects, profile: Profile, notes: list[str]) -> None:
         self._objects, self._profile, self._notes = objects, profile, notes
-        self._cob_ids: dict[int, int] = {}
-        """Of TPDOs that are to be mapped anew, before it."""
         self._changes: list[_Change] = []
-        self._now: dict[Key, int] = {}
-        """What was written last."""
+        self._written: dict[Key, int] = {}
 
     def run(self) -> tuple[PdoMap, ...]:
         """Set up the TPDOs and return those that are used."""
         wanted = {pdo.number: pdo for pdo in self._profile.tpdos}
         try:
-            for number in range(1, _TPDO_COUNT + 1):
+            for number in range(1, TPDO_COUNT + 1):
                 pdo = wanted.get(number)
                 if pdo is None:
                     self._switch_off(number)
@@ -311,15 +306,12 @@ class TpdoSetup:
     # As wanted ------------------------------------------------------------------------------------------------------
 
     def _as_wanted(self, pdo: PdoMap) -> bool:
-        """Return whether a TPDO is valid and as wanted; remember what it had otherwise."""
-        objects, communication = self._objects, 0x1800 + pdo.number - 1
-        mapping = communication + _MAPPING
+        """Return whether a TPDO is valid and as wanted."""
+        objects, (communication, mapping) = self._objects, tpdo_parameters(pdo.number)
         cob_id = objects.number((communication, 1), 4)
-        count = objects.number((mapping, 0), 1)
-        self._cob_ids[pdo.number] = cob_id
         return (
-            cob_id & ~NO_RTR == pdo.cob_id
-            and count == len(pdo.words)
+            objects.number((mapping, 0), 1) == len(pdo.words)
+            and cob_id & ~NO_RTR == pdo.cob_id
             and all(objects.number((mapping, n), 4) == word for n, word in enumerate(pdo.words, 1))
             and objects.number((communication, 2), 1) == pdo.transmission_type
             and (not _is_temperature(pdo) or self._timers_as_wanted(communication))
@@ -331,10 +323,9 @@ class TpdoSetup:
         return inhibit in (None, 10 * EVENT_MS) and timer == EVENT_MS
 
     def _write(self, pdo: PdoMap) -> None:
-        """Map a TPDO anew."""
-        objects, communication = self._objects, 0x1800 + pdo.number - 1
-        mapping = communication + _MAPPING
-        cob_id = self._cob_ids[pdo.number]
+        """Map a TPDO; `_as_wanted` has read its COB-ID."""
+        objects, (communication, mapping) = self._objects, tpdo_parameters(pdo.number)
+        cob_id = objects.values[communication, 1]
         self._change((communication, 1), cob_id | INVALID, 4)
         self._change((mapping, 0), 0, 1)
         for entry, word in enumerate(pdo.words, 1):
@@ -347,13 +338,18 @@ class TpdoSetup:
         valid = cob_id & NO_RTR | pdo.cob_id
         self._change((communication, 1), valid, 4)
         # read back at the end and not after each write: a later write may undo an earlier one
-        for entry in range(len(pdo.words) + 1, _MOST_ENTRIES + 1):
-            objects.values.pop((mapping, entry), None)  # of the mapping before, and none of this one
-        objects.require((mapping, 0), len(pdo.words), 1, "number of mapped objects")
-        for entry, word in enumerate(pdo.words, 1):
-            objects.require((mapping, entry), word, 4, "mapping entry")
-        objects.require((communication, 2), pdo.transmission_type, 1, "transmission type")
+        for entry in range(len(pdo.words) + 1, MAX_PDO_BYTES + 1):
+            objects.values.pop((mapping, entry), None)  # not part of this mapping
+        self._require_mapping(pdo, pdo.transmission_type)
         objects.require((communication, 1), valid, 4, "COB-ID")
+
+    def _require_mapping(self, pdo: PdoMap, transmission_type: int) -> None:
+        """Read mapping and transmission type back."""
+        communication, mapping = tpdo_parameters(pdo.number)
+        self._objects.require((mapping, 0), len(pdo.words), 1, "number of mapped objects")
+        for entry, word in enumerate(pdo.words, 1):
+            self._objects.require((mapping, entry), word, 4, "mapping entry")
+        self._objects.require((communication, 2), transmission_type, 1, "transmission type")
 
     def _set_timers(self, communication: int) -> None:
         """Set event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
@@ -365,18 +361,18 @@ class TpdoSetup:
         self._objects.require(timer, EVENT_MS, 2, "event timer in ms")
 
     def _change(self, key: Key, value: int, size: int) -> None:
-        """Write a number, and remember what was there before it."""
-        before = self._now.get(key, self._objects.values.get(key))
+        """Write a number, and remember the one that it replaces."""
+        before = self._written.get(key, self._objects.values.get(key))
         if before is None:
             raw = self._objects.read(key)
             before = None if raw is None else int.from_bytes(raw[:size], "little")
         self._objects.write(key, value, size)
-        self._now[key] = value
+        self._written[key] = value
         if before is not None:
             self._changes.append(_Change(key, before, size))
 
     def _switch_off(self, number: int) -> None:
-        key = (0x1800 + number - 1, 1)
+        key = (tpdo_parameters(number)[0], 1)
         cob_id = self._objects.optional_number(key, 4)
         if cob_id is not None and not cob_id & INVALID:
             self._change(key, cob_id | INVALID, 4)
@@ -392,13 +388,16 @@ class TpdoSetup:
             del values[key]  # of the attempt
         found, unusable = self._found()
         try:
-            used = self._chosen(found)
+            used = self._select(found)
         except LayoutError as error:
             raise refused.explained("; ".join((str(error), *unusable))) from refused
-        for number in range(1, _TPDO_COUNT + 1):
+        for number in range(1, TPDO_COUNT + 1):
             if number not in {pdo.number for pdo in used}:
-                self._try_to_switch_off(number)
-        used = tuple(self._valid(pdo) for pdo in used)
+                try:
+                    self._switch_off(number)
+                except BootError as error:  # it costs bus load and no more
+                    self._notes.append(f"TPDO{number} is not needed and stays on ({error.detail})")
+        used = tuple(self._make_valid(pdo) for pdo in used)
         names = ", ".join(f"TPDO{pdo.number} ({pdo.cob_id:03X}h)" for pdo in used)
         self._notes.append(f"its mapping is used as it is: {names} ({refused.detail})")
         return used
@@ -406,49 +405,39 @@ class TpdoSetup:
     def _put_back(self) -> None:
         """Undo what the attempt has written, the last first: that is the order of CiA 301 again.
 
-        What the drive does not take back will show when its TPDOs are read.
+        What the drive does not take back shows when its TPDOs are read.
         """
         for change in reversed(self._changes):
             with suppress(BootError):
                 self._objects.write(change.key, change.before, change.size)
         self._changes.clear()
-        self._now.clear()
+        self._written.clear()
 
     def _found(self) -> tuple[list[PdoMap], list[str]]:
         """Read all TPDOs that there are; return those that can be used, and why others cannot."""
         maps, unusable = [], []
-        for number in range(1, _TPDO_COUNT + 1):
-            communication = 0x1800 + number - 1
-            objects = NodeObjects(self._objects.access, self._profile.node_id)
-            cob_id = objects.optional_number((communication, 1), 4)
-            if cob_id is None:
-                continue
-            count = objects.number((communication + _MAPPING, 0), 1)
-            words = [
-                objects.number((communication + _MAPPING, entry), 4)
-                for entry in range(1, min(count, _MOST_ENTRIES) + 1)
-            ]
-            kind = objects.number((communication, 2), 1)
+        objects = NodeObjects(self._objects.access, self._profile.node_id)  # values that are not in force
+        for tpdo in read_tpdos(lambda key: objects.optional_number(key, 4)):
             try:
-                if cob_id & EXTENDED:
-                    raise PdoError(f"TPDO{number} has a 29-bit COB-ID")
-                maps.append(self._map_of(number, cob_id & CAN_ID, words, kind))
+                if tpdo.extended:
+                    raise PdoError(f"TPDO{tpdo.number} has a 29-bit COB-ID")
+                maps.append(self._map_of(tpdo))
             except PdoError as error:
-                if count:
-                    unusable.append(f"TPDO{number}: {error}")
+                if tpdo.words:
+                    unusable.append(f"TPDO{tpdo.number}: {error}")
         return maps, unusable
 
-    def _map_of(self, number: int, cob_id: int, words: list[int], kind: int) -> PdoMap:
+    def _map_of(self, tpdo: Tpdo) -> PdoMap:
         """Return the map of a TPDO that was found; of a sensor by the objects of its own profile."""
         profile = self._profile
         if isinstance(profile, DriveProfile):
-            return pdo_of_words(profile.node_id, number, cob_id, words, kind, profile.objects)
+            return map_of(profile.node_id, tpdo, profile.objects)
         for pdo in profile.tpdos:
-            if (pdo.number, pdo.cob_id, list(pdo.words)) == (number, cob_id, words):
-                return PdoMap(cob_id, pdo.objects, kind, number)
-        raise PdoError(f"it maps {', '.join(f'0x{word:08X}' for word in words)}")
+            if (pdo.number, pdo.cob_id, pdo.words) == (tpdo.number, tpdo.cob_id, tpdo.words):
+                return PdoMap(pdo.cob_id, pdo.objects, tpdo.transmission_type, pdo.number)
+        raise PdoError(f"it maps {', '.join(f'0x{word:08X}' for word in tpdo.words)}")
 
-    def _chosen(self, found: list[PdoMap]) -> tuple[PdoMap, ...]:
+    def _select(self, found: list[PdoMap]) -> tuple[PdoMap, ...]:
         """Return the TPDOs that carry all that the profile wants. Raises LayoutError."""
         profile = self._profile
         if not isinstance(profile, DriveProfile):
@@ -456,66 +445,47 @@ class TpdoSetup:
             if missing := [f"{pdo.cob_id:03X}h" for pdo in profile.tpdos if pdo.cob_id not in carried]:
                 raise LayoutError(f"no TPDO is that of {', '.join(missing)}")
             return tuple(found)
-        used = chosen(profile.objects, found)
+        used = select_tpdos(profile.objects, found)
         if profile.temperature is None:
             return used
         (wanted,) = filter(_is_temperature, profile.tpdos)
         same = [pdo for pdo in found if (pdo.cob_id, pdo.words) == (wanted.cob_id, wanted.words)]
         if not same:
-            raise LayoutError(
-                f"no TPDO with COB-ID {wanted.cob_id:03X}h carries {label(*profile.temperature.key)} alone (temperature)"
-            )
+            key = label(*profile.temperature.key)
+            raise LayoutError(f"no TPDO with COB-ID {wanted.cob_id:03X}h carries {key} alone (temperature)")
         return (*used, PdoMap(wanted.cob_id, wanted.objects, same[0].transmission_type, same[0].number))
 
-    def _try_to_switch_off(self, number: int) -> None:
-        """Switch off a TPDO that nobody needs; one that cannot be costs bus load and no more."""
-        try:
-            self._switch_off(number)
-        except BootError as error:
-            self._notes.append(f"TPDO{number} is not needed and stays on ({error.detail})")
-
-    def _asked_for(self, pdo: PdoMap) -> tuple[int, ...]:
-        """Return the types that the profile itself wants for a TPDO of this number."""
-        return tuple(
-            each.transmission_type
-            for each in self._profile.tpdos
-            if each.number == pdo.number and each.transmission_type in BY_ITSELF
-        )
-
-    def _by_itself(self, pdo: PdoMap, refused: BootError) -> bool:
-        """Accept a TPDO that the drive sends by itself, where the profile allows it; raises `refused`."""
-        profile = self._profile
-        if pdo.transmission_type not in BY_ITSELF:
-            raise refused.explained(
-                f"TPDO{pdo.number} has transmission type {pdo.transmission_type}"
-            ) from refused
-        if not (isinstance(profile, DriveProfile) and profile.by_itself):
-            text = f"TPDO{pdo.number} has transmission type {pdo.transmission_type}: joint_N.max_age_ms allows it"
+    def _accept_acyclic(self, pdo: PdoMap, refused: BootError) -> bool:
+        """Accept a TPDO that is not bound to SYNC, where the profile allows it; raises `refused`."""
+        profile, kind = self._profile, f"transmission type {pdo.transmission_type}"
+        if pdo.transmission_type not in ACYCLIC:
+            raise refused.explained(f"TPDO{pdo.number} has {kind}") from refused
+        if not (isinstance(profile, DriveProfile) and profile.acyclic):
+            text = f"TPDO{pdo.number} has {kind}: joint_N.max_age_ms allows it"
             raise refused.explained(text) from refused
-        self._notes.append(f"TPDO{pdo.number} keeps transmission type {pdo.transmission_type}")
+        self._notes.append(f"TPDO{pdo.number} keeps {kind}")
         return True
 
-    def _valid(self, pdo: PdoMap) -> PdoMap:
-        """Make a TPDO valid, and sent at each SYNC, where it is not; return it as it then is, read once more."""
-        objects, communication = self._objects, 0x1800 + pdo.number - 1
+    def _make_valid(self, pdo: PdoMap) -> PdoMap:
+        """Make a TPDO valid, and sent at each SYNC, where it is not; return it as it is in force, read once more."""
+        objects, communication = self._objects, tpdo_parameters(pdo.number)[0]
         cob_id = objects.number((communication, 1), 4)
-        event = _is_temperature(pdo) or pdo.transmission_type in self._asked_for(pdo)
-        if pdo.transmission_type != EVERY_SYNC and not event:
+        configured = {
+            each.transmission_type for each in self._profile.tpdos if each.number == pdo.number
+        }.intersection(ACYCLIC)
+        keeps_type = _is_temperature(pdo) or pdo.transmission_type in configured
+        if pdo.transmission_type != EVERY_SYNC and not keeps_type:
             with suppress(BootError):
                 if not cob_id & INVALID:
                     objects.write((communication, 1), cob_id | INVALID, 4)
             try:
                 objects.write((communication, 2), EVERY_SYNC, 1)
             except BootError as refused:
-                event = self._by_itself(pdo, refused)
+                keeps_type = self._accept_acyclic(pdo, refused)
         if objects.number((communication, 1), 4) & INVALID:
             objects.put((communication, 1), cob_id & NO_RTR | pdo.cob_id, 4, "COB-ID")
-        mapping = communication + _MAPPING
-        objects.require((mapping, 0), len(pdo.words), 1, "number of mapped objects")
-        for entry, word in enumerate(pdo.words, 1):
-            objects.require((mapping, entry), word, 4, "mapping entry")
-        kind = pdo.transmission_type if event else EVERY_SYNC
-        objects.require((communication, 2), kind, 1, "transmission type")
+        kind = pdo.transmission_type if keeps_type else EVERY_SYNC
+        self._require_mapping(pdo, kind)
         return PdoMap(pdo.cob_id, pdo.objects, kind, pdo.number)
 
 

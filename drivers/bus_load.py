@@ -13,7 +13,7 @@ from jtqd.drivers.drive import EVENT_MS, drive_layout, drive_tpdo3
 from jtqd.drivers.frame import unstuffed_bits, worst_case_bits
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.own_objects import JTQD_NODE, contact_tpdos, estimate_tpdos
-from jtqd.drivers.pdo import BY_ITSELF, LAST_SYNC_TYPE, SYNC_COB_ID, PdoMap
+from jtqd.drivers.pdo import ACYCLIC, LAST_SYNC_TYPE, SYNC_COB_ID, PdoMap
 from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
 LIMIT = 0.95
@@ -147,7 +147,7 @@ def configured_load(
         rows += [
             # one that the drive sends by itself is counted once per SYNC: an inhibit time must keep it so
             Row(pdo.cob_id, f"drive {node} TPDO{pdo.number}", pdo.length)
-            if pdo.transmission_type in BY_ITSELF
+            if pdo.transmission_type in ACYCLIC
             else pdo_row(f"drive {node} TPDO{pdo.number}", pdo)
             for pdo in tpdos
         ]

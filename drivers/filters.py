@@ -42,7 +42,7 @@ def exact(can_id: int) -> CanFilter:
     return CanFilter(can_id, identifier | CAN_EFF_FLAG | CAN_RTR_FLAG)
 
 
-def look_alikes(can_id: int) -> CanFilter:
+def any_format(can_id: int) -> CanFilter:
     """Return the filter for `can_id` in both formats, data and remote, so that frames of the wrong kind can be counted."""
     return CanFilter(can_id & CAN_EFF_MASK, CAN_EFF_MASK)
 

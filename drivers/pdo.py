@@ -15,22 +15,22 @@ import struct
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
+from jtqd.drivers.frame import CAN_EFF_MASK
 from jtqd.drivers.object_dictionary import ObjectStore
-from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, SdoAbort, label
+from jtqd.drivers.sdo import DEVICE_STATE, NOT_MAPPABLE, PDO_TOO_LONG, VALUE_RANGE, Key, SdoAbort, label
 
 MAX_PDO_BYTES = 8
-LOWEST_PDO_ID, HIGHEST_PDO_ID = (
-    0x181,
-    0x57F,
-)  # CiA 301, 7.3.5: others are restricted or belong to other services
-LAST_SYNC_TYPE = 240  # transmission types 1..240: every n-th SYNC
-
+LOWEST_PDO_ID, HIGHEST_PDO_ID = 0x181, 0x57F
+"""Identifiers that a PDO may have (CiA 301, 7.3.5); others are restricted or belong to other services."""
+LAST_SYNC_TYPE = 240
+"""Transmission types 1..240: every n-th SYNC."""
 SYNC_COB_ID = 0x080
+TPDO_COUNT = 4
 TPDO_BASES = (0x180, 0x280, 0x380, 0x480)
 """COB-IDs of a node's TPDOs 1 to 4 in the predefined connection set (CiA 301, 7.3.5), without the node-ID."""
 EVERY_SYNC = 1
 """Transmission type of a TPDO that is sent at each SYNC."""
-BY_ITSELF = (0, 254, 255)
+ACYCLIC = (0, 254, 255)
 """Transmission types of a TPDO whose frames belong to no SYNC: sent on a change, at the next SYNC (0) or at once."""
 EVENT_DRIVEN = (254, 255)
 """Transmission types of a PDO that its producer sends by itself."""
@@ -123,6 +123,55 @@ class PdoMap:
     def names(self) -> tuple[str, ...]:
         """The objects' names, in the order `layout` unpacks them."""
         return tuple(mapped.name for mapped in self.objects)
+
+
+def tpdo_parameters(number: int) -> tuple[int, int]:
+    """Return the indices of the communication and the mapping parameter of a TPDO: 1800h and 1A00h of TPDO1."""
+    return _TPDO + number - 1, _TPDO + _MAPPING_OFFSET + number - 1
+
+
+@dataclass(frozen=True)
+class Tpdo:
+    """One TPDO as it is configured in a device.
+
+    Attributes:
+        words: its mapping entries 0xIIIISSLL.
+        on: it is valid (bit 31 of its COB-ID is clear).
+        extended: its COB-ID has 29 bits.
+        timer_ms: its event timer (1800h:5); 0: none, or not read.
+        mapping_fixed, type_fixed: by its EDS they cannot be written; on a bus this is not known.
+    """
+
+    number: int
+    cob_id: int
+    words: tuple[int, ...]
+    transmission_type: int = EVERY_SYNC
+    on: bool = True
+    extended: bool = False
+    timer_ms: int = 0
+    mapping_fixed: bool = False
+    type_fixed: bool = False
+
+    @property
+    def objects(self) -> tuple[str, ...]:
+        """Its objects as "6064h:0/32" (bits)."""
+        return tuple(f"{label(*split_word(each)[:2])}/{each & 0xFF}" for each in self.words)
+
+
+def read_tpdos(number_of: Callable[[Key], int | None]) -> list[Tpdo]:
+    """Read the TPDOs of the predefined connection set that a device has; `number_of`: value of an object, None: absent."""
+    found = []
+    for number in range(1, TPDO_COUNT + 1):
+        communication, mapping = tpdo_parameters(number)
+        cob_id = number_of((communication, 1))
+        if cob_id is None:
+            continue
+        kind, count = ((number_of(key) or 0) & 0xFF for key in ((communication, 2), (mapping, 0)))
+        words = tuple(number_of((mapping, sub)) or 0 for sub in range(1, min(count, 8 * MAX_PDO_BYTES) + 1))
+        extended = bool(cob_id & EXTENDED)
+        identifier = cob_id & (CAN_EFF_MASK if extended else CAN_ID)
+        found.append(Tpdo(number, identifier, words, kind, not cob_id & INVALID, extended))
+    return found
 
 
 def split_word(word: int) -> tuple[int, int, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from jtqd.drivers.drive import ScalingError
+from jtqd.drivers.drive import ScalingError, si_prefix
 from jtqd.drivers.object_dictionary import ANY_IDENTITY, Identity
 from jtqd.drivers.pdo import MappedObject, PdoMap
 from jtqd.drivers.sdo import Key
@@ -98,5 +98,4 @@ def _nm_of_unit(profile: SensorProfile, channel: int, word: int) -> float:
         expected = "0xXX230000 (J = Nm) or a word given in the configuration"
         key = UNIT_OBJECT, channel
         raise ScalingError(key, "physical unit", expected=expected, found=f"0x{word:08X}")
-    exponent = int.from_bytes([word >> 24], signed=True)
-    return 10.0**exponent
+    return si_prefix(word)

@@ -15,10 +15,10 @@ from pathlib import Path
 
 from jtqd.drivers.drive import DRIVE_SCALING_OBJECTS, OTHER_SCALING_OBJECTS, drive_tpdo1, drive_tpdo2
 from jtqd.drivers.filters import exact
-from jtqd.drivers.frame import CAN_EFF_MASK, FRAME, FRAME_SIZE, pack
+from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
-from jtqd.drivers.pdo import CAN_ID, EXTENDED, INVALID, SYNC_COB_ID
+from jtqd.drivers.pdo import SYNC_COB_ID, TPDO_COUNT, Tpdo, read_tpdos, tpdo_parameters
 from jtqd.drivers.sdo import (
     ANSWER_S,
     REQUEST_ID,
@@ -67,31 +67,6 @@ class SurveyError(ValueError):
 
 
 @dataclass(frozen=True)
-class Tpdo:
-    """One TPDO as it is configured.
-
-    Attributes:
-        words: its mapping entries 0xIIIISSLL.
-        timer_ms: its event timer (1800h:5); 0: none.
-        mapping_fixed, type_fixed: its EDS says that they cannot be written; a bus does not tell.
-    """
-
-    number: int
-    cob_id: int
-    on: bool
-    transmission_type: int
-    words: tuple[int, ...]
-    timer_ms: int = 0
-    mapping_fixed: bool = False
-    type_fixed: bool = False
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Its objects as "6064h:0/32" (bits)."""
-        return tuple(f"{label(each >> 16, each >> 8 & 0xFF)}/{each & 0xFF}" for each in self.words)
-
-
-@dataclass(frozen=True)
 class Survey:
     """One device.
 
@@ -133,24 +108,13 @@ class Survey:
 
 
 def tpdos(access: SdoAccess) -> tuple[Tpdo, ...]:
-    """Read the four TPDOs of the predefined connection set (CiA 301, 1800h and 1A00h). Raises SurveyError."""
+    """Read the TPDOs of the predefined connection set. Raises SurveyError."""
     return _tpdos(lambda key: _number(access, key))
 
 
 def _tpdos(number_of: Callable[[Key], int | None]) -> tuple[Tpdo, ...]:
-    found = []
-    for number in range(1, 5):
-        communication = 0x1800 + number - 1
-        mapping = communication + 0x200
-        cob_id = number_of((communication, 1))
-        if cob_id is None:
-            continue
-        kind, timer_ms = (number_of((communication, sub)) or 0 for sub in (2, 5))
-        count = min(number_of((mapping, 0)) or 0, 64)
-        words = tuple(number_of((mapping, sub)) or 0 for sub in range(1, count + 1))
-        identifier = cob_id & (CAN_EFF_MASK if cob_id & EXTENDED else CAN_ID)
-        found.append(Tpdo(number, identifier, not cob_id & INVALID, kind, words, timer_ms))
-    return tuple(found)
+    timers = {number: (tpdo_parameters(number)[0], 5) for number in range(1, TPDO_COUNT + 1)}
+    return tuple(replace(pdo, timer_ms=number_of(timers[pdo.number]) or 0) for pdo in read_tpdos(number_of))
 
 
 def _number(access: SdoAccess, key: Key) -> int | None:
@@ -227,11 +191,14 @@ def survey_of_eds(path: Path, node: int, more: Iterable[Key] = ()) -> Survey:
 
 
 def _fixed_by(pdo: Tpdo, entries: Mapping[Key, Entry]) -> Tpdo:
-    """Return the TPDO with what its EDS says of its mapping and transmission type: whether they can be written."""
-    communication = 0x1800 + pdo.number - 1
-    mapping = [(communication + 0x200, sub) for sub in range(len(pdo.words) + 1)]
-    fixed = [key in entries and not entries[key].writable for key in (*mapping, (communication, 2))]
-    return replace(pdo, mapping_fixed=any(fixed[:-1]), type_fixed=fixed[-1])
+    """Return the TPDO with what its EDS has of mapping and transmission type: whether they can be written."""
+    communication, mapping = tpdo_parameters(pdo.number)
+
+    def fixed(*keys: Key) -> bool:
+        return any(key in entries and not entries[key].writable for key in keys)
+
+    entry_keys = ((mapping, sub) for sub in range(len(pdo.words) + 1))
+    return replace(pdo, mapping_fixed=fixed(*entry_keys), type_fixed=fixed((communication, 2)))
 
 
 class BusSurvey:

@@ -45,7 +45,7 @@ def boot_request(
             "sdo_timeout_ms": joint.sdo_timeout_ms,
             "objects": asdict(joint.objects),
             "tpdos": tpdos_as_json(joint.tpdos),
-            "by_itself": joint.max_age_ms > 0.0,
+            "acyclic": joint.max_age_ms > 0.0,
             "torque_constant_nm_per_a": joint.joint.torque_constant_nm_per_a,
             "mandatory": joint.mandatory or only is not None,
         }

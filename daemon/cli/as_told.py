@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from jtqd.drivers.drive import (
@@ -24,17 +24,17 @@ from jtqd.drivers.drive import (
     DriveObjects,
     LayoutError,
     ScalingError,
-    chosen,
     drive_layout,
     is_increments,
-    pdo_of_words,
+    map_of,
+    select_tpdos,
     si_per_unit,
     unit_of_position,
     unit_of_velocity,
 )
-from jtqd.drivers.pdo import BY_ITSELF, EVERY_SYNC, PdoError
+from jtqd.drivers.pdo import ACYCLIC, EVERY_SYNC, PdoError, Tpdo
 from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.survey import Survey, Tpdo
+from jtqd.drivers.survey import Survey
 
 _POSITION_UNIT, _VELOCITY_UNIT = (0x60A8, 0), (0x60A9, 0)
 _FEED: tuple[Key, Key] = ((0x6092, 1), (0x6092, 2))
@@ -215,11 +215,11 @@ def layout_told(node: int, survey: Survey | None, objects: DriveObjects) -> Layo
     maps, unusable = [], []
     for each in usable:
         try:
-            maps.append(pdo_of_words(node, each.number, each.cob_id, each.words, EVERY_SYNC, objects))
+            maps.append(map_of(node, replace(each, transmission_type=EVERY_SYNC), objects))
         except PdoError as error:
             unusable.append(f"TPDO{each.number}: {error}")
     try:
-        numbers = [pdo.number for pdo in chosen(objects, maps)]
+        numbers = [pdo.number for pdo in select_tpdos(objects, maps)]
     except LayoutError as error:
         told = "; ".join((str(error), *unusable))
         problem = f"node {node} ({survey.title}): its mapping is fixed, by its EDS: {told}"
@@ -230,7 +230,7 @@ def layout_told(node: int, survey: Survey | None, objects: DriveObjects) -> Layo
     }:
         return Layout()
     wrong = [
-        each for each in used if each.type_fixed and each.transmission_type not in (EVERY_SYNC, *BY_ITSELF)
+        each for each in used if each.type_fixed and each.transmission_type not in (EVERY_SYNC, *ACYCLIC)
     ]
     if wrong:
         problem = (
@@ -243,7 +243,7 @@ def layout_told(node: int, survey: Survey | None, objects: DriveObjects) -> Layo
 
 
 def _by_itself(tpdos: Sequence[Tpdo]) -> list[Tpdo]:
-    return [each for each in tpdos if each.type_fixed and each.transmission_type in BY_ITSELF]
+    return [each for each in tpdos if each.type_fixed and each.transmission_type in ACYCLIC]
 
 
 def _age_ms(tpdos: Sequence[Tpdo]) -> int | None:

@@ -17,11 +17,11 @@ from jtqd.drivers.drive import (
     DriveObjects,
     LayoutError,
     Temperature,
-    chosen,
     drive_layout,
-    pdo_of_words,
+    map_of,
+    select_tpdos,
 )
-from jtqd.drivers.pdo import BY_ITSELF, PdoError, PdoMap
+from jtqd.drivers.pdo import ACYCLIC, PdoError, PdoMap, Tpdo
 from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.estimator.checked import ConfigError, Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, choice, limits
@@ -188,17 +188,17 @@ def tpdos_of(
         return drive_layout(node, objects)
     where = f"{path}: key '{joint}.tpdos'"
     for each in tpdos:
-        if each.type != 1 and each.type not in BY_ITSELF:
+        if each.type != 1 and each.type not in ACYCLIC:
             raise ConfigError(f"{where}: found type {each.type}, expected 1, 0, 254 or 255")
-        if each.type in BY_ITSELF and not by_itself:
+        if each.type in ACYCLIC and not by_itself:
             raise ConfigError(
                 f"{path}: key '{joint}.max_age_ms': missing, expected ms because TPDO{each.number} has type {each.type}"
             )
     try:
         maps = tuple(
-            pdo_of_words(node, each.number, each.cob_id, each.objects, each.type, objects) for each in tpdos
+            map_of(node, Tpdo(each.number, each.cob_id, each.objects, each.type), objects) for each in tpdos
         )
-        used = chosen(objects, maps)
+        used = select_tpdos(objects, maps)
     except (PdoError, LayoutError) as error:
         raise ConfigError(f"{where}: {error}") from None
     for name, taken in (("number", {3}), ("cob_id", {0x380 + node})):

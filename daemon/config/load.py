@@ -29,7 +29,7 @@ from jtqd.daemon.config.settings import (
     SafetySettings,
 )
 from jtqd.daemon.profiles import path_of, with_profiles
-from jtqd.drivers.drive import DriveObjects, Temperature, chosen, maps_of_json
+from jtqd.drivers.drive import DriveObjects, Temperature, maps_of_json, select_tpdos
 from jtqd.drivers.pdo import PdoMap
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
@@ -175,7 +175,7 @@ def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
         if booted is None or "tpdos" not in booted:
             return joint
         maps = maps_of_json(joint.node_id, booted["tpdos"], joint.objects)
-        return replace(joint, tpdos=chosen(joint.objects, maps))
+        return replace(joint, tpdos=select_tpdos(joint.objects, maps))
 
     return replace(config, joints=tuple(of(joint) for joint in config.joints))
 

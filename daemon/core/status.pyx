@@ -32,7 +32,7 @@ from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.counters import COUNTERS, word_of
-from jtqd.drivers.drive import STATES, TOLD
+from jtqd.drivers.drive import STATE_MASK, STATES
 from jtqd.estimator import status as st
 from jtqd.estimator.observer cimport follow_reference, restart_reference
 from jtqd.estimator.plausibility cimport Plausibility
@@ -301,8 +301,8 @@ cdef class JointTally:
 cdef enum:
     POWERED = -1  # the motor carries current
     STATE_BITS = 0x7F
-if STATE_BITS != TOLD:
-    raise ImportError(f"found {TOLD:02X}h, expected the state of a drive in the bits {STATE_BITS:02X}h of its statusword")
+if STATE_BITS != STATE_MASK:
+    raise ImportError(f"found {STATE_MASK:02X}h, expected the state of a drive in the bits {STATE_BITS:02X}h of its statusword")
 cdef int8_t OF_STATE[STATE_BITS + 1]
 for _code in range(STATE_BITS + 1):
     _forced = faults.STATUS_OF_STATE.get(STATES[_code], st.OFF)

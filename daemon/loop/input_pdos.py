@@ -13,7 +13,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
 from jtqd.drivers.drive import CIA_402, DriveObjects, Place, drive_layout, drive_tpdo3, places
-from jtqd.drivers.pdo import BY_ITSELF, PdoMap
+from jtqd.drivers.pdo import ACYCLIC, PdoMap
 from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
 POSITIONS = ("motor_position", "link_position")
@@ -109,7 +109,7 @@ def input_pdos(config: Config) -> list[InputPdo]:
             each,
             joint.node_id,
             f"drive {joint.node_id} TPDO{each.number}",
-            round(joint.max_age_ms * 1e6) if each.transmission_type in BY_ITSELF else 0,
+            round(joint.max_age_ms * 1e6) if each.transmission_type in ACYCLIC else 0,
         )
         for joint in config.joints
         for each in joint.tpdos

@@ -40,7 +40,7 @@ from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
-from jtqd.drivers.filters import CanFilter, look_alikes
+from jtqd.drivers.filters import CanFilter, any_format
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import SYNC_COB_ID
@@ -199,9 +199,7 @@ def loop_filters(config: Config) -> list[CanFilter]:
     inputs = input_pdos(config)
     pdos = [*(pdo.cob_id for pdo in inputs), *(each.cob_id for each in joint_temperatures(config))]
     nodes = dict.fromkeys(pdo.node_id for pdo in inputs)
-    return [
-        look_alikes(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))
-    ]
+    return [any_format(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))]
 
 
 def warm_up(estimators: list[AnyEstimator]) -> None:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from jtqd.drivers.drive import State, fast_state
+from jtqd.drivers.drive import State, state_of
 from jtqd.drivers.own_objects import COMMANDER_NODE
 from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.sysid.motion.drives import (
@@ -381,7 +381,7 @@ class Commander:
 
     def _enabling(self, turn: int) -> bytes | None:
         """Send 6040h 6, 7, 15, each after the statusword has confirmed the one before."""
-        states = [fast_state(drive.statusword) for drive in self.inputs.drives]
+        states = [state_of(drive.statusword) for drive in self.inputs.drives]
         if all(state is State.OPERATION_ENABLED for state in states):
             self._enter(Phase.PLAYING)
         elif self._phase_s() > self.timing.enable_s:

@@ -31,18 +31,28 @@ from jtqd.drivers.drive import (
     DriveScaling,
     LayoutError,
     State,
-    chosen,
     drive_rpdo1,
     drive_rpdo2,
     drive_tpdo3,
-    pdo_of_words,
+    map_of,
+    select_tpdos,
     state_of,
 )
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
-from jtqd.drivers.pdo import CAN_ID, EVERY_SYNC, INVALID, SYNC_COB_ID, PdoError, PdoMap, split_word
+from jtqd.drivers.pdo import (
+    CAN_ID,
+    EVERY_SYNC,
+    INVALID,
+    SYNC_COB_ID,
+    PdoError,
+    PdoMap,
+    read_tpdos,
+    split_word,
+    tpdo_parameters,
+)
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, Key, SdoAccess, SdoClient, Transfer
 from jtqd.drivers.sensor import SensorProfile, SensorScaling
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Setpoints, Timing
@@ -302,23 +312,17 @@ def _require_rpdo(drive: NodeObjects, communication: int, pdo: PdoMap) -> None:
 def _tpdos(drive: NodeObjects, profile: DriveProfile) -> tuple[PdoMap, ...]:
     """Return the TPDOs that carry the drive's quantities, as they are mapped now, by jtqd or for good. Raises BootError."""
     maps = []
-    for number in range(1, 5):
-        communication = 0x1800 + number - 1
-        cob_id = drive.optional_number((communication, 1), 4)
-        if cob_id is None or cob_id & INVALID:
-            continue
-        count = drive.number((communication + 0x200, 0), 1)
-        words = [drive.number((communication + 0x200, entry), 4) for entry in range(1, min(count, 8) + 1)]
-        kind = drive.number((communication, 2), 1)
+    for tpdo in read_tpdos(lambda key: drive.optional_number(key, 4)):
         with suppress(PdoError):  # whatever else it sends
-            maps.append(pdo_of_words(drive.node, number, cob_id & CAN_ID, words, kind, profile.objects))
+            if tpdo.on:
+                maps.append(map_of(drive.node, tpdo, profile.objects))
     try:
-        used = chosen(profile.objects, maps)
+        used = select_tpdos(profile.objects, maps)
     except LayoutError as error:
         raise BootError(drive.node, "1A00h", detail=f"{error}; start jtqd, which configures it") from None
     for pdo in used:
         if pdo.transmission_type != EVERY_SYNC:
-            key, found = (0x1800 + pdo.number - 1, 2), str(pdo.transmission_type)
+            key, found = (tpdo_parameters(pdo.number)[0], 2), str(pdo.transmission_type)
             what = "transmission type (a motion needs every value at each SYNC)"
             raise mismatch(drive.node, key, what, expected=str(EVERY_SYNC), found=found)
     return used

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
-from jtqd.drivers.drive import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, State, drive_tpdo3, fast_state, places
+from jtqd.drivers.drive import NOT_MEASURED, TEMPERATURE_C_PER_UNIT, State, drive_tpdo3, places, state_of
 from jtqd.drivers.emcy import NO_ERROR, Emergency, parse
 from jtqd.drivers.nmt import BOOT_UP, HEARTBEAT_BASE, OPERATIONAL, STATES
 from jtqd.drivers.pdo import SYNC_COB_ID
@@ -324,13 +324,13 @@ class Supervision:
         """Return whether drive `turn` follows no set-point any more, by a fresh statusword or a confirmed SDO."""
         drive = self._inputs.drives[turn]
         fresh = drive.moved_cycle >= self._inputs.cycle - self._stale
-        return drive.sdo_confirmed or (fresh and fast_state(drive.statusword) is not State.OPERATION_ENABLED)
+        return drive.sdo_confirmed or (fresh and state_of(drive.statusword) is not State.OPERATION_ENABLED)
 
     def all_off(self) -> bool:
         """Return whether fresh statuswords of all drives show that their motors are not driven."""
         oldest = self._inputs.cycle - self._stale
         return all(
-            fast_state(drive.statusword) not in POWERED and drive.moved_cycle >= oldest
+            state_of(drive.statusword) not in POWERED and drive.moved_cycle >= oldest
             for drive in self._inputs.drives
         )
 
@@ -373,7 +373,7 @@ class Supervision:
 
 
 def _state(drive: DriveInput, enabled: bool) -> Violation | None:
-    state = fast_state(drive.statusword)
+    state = state_of(drive.statusword)
     if enabled and state is not State.OPERATION_ENABLED:
         return Violation(f"{drive.who}: {describe(drive.statusword)}, expected operation enabled", True)
     if state in FAULTED:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from enum import Enum
 from typing import Final
 
-from jtqd.drivers.drive import State, fast_state
+from jtqd.drivers.drive import State, state_of
 from jtqd.sysid.motion.drives import (
     DISABLE_VOLTAGE,
     POWERED,
@@ -237,7 +237,7 @@ class PowerOff:
             self._powered_ns = now_ns
             if self._elapsed_s(now_ns) > self._timing.disable_s:
                 drives = self._inputs.drives
-                drive = next((d for d in drives if fast_state(d.statusword) in POWERED), drives[-1])
+                drive = next((d for d in drives if state_of(d.statusword) in POWERED), drives[-1])
                 self.violation = Violation(
                     f"{drive.who}: {describe(drive.statusword)} after {self._timing.disable_s:g} s, expected no power",
                     True,
@@ -250,7 +250,7 @@ class PowerOff:
         return self._commands.control(turn, DISABLE_VOLTAGE)
 
     def _on(self, turn: int, now_ns: int) -> bytes | None:
-        states = [fast_state(drive.statusword) for drive in self._inputs.drives]
+        states = [state_of(drive.statusword) for drive in self._inputs.drives]
         if all(state is State.OPERATION_ENABLED for state in states):
             self.over = self.index == self._end - 1
             return self._commands.setpoint(turn, self.index)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, LogFile, Records, iter_topics, log_parts, topics_of
-from jtqd.drivers.drive import NOT_MEASURED, STATES, TEMPERATURE_C_PER_UNIT, TOLD, State, drive_tpdo3
+from jtqd.drivers.drive import NOT_MEASURED, STATE_MASK, STATES, TEMPERATURE_C_PER_UNIT, State, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, counted
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
@@ -282,7 +282,7 @@ def _temperatures(frames: Records, nodes: Mapping[int, TemperatureOf]) -> dict[i
 
 def _enabled(state: Records) -> Flags:
     """Return cycles [n] in which the drive is in "operation enabled", by a fresh statusword."""
-    found: Flags = _ENABLED[state["statusword"] & TOLD]
+    found: Flags = _ENABLED[state["statusword"] & STATE_MASK]
     return found & _fresh(state)
 
 
@@ -363,7 +363,7 @@ def _columns(state: Records, sensor: bool, temperature: FloatArray | None) -> Jo
 
 
 def _unpowered(statusword: NDArray[Any]) -> Flags:
-    found: Flags = _NO_POWER[statusword & TOLD]
+    found: Flags = _NO_POWER[statusword & STATE_MASK]
     return found
 
 

@@ -790,7 +790,7 @@ def test_a_transmission_type_that_cannot_be_written_is_named(bench):
 def test_a_type_that_cannot_be_written_is_accepted_where_an_age_is_configured(bench, kind):
     fixed(bench.drive1, *ELSEWHERE, kind=kind)
     assert f"TPDO1 has transmission type {kind}: joint_N.max_age_ms allows it" in str(bench.fails())
-    node = bench.boot(nodes=[{**NODES[0], "by_itself": True}, *NODES[1:]]).nodes[1]
+    node = bench.boot(nodes=[{**NODES[0], "acyclic": True}, *NODES[1:]]).nodes[1]
     assert [pdo.transmission_type for pdo in node.tpdos] == [kind] * 3
     assert f"TPDO1 keeps transmission type {kind}" in node.notes
 

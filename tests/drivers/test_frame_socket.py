@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.drivers.filters import CanFilter, exact, look_alikes
+from jtqd.drivers.filters import CanFilter, any_format, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusError, BusGone, open_frame_socket
 from jtqd.drivers.hub import Hub
@@ -124,7 +124,7 @@ def test_exact_filters_refuse_remote_and_29_bit_frames_of_the_same_number(bench)
 
 
 def test_look_alikes_filter_lets_the_wrong_formats_through(bench):
-    a, b = bench.open(), bench.open([look_alikes(0x181)])
+    a, b = bench.open(), bench.open([any_format(0x181)])
     alike = [TPDO, pack(0x181 | CAN_EFF_FLAG), pack(0x181 | CAN_RTR_FLAG)]
     for frame in [*alike, pack(0x981 | CAN_EFF_FLAG), pack(0x180)]:
         a.send(frame)

@@ -54,7 +54,7 @@ def test_tpdos_as_they_are():
     store.set_number(0x1A00, 1, 0x6064_0020)
     store.set_number(0x1A00, 2, 0x60E4_0120)
     one = tpdos(store)[0]
-    assert one == Tpdo(1, 0x185, False, 1, (0x6064_0020, 0x60E4_0120))
+    assert one == Tpdo(1, 0x185, (0x6064_0020, 0x60E4_0120), on=False)
     assert one.objects == ("6064h:0/32", "60E4h:1/32")
     assert len(tpdos(store)) == 3, "the fourth is not there"
 

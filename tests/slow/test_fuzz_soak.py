@@ -53,7 +53,7 @@ def test_a_loop_that_gets_dearer_in_a_storm_is_seen_on_any_machine() -> None:
     assert not unchanged(compare(quiet, [replace(each, missed=20) for each in quiet]))
     heard = compare(quiet, [replace(each, foreign=1) for each in quiet])
     assert not unchanged(heard)
-    assert unchanged(heard | {"look_alikes": 6})
+    assert unchanged(heard | {"any_format": 6})
 
 
 def test_frames_of_a_storm_that_reach_the_loop_are_those_that_look_like_its_own() -> None:

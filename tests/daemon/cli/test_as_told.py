@@ -22,7 +22,8 @@ from jtqd.daemon.cli.as_told import layout_told, unit_problems, units_told
 from jtqd.daemon.cli.draft import Wanted, draft_joint, drive_lines
 from jtqd.daemon.config import load_config
 from jtqd.drivers.drive import CIA_402, DriveProfile, drive_scaling
-from jtqd.drivers.survey import Survey, Tpdo, survey_of_eds
+from jtqd.drivers.pdo import Tpdo
+from jtqd.drivers.survey import Survey, survey_of_eds
 from tests.drivers.canopen_nodes import booted
 from tests.library_drives.bench import LibraryBench
 from tests.library_drives.motion import moves_as_it_should, quantities
@@ -160,14 +161,14 @@ def test_a_unit_that_is_no_angle_is_told(numbers: dict[tuple[int, int], int], te
 # TPDOs --------------------------------------------------------------------------------------------------------------
 
 OWN = (
-    Tpdo(1, 0x185, True, 1, (0x6064_0020, 0x60E4_0120)),
-    Tpdo(2, 0x285, True, 1, (0x606C_0020, 0x6078_0010, 0x6041_0010)),
+    Tpdo(1, 0x185, (0x6064_0020, 0x60E4_0120)),
+    Tpdo(2, 0x285, (0x606C_0020, 0x6078_0010, 0x6041_0010)),
 )
 MAKERS = (
-    Tpdo(1, 0x185, True, 1, (0x6041_0010, 0x6064_0020)),
-    Tpdo(2, 0x385, True, 1, (0x6061_0008, 0x606C_0020, 0x6078_0010)),
-    Tpdo(3, 0x285, True, 255, (0x1001_0008,)),
-    Tpdo(4, 0x485, True, 1, (0x60E4_0120,)),
+    Tpdo(1, 0x185, (0x6041_0010, 0x6064_0020)),
+    Tpdo(2, 0x385, (0x6061_0008, 0x606C_0020, 0x6078_0010)),
+    Tpdo(3, 0x285, (0x1001_0008,), 255),
+    Tpdo(4, 0x485, (0x60E4_0120,)),
 )
 
 

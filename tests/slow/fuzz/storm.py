@@ -153,7 +153,7 @@ def unchanged(result: dict[str, Any]) -> bool:
     return bool(
         result["cpu_ratio"][0] <= MOST_CPU
         and result["work_p50_ratio"][0] <= MOST_WORK
-        and stormy["foreign_frames_taken"] <= result.get("look_alikes", 0)
+        and stormy["foreign_frames_taken"] <= result.get("any_format", 0)
         and stormy["missed_per_1000"] <= 2.0 * quiet["missed_per_1000"] + _MISSED_PER_1000
     )
 
@@ -198,7 +198,7 @@ def storm(seed: int, count: int, pairs: int = PAIRS) -> dict[str, Any]:
             "seed": seed,
             "frames": count,
             "frames_per_s": round(count / (sum(each.time_ns for each in stormy) * 1e-9)),
-            "look_alikes": sum(map(looks_alike, frames)),
+            "any_format": sum(map(looks_alike, frames)),
             "refused_by_bus": refused,
             **compare(quiet, stormy),
             "growth_kb": growth,

