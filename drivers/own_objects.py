@@ -61,7 +61,7 @@ ZERO_FIELDS = (
     "current_used_a",
     "limit_rad",
 )
-"""Sub-indices 1.. of `ZEROS` (`jtqd.estimator.learned.Zeros`)."""
+"""Sub-indices 1.. of `ZEROS` (`jtqd.estimator.status.Zeros`)."""
 
 JOINT_PARAMETERS = (
     "gear_ratio",

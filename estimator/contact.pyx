@@ -32,7 +32,7 @@ import numpy as np
 from jtqd.estimator.observer cimport fill_fused_observer, fill_guard, observe_fused, restart_guard
 from jtqd.estimator.observer cimport FusedObserved, GuardLaw, GuardState
 from jtqd.estimator.sample cimport Sample
-from jtqd.estimator.zeros cimport local_stiffness
+from jtqd.estimator.path_difference cimport local_stiffness
 
 from jtqd.estimator.sample import columns
 from jtqd.estimator.settings import tracking_of

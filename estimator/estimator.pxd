@@ -1,8 +1,8 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
-from jtqd.estimator.agreement cimport AgreementLaw, AgreementState
+from jtqd.estimator.path_difference cimport AgreementLaw, AgreementState
 from jtqd.estimator.contact cimport LinkLaw, LinkState
-from jtqd.estimator.fusion cimport Fused, FusionLaw
+from jtqd.estimator.uncertainty cimport Fused, FusionLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
 from jtqd.estimator.observer cimport (
     FusedObserved,
@@ -16,8 +16,8 @@ from jtqd.estimator.observer cimport (
 )
 from jtqd.estimator.perceptron cimport PerceptronLaw
 from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
-from jtqd.estimator.validity cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
-from jtqd.estimator.zeros cimport ZerosLaw, ZerosState
+from jtqd.estimator.uncertainty cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
+from jtqd.estimator.path_difference cimport ZerosLaw, ZerosState
 
 cdef struct NetworkLaw:
     bint used

@@ -3,11 +3,11 @@ from typing import Final
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
 from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.joint import Joint, Torsion
-from jtqd.estimator.learned import Zeros
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import Zeros
 
 STANDSTILL_SIGMAS: Final[float]
 LOWERED_S: Final[float]

@@ -13,7 +13,7 @@ loss went through the same filter; how old the result is says `age`.
 from libc.math cimport NAN, fabs, fmin, sqrt
 from libc.string cimport memcmp
 
-from jtqd.estimator.agreement cimport (
+from jtqd.estimator.path_difference cimport (
     TURN_WAVES,
     doubt_of,
     fill_agreement,
@@ -27,7 +27,7 @@ from jtqd.estimator.agreement cimport (
 )
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
-from jtqd.estimator.fusion cimport (
+from jtqd.estimator.uncertainty cimport (
     Fused,
     Rest,
     at_rest,
@@ -60,7 +60,7 @@ from jtqd.estimator.observer cimport (
 )
 from jtqd.estimator.perceptron cimport Perceptron, evaluate
 from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values, no_values
-from jtqd.estimator.validity cimport (
+from jtqd.estimator.uncertainty cimport (
     Spread,
     fill_fused_trust,
     fill_trust,
@@ -70,7 +70,7 @@ from jtqd.estimator.validity cimport (
     standing,
     trust,
 )
-from jtqd.estimator.zeros cimport (
+from jtqd.estimator.path_difference cimport (
     beyond,
     completes,
     drop_block,
@@ -92,13 +92,13 @@ import numpy as np
 
 from jtqd.estimator import status as st
 from jtqd.estimator.corrections import ExtendedInputs
-from jtqd.estimator.fusion import FOREIGN_SIGMAS
+from jtqd.estimator.uncertainty import FOREIGN_SIGMAS
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
 from jtqd.estimator.settings import METHODS, tracking_of
-from jtqd.estimator.validity import FADE_START
-from jtqd.estimator.learned import APART, LEFT
+from jtqd.estimator.uncertainty import FADE_START
+from jtqd.estimator.status import APART, LEFT
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open.
@@ -341,7 +341,7 @@ cdef class FusedEstimator(Estimator):
 
     @property
     def past(self):
-        """All that it knows of the samples so far, bytes of layout `learned.PAST_LAYOUT`; `past = other.past` goes on there.
+        """All that it knows of the samples so far, bytes of layout `status.PAST_LAYOUT`; `past = other.past` goes on there.
 
         Raises ValueError for bytes of another length.
         """

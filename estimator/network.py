@@ -18,8 +18,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.envelope import Envelope, finite
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Envelope, Joint, finite
 from jtqd.estimator.onnx_graph import GraphFile, NativeGraph, NetworkError, OnnxGraph, RuntimeCheck
 from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.settings import METHODS, EstimatorSettings

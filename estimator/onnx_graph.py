@@ -30,7 +30,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.envelope import finite
+from jtqd.estimator.joint import finite
 from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.sha256 import sha256_hex
 

@@ -15,7 +15,7 @@ cdef struct Values:  # `jtqd.estimator.status.Estimate` as a block; NaN where no
     double torque_rate_nm_s, load_nm  # `contact`: load of the sample before
     int status
 
-cdef struct Learned:  # `jtqd.estimator.zeros.Zeros` as a block
+cdef struct Learned:  # `jtqd.estimator.path_difference.Zeros` as a block
     double link_rad, link_sigma_rad, link_used_rad, current_a, current_sigma_a, current_used_a, limit_rad
     uint64_t flags, jumps
 

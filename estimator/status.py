@@ -6,7 +6,7 @@ The status codes are those published on the bus (low or high nibble of the estim
 from __future__ import annotations
 
 from math import nan
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, Protocol, Self
 
 OFF: Final = 0
 STARTING: Final = 1
@@ -62,3 +62,105 @@ class Estimate(NamedTuple):
 STARTING_ESTIMATE: Final = Estimate(nan, nan, STARTING, nan, nan, nan)
 INVALID_ESTIMATE: Final = Estimate(nan, nan, INVALID, nan, nan, nan)
 """What a joint that is not estimated shows."""
+
+
+# What an estimator has learned ---------------------------------------------------------------------------------------
+
+TRACKED, LEARNED, BEYOND, LEFT, APART = (1 << n for n in range(5))
+"""Bits of `Zeros.flags`: the zeros are tracked; the link zero is learned; it is beyond the joint file's limit; what is known
+of it is not yet taken off; the two views disagree now (also where nothing is tracked)."""
+
+
+class Zeros(NamedTuple):
+    """What is known of the zeros of a joint, and its standard deviations; 0 and the prior width where nothing is.
+
+    link_rad, current_a: what the readings are off by; link_used_rad, current_used_a: what is taken off them; limit_rad: of
+    the joint file, for a link zero that is plausible; flags: bits TRACKED to APART; jumps: how often a zero that was
+    learned became unknown, because the views were apart for JUMP_S.
+    """
+
+    link_rad: float
+    link_sigma_rad: float
+    link_used_rad: float
+    current_a: float
+    current_sigma_a: float
+    current_used_a: float
+    limit_rad: float
+    flags: int
+    jumps: int
+
+    @property
+    def tracked(self) -> bool:
+        """Return whether there is anything to tell."""
+        return bool(self.flags & TRACKED)
+
+    @property
+    def learned(self) -> bool:
+        """Return whether the link zero is known better than friction of the day alone would let it be."""
+        return bool(self.flags & LEARNED)
+
+    @property
+    def plausible(self) -> bool:
+        """Return whether the link zero is within the joint file's limit."""
+        return not self.flags & BEYOND
+
+    def content(self) -> dict[str, Any] | None:
+        """Return plain values for JSON; None where nothing is tracked."""
+        if not self.tracked:
+            return None
+        return self._asdict() | {"learned": self.learned, "plausible": self.plausible}
+
+    @property
+    def text(self) -> str:
+        """Return what is known of the zeros for a reader; "" where they are not tracked."""
+        if not self.tracked:
+            return ""
+        found = f"link {1e6 * self.link_rad:+.0f} µrad, sigma {1e6 * self.link_sigma_rad:.0f} µrad"
+        used = (
+            f"{1e6 * self.link_used_rad:+.0f} µrad taken off" if self.link_used_rad else "nothing taken off"
+        )
+        text = f"{found}, {used}" if self.learned else "link not learned yet: the joint has to move both ways"
+        if self.current_used_a:
+            text += f"; current {self.current_a:+.3f} A, {self.current_used_a:+.3f} A taken off"
+        if self.jumps:
+            text += f"; jumped {'once' if self.jumps == 1 else f'{self.jumps} times'}"
+        return text if self.plausible else f"{text}; {self.implausible}"
+
+    @property
+    def implausible(self) -> str:
+        """Return what a zero beyond the limit may be."""
+        return (
+            f"{1e3 * self.link_rad:+.2f} mrad, limit {1e3 * self.limit_rad:.2f} mrad: the encoder has slipped, was mounted "
+            "anew, or the joint file is another joint's"
+        )
+
+
+PAST_LAYOUT: Final = 6
+"""Number of the layout of `past`, which logs hold: another one where its fields, their order or their meaning change.
+`tests/estimator/test_learned.py` has the size that belongs to it."""
+
+
+class Learner(Protocol):
+    """An estimator that learns zeros; `jtqd.estimator.estimator.FusedEstimator` is one."""
+
+    past: bytes | memoryview
+
+    @property
+    def zeros(self) -> Zeros | None:
+        """Return what is known of the zeros, None where they are not tracked."""
+
+    def shares_past(self, other: Self) -> bool:
+        """Return whether the past of `other` means the same here."""
+
+
+def learner_of(estimator: object) -> Any:
+    """Return the `Learner` of an estimator, which may stand behind the corrections of effects; None without one."""
+    inner = getattr(estimator, "inner", estimator)
+    return inner if getattr(inner, "zeros", None) is not None else None
+
+
+def same_past(old: Any, new: Any) -> bool:
+    """Return whether what `old` has learned is true for `new`; both track zeros then."""
+    one, other = learner_of(old), learner_of(new)
+    same_effects = old.joint.effects == new.joint.effects
+    return one is not None and other is not None and same_effects and bool(other.shares_past(one))

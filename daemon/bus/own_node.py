@@ -113,7 +113,7 @@ class OwnNode:
             store.on_read(0x2207, sub, partial(self._emergency, node))
 
     def _zero(self, joint: int, name: str) -> float:
-        """Return a value of `jtqd.estimator.learned.Zeros`."""
+        """Return a value of `jtqd.estimator.status.Zeros`."""
         zeros = self._reader.read().zeros
         value: float = getattr(zeros[joint] if joint < len(zeros) else NO_ZEROS, name)
         return value

@@ -19,7 +19,7 @@ from typing import NamedTuple
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.shared import cycle_record as cycle
 from jtqd.daemon.shared.snapshot import PAST_WORDS, View
-from jtqd.estimator.learned import PAST_LAYOUT, Zeros
+from jtqd.estimator.status import PAST_LAYOUT, Zeros
 
 CDR_HEADER = b"\x00\x01\x00\x00"
 _NS = 1_000_000_000

@@ -27,7 +27,7 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.daemon.shared.snapshot import PAST_WORDS
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.learned import PAST_LAYOUT
+from jtqd.estimator.status import PAST_LAYOUT
 from jtqd.models.files import load_yaml
 
 # ---- names and types that a replay needs of a log's messages; another version may have others ----

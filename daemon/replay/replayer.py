@@ -40,9 +40,9 @@ from jtqd.daemon.shared.cycle_record import (
 from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.estimator.arrays import BoolArray, FloatArray, IntegerArray, RecordArray
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.learned import learner_of
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import learner_of
 
 # ---- inputs ----
 

@@ -33,11 +33,11 @@ from jtqd.daemon.replay.runs import (
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.learned import same_past
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
 from jtqd.estimator.network import NATIVE_LIMIT, load_network
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.settings import METHODS, bandwidth_of
+from jtqd.estimator.status import same_past
 from jtqd.models.files import load_joint
 
 # ---- models: those that the log carries, or others from a directory ----

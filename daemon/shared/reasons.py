@@ -18,7 +18,7 @@ from jtqd.daemon.shared.snapshot import (
 )
 from jtqd.drivers.drive import State, state_of
 from jtqd.estimator import status as st
-from jtqd.estimator.learned import APART, LEFT, Zeros
+from jtqd.estimator.status import APART, LEFT, Zeros
 
 SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
-from jtqd.estimator.learned import Zeros
+from jtqd.estimator.status import Zeros
 
 STATUS_CODES = 16
 MAX_NODE = 128

@@ -35,7 +35,7 @@ from jtqd.daemon.shared.reasons import (
 from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, InputView, JointView, View
 from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.estimator import status as st
-from jtqd.estimator.learned import Zeros
+from jtqd.estimator.status import Zeros
 
 NEAR_SIGMAS = 2.0
 """A deviation ends within so many sigmas: on the edge it does not begin again and again."""

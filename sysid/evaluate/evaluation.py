@@ -19,7 +19,7 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 
 from jtqd.estimator.checked import counted
-from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.joint import Envelope
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import recommended

@@ -64,7 +64,6 @@ from scipy.optimize import nnls
 from scipy.special import chdtri, ndtri, stdtrit
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
-from jtqd.estimator.fusion import GAUSS, Fusion
 from jtqd.estimator.joint import (
     Fused,
     FusedSigma,
@@ -74,6 +73,7 @@ from jtqd.estimator.joint import (
 )
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
+from jtqd.estimator.uncertainty import GAUSS, Fusion
 from jtqd.sysid.fit.residuals import TRACKING_RAD_S, WAVE_RAD_S, PathResiduals, Served, served
 from jtqd.sysid.fit.signals import RunSignals
 

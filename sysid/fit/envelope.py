@@ -9,12 +9,13 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.envelope import MAX_CELLS, Envelope
 from jtqd.estimator.joint import (
+    MAX_CELLS,
     AdditiveLoss,
+    Envelope,
     Torsion,
 )
-from jtqd.estimator.validity import FusedTrust
+from jtqd.estimator.uncertainty import FusedTrust
 from jtqd.sysid.fit.residuals import path_residuals
 from jtqd.sysid.fit.signals import RunSignals
 

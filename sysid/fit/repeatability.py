@@ -29,9 +29,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.agreement import EVERY, TURNING_RAD_S, levels, turn_waves
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import (
     TURN_WAVES,
     Agreement,
@@ -40,7 +38,16 @@ from jtqd.estimator.joint import (
     FusedSigma,
     Turn,
 )
-from jtqd.estimator.zeros import CORRELATION_S, MOVING_RAD_S, ONE_WAY
+from jtqd.estimator.path_difference import (
+    CORRELATION_S,
+    EVERY,
+    MOVING_RAD_S,
+    ONE_WAY,
+    TURNING_RAD_S,
+    levels,
+    turn_waves,
+)
+from jtqd.estimator.uncertainty import Fusion
 from jtqd.sysid.fit.residuals import PathResiduals, served
 
 WORTH: Final = 0.05

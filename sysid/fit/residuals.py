@@ -17,10 +17,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.agreement import followed
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.estimator import SLOPE_NM, quadrants
-from jtqd.estimator.fusion import DISAGREE_SIGMAS, GAUSS, Fusion, held
 from jtqd.estimator.joint import (
     AdditiveLoss,
     Fused,
@@ -28,7 +26,9 @@ from jtqd.estimator.joint import (
 )
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
+from jtqd.estimator.path_difference import followed
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
+from jtqd.estimator.uncertainty import DISAGREE_SIGMAS, GAUSS, Fusion, held
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import deflection, local_stiffness, torsion_now, torsion_through, torsion_torque
 

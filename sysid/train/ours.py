@@ -19,13 +19,12 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
-from jtqd.estimator.envelope import Envelope
 from jtqd.estimator.estimator import FusedEstimator, quadrants
-from jtqd.estimator.fusion import Fusion, turning
-from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, Torsion
+from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.onnx_graph import perceptron_content
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.uncertainty import Fusion, turning
 from jtqd.sysid.fit.calibration import conformal_scale
 from jtqd.sysid.fit.envelope import envelope_of
 from jtqd.sysid.fit.fused import folds

@@ -18,7 +18,7 @@ from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
 from jtqd.estimator.observer import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED
-from jtqd.estimator.validity import FADE_START
+from jtqd.estimator.uncertainty import FADE_START
 from tests.benchmarks.fixture import (
     ENVELOPE_HIGH,
     ENVELOPE_LOW,

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.envelope import Envelope
-from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion
+from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, LossSide, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from tests.estimator.estimator_helpers import Motion, SmallNetwork, joint1, motion
 

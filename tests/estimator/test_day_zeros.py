@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.agreement import followed, levels
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
-from jtqd.estimator.fusion import Fusion, held
 from jtqd.estimator.joint import DayZeros, Joint
 from jtqd.estimator.losses import AdditiveLossModel
+from jtqd.estimator.path_difference import followed, levels
+from jtqd.estimator.uncertainty import Fusion, held
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_fused_estimator import NARROW

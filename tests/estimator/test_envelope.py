@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.envelope import Envelope
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Envelope, Joint
 from tests.estimator.fused_helpers import fused_joint
 
 MAP = ((0, 1, 0), (1, 1, 1), (0, 1, 0))

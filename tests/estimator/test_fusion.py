@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.fusion import HOLD_S, Fusion, held
 from jtqd.estimator.joint import FusedSigma
+from jtqd.estimator.uncertainty import HOLD_S, Fusion, held
 from tests.estimator.fused_helpers import SIGMA
 
 RAW, LOSS, HALF, V, TORSION_NM = 12.0, 3.0, 0.0, 1.0, 8.0

@@ -10,10 +10,10 @@ import pytest
 from jtqd.daemon.shared.snapshot import PAST_WORDS
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.estimator.learned import LEARNED, PAST_LAYOUT, TRACKED, Zeros, same_past
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import LEARNED, PAST_LAYOUT, TRACKED, Zeros, same_past
 from tests.estimator.test_fused_estimator import NARROW
 from tests.estimator.test_zeros import ON, driven
 

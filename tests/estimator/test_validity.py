@@ -13,10 +13,10 @@ from scipy.interpolate import RegularGridInterpolator
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
-from jtqd.estimator.envelope import Envelope
+from jtqd.estimator.joint import Envelope
 from jtqd.estimator.losses import FrictionModel, LossModel
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.validity import (
+from jtqd.estimator.uncertainty import (
     DISTANCE_MARGIN,
     TEMPERATURE_MARGIN_K,
     FusedTrust,

@@ -13,10 +13,10 @@ from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import FusedEstimator, observe_run
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.learned import Zeros
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import Zeros
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_fused_estimator import NARROW
 

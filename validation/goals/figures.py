@@ -14,8 +14,8 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS
+from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.methods import PAPERS
 from jtqd.sysid.planner.campaigns import seed_of
 from jtqd.sysid.planner.plan import Run

@@ -16,7 +16,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray
 from jtqd.estimator.checked import natural
-from jtqd.estimator.fusion import GAUSS
+from jtqd.estimator.uncertainty import GAUSS
 from validation.goals.identify import (
     FIT_SEED,
     JUDGE_SEED,

@@ -21,12 +21,12 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
+from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.fit.few_runs import Prior, fit_few_runs
 from jtqd.sysid.fit.friction import FitError, fit_friction
 from jtqd.sysid.fit.losses import LossFitError

@@ -17,14 +17,13 @@ from jtqd.daemon.shared.snapshot import LEARNED, NO_ZEROS, Snapshot, SnapshotRea
 from jtqd.daemon.supervisor.service import metrics_text
 from jtqd.daemon.supervisor.summary import summary_of
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
-from jtqd.estimator import learned
-from jtqd.estimator.learned import Zeros
-from jtqd.estimator.status import DEGRADED
+from jtqd.estimator import status
+from jtqd.estimator.status import DEGRADED, Zeros
 from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import ROOT
 
-FOUND = Zeros(1.02e-4, 9e-6, 9.8e-5, 0.01, 0.02, 0.005, 2e-3, learned.TRACKED | learned.LEARNED, 0)
-FAR = FOUND._replace(link_rad=2.31e-3, flags=FOUND.flags | learned.BEYOND)
+FOUND = Zeros(1.02e-4, 9e-6, 9.8e-5, 0.01, 0.02, 0.005, 2e-3, status.TRACKED | status.LEARNED, 0)
+FAR = FOUND._replace(link_rad=2.31e-3, flags=FOUND.flags | status.BEYOND)
 
 
 @pytest.fixture
@@ -51,7 +50,7 @@ def test_a_zero_beyond_its_limit_is_a_condition_with_its_numbers() -> None:
 def test_a_zero_that_jumps_is_told_until_it_is_known_again() -> None:
     watch = Observer()
     assert watch.lines(view(8, zeros=(FOUND, NO_ZEROS)), 0.0) == []
-    lost = FOUND._replace(flags=learned.TRACKED, jumps=1)
+    lost = FOUND._replace(flags=status.TRACKED, jumps=1)
     (line,) = watch.lines(view(16, zeros=(lost, NO_ZEROS)), 0.05)
     assert line == "joint 1: the link encoder's zero has jumped, from +98 µrad, and is not known again yet"
     assert watch.lines(view(24, zeros=(lost, NO_ZEROS)), 3.0) == []
@@ -63,9 +62,9 @@ def test_a_zero_that_jumps_is_told_until_it_is_known_again() -> None:
 @pytest.mark.parametrize(
     ("flags", "said"),
     [
-        (learned.BEYOND, r"zero is \+0.10 mrad, limit 2.00 mrad"),
-        (learned.LEFT, r"\+4 µrad of it are not yet taken off"),
-        (learned.APART, "current and torsion disagree"),
+        (status.BEYOND, r"zero is \+0.10 mrad, limit 2.00 mrad"),
+        (status.LEFT, r"\+4 µrad of it are not yet taken off"),
+        (status.APART, "current and torsion disagree"),
         (0, "network output is not finite"),
     ],
 )

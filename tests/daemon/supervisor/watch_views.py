@@ -7,8 +7,7 @@ from jtqd.daemon.shared.conditions import Conditions
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import NO_ZEROS, JointView, View
 from jtqd.daemon.supervisor.health import Health
-from jtqd.estimator.learned import Zeros
-from jtqd.estimator.status import VALID
+from jtqd.estimator.status import VALID, Zeros
 
 NAN = float("nan")
 WELL = JointView(10.0, 0.5, NAN, NAN, NAN, 10.0, 0x27, VALID, 0, 15, 0, 10.0, 1.25)

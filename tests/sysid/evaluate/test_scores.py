@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from jtqd.estimator.envelope import Envelope
-from jtqd.estimator.joint import QUADRANTS
+from jtqd.estimator.joint import QUADRANTS, Envelope
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.sysid.evaluate.evaluation import worse_runs

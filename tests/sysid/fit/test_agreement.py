@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.agreement import turn_waves
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Agreement
+from jtqd.estimator.path_difference import turn_waves
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.fused import fit_fused
 from jtqd.sysid.fit.repeatability import LOWERED, QUANTILE, Levels, TurnRun, fit_agreement, fit_turn

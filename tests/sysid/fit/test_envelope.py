@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from jtqd.estimator.envelope import Envelope
-from jtqd.estimator.validity import FusedTrust
+from jtqd.estimator.joint import Envelope
+from jtqd.estimator.uncertainty import FusedTrust
 from jtqd.sysid.fit.envelope import BEYOND_SHARE, MOST_WIDER, envelope_of, velocity_step, widened
 
 

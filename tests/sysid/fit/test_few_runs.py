@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
+from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.command import losses_main
 from jtqd.sysid.fit.few_runs import FewRunsFit, fit_few_runs

@@ -10,11 +10,11 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.fusion import GAUSS, Fusion
 from jtqd.estimator.joint import AdditiveLoss, Friction, FusedSigma, Joint
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
+from jtqd.estimator.uncertainty import GAUSS, Fusion
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.days import Day
 from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run

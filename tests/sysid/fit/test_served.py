@@ -9,10 +9,10 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.estimator import FusedEstimator
-from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Tracking
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.fit.calibration import (
     COVERAGE,
     LATEST,

@@ -3,6 +3,22 @@ from typing import Final
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Fused, Turn
 
+MOVING_RAD_S: Final[float]
+ONE_WAY: Final[float]
+BLOCK: Final[int]
+CORRELATION_S: Final[float]
+DOUBT: Final[float]
+SURE: Final[float]
+COVERED: Final[float]
+SLEW_S: Final[float]
+LARGEST_LINK: Final[float]
+CURRENT_SHARE: Final[float]
+LEAST_GAIN: Final[float]
+FRICTION_SHARE: Final[float]
+DRIFT_S: Final[float]
+JUMP: Final[float]
+JUMP_S: Final[float]
+KNOWN_SHARE: Final[float]
 TREND_S: Final[float]
 UP_S: Final[float]
 DOWN_S: Final[float]
