@@ -253,7 +253,7 @@ def main(argv: list[str]) -> int:
                 f"{joints[0].gear_ratio:g} as in {options.joint}: files of the same joint"
             )
         columns = None if options.columns is None else ColumnMap.load(options.columns)
-        runs = read_runs(options.runs, columns, in_pieces=True, joints=only(options.number))
+        runs = read_runs(options.runs, columns, segments=True, joints=only(options.number))
         number = joint_number(options.number, joints[0], runs)
         runs = with_joint(runs, number)
         notes = [f"{run.name}: {note}" for run in runs for note in run.notes]

@@ -56,7 +56,7 @@ def main(argv: list[str]) -> int:
         check_installed("analysis", *_NEEDED)
         check_joint_files(files)
         _check_out(options.out, options.force)
-        runs = read_runs(options.runs, columns, in_pieces=True, joints=named_joints(files))
+        runs = read_runs(options.runs, columns, segments=True, joints=named_joints(files))
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
         scope = scope_of(options.without, options.given, joints, known)

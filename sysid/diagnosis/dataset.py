@@ -46,7 +46,8 @@ from jtqd.sysid.diagnosis.signals import (
     without_held,
 )
 from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
-from jtqd.sysid.runs.bad_samples import clip_limits, held_rows
+from jtqd.sysid.runs.bad_samples import held_values, saturation_limits
+from jtqd.sysid.runs.channels import Channels
 
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0
@@ -143,7 +144,7 @@ def usable_signals(
     out: list[list[JointSignals]] = []
     reasons: list[str] = []
     bases = {n: BaseLoss(joints[n]) for n in numbers}
-    limits = clip_limits((table for _, table in runs), {n: joints[n] for n in numbers})
+    limits = saturation_limits((table for _, table in runs), {n: joints[n] for n in numbers})
     rates = [1.0 / float(np.median(np.diff(table.time_s))) for _, table in runs]
     usual = float(np.median(rates))
     for (name, table), rate in zip(runs, rates, strict=True):
@@ -160,7 +161,7 @@ def usable_signals(
             if n not in table.joints:
                 continue
             try:
-                held = held_rows(table.time_s, table.joints[n], joints[n], limits[n])
+                held = held_values(Channels(table.time_s, table.joints[n], joints[n], name), limits[n])
                 mine.append(without_held(joint_signals(name, table, n, joints[n], bases[n]), held))
             except SignalsError as error:
                 reasons.append(str(error))

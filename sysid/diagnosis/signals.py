@@ -178,7 +178,7 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
         reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
     out, worth = {}, {}
     scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
-    apart = {name: h.apart for name, h in held.items()}
+    apart = {name: h.deviation for name, h in held.items()}
     for balance, columns in ((TORSION, ("torque_nm",)), (MOTOR, ("torque_nm", "current_a"))):
         rows = [held[name].rows for name in columns if name in held]
         if rows:

@@ -40,7 +40,7 @@ from jtqd.sysid.evaluate.scores import (
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import STYLE, page_svg, plain
 from jtqd.sysid.report.page import LIGHT
-from jtqd.sysid.runs.checks import RunIssue
+from jtqd.sysid.runs.channels import RunIssue
 
 SCHEMA: Final = "jtq.accuracy/1"
 BASELINE: Final = "tob"

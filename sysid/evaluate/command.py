@@ -20,7 +20,7 @@ from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
 from jtqd.sysid.evaluate.methods import JointModels, load_models, take_samples
 from jtqd.sysid.evaluate.report import as_mapping, text_lines
 from jtqd.sysid.progress import progress
-from jtqd.sysid.runs.checks import RunIssue
+from jtqd.sysid.runs.channels import RunIssue
 from jtqd.sysid.runs.run_file import RunError
 
 BY: Final = "jtq evaluate"

@@ -55,7 +55,7 @@ from jtqd.sysid.evaluate.scores import (
 )
 from jtqd.sysid.fit.efficiency import TITLES as QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
-from jtqd.sysid.runs.checks import RunIssue
+from jtqd.sysid.runs.channels import RunIssue
 
 METHODS: Final = ("tob", PAPERS, OURS)
 SAMPLES: Final = 3000

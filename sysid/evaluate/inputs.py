@@ -22,7 +22,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.evaluate.methods import JointModels, run_hashes
 from jtqd.sysid.progress import progress
-from jtqd.sysid.runs.checks import RunIssue, check_channels
+from jtqd.sysid.runs.channels import Channels, RunIssue, check_channels
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run, run_paths
 from jtqd.sysid.runs.run_file import RunError, RunFile
@@ -184,7 +184,7 @@ def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue
         return [RunIssue("dead_channel", f"{name}: {note}: j{number} not scored") for note in dead]
     if missing:
         return [RunIssue("missing_columns", f"{where}: found no {', '.join(missing)}: not scored")]
-    found = check_channels(file.table.time_s, columns, joint, where)
+    found = check_channels(Channels(file.table.time_s, columns, joint, where))
     return [RunIssue(item.kind, f"{item.text}: j{number} not scored") for item in found]
 
 

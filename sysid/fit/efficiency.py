@@ -38,7 +38,7 @@ from jtqd.estimator.losses import (
 )
 from jtqd.sysid.fit.plateaus import Mean, Plateau
 from jtqd.sysid.report.figures import plain
-from jtqd.sysid.runs.checks import RunIssue
+from jtqd.sysid.runs.channels import RunIssue
 
 COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")
 FEWEST_DISTINCT: Final = len(COEFFICIENTS) + 1

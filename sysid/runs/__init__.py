@@ -1,4 +1,4 @@
-"""Recorded runs: files to run tables and back, checks of what may be used, and the joint file of each joint.
+"""Recorded runs: files to run tables and back, checks of their channels, and the joint file of each joint.
 
 In: CSV, gzipped CSV, Parquet, MCAP logs of jtqd, with an optional column map. Out: `RunFile` and `CheckedRun`, frozen.
 Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are imported when such a file is read.
@@ -14,9 +14,10 @@ Imports estimator and models; logs (`jtqd.sysid.runs.logs`) and Parquet are impo
     True
 """
 
-from jtqd.sysid.runs.checks import CheckedRun, CheckedRuns, RunIssue, check_run, check_runs
+from jtqd.sysid.runs.channels import RunIssue
+from jtqd.sysid.runs.checks import CheckedRun, CheckedRuns, check_run, check_runs
 from jtqd.sysid.runs.column_map import Column, ColumnMap
-from jtqd.sysid.runs.files import read_pieces, read_run, read_runs, run_paths
+from jtqd.sysid.runs.files import read_run, read_runs, run_paths
 from jtqd.sysid.runs.joints import joint_files, joint_number, joints_of, named_joints, only
 from jtqd.sysid.runs.run_file import RunError, RunFile
 from jtqd.sysid.runs.tables import write_run
@@ -36,7 +37,6 @@ __all__ = [
     "joints_of",
     "named_joints",
     "only",
-    "read_pieces",
     "read_run",
     "read_runs",
     "run_paths",

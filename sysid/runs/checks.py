@@ -1,11 +1,12 @@
-"""What of a run may be used: `check_run`, one set of checks for fits, campaigns, evaluation and diagnosis.
+"""Which channels of a run may be used: one set of checks for fits, campaigns, evaluation and diagnosis (`check_run`).
 
-Every check of a joint's channels against each other holds for every use (`channels`). A diagnosis takes every column at
-its word, so a thorough check asks more: length and time base (`time_base`), single samples that are none (`wild`), channels
-of one value, units (`units`), energy, held and clipped stretches, spikes, skew, columns exchanged between two joints
-(`swapped`). A joint of a run whose columns contradict each other (unit,
-sign, dead, another joint's file or columns) is left out with one line; a channel that is only not needed (temperature, link
-encoder) is left out alone; what is usable but odd (short stuck stretches, clipping, spikes, uneven time) is a note.
+Comparing a joint's channels with each other (`channels`) serves every use. A diagnosis relies on every column, so a thorough
+check adds: length and time base (`time_base`), outliers and held values (`bad_samples`), constant channels, units (`units`),
+energy, spikes, skew, and columns exchanged between two joints.
+
+A joint whose columns contradict each other (unit, sign, dead, another joint's file or columns) is left out of the run with
+one line. A faulty channel that is not needed (temperature, link encoder) is left out alone. What is usable but suspicious
+(short stuck stretches, saturation, spikes, uneven time) is a note.
 """
 
 from __future__ import annotations
@@ -19,17 +20,19 @@ import numpy as np
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.runs.bad_samples import Limits, check_held, clip_limits, without_wild_samples
+from jtqd.sysid.runs.bad_samples import Limits, check_held, saturation_limits, without_outliers
 from jtqd.sysid.runs.channels import (
+    MOTION,
+    Channels,
     RunIssue,
     check_channels,
     check_energy,
     check_spikes,
-    one_value,
+    constant_channels,
     swapped_columns,
 )
 from jtqd.sysid.runs.run_file import RunFile
-from jtqd.sysid.runs.segments import SHORTEST_PIECE_S
+from jtqd.sysid.runs.segments import SHORTEST_SEGMENT_S
 from jtqd.sysid.runs.time_base import (
     SKEW_NOTED_S,
     SKEW_REFUSED_S,
@@ -40,19 +43,8 @@ from jtqd.sysid.runs.time_base import (
 )
 from jtqd.sysid.runs.units import temperature_issue, unit_issues
 
-__all__ = [
-    "CheckedRun",
-    "CheckedRuns",
-    "RunIssue",
-    "channel_findings",
-    "check_channels",
-    "check_run",
-    "check_runs",
-]
-
 _REFUSING: Final = ("_dead", "_sign", "_scale", "_unit")
 _REFUSING_KINDS: Final = ("gear_ratio", "joint_file")
-_MOTION: Final = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
 _SPARE: Final = {
     "link_position_rad_stuck": ("link_position_rad", "link_velocity_rad_s"),
     "motor_position_rad_stuck": ("motor_position_rad",),
@@ -65,8 +57,8 @@ class CheckedRun:
     """Result of `check_run`.
 
     Attributes:
-        table: what may be used; None: nothing.
-        refused: why joints (or the whole run) are left out. notes: what is odd about the rest.
+        table: columns that may be used; None: nothing.
+        refused: why joints (or the whole run) are left out. notes: what is suspicious about the rest.
     """
 
     table: RunTable | None
@@ -79,8 +71,8 @@ class CheckedRuns:
     """Result of `check_runs`.
 
     Attributes:
-        runs: (name, table) with what may be used.
-        notes, refused: as those of `CheckedRun`, one line each. lost: joints of which nothing is left.
+        runs: (name, table) with the columns that may be used.
+        notes, refused: as those of `CheckedRun`, one line each. lost: joints that are left out of every run.
     """
 
     runs: tuple[tuple[str, RunTable], ...]
@@ -99,50 +91,25 @@ def check_run(
 ) -> CheckedRun:
     """Check the joints of one run that have a joint file; `name` begins every line.
 
-    thorough: as a diagnosis needs it; only then are columns changed (rows with a wild sample left out, positions that roll
-    over made continuous, uneven steps made even, channels that are not needed left out when they are wrong). limits: where
-    channels clip in other runs.
+    thorough: as a diagnosis needs it; only then are columns changed (rows with an outlier left out, positions that roll over
+    unwrapped, uneven steps resampled, faulty channels that are not needed left out). limits: where channels saturate in
+    other runs.
     """
-    notes: list[RunIssue] = []
     if thorough:
-        unfit = _too_short(table, name) or check_rate(table.time_s, name)
-        if unfit:
-            return CheckedRun(None, tuple(unfit))
-        table, wild = without_wild_samples(table, joints, name)
-        standing, still = _of_one_value(table, joints, name)
-        if standing:
-            return CheckedRun(None, tuple(standing), tuple(wild))
-        table, rolled = unwrapped(table, name)
-        table, uneven = on_even_steps(table, name)
-        notes += wild + still + rolled + uneven
+        return _thorough(table, joints, name, limits or {})
     refused: list[RunIssue] = []
     usable: dict[int, JointColumns] = {}
-    exchanged = swapped_columns(table, joints, name) if thorough else []
-    refused += [issue for _, _, issue in exchanged]
-    for number in sorted(set(joints) & set(table.joints) - {n for a, b, _ in exchanged for n in (a, b)}):
-        where = f"{name}: j{number}" if name else f"j{number}"
-        if thorough:
-            columns, why, odd = _checked_joint(
-                table, number, joints[number], where, (limits or {}).get(number)
-            )
-            notes += odd
-        else:
-            columns = table.joints[number]
-            why = check_channels(table.time_s, columns, joints[number], where)
-        refused += why
-        if columns is not None and not why:
-            usable[number] = columns
-    if thorough:
-        opposite = _opposite_sensors(usable, name)
-        if opposite:
-            refused += opposite
-            del usable[2]
-    return CheckedRun(RunTable(table.time_s, usable) if usable else None, tuple(refused), tuple(notes))
+    for number in sorted(set(joints) & set(table.joints)):
+        issues = check_channels(_channels(table, number, joints, name))
+        refused += issues
+        if not issues:
+            usable[number] = table.joints[number]
+    return CheckedRun(RunTable(table.time_s, usable) if usable else None, tuple(refused))
 
 
 def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> CheckedRuns:
     """Return what of the runs can be used for a diagnosis of `joints` (joint file by number)."""
-    limits = clip_limits((without_wild_samples(table, joints, name)[0] for name, table in runs), joints)
+    limits = saturation_limits((without_outliers(table, joints, name)[0] for name, table in runs), joints)
     each = [(name, check_run(table, joints, name, thorough=True, limits=limits)) for name, table in runs]
     usable = tuple((name, run.table) for name, run in each if run.table is not None)
     left = {number for _, table in usable for number in table.joints}
@@ -156,7 +123,7 @@ def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]
 
 
 def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list[RunIssue]:
-    """Return what is wrong with one joint's channels in any run, those included that the reader has called dead."""
+    """Return what is wrong with one joint's channels in any run, including those that the reader found dead."""
     issues: list[RunIssue] = []
     for run in runs:
         issues += [
@@ -166,106 +133,110 @@ def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list
     return issues
 
 
+def _channels(table: RunTable, number: int, joints: Mapping[int, Joint], name: str) -> Channels:
+    where = f"{name}: j{number}" if name else f"j{number}"
+    return Channels(table.time_s, table.joints[number], joints[number], where)
+
+
+def _thorough(
+    table: RunTable, joints: Mapping[int, Joint], name: str, limits: Mapping[int, Limits]
+) -> CheckedRun:
+    unfit = _too_short(table, name) or check_rate(table.time_s, name)
+    if unfit:
+        return CheckedRun(None, tuple(unfit))
+    table, notes = without_outliers(table, joints, name)
+    constant = {
+        number: [*constant_channels(table.joints[number], f"{name}: j{number}")]
+        for number in sorted(set(joints) & set(table.joints))
+    }
+    standing = [issue for each in constant.values() for issue in each]
+    if constant and all(len(each) == 2 for each in constant.values()):  # neither motion nor current changes
+        return CheckedRun(None, tuple(standing), tuple(notes))
+    table, rolled = unwrapped(table, name)
+    table, uneven = on_even_steps(table, name)
+    notes += standing + rolled + uneven
+    exchanged = swapped_columns(table, joints, name)
+    refused = [issue for _, _, issue in exchanged]
+    swapped = {number for a, b, _ in exchanged for number in (a, b)}
+    usable: dict[int, JointColumns] = {}
+    for number in sorted(set(joints) & set(table.joints) - swapped):
+        columns, why, odd = _checked_joint(table, number, joints, name, limits.get(number))
+        notes += odd
+        refused += why
+        if columns is not None:
+            usable[number] = columns
+    if opposite := _opposite_sensors(usable, name):
+        refused += opposite
+        del usable[2]
+    return CheckedRun(RunTable(table.time_s, usable) if usable else None, tuple(refused), tuple(notes))
+
+
 def _too_short(table: RunTable, name: str) -> list[RunIssue]:
     seconds = float(table.time_s[-1] - table.time_s[0] + np.median(np.diff(table.time_s)))
-    if seconds > (1.0 - 1e-6) * SHORTEST_PIECE_S:
+    if seconds > (1.0 - 1e-6) * SHORTEST_SEGMENT_S:
         return []
     found = f"{counted(len(table.time_s), 'sample')}, {seconds:.3g} s"
-    return [
-        RunIssue("too_short", f"{name}: found {found}, expected a run of at least {SHORTEST_PIECE_S:g} s")
-    ]
-
-
-def _of_one_value(
-    table: RunTable, joints: Mapping[int, Joint], name: str
-) -> tuple[list[RunIssue], list[RunIssue]]:
-    """Return why nothing was measured in a run whose joints stand with a constant current, else notes of joints that stand
-    and of currents that never change in motion.
-    """
-    found = {n: one_value(table.joints[n], f"{name}: j{n}") for n in sorted(set(joints) & set(table.joints))}
-    issues = [issue for each in found.values() for issue in each]
-    dead = found and all(len(each) == 2 for each in found.values())
-    return (issues, []) if dead else ([], issues)
+    text = f"{name}: found {found}, expected a run of at least {SHORTEST_SEGMENT_S:g} s"
+    return [RunIssue("too_short", text)]
 
 
 def _checked_joint(
-    table: RunTable, number: int, joint: Joint, where: str, limits: Limits | None
+    table: RunTable, number: int, joints: Mapping[int, Joint], name: str, limits: Limits | None
 ) -> tuple[JointColumns | None, list[RunIssue], list[RunIssue]]:
     """Return columns that may be used (None: the joint is left out of this run), why not, and notes."""
-    columns = table.joints[number]
-    missing = _missing(columns, where)
-    if missing:
-        return None, missing, []
+    c = _channels(table, number, joints, name)
+    if missing := _missing(c):
+        return None, [missing], []
     notes: list[RunIssue] = []
-    hot = temperature_issue(table.time_s, columns, where)
-    if hot is not None:
+    if (hot := temperature_issue(c)) is not None:
         notes.append(hot)
-        columns = replace(columns, temperature_c=None)
-    issues = (
-        unit_issues(table.time_s, columns, joint, where)
-        or check_channels(table.time_s, columns, joint, where)
-        or check_energy(table.time_s, columns, joint, where)
-    )
+        c = replace(c, run=replace(c.run, temperature_c=None))
+    issues = unit_issues(c) or check_channels(c) or [*check_energy(c)]
     refusing = [i for i in issues if i.kind.endswith(_REFUSING) or i.kind in _REFUSING_KINDS]
     if refusing:
         return None, refusing, notes
-    columns, spared = _spared(columns, issues)
-    notes += spared
-    refusing, short = check_held(table.time_s, columns, joint, where, limits)
-    notes += short + check_spikes(columns, joint, where)
+    for item in issues:
+        if item.kind in _SPARE:
+            unused: dict[str, Any] = dict.fromkeys(_SPARE[item.kind])
+            c = replace(c, run=replace(c.run, **unused))
+            notes.append(RunIssue(item.kind, f"{item.text}; not used"))
+    refusing, short = check_held(c, limits)
+    notes += [*short, *check_spikes(c)]
     if refusing:
         return None, refusing, notes
-    late = skew_s(RunTable(table.time_s, {**table.joints, number: columns}), number, joint)
+    late = skew_s(RunTable(table.time_s, {**table.joints, number: c.run}), number, joints[number])
     if late is not None and abs(late) >= SKEW_NOTED_S:
-        skew = RunIssue(
-            "torque_nm_skew",
-            f"{where}.torque_nm: found it {abs(late):.3g} s {'behind' if late > 0.0 else 'ahead of'} current and motion, "
-            "expected channels in step: skew",
-        )
+        side = "behind" if late > 0.0 else "ahead of"
+        text = f"found it {abs(late):.3g} s {side} current and motion, expected channels in step: skew"
+        skew = c.issue("torque_nm", "skew", text)
         if abs(late) >= SKEW_REFUSED_S:
             return None, [skew], notes
         notes.append(skew)
-    return columns, [], notes
+    return c.run, [], notes
 
 
-def _missing(columns: JointColumns, where: str) -> list[RunIssue]:
+def _missing(c: Channels) -> RunIssue | None:
     """Return the first column that is missing or dead and without which a joint cannot be diagnosed."""
-    if columns.torque_nm is None or not np.any(columns.torque_nm):
-        return [
-            RunIssue(
-                "torque_nm_missing",
-                f"{where}.torque_nm: found no valid torque sensor channel, expected the reference of a diagnosis: a sensor, "
-                "or a known load or a model's torque (jN.load of a column map)",
-            )
-        ]
-    if np.ptp(columns.torque_nm) == 0.0 and _moves(columns):
+    torque = c.run.torque_nm
+    if torque is None or not np.any(torque):
         text = (
-            f"{where}.torque_nm: found {columns.torque_nm[0]:.4g} Nm in the whole run while the joint moves"
+            "found no valid torque sensor channel, expected the reference of a diagnosis: a sensor, or a known load or a "
+            "model's torque (jN.load of a column map)"
         )
-        return [RunIssue("torque_nm_dead", f"{text}, expected a measurement that changes: dead channel")]
-    if columns.current_a is None:
-        text = f"{where}.current_a: found no such column, expected the motor current"
-        return [RunIssue("current_a_missing", text)]
-    if all(getattr(columns, name) is None for name in _MOTION):
-        text = f"{where}: found no position and no velocity, expected at least one of them"
-        return [RunIssue("motion_missing", text)]
-    return []
-
-
-def _moves(columns: JointColumns) -> bool:
-    return any(np.ptp(column) > 0.0 for name in _MOTION if (column := getattr(columns, name)) is not None)
-
-
-def _spared(columns: JointColumns, issues: Sequence[RunIssue]) -> tuple[JointColumns, list[RunIssue]]:
-    """Return columns without the stuck ones that a diagnosis can do without."""
-    notes = []
-    for item in issues:
-        unused = _SPARE.get(item.kind)
-        if unused is not None:
-            empty: dict[str, Any] = dict.fromkeys(unused)
-            columns = replace(columns, **empty)
-            notes.append(RunIssue(item.kind, f"{item.text}; not used"))
-    return columns, notes
+        return c.issue("torque_nm", "missing", text)
+    motion = [column for name in MOTION if (column := getattr(c.run, name)) is not None]
+    if np.ptp(torque) == 0.0 and any(np.ptp(column) > 0.0 for column in motion):
+        text = (
+            f"found {torque[0]:.4g} Nm in the whole run while the joint moves, expected a measurement that changes: dead "
+            "channel"
+        )
+        return c.issue("torque_nm", "dead", text)
+    if c.run.current_a is None:
+        return c.issue("current_a", "missing", "found no such column, expected the motor current")
+    if not motion:
+        text = f"{c.where}: found no position and no velocity, expected at least one of them"
+        return RunIssue("motion_missing", text)
+    return None
 
 
 def _opposite_sensors(usable: Mapping[int, JointColumns], name: str) -> list[RunIssue]:
@@ -278,10 +249,8 @@ def _opposite_sensors(usable: Mapping[int, JointColumns], name: str) -> list[Run
     size = float(np.std(one))
     if size == 0.0 or float(np.std(one + two)) > 0.2 * size:
         return []
-    return [
-        RunIssue(
-            "torque_nm_frame",
-            f"{name}: j2.torque_nm: found the opposite of j1.torque_nm, expected the same (positive along each joint's own "
-            "positive current): the columns of one joint are in the frame of the other",
-        )
-    ]
+    text = (
+        f"{name}: j2.torque_nm: found the opposite of j1.torque_nm, expected the same (positive along each joint's own "
+        "positive current): the columns of one joint are in the frame of the other"
+    )
+    return [RunIssue("torque_nm_frame", text)]

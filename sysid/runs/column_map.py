@@ -50,41 +50,44 @@ from jtqd.estimator.decoder import (
 )
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.models.files import load_yaml
-from jtqd.sysid.runs.bad_samples import wild_rows
+from jtqd.sysid.runs.bad_samples import outlier_rows
 
 LONGEST: Final = 1000
 DEEPEST: Final = 40
-"""Characters and levels of an expression: more is no expression that a person wrote."""
+"""Characters and levels of an expression."""
 _QUOTED: Final = re.compile(r"`([^`]*)`")
 _STAND_IN: Final = "_column_{}_"
 
+Cells = Mapping[str, FloatArray]
+"""Columns [n] of a file by name."""
+
 
 class ExpressionError(ValueError):
-    """A text is neither a column nor an expression; the message says what was found and what was expected."""
+    """A text is neither a column nor an expression; the message has what was found and what was expected."""
 
 
 @dataclass(frozen=True)
 class Function:
-    """What a map may call. what: unit in, unit out, for messages and the docs; arguments: least and most of them."""
+    """Function of an expression. what: unit in, unit out, for messages and the docs; arguments: their number."""
 
     what: str
-    arguments: tuple[int, int]
+    arguments: int
     call: Callable[..., FloatArray]
 
 
-def _unwrapped(x: FloatArray, period: float) -> FloatArray:
-    return np.unwrap(x, period=float(period))
-
-
 FUNCTIONS: Final[Mapping[str, Function]] = {
-    "deg2rad": Function("degrees -> rad, deg/s -> rad/s", (1, 1), np.deg2rad),
-    "rev2rad": Function("revolutions -> rad, rev/s -> rad/s", (1, 1), lambda x: 2.0 * math.pi * x),
-    "rpm2rad_s": Function("rpm -> rad/s", (1, 1), lambda x: x * (2.0 * math.pi / 60.0)),
-    "unwrap": Function("unwrap(x, period): a position that rolls over, in its own unit", (2, 2), _unwrapped),
-    "sin": Function("rad -> 1", (1, 1), np.sin),
-    "cos": Function("rad -> 1", (1, 1), np.cos),
-    "abs": Function("any unit, kept", (1, 1), np.abs),
-    "sign": Function("any unit -> -1, 0, 1", (1, 1), np.sign),
+    "deg2rad": Function("degrees -> rad, deg/s -> rad/s", 1, np.deg2rad),
+    "rev2rad": Function("revolutions -> rad, rev/s -> rad/s", 1, lambda x: 2.0 * math.pi * x),
+    "rpm2rad_s": Function("rpm -> rad/s", 1, lambda x: x * (2.0 * math.pi / 60.0)),
+    "unwrap": Function(
+        "unwrap(x, period): a position that rolls over, in its own unit",
+        2,
+        lambda x, period: np.unwrap(x, period=float(period)),
+    ),
+    "sin": Function("rad -> 1", 1, np.sin),
+    "cos": Function("rad -> 1", 1, np.cos),
+    "abs": Function("any unit, kept", 1, np.abs),
+    "sign": Function("any unit -> -1, 0, 1", 1, np.sign),
 }
 _CONSTANTS: Final = {"pi": math.pi}
 _OPERATORS: Final[Mapping[type[ast.operator], Callable[[FloatArray, FloatArray], FloatArray]]] = {
@@ -104,41 +107,25 @@ _ALLOWED: Final = "numbers, columns of the file, + - * /, pi and " + ", ".join(F
 
 @dataclass(frozen=True)
 class Expression:
-    """A parsed text. names: columns that it reads, each once, in order."""
+    """A parsed expression. names: columns that it reads, each once, in order."""
 
-    text: str
     names: tuple[str, ...]
-    _body: ast.expr
-    _columns: Mapping[str, str]
+    _evaluate: Callable[[Cells], Any]
 
-    def value(self, cells: Mapping[str, FloatArray]) -> FloatArray:
+    def value(self, cells: Cells) -> FloatArray:
         """Return the value [n] from columns [n]; division by zero gives infinity, which a run table refuses."""
         n = len(next(iter(cells.values())))
         with np.errstate(all="ignore"):
-            return np.broadcast_to(np.asarray(self._eval(self._body, cells), np.float64), (n,)).copy()
-
-    def _eval(self, node: ast.expr, cells: Mapping[str, FloatArray]) -> FloatArray:
-        if isinstance(node, ast.Constant):
-            return np.float64(node.value)  # type: ignore[arg-type, return-value]
-        if isinstance(node, ast.BinOp):
-            return _OPERATORS[type(node.op)](self._eval(node.left, cells), self._eval(node.right, cells))
-        if isinstance(node, ast.UnaryOp):
-            inner = self._eval(node.operand, cells)
-            return -inner if isinstance(node.op, ast.USub) else inner
-        if isinstance(node, ast.Call):
-            function = FUNCTIONS[_name(node.func)]
-            return function.call(*(self._eval(each, cells) for each in node.args))
-        name = _name(node)
-        return cells[self._columns[name]] if name in self._columns else np.float64(_CONSTANTS[name])  # type: ignore[return-value]
+            return np.broadcast_to(np.asarray(self._evaluate(cells), np.float64), (n,)).copy()
 
 
 def parse(text: str, header: Sequence[str], target: str = "it") -> Expression:
-    """Return the expression that `text` is for a file with these columns; target: what it is for, in messages.
+    """Return the expression that `text` is for a file with these columns; target: its use, in messages.
 
     Raises ExpressionError.
     """
     if text in header:
-        return Expression(text, (text,), ast.Name(text), {text: text})
+        return Expression((text,), lambda cells: cells[text])
     if len(text) > LONGEST:
         raise ExpressionError(f"found an expression of {len(text)} characters, expected at most {LONGEST}")
     quoted: dict[str, str] = {}
@@ -156,52 +143,86 @@ def parse(text: str, header: Sequence[str], target: str = "it") -> Expression:
         raise ExpressionError(
             f"found {shown(text)} for {target}, expected a column of the file or an expression of columns: {_ALLOWED}"
         ) from None
-    columns: dict[str, str] = {}
-    _check(body, _Text(text, target, tuple(header), quoted), columns, 0)
-    return Expression(text, tuple(dict.fromkeys(columns.values())), body, columns)
+    names: dict[str, None] = {}
+    evaluate = _Compiler(text, target, tuple(header), quoted, names).compiled(body)
+    return Expression(tuple(names), evaluate)
 
 
-class _Text(NamedTuple):
-    """What is being parsed: the text, what for, the columns of the file, the names that stand for backquoted ones."""
+class _Compiler(NamedTuple):
+    """Turns the syntax tree of a text into a function of the cells, and refuses everything that is not allowed.
+
+    header: columns of the file; quoted: columns by the name that stands for them in the tree; names: columns read so far.
+    """
 
     text: str
     target: str
     header: tuple[str, ...]
     quoted: Mapping[str, str]
+    names: dict[str, None]
 
     def error(self, found: str, expected: str = _ALLOWED) -> ExpressionError:
         return ExpressionError(f"found {found} in {shown(self.text)} for {self.target}, expected {expected}")
 
-
-def _check(node: ast.expr, whole: _Text, columns: dict[str, str], depth: int) -> None:
-    """Refuse everything that is not allowed, and note the columns."""
-    if depth > DEEPEST:
-        raise whole.error(f"more than {DEEPEST} levels", "fewer parentheses")
-    inner: list[ast.expr] = []
-    if isinstance(node, ast.Constant):
-        _check_number(node, whole)
-    elif isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
-        inner = [node.left, node.right]
-    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
-        inner = [node.operand]
-    elif isinstance(node, ast.Call):
-        inner = _arguments(node, whole)
-    elif name := _name(node):
-        column = whole.quoted.get(name, name)
-        if column in whole.header:
-            columns[name] = column
-        elif name not in _CONSTANTS:
+    def compiled(self, node: ast.expr, depth: int = 0) -> Callable[[Cells], Any]:
+        if depth > DEEPEST:
+            raise self.error(f"more than {DEEPEST} levels", "fewer parentheses")
+        if isinstance(node, ast.Constant):
+            number = self._number(node.value)
+            return lambda _: number
+        if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+            operator = _OPERATORS[type(node.op)]
+            left, right = self.compiled(node.left, depth + 1), self.compiled(node.right, depth + 1)
+            return lambda cells: operator(left(cells), right(cells))
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+            inner = self.compiled(node.operand, depth + 1)
+            return (lambda cells: -inner(cells)) if isinstance(node.op, ast.USub) else inner
+        if isinstance(node, ast.Call):
+            call = self._function(node).call
+            arguments = [self.compiled(each, depth + 1) for each in node.args]
+            return lambda cells: call(*(each(cells) for each in arguments))
+        name = _name(node)
+        if not name:
+            raise self.error(_kind(node))
+        column = self.quoted.get(name, name)
+        if column in self.header:
+            self.names[column] = None
+            return lambda cells: cells[column]
+        if name not in _CONSTANTS:
+            few = ", ".join(f"'{each}'" for each in self.header[:4])
+            there = few if len(self.header) <= 4 else f"{few}, ... {len(self.header)} in all"
             raise ExpressionError(
-                f"found no column '{column}', expected it for {whole.target} (there are {_some(whole.header)})"
+                f"found no column '{column}', expected it for {self.target} (there are {there})"
             )
-    else:
-        raise whole.error(_kind(node))
-    for each in inner:
-        _check(each, whole, columns, depth + 1)
+        return lambda _: np.float64(_CONSTANTS[name])
+
+    def _number(self, value: object) -> np.float64:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise self.error(shown(value))
+        try:
+            return np.float64(value)
+        except OverflowError:
+            raise self.error("a number out of range") from None
+
+    def _function(self, node: ast.Call) -> Function:
+        name = _name(node.func)
+        if name not in FUNCTIONS or node.keywords:
+            raise self.error(f"the call of {name or 'something'!r}")
+        function = FUNCTIONS[name]
+        if len(node.args) != function.arguments:
+            raise self.error(
+                f"{len(node.args)} arguments of {name}", f"{function.arguments} ({function.what})"
+            )
+        if name == "unwrap":
+            names = (
+                _name(each) for each in ast.walk(node.args[1]) if isinstance(each, ast.Name | ast.Attribute)
+            )
+            if any(each != "pi" for each in names):
+                raise self.error("a period of unwrap that is no number", "e.g. 2 * pi or 4096")
+        return function
 
 
 def _kind(node: ast.expr) -> str:
-    """What is not allowed, in words; a comma is one that was meant as a decimal point, most of the time."""
+    """Return what is not allowed, in words; a comma is often meant as a decimal point."""
     if isinstance(node, ast.BinOp):
         return f"the operator {_REFUSED.get(type(node.op), type(node.op).__name__)}"
     if isinstance(node, ast.Subscript):
@@ -209,33 +230,8 @@ def _kind(node: ast.expr) -> str:
     return "a comma" if isinstance(node, ast.Tuple) else type(node).__name__
 
 
-def _check_number(node: ast.Constant, whole: _Text) -> None:
-    value = node.value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise whole.error(shown(value))
-    try:
-        float(value)
-    except OverflowError:
-        raise whole.error("a number out of range") from None
-
-
-def _arguments(node: ast.Call, whole: _Text) -> list[ast.expr]:
-    name = _name(node.func)
-    if name not in FUNCTIONS or node.keywords:
-        raise whole.error(f"the call of {name or 'something'!r}")
-    function = FUNCTIONS[name]
-    low, high = function.arguments
-    if not low <= len(node.args) <= high:
-        raise whole.error(f"{len(node.args)} arguments of {name}", f"{low} ({function.what})")
-    if name == "unwrap":
-        names = (_name(each) for each in ast.walk(node.args[1]) if isinstance(each, ast.Name | ast.Attribute))
-        if any(each != "pi" for each in names):
-            raise whole.error("a period of unwrap that is no number", "e.g. 2 * pi or 4096")
-    return node.args
-
-
 def _name(node: ast.AST) -> str:
-    """The name of a column or function; dots belong to it ("effort.j1"); "" for anything else."""
+    """Return the name of a column or function; dots belong to it ("effort.j1"); "" for anything else."""
     if isinstance(node, ast.Name):
         return node.id
     if isinstance(node, ast.Attribute):
@@ -244,19 +240,14 @@ def _name(node: ast.AST) -> str:
     return ""
 
 
-def _some(header: tuple[str, ...]) -> str:
-    few = ", ".join(f"'{name}'" for name in header[:4])
-    return few if len(header) <= 4 else f"{few}, ... {len(header)} in all"
-
-
 TIME: Final = "time_s"
 JOINTS: Final = range(1, 8)
 GRAVITY_M_S2: Final = 9.80665
 WINDOW_S: Final = 0.05
-"""Longest piece of a position to which a cubic is fitted for its velocity and acceleration."""
+"""Longest window of a position to which a cubic is fitted for its velocity and acceleration."""
 _QUIET: Final = 0.02
 _FEWEST_ROWS: Final = 7
-_WILD_RAD: Final = 0.1
+_OUTLIER_RAD: Final = 0.1
 _SOURCE: Final = (
     "a column of the file, an expression of columns, or {column: either, scale: 1.0, offset: 0.0}"
 )
@@ -275,7 +266,7 @@ class Column:
 
 @dataclass(frozen=True)
 class KnownLoad:
-    """What hangs on a joint whose torque nobody measured: a pendulum, or the torque that a model gives.
+    """Load of a joint without a torque sensor: a pendulum, or the torque that a model gives.
 
     torque_nm: a column or an expression [Nm], else None; mass [kg] at lever [m] from the axis, inertia about the axis
     [kg m2], hangs_at: link position at rest [rad].
@@ -289,7 +280,7 @@ class KnownLoad:
     gravity_m_s2: float = GRAVITY_M_S2
 
     def torque(self, time_s: FloatArray, position_rad: FloatArray) -> FloatArray:
-        """Return what the joint exerts on the pendulum [n, Nm] at link positions [n] of one piece without gaps."""
+        """Return the torque of the joint on the pendulum [n, Nm] at link positions [n] of one segment without gaps."""
         _, acceleration = motion_of(time_s, position_rad)
         weight = self.mass_kg * self.gravity_m_s2 * self.lever_m * np.sin(position_rad - self.hangs_at_rad)
         return self.inertia_kgm2 * acceleration + weight
@@ -370,7 +361,7 @@ class ColumnMap:
         return found
 
     def completed(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return the targets [n] of one piece without gaps: torques of known loads and currents of voltage drives added.
+        """Return the targets [n] of one segment without gaps: torques of known loads and currents of voltage drives added.
 
         values: every source's, by its key.
         """
@@ -398,8 +389,8 @@ class ColumnMap:
                 else f"a known load of {load.mass_kg:g} kg at {load.lever_m:g} m and {load.inertia_kgm2:g} kg m2"
             )
             lines.append(
-                f"j{n}.torque_nm is {what}: taken as true, no effect of a torque sensor is looked for; what is "
-                "wrong with the load is taken for the joint's"
+                f"j{n}.torque_nm is {what}: taken as true, no effect of a torque sensor is looked for; an error of the load "
+                "is taken for the joint's"
             )
         for n, drive in (self.drives or {}).items():
             lines.append(
@@ -416,15 +407,15 @@ def targets() -> list[str]:
 
 
 def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return velocity and acceleration [n]: of the cubic through a window of the position around each row, ends held.
+    """Return velocity and acceleration [n] of the cubic through a window of the position around each row, ends held.
 
     The window is the shortest in which the position's noise (rounding included) is below _QUIET of the motion's largest
-    acceleration, WINDOW_S at most: what is longer rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964,
-    doi 10.1021/ac60214a047). A wild sample (`wild`) is taken to lie between its neighbours: it would be in all the window.
+    acceleration, WINDOW_S at most: a longer one rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964,
+    doi 10.1021/ac60214a047). Outlier samples are interpolated: each would be in the whole window.
     """
-    wild = wild_rows(position, _WILD_RAD)
-    if wild.any():
-        position = np.interp(time_s, time_s[~wild], position[~wild])
+    outliers = outlier_rows(position, _OUTLIER_RAD)
+    if outliers.any():
+        position = np.interp(time_s, time_s[~outliers], position[~outliers])
     step = float(np.median(np.diff(time_s)))
     longest = min(
         max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)),
@@ -437,7 +428,7 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
     largest = float(np.max(np.abs(np.correlate(position, weights[1], mode="valid"))))
     noise = float(np.std(np.diff(position, 4))) / math.sqrt(
         70.0
-    )  # of white noise; of the motion next to nothing
+    )  # white noise; the motion adds almost nothing
     half = longest
     for half in range(min(_FEWEST_ROWS // 2, longest), longest + 1):
         weights = _weights(half, step)
@@ -448,7 +439,7 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _weights(half: int, step: float) -> tuple[FloatArray, FloatArray]:
-    """Weights [2 half + 1] of a cubic's slope and second derivative in its middle."""
+    """Return weights [2 half + 1] of a cubic's slope and second derivative in its middle."""
     at = np.arange(-half, half + 1) * step
     cubic = np.linalg.pinv(np.column_stack((np.ones_like(at), at, at * at, at**3)))
     return cubic[1], 2.0 * cubic[2]
@@ -486,8 +477,8 @@ class _Model:
 
 
 @dataclass(frozen=True)
-class _Turning:
-    """A load that only turns."""
+class _Inertia:
+    """A load without weight."""
 
     inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)]
     hangs_at_rad: Annotated[float, limits("rad")] = 0.0
@@ -496,7 +487,7 @@ class _Turning:
 
 @dataclass(frozen=True)
 class _Pendulum:
-    """A load that hangs; left out, its inertia is that of a point."""
+    """A load with weight; by default its inertia is that of a point mass."""
 
     mass_kg: Annotated[float, limits("kg", ge=0.0)]
     lever_m: Annotated[float, limits("m", ge=0.0)]
@@ -510,13 +501,11 @@ def _load(value: Any) -> KnownLoad:
     if "torque_nm" in keys:
         return KnownLoad(read(_Model, value).torque_nm)
     if "inertia_kgm2" in keys and "mass_kg" not in keys:
-        return KnownLoad(**vars(read(_Turning, value)))
+        return KnownLoad(**vars(read(_Inertia, value)))
     load = KnownLoad(**vars(read(_Pendulum, value)))
-    return (
-        replace(load, inertia_kgm2=load.mass_kg * load.lever_m * load.lever_m)
-        if math.isnan(load.inertia_kgm2)
-        else load
-    )
+    if not math.isnan(load.inertia_kgm2):
+        return load
+    return replace(load, inertia_kgm2=load.mass_kg * load.lever_m * load.lever_m)
 
 
 @cache
@@ -546,11 +535,8 @@ def _check_load(joint: int, load: KnownLoad, columns: Mapping[str, Column]) -> N
 
 
 def _check_drive(joint: int, columns: Mapping[str, Column]) -> None:
-    key, velocity, position = (
-        f"j{joint}.drive",
-        f"j{joint}.motor_velocity_rad_s",
-        f"j{joint}.motor_position_rad",
-    )
+    key = f"j{joint}.drive"
+    velocity, position = f"j{joint}.motor_velocity_rad_s", f"j{joint}.motor_position_rad"
     if f"j{joint}.current_a" in columns:
         raise FieldError("map", key, Verbatim(f"it beside 'j{joint}.current_a'"), "one of them")
     if not {velocity, position} & set(columns):

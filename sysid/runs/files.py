@@ -28,70 +28,9 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.logs import read_log
 from jtqd.sysid.runs.run_file import Content, RunError, RunFile
 from jtqd.sysid.runs.segments import runs_of
 from jtqd.sysid.runs.tables import read_csv, read_parquet
-
-_ROWS: Final = 64
-"""Samples in a row that must agree."""
-_KEPT: Final = np.uint64(0xFFFF_FFF0_0000_0000)
-"""Bits of a number that are compared: five digits, as a table may have fewer than a log."""
-_LEAST: Final = 50
-_OF_ALL: Final = 0.2
-"""Different stretches that a run must have to be judged: their number, and part of all its stretches."""
-_SAMPLE: Final = 400
-_SHARE: Final = 0.5
-"""Part of the stretches of the shorter run that must be in the longer one."""
-_FACTOR: Final = 0x9E37_79B9_7F4A_7C15
-"""Odd, so that it has an inverse modulo 2^64; the fractional part of the golden ratio."""
-_INVERSE: Final = pow(_FACTOR, -1, 2**64)
-
-Stretches = Mapping[int, npt.NDArray[np.uint64]]
-
-
-def stretches(table: RunTable) -> Stretches:
-    """Return the different stretches of each joint as sorted numbers [n]; a joint that cannot be judged is left out."""
-    found = {number: _of_joint(columns) for number, columns in table.joints.items()}
-    return {number: each for number, each in found.items() if each is not None}
-
-
-def same_run(one: Stretches, two: Stretches) -> bool:
-    """Return whether most of the shorter run is in the other one, for every joint that both have."""
-    joints = one.keys() & two.keys()
-    return bool(joints) and all(_share(one[joint], two[joint]) > _SHARE for joint in joints)
-
-
-def _of_joint(columns: JointColumns) -> npt.NDArray[np.uint64] | None:
-    position, current = columns.motor_position_rad, columns.current_a
-    if position is None or current is None or len(position) < _ROWS + _LEAST:
-        return None
-    rows = _kept(position) * np.uint64(_FACTOR) ^ (_kept(current) >> np.uint64(7)) * np.uint64(_INVERSE)
-    # stretch i = sum of rows[i + j] FACTOR^j over j, by the difference of two sums from the beginning
-    powers = _powers(_FACTOR, len(rows))
-    sums = np.concatenate([np.zeros(1, np.uint64), np.cumsum(rows * powers, dtype=np.uint64)])
-    every = (sums[_ROWS:] - sums[:-_ROWS]) * _powers(_INVERSE, len(sums) - _ROWS)
-    different = np.unique(every)
-    return different if len(different) >= max(_LEAST, _OF_ALL * len(every)) else None
-
-
-def _kept(numbers: FloatArray) -> npt.NDArray[np.uint64]:
-    return (numbers + 0.0).view(np.uint64) & _KEPT  # + 0.0: no negative zero
-
-
-def _powers(factor: int, count: int) -> npt.NDArray[np.uint64]:
-    factors = np.full(count, factor, np.uint64)
-    factors[0] = 1
-    return np.cumprod(factors, dtype=np.uint64)
-
-
-def _share(one: npt.NDArray[np.uint64], two: npt.NDArray[np.uint64]) -> float:
-    """Of a sample of the shorter one: the first ones, as their order is no order in time."""
-    short, long = sorted((one, two), key=len)
-    sample = short[:_SAMPLE]
-    at = np.minimum(np.searchsorted(long, sample), len(long) - 1)
-    return float(np.mean(long[at] == sample))
-
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
 LOGS: Final = (".mcap",)
@@ -100,9 +39,9 @@ _PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.
 
 
 def run_paths(arguments: Sequence[Path]) -> list[Path]:
-    """Return the run files meant: a file is itself; a directory the tables in it, or the logs when it has no table.
+    """Return the run files: a file is itself; a directory stands for its tables, or its logs where it has no table.
 
-    A campaign's directory holds the log of every run beside its table: read once, not twice.
+    A campaign's directory holds the log of every run and its table: each run is read once.
 
     Raises RunError for a path that does not exist, or a directory without a run.
     """
@@ -129,36 +68,32 @@ def read_runs(
     arguments: Sequence[Path],
     columns: ColumnMap | Path | None = None,
     *,
-    in_pieces: bool = False,
+    segments: bool = False,
     joints: Sequence[int] | None = None,
 ) -> list[RunFile]:
     """Read all runs of files and directories (`run_paths`); a progress bar on a terminal.
 
     columns: a column map or its file. Names are unique: the file's, or its path where two files share a name.
-    in_pieces: a recording with gaps gives one run for each piece between them, "a.csv (1 of 3)", not an error; rows with a
+    segments: a recording with gaps gives one run for each segment between them, "a.csv (1 of 3)", not an error; rows with a
     blank cell are gaps, and a table whose time starts again is several runs, "a.csv (run 1 of 2)"; the parts of one run of
-    jtqd are one recording.
-    joints: numbers of those that are wanted of a log, where a row needs the inputs of all of them; None: all that it has. A
-    table gives the joints that it has.
+    jtqd are one recording. Segments shorter than SHORTEST_SEGMENT_S and rows written twice are left out, with a note.
+    joints: numbers of those wanted of a log, where a row needs the inputs of all of them; None: all. A table gives all.
 
     Raises:
-        RunError: as `read_run` and `run_paths`, or one run given twice, which would count it twice: the same data, or a
-            log and the table of it (`same_run`).
+        RunError: as `read_run` and `run_paths`; for one run given twice (the same data, or a log and its table); with
+            `segments` where no segment is long enough.
         ConfigError: the column map cannot be used.
     """
     mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
     runs: list[RunFile] = []
-    known: list[tuple[str, Stretches]] = []
+    known: list[tuple[str, Windows]] = []
     paths = run_paths(arguments)
     twice = next((path for path in paths if paths.count(path) > 1), None)
     if twice is not None:
         raise RunError(f"{twice}: found it twice, expected every run once")
-    groups = _recordings(paths) if in_pieces else [(path,) for path in paths]
-    for path, *parts in progress(groups, "reading runs"):
-        if parts:
-            read = runs_of(read_log(path, *parts, joints=joints), whole=False)
-        else:
-            read = runs_of(_content(path, mapping, joints, blanks=in_pieces), whole=not in_pieces)
+    for path, *parts in progress(_recordings(paths) if segments else [(p,) for p in paths], "reading runs"):
+        content = _content(path, *parts, columns=mapping, joints=joints, blanks=segments)
+        read = runs_of(content, whole=not segments)
         same = next((other.name for other in runs if other.sha256 == read[0].sha256), None)
         if same is not None:
             raise RunError(f"{path}: found the same data as in {same}, expected every run once")
@@ -168,7 +103,7 @@ def read_runs(
             for run in read
         ]
         for run in read:
-            found = stretches(run.table)
+            found = windows(run.table)
             same = next((name for name, each in known if same_run(each, found)), None)
             if same is not None:
                 raise RunError(
@@ -176,9 +111,9 @@ def read_runs(
                     "current agree), expected every run once"
                 )
             known.append((run.name, found))
-        if runs and mapping is not None:  # what holds for every file is said once
-            said = set(mapping.remarks())
-            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
+        if runs and mapping is not None:  # remarks on the map stand in the notes of the first run only
+            remarks = set(mapping.remarks())
+            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in remarks))
         runs += read
     return runs
 
@@ -191,21 +126,12 @@ def read_run(
     columns: for tables; a log of jtqd has its own names. joints: of a log, as in `read_runs`. Raises RunError, also for a
     recording with gaps.
     """
-    [run] = runs_of(_content(Path(path), columns, joints), whole=True)
+    [run] = runs_of(_content(Path(path), columns=columns, joints=joints), whole=True)
     return run
 
 
-def read_pieces(path: Path | str, columns: ColumnMap | None = None) -> list[RunFile]:
-    """Read one file as `read_run`, taken apart where its time starts again, at its gaps and rows with a blank cell; pieces
-    shorter than SHORTEST_PIECE_S are left out and noted, and so are rows written twice.
-
-    Raises RunError, also where no piece is long enough.
-    """
-    return runs_of(_content(Path(path), columns, blanks=True), whole=False)
-
-
 def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Return the files of each recording: jtqd ends a log and begins the next part after a while (docs/logs.md)."""
+    """Return the files of each recording: jtqd splits a long log into parts (docs/logs.md)."""
     groups: dict[object, list[Path]] = {}
     for path in paths:
         run = _PART.fullmatch(path.name)
@@ -215,17 +141,87 @@ def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
 
 
 def _content(
-    path: Path, columns: ColumnMap | None, joints: Sequence[int] | None = None, *, blanks: bool = False
+    path: Path, *parts: Path, columns: ColumnMap | None, joints: Sequence[int] | None, blanks: bool = False
 ) -> Content:
-    """Read a file; blanks: rows of a table with a blank cell are left out, else refused."""
+    """Read a file, or all parts of a log; blanks: rows of a table with a blank cell are left out, else refused."""
     if not path.is_file():
-        found = "something that is no file" if path.exists() else "no such file"
-        found = "a directory" if path.is_dir() else found
+        found = (
+            "a directory"
+            if path.is_dir()
+            else "something that is no file"
+            if path.exists()
+            else "no such file"
+        )
         raise RunError(f"{path}: found {found}, expected a run file ({', '.join(TABLES + LOGS)})")
     if path.name.endswith(LOGS):
-        return read_log(path, joints=joints)
+        from jtqd.sysid.runs.logs import read_log
+
+        return read_log(path, *parts, joints=joints)
     if path.name.endswith(".parquet"):
         return read_parquet(path, columns, blanks=blanks)
     if path.name.endswith(TABLES):
         return read_csv(path, columns, blanks=blanks)
     raise RunError(f"{path}: found a file ending in '{path.suffix}', expected {', '.join(TABLES + LOGS)}")
+
+
+_WINDOW_ROWS: Final = 64
+"""Samples in a row that must agree."""
+_DIGITS: Final = np.uint64(0xFFFF_FFF0_0000_0000)
+"""Bits of a number that are compared: five digits, as a table may have fewer than a log."""
+_FEWEST: Final = 50
+_OF_ALL: Final = 0.2
+"""Different windows that a run must have to be judged: their number, and part of all its windows."""
+_SAMPLE: Final = 400
+_SHARE: Final = 0.5
+"""Part of the windows of the shorter run that must be in the longer one."""
+_FACTOR: Final = 0x9E37_79B9_7F4A_7C15
+"""Odd, so that it has an inverse modulo 2^64; the fractional part of the golden ratio."""
+_INVERSE: Final = pow(_FACTOR, -1, 2**64)
+
+Hashes = npt.NDArray[np.uint64]
+Windows = Mapping[int, Hashes]
+"""Sorted hashes [n] of the different windows of a run, by joint."""
+
+
+def windows(table: RunTable) -> Windows:
+    """Return the hashes of the different windows of each joint; a joint that cannot be judged is left out."""
+    found = {number: _hashes(columns) for number, columns in table.joints.items()}
+    return {number: each for number, each in found.items() if each is not None}
+
+
+def same_run(one: Windows, two: Windows) -> bool:
+    """Return whether most of the shorter run is in the other one, for every joint that both have."""
+    joints = one.keys() & two.keys()
+    return bool(joints) and all(_common(one[joint], two[joint]) > _SHARE for joint in joints)
+
+
+def _hashes(columns: JointColumns) -> Hashes | None:
+    position, current = columns.motor_position_rad, columns.current_a
+    if position is None or current is None or len(position) < _WINDOW_ROWS + _FEWEST:
+        return None
+    rows = _bits(position) * np.uint64(_FACTOR) ^ (_bits(current) >> np.uint64(7)) * np.uint64(_INVERSE)
+    # window i = sum of rows[i + j] FACTOR^j over j, by the difference of two sums from the beginning
+    sums = np.concatenate(
+        [np.zeros(1, np.uint64), np.cumsum(rows * _powers(_FACTOR, len(rows)), dtype=np.uint64)]
+    )
+    every = (sums[_WINDOW_ROWS:] - sums[:-_WINDOW_ROWS]) * _powers(_INVERSE, len(sums) - _WINDOW_ROWS)
+    different = np.unique(every)
+    return different if len(different) >= max(_FEWEST, _OF_ALL * len(every)) else None
+
+
+def _bits(numbers: FloatArray) -> Hashes:
+    return (numbers + 0.0).view(np.uint64) & _DIGITS  # + 0.0: no negative zero
+
+
+def _powers(factor: int, count: int) -> Hashes:
+    factors = np.full(count, factor, np.uint64)
+    factors[0] = 1
+    return np.cumprod(factors, dtype=np.uint64)
+
+
+def _common(one: Hashes, two: Hashes) -> float:
+    """Return the share of a sample of the shorter one that is in the longer one; hashes are in no order of time."""
+    short, long = sorted((one, two), key=len)
+    sample = short[:_SAMPLE]
+    at = np.minimum(np.searchsorted(long, sample), len(long) - 1)
+    return float(np.mean(long[at] == sample))

@@ -33,7 +33,7 @@ _NO_POWER: Final = np.array(
     [state in (State.SWITCH_ON_DISABLED, State.READY, State.SWITCHED_ON) for state in STATES]
 )
 _LINK: Final = "link_position_rad"
-"""Not there in the log of a joint with one encoder."""
+"""Absent in the log of a joint with one encoder."""
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", _LINK)
 _STATE: Final = np.dtype(
     [
@@ -44,7 +44,7 @@ _STATE: Final = np.dtype(
         ("input_flags", "<u2"),
     ]
 )
-"""What is kept of a joint's messages."""
+"""Fields of a joint's messages that are read."""
 _TOPIC: Final = re.compile(r"/joint/(\d+)/state")
 _FRAMES: Final = "/can/frames"
 _CONFIGURATION: Final = "configuration.yaml"
@@ -55,11 +55,11 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class LoggedRun:
-    """The run table of a log and the account of its cycles: rows + incomplete + missed are all slots of SYNC.
+    """Run table of a log with an account of its cycles: rows + incomplete + missed are all slots of SYNC.
 
     Attributes:
-        table: torque_nm is None where the log has no value of the sensor at all, temperature_c where the drive sent none,
-            link_position_rad of a joint with one encoder.
+        table: torque_nm is None where the log has no sensor value at all, temperature_c where the drive sent none,
+            link_position_rad for a joint with one encoder.
         missed: slots without a cycle (missed by the loop, or left silent on purpose).
         incomplete: cycles left out because an input was not fresh.
         incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
@@ -99,53 +99,43 @@ def log_to_run(
     Args:
         log: MCAP of jtqd, or the parts of one run, or their directory.
         joints: numbers of those that are wanted; None: all. Those whose drive was never enabled, or that lack an input
-            in the whole motion, are left out and named, as long as one is left.
-        all_needed: then the log is refused instead.
+            in the whole motion, are left out and reported, as long as one is left.
+        all_needed: refuse the log instead of leaving joints out.
         nodes: node-IDs of the drives in the order of the log's joints, for their temperatures; None: by the
             configuration that is attached to the log, without one 1, 2, ...
         sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
             torque_nm is None.
         enabled: further joints whose drives must be in "operation enabled" at both ends, although they are not wanted.
-        last_motion: begin behind the last time without power, not at the first cycle with it.
+        last_motion: begin after the last time without power, not at the first cycle with it.
 
     Raises:
         LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
         OSError: the file cannot be read.
     """
-    name = log if isinstance(log, Path) else log[0]  # names the run where something is wrong
+    name = log if isinstance(log, Path) else log[0]  # names the run in messages
     there = _joints_of(log, name)
-    wanted = _Wanted(name, list(dict.fromkeys(there if joints is None else joints)), all_needed)
+    wanted = list(dict.fromkeys(there if joints is None else joints))
+    left_out: dict[int, str] = {}
+
+    def leave_out(reasons: Mapping[int, str]) -> None:
+        left_out.update(reasons)
+        if left_out and (all_needed or len(left_out) == len(wanted)):
+            raise LogError(f"{name}: {'; '.join(left_out.values())}")
+
     have = ", ".join(map(str, there))
-    wanted.leave_out({n: f"found no joint {n}, the log has {have}" for n in wanted.numbers if n not in there})
+    leave_out({n: f"found no joint {n}, the log has {have}" for n in wanted if n not in there})
     by_log = _temperatures_of(log, there)
     node_of = dict(zip(there, nodes or [node for node, _ in by_log], strict=False))
     scale_of = {number: scale for number, (_, scale) in zip(there, by_log, strict=True)}
-    looked_at = dict.fromkeys(number for number in (*wanted.numbers, *enabled) if number in there)
-    told_by = {number: (node_of.get(number, number), scale_of[number]) for number in looked_at}
-    states, readings = _read(log, name, told_by)
-    beside = {number: states.pop(number) for number in list(states) if number not in wanted.numbers}
-    wanted.leave_out({number: why for number, state in states.items() if (why := _unusable(number, state))})
-    states = {number: state for number, state in states.items() if number not in wanted.left_out}
-    span = _span(states | beside, name, last_motion=last_motion)
+    read = dict.fromkeys(number for number in (*wanted, *enabled) if number in there)
+    states, readings = _read(log, name, {n: (node_of.get(n, n), scale_of[n]) for n in read})
+    others = {number: states.pop(number) for number in list(states) if number not in wanted}
+    leave_out({number: why for number, state in states.items() if (why := _unusable(number, state))})
+    states = {number: state for number, state in states.items() if number not in left_out}
+    span = _span(states | others, name, last_motion=last_motion)
     temperatures = {number: _temperature(readings[number], span) for number in states}
     states = {number: state[span] for number, state in states.items()}
-    return _run_of(name, states, temperatures, sensor=sensor, left_out=wanted.left_out)
-
-
-@dataclass
-class _Wanted:
-    """Joints that are wanted of a log, and why some of them are left out."""
-
-    log: Path
-    numbers: Sequence[int]
-    all_needed: bool
-    left_out: dict[int, str] = field(default_factory=dict)
-
-    def leave_out(self, reasons: Mapping[int, str]) -> None:
-        """Leave joints out; LogError where all are needed, or none would be left."""
-        self.left_out |= reasons
-        if self.left_out and (self.all_needed or len(self.left_out) == len(self.numbers)):
-            raise LogError(f"{self.log}: {'; '.join(self.left_out.values())}")
+    return _run_of(name, states, temperatures, sensor=sensor, left_out=left_out)
 
 
 def _run_of(
@@ -156,7 +146,7 @@ def _run_of(
     sensor: bool,
     left_out: Mapping[int, str],
 ) -> LoggedRun:
-    """Return the complete cycles of a motion as a table, with the account of the others; LogError where there are none."""
+    """Return the complete cycles of a motion as a table, with an account of the others; LogError where there are none."""
     present = {f"joint {number}": _complete(number, state, log) for number, state in states.items()}
     with_sensor = _with_sensor(states.values()) if sensor else None
     if with_sensor is not None:  # a dead sensor must not take the drives' columns with it
@@ -265,7 +255,7 @@ def _read(
 
 
 def _temperatures(frames: Records, nodes: Mapping[int, TemperatureOf]) -> dict[int, Readings]:
-    """Return what the drives' TPDO3 say in these cycles: rows and values [degC] by joint, for those that say anything."""
+    """Return the temperatures of the drives' TPDO3 in these cycles: rows and values [degC] by joint."""
     raw = frames["frames"]
     stored = np.arange(raw.shape[1]) < frames["frame_count"][:, None]
     stored &= raw["length"] >= 2
@@ -310,7 +300,7 @@ def _inputs_of(state: Records) -> tuple[str, ...]:
 
 
 def _span(states: Mapping[int, Records], log: Path, *, last_motion: bool) -> slice:
-    """From the first to the last cycle that counts; what is stale in between is looked at later."""
+    """Return the cycles from the first to the last in which all drives are enabled; stale ones in between are included."""
     rows = np.flatnonzero(np.logical_and.reduce([_enabled(state) for state in states.values()]))
     if last_motion and len(rows):
         off: Flags = np.logical_or.reduce(
@@ -368,15 +358,15 @@ def _unpowered(statusword: NDArray[Any]) -> Flags:
 
 
 def _powered(statusword: NDArray[Any]) -> FloatArray | None:
-    """Column `enabled` [n]; None for a run in which the power was never off, which is most of them."""
+    """Return the column `enabled` [n]; None for a run in which the power was never off."""
     off = _unpowered(statusword)
     return np.where(off, 0.0, 1.0) if off.any() else None
 
 
 def _temperature(readings: Readings, span: slice) -> FloatArray | None:
-    """Temperature [n] of a drive's joint over the cycles of `span` [degC] by its TPDO3, held between two; None without any.
+    """Return the temperature [n] over the cycles of `span` [degC], held between two TPDO3; None without any.
 
-    Before the first frame of the span that frame's value holds: the one before it was sent while the drive was off, and an
+    Before the first frame of the span that frame's value holds: an earlier one was sent while the drive was off, and an
     emulated day begins when the drives are enabled. Where the span has no frame, the last one before it counts.
     """
     rows, values = readings
@@ -390,9 +380,6 @@ def _temperature(readings: Readings, span: slice) -> FloatArray | None:
 
 def read_log(path: Path, *parts: Path, joints: Sequence[int] | None = None) -> Content:
     """Read a log, or all parts of one run; the hash is that of all files one after another."""
-    from jtqd.daemon.logs import LogError
-    from jtqd.sysid.runs.logs import log_to_run
-
     sha256 = file_bytes(path)[1]
     if parts:
         sha256 = hashlib.sha256(b"".join(file_bytes(each)[0] for each in (path, *parts))).hexdigest()

@@ -22,11 +22,10 @@ class RunFile:
 
     Attributes:
         name: for messages; unique among runs that were read together.
-        path, source: the file, and what it is: "csv", "parquet" or "mcap".
+        path, source: the file, and its kind: "csv", "parquet" or "mcap".
         sha256: of the file on disk (hex).
-        table: its columns. The pieces of one recording keep its time.
+        table: its columns. The segments of one recording keep its time.
         notes: what is suspicious about it, one line each.
-        piece: number of this piece of its run in the file, and how many there are.
     """
 
     name: str
@@ -35,12 +34,11 @@ class RunFile:
     sha256: str
     table: RunTable
     notes: tuple[str, ...] = ()
-    piece: tuple[int, int] = (1, 1)
 
 
 @dataclass(frozen=True)
 class Content:
-    """What was read of a file: target columns and further sources [n] by key, lines [n] for messages (None: samples)."""
+    """Columns of a file: targets and further sources [n] by key, and their lines [n] for messages (None: sample numbers)."""
 
     path: Path
     source: str
@@ -52,7 +50,7 @@ class Content:
 
 
 def file_bytes(path: Path) -> tuple[bytes, str]:
-    """Return the content of a file and its SHA-256."""
+    """Return the content of a file and its SHA-256. Raises RunError."""
     try:
         data = path.read_bytes()
     except OSError as error:
@@ -63,5 +61,5 @@ def file_bytes(path: Path) -> tuple[bytes, str]:
 
 
 def header_place(path: Path) -> str:
-    """Only text has lines."""
+    """Return the line of a table's header for messages; only text has lines."""
     return " line 1:" if ".csv" in path.suffixes else ""

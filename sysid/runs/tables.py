@@ -1,6 +1,7 @@
 """Run tables as files: CSV, gzipped CSV and Parquet are read, CSV and gzipped CSV are written.
 
 A table has one header row, UTF-8, cells between commas, semicolons or tabs. pyarrow is imported when a Parquet file is read.
+The true torques of an emulated run, which no instrument measures, are NAME.truth.npz beside NAME.csv.gz.
 """
 
 from __future__ import annotations
@@ -13,98 +14,22 @@ import io
 import math
 import os
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 from zipfile import BadZipFile
 
 import numpy as np
 
-from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
 from jtqd.sysid.runs.column_map import TIME, Column, ColumnMap, Expression, ExpressionError, targets
 from jtqd.sysid.runs.run_file import Content, RunError, file_bytes, header_place
 
-
-def wanted_columns(header: Sequence[str], path: Path, columns: ColumnMap | None) -> ColumnMap:
-    """Return the map, or for none one of the run table's own names that are there."""
-    if columns is not None:
-        return columns
-    if TIME not in header:
-        raise RunError(
-            f"{path}:{header_place(path)} found no column '{TIME}' (first columns: {list(header[:4])}), "
-            "expected the run table's names or a column map"
-        )
-    return ColumnMap({name: Column(name) for name in targets() if name in header}, {})
-
-
-def wanted_expressions(header: Sequence[str], path: Path, columns: ColumnMap) -> dict[str, Expression]:
-    """Return what is read for each target and further source, parsed; RunError where the file cannot give it."""
-    try:
-        return columns.parsed(list(header), f"{path}:{header_place(path)}")
-    except ExpressionError as error:
-        raise RunError(str(error)) from None
-
-
-def names_read(wanted: Mapping[str, Expression]) -> list[str]:
-    """Return the columns of the file that are read, each once."""
-    return list(dict.fromkeys(name for each in wanted.values() for name in each.names))
-
-
-def without_blanks(
-    path: Path, cells: Mapping[str, FloatArray], wanted: Mapping[str, Expression], columns: ColumnMap
-) -> tuple[dict[str, FloatArray], BoolArray, dict[str, Expression], tuple[str, ...]]:
-    """Return cells [n] without rows in which one is blank (NaN), the rows kept [all], the targets that have a value at all,
-    and notes. A column that is blank everywhere is absent. Raises RunError for one that cannot be.
-    """
-    blank = {name: np.isnan(cell) for name, cell in cells.items()}
-    absent = {name for name, rows in blank.items() if len(rows) and rows.all()}
-    made = {f"j{n}" for n in (*(columns.loads or {}), *(columns.drives or {}))}
-    for key, each in wanted.items():
-        name = next((name for name in each.names if name in absent), None)
-        if name is not None and (key == TIME or key.partition(".")[0] in made):
-            raise RunError(
-                f"{path}: column {name!r}: found it blank in every row, expected numbers for {key}"
-            )
-    there = {key: each for key, each in wanted.items() if not absent & set(each.names)}
-    used = names_read(there)
-    keep = ~np.any([blank[name] for name in used], axis=0)
-    notes = [f"column {name!r} is blank in every row: taken as absent" for name in cells if name in absent]
-    count = {name: int(blank[name].sum()) for name in used if blank[name].any()}
-    if count:
-        which = ", ".join(f"{name!r} in {rows}" for name, rows in count.items())
-        notes.append(
-            f"{int((~keep).sum())} of {counted(len(keep), 'row')} left out for a blank cell ({which})"
-        )
-    if count and np.count_nonzero(keep) < 2:
-        raise RunError(
-            f"{path}: {notes[-1]}: found {counted(int(keep.sum()), 'sample')}, expected at least 2"
-        )
-    return {name: cells[name][keep] for name in used}, keep, there, tuple(notes)
-
-
-def scaled(
-    cells: Mapping[str, FloatArray], wanted: Mapping[str, Expression], columns: ColumnMap
-) -> dict[str, FloatArray]:
-    """Return the values [n] of targets and further sources, by scale and offset of the map."""
-    sources = columns.sources()
-    with np.errstate(over="ignore", invalid="ignore"):  # the table refuses what is not finite
-        return {
-            key: sources[key].scale * each.value(cells) + sources[key].offset for key, each in wanted.items()
-        }
-
-
 _BLANK: Final = ("", "nan")
-
-
-class _Rows(Protocol):
-    """What csv.reader returns."""
-
-    line_num: int
-
-    def __next__(self) -> list[str]: ...
 
 
 def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
@@ -112,40 +37,142 @@ def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> 
     data, sha256 = file_bytes(path)
     text = _text(path, data)
     separator = _separator(text)
-    text, cut = _without_cut_row(text, separator) if blanks else (text, ())
-    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-    header = _header(rows, path)
-    columns = wanted_columns(header, path, columns)
-    wanted = wanted_expressions(header, path, columns)
-    cells, lines = _cells_of_text(rows, path, header, names_read(wanted), blanks=blanks)
-    cells, keep, wanted, notes = without_blanks(path, cells, wanted, columns)
-    lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
-    return Content(path, "csv", sha256, scaled(cells, wanted, columns), lines, (*cut, *notes), columns)
-
-
-def _without_cut_row(text: str, separator: str) -> tuple[str, tuple[str, ...]]:
-    """Return the text without a last row that ends before its line does, in less cells than the row before, and a note: a
-    recorder was ended while it wrote.
-    """
-    *before, row, last = ("", "", *text.rsplit("\n", 2))[-3:]
-    if not last or last.count(separator) >= row.count(separator):
-        return text, ()
-    return "\n".join([*before, row, ""]), (f"the last row left out: it ends after {last[-20:]!r}",)
-
-
-def _separator(text: str) -> str:
-    """Return the mark by which the header and the row below have as many cells, the rarer one in names before the comma
-    ("Zeit, ms;Weg, mm"); without such the first that the header has.
-    """
-    header = text.lstrip().split("\n", 1)[0]
-    for mark in "\t;,":
-        try:
-            names, row = islice(csv.reader(io.StringIO(text.lstrip(), newline=""), delimiter=mark), 2)
-        except (ValueError, csv.Error):  # no row below, or no CSV
+    text, notes = _without_cut_row(text, separator) if blanks else (text, ())
+    rows = _rows(text, separator, path)
+    header = [name.strip() for name in next(rows, (1, []))[1]]
+    twice = next((name for k, name in enumerate(header) if name and name in header[:k]), None)
+    if twice is not None:
+        raise RunError(f"{path}: line 1: found column {twice!r} twice, expected every name once")
+    wanted = _Wanted.of(header, path, columns)
+    source = {name: header.index(name) for name in wanted.names}
+    cells: dict[str, list[float]] = {name: [] for name in source}
+    lines: list[int] = []
+    for line, row in rows:
+        if not row:
             continue
-        if len(names) == len(row) > 1:
-            return mark
-    return next((mark for mark in ",;\t" if mark in header), ",")
+        if len(row) != len(header):
+            raise RunError(f"{path}: line {line}: found {counted(len(row), 'cell')}, expected {len(header)}")
+        for name, index in source.items():
+            try:
+                value = float(row[index])
+            except ValueError:
+                value = math.nan
+            if not math.isfinite(value) and not (blanks and row[index].strip().lower() in _BLANK):
+                comma = " with a decimal point" if "," in row[index] else ""
+                raise RunError(
+                    f"{path}: line {line}, column {name!r}: found {row[index][:40]!r}, expected a finite number{comma}"
+                )
+            cells[name].append(value)
+        lines.append(line)
+    if len(lines) < 2:
+        raise RunError(f"{path}: found {counted(len(lines), 'sample')} below the header, expected at least 2")
+    arrays = {name: np.array(column) for name, column in cells.items()}
+    return wanted.content("csv", sha256, arrays, lines, notes)
+
+
+def read_parquet(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
+    """Read a table; blanks: rows with a blank cell are left out, else refused."""
+    data, sha256 = file_bytes(path)
+    if importlib.util.find_spec("pyarrow") is None:
+        raise RunError(f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow")
+    import pyarrow as pa  # type: ignore[import-not-found,import-untyped,unused-ignore]
+    import pyarrow.parquet as pq  # type: ignore[import-not-found,import-untyped,unused-ignore]
+
+    try:
+        file = pq.ParquetFile(pa.BufferReader(data))
+        wanted = _Wanted.of(list(file.schema_arrow.names), path, columns)
+        table = file.read(columns=wanted.names)
+    except RunError:
+        raise
+    except (pa.ArrowException, OSError, ValueError) as error:
+        raise RunError(f"{path}: not a readable Parquet file: {' '.join(str(error).split())}") from None
+    cells = {
+        name: _numbers(path, name, table.column(name).to_numpy(), blanks=blanks)
+        for name in table.column_names
+    }
+    return wanted.content("parquet", sha256, cells)
+
+
+@dataclass(frozen=True)
+class _Wanted:
+    """What is read of a table: its column map, and the expression of each target and further source."""
+
+    path: Path
+    columns: ColumnMap
+    expressions: Mapping[str, Expression]
+
+    @classmethod
+    def of(cls, header: Sequence[str], path: Path, columns: ColumnMap | None) -> _Wanted:
+        """Parse the map for a file with these columns; None: the run table's own names. Raises RunError."""
+        place = f"{path}:{header_place(path)}"
+        if columns is None:
+            if TIME not in header:
+                raise RunError(
+                    f"{place} found no column '{TIME}' (first columns: {list(header[:4])}), expected the run table's names "
+                    "or a column map"
+                )
+            columns = ColumnMap({name: Column(name) for name in targets() if name in header}, {})
+        try:
+            return cls(path, columns, columns.parsed(list(header), place))
+        except ExpressionError as error:
+            raise RunError(str(error)) from None
+
+    @property
+    def names(self) -> list[str]:
+        """Columns of the file that are read, each once."""
+        return _names(self.expressions)
+
+    def content(
+        self,
+        source: str,
+        sha256: str,
+        cells: Mapping[str, FloatArray],
+        lines: Sequence[int] | None = None,
+        notes: tuple[str, ...] = (),
+    ) -> Content:
+        """Return the targets of the cells [n] without rows in which one is blank (NaN); lines [n]: of the rows.
+
+        A column that is blank everywhere is absent. Raises RunError for one that cannot be.
+        """
+        blank = {name: np.isnan(cell) for name, cell in cells.items()}
+        absent = {name for name, rows in blank.items() if len(rows) and rows.all()}
+        made = {f"j{n}" for n in (*(self.columns.loads or {}), *(self.columns.drives or {}))}
+        for key, each in self.expressions.items():
+            name = next((name for name in each.names if name in absent), None)
+            if name is not None and (key == TIME or key.partition(".")[0] in made):
+                raise RunError(
+                    f"{self.path}: column {name!r}: found it blank in every row, expected numbers for {key}"
+                )
+        used = {key: each for key, each in self.expressions.items() if not absent & set(each.names)}
+        names = _names(used)
+        keep = ~np.any([blank[name] for name in names], axis=0)
+        found = [
+            f"column {name!r} is blank in every row: taken as absent" for name in cells if name in absent
+        ]
+        count = {name: int(blank[name].sum()) for name in names if blank[name].any()}
+        if count:
+            which = ", ".join(f"{name!r} in {rows}" for name, rows in count.items())
+            rows = counted(len(keep), "row")
+            found.append(f"{int((~keep).sum())} of {rows} left out for a blank cell ({which})")
+            if np.count_nonzero(keep) < 2:
+                kept = counted(int(keep.sum()), "sample")
+                raise RunError(f"{self.path}: {found[-1]}: found {kept}, expected at least 2")
+        if lines is not None:
+            lines = [line for line, kept in zip(lines, keep, strict=True) if kept]
+        kept_cells = {name: cells[name][keep] for name in names}
+        sources = self.columns.sources()
+        with np.errstate(
+            over="ignore", invalid="ignore"
+        ):  # the run table refuses numbers that are not finite
+            values = {
+                key: sources[key].scale * each.value(kept_cells) + sources[key].offset
+                for key, each in used.items()
+            }
+        return Content(self.path, source, sha256, values, lines, (*notes, *found), self.columns)
+
+
+def _names(expressions: Mapping[str, Expression]) -> list[str]:
+    return list(dict.fromkeys(name for each in expressions.values() for name in each.names))
 
 
 def _text(path: Path, data: bytes) -> str:
@@ -160,102 +187,56 @@ def _text(path: Path, data: bytes) -> str:
     return text
 
 
-def _header(rows: _Rows, path: Path) -> list[str]:
-    header = [name.strip() for name in _next_row(rows, path) or []]
-    seen: set[str] = set()
-    for name in header:
-        if name and name in seen:
-            raise RunError(f"{path}: line 1: found column {name!r} twice, expected every name once")
-        seen.add(name)
-    return header
+def _separator(text: str) -> str:
+    """Return the mark that gives the header and the row below it equally many cells, marks rare in names before the comma
+    ("Zeit, ms;Weg, mm"); else the first that the header has.
+    """
+    header = text.lstrip().split("\n", 1)[0]
+    for mark in "\t;,":
+        try:
+            names, row = islice(csv.reader(io.StringIO(text.lstrip(), newline=""), delimiter=mark), 2)
+        except (ValueError, csv.Error):  # no row below, or no CSV
+            continue
+        if len(names) == len(row) > 1:
+            return mark
+    return next((mark for mark in ",;\t" if mark in header), ",")
 
 
-def _next_row(rows: _Rows, path: Path) -> list[str] | None:
+def _without_cut_row(text: str, separator: str) -> tuple[str, tuple[str, ...]]:
+    """Return the text without a last row that has no line end and fewer cells than the row before (the recorder was ended
+    while it wrote), and a note.
+    """
+    *before, row, last = ("", "", *text.rsplit("\n", 2))[-3:]
+    if not last or last.count(separator) >= row.count(separator):
+        return text, ()
+    return "\n".join([*before, row, ""]), (f"the last row left out: it ends after {last[-20:]!r}",)
+
+
+def _rows(text: str, separator: str, path: Path) -> Iterator[tuple[int, list[str]]]:
+    """Yield the line on which each row ends, and its cells."""
+    rows = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
     try:
-        return next(rows)
-    except StopIteration:
-        return None
+        for row in rows:
+            yield rows.line_num, row
     except csv.Error as error:
         raise RunError(f"{path}: line {rows.line_num}: found text that is not CSV ({error})") from None
 
 
-def _cells_of_text(
-    rows: _Rows, path: Path, header: list[str], wanted: Sequence[str], *, blanks: bool
-) -> tuple[dict[str, FloatArray], list[int]]:
-    """Return columns of the file as arrays [n], n >= 2, all finite, and the line [n] on which each sample ends. blanks: a
-    blank cell is NaN.
+def _numbers(path: Path, name: str, values: Any, *, blanks: bool) -> FloatArray:
+    """Return one column as float64 [n]. Raises RunError with the first row that is text or infinite, or blank where blanks
+    are not allowed.
     """
-    source = {name: header.index(name) for name in wanted}
-    cells: dict[str, list[float]] = {name: [] for name in source}
-    lines: list[int] = []
-    while (row := _next_row(rows, path)) is not None:
-        if not row:
-            continue
-        line = rows.line_num
-        if len(row) != len(header):
-            raise RunError(f"{path}: line {line}: found {counted(len(row), 'cell')}, expected {len(header)}")
-        for name, index in source.items():
-            try:
-                value = float(row[index])
-            except ValueError:
-                value = math.nan
-            if not math.isfinite(value) and not (blanks and row[index].strip().lower() in _BLANK):
-                comma = " with a decimal point" if "," in row[index] else ""
-                raise RunError(
-                    f"{path}: line {line}, column {name!r}: found {row[index][:40]!r}, "
-                    f"expected a finite number{comma}"
-                )
-            cells[name].append(value)
-        lines.append(line)
-    if len(lines) < 2:
-        raise RunError(f"{path}: found {counted(len(lines), 'sample')} below the header, expected at least 2")
-    return {name: np.array(column) for name, column in cells.items()}, lines
-
-
-def read_parquet(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
-    """Read a table; blanks: rows with a blank cell are left out, else refused."""
-    data, sha256 = file_bytes(path)
-    if importlib.util.find_spec("pyarrow") is None:
-        raise RunError(f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow")
-    import pyarrow as pa  # type: ignore[import-not-found,import-untyped,unused-ignore]
-    import pyarrow.parquet as pq  # type: ignore[import-not-found,import-untyped,unused-ignore]
-
-    try:
-        file = pq.ParquetFile(pa.BufferReader(data))
-        header = list(file.schema_arrow.names)
-        columns = wanted_columns(header, path, columns)
-        wanted = wanted_expressions(header, path, columns)
-        table = file.read(columns=names_read(wanted))
-    except (pa.ArrowException, OSError, ValueError) as error:
-        if isinstance(error, RunError):
-            raise
-        raise RunError(f"{path}: not a readable Parquet file: {' '.join(str(error).split())}") from None
-    cells = {
-        name: _cells_of_arrow(path, name, table.column(name), blanks=blanks) for name in table.column_names
-    }
-    cells, _, wanted, notes = without_blanks(path, cells, wanted, columns)
-    return Content(path, "parquet", sha256, scaled(cells, wanted, columns), None, notes, columns)
-
-
-def _cells_of_arrow(path: Path, name: str, column: Any, *, blanks: bool) -> FloatArray:
-    """Return one column as float64 [n]; text that is no number, infinity and, unless blanks are allowed, empty cells and
-    NaN: RunError with the first bad row.
-    """
-    values = column.to_numpy()
     try:
         cells: FloatArray = np.asarray(values, np.float64)
+        good = ~np.isinf(cells) if blanks else np.isfinite(cells)
+        if good.all():
+            return cells
+        row = int(np.argmin(good))
+        found = str(cells[row])
     except (TypeError, ValueError):
         row = next((k for k, value in enumerate(values) if not _is_number(value)), 0)
-        raise RunError(
-            f"{path}: row {row + 1}, column {name!r}: found {str(values[row])[:40]!r}, expected a finite number"
-        ) from None
-    good = ~np.isinf(cells) if blanks else np.isfinite(cells)
-    if not good.all():
-        row = int(np.argmin(good))
-        raise RunError(
-            f"{path}: row {row + 1}, column {name!r}: found {cells[row]}, expected a finite number"
-        )
-    return cells
+        found = repr(str(values[row])[:40])
+    raise RunError(f"{path}: row {row + 1}, column {name!r}: found {found}, expected a finite number")
 
 
 def _is_number(value: object) -> bool:
@@ -276,9 +257,9 @@ def write_run(path: Path | str, table: RunTable) -> str:
 
     Returns the SHA-256 of the file (hex), as `read_run` does. The same table gives the same bytes.
 
-    Columns: time_s, then those that each joint has, in the order of the joints' numbers and of COLUMN_NAMES. Numbers are
-    written to 1e-10 of their unit, less than what any encoder, current or torque channel resolves and a third of the size
-    that all 17 digits would take: reading gives every value back to 5e-11 (values above 1e5 to 1e-15 of themselves).
+    Columns: time_s, then those of each joint, in the order of the joints' numbers and of COLUMN_NAMES. Numbers are written
+    to 1e-10 of their unit, below the resolution of any encoder, current or torque channel: reading gives every value back to
+    5e-11 (values above 1e5 to 1e-15 of themselves).
 
     Raises:
         ValueError: the name ends in neither .csv nor .csv.gz.
@@ -287,7 +268,7 @@ def write_run(path: Path | str, table: RunTable) -> str:
     path = Path(path)
     if not path.name.endswith((".csv", ".csv.gz")):
         raise ValueError(f"{path}: found a name ending in '{path.suffix}', expected .csv or .csv.gz")
-    names, columns = ["time_s"], [table.time_s]
+    names, columns = [TIME], [table.time_s]
     for number in sorted(table.joints):
         for name in COLUMN_NAMES:
             column = getattr(table.joints[number], name)
@@ -313,12 +294,9 @@ def write_run(path: Path | str, table: RunTable) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-ENDING: Final = ".truth.npz"
-
-
 def truth_path(run: Path) -> Path:
-    """Return where the true torques of a run file lie: NAME.truth.npz beside NAME.csv.gz."""
-    return run.with_name(run.name.removesuffix(".gz").removesuffix(".csv") + ENDING)
+    """Return the file of the true torques of a run file: NAME.truth.npz beside NAME.csv.gz."""
+    return run.with_name(run.name.removesuffix(".gz").removesuffix(".csv") + ".truth.npz")
 
 
 def write_truth(run: Path, torque_nm: Mapping[int, FloatArray]) -> None:

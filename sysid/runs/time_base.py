@@ -1,4 +1,4 @@
-"""Time base of a run for a diagnosis: rate, unevenness, positions that roll over, skew between channels."""
+"""Time base of a run for a diagnosis: sample rate, resampling of uneven steps, unwrapping of positions, skew of channels."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.sysid.runs.channels import MOVING_RAD_S, RunIssue
 
 SLOWEST_HZ: Final = 50.0
-"""Below it accelerations and reversals are not in the data; ripple of slow motion folds."""
+"""Below it accelerations and reversals are not in the data, and ripple of slow motion is aliased."""
 UNEVEN: Final = 0.3
-"""A step this part off the median is an uneven one: jitter of a stamp is less, a lost row more."""
+"""A step this part off the median is uneven: jitter of a stamp is less, a lost row more."""
 JITTER: Final = 0.05
 """Less is no jitter (`diagnosis.signals.second_difference` takes such steps for even)."""
 _SMOOTHER: Final = 0.7
-"""Part of the roughness of positions at the stamps' word that equal steps must leave to be believed."""
+"""Equal steps are taken where they leave this part of the roughness that positions have over the stamps, or less."""
 _ROWS_AHEAD: Final = 4
 _FOLLOWED: Final = 0.05
 """Part of a stamp's distance by which the phase of the cycles follows it: a clock drifts, jitter does not last."""
 SKEW_NOTED_S: Final = 0.02
-"""Less is the matter of the effect channel_delay."""
+"""Less is left to the effect channel_delay."""
 SKEW_REFUSED_S: Final = 0.1
 _SKEW_LONGEST_S: Final = 0.6
 _SKEW_STEP_S: Final = 0.005
 _SKEW_GAIN: Final = 0.5
-"""Part of the residual energy that a shift must take away to be believed."""
+"""Part of the residual energy that a shift must take away to be accepted."""
 _SKEW_MATTERS: Final = 0.005
-"""Part of the torque's variance that it must take away: where a regression leaves next to nothing, stiction bends that."""
+"""Part of the torque's variance that it must take away: a regression that leaves almost nothing is bent by stiction."""
 _TURN_PER_ROW: Final = 0.25
-"""Part of a turn from one row to the next up to which a roll-over is told from motion."""
+"""Part of a turn from one row to the next up to which a roll-over can be distinguished from motion."""
 _POSITIONS: Final = ("motor_position_rad", "link_position_rad")
 
 
@@ -44,25 +44,22 @@ def check_rate(time_s: FloatArray, where: str) -> list[RunIssue]:
     step = float(np.median(np.diff(time_s)))
     if 1.0 / step >= SLOWEST_HZ:
         return []
-    guess = ", or time in milliseconds" if step >= 0.5 else ""
-    return [
-        RunIssue(
-            "sample_rate",
-            f"{where}: time_s: found {1.0 / step:.4g} Hz (steps of {step:.4g} s), expected at least {SLOWEST_HZ:g} Hz: "
-            f"recorded too slowly for friction and ripple{guess}",
-        )
-    ]
+    text = (
+        f"{where}: time_s: found {1.0 / step:.4g} Hz (steps of {step:.4g} s), expected at least {SLOWEST_HZ:g} Hz: "
+        f"recorded too slowly for friction and ripple{', or time in milliseconds' if step >= 0.5 else ''}"
+    )
+    return [RunIssue("sample_rate", text)]
 
 
 def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
-    """Return the run on equal steps where its own are uneven, and a note of it.
+    """Return the run resampled to equal steps where its own are uneven, and a note of it.
 
-    Values between two rows lie on a cubic through both with the slopes of a parabola through three rows: on straight lines
-    every missing cycle would leave two blows in the acceleration. A run whose steps are equal but for jitter is returned
-    as it is, if its stamps can be believed.
+    Values between two rows lie on a cubic through both with the slopes of a parabola through three rows: linear
+    interpolation would put two steps into the acceleration at every lost cycle. A run whose steps are equal but for jitter
+    is returned unchanged if its stamps are right.
 
-    Stamps that a computer gives, or that were rounded, jitter where the samples do not: at their word a position would jump
-    by speed times jitter. What is believed, the stamps or equal steps with rows missing, is what leaves positions smoother.
+    Stamps of a computer's clock, or rounded ones, jitter where the samples do not: a position over such stamps jumps by
+    speed times jitter. Stamps or equal steps with rows missing are taken, whichever leaves positions smoother.
     """
     steps = np.diff(table.time_s)
     median = float(np.median(steps))
@@ -77,35 +74,36 @@ def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]
             f"{part:.0%} (up to {float(np.max(steps)):.4g} s)"
         )
 
-    believed = _resampled(table, table.time_s, median)
+    by_stamps = _resampled(table, table.time_s, median)
     equal = _resampled(table, *_equal_steps(table.time_s, median))
-    if _roughness(equal) < _SMOOTHER * _roughness(believed):
+    if _roughness(equal) < _SMOOTHER * _roughness(by_stamps):
         text = f"{found(JITTER)}, but positions that are smooth over equal steps: the stamps jitter, not the samples"
         return equal, [RunIssue("time_jitter", f"{text}; equal steps used")]
     if np.max(off) <= UNEVEN * median:
         return table, []
-    return believed, [RunIssue("time_uneven", f"{found(UNEVEN)}: resampled to equal steps")]
+    return by_stamps, [RunIssue("time_uneven", f"{found(UNEVEN)}: resampled to equal steps")]
 
 
 def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
-    """Return the run on steps of step_s, its rows being of these times [n]."""
+    """Return the run on steps of step_s, its rows at these times [n]."""
     grid = np.arange(time_s[0], time_s[-1] + 1e-9, step_s)
-
-    def on_grid(column: FloatArray | None) -> FloatArray | None:
-        return None if column is None else _cubic(grid, time_s, column)
-
     joints = {
-        number: JointColumns(**{name: on_grid(getattr(columns, name)) for name in COLUMN_NAMES})
+        number: JointColumns(
+            **{
+                name: None if (column := getattr(columns, name)) is None else _cubic(grid, time_s, column)
+                for name in COLUMN_NAMES
+            }
+        )
         for number, columns in table.joints.items()
     }
     return RunTable(grid, joints)
 
 
 def _equal_steps(time_s: FloatArray, step_s: float) -> tuple[FloatArray, float]:
-    """Return times of the rows [n] that are whole steps from each other, and the step that ends where the stamps do.
+    """Return times of the rows [n] that are whole steps apart, and the step that ends where the stamps do.
 
-    A row is of the next cycle, or as many on as it and the rows after it are late of the others before, whose mean phase is
-    followed: jitter makes one row late, a lost row all that follow.
+    A row belongs to the next cycle, or to a later one where it and the following rows are late against the mean phase of the
+    rows before: jitter makes one row late, a lost row all that follow.
     """
     ahead = np.min(
         [np.append(time_s[k:], np.full(k, np.inf)) - k * step_s for k in range(_ROWS_AHEAD)], axis=0
@@ -154,17 +152,14 @@ def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
                 continue
             changed[name] = np.unwrap(position, period=turn)
             rolls = int(np.count_nonzero(np.abs(np.diff(position)) > 0.5 * turn))
-            text = (
-                f"{where}: j{number}.{name}: found it rolling over by {turn:.4g} rad {counted(rolls, 'time')}: "
-                "made continuous"
-            )
-            notes.append(RunIssue("position_rollover", text))
+            found = f"found it rolling over by {turn:.4g} rad {counted(rolls, 'time')}: made continuous"
+            notes.append(RunIssue("position_rollover", f"{where}: j{number}.{name}: {found}"))
         joints[number] = replace(columns, **changed) if changed else columns
     return (RunTable(table.time_s, joints) if notes else table), notes
 
 
 def _turn(position: FloatArray) -> float | None:
-    """The period of a position that rolls over by 2 pi (or by 360, for what is still to be found in degrees), else None."""
+    """Return the period of a position that rolls over by 2 pi (or by 360, before degrees are found), else None."""
     steps = np.abs(np.diff(position))
     for period in (2.0 * math.pi, 360.0):
         jumps = steps > 0.5 * period
@@ -177,10 +172,10 @@ def _turn(position: FloatArray) -> float | None:
 
 
 def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
-    """Seconds by which the sensor's torque comes late (early: negative) against current and motion; None: not measurable.
+    """Return the seconds by which the sensor's torque is late (early: negative) against current and motion; None: unknown.
 
-    The torque is shifted over the regression on motor torque, acceleration, friction's sign, velocity and a constant;
-    where the residual is smallest, the channels are in step. Friction would bias a plain cross-correlation.
+    The torque is shifted over the regression on motor torque, acceleration, friction's sign, velocity and a constant; the
+    channels are in step where the residual is smallest. Friction would bias a plain cross-correlation.
     """
     columns = table.joint(number, joint.gear_ratio)
     torque, current, velocity = columns.torque_nm, columns.current_a, columns.motor_velocity_rad_s
@@ -188,7 +183,8 @@ def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
         return None
     dt = float(np.median(np.diff(table.time_s)))
     width = max(1, round(_SKEW_STEP_S / dt))
-    tau, i, w = (_means(column, width) for column in (torque, current, velocity))
+    whole = len(torque) // width * width
+    tau, i, w = (x[:whole].reshape(-1, width).mean(axis=1) for x in (torque, current, velocity))
     step = dt * width
     reach = round(_SKEW_LONGEST_S / step)
     v = w / joint.gear_ratio
@@ -198,19 +194,20 @@ def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
     x = np.column_stack((i, np.gradient(w, step), np.tanh(v / MOVING_RAD_S), v, np.ones(len(v))))[inside]
     size = np.linalg.norm(x, axis=0)
     q, _ = np.linalg.qr(x / np.where(size > 0.0, size, 1.0))
-    left = _left_over(q, tau - np.mean(tau), 2 * reach + 1)
-    best = int(np.argmin(left))
-    if left[reach] - left[best] < _SKEW_MATTERS:
+    residual = _residual_shares(q, tau - np.mean(tau), 2 * reach + 1)
+    best = int(np.argmin(residual))
+    if residual[reach] - residual[best] < _SKEW_MATTERS:
         return 0.0
-    if left[best] > (1.0 - _SKEW_GAIN) * left[reach] or left[best] > 0.5 or best in (0, 2 * reach):
+    at_end = best in (0, 2 * reach)
+    if residual[best] > (1.0 - _SKEW_GAIN) * residual[reach] or residual[best] > 0.5 or at_end:
         return 0.0 if best == reach else None
     return (best - reach) * step
 
 
-def _left_over(q: FloatArray, y: FloatArray, shifts: int) -> FloatArray:
-    """Part of the variance of y[k : k + n] that the orthonormal q [n, p] does not explain, for k = 0 .. shifts - 1.
+def _residual_shares(q: FloatArray, y: FloatArray, shifts: int) -> FloatArray:
+    """Return the part of the variance of y[k : k + n] that the orthonormal q [n, p] does not explain, k = 0 .. shifts - 1.
 
-    q spans the constant. All shifts at once: the products with q are correlations, taken by FFT; sums are running ones.
+    q spans the constant. All shifts at once: the products with q are correlations by FFT, the sums are running ones.
     """
     n = len(q)
     size = 1 << (len(y) + n).bit_length()
@@ -220,11 +217,4 @@ def _left_over(q: FloatArray, y: FloatArray, shifts: int) -> FloatArray:
     constant = (total[n : n + shifts] - total[:shifts]) ** 2 / n
     variance = np.maximum(energy[n : n + shifts] - energy[:shifts] - constant, 1e-30)
     result: FloatArray = 1.0 - (np.sum(products**2, axis=1) - constant) / variance
-    return result
-
-
-def _means(x: FloatArray, width: int) -> FloatArray:
-    """Averages over equal pieces of `width` samples."""
-    whole = len(x) // width * width
-    result: FloatArray = x[:whole].reshape(-1, width).mean(axis=1)
     return result

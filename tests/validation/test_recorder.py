@@ -69,7 +69,7 @@ def test_the_text_holds_the_values(name: str) -> None:
 @pytest.mark.parametrize("name", sorted(PRESETS))
 def test_every_preset_can_be_read(name: str, tmp_path: Path) -> None:
     paths, _ = write(tmp_path, [a_run(), a_run(0.4)], {1: JOINT}, PRESETS[name], 3)
-    runs = read_runs(paths, in_pieces=True)
+    runs = read_runs(paths, segments=True)
     assert len(runs) == 2
     assert len(runs[0].table.time_s) > 90
 

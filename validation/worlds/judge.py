@@ -54,7 +54,7 @@ def judged(
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         paths, files = write(Path(folder), runs, joints, recorder, seed)
         try:
-            read = read_runs(paths, in_pieces=True)  # as the command does
+            read = read_runs(paths, segments=True)  # as the command does
             return diagnosed(read, joints_of(files, read))
         except (ConfigError, RunError, RunTableError) as error:
             text = str(error).replace(folder, "")

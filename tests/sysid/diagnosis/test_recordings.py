@@ -81,7 +81,7 @@ def test_one_recording_whose_time_starts_again_counts_once(tmp_path: Path) -> No
         text += (tmp_path / "part.csv").read_text().splitlines(keepends=True)[1 if text else 0 :]
     (tmp_path / "part.csv").unlink()
     (tmp_path / "a.csv").write_text("".join(text))
-    runs = read_runs([tmp_path], in_pieces=True)
+    runs = read_runs([tmp_path], segments=True)
     assert [run.name for run in runs] == [f"a.csv (run {k} of 3)" for k in (1, 2, 3)]
     found = signals(*((run.name, run.table) for run in runs))
     assert recordings(found) == [0, 0, 1, 2]

@@ -13,7 +13,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
-from jtqd.sysid.runs.channels import check_channels, gear_ratio_of
+from jtqd.sysid.runs.channels import Channels, check_channels
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
 from tests.estimator.estimator_helpers import joint1
@@ -37,7 +37,7 @@ def ideal() -> RunTable:
 
 def kinds(table: RunTable, joint: Joint = JOINT, number: int = 1, **changes: FloatArray | None) -> list[str]:
     run = replace(table.joints[number], **changes)
-    found = check_channels(table.time_s, run, joint, f"run.csv: j{number}")
+    found = check_channels(Channels(table.time_s, run, joint, f"run.csv: j{number}"))
     assert all(item.text.startswith("run.csv: j1") or number == 2 for item in found)
     assert all("\n" not in item.text for item in found)
     return [item.kind for item in found]
@@ -74,7 +74,7 @@ def test_measured_runs_of_a_real_arm_have_no_finding(run: str) -> None:
     table = read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns).table
     for number, path in columns.joint_files.items():
         joint = load_joint(path)
-        assert check_channels(table.time_s, table.joints[number], joint, "run") == []
+        assert check_channels(Channels(table.time_s, table.joints[number], joint, "run")) == []
 
 
 def test_dead_channels(noisy: RunTable) -> None:
@@ -89,7 +89,9 @@ def test_a_sensor_that_stays_where_it_was(noisy: RunTable) -> None:
     torque = column(noisy, "torque_nm")
     torque[1200:] = torque[1200]
     assert kinds(noisy, torque_nm=torque) == ["torque_nm_stuck"]
-    text = check_channels(noisy.time_s, replace(noisy.joints[1], torque_nm=torque), JOINT, "r: j1")[0].text
+    text = check_channels(Channels(noisy.time_s, replace(noisy.joints[1], torque_nm=torque), JOINT, "r: j1"))[
+        0
+    ].text
     assert f"found exactly {torque[1200]:g} Nm for" in text
     # a stretch in the middle is enough, when the current moved in it
     torque = column(noisy, "torque_nm")
@@ -130,7 +132,7 @@ def test_swapped_torque_and_current_are_told_apart_without_positions(noisy: RunT
 @pytest.mark.parametrize("ratio", [50.0, 98.0, 102.0, 160.0])
 def test_wrong_gear_ratio(noisy: RunTable, ratio: float) -> None:
     assert kinds(noisy, replace(JOINT, gear_ratio=ratio)) == ["gear_ratio"]
-    assert gear_ratio_of(noisy.time_s, noisy.joints[1]) == pytest.approx(100.0, rel=2e-3)
+    assert Channels(noisy.time_s, noisy.joints[1], JOINT, "r").gear_ratio == pytest.approx(100.0, rel=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -163,9 +165,9 @@ def test_positions_that_roll_over_are_no_finding(noisy: RunTable) -> None:
 
 
 def test_channels_that_are_not_there_are_not_asked(noisy: RunTable) -> None:
-    assert check_channels(noisy.time_s, JointColumns(), JOINT, "r") == []
+    assert check_channels(Channels(noisy.time_s, JointColumns(), JOINT, "r")) == []
     only = JointColumns(current_a=noisy.joints[1].current_a, torque_nm=noisy.joints[1].torque_nm)
-    assert check_channels(noisy.time_s, only, JOINT, "r") == []
+    assert check_channels(Channels(noisy.time_s, only, JOINT, "r")) == []
 
 
 def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal: RunTable) -> None:
@@ -175,6 +177,6 @@ def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal: RunTable) -
     run = JointColumns(
         current_a=np.linspace(0.0, 1.5, n), motor_velocity_rad_s=np.zeros(n), torque_nm=np.full(n, 6.0)
     )
-    assert check_channels(time_s, run, JOINT, "r") == []
+    assert check_channels(Channels(time_s, run, JOINT, "r")) == []
     moving = replace(run, motor_velocity_rad_s=np.full(n, 50.0))
-    assert [f.kind for f in check_channels(time_s, moving, JOINT, "r")] == ["torque_nm_stuck"]
+    assert [f.kind for f in check_channels(Channels(time_s, moving, JOINT, "r"))] == ["torque_nm_stuck"]

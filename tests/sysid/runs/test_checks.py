@@ -13,7 +13,7 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
-from jtqd.sysid.runs.bad_samples import wild_rows, without_wild_samples
+from jtqd.sysid.runs.bad_samples import outlier_rows, without_outliers
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.time_base import on_even_steps, skew_s, unwrapped
 from tests.sysid.runs.spoiled_runs import (
@@ -304,7 +304,7 @@ def test_every_run_is_judged_for_itself(run: RunTable) -> None:
     assert [line[0] for line in result.refused] == ["b", "c"]
 
 
-def with_wild(run: RunTable, name: str, value: float) -> RunTable:
+def with_outlier(run: RunTable, name: str, value: float) -> RunTable:
     column = getattr(run.joints[1], name).copy()
     column[7000] = value
     return changed(run, lambda c: replace(c, **{name: column}))
@@ -312,19 +312,19 @@ def with_wild(run: RunTable, name: str, value: float) -> RunTable:
 
 @pytest.mark.parametrize("name", sorted(set(COLUMN_NAMES) - {"enabled", "link_velocity_rad_s"}))
 @pytest.mark.parametrize("value", [1e30, -1e6, 4e3])
-def test_a_row_with_a_wild_sample_is_left_out_and_said(run: RunTable, name: str, value: float) -> None:
-    kept, [note] = without_wild_samples(with_wild(run, name, value), JOINTS, "r.csv")
-    assert f"j1.{name}: found 1 wild sample, {value:.4g} at 7 s" in note.text
+def test_a_row_with_an_outlier_sample_is_left_out_and_said(run: RunTable, name: str, value: float) -> None:
+    kept, [note] = without_outliers(with_outlier(run, name, value), JOINTS, "r.csv")
+    assert f"j1.{name}: found 1 outlier sample, {value:.4g} at 7 s" in note.text
     assert np.array_equal(kept.time_s, np.delete(run.time_s, 7000))
     for number, column in ((1, name), (2, "torque_nm")):
         before = getattr(run.joints[number], column)
         assert np.array_equal(getattr(kept.joints[number], column), np.delete(before, 7000))
 
 
-def test_a_wild_sample_is_interpolated_as_a_lost_row(run: RunTable) -> None:
-    result = checked(with_wild(run, "torque_nm", 1e30))
-    wild, uneven = result.notes
-    assert "1 wild sample" in wild
+def test_an_outlier_sample_is_interpolated_as_a_lost_row(run: RunTable) -> None:
+    result = checked(with_outlier(run, "torque_nm", 1e30))
+    outlier, uneven = result.notes
+    assert "1 outlier sample" in outlier
     assert "found 1 of 19998 steps off" in uneven
     assert result.refused == ()
     kept, before = result.runs[0][1].joints[1].torque_nm, run.joints[1].torque_nm
@@ -333,15 +333,15 @@ def test_a_wild_sample_is_interpolated_as_a_lost_row(run: RunTable) -> None:
     assert kept == pytest.approx(before, abs=2.0)
 
 
-def test_what_a_joint_can_do_is_not_wild(run: RunTable) -> None:
+def test_what_a_joint_can_do_is_no_outlier(run: RunTable) -> None:
     """A kick of twice the rating at the start, a blow, a channel that steps, one that is wrong for longer."""
     for rows, value in ((slice(1, 2), 80.0), (slice(7000, 7001), 18.0), (slice(7000, 8000), 1e3)):
         torque = np.array(run.joints[1].torque_nm)
         torque[rows] += value
         kicked = changed(run, lambda c, torque=torque: replace(c, torque_nm=torque))  # type: ignore[misc]
-        assert without_wild_samples(kicked, JOINTS, "r.csv")[1] == []
-    assert not wild_rows(np.repeat([0.0, 50.0], 500), 1.0).any()
-    assert not wild_rows(np.append([0.0], np.sin(np.arange(0.0, 20.0, 0.01)) + 9.0), 1.0).any(), "an end"
+        assert without_outliers(kicked, JOINTS, "r.csv")[1] == []
+    assert not outlier_rows(np.repeat([0.0, 50.0], 500), 1.0).any()
+    assert not outlier_rows(np.append([0.0], np.sin(np.arange(0.0, 20.0, 0.01)) + 9.0), 1.0).any(), "an end"
 
 
 @pytest.mark.parametrize("count", [2, 10, 900])

@@ -7,7 +7,7 @@ import pytest
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.sysid.runs.column_map import ColumnMap, KnownLoad, motion_of
-from jtqd.sysid.runs.files import read_pieces, read_run
+from jtqd.sysid.runs.files import read_run, read_runs
 from jtqd.sysid.runs.run_file import RunError
 
 T = np.arange(0.0, 6.0, 0.004)
@@ -148,8 +148,8 @@ def test_a_wrong_expression_names_file_key_and_map(tmp_path: Path) -> None:
     )
 
 
-def test_gaps_make_pieces_that_keep_their_time(tmp_path: Path) -> None:
-    """Gaps of 0.5 and 0.1 s; one of three rows is bridged; a piece of half a second is left out."""
+def test_gaps_make_segments_that_keep_their_time(tmp_path: Path) -> None:
+    """Gaps of 0.5 and 0.1 s; one of three rows is bridged; a segment of half a second is left out."""
     keep = ~(
         ((T > 2.0) & (T < 2.5))
         | ((T > 4.0) & (T < 4.1))
@@ -159,20 +159,19 @@ def test_gaps_make_pieces_that_keep_their_time(tmp_path: Path) -> None:
     path = table(tmp_path / "a.csv", {"time_s": T[keep], "j1.current_a": Q[keep], "j1.torque_nm": V[keep]})
     with pytest.raises(RunError, match="found a gap of 0"):
         read_run(path)
-    pieces = read_pieces(path)
-    assert [run.name for run in pieces] == ["a.csv (1 of 3)", "a.csv (2 of 3)", "a.csv (3 of 3)"]
-    assert [run.piece for run in pieces] == [(1, 3), (2, 3), (3, 3)]
-    assert [float(run.table.time_s[0]) for run in pieces] == pytest.approx([0.0, 2.5, 4.7])
-    assert len({run.sha256 for run in pieces}) == 1
-    assert "3 gaps of more than 0.025 s: used as 3 pieces of one recording" in " ".join(pieces[0].notes)
-    assert pieces[1].notes == ()
+    segments = read_runs([path], segments=True)
+    assert [run.name for run in segments] == ["a.csv (1 of 3)", "a.csv (2 of 3)", "a.csv (3 of 3)"]
+    assert [float(run.table.time_s[0]) for run in segments] == pytest.approx([0.0, 2.5, 4.7])
+    assert len({run.sha256 for run in segments}) == 1
+    assert "3 gaps of more than 0.025 s: used as 3 segments of one recording" in " ".join(segments[0].notes)
+    assert segments[1].notes == ()
 
 
-def test_a_wild_position_is_not_in_the_torque_of_the_load_beside_it(tmp_path: Path) -> None:
-    wild = np.sin(T)
-    wild[1000] = 1e6
+def test_an_outlier_of_a_position_is_not_in_the_torque_of_the_load_beside_it(tmp_path: Path) -> None:
+    outlier = np.sin(T)
+    outlier[1000] = 1e6
     torques = []
-    for angle in (np.sin(T), wild):
+    for angle in (np.sin(T), outlier):
         path = table(tmp_path / "a.csv", {"t": T, "q": angle, "i": T})
         columns = ColumnMap.from_mapping(
             {
@@ -196,23 +195,24 @@ def test_turns_in_a_gap_are_not_known(tmp_path: Path) -> None:
     columns = ColumnMap.from_mapping(
         {"time_s": "t", "j1.current_a": "i", "j1.motor_position_rad": "unwrap(q, 2 * pi)"}, "m", Path()
     )
-    first, second = read_pieces(path, columns)
+    first, second = read_runs([path], columns, segments=True)
     assert any("j1.motor_position_rad is unwrapped, its turns in the gaps" in note for note in first.notes)
-    for piece in (first, second):
-        position = piece.table.joints[1].motor_position_rad
+    for segment in (first, second):
+        position = segment.table.joints[1].motor_position_rad
         assert position is not None
-        assert np.diff(position) == pytest.approx(9.0 * np.diff(piece.table.time_s), abs=1e-6)
+        assert np.diff(position) == pytest.approx(9.0 * np.diff(segment.table.time_s), abs=1e-6)
 
 
-def test_pieces_that_are_all_too_short_are_refused(tmp_path: Path) -> None:
+def test_segments_that_are_all_too_short_are_refused(tmp_path: Path) -> None:
     keep = (T % 0.5) < 0.4
     path = table(tmp_path / "a.csv", {"time_s": T[keep], "j1.current_a": Q[keep]})
     with pytest.raises(
-        RunError, match=r"found 12 pieces between gaps, the longest of 0\.\d+ s, expected one of at least 1 s"
+        RunError,
+        match=r"found 12 segments between gaps, the longest of 0\.\d+ s, expected one of at least 1 s",
     ):
-        read_pieces(path)
+        read_runs([path], segments=True)
 
 
-def test_a_short_whole_recording_is_one_piece(tmp_path: Path) -> None:
-    [run] = read_pieces(table(tmp_path / "a.csv", {"time_s": T[:50], "j1.current_a": Q[:50]}))
+def test_a_short_whole_recording_is_one_segment(tmp_path: Path) -> None:
+    [run] = read_runs([table(tmp_path / "a.csv", {"time_s": T[:50], "j1.current_a": Q[:50]})], segments=True)
     assert run.name == "a.csv"

@@ -16,7 +16,7 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sysid import runs
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import read_pieces, read_run, read_runs
+from jtqd.sysid.runs.files import read_run, read_runs
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import write_run
 
@@ -156,7 +156,7 @@ def test_a_time_that_starts_again_is_another_run(tmp_path: Path) -> None:
     time_s = np.concatenate((T, gap, 100.0 + T))
     cells = {"time_s": time_s, "j1.current_a": noise[: len(time_s)], "j1.motor_position_rad": time_s}
     path = _table(tmp_path / "a.csv", cells)
-    [first, *others] = read_runs([path], in_pieces=True)
+    [first, *others] = read_runs([path], segments=True)
     names = [run.name for run in (first, *others)]
     assert names == ["a.csv (run 1 of 2)", "a.csv (run 2 of 2) (1 of 3)"] + [
         f"a.csv (run 2 of 2) ({k} of 3)" for k in (2, 3)
@@ -175,7 +175,7 @@ def test_one_wrong_stamp_is_no_other_run(tmp_path: Path) -> None:
         time_s[row] = stamp
         path = _table(tmp_path / "a.csv", {"time_s": time_s, "j1.current_a": T})
         with pytest.raises(RunError, match=f"line {row + 2}: found time .*expected rising time"):
-            read_pieces(path)
+            read_runs([path], segments=True)
 
 
 def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
@@ -183,14 +183,14 @@ def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
     rows = np.sort(np.concatenate((np.arange(2000), [700, 900, 900])))
     cells = {"time_s": t[rows], "j1.current_a": np.sin(t)[rows]}
     path = _table(tmp_path / "twice.csv", cells)
-    [run] = read_pieces(path)
+    [run] = read_runs([path], segments=True)
     assert run.table.time_s.tolist() == t.tolist()
     assert run.notes == ("3 of 2003 rows left out: they are the row before once more",)
     with pytest.raises(RunError, match=r"line 703: found time 1\.4 s after 1\.4 s, expected rising time"):
         read_run(path)
     cells["j1.current_a"][701] += 0.1  # one of both has a wrong time
     with pytest.raises(RunError, match=r"line 703: found time 1\.4 s after 1\.4 s, expected rising time"):
-        read_pieces(_table(tmp_path / "stamp.csv", cells))
+        read_runs([_table(tmp_path / "stamp.csv", cells)], segments=True)
 
 
 def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path: Path) -> None:
@@ -198,7 +198,9 @@ def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path: Path) 
     late = 1e-3 * np.random.default_rng(1).uniform(-0.1, 0.7, 3000)
     t = np.round(0.001 * np.arange(3000.0) + late, 3)
     assert np.any(np.diff(t) == 0.0)
-    [run] = read_pieces(_table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t + late)}))
+    [run] = read_runs(
+        [_table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t + late)})], segments=True
+    )
     assert np.all(np.diff(run.table.time_s) > 0.0)
     assert run.table.time_s == pytest.approx(t, abs=1.01e-3)
     count = np.count_nonzero(np.diff(t) == 0.0)
@@ -209,16 +211,16 @@ def test_a_row_that_a_recorder_did_not_finish_is_left_out_and_said(tmp_path: Pat
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0, "j1.motor_position_rad": T})
     whole = path.read_text()
     path.write_text(whole + "5.0,6.")
-    [run] = read_pieces(path)
+    [run] = read_runs([path], segments=True)
     assert run.table.time_s.tolist() == T.tolist()
     assert run.notes == ("the last row left out: it ends after '5.0,6.'",)
     with pytest.raises(RunError, match="found 2 cells, expected 3"):
         read_run(path)
     path.write_text(whole.rstrip())  # whole, without its line's end
-    assert read_pieces(path)[0].notes == ()
+    assert read_runs([path], segments=True)[0].notes == ()
     path.write_text(whole + "5.0,6.0\n")
     with pytest.raises(RunError, match="found 2 cells, expected 3"):
-        read_pieces(path)
+        read_runs([path], segments=True)
 
 
 def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
@@ -226,14 +228,14 @@ def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
     cells = {"time_s": T, "j1.current_a": current, "j1.motor_position_rad": np.cumsum(current)}
     path = _table(tmp_path / "a.csv", {name: np.tile(column, 2) for name, column in cells.items()})
     with pytest.raises(RunError, match=r"same run \(a.csv \(run 2 of 2\)\) as in a.csv \(run 1 of 2\)"):
-        read_runs([path], in_pieces=True)
+        read_runs([path], segments=True)
 
 
 def test_rows_with_a_blank_cell_are_gaps(tmp_path: Path) -> None:
     current, warm = np.round(np.sin(T), 3).astype(object), np.full(len(T), "", object)
     current[[50, 51]], current[200:220] = "", "NaN"
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": current, "j1.temperature_c": warm})
-    first, second = read_pieces(path)
+    first, second = read_runs([path], segments=True)
     assert "22 of 400 rows left out for a blank cell ('j1.current_a' in 22)" in first.notes
     assert "column 'j1.temperature_c' is blank in every row: taken as absent" in first.notes
     assert first.table.joints[1].temperature_c is None
@@ -242,7 +244,7 @@ def test_rows_with_a_blank_cell_are_gaps(tmp_path: Path) -> None:
         read_run(path)
     current[7] = "inf"
     with pytest.raises(RunError, match=r"line 9, column 'j1.current_a': found 'inf'"):
-        read_pieces(_table(path, {"time_s": T, "j1.current_a": current}))
+        read_runs([_table(path, {"time_s": T, "j1.current_a": current})], segments=True)
 
 
 def test_what_a_load_is_computed_from_cannot_be_blank(tmp_path: Path) -> None:
@@ -250,7 +252,7 @@ def test_what_a_load_is_computed_from_cannot_be_blank(tmp_path: Path) -> None:
     load = {"inertia_kgm2": 0.1}
     columns = _map(time_s="t", j1__link_position_rad="q", j1__current_a="i", j1__load=load)
     with pytest.raises(RunError, match="column 'q': found it blank in every row"):
-        read_pieces(path, columns)
+        read_runs([path], columns, segments=True)
 
 
 def test_a_comma_separates_wherever_the_header_has_one(tmp_path: Path) -> None:
@@ -456,9 +458,9 @@ def test_a_directory_is_its_tables_and_names_are_unique(tmp_path: Path) -> None:
     read = read_runs([one, other / "a.csv.gz"])
     assert [run.name for run in read] == ["a.csv.gz", str(other / "a.csv.gz")]
     assert [(run.path, run.source) for run in read] == [(d / "a.csv.gz", "csv") for d in (one, other)]
-    for in_pieces in (False, True):
+    for segments in (False, True):
         with pytest.raises(RunError, match=r"one/a\.csv\.gz: found it twice, expected every run once"):
-            read_runs([one, one / "a.csv.gz"], in_pieces=in_pieces)
+            read_runs([one, one / "a.csv.gz"], segments=segments)
     shutil.copy(one / "a.csv.gz", one / "twin.csv.gz")
     with pytest.raises(RunError, match=r"same data as in a\.csv\.gz, expected every run once"):
         read_runs([one])

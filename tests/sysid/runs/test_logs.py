@@ -376,7 +376,7 @@ def test_the_parts_of_a_run_are_one_recording(tmp_path: Path) -> None:
     write_log(parts[0], cycles[:2000])
     write_log(parts[1], cycles[2060:])
     write_log(tmp_path / "b-20260102T000000Z-0001.mcap", regular(1500, lambda n: joints(n + 9000), start=9))
-    runs = read_runs([tmp_path], in_pieces=True)
+    runs = read_runs([tmp_path], segments=True)
     assert [run.name for run in runs] == [
         f"{parts[0].name} (1 of 2)",
         f"{parts[0].name} (2 of 2)",
@@ -386,4 +386,4 @@ def test_the_parts_of_a_run_are_one_recording(tmp_path: Path) -> None:
     assert runs[0].notes[0] == f"2 parts of one run: {parts[0].name} to {parts[1].name}"
     whole = b"".join(part.read_bytes() for part in parts)
     assert runs[0].sha256 == runs[1].sha256 == hashlib.sha256(whole).hexdigest()
-    assert len(read_runs([parts[1]], in_pieces=True)) == 1
+    assert len(read_runs([parts[1]], segments=True)) == 1

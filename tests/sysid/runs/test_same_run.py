@@ -11,7 +11,7 @@ from jtqd.daemon.logs import export
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import command as diagnose
 from jtqd.sysid.runs import RunError, read_runs
-from jtqd.sysid.runs.files import same_run, stretches
+from jtqd.sysid.runs.files import same_run, windows
 from jtqd.sysid.runs.tables import write_run
 from tests.paths import ROOT
 
@@ -52,15 +52,15 @@ def part(table: RunTable, rows: slice, digits: int = 17) -> RunTable:
 )
 def test_the_same_samples_are_the_same_run(rows: slice, digits: int) -> None:
     whole = run(1)
-    assert same_run(stretches(whole), stretches(part(whole, rows, digits)))
-    assert same_run(stretches(part(whole, rows, digits)), stretches(whole))
+    assert same_run(windows(whole), windows(part(whole, rows, digits)))
+    assert same_run(windows(part(whole, rows, digits)), windows(whole))
 
 
 @pytest.mark.parametrize("moves", [1.0, 0.1])
 @pytest.mark.parametrize("levels", [3.0, 1.0, 0.0])
 def test_runs_of_one_motion_are_not(moves: float, levels: float) -> None:
     """Also with little noise, and mostly at rest; without any noise nobody can tell, so it is not tried."""
-    one, two = (stretches(run(seed, moves=moves, levels=levels)) for seed in (1, 2))
+    one, two = (windows(run(seed, moves=moves, levels=levels)) for seed in (1, 2))
     if levels:
         assert not same_run(one, two)
     elif moves < 1.0:
@@ -70,15 +70,15 @@ def test_runs_of_one_motion_are_not(moves: float, levels: float) -> None:
 def test_other_joints_and_missing_columns_are_not_compared() -> None:
     table = run(1)
     other = RunTable(table.time_s, {2: table.joints[1]})
-    assert not same_run(stretches(table), stretches(other))
-    assert stretches(RunTable(table.time_s, {1: JointColumns(current_a=table.joints[1].current_a)})) == {}
-    assert stretches(run(1, rows=100)) == {}
+    assert not same_run(windows(table), windows(other))
+    assert windows(RunTable(table.time_s, {1: JointColumns(current_a=table.joints[1].current_a)})) == {}
+    assert windows(run(1, rows=100)) == {}
 
 
 def test_one_joint_that_differs_makes_another_run() -> None:
     one, two = run(1), run(2)
     both = [RunTable(one.time_s, {1: one.joints[1], 2: each.joints[1]}) for each in (one, two)]
-    assert not same_run(*map(stretches, both))
+    assert not same_run(*map(windows, both))
 
 
 def test_a_log_and_its_table_are_refused_in_one_line(
@@ -88,7 +88,7 @@ def test_a_log_and_its_table_are_refused_in_one_line(
     export.main(["csv", str(LOG), "--out", str(table)])
     capsys.readouterr()
     with pytest.raises(RunError, match=r"exported\.csv: found the same run as in network\.mcap"):
-        read_runs([LOG, table], in_pieces=True)
+        read_runs([LOG, table], segments=True)
     joint = str(ROOT / "models" / "joint1.yaml")
     assert diagnose.main([str(LOG), str(table), "--joint", joint, "--out", str(tmp_path / "d")]) == 1
     told = capsys.readouterr().err
@@ -99,10 +99,10 @@ def test_a_log_and_its_table_are_refused_in_one_line(
 def test_a_table_of_all_cycles_is_the_same_run_without_its_blank_cells(tmp_path: Path) -> None:
     table = tmp_path / "all.csv"
     export.main(["csv", str(LOG), "--out", str(table), "--all-cycles"])
-    [found] = read_runs([table], in_pieces=True)
+    [found] = read_runs([table], segments=True)
     assert "193 of 1050 rows left out for a blank cell ('j1.temperature_c' in 193" in found.notes[0]
     with pytest.raises(RunError, match=r"found the same run as in network\.mcap"):
-        read_runs([LOG, table], in_pieces=True)
+        read_runs([LOG, table], segments=True)
 
 
 def test_two_runs_are_read(tmp_path: Path) -> None:

@@ -19,11 +19,11 @@ def test_a_shift_is_believed_that_takes_away_half(
     velocity = np.sin(t)
     columns = JointColumns(current_a=velocity, motor_velocity_rad_s=100.0 * velocity, torque_nm=np.cos(t))
 
-    def left_over(_q: object, _y: object, shifts: int) -> np.ndarray:
+    def residual_shares(_q: object, _y: object, shifts: int) -> np.ndarray:
         curve = np.full(shifts, 0.051)
         curve[shifts // 2 + 21] = left
         return curve
 
-    monkeypatch.setattr(time_base, "_left_over", left_over)
+    monkeypatch.setattr(time_base, "_residual_shares", residual_shares)
     found = time_base.skew_s(RunTable(t, {1: columns}), 1, PLAIN)
     assert found == (late_s if late_s is None else pytest.approx(late_s))
