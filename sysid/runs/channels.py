@@ -125,7 +125,7 @@ class Channels:
 
     @cached_property
     def gear_ratio(self) -> float | None:
-        """Motor turns per link turn by the two positions, signed; None where they moved too little.
+        """Motor turns per link turn by the two positions, signed; None where one of them moved too little.
 
         The median over blocks of 0.2 s in which the link turned: a position that rolls over spoils single blocks only.
         """
@@ -136,7 +136,7 @@ class Channels:
         turned = np.abs(link) > 2e-3
         if float(np.sum(np.abs(link[turned]))) < TURNED_RAD:
             return None
-        return float(np.median(motor[turned] / link[turned]))
+        return float(np.median(motor[turned] / link[turned])) or None
 
     def issue(self, channel: str, fault: str, text: str) -> RunIssue:
         """Return the issue of a channel of this joint, of kind CHANNEL_FAULT."""

@@ -116,12 +116,14 @@ def test_stuck_channels_by_how_long(run: RunTable) -> None:
     assert "stuck channel" in long.refused[0]
 
 
-def test_a_stuck_link_encoder_is_not_used_and_the_joint_stays(run: RunTable) -> None:
-    result = checked(changed(run, partial(held, "link_position_rad", 0, len(run.time_s))))
+@pytest.mark.parametrize("name", ["link_position_rad", "motor_position_rad"])
+def test_a_stuck_encoder_is_not_used_and_the_joint_stays(run: RunTable, name: str) -> None:
+    result = checked(changed(run, partial(held, name, 0, len(run.time_s))))
     assert result.refused == ()
+    assert f"j1.{name}" in result.notes[0]
     assert "stuck channel; not used" in result.notes[0]
-    assert result.runs[0][1].joints[1].link_position_rad is None
-    assert result.runs[0][1].joints[2].link_position_rad is not None
+    assert getattr(result.runs[0][1].joints[1], name) is None
+    assert getattr(result.runs[0][1].joints[2], name) is not None
 
 
 def test_a_clipped_sensor_is_refused_when_it_clips_most_of_the_time(run: RunTable) -> None:
