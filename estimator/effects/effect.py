@@ -221,7 +221,7 @@ class Effect:
     """Base of all effects. A file of this package holds one subclass, named in `name` as the file is.
 
     equation, source: one line each; tell_tale: where it shows and how one recognises it.
-    experiment: kind of motion that shows it (`sysid.diagnosis.towing_motion.EXPERIMENTS`).
+    experiment: kind of motion that shows it (`sysid.planner.experiments.EXPERIMENTS`).
     confused_with: effect that looks the same on poor runs -> kind of motion that separates the two; a pair stands in one of
     both files. by_hand: such an effect -> what separates the two besides a motion.
     hooks: names of the hooks it has; needs: fields of State without which it cannot be judged.

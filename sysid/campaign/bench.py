@@ -26,11 +26,10 @@ from jtqd.sysid.motion.setpoints import (
     Setpoints,
     Surroundings,
     Timing,
-    approach,
 )
 from jtqd.sysid.motion.shell import Progress, play
 from jtqd.sysid.planner.design import current_at
-from jtqd.sysid.planner.single_joint import allowed_torque
+from jtqd.sysid.planner.single_joint import allowed_torque, approach
 
 PERIOD_US: Final = 1000
 LONGEST_PERIOD_US: Final = 10_000

@@ -39,12 +39,12 @@ from jtqd.sysid.planner.campaigns import (
     Unit,
     check_joints,
     make_plan_of,
-    said_of,
     seed_of,
+    unit_lines,
     units_of,
 )
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
-from jtqd.sysid.planner.single_joint import parsed_limits, room_of, tightest, with_limits
+from jtqd.sysid.planner.single_joint import parsed_limits, range_of, tightest, with_limits
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"
@@ -190,8 +190,8 @@ def wanted_plan(
         check_joints(plan, units)
         alone = {}
         for number in sorted({run.velocity_joint for run in plan.runs if run.current_joint is None}):
-            room = room_of(number, joints[number - 1], plan.limits).limits
-            alone[number] = tightest(plan.alone[number], room) if number in plan.alone else room
+            own = range_of(number, joints[number - 1], plan.limits).limits
+            alone[number] = tightest(plan.alone[number], own) if number in plan.alone else own
     except ConfigError as error:
         raise ConfigError(f"{options.plan}: {error}") from None
     return replace(plan, alone=alone)
@@ -276,15 +276,15 @@ def _moved(row: Mapping[str, Any]) -> str:
     return f"{row['velocity_joint']}{' alone' if row['current_joint'] is None else ''}"
 
 
-def unit_lines(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -> list[str]:
+def plan_notes(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -> list[str]:
     """Return what the runs of each unit can identify, and why one has none; nothing for the one towing bench of old."""
     if [unit.joints for unit in units] == [(1, 2)] and units[0].measured:
         return []
     kind = options.plan if options.plan in KINDS else ""
     moved = {run.joints for run in plan.runs}
-    lines = said_of(
+    lines = unit_lines(
         [unit for unit in units if kind or unit.joints in moved],
-        lambda unit: (kind and unit.refused(kind)) or unit.serves(),
+        lambda unit: (kind and unit.refusal(kind)) or unit.purpose,
     )
     for number, limits in sorted(plan.alone.items()):
         low, high = limits.position_rad
@@ -403,7 +403,7 @@ def _dry_run(options: argparse.Namespace) -> int:
     plan = _make_plan(options, config, units)
     setpoints = _check_plan(plan, options)
     config.check_temperature(plan.limits.temperature_c)
-    notes = unit_lines(options, units, plan)
+    notes = plan_notes(options, units, plan)
     if options.json:
         print(json.dumps(dry_run_mapping(plan, setpoints, load, notes)))
     else:
@@ -427,7 +427,7 @@ def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bo
         setpoints = _check_plan(plan, options)
         config.check_temperature(plan.limits.temperature_c)
         directory.begin(plan, made_from)
-        for line in unit_lines(options, units, plan):
+        for line in plan_notes(options, units, plan):
             print(f"jtq campaign: {line}", file=sys.stderr)
         outcome = _run(options, config, plan, setpoints, directory, exact_next=exact_next)
     finally:

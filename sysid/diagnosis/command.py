@@ -19,10 +19,15 @@ from jtqd.estimator.checked import ConfigError, check_installed, counted, make_d
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.campaign.bench import BenchConfig
-from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
+from jtqd.sysid.diagnosis.next_experiment import (
+    CONFIG,
+    MOTION_FILE,
+    PLAN_FILE,
+    campaign_command,
+    joint_motion_file,
+)
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
 from jtqd.sysid.planner.plan import Plan
 from jtqd.sysid.planner.single_joint import beyond_file, parsed_limits, with_limits

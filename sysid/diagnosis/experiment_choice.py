@@ -13,7 +13,7 @@ from itertools import combinations
 from typing import Final
 
 from jtqd.estimator.effects import EFFECTS
-from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS
+from jtqd.sysid.planner.experiments import EXPERIMENTS
 
 MOST_KINDS: Final = 3
 _DEFAULT: Final = "excitation"

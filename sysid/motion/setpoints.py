@@ -128,6 +128,11 @@ def partner_of(velocity_joint: int, current_joint: int | None) -> int | None:
     return current_joint
 
 
+def moved_joints(velocity_joint: int, current_joint: int | None) -> tuple[int, ...]:
+    """Return the numbers of the joints that are moved, rising."""
+    return tuple(sorted((velocity_joint,) if current_joint is None else (velocity_joint, current_joint)))
+
+
 MOST_JOINTS: Final = 4
 """Of a bus."""
 
@@ -221,9 +226,8 @@ class Setpoints:
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """Numbers of the joints that are moved, in rising order."""
-        moved = (self.velocity_joint, *(() if self.current_joint is None else (self.current_joint,)))
-        return tuple(sorted(moved))
+        """Numbers of the joints that are moved, rising."""
+        return moved_joints(self.velocity_joint, self.current_joint)
 
     @property
     def duration_s(self) -> float:
@@ -441,30 +445,3 @@ def _smooth(series: FloatArray, limit: float, what: str, unit: str) -> None:
         raise MotionError(
             f"plan: {what} {where} of {steps[jumps[0]]:.3f} {unit}, limit {limit:g} {unit} per ms"
         )
-
-
-APPROACH_SHARE: Final = 0.3
-"""Largest velocity of an approach, as a part of its limit."""
-APPROACH_S: Final = 1.0
-"""Shortest ramp of an approach."""
-
-
-def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) -> Setpoints:
-    """Return the motion of one joint, alone, from where it stands to another place, slowly; positions by its own encoder.
-
-    Raises:
-        MotionError: it stands, or shall stand, outside of its travel.
-    """
-    low, high = limits.position_rad
-    for what, position in (("stands at", start_rad), ("shall go to", target_rad)):
-        if not low <= position <= high:
-            raise MotionError(
-                f"joint {joint}: {what} {position:.3f} rad, travel_rad is {low:g} to {high:g}: move it by hand"
-            )
-    distance = target_rad - start_rad
-    speed = min(APPROACH_SHARE * limits.velocity_rad_s, max(abs(distance) / APPROACH_S, 1e-6))
-    ramp, hold = round(APPROACH_S / PERIOD_S), round((abs(distance) / speed - APPROACH_S) / PERIOD_S)
-    rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, ramp + 1) / ramp)
-    shape = np.concatenate((rising, np.ones(max(hold, 0)), rising[::-1], np.zeros(1)))
-    velocity = shape * (distance / (float(shape.sum()) * PERIOD_S))
-    return Setpoints(joint, velocity, np.zeros(len(velocity)), current_joint=None)

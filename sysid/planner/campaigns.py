@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -25,9 +25,22 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.planner import single_joint
-from jtqd.sysid.planner.design import POPULATION, STARTS, Design, ExcitationLimits, design, draw
-from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Fourier, Plan, Plateau, Rest, Run, Segment
-from jtqd.sysid.planner.single_joint import Room, room_of
+from jtqd.sysid.planner.design import ExcitationLimits, design, starts_of
+from jtqd.sysid.planner.plan import (
+    BETWEEN_S,
+    DEFAULT_LIMITS,
+    EDGE_S,
+    Fourier,
+    Off,
+    Plan,
+    Point,
+    Run,
+    run_over,
+    trajectory_run,
+)
+from jtqd.sysid.planner.single_joint import HARMONICS, SHORTEST_S, MotionRange, range_of
+
+# Joints that are moved together ---------------------------------------------------------------------------------
 
 Pair = tuple[int, int]
 
@@ -45,11 +58,11 @@ class Unit:
         return f"joint{'s' if len(self.joints) > 1 else ''}_{'_'.join(map(str, self.joints))}"
 
     @property
-    def who(self) -> str:
+    def title(self) -> str:
         """For people: "joint 3", "joints 3 and 4"."""
         return f"joint{'s' if len(self.joints) > 1 else ''} {' and '.join(map(str, self.joints))}"
 
-    def refused(self, kind: str) -> str:
+    def refusal(self, kind: str) -> str:
         """Return why a campaign of this kind has no runs of these joints; "" where it has."""
         if kind == "efficiency" and len(self.joints) == 1:
             return (
@@ -62,12 +75,13 @@ class Unit:
             return f"no {what} {reference}; jtq campaign excitation needs none"
         return ""
 
-    def serves(self) -> str:
-        """Return what its runs can identify."""
+    @property
+    def purpose(self) -> str:
+        """What its runs can identify."""
         if not self.measured:
             return (
                 "no torque sensor: current, motion and temperature are recorded; jtq fit and jtq diagnose need a known load "
-                "beside them (jN.load of a column map)"
+                "(jN.load of a column map)"
             )
         if len(self.joints) == 1:
             return (
@@ -77,50 +91,47 @@ class Unit:
         return "on a towing bench: efficiency, losses, torsion"
 
 
-def said_of(units: Iterable[Unit], say: Callable[[Unit], str]) -> list[str]:
-    """Return what is said of each unit, a line for all those of which the same is said; nothing where it is ""."""
+def unit_lines(units: Iterable[Unit], text_of: Callable[[Unit], str]) -> list[str]:
+    """Return a line for all units with the same text; nothing for an empty text."""
     of: dict[str, list[str]] = {}
     for unit in units:
-        of.setdefault(say(unit), []).append(unit.who)
-    return [f"{'; '.join(who)}: {text}" for text, who in of.items() if text]
+        of.setdefault(text_of(unit), []).append(unit.title)
+    return [f"{'; '.join(titles)}: {text}" for text, titles in of.items() if text]
 
 
 def units_of(channels: Sequence[int | None], sensor: bool, towing: Iterable[Pair] = ()) -> tuple[Unit, ...]:
     """Return the units of a bus in the order of their first joints.
 
-    channels: of the sensor, for joints 1, 2, ...; sensor: there is one. towing: pairs that are said to be coupled.
+    channels: of the sensor, for joints 1, 2, ...; sensor: there is one. towing: pairs that the operator has coupled.
 
     Raises:
         ConfigError: a pair of joints that are not there, or of which one is in another pair.
     """
-    pairs: dict[int, Pair] = {}
     shared: dict[int, list[int]] = {}
     for number, channel in enumerate(channels, 1):
         if sensor and channel is not None:
             shared.setdefault(channel, []).append(number)
-    given = [(min(pair), max(pair)) for pair in towing]
-    found = [*given, *((one, two) for one, two in _pairs(shared.values()))]
-    for pair in dict.fromkeys(found):
+    pairs: dict[int, Pair] = {}
+    for pair in dict.fromkeys([*((min(each), max(each)) for each in towing), *_pairs(shared.values())]):
         for number in pair:
             if not 1 <= number <= len(channels):
                 raise ConfigError(
                     f"--towing: found joint {number}, expected joints of the bus, 1 to {len(channels)}"
                 )
             if number in pairs:
+                one, two = (sum(each) - number for each in (pairs[number], pair))
                 raise ConfigError(
-                    f"found joint {number} coupled with joints {_other(pairs[number], number)} and {_other(pair, number)}, "
-                    "expected one (sensor_channel, --towing)"
+                    f"found joint {number} coupled with joints {one} and {two}, expected one (sensor_channel, --towing)"
                 )
         pairs |= dict.fromkeys(pair, pair)
-    made = []
-    for number in range(1, len(channels) + 1):
-        joints = pairs.get(number, (number,))
-        if joints[0] == number:
-            made.append(Unit(joints, sensor and all(channels[each - 1] is not None for each in joints)))
-    return tuple(made)
+    return tuple(
+        Unit(joints, sensor and all(channels[each - 1] is not None for each in joints))
+        for number in range(1, len(channels) + 1)
+        if (joints := pairs.get(number, (number,)))[0] == number
+    )
 
 
-def _pairs(groups: Iterable[list[int]]) -> Iterable[Pair]:
+def _pairs(groups: Iterable[list[int]]) -> Iterator[Pair]:
     for group in groups:
         if len(group) > 2:
             raise ConfigError(
@@ -128,10 +139,6 @@ def _pairs(groups: Iterable[list[int]]) -> Iterable[Pair]:
             )
         if len(group) == 2:
             yield group[0], group[1]
-
-
-def _other(pair: Pair, number: int) -> int:
-    return pair[0] if pair[1] == number else pair[1]
 
 
 def check_joints(plan: Plan, units: Sequence[Unit]) -> None:
@@ -148,24 +155,24 @@ def check_joints(plan: Plan, units: Sequence[Unit]) -> None:
                 )
         unit = of[run.velocity_joint]
         if run.joints == unit.joints:
-            if len(unit.joints) < len(of) and any(
-                each.to_mapping()["kind"] == "power_off" for each in run.segments
-            ):
+            if len(unit.joints) < len(of) and any(isinstance(each, Off) for each in run.segments):
                 raise ConfigError(
-                    f"run '{run.name}': found power_off, expected none beside joints that must be held"
+                    f"run '{run.name}': found power_off, expected none where other joints must be held"
                 )
-            continue
-        if run.current_joint is None:
+        elif run.current_joint is None:
             raise ConfigError(
-                f"run '{run.name}': found joint {run.velocity_joint} moved alone, expected a run of {unit.who}: they are "
+                f"run '{run.name}': found joint {run.velocity_joint} moved alone, expected a run of {unit.title}: they are "
                 "coupled"
             )
-        one, two = run.joints
-        raise ConfigError(
-            f"run '{run.name}': found joints {one} and {two} driven against each other, expected joints that share a channel"
-            f" of the torque sensor; --towing {one},{two} says that they are coupled on a bench"
-        )
+        else:
+            one, two = run.joints
+            raise ConfigError(
+                f"run '{run.name}': found joints {one} and {two} driven against each other, expected joints that share a "
+                f"channel of the torque sensor; --towing {one},{two} says that they are coupled on a bench"
+            )
 
+
+# Constant velocity and load -------------------------------------------------------------------------------------
 
 VELOCITIES_RAD_S: Final = (0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0)
 """Section II of the paper."""
@@ -180,49 +187,53 @@ DRIVES: Final = {"forward_1": 1, "back_1": 2}
 RAMP_S: Final = 0.4
 HOLD_S: Final = 2.1
 _RAMP_PER_RAD_S: Final = 0.35
-"""Longer ramps for larger steps: 5.4 rad/s^2 at most, 7.5 Nm for both rotors of the bench, which come on top of the load."""
-_EDGE_S: Final = 0.5
+"""Longer ramps for larger steps: 5.4 rad/s^2 at most, 7.5 Nm for both rotors of the bench on top of the load."""
+_PLATEAU_EDGE_S: Final = 0.5
 _TRAVEL_SHARE: Final = 0.95
 """Part of the travel limit that is used: the joint overshoots a little."""
 
-Point = tuple[float, float]
-"""(velocity [rad/s], current [A])"""
 
-
-def currents_of(velocity_rad_s: float) -> tuple[float, ...]:
-    """Magnitudes of the driving joint's currents [A] at a velocity, by section II."""
-    return CURRENTS_A if abs(velocity_rad_s) <= FAST_RAD_S else CURRENTS_A[:-1]
-
-
-def ladder(
-    name: str, velocity_joint: int, points: Iterable[Point], hold_s: float, travel_rad: float = math.inf
+def plateau_run(
+    name: str,
+    velocity_joint: int,
+    points: Iterable[tuple[float, float]],
+    hold_s: float,
+    travel_rad: float = math.inf,
 ) -> Run:
-    """Return one run: from rest over all points, each held for hold_s after its ramp, back to rest.
+    """Return one run: from rest over all points (velocity [rad/s], current [A]), each held for hold_s, back to rest.
 
-    Before a point that would take the joint further than travel_rad from where the run began (with some room to stop
-    in), it turns back there without load; a smooth ramp covers the mean of its two velocities times its length.
+    Before a point that would take the joint further than travel_rad from where the run began (with room to stop in), it
+    turns back there without load.
     """
-    segments: list[Segment] = [Rest(_EDGE_S, 0.0)]
+    return run_over(name, velocity_joint, _turned_back(points, hold_s, travel_rad), _ramp_s, _PLATEAU_EDGE_S)
+
+
+def _turned_back(points: Iterable[tuple[float, float]], hold_s: float, travel_rad: float) -> Iterator[Point]:
+    """Yield the points and those that turn back; a smooth ramp covers the mean of its velocities times its length."""
     velocity = position = 0.0
     for target, current in points:
-        ramp_s = _ramp_s(target - velocity)
-        step = 0.5 * (velocity + target) * ramp_s + target * hold_s
+        step = 0.5 * (velocity + target) * _ramp_s(target - velocity) + target * hold_s
         to_stop = 0.5 * target * _ramp_s(target)
         if position and abs(position + step + to_stop) > _TRAVEL_SHARE * travel_rad:
             back = -math.copysign(abs(target), position)
-            ramp_s = _ramp_s(back - velocity)
-            position += 0.5 * (velocity + back) * ramp_s
-            ramp_out_s = _ramp_s(target - back)
-            hold_back_s = max(round(-(position + 0.5 * (back + target) * ramp_out_s) / back, 3), 0.0)
-            segments.append(Plateau(back, 0.0, hold_back_s, ramp_s))
+            position += 0.5 * (velocity + back) * _ramp_s(back - velocity)
+            ramp_out = 0.5 * (back + target) * _ramp_s(target - back)
+            hold_back_s = max(round(-(position + ramp_out) / back, 3), 0.0)
+            yield back, 0.0, hold_back_s
             position += back * hold_back_s
-            velocity, ramp_s = back, ramp_out_s
-            step = 0.5 * (velocity + target) * ramp_s + target * hold_s
-        segments.append(Plateau(target, current, hold_s, ramp_s))
+            step = ramp_out + target * hold_s
+        yield target, current, hold_s
         position += step
         velocity = target
-    segments.append(Rest(_EDGE_S, _ramp_s(velocity)))
-    return Run(name, velocity_joint, tuple(segments))
+
+
+def _ramp_s(step_rad_s: float) -> float:
+    return max(RAMP_S, round(_RAMP_PER_RAD_S * abs(step_rad_s), 3))
+
+
+def currents_of(velocity_rad_s: float) -> tuple[float, ...]:
+    """Return magnitudes of the driving joint's currents [A] at a velocity, by section II."""
+    return CURRENTS_A if abs(velocity_rad_s) <= FAST_RAD_S else CURRENTS_A[:-1]
 
 
 def efficiency_runs(
@@ -242,14 +253,14 @@ def efficiency_runs(
         for drive, joint in DRIVES.items():
             for letter, sign in (("p", 1.0), ("n", -1.0)):
                 points = [(sign * velocity, sign * current + 0.0) for current in currents]  # no "-0.0"
-                runs.append(ladder(f"{drive}_{letter}{velocity:g}", joint, points, hold_s, travel_rad))
+                runs.append(plateau_run(f"{drive}_{letter}{velocity:g}", joint, points, hold_s, travel_rad))
     return tuple(runs)
 
 
 def validation_runs(hold_s: float = HOLD_S) -> tuple[Run, ...]:
     """Section IV.A: a run per velocity and kind of drive; every current in both directions, one after the other."""
     return tuple(
-        ladder(
+        plateau_run(
             f"constant_{drive}_{velocity:g}",
             joint,
             [(sign * velocity, sign * current) for current in currents for sign in (1.0, -1.0)],
@@ -266,9 +277,7 @@ def slow_and_fast(velocities: Sequence[float]) -> list[float]:
     return [rising[n // 2] if n % 2 == 0 else rising[-1 - n // 2] for n in range(len(rising))]
 
 
-def _ramp_s(step_rad_s: float) -> float:
-    return max(RAMP_S, round(_RAMP_PER_RAD_S * abs(step_rad_s), 3))
-
+# Varying velocity and load --------------------------------------------------------------------------------------
 
 Joints = tuple[Joint, Joint] | None
 """Velocity joint and driving joint of the design; None: those that ship. Either order serves, the joints being alike."""
@@ -278,20 +287,12 @@ OnTried = Callable[[int], None]
 FULL_RAD_S: Final = 3.0
 MEDIUM_RAD_S: Final = 1.2
 SLOW_RAD_S: Final = 0.3
-"""Most of a trajectory with this peak lies below 0.2 rad/s, where friction is most of what is to be learned."""
+"""Most of a trajectory with this peak lies below 0.2 rad/s, where friction dominates."""
 CURRENT_A: Final = 5.0
 JOINT_CURRENT_A: Final = 8.0
 """Of the velocity joint, by the model of the design: rated current of the bench's drives, which limit theirs at 9 A."""
 _LIMIT_SHARE: Final = 0.9
 """Planned peaks as a part of the plan's limits: a controller overshoots, and a limit that is met ends the run."""
-
-EDGE_S: Final = 1.0
-BETWEEN_S: Final = 2.0
-"""At rest between two trajectories: section III of the paper."""
-SHORTEST_S: Final = 2.0
-"""Of one trajectory: below it, acceleration limits leave nothing of the velocity."""
-HARMONICS: Final = 5
-
 _SECOND_LEVELS: Final = (SLOW_RAD_S, MEDIUM_RAD_S, FULL_RAD_S)
 
 
@@ -314,28 +315,24 @@ def excitation_runs(
         ConfigError: runs too short for two trajectories.
     """
     duration_s = _trajectory_s(run_s, (2.0 * EDGE_S + BETWEEN_S), 2)
-    levels = [FULL_RAD_S] * count + [_second_level(k) for k in range(count)]
+    # the second level changes after each pair of runs, so that either joint is the velocity joint at every level
+    levels = [FULL_RAD_S] * count + [_SECOND_LEVELS[k // 2 % len(_SECOND_LEVELS)] for k in range(count)]
     fourier: dict[int, Fourier] = {}
     for level in dict.fromkeys(levels):
         places = [k for k, each in enumerate(levels) if each == level]
-        chosen = seed_of("excitation", level, seed)
         made = design(
             _design_limits(limits, level),
             count=len(places),
             duration_s=duration_s,
             harmonics=HARMONICS,
-            seed=chosen,
+            seed=seed_of("excitation", level, seed),
             evaluations=evaluations,
             joints=joints,
             on_progress=on_progress,
         )
-        fourier.update(zip(places, map(_segment, made), strict=True))
+        fourier.update(zip(places, (one.segment for one in made), strict=True))
     return tuple(
-        Run(
-            f"excitation_{k + 1:02d}",
-            1 + k % 2,
-            (*_rests(EDGE_S), fourier[k], *_rests(BETWEEN_S), fourier[count + k], *_rests(EDGE_S)),
-        )
+        trajectory_run(f"excitation_{k + 1:02d}", 1 + k % 2, fourier[k], fourier[count + k])
         for k in range(count)
     )
 
@@ -343,25 +340,14 @@ def excitation_runs(
 def variable_runs(
     limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
 ) -> tuple[Run, ...]:
-    """Section IV.B: `count` runs of one trajectory each, never to be trained on; the velocity joint alternates.
+    """Section IV.B: `count` runs of one drawn trajectory each, for validation only; the velocity joint alternates.
 
     Raises:
         ConfigError: runs too short for a trajectory.
     """
-    duration_s = _trajectory_s(run_s, 2.0 * EDGE_S, 1)
-    chosen = seed_of("variable", FULL_RAD_S, seed)
-    made = draw(
-        _design_limits(limits, FULL_RAD_S),
-        count=count,
-        duration_s=duration_s,
-        harmonics=HARMONICS,
-        seed=chosen,
-        joints=joints,
-    )
-    return tuple(
-        Run(f"variable_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), _segment(one), *_rests(EDGE_S)))
-        for k, one in enumerate(made)
-    )
+    drawn = seed_of("variable", FULL_RAD_S, seed)
+    wanted = _design_limits(limits, FULL_RAD_S)
+    return _drawn_runs("variable", wanted, count, run_s, seed=drawn, joints=joints)
 
 
 def outside_runs(
@@ -374,8 +360,7 @@ def outside_runs(
     load: float = 1.5,
     velocity_rad_s: float = FULL_RAD_S,
 ) -> tuple[Run, ...]:
-    """Return runs with `load` times the currents of any other campaign, or a higher peak velocity: what no model has been
-    trained on.
+    """Return runs outside of every training range: `load` times the currents of other campaigns, or a higher velocity.
 
     Raises:
         ConfigError: runs too short for a trajectory.
@@ -388,30 +373,29 @@ def outside_runs(
         joint_current_a=load * JOINT_CURRENT_A,
         torque_nm=_LIMIT_SHARE * limits.torque_nm,
     )
-    chosen = seed_of("outside", velocity_rad_s, seed)
-    made = draw(
-        wanted,
+    drawn = seed_of("outside", velocity_rad_s, seed)
+    return _drawn_runs("outside", wanted, count, run_s, seed=drawn, joints=joints)
+
+
+def _drawn_runs(
+    name: str, limits: ExcitationLimits, count: int, run_s: float, *, seed: int, joints: Joints
+) -> tuple[Run, ...]:
+    made = design(
+        limits,
         count=count,
         duration_s=_trajectory_s(run_s, 2.0 * EDGE_S, 1),
         harmonics=HARMONICS,
-        seed=chosen,
+        seed=seed,
+        evaluations=1,
         joints=joints,
     )
-    return tuple(
-        Run(f"outside_{k + 1:02d}", 1 + k % 2, (*_rests(EDGE_S), _segment(one), *_rests(EDGE_S)))
-        for k, one in enumerate(made)
-    )
+    return tuple(trajectory_run(f"{name}_{k + 1:02d}", 1 + k % 2, one.segment) for k, one in enumerate(made))
 
 
 def seed_of(purpose: str, level: float, seed: int) -> int:
-    """A seed of 32 bits for each purpose and level: no two of them share their random numbers, whatever `seed` is."""
+    """Return a seed of 32 bits for a purpose and level: no two of them share their random numbers, whatever `seed` is."""
     digest = hashlib.sha256(f"{purpose}/{level!r}/{seed}".encode()).digest()
     return int.from_bytes(digest[:4], "big")
-
-
-def _second_level(run: int) -> float:
-    """Changes after each pair of runs, so that either joint is the velocity joint at every level."""
-    return _SECOND_LEVELS[run // 2 % len(_SECOND_LEVELS)]
 
 
 def _trajectory_s(run_s: float, rests_s: float, trajectories: int) -> float:
@@ -424,14 +408,6 @@ def _trajectory_s(run_s: float, rests_s: float, trajectories: int) -> float:
     return duration_s
 
 
-def _rests(hold_s: float) -> tuple[Segment, ...]:
-    return (Rest(hold_s, 0.0),)  # it begins at rest: nothing to ramp
-
-
-def _segment(made: Design) -> Fourier:
-    return Fourier(made.velocity, made.current)
-
-
 def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
     """Well within the plan's limits, so that none of them ends a run."""
     return ExcitationLimits(
@@ -442,6 +418,8 @@ def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
         torque_nm=_LIMIT_SHARE * limits.torque_nm,
     )
 
+
+# Campaigns ------------------------------------------------------------------------------------------------------
 
 KINDS: Final = ("efficiency", "excitation", "validate")
 RUNS: Final = 24
@@ -457,14 +435,14 @@ _QUICK_CURRENTS: Final = (1.0, 2.5, 4.0)
 
 @dataclass(frozen=True)
 class Scale:
-    """How large a campaign is; None: as in the paper, or small with `quick`.
+    """Size of a campaign; None: as in the paper, or small with `quick`.
 
     Attributes:
         runs: number of Fourier runs. seconds: length of one. hold_s: of a point at constant velocity.
         seed: of the trajectories. evaluations: of each search.
         quick: a small campaign of the same kind: enough points for every fit, too few for a good one.
         limits: of the plan; the Fourier runs stay well within them.
-        joints: of the bench, for what a motion takes; None: those that ship.
+        joints: of the bench, for the torque of a motion; None: those that ship.
     """
 
     runs: int | None = None
@@ -476,10 +454,6 @@ class Scale:
     limits: Limits = DEFAULT_LIMITS
     joints: Joints = None
 
-    def of_pair(self, joints: Joints) -> Scale:
-        """Return the same for the pair of these joint files."""
-        return replace(self, joints=joints)
-
     def or_else(self, name: str, whole: Any, quick: Any) -> Any:
         """Return the value of an option: as given, else by the size of the campaign."""
         given = getattr(self, name)
@@ -487,55 +461,41 @@ class Scale:
 
     @property
     def motions_tried(self) -> int:
-        """How many motions an excitation campaign tries before it begins."""
+        """Number of motions that an excitation campaign tries before it begins."""
         evaluations: int = self.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS)
-        starts = STARTS if evaluations > POPULATION else 1
         runs: int = self.or_else("runs", RUNS, QUICK_RUNS)
-        return 2 * runs * starts * evaluations
+        return 2 * runs * starts_of(evaluations) * evaluations
 
 
 def make_plan(kind: str, scale: Scale, on_progress: OnTried | None = None) -> Plan:
-    """The plan of one of KINDS; on_progress is called with how many motions were tried, `scale.motions_tried` in all.
+    """Return the plan of one of KINDS for joints 1 and 2 on a towing bench.
+
+    on_progress: called with the number of motions tried, `scale.motions_tried` in all.
 
     Raises:
         ConfigError: a scale that leaves nothing to be driven.
     """
+    limits, hold_s = scale.limits, scale.or_else("hold_s", HOLD_S, 1.0)
+    count = scale.or_else("runs", RUNS, QUICK_RUNS)
     if kind == "efficiency":
-        runs = _efficiency(scale)
+        velocities = _QUICK_VELOCITIES if scale.quick else VELOCITIES_RAD_S
+        currents = _QUICK_CURRENTS if scale.quick else None
+        runs = efficiency_runs(velocities, hold_s, currents, limits.travel_rad)
     elif kind == "excitation":
-        runs = _excitation(scale, on_progress)
+        runs = excitation_runs(
+            limits,
+            count,
+            scale.or_else("seconds", 24.0, 10.0),
+            seed=scale.seed,
+            evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
+            joints=scale.joints,
+            on_progress=on_progress,
+        )
     else:
-        runs = _validate(scale)
-    return Plan(kind, scale.limits, runs)
-
-
-def _efficiency(scale: Scale) -> tuple[Run, ...]:
-    hold_s = scale.or_else("hold_s", HOLD_S, 1.0)
-    if scale.quick:
-        return efficiency_runs(_QUICK_VELOCITIES, hold_s, _QUICK_CURRENTS, scale.limits.travel_rad)
-    return efficiency_runs(hold_s=hold_s, travel_rad=scale.limits.travel_rad)
-
-
-def _excitation(scale: Scale, on_progress: OnTried | None) -> tuple[Run, ...]:
-    return excitation_runs(
-        scale.limits,
-        scale.or_else("runs", RUNS, QUICK_RUNS),
-        scale.or_else("seconds", 24.0, 10.0),
-        seed=scale.seed,
-        evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
-        joints=scale.joints,
-        on_progress=on_progress,
-    )
-
-
-def _validate(scale: Scale) -> tuple[Run, ...]:
-    return validation_runs(scale.or_else("hold_s", HOLD_S, 1.0)) + variable_runs(
-        scale.limits,
-        scale.or_else("runs", RUNS, QUICK_RUNS),
-        scale.or_else("seconds", 12.0, 6.0),
-        seed=scale.seed,
-        joints=scale.joints,
-    )
+        seconds = scale.or_else("seconds", 12.0, 6.0)
+        drawn = variable_runs(limits, count, seconds, seed=scale.seed, joints=scale.joints)
+        runs = validation_runs(hold_s) + drawn
+    return Plan(kind, limits, runs)
 
 
 def make_plan_of(
@@ -545,28 +505,28 @@ def make_plan_of(
     scale: Scale,
     on_progress: OnTried | None = None,
 ) -> Plan:
-    """The plan of one of KINDS for all units of a bus that can be moved so; joints: files of joints 1, 2, ...
+    """Return the plan of one of KINDS for all units of a bus that can be moved so; joints: files of joints 1, 2, ...
 
     Raises:
         ConfigError: nothing to be driven, or a joint that is moved alone without limits.
     """
-    able = [unit for unit in units if not unit.refused(kind)]
+    able = [unit for unit in units if not unit.refusal(kind)]
     if not able:
-        raise ConfigError("; ".join(said_of(units, lambda unit: unit.refused(kind))))
+        raise ConfigError("; ".join(unit_lines(units, lambda unit: unit.refusal(kind))))
     if [unit.joints for unit in units] == [(1, 2)]:
-        return make_plan(kind, scale.of_pair((joints[0], joints[1])), on_progress)
+        return make_plan(kind, replace(scale, joints=(joints[0], joints[1])), on_progress)
     runs: list[Run] = []
     limits: dict[int, Limits] = {}
     for unit in able:
         if len(unit.joints) == 2:
             one, two = unit.joints
-            of_pair = scale.of_pair((joints[one - 1], joints[two - 1]))
+            of_pair = replace(scale, joints=(joints[one - 1], joints[two - 1]))
             runs += [_driven_by(run, unit) for run in make_plan(kind, of_pair, on_progress).runs]
             continue
         [number] = unit.joints
-        room = room_of(number, joints[number - 1], scale.limits)
-        limits[number] = room.limits
-        runs += [replace(run, name=f"{unit.name}_{run.name}") for run in _alone(kind, number, room, scale)]
+        motion = range_of(number, joints[number - 1], scale.limits)
+        limits[number] = motion.limits
+        runs += [replace(run, name=f"{unit.name}_{run.name}") for run in _alone(kind, number, motion, scale)]
     return Plan(kind, scale.limits, tuple(runs), limits)
 
 
@@ -578,14 +538,15 @@ def _driven_by(run: Run, unit: Unit) -> Run:
     return Run(f"{unit.name}_{name}", mover, run.segments, driver)
 
 
-def _alone(kind: str, number: int, room: Room, scale: Scale) -> tuple[Run, ...]:
+def _alone(kind: str, number: int, motion: MotionRange, scale: Scale) -> tuple[Run, ...]:
     count: int = scale.or_else("runs", ALONE_RUNS, QUICK_ALONE_RUNS)
     seed = seed_of(f"alone/{kind}", float(number), scale.seed)
     if kind == "validate":
-        return single_joint.variable_runs(number, room, count, scale.or_else("seconds", 12.0, 6.0), seed=seed)
+        seconds = scale.or_else("seconds", 12.0, 6.0)
+        return single_joint.variable_runs(number, motion, count, seconds, seed=seed)
     return single_joint.excitation_runs(
         number,
-        room,
+        motion,
         count,
         scale.or_else("seconds", 24.0, 10.0),
         seed=seed,

@@ -6,8 +6,6 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, fields
 from pathlib import Path
 from typing import Final
@@ -17,12 +15,13 @@ import numpy as np
 from jtqd.estimator.checked import ConfigError, count, natural, seconds
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.planner.design import FINAL_RATE_HZ, STARTS, Bench, Design, ExcitationLimits, design
-from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Fourier, Plan, Rest, Run, check_plan
+from jtqd.sysid.planner.design import FINAL_RATE_HZ, STARTS, Bench, ExcitationLimits, design, starts_of
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Fourier, Plan, check_plan, segment_mapping, trajectory_run
+from jtqd.sysid.progress import bar
 
 EVALUATIONS: Final = 2000
 _LARGEST: Final = 1e4
-"""Of any limit, in its unit: beyond it nothing is a limit of a joint, and the search loses its digits."""
+"""Of any limit, in its unit: a larger one is no limit of a joint, and the search loses its digits."""
 LIMIT_OPTIONS: Final = {
     "velocity_rad_s": ("--velocity", "rad/s", "peak velocity, joint side"),
     "acceleration_rad_s2": ("--acceleration", "rad/s2", "peak acceleration, joint side"),
@@ -55,39 +54,34 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument("--count", type=count, metavar="N", help="runs (default 8)")
-    made.add_argument(
-        "--duration", type=seconds, default=20.0, metavar="S", help="length of a run (default 20)"
-    )
-    made.add_argument("--harmonics", type=count, default=5, metavar="N", help="of each series (default 5)")
-    made.add_argument("--seed", type=natural, default=0, metavar="N", help="same seed, same runs (default 0)")
-    made.add_argument(
+    add = made.add_argument
+    add("--count", type=count, default=8, metavar="N", help="runs (default 8)")
+    add("--duration", type=seconds, default=20.0, metavar="S", help="length of a run (default 20)")
+    add("--harmonics", type=count, default=5, metavar="N", help="of each series (default 5)")
+    add("--seed", type=natural, default=0, metavar="N", help="same seed, same runs (default 0)")
+    add(
         "--evaluations",
         type=count,
         metavar="N",
         default=EVALUATIONS,
         help=f"motions evaluated by a search (default {EVALUATIONS})",
     )
-    made.add_argument(
+    add(
         "--starts",
         type=count,
         metavar="N",
         help=f"searches per run, of which the best is used (default {STARTS})",
     )
-    made.add_argument(
+    add(
         "--joints",
         type=Path,
         nargs=2,
         metavar="FILE",
         help="joint files of velocity joint and driving joint (default: the shipped ones)",
     )
-    made.add_argument(
-        "--velocity-joint", type=int, choices=(1, 2), default=1, help="joint in velocity mode (default 1)"
-    )
-    made.add_argument(
-        "--out", type=Path, metavar="FILE", help="write the runs as a plan (jtq.plan/1) to this file"
-    )
-    made.add_argument("--json", action="store_true", help="print the result as JSON")
+    add("--velocity-joint", type=int, choices=(1, 2), default=1, help="joint in velocity mode (default 1)")
+    add("--out", type=Path, metavar="FILE", help="write the runs as a plan (jtq.plan/1) to this file")
+    add("--json", action="store_true", help="print the result as JSON")
     group = made.add_argument_group("limits that no run exceeds")
     for one in fields(ExcitationLimits):
         option, unit, text = LIMIT_OPTIONS[one.name]
@@ -102,68 +96,71 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-REST_S: Final = 1.0
-"""Rest before and after each motion; two in a row make the 2 s of the paper's section III."""
-
-
 def main(argv: list[str]) -> int:
     """Design the runs; exit status 0 done, 1 failure, 2 usage."""
     options = parser().parse_args(argv)
     try:
-        limits = ExcitationLimits(
-            **{one.name: getattr(options, one.name) for one in fields(ExcitationLimits)}
-        )
-        return _design(options, limits, _joints(options))
+        _design(options)
     except ConfigError as error:
         print(f"jtq excitation: {error}", file=sys.stderr)
+        return 1
     except OSError as error:
         print(
             f"jtq excitation: {error.filename or options.out or 'output'}: {error.strerror or error}",
             file=sys.stderr,
         )
-    return 1
+        return 1
+    return 0
 
 
 def _joints(options: argparse.Namespace) -> tuple[Joint, Joint]:
     """Return the velocity joint, driving joint."""
-    if options.joints is not None:
-        one, two = options.joints
-    else:
-        both = [shipped("joint1.yaml"), shipped("joint2.yaml")]
-        one, two = both if options.velocity_joint == 1 else both[::-1]
-    return load_joint(one), load_joint(two)
+    both = options.joints or [shipped("joint1.yaml"), shipped("joint2.yaml")]
+    if options.joints is None and options.velocity_joint == 2:
+        both.reverse()
+    return load_joint(both[0]), load_joint(both[1])
 
 
-def _design(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple[Joint, Joint]) -> int:
-    number, evaluations = options.count or 8, options.evaluations
+def _design(options: argparse.Namespace) -> None:
+    limits = ExcitationLimits(**{one.name: getattr(options, one.name) for one in fields(ExcitationLimits)})
+    joints = _joints(options)
     if options.out is not None:
         _require_within_campaign(limits)
         options.out.parent.mkdir(parents=True, exist_ok=True)
-    with _progress("designing", number * (options.starts or STARTS) * evaluations) as advance:
+    starts = options.starts or starts_of(options.evaluations)
+    with bar("designing", options.count * starts * options.evaluations) as advance:
         designs = design(
             limits,
-            count=number,
+            count=options.count,
             duration_s=options.duration,
             harmonics=options.harmonics,
             seed=options.seed,
-            evaluations=evaluations,
-            starts=options.starts,
+            evaluations=options.evaluations,
+            starts=starts,
             joints=joints,
             on_progress=advance,
         )
     if options.out is not None:
-        plan = as_plan(designs, options.velocity_joint)
+        runs = tuple(
+            trajectory_run(f"excitation_{k:02d}", options.velocity_joint, one.segment)
+            for k, one in enumerate(designs, 1)
+        )
+        plan = Plan("excitation", DEFAULT_LIMITS, runs)
         check_plan(plan)
         options.out.write_text(plan.to_yaml(), encoding="utf-8")
         print(f"jtq excitation: wrote {options.out}", file=sys.stderr)
-    peaks = [peaks_of(one, joints) for one in designs]
+    peaks = [_peaks(one.segment, joints) for one in designs]
     if options.json:
-        runs = [
-            {"segment": one.to_mapping(), "information_log_det": one.information_log_det, "peaks": peak}
+        found = [
+            {
+                "segment": segment_mapping(one.segment),
+                "information_log_det": one.information_log_det,
+                "peaks": peak,
+            }
             for one, peak in zip(designs, peaks, strict=True)
         ]
-        print(json.dumps({"schema": "jtq.excitation/1", "limits": asdict(limits), "runs": runs}))
-        return 0
+        print(json.dumps({"schema": "jtq.excitation/1", "limits": asdict(limits), "runs": found}))
+        return
     print(
         "peaks computed from the joint files; -log det of the information of all runs so far (lower is better)"
     )
@@ -171,25 +168,22 @@ def _design(options: argparse.Namespace, limits: ExcitationLimits, joints: tuple
     for k, (one, peak) in enumerate(zip(designs, peaks, strict=True), 1):
         cells = "".join(f"{peak[name]:8.2f}" for name in peak)
         print(f"{k:>5}{cells}{-one.information_log_det:>10.2f}")
-    return 0
 
 
 def _require_within_campaign(limits: ExcitationLimits) -> None:
-    """A plan stops the bench at the limits that it holds: no run in it may be allowed more. Raises ConfigError."""
-    for name in LIMIT_OPTIONS:
-        shared = "current_a" if name == "joint_current_a" else name
-        highest = getattr(DEFAULT_LIMITS, shared, math.inf)
+    """Refuse limits beyond those at which a campaign stops the bench. Raises ConfigError."""
+    for name, (option, _, _) in LIMIT_OPTIONS.items():
+        highest = getattr(DEFAULT_LIMITS, "current_a" if name == "joint_current_a" else name, math.inf)
         if getattr(limits, name) > highest:
             raise ConfigError(
-                f"{LIMIT_OPTIONS[name][0]}: found {getattr(limits, name):g}, expected at most {highest:g} in a plan: "
+                f"{option}: found {getattr(limits, name):g}, expected at most {highest:g} in a plan: "
                 "a campaign stops beyond it"
             )
 
 
-def peaks_of(one: Design, joints: tuple[Joint, Joint]) -> dict[str, float]:
-    """Largest magnitudes of a run at its set-points, by the names of the limits; torque by the joint files."""
-    duration = one.velocity.duration_s
-    time_s = np.linspace(0.0, duration, round(duration * FINAL_RATE_HZ) + 1)
+def _peaks(one: Fourier, joints: tuple[Joint, Joint]) -> dict[str, float]:
+    """Return the largest magnitudes of a run at its set-points, by the names of the limits; torque by the joint files."""
+    time_s = np.linspace(0.0, one.duration_s, round(one.duration_s * FINAL_RATE_HZ) + 1)
     position, velocity, acceleration = one.velocity.motion(time_s)
     current = one.current.value(time_s)
     values = {
@@ -200,31 +194,6 @@ def peaks_of(one: Design, joints: tuple[Joint, Joint]) -> dict[str, float]:
         "torque_nm": Bench(*joints).torque(current, velocity, acceleration),
     }
     return {name: float(np.abs(value).max()) for name, value in values.items()}
-
-
-def as_plan(designs: tuple[Design, ...], velocity_joint: int) -> Plan:
-    """Return a plan with one run per design, at rest before and after, within the campaigns' own limits."""
-    runs = tuple(
-        Run(
-            f"excitation_{k:02d}",
-            velocity_joint,
-            (Rest(REST_S, 0.0), Fourier(one.velocity, one.current), Rest(REST_S, 0.0)),
-        )
-        for k, one in enumerate(designs, 1)
-    )
-    return Plan("excitation", DEFAULT_LIMITS, runs)
-
-
-@contextmanager
-def _progress(text: str, total: int) -> Iterator[Callable[[int], None]]:
-    """Yield a bar on standard error, on a terminal only."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task(text, total=total)
-        yield lambda number: bar.advance(task, number)
 
 
 if __name__ == "__main__":

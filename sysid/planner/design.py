@@ -1,23 +1,24 @@
 """D-optimal excitation of two coupled joints: Fourier coefficients that determine the losses best within limits.
 
     designs = design(ExcitationLimits(), count=8, duration_s=20.0, seed=1)
-    segment = designs[0].to_mapping()          # the `fourier` segment of a plan (schema jtq.plan/1)
+    designs[0].segment                         # a Fourier segment of a plan
 
 One joint moves by velocity, the other one loads it with a current. A genome [4 H + 1] holds the amplitudes a, b of the
 velocity, a, b of the current and its offset, H harmonics each. Only its direction counts: `Candidates` scales it radially
 into the limits, with the torque that the joint files predict.
 
 The runs are designed one after the other, each for the information that it adds (sequential D-optimality): the first four
-of eight are a design of four. `draw` gives runs that are not optimised, for validation.
+of eight are a design of four. With one evaluation the coefficients are drawn, not optimised, as a validation needs them.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, fields
-from typing import Any, Final, NamedTuple
+from itertools import repeat
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,20 +29,27 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S, LossModel
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.planner.fourier import MAX_HARMONICS, FourierSeries, FourierTrajectory
+from jtqd.sysid.planner.plan import Fourier
 
 FUNDAMENTAL_HZ: Final = 0.1
 GOLDEN: Final = 0.5 * (1.0 + math.sqrt(5.0))
 REVERSAL_S: Final = 0.1
 REVERSAL_RAD_S: Final = 0.2
 REVERSAL_OVERSHOOT: Final = 0.2
-"""How far from a reversal in time the torque rings, the velocity from which Table I counts, and the overshoot as a part
-of the torque; time and overshoot as the emulated bench shows them at 5 A."""
+"""Time for which the torque rings about a reversal, the velocity from which Table I counts, and the overshoot as a part of
+the torque; time and overshoot as the emulated bench shows them at 5 A."""
 _BISECTIONS: Final = 12
+SEARCH_RATE_HZ: Final = 20.0
+"""Grid of the search: at least 40 instants in a period of the fastest harmonic (0.5 Hz with five of 0.1 Hz)."""
+FINAL_RATE_HZ: Final = 1000.0
+"""Grid of the final scaling: that of the set-points, so that none of them exceeds a limit."""
+SHORTEST_S: Final = 1.0
+LONGEST_S: Final = 600.0
 
 
 @dataclass(frozen=True)
 class ExcitationLimits:
-    """What no designed run may exceed; joint side, each > 0 (ConfigError otherwise).
+    """Limits of a designed run; joint side, each > 0 (ConfigError otherwise).
 
     Attributes:
         velocity_rad_s, acceleration_rad_s2: peaks of the velocity joint.
@@ -65,38 +73,21 @@ class ExcitationLimits:
                 raise ConfigError(f"limits: {one.name}: found {value!r}, expected a finite number > 0")
 
 
-class Motion(NamedTuple):
-    """Scaled candidates over the grid: every array [m, n].
-
-    velocity, acceleration of the velocity joint [rad/s, rad/s^2]; current of the driving joint [A]; torque between the
-    joints [Nm], positive along the positive current of either; `velocity_scale`, `current_scale` [m, 1] are what the
-    genome's amplitudes were multiplied with.
-    """
-
-    velocity: FloatArray
-    acceleration: FloatArray
-    current: FloatArray
-    torque: FloatArray
-    velocity_scale: FloatArray
-    current_scale: FloatArray
-
-
 class Bench:
     """Static model of two coupled joints: the first moves by velocity, the second drives it by current.
 
     In steady state the second joint, at i_2 and v_2 = -v_1, gives tau = G Kt i_2 - loss_2(i_2, v_2) (estimator/losses.pyx);
-    rotor and link inertia are added, stiffness and control are left out.
+    rotor and link inertia are added, stiffness and control are neglected.
     """
 
     def __init__(self, velocity_joint: Joint, driving_joint: Joint) -> None:
-        self._losses: Final = (LossModel(velocity_joint), LossModel(driving_joint))
-        self._rotor: Final = tuple(
-            j.gear_ratio**2 * j.rotor_inertia_kgm2 for j in (velocity_joint, driving_joint)
-        )
-        self._links: Final = tuple(j.link_inertia_kgm2 for j in (velocity_joint, driving_joint))
+        pair = (velocity_joint, driving_joint)
+        self._losses: Final = tuple(LossModel(joint) for joint in pair)
+        self._rotor: Final = tuple(j.gear_ratio**2 * j.rotor_inertia_kgm2 for j in pair)
+        self._links: Final = tuple(j.link_inertia_kgm2 for j in pair)
 
     def torque(self, current: FloatArray, velocity: FloatArray, acceleration: FloatArray) -> FloatArray:
-        """Torque between the joints [Nm] from the driving joint's current [A] and the velocity joint's motion.
+        """Return the torque between the joints [Nm] for a current of the driving joint [A] and a motion of the other.
 
         The loss belongs to the current less the part that accelerates the rotor, as in the estimator.
         """
@@ -108,7 +99,7 @@ class Bench:
     def torque_range(
         self, own_current_a: float, velocity: FloatArray, acceleration: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Least and largest torque [Nm] at which the velocity joint needs at most own_current_a for its motion.
+        """Return the least and largest torque [Nm] at which the velocity joint needs at most own_current_a.
 
         Its torque grows with its current, so the range of currents maps onto the range of torques by its ends.
         """
@@ -121,11 +112,27 @@ class Bench:
         return low, high
 
 
+class Motion(NamedTuple):
+    """Scaled candidates over the grid: every array [m, n].
+
+    velocity, acceleration of the velocity joint [rad/s, rad/s^2]; current of the driving joint [A]; torque between the
+    joints [Nm], positive along the positive current of either; `velocity_scale`, `current_scale` [m, 1]: factors of the
+    genome's amplitudes.
+    """
+
+    velocity: FloatArray
+    acceleration: FloatArray
+    current: FloatArray
+    torque: FloatArray
+    velocity_scale: FloatArray
+    current_scale: FloatArray
+
+
 class Candidates:
     """Turns genomes into motions that keep the limits, on one time grid.
 
     duration_s: length of a run; rate_hz: grid. The motion is linear in its amplitudes, so it is a product with matrices
-    that are made once.
+    that are computed once.
 
     Raises ConfigError for limits that leave no motion at all.
     """
@@ -146,18 +153,17 @@ class Candidates:
         self.dimension: Final = 4 * harmonics + 1
         self.omega_velocity, self.omega_current = fundamentals(duration_s)
         time_s = np.linspace(0.0, duration_s, round(duration_s * rate_hz) + 1)
-
         pair = 2 * harmonics
-        trajectories = [self._trajectory(c).motion(time_s) for c in _unit_vectors(pair)]
-        self._position, self._velocity, self._acceleration = (
-            np.array([one[order] for one in trajectories]) for order in range(3)
+        self._position, self._velocity, self._acceleration = unit_motions(
+            self.omega_velocity, harmonics, duration_s, time_s
         )
-        self._current: Final = np.array([self._series(c).value(time_s) for c in _unit_vectors(pair + 1)])
-
+        self._current: Final = np.array(
+            [self._series(tuple(c)).value(time_s) for c in np.eye(pair + 1).tolist()]
+        )
         self._refuse_too_weak()
 
     def _refuse_too_weak(self) -> None:
-        """The least that every motion needs: to drag the idle driving joint slowly either way, with its overshoot."""
+        """Refuse limits below what every motion needs: to drag the idle driving joint slowly, with its overshoot."""
         slow = min(REVERSAL_RAD_S, self.limits.velocity_rad_s)
         velocity, acceleration = np.array([[slow, -slow]]), np.zeros((1, 2))
         torque = self.bench.torque(np.zeros((1, 2)), velocity, acceleration) * (1.0 + REVERSAL_OVERSHOOT)
@@ -169,10 +175,6 @@ class Candidates:
                 f"{float(np.abs(torque).max()):.1f} Nm"
             )
 
-    def _trajectory(self, c: tuple[float, ...]) -> FourierTrajectory:
-        H = self.harmonics
-        return FourierTrajectory(self.omega_velocity, c[:H], c[H:], self.duration_s)
-
     def _series(self, c: tuple[float, ...]) -> FourierSeries:
         H = self.harmonics
         return FourierSeries(self.omega_current, c[:H], c[H:-1], self.duration_s, c[-1])
@@ -180,10 +182,9 @@ class Candidates:
     def motion(self, genomes: FloatArray) -> Motion:
         """Scale every genome [m, 4 H + 1] radially until a limit is active for the velocity and one for the current.
 
-        The velocity alone is scaled to its own three limits; it is made smaller still where the velocity joint could not
-        even drag the idle driving joint so. Then the current is scaled to its peak, or, where that asks too much of the
-        velocity joint or too much torque, to the largest scale found by bisection that does not. Both bisections keep
-        to the side of the limits.
+        The velocity alone is scaled to its own three limits, and further down where the velocity joint could not drag the
+        idle driving joint. Then the current is scaled to its peak, or, where that asks too much of the velocity joint or too
+        much torque, to the largest allowed scale. Both bisections stay on the allowed side.
         """
         limits, pair = self.limits, 2 * self.harmonics
         velocity, acceleration = genomes[:, :pair] @ self._velocity, genomes[:, :pair] @ self._acceleration
@@ -196,7 +197,13 @@ class Candidates:
             ]
         )
         i_scale = limits.current_a / _peak(current)
-        v_scale = _largest(v_scale, lambda s, k: self._idle_allowed(s * velocity[k], s * acceleration[k]))
+
+        def idle_allowed(scale: FloatArray, rows: NDArray[np.intp]) -> NDArray[np.bool_]:
+            v, a = scale * velocity[rows], scale * acceleration[rows]
+            low, high = self._torque_range(v, a)
+            return _between(low, self.bench.torque(np.zeros_like(v), v, a), high)
+
+        v_scale = _largest(v_scale, idle_allowed)
         velocity, acceleration = v_scale * velocity, v_scale * acceleration
         hardest, margin = _at_reversal(velocity, acceleration, current)
         low, high = self._torque_range(hardest, acceleration)
@@ -212,53 +219,39 @@ class Candidates:
         return Motion(velocity, acceleration, current, torque, v_scale, i_scale)
 
     def _torque_range(self, velocity: FloatArray, acceleration: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Least and largest torque [Nm] that keeps both the torque's limit and that of the velocity joint's current."""
+        """Return the least and largest torque [Nm] by its own limit and that of the velocity joint's current."""
         low, high = self.bench.torque_range(self.limits.joint_current_a, velocity, acceleration)
         limit = self.limits.torque_nm
         return np.maximum(low, -limit), np.minimum(high, limit)
 
-    def _idle_allowed(self, velocity: FloatArray, acceleration: FloatArray) -> NDArray[np.bool_]:
-        """Return whether the motion is allowed while the driving joint has no current, [m] of arrays [m, n]."""
-        torque = self.bench.torque(np.zeros_like(velocity), velocity, acceleration)
-        low, high = self._torque_range(velocity, acceleration)
-        return _between(low, torque, high)
-
-    def series(self, genome: FloatArray) -> tuple[FourierTrajectory, FourierSeries, Motion]:
-        """Return the scaled run of one genome [4 H + 1], as series and over the grid ([1, n])."""
+    def segment(self, genome: FloatArray) -> tuple[Fourier, Motion]:
+        """Return the scaled run of one genome [4 H + 1], as a segment and over the grid ([1, n])."""
         motion = self.motion(genome[None, :])
         H = self.harmonics
         v = tuple((float(motion.velocity_scale[0, 0]) * genome[: 2 * H]).tolist())
         i = tuple((float(motion.current_scale[0, 0]) * genome[2 * H :]).tolist())
-        return self._trajectory(v), self._series(i), motion
+        trajectory = FourierTrajectory(self.omega_velocity, v[:H], v[H:], self.duration_s)
+        return Fourier(trajectory, self._series(i)), motion
 
 
-_STEPS: Final = 200
-_OVER: Final = 3.0
-"""Largest current tried, in torques over G Kt."""
-
-
-def current_at(joint: Joint, torque_nm: float, velocity_rad_s: float) -> float:
-    """Current [A] at which the joint, driving at this velocity, gives this torque; of the loss, the largest on the way."""
-    loss = LossModel(joint)
-    highest = _OVER * torque_nm / loss.torque_per_ampere
-    currents = np.linspace(0.0, highest, _STEPS)
-    speeds = np.full_like(currents, velocity_rad_s)
-    given = loss.torque_per_ampere * currents - loss.loss_many(currents, speeds)
-    enough = np.flatnonzero(given >= torque_nm)
-    return float(currents[enough[0]] if len(enough) else highest)
-
-
-def rounded_down(value: float) -> float:
-    """Two significant digits after rounding down: limits are read by people."""
-    place = 10.0 ** (math.floor(math.log10(value)) - 1)
-    return float(round(math.floor(value / place + 1e-9) * place, 6))
+def unit_motions(
+    omega_rad_s: float, harmonics: int, duration_s: float, time_s: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return position, velocity, acceleration [2 H, n] of the trajectories with a single amplitude of 1."""
+    H = harmonics
+    motions = [
+        FourierTrajectory(omega_rad_s, tuple(c[:H]), tuple(c[H:]), duration_s).motion(time_s)
+        for c in np.eye(2 * H).tolist()
+    ]
+    position, velocity, acceleration = (np.array([one[order] for one in motions]) for order in range(3))
+    return position, velocity, acceleration
 
 
 def fundamentals(duration_s: float) -> tuple[float, float]:
-    """Angular frequencies [rad/s] of velocity and current: whole periods of about 10 s, and that over the golden ratio.
+    """Return angular frequencies [rad/s] of velocity and current: whole periods of about 10 s, and over the golden ratio.
 
-    The golden ratio is the number that fractions approach worst: harmonics of the two never stay in step, so that all
-    four quadrants of velocity and torque fill.
+    Fractions approach the golden ratio worst: harmonics of the two never stay in step, so that all four quadrants of
+    velocity and torque fill.
     """
     velocity = 2.0 * math.pi * max(1.0, round(FUNDAMENTAL_HZ * duration_s)) / duration_s
     return velocity, velocity / GOLDEN
@@ -267,23 +260,19 @@ def fundamentals(duration_s: float) -> tuple[float, float]:
 def _at_reversal(
     velocity: FloatArray, acceleration: FloatArray, current: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Velocity to check the limits with, and the factor by which the torque must keep away from them; [m, n] each.
+    """Return the velocity to check the limits with, and the margin of the torque to them as a factor; [m, n] each.
 
-    When the driving joint turns from driving to being driven under load, its loss changes sides: the torque leaps by a
-    half and rings, since the velocity loop has to follow. Within REVERSAL_S of a reversal the check therefore takes the
-    side with the larger torque and leaves REVERSAL_OVERSHOOT for the ringing.
+    When the driving joint turns from driving to being driven under load, its loss changes sides: the torque jumps by half
+    and rings. Within REVERSAL_S of a reversal the check therefore takes the side with the larger torque and leaves
+    REVERSAL_OVERSHOOT for the ringing.
     """
     close = np.abs(velocity) < np.maximum(REVERSAL_RAD_S, REVERSAL_S * np.abs(acceleration))
     driven = np.where(current >= 0.0, REVERSAL_RAD_S, -REVERSAL_RAD_S)  # v_2 = -v_1 against its current
     return np.where(close, driven, velocity), np.where(close, 1.0 + REVERSAL_OVERSHOOT, 1.0)
 
 
-def _unit_vectors(count: int) -> list[tuple[float, ...]]:
-    return [tuple(row) for row in np.eye(count).tolist()]
-
-
 def _peak(values: FloatArray) -> FloatArray:
-    """Return the largest size of each row, [m, 1], never zero: a genome of zeros stays at rest."""
+    """Return the largest magnitude of each row, [m, 1], never zero: a genome of zeros stays at rest."""
     return np.asarray(np.maximum(np.abs(values).max(axis=1, keepdims=True), 1e-12))
 
 
@@ -295,10 +284,9 @@ def _between(low: FloatArray, value: FloatArray, high: FloatArray) -> NDArray[np
 def _largest(
     scale: FloatArray, allowed: Callable[[FloatArray, NDArray[np.intp]], NDArray[np.bool_]]
 ) -> FloatArray:
-    """Return each row's scale [m, 1], or where it is not allowed the largest that bisection finds below.
+    """Return each row's scale [m, 1], or where it is not allowed the largest allowed one that bisection finds below.
 
-    allowed(scale [k, 1], rows [k]) tells whether these rows may have this scale; scale 0 must be allowed. The result
-    has been asked and allowed, unless it is 0.
+    allowed(scale [k, 1], rows [k]): whether these rows may have this scale; scale 0 must be allowed.
     """
     rows = np.flatnonzero(~allowed(scale, np.arange(len(scale))))
     if not len(rows):
@@ -313,6 +301,69 @@ def _largest(
     return result
 
 
+# Information ----------------------------------------------------------------------------------------------------
+
+STRIBECK_VELOCITY_RAD_S: Final = 0.05
+_RIDGE: Final = 1e-9
+"""Added to the diagonal of the information, whose columns have a mean square near 1: a run that leaves out a quadrant
+gets a bad log det in place of an infinite one; that of a useful run changes by less than 0.001."""
+
+
+def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatArray:
+    """Return the 20 columns of the loss model [..., 20] at velocities [rad/s] and joint torques [Nm] of one shape [...].
+
+    Per direction of motion d and, in it, per quadrant q (driving or back-driven), with s = tanh(v/0.02):
+
+        loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2)) + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
+
+    The estimator's own loss (estimator/losses.pyx) is finer in the load: lines between nodes. The few coefficients of a
+    polynomial make a better design: they need the ends and the middle of every range. At the same instant the other joint
+    has (-v, tau), which only permutes columns and changes signs: one determinant serves both joints.
+
+    Order: direction positive, then negative; in each 4 columns of speed, 3 of load driving (tau v >= 0), 3 back-driven.
+    """
+    v, tau = velocity_rad_s, torque_nm
+    s = np.tanh(v / DIRECTION_VELOCITY_RAD_S)
+    load, speed = np.abs(tau), np.abs(v)
+    own = np.stack([s, speed * s, v * speed, s * np.exp(-np.square(v / STRIBECK_VELOCITY_RAD_S))], axis=-1)
+    loaded = np.stack([load * s, load * load * s, load * speed * s], axis=-1)
+    driving = tau * v >= 0.0
+    blocks = []
+    for side in (v >= 0.0, v < 0.0):
+        blocks.append(own * side[..., None])
+        blocks += [loaded * (side & quadrant)[..., None] for quadrant in (driving, ~driving)]
+    return np.concatenate(blocks, axis=-1)
+
+
+class Information:
+    """Information matrices with fixed scales: the mean square of each column over the box of velocity and torque.
+
+    velocity_rad_s, torque_nm: half widths of the box. The scales shift every log det by the same amount and leave the
+    optimum unchanged; they make the numbers readable and the matrices well conditioned.
+    """
+
+    def __init__(self, velocity_rad_s: float, torque_nm: float) -> None:
+        # fine in velocity for the narrow Stribeck column
+        grid = np.meshgrid(
+            velocity_rad_s * np.linspace(-1.0, 1.0, 1000), torque_nm * np.linspace(-1.0, 1.0, 20)
+        )
+        v, tau = (axis.ravel() for axis in grid)
+        self._scale: Final = np.sqrt(np.mean(np.square(loss_regressor(v, tau)), axis=0))
+
+    def of(self, velocity: FloatArray, torque: FloatArray) -> FloatArray:
+        """Return X^T X / n [m, 20, 20] of m runs over n instants, [m, n] each, columns scaled."""
+        X = loss_regressor(velocity, torque) / self._scale
+        product: FloatArray = np.matmul(X.transpose(0, 2, 1), X) / X.shape[1]
+        return product
+
+
+def log_det(information: FloatArray) -> FloatArray:
+    """Return the log of the determinant of [..., p, p], finite also where a quadrant is missing; higher is better."""
+    return np.asarray(np.linalg.slogdet(information + _RIDGE * np.eye(information.shape[-1]))[1])
+
+
+# Search ---------------------------------------------------------------------------------------------------------
+
 Criterion = Callable[[FloatArray], FloatArray]
 """Values [m], lower is better, of genomes [m, d] in [-1, 1]; may be infinite, never NaN."""
 
@@ -323,10 +374,10 @@ RECOMBINATION: Final = 0.9
 """Of the differential evolution (docs/fit.md has the comparison). scipy's own settings take four times as many
 evaluations for a design as good."""
 POLISHING: Final = 0.1
-"""Share of the evaluations that is kept for walking downhill from the best genome: a design gains nothing more from it
-than from as much evolution, but where the criterion is smooth the minimum is reached, not only approached."""
+"""Share of the evaluations for the descent from the best genome, which reaches the minimum where the criterion is smooth."""
 _SLOPE_STEP: Final = 1e-3
-"""Of the differences that the slope is made of: above the steps of a scale that bisection finds (1/4096)."""
+"""Of the differences for the slope: above the steps of a scale that bisection finds (1/4096)."""
+STARTS: Final = 3
 
 
 class Found(NamedTuple):
@@ -339,8 +390,8 @@ class Found(NamedTuple):
 def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.random.Generator) -> Found:
     """Return the best genome of a search of at most `evaluations` (>= 1); the same generator state gives the same result.
 
-    Below two populations the genomes are drawn uniformly, POPULATION at most; beyond it they evolve (scipy's
-    differential evolution, whole generations of POPULATION), and the last tenth polishes the best of them.
+    Below two populations the genomes are drawn uniformly, POPULATION at most; beyond it they evolve (scipy's differential
+    evolution, whole generations of POPULATION), and the last tenth polishes the best of them.
 
     Raises:
         ValueError: evaluations below 1.
@@ -376,11 +427,11 @@ def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.
 
 
 class _SpentError(Exception):
-    """The evaluations are spent; scipy's own limit is looked at between two lines only."""
+    """The evaluations are spent; scipy checks its own limit between two lines only."""
 
 
 def _polished(criterion: Criterion, found: Found, evaluations: int) -> Found:
-    """Return the best of a walk downhill from a genome (L-BFGS-B); a slope takes one evaluation per gene and one more."""
+    """Return the best of a descent from a genome (L-BFGS-B); a slope takes one evaluation per gene and one more."""
     from scipy.optimize import minimize
 
     best, left = found, evaluations
@@ -412,181 +463,56 @@ def _polished(criterion: Criterion, found: Found, evaluations: int) -> Found:
     return best
 
 
-STRIBECK_VELOCITY_RAD_S: Final = 0.05
-_RIDGE: Final = 1e-9
-"""Added to the diagonal of the information, whose columns have a mean square near 1: a run that leaves out a quadrant
-gets a bad log det in place of an infinite one; that of a useful run changes by less than 0.001."""
+class Problem(Protocol):
+    """What is searched for one trajectory."""
+
+    @property
+    def dimension(self) -> int:
+        """Length of a genome."""
+
+    def criterion(self, before: FloatArray) -> Criterion:
+        """Return -log det of the information so far [p, p] plus that of each candidate, as a function of genomes."""
+
+    def finish(self, genome: FloatArray, before: FloatArray) -> tuple[Fourier, FloatArray]:
+        """Return the segment of a genome [d], scaled on the grid of the set-points, and the information so far with it."""
 
 
-def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatArray:
-    """Return the 20 columns of the loss model [..., 20] at velocities [rad/s] and joint torques [Nm] of one shape [...].
+Search = Callable[[Criterion, int, np.random.Generator], Found]
+"""(criterion, dimension, generator) -> the best genome found."""
 
-    Per direction of motion d and, in it, per quadrant q (driving or back-driven), with s = tanh(v/0.02):
 
-        loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2)) + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
+def sequence(problems: Iterable[Problem], search: Search, *, seed: int) -> list[tuple[Fourier, FloatArray]]:
+    """Return a trajectory for each problem, the best one given those before it, and the information up to it.
 
-    The estimator's own loss (estimator/losses.pyx) is finer in the load: lines between nodes. For a design the few
-    coefficients of a polynomial do better: they ask for the ends and the middle of every range. At the same instant the
-    other joint has (-v, tau), which only changes places and signs of the columns: one determinant serves both joints.
-
-    Order: direction positive, then negative; in each 4 columns of speed, 3 of load driving (tau v >= 0), 3 back-driven.
+    Trajectory k of a seed has its own random numbers, whatever their number.
     """
-    v, tau = velocity_rad_s, torque_nm
-    s = np.tanh(v / DIRECTION_VELOCITY_RAD_S)
-    load, speed = np.abs(tau), np.abs(v)
-    own = np.stack([s, speed * s, v * speed, s * np.exp(-np.square(v / STRIBECK_VELOCITY_RAD_S))], axis=-1)
-    loaded = np.stack([load * s, load * load * s, load * speed * s], axis=-1)
-    driving = tau * v >= 0.0
-    blocks = []
-    for side in (v >= 0.0, v < 0.0):
-        blocks.append(own * side[..., None])
-        blocks += [loaded * (side & quadrant)[..., None] for quadrant in (driving, ~driving)]
-    return np.concatenate(blocks, axis=-1)
+    designed: list[tuple[Fourier, FloatArray]] = []
+    information: FloatArray = np.zeros((1, 1))
+    for k, problem in enumerate(problems):
+        rng = np.random.default_rng([seed, k])
+        found = search(problem.criterion(information), problem.dimension, rng)
+        segment, information = problem.finish(found.genome, information)
+        designed.append((segment, information))
+    return designed
 
 
-class Information:
-    """Information matrices with fixed scales: the mean square of each column over the box of velocity and torque.
-
-    velocity_rad_s, torque_nm: half widths of the box. The scale is a constant, so it shifts every log det by the same
-    amount; it makes them readable and the matrices well scaled. Without it an optimum would be the same.
-    """
-
-    def __init__(self, velocity_rad_s: float, torque_nm: float) -> None:
-        # fine in velocity for the narrow Stribeck column
-        grid = np.meshgrid(
-            velocity_rad_s * np.linspace(-1.0, 1.0, 1000), torque_nm * np.linspace(-1.0, 1.0, 20)
-        )
-        v, tau = (axis.ravel() for axis in grid)
-        self._scale: Final = np.sqrt(np.mean(np.square(loss_regressor(v, tau)), axis=0))
-
-    def of(self, velocity: FloatArray, torque: FloatArray) -> FloatArray:
-        """Return X^T X / n [m, 20, 20] of m runs over n instants, [m, n] each, columns scaled."""
-        X = loss_regressor(velocity, torque) / self._scale
-        product: FloatArray = np.matmul(X.transpose(0, 2, 1), X) / X.shape[1]
-        return product
-
-
-def log_det(information: FloatArray) -> FloatArray:
-    """Natural log of the determinant of [..., 20, 20], finite also where a quadrant is missing; higher is better."""
-    return np.asarray(np.linalg.slogdet(information + _RIDGE * np.eye(information.shape[-1]))[1])
-
-
-def condition(information: FloatArray) -> float:
-    """Condition number of the scaled regressor, the root of that of its information [20, 20]."""
-    return float(np.sqrt(np.linalg.cond(information)))
-
-
-Search = Callable[[Criterion, int, int, np.random.Generator], Found]
-"""(criterion, dimension, evaluations, generator) -> the best genome found."""
-
-STARTS: Final = 3
-SEARCH_RATE_HZ: Final = 20.0
-"""Grid of the search: at least 40 instants in a period of the fastest harmonic (0.5 Hz with five of 0.1 Hz)."""
-FINAL_RATE_HZ: Final = 1000.0
-"""Grid of the final scaling: that of the set-points, so that none of them exceeds a limit."""
-SHORTEST_S: Final = 1.0
-LONGEST_S: Final = 600.0
+# Two coupled joints ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Design:
-    """One run of the excitation: motion of the velocity joint and current of the driving joint.
+    """One trajectory of the excitation of two coupled joints.
 
-    Attributes:
-        velocity, current: the two series, of the same duration.
-        information_log_det: log det of the scaled information of all runs so far, this one included; grows with every
-            run. It compares designs for the same limits; its zero has no meaning of its own.
+    information_log_det: of the scaled information of all trajectories so far; grows with every one. It compares designs for
+    the same limits; its zero has no meaning.
     """
 
-    velocity: FourierTrajectory
-    current: FourierSeries
+    segment: Fourier
     information_log_det: float
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the `fourier` segment of a plan: plain numbers, ready for YAML."""
-        return {
-            "kind": "fourier",
-            "velocity": self.velocity.to_mapping(),
-            "current": self.current.to_mapping(),
-            "duration_s": self.velocity.duration_s,
-        }
 
-
-def design(
-    limits: ExcitationLimits,
-    *,
-    count: int,
-    duration_s: float,
-    harmonics: int = 5,
-    seed: int = 0,
-    evaluations: int = 2000,
-    starts: int | None = None,
-    joints: tuple[Joint, Joint] | None = None,
-    on_progress: Callable[[int], None] | None = None,
-) -> tuple[Design, ...]:
-    """Return `count` runs of duration_s seconds each, every one within the limits and with at least one limit reached.
-
-    Args:
-        limits: what no run may exceed at any set-point of 1 kHz.
-        count: number of runs, >= 1. duration_s: length of each, 1 to 600 s. harmonics: of velocity and of current.
-        seed: the same arguments give the same runs.
-        evaluations: most motions that each search tries, >= 1.
-        starts: independent searches for each run, of which the best counts. None: 3, or 1 where there are so few
-            evaluations that nothing would be searched but only drawn.
-        joints: velocity joint and driving joint; None: the two that ship. They give the torque of a current and the
-            current of a motion.
-        on_progress: called after each batch with the number of motions tried since the last call.
-
-    Raises:
-        ConfigError: an argument is out of range, or scipy is needed (more than one generation) and not installed.
-    """
-    if starts is None:
-        starts = STARTS if evaluations > POPULATION else 1
-    _check_range("count", count, 1, 1000)
-    _check_range("evaluations", evaluations, 1, 10_000_000)
-    _check_range("starts", starts, 1, 1000)
-
-    def search(criterion: Criterion, dimension: int, evaluations: int, rng: np.random.Generator) -> Found:
-        generators = rng.spawn(starts or 1)
-        found = [minimise(criterion, dimension, evaluations=evaluations, rng=each) for each in generators]
-        return min(found, key=lambda one: one.value)
-
-    return sequence(
-        Problem(limits, duration_s=duration_s, harmonics=harmonics, joints=joints, on_progress=on_progress),
-        search,
-        count=count,
-        seed=seed,
-        evaluations=evaluations,
-    )[0]
-
-
-def draw(
-    limits: ExcitationLimits,
-    *,
-    count: int,
-    duration_s: float,
-    harmonics: int = 5,
-    seed: int = 0,
-    joints: tuple[Joint, Joint] | None = None,
-) -> tuple[Design, ...]:
-    """Return runs with random coefficients within the same limits: the first that are drawn, chosen by nothing.
-
-    Arguments and errors as `design`.
-    """
-    return design(
-        limits,
-        count=count,
-        duration_s=duration_s,
-        harmonics=harmonics,
-        seed=seed,
-        evaluations=1,
-        starts=1,
-        joints=joints,
-    )
-
-
-class Problem:
-    """Limits and joints of a design task, with the matrices that its evaluation needs.
+class CoupledJoints:
+    """Problem of one trajectory of two coupled joints, with the matrices that its evaluation needs.
 
     Raises:
         ConfigError: duration or harmonics out of range.
@@ -604,15 +530,13 @@ class Problem:
         _check_range("duration_s", duration_s, SHORTEST_S, LONGEST_S)
         _check_range("harmonics", harmonics, 1, MAX_HARMONICS)
         bench = Bench(*(joints or (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))))
-        coarse, fine = (
+        self._coarse, self._fine = (
             Candidates(bench, limits, duration_s=duration_s, harmonics=harmonics, rate_hz=rate_hz)
             for rate_hz in (SEARCH_RATE_HZ, FINAL_RATE_HZ)
         )
-        self._coarse: Final = coarse
-        self._fine: Final = fine
         self._information: Final = Information(limits.velocity_rad_s, limits.torque_nm)
         self._on_progress: Final = on_progress
-        self.dimension: Final = coarse.dimension
+        self.dimension: Final = self._coarse.dimension
 
     def criterion(self, before: FloatArray) -> Criterion:
         """Return -log det of the information so far [20, 20] plus that of each candidate, as a function of genomes."""
@@ -625,31 +549,86 @@ class Problem:
 
         return value
 
-    def finish(
-        self, genome: FloatArray, before: FloatArray
-    ) -> tuple[FourierTrajectory, FourierSeries, FloatArray]:
-        """Scale a genome [d] on the fine grid; return its series and the information so far with it."""
-        velocity, current, motion = self._fine.series(genome)
-        return velocity, current, before + self._information.of(motion.velocity, motion.torque)[0]
+    def finish(self, genome: FloatArray, before: FloatArray) -> tuple[Fourier, FloatArray]:
+        """Return the segment of a genome [d] and the information so far with it."""
+        segment, motion = self._fine.segment(genome)
+        return segment, before + self._information.of(motion.velocity, motion.torque)[0]
 
 
-def sequence(
-    problem: Problem, search: Search, *, count: int, seed: int, evaluations: int
-) -> tuple[tuple[Design, ...], FloatArray]:
-    """Design `count` runs one after the other by any search; return them and their common information [20, 20].
+def design(
+    limits: ExcitationLimits,
+    *,
+    count: int,
+    duration_s: float,
+    harmonics: int = 5,
+    seed: int = 0,
+    evaluations: int = 2000,
+    starts: int | None = None,
+    joints: tuple[Joint, Joint] | None = None,
+    on_progress: Callable[[int], None] | None = None,
+) -> tuple[Design, ...]:
+    """Return `count` trajectories of duration_s seconds, every one within the limits and with at least one limit reached.
 
-    Run k of a seed has its own random numbers, whatever the number of runs.
+    Args:
+        limits: which no trajectory exceeds at any set-point of 1 kHz.
+        count: number of trajectories, >= 1. duration_s: length of each, 1 to 600 s. harmonics: of velocity and of current.
+        seed: the same arguments give the same trajectories.
+        evaluations: most motions that each search tries, >= 1; 1: the coefficients are drawn.
+        starts: independent searches for each trajectory, of which the best counts. None: 3, or 1 for so few evaluations
+            that nothing is searched.
+        joints: velocity joint and driving joint; None: the two that ship. They give the torque of a current and the
+            current of a motion.
+        on_progress: called after each batch with the number of motions tried since the last call.
+
+    Raises:
+        ConfigError: an argument is out of range, or scipy is needed (more than one generation) and not installed.
     """
-    designs: list[Design] = []
-    information: FloatArray = np.zeros((1, 1))
-    for k in range(count):
-        rng = np.random.default_rng([seed, k])
-        found = search(problem.criterion(information), problem.dimension, evaluations, rng)
-        velocity, current, information = problem.finish(found.genome, information)
-        designs.append(Design(velocity, current, float(log_det(information))))
-    return tuple(designs), information
+    starts = starts_of(evaluations) if starts is None else starts
+    _check_range("count", count, 1, 1000)
+    _check_range("evaluations", evaluations, 1, 10_000_000)
+    _check_range("starts", starts, 1, 1000)
+
+    def search(criterion: Criterion, dimension: int, rng: np.random.Generator) -> Found:
+        generators = rng.spawn(starts)
+        found = [minimise(criterion, dimension, evaluations=evaluations, rng=each) for each in generators]
+        return min(found, key=lambda one: one.value)
+
+    problem = CoupledJoints(
+        limits, duration_s=duration_s, harmonics=harmonics, joints=joints, on_progress=on_progress
+    )
+    designed = sequence(repeat(problem, count), search, seed=seed)
+    return tuple(Design(segment, float(log_det(information))) for segment, information in designed)
+
+
+def starts_of(evaluations: int) -> int:
+    """Return the number of searches for a trajectory: one where so few evaluations only draw."""
+    return STARTS if evaluations > POPULATION else 1
 
 
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise ConfigError(f"{name}: found {value!r}, expected {low:g} to {high:g}")
+
+
+# Currents of a torque -------------------------------------------------------------------------------------------
+
+_STEPS: Final = 200
+_OVER: Final = 3.0
+"""Largest current tried, in torques over G Kt."""
+
+
+def current_at(joint: Joint, torque_nm: float, velocity_rad_s: float) -> float:
+    """Return the current [A] at which the joint, driving at this velocity, gives this torque."""
+    loss = LossModel(joint)
+    highest = _OVER * torque_nm / loss.torque_per_ampere
+    currents = np.linspace(0.0, highest, _STEPS)
+    speeds = np.full_like(currents, velocity_rad_s)
+    given = loss.torque_per_ampere * currents - loss.loss_many(currents, speeds)
+    enough = np.flatnonzero(given >= torque_nm)
+    return float(currents[enough[0]] if len(enough) else highest)
+
+
+def rounded_down(value: float) -> float:
+    """Round down to two significant digits, for limits that people read."""
+    place = 10.0 ** (math.floor(math.log10(value)) - 1)
+    return float(round(math.floor(value / place + 1e-9) * place, 6))

@@ -1,8 +1,8 @@
-"""Plans of a campaign (schema jtq.plan/1): frozen, checked, to and from YAML, and as set-points at 1 kHz.
+"""Plans of motions (schema jtq.plan/1): segments, runs, limits; to and from YAML, and as set-points at 1 kHz.
 
-A plan gives the commands of two joints on a towing bench, or of one that is moved alone, segment by segment. `expand` makes
-set-points of a run, millisecond by millisecond; `check_run` and `check_plan` hold them against the plan's own limits. All
-but `load_plan` is pure.
+A plan gives the commands of two joints on a towing bench, or of one that is moved alone, segment by segment: plateaus,
+rests, rests without power, and Fourier trajectories. `expand` gives the set-points of a run, millisecond by millisecond;
+`check_run` and `check_plan` compare them with the plan's limits.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -21,7 +21,7 @@ import yaml
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import ConfigError, Verbatim, finite
-from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, parsed, read, read_kind
+from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, parsed, read, split
 from jtqd.models.files import load_yaml
 from jtqd.sysid.motion.setpoints import (
     MOST_JOINTS,
@@ -32,10 +32,11 @@ from jtqd.sysid.motion.setpoints import (
     MotionError,
     Setpoints,
     check_setpoints,
+    moved_joints,
     partner_of,
     path,
 )
-from jtqd.sysid.planner.fourier import CurrentFile, FourierSeries, FourierTrajectory, SeriesFile
+from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory, smooth_step
 
 SCHEMA: Final = "jtq.plan/1"
 DEFAULT_RAMP_S: Final = 0.5
@@ -49,7 +50,10 @@ DEFAULT_LIMITS: Final = Limits(
 )
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
 _RESERVED: Final = ("plan", "campaign")
-"""The campaign's own files beside those of the runs."""
+"""Names of the campaign's own files."""
+
+
+# Segments -------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -76,10 +80,6 @@ class Plateau:
         """Whether velocity or current is other than zero at its end."""
         return self.velocity_rad_s != 0.0 or self.current_a != 0.0
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain numbers, ready for YAML."""
-        return {"kind": "plateau", **{item.name: getattr(self, item.name) for item in fields(self)}}
-
 
 @dataclass(frozen=True)
 class Rest:
@@ -93,15 +93,11 @@ class Rest:
         """Ramp and hold."""
         return self.ramp_s + self.hold_s
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain numbers, ready for YAML."""
-        return {"kind": "rest", "hold_s": self.hold_s, "ramp_s": self.ramp_s}
-
 
 @dataclass(frozen=True)
 class Off:
-    """Both joints stand and their drives are off for hold_s [s], the way there and back included: what the current reads
-    then is its sensor's own error. Must begin at rest.
+    """Both joints stand and their drives are off for hold_s [s], switching off and on included: the current then reads the
+    offset of its sensor. Must begin at rest.
     """
 
     hold_s: Annotated[float, limits("s", ge=SHORTEST_OFF_S, le=LONGEST_S)]
@@ -111,10 +107,6 @@ class Off:
         """From rest to rest."""
         return self.hold_s
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain numbers, ready for YAML."""
-        return {"kind": "power_off", "hold_s": self.hold_s}
-
 
 @dataclass(frozen=True)
 class Fourier:
@@ -123,29 +115,67 @@ class Fourier:
     velocity: FourierTrajectory
     current: FourierSeries
 
+    @classmethod
+    def alone(cls, velocity: FourierTrajectory) -> Fourier:
+        """Return the segment of a joint that is moved alone: the current is zero."""
+        return cls(velocity, FourierSeries(velocity.omega_rad_s, (0.0,), (0.0,), velocity.duration_s))
+
     @property
     def duration_s(self) -> float:
         """Of both series."""
         return self.velocity.duration_s
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain numbers, ready for YAML."""
-        return {
-            "kind": "fourier",
-            "duration_s": self.duration_s,
-            "velocity": self.velocity.to_mapping(),
-            "current": self.current.to_mapping(),
-        }
-
 
 Segment = Plateau | Rest | Fourier | Off
+_KINDS: Final[Mapping[str, type[Segment]]] = {
+    "plateau": Plateau,
+    "rest": Rest,
+    "power_off": Off,
+    "fourier": Fourier,
+}
+
+
+def segment_mapping(segment: Segment) -> dict[str, Any]:
+    """Return a segment as it stands in a plan."""
+    if isinstance(segment, Fourier):
+        series = {"velocity": segment.velocity.to_mapping(), "current": segment.current.to_mapping()}
+        return {"kind": "fourier", "duration_s": segment.duration_s, **series}
+    kind = next(kind for kind, each in _KINDS.items() if isinstance(segment, each))
+    return {"kind": kind, **vars(segment)}
+
+
+@dataclass(frozen=True)
+class _FourierFile:
+    duration_s: Annotated[float, limits("s", ge=0.1, le=LONGEST_S)]
+    velocity: Mapping[str, Any]
+    current: Mapping[str, Any]
+
+
+def _segment(section: Mapping[str, Any], *, alone: bool) -> Segment:
+    """Return a segment of a plan. alone: of a joint without a current; without power it would fall under a load."""
+    kinds = [kind for kind in _KINDS if not (alone and kind == "power_off")]
+    kind, keys = split(section, "kind", Annotated[str, choice(kinds)])
+    if kind != "fourier":
+        no_current = {"current_a": 0.0} if alone and kind == "plateau" else {}
+        found: Segment = read(_KINDS[kind], keys, **no_current)
+        return found
+    file = read(_FourierFile, keys, **({"current": {}} if alone else {}))
+    with below("velocity"):
+        velocity = read(FourierTrajectory, file.velocity, duration_s=file.duration_s)
+    if alone:
+        return Fourier.alone(velocity)
+    with below("current"):
+        return Fourier(velocity, read(FourierSeries, file.current, duration_s=file.duration_s))
+
+
+# Runs -----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Run:
     """One run: its name (also that of its files), the joint in velocity mode, its segments in order, the other joint.
 
-    current_joint: in torque mode; left out, the other one of joints 1 and 2; None: the velocity joint is moved alone, and
+    current_joint: in torque mode; by default the other one of joints 1 and 2; None: the velocity joint is moved alone, and
     no segment has a current. Raises ValueError for joints that are no pair.
     """
 
@@ -160,8 +190,7 @@ class Run:
     @property
     def joints(self) -> tuple[int, ...]:
         """Numbers of the joints that are moved, rising."""
-        moved = (self.velocity_joint, *(() if self.current_joint is None else (self.current_joint,)))
-        return tuple(sorted(moved))
+        return moved_joints(self.velocity_joint, self.current_joint)
 
     @property
     def duration_s(self) -> float:
@@ -170,16 +199,116 @@ class Run:
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values, ready for YAML."""
-        segments = [segment.to_mapping() for segment in self.segments]
+        segments = [segment_mapping(segment) for segment in self.segments]
         if self.current_joint is None:
             for each in segments:
                 each.pop("current", None)
                 each.pop("current_a", None)
             return {"name": self.name, "joint": self.velocity_joint, "segments": segments}
-        pair: dict[str, Any] = {"velocity_joint": self.velocity_joint}
+        pair = {"velocity_joint": self.velocity_joint}
         if self.joints != (1, 2):
             pair["current_joint"] = self.current_joint
         return {"name": self.name, **pair, "segments": segments}
+
+
+Point = tuple[float, float, float]
+"""Velocity [rad/s], current [A], hold [s]."""
+
+
+def run_over(
+    name: str, velocity_joint: int, points: Iterable[Point], ramp_s: Callable[[float], float], edge_s: float
+) -> Run:
+    """Return the run from rest over all points, each held after a ramp, back to rest; edge_s: rest at either end.
+
+    ramp_s: length of the ramp for a step of the velocity [rad/s].
+    """
+    segments: list[Segment] = [Rest(edge_s, 0.0)]
+    velocity = 0.0
+    for target, current, hold_s in points:
+        segments.append(Plateau(target, current, hold_s, ramp_s(target - velocity)))
+        velocity = target
+    segments.append(Rest(edge_s, ramp_s(velocity)))
+    return Run(name, velocity_joint, tuple(segments))
+
+
+EDGE_S: Final = 1.0
+"""Rest before and after Fourier trajectories."""
+BETWEEN_S: Final = 2.0
+"""Rest between two trajectories: section III of the paper."""
+
+
+def trajectory_run(
+    name: str, velocity_joint: int, *trajectories: Fourier, current_joint: int | None = OTHER_ONE
+) -> Run:
+    """Return a run of Fourier trajectories with rests before, between and after them."""
+    segments: list[Segment] = [Rest(EDGE_S, 0.0)]
+    for each in trajectories:
+        segments += [each, Rest(BETWEEN_S, 0.0)]
+    segments[-1] = Rest(EDGE_S, 0.0)
+    return Run(name, velocity_joint, tuple(segments), current_joint)
+
+
+def _run_name(value: Any) -> str:
+    if not isinstance(value, str) or not value.strip():
+        raise FieldError("run", "", value, "a text")
+    if not _NAME.fullmatch(value) or value in _RESERVED:
+        raise ValueError("found another name")
+    return value
+
+
+_RunName = Annotated[
+    str,
+    parsed(
+        _run_name,
+        "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
+    ),
+]
+_Number = Annotated[int, limits(ge=1, le=MOST_JOINTS)]
+
+
+@dataclass(frozen=True)
+class _AloneRun:
+    name: _RunName
+    joint: _Number
+    segments: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class _PairRun:
+    name: _RunName
+    velocity_joint: _Number
+    segments: tuple[Mapping[str, Any], ...] = ()
+    current_joint: _Number | None = None
+
+    def __post_init__(self) -> None:
+        if self.current_joint is None and self.velocity_joint > 2:
+            raise FieldError("run", "current_joint", MISSING, f"a whole number from 1 to {MOST_JOINTS}")
+        if self.current_joint == self.velocity_joint:
+            raise FieldError("run", "current_joint", self.current_joint, "another joint than velocity_joint")
+
+
+def _run(mapping: Mapping[str, Any]) -> Run:
+    """Return a run of a plan. Raises FieldError."""
+    file = read(_AloneRun, mapping) if "joint" in mapping else read(_PairRun, mapping)
+    alone = isinstance(file, _AloneRun)
+    if not file.segments:
+        raise FieldError("run", "segments", Verbatim("none"), "a list of at least one segment")
+    segments: list[Segment] = []
+    for n, section in enumerate(file.segments):
+        with below(f"segments[{n}]"):
+            each = _segment(section, alone=alone)
+            before = segments[-1] if segments else None
+            if isinstance(each, Fourier | Off) and isinstance(before, Plateau) and before.moving:
+                expected = "a rest before it, because the plateau before it ends in motion"
+                raise FieldError("run", "kind", section["kind"], expected)
+            segments.append(each)
+    if isinstance(file, _AloneRun):
+        return Run(file.name, file.joint, tuple(segments), None)
+    other = OTHER_ONE if file.current_joint is None else file.current_joint
+    return Run(file.name, file.velocity_joint, tuple(segments), other)
+
+
+# Plans ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -199,16 +328,24 @@ class Plan:
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values, ready for YAML."""
+        alone = [
+            {
+                "joint": number,
+                **{name: getattr(each, name) for name in ("current_a", "velocity_rad_s", "torque_nm")},
+                "travel_rad": list(each.position_rad),
+            }
+            for number, each in sorted(self.alone.items())
+        ]
         return {
             "schema": SCHEMA,
             "name": self.name,
             "limits": {each.name: finite(getattr(self.limits, each.name)) for each in fields(_LimitsFile)},
-            **({"alone": [_of_joint(*each) for each in sorted(self.alone.items())]} if self.alone else {}),
+            **({"alone": alone} if alone else {}),
             "runs": [run.to_mapping() for run in self.runs],
         }
 
     def limits_of(self, run: Run | Setpoints) -> Limits:
-        """Return what holds in a run. Raises ConfigError for a joint that is moved alone without limits."""
+        """Return the limits of a run. Raises ConfigError for a joint that is moved alone without limits."""
         if run.current_joint is not None:
             return self.limits
         if run.velocity_joint not in self.alone:
@@ -219,13 +356,13 @@ class Plan:
 
     @property
     def sha256(self) -> str:
-        """Hash of the content (hex), whatever the layout of the file: two plans are the same when this is."""
+        """Hash of the content (hex), independent of the layout of the file."""
         text = json.dumps(self.to_mapping(), sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
     @property
     def duration_s(self) -> float:
-        """Sum over the runs, without what lies between them."""
+        """Sum over the runs, without the times between them."""
         return sum(run.duration_s for run in self.runs)
 
     def to_yaml(self) -> str:
@@ -235,13 +372,12 @@ class Plan:
 
 def load_plan(path: Path) -> Plan:
     """Read a plan file. Raises ConfigError."""
-    mapping = load_yaml(path)
-    return Plan.from_mapping(mapping, str(path))
+    return Plan.from_mapping(load_yaml(path), str(path))
 
 
 @dataclass(frozen=True)
 class _LimitsFile:
-    """`limits` of a plan; a key left out has its value in DEFAULT_LIMITS, temperature_c: null means no limit."""
+    """`limits` of a plan; by default those of DEFAULT_LIMITS, temperature_c: null means no limit."""
 
     current_a: Annotated[float, limits("A", gt=0.0)] = DEFAULT_LIMITS.current_a
     velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)] = DEFAULT_LIMITS.velocity_rad_s
@@ -249,16 +385,12 @@ class _LimitsFile:
     travel_rad: Annotated[float, limits("rad", gt=0.0)] = DEFAULT_LIMITS.travel_rad
     temperature_c: Annotated[float, limits("degC", gt=0.0)] | None = DEFAULT_LIMITS.temperature_c
 
-    def limits(self) -> Limits:
-        temperature_c = math.inf if self.temperature_c is None else self.temperature_c
-        return Limits(self.current_a, self.velocity_rad_s, self.torque_nm, self.travel_rad, temperature_c)
-
 
 @dataclass(frozen=True)
 class _AloneLimits:
-    """Limits of a joint that is moved alone; its travel is that of its own encoder, its temperature's limit the plan's."""
+    """`alone` of a plan; travel_rad by the joint's own encoder, the temperature's limit is the plan's."""
 
-    joint: Annotated[int, limits(ge=1, le=MOST_JOINTS)]
+    joint: _Number
     current_a: Annotated[float, limits("A", gt=0.0)]
     velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)]
     torque_nm: Annotated[float, limits("Nm", gt=0.0)]
@@ -267,93 +399,6 @@ class _AloneLimits:
     def __post_init__(self) -> None:
         if not self.travel_rad[0] < self.travel_rad[1]:
             raise FieldError("alone", "travel_rad", list(self.travel_rad), "two rising numbers in rad")
-
-    def limits(self, plan: Limits) -> Limits:
-        low, high = self.travel_rad
-        return Limits(
-            current_a=self.current_a,
-            velocity_rad_s=self.velocity_rad_s,
-            torque_nm=self.torque_nm,
-            travel_rad=high - low,
-            temperature_c=plan.temperature_c,
-            position_rad=(low, high),
-        )
-
-
-def _of_joint(number: int, limits: Limits) -> dict[str, Any]:
-    """Return limits of a joint that is moved alone, plain."""
-    values = {name: getattr(limits, name) for name in ("current_a", "velocity_rad_s", "torque_nm")}
-    return {"joint": number, **values, "travel_rad": list(limits.position_rad)}
-
-
-_Number = Annotated[int, limits(ge=1, le=MOST_JOINTS)]
-
-
-def _run_name(value: Any) -> str:
-    if not isinstance(value, str) or not value.strip():
-        raise FieldError("run", "", value, "a text")
-    if not _NAME.fullmatch(value) or value in _RESERVED:
-        raise ValueError("found another name")
-    return value
-
-
-_RunName = Annotated[
-    str,
-    parsed(
-        _run_name,
-        "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
-    ),
-]
-
-
-@dataclass(frozen=True)
-class _AloneRun:
-    """A run of a joint that is moved alone."""
-
-    name: _RunName
-    joint: _Number
-    segments: tuple[Mapping[str, Any], ...] = ()
-
-    @property
-    def joints(self) -> tuple[int, int | None]:
-        return self.joint, None
-
-
-@dataclass(frozen=True)
-class _PairRun:
-    """A run of two joints on a towing bench."""
-
-    name: _RunName
-    velocity_joint: _Number
-    segments: tuple[Mapping[str, Any], ...] = ()
-    current_joint: _Number | None = None
-
-    def __post_init__(self) -> None:
-        if self.current_joint is None and self.velocity_joint > 2:
-            raise FieldError("run", "current_joint", MISSING, f"a whole number from 1 to {MOST_JOINTS}")
-        if self.current_joint == self.velocity_joint:
-            raise FieldError("run", "current_joint", self.current_joint, "another joint than velocity_joint")
-
-    @property
-    def joints(self) -> tuple[int, int | None]:
-        return self.velocity_joint, OTHER_ONE if self.current_joint is None else self.current_joint
-
-
-def _run(mapping: Mapping[str, Any]) -> Run:
-    file = read(_AloneRun, mapping) if "joint" in mapping else read(_PairRun, mapping)
-    if not file.segments:
-        raise FieldError("run", "segments", Verbatim("none"), "a list of at least one segment")
-    segments: list[Segment] = []
-    for n, section in enumerate(file.segments):
-        with below(f"segments[{n}]"):
-            each = _segment(section, alone=isinstance(file, _AloneRun))
-            before = segments[-1] if segments else None
-            if isinstance(each, Fourier | Off) and isinstance(before, Plateau) and before.moving:
-                expected = "a rest before it, because the plateau before it ends in motion"
-                raise FieldError("run", "kind", section["kind"], expected)
-            segments.append(each)
-    joint, other = file.joints
-    return Run(file.name, joint, tuple(segments), other)
 
 
 @dataclass(frozen=True)
@@ -375,77 +420,30 @@ class _PlanFile:
                 if any(run.name == each.name for each in runs):
                     raise FieldError("run", "name", run.name, "a unique name")
                 runs.append(run)
-        limits = self.limits.limits()
-        return Plan(self.name, limits, tuple(runs), {each.joint: each.limits(limits) for each in self.alone})
+        celsius = math.inf if self.limits.temperature_c is None else self.limits.temperature_c
+        alone = {
+            each.joint: Limits(
+                each.current_a,
+                each.velocity_rad_s,
+                each.torque_nm,
+                each.travel_rad[1] - each.travel_rad[0],
+                celsius,
+                each.travel_rad,
+            )
+            for each in self.alone
+        }
+        return Plan(self.name, Limits(**vars(self.limits) | {"temperature_c": celsius}), tuple(runs), alone)
 
 
-@dataclass(frozen=True)
-class _Turning:
-    """A plateau of a joint that is moved alone."""
-
-    velocity_rad_s: Annotated[float, limits("rad/s")]
-    hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
-    ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
-
-    def segment(self) -> Plateau:
-        return Plateau(self.velocity_rad_s, 0.0, self.hold_s, self.ramp_s)
-
-
-@dataclass(frozen=True)
-class _AloneFourier:
-    """A fourier segment of a joint that is moved alone."""
-
-    duration_s: Annotated[float, limits("s", ge=0.1, le=LONGEST_S)]
-    velocity: SeriesFile
-
-    def segment(self) -> Fourier:
-        one = self.velocity
-        trajectory = FourierTrajectory(one.omega_rad_s, one.a, one.b, self.duration_s)
-        return Fourier(trajectory, no_current(trajectory))
-
-
-@dataclass(frozen=True)
-class _PairFourier(_AloneFourier):
-    current: CurrentFile
-
-    def segment(self) -> Fourier:
-        one = self.current
-        series = FourierSeries(one.omega_rad_s, one.a, one.b, self.duration_s, one.offset_a)
-        return replace(super().segment(), current=series)
-
-
-_ALONE: Final[Mapping[str, type]] = {"plateau": _Turning, "rest": Rest, "fourier": _AloneFourier}
-_PAIR: Final[Mapping[str, type]] = {
-    "plateau": Plateau,
-    "rest": Rest,
-    "power_off": Off,
-    "fourier": _PairFourier,
-}
-
-
-def _segment(section: Mapping[str, Any], *, alone: bool) -> Segment:
-    """`alone`: no segment has a current; without power a joint that carries a load would fall."""
-    found = read_kind(_ALONE if alone else _PAIR, section)
-    return found if isinstance(found, Plateau | Rest | Off) else found.segment()
-
-
-def no_current(velocity: FourierTrajectory) -> FourierSeries:
-    """Return the current of a joint that nothing tows."""
-    return FourierSeries(velocity.omega_rad_s, (0.0,), (0.0,), velocity.duration_s)
-
-
-def smooth_step(x: FloatArray) -> FloatArray:
-    """10 x^3 - 15 x^4 + 6 x^5: from 0 to 1 over x in 0..1 with first and second derivative zero at both ends."""
-    result: FloatArray = x * x * x * (10.0 + x * (-15.0 + 6.0 * x))
-    return result
+# Set-points -----------------------------------------------------------------------------------------------------
 
 
 def expand(run: Run) -> Setpoints:
-    """Set-points of a run at 1 kHz, from rest.
+    """Return the set-points of a run at 1 kHz, from rest.
 
     A plateau or rest begins where the segment before it ended: both targets go to their new values on one smooth step
-    (velocity and acceleration continuous) and then hold. Ramp, hold, Fourier series and time
-    without power are a mark each; "ramp" marks have no values.
+    (velocity and acceleration continuous) and then hold. Ramp, hold, Fourier series and time without power are a mark each;
+    "ramp" marks have no values.
     """
     velocities: list[FloatArray] = []
     currents: list[FloatArray] = []
@@ -453,38 +451,37 @@ def expand(run: Run) -> Setpoints:
     off: list[tuple[int, int]] = []
     velocity = current = 0.0
     count = 0
+
+    def add(kind: str, v: FloatArray, i: FloatArray, *target: float) -> None:
+        nonlocal count
+        velocities.append(v)
+        currents.append(i)
+        if len(v):
+            marks.append(Mark(kind, count * PERIOD_S, (count + len(v)) * PERIOD_S, *target))
+        count += len(v)
+
     for segment in run.segments:
-        if isinstance(segment, Fourier):
-            n = samples(segment.duration_s)
+        n = samples(segment.duration_s)
+        if isinstance(segment, Fourier):  # from rest to rest
             time_s = np.arange(n) * PERIOD_S
-            velocities.append(segment.velocity.velocity(time_s))
-            currents.append(segment.current.value(time_s))
-            marks.append(Mark("fourier", count * PERIOD_S, (count + n) * PERIOD_S))
-            count += n
-            continue  # from rest to rest
-        if isinstance(segment, Off):
-            n = samples(segment.duration_s)
-            velocities.append(np.full(n, velocity))  # at rest, or Setpoints refuses it
-            currents.append(np.full(n, current))
-            marks.append(Mark("power_off", count * PERIOD_S, (count + n) * PERIOD_S))
+            add("fourier", segment.velocity.motion(time_s)[1], segment.current.value(time_s))
+        elif isinstance(segment, Off):  # at rest, or Setpoints refuses it
             off.append((count, count + n))
-            count += n
-            continue
-        target = (segment.velocity_rad_s, segment.current_a) if isinstance(segment, Plateau) else (0.0, 0.0)
-        ramp, hold = samples(segment.ramp_s), samples(segment.hold_s)
-        if (velocity, current) == target:  # nothing to ramp: all of it is held
-            ramp, hold = 0, ramp + hold
-        share = np.concatenate((smooth_step(np.arange(1, ramp + 1) / max(ramp, 1)), np.ones(hold)))
-        velocities.append(velocity + (target[0] - velocity) * share)
-        currents.append(current + (target[1] - current) * share)
-        middle, end = (count + ramp) * PERIOD_S, (count + ramp + hold) * PERIOD_S
-        if ramp:
-            marks.append(Mark("ramp", count * PERIOD_S, middle))
-        if hold:
-            kind = "plateau" if isinstance(segment, Plateau) else "rest"
-            marks.append(Mark(kind, middle, end, *target))
-        velocity, current = target
-        count += ramp + hold
+            add("power_off", np.full(n, velocity), np.full(n, current))
+        else:
+            plateau = isinstance(segment, Plateau)
+            target = (
+                (segment.velocity_rad_s, segment.current_a) if isinstance(segment, Plateau) else (0.0, 0.0)
+            )
+            ramp, hold = samples(segment.ramp_s), samples(segment.hold_s)
+            if (velocity, current) == target:  # nothing to ramp: all of it is held
+                ramp, hold = 0, ramp + hold
+            dv, di = target[0] - velocity, target[1] - current
+            share = smooth_step(np.arange(1, ramp + 1) / max(ramp, 1))
+            add("ramp", velocity + dv * share, current + di * share)
+            ones = np.ones(hold)
+            add("plateau" if plateau else "rest", velocity + dv * ones, current + di * ones, *target)
+            velocity, current = target
     if run.current_joint is None:
         marks = [replace(mark, current_a=None) for mark in marks]
     return Setpoints(
@@ -508,7 +505,7 @@ def travel_rad(setpoints: Setpoints) -> float:
 
 
 def check_run(run: Run, limits: Limits) -> Setpoints:
-    """Set-points of a run that keeps the limits, does not jump, and ends at rest.
+    """Return the set-points of a run that keeps the limits, does not jump, and ends at rest.
 
     Raises:
         ConfigError: naming the run, the quantity, when, what was found and the limit.
@@ -529,12 +526,12 @@ def check_run(run: Run, limits: Limits) -> Setpoints:
 
 
 def check_plan(plan: Plan) -> dict[str, Setpoints]:
-    """Set-points of every run by its name. Raises ConfigError as check_run."""
+    """Return the set-points of every run by its name. Raises ConfigError as check_run."""
     return {run.name: check_run(run, plan.limits_of(run)) for run in plan.runs}
 
 
 def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
-    """Return the content of NAME.json: which segment was when, in seconds of the run table (to about a cycle)."""
+    """Return the content of NAME.json: when each segment was, in seconds of the run table (to about a cycle)."""
     return {
         "run": run.name,
         "velocity_joint": run.velocity_joint,
@@ -551,3 +548,70 @@ def marks_of(run: Run, setpoints: Setpoints) -> dict[str, Any]:
             for mark in setpoints.marks
         ],
     }
+
+
+# Partial runs ---------------------------------------------------------------------------------------------------
+
+BACK_RAD: Final = 0.005
+"""A joint that is moved alone has come back where it is no further than this from where it began."""
+
+
+def partial_runs(run: Run) -> tuple[Run, ...]:
+    """Return a run cut into runs from rest to rest, NAME~1, NAME~2, ...; the run itself where it cannot be cut.
+
+    A run is cut in the middle of the rests between its motions; a joint that is moved alone must have come back there to
+    where it began. A run of one direction, which does not rest, is cut between its plateaus, each with the ramps of the
+    run's own ends. A partial run never goes further from its start than the run does.
+    """
+    if any(isinstance(each, Off) for each in run.segments):
+        return (run,)
+    moving = [place for place, each in enumerate(run.segments) if not isinstance(each, Rest)]
+    if len(moving) < 2:
+        return (run,)
+    found = _cut_at_plateaus(run, moving) or _cut_at_rests(run)
+    parts = tuple(
+        replace(run, name=f"{run.name}~{number}", segments=tuple(each))
+        for number, each in enumerate(found, 1)
+    )
+    far = travel_rad(expand(run)) + BACK_RAD
+    if len(parts) < 2 or any(travel_rad(expand(part)) > far for part in parts):
+        return (run,)
+    return parts
+
+
+def _cut_at_rests(run: Run) -> list[list[Segment]]:
+    """Cut in the middle of each rest between two motions."""
+    parts: list[list[Segment]] = [[]]
+    whole = path(expand(run))
+    ends = np.cumsum([samples(each.duration_s) for each in run.segments])
+    position = whole[np.minimum(ends, len(whole)) - 1]  # at the end of each segment
+    last = max(place for place, each in enumerate(run.segments) if not isinstance(each, Rest))
+    moved = False
+    for place, each in enumerate(run.segments):
+        home = run.current_joint is not None or abs(position[place]) <= BACK_RAD
+        if isinstance(each, Rest) and moved and place < last and home:
+            # only after a plateau does the rest begin with a ramp down
+            ramp_s = each.ramp_s if isinstance(run.segments[place - 1], Plateau) else 0.0
+            half_s = 0.5 * (each.duration_s - ramp_s)
+            parts[-1].append(Rest(half_s, ramp_s))
+            parts.append([Rest(half_s, 0.0)])
+            moved = False
+            continue
+        moved = moved or not isinstance(each, Rest)
+        parts[-1].append(each)
+    return parts
+
+
+def _cut_at_plateaus(run: Run, moving: list[int]) -> list[list[Segment]]:
+    """Cut a run of plateaus of one direction on a towing bench; nothing for any other run."""
+    plateaus = [each for each in run.segments if isinstance(each, Plateau)]
+    first, last = run.segments[0], run.segments[-1]
+    if run.current_joint is None or len(plateaus) != len(moving) or moving[-1] - moving[0] + 1 != len(moving):
+        return []
+    if not isinstance(first, Rest) or not isinstance(last, Rest):
+        return []
+    if not (all(p.velocity_rad_s > 0.0 for p in plateaus) or all(p.velocity_rad_s < 0.0 for p in plateaus)):
+        return []
+    ramp_s = max(each.ramp_s for each in (plateaus[0], last))
+    ends = Rest(first.duration_s, 0.0), Rest(last.hold_s, ramp_s)
+    return [[ends[0], replace(each, ramp_s=max(ramp_s, each.ramp_s)), ends[1]] for each in plateaus]

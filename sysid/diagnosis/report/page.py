@@ -9,9 +9,8 @@ import yaml
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect
-from jtqd.sysid.diagnosis.arm_motion import MOTION_FILE, joint_motion_file
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
-from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, campaign_command
+from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, campaign_command, joint_motion_file
 from jtqd.sysid.diagnosis.report import views
 from jtqd.sysid.diagnosis.report.pictures import pictures, trace_rows
 from jtqd.sysid.diagnosis.report.views import gap_views

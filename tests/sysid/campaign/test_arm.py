@@ -20,7 +20,7 @@ from jtqd.sysid.campaign import bench as campaign_bench
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
 from jtqd.sysid.campaign.command import main
 from jtqd.sysid.campaign.emulated import PLANT, emulated_run
-from jtqd.sysid.campaign.runner import findings, pieces_of
+from jtqd.sysid.campaign.runner import findings, partial_runs
 from jtqd.sysid.motion.setpoints import (
     Limits,
     MotionResult,
@@ -43,7 +43,7 @@ from jtqd.sysid.planner.plan import (
     load_plan,
     travel_rad,
 )
-from jtqd.sysid.planner.single_joint import SHARE, ladder_run, parsed_limits, room_of, tightest
+from jtqd.sysid.planner.single_joint import SHARE, parsed_limits, plateau_run, range_of, tightest
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import with_joint
 from jtqd.sysid.runs.logs import LoggedRun
@@ -51,7 +51,7 @@ from jtqd.sysid.runs.tables import write_run
 
 LIMITS = MotionLimits((-1.0, 2.0), 1.5, 6.0, 25.0)
 JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=LIMITS)
-ROOM = room_of(1, JOINT, DEFAULT_LIMITS)
+ROOM = range_of(1, JOINT, DEFAULT_LIMITS)
 
 
 def config_file(
@@ -198,23 +198,24 @@ def test_a_joint_alone_stays_where_it_may_be_and_comes_back(kind: str) -> None:
 
 
 def test_plateaus_are_there_in_both_directions_at_every_velocity() -> None:
-    run = ladder_run(1, ROOM, "r", (0.2, 0.5))
+    run = plateau_run(1, ROOM, "r", (0.2, 0.5))
     held = sorted({each.velocity_rad_s for each in run.segments if isinstance(each, Plateau)})
     fastest = SHARE * LIMITS.velocity_rad_s
     assert held == pytest.approx([share * fastest for share in (-0.5, -0.2, 0.2, 0.5)])
-    alone = ladder_run(1, replace(ROOM, acceleration_rad_s2=1.0), "r", (0.2, 1.0))
+    alone = plateau_run(1, replace(ROOM, acceleration_rad_s2=1.0), "r", (0.2, 1.0))
     assert len(alone.segments) == 2 + 5, "no room for the fast one at this acceleration"
 
 
 def test_searching_pays_more_information_than_drawing() -> None:
     """The velocities of a design cover more than those of a draw: it is the reason to search at all."""
-    from jtqd.sysid.planner.single_joint import _log_det, _Trajectories, trajectories
+    from jtqd.sysid.planner.design import log_det
+    from jtqd.sysid.planner.single_joint import _Trajectories, trajectories
 
     def information(evaluations: int) -> float:
         task = _Trajectories(ROOM, 1.0, 3.0)
         (segment,) = trajectories(ROOM, [1.0], 3.0, seed=2, evaluations=evaluations)
         amplitudes = np.array([*segment.velocity.a, *segment.velocity.b])
-        return float(_log_det(task.made(amplitudes)[1]))
+        return float(log_det(task.finish(amplitudes, np.zeros((6, 6)))[1]))
 
     assert information(400) > information(1) + 1.0
 
@@ -296,8 +297,8 @@ def test_the_tighter_limit_holds() -> None:
 
 
 def test_plateaus_of_a_joint_alone_are_driven_again_one_velocity_at_a_time() -> None:
-    run = ladder_run(1, ROOM, "r", (0.1, 0.2, 0.5))
-    pieces = pieces_of(run)
+    run = plateau_run(1, ROOM, "r", (0.1, 0.2, 0.5))
+    pieces = partial_runs(run)
     assert [piece.name for piece in pieces] == ["r~1", "r~2", "r~3"]
     assert sum(piece.duration_s for piece in pieces) == pytest.approx(run.duration_s, abs=0.01)
     for piece in pieces:
@@ -307,7 +308,7 @@ def test_plateaus_of_a_joint_alone_are_driven_again_one_velocity_at_a_time() -> 
 
 def test_a_run_of_one_direction_is_driven_again_plateau_by_plateau() -> None:
     (run, *_) = efficiency_runs((1.4,), 2.1, (1.0, 2.5, 4.0))
-    pieces = pieces_of(run)
+    pieces = partial_runs(run)
     assert len(pieces) == 3
     wanted = [each for each in run.segments if isinstance(each, Plateau)]
     for piece, plateau in zip(pieces, wanted, strict=True):

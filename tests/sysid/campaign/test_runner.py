@@ -28,12 +28,12 @@ from jtqd.sysid.campaign.runner import (
     findings,
     gap_too_long,
     go_through,
-    pieces_of,
+    partial_runs,
 )
 from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.commander import Pace
 from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
-from jtqd.sysid.planner.campaigns import ladder
+from jtqd.sysid.planner.campaigns import plateau_run
 from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
@@ -174,7 +174,7 @@ def fourier_run(name: str = "b", trajectories: int = 2) -> Run:
 
 def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
     run = fourier_run()
-    one, two = pieces_of(run)
+    one, two = partial_runs(run)
     assert (one.name, two.name) == ("b~1", "b~2")
     assert one.duration_s + two.duration_s == run.duration_s
     whole = expand(run)
@@ -186,8 +186,12 @@ def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
 
 
 def test_a_ladder_and_a_single_trajectory_are_not_cut() -> None:
-    for run in (ladder("r", 2, [(1.2, 1.0), (-1.2, 3.0)], 0.8), fourier_run(trajectories=1), PLAN.runs[0]):
-        assert pieces_of(run) == (run,)
+    for run in (
+        plateau_run("r", 2, [(1.2, 1.0), (-1.2, 3.0)], 0.8),
+        fourier_run(trajectories=1),
+        PLAN.runs[0],
+    ):
+        assert partial_runs(run) == (run,)
 
 
 @pytest.mark.parametrize(
@@ -368,7 +372,7 @@ Change = Callable[[dict[int, JointColumns]], None]
 @lru_cache
 def good_run() -> tuple[RunTable, Setpoints, tuple[Joint, Joint]]:
     """Joint 2 drives over three points, both directions; as measured on the emulated bench."""
-    points = expand(ladder("r", 2, [(1.2, 1.0), (1.2, 3.0), (-1.2, -3.0)], 0.8))
+    points = expand(plateau_run("r", 2, [(1.2, 1.0), (1.2, 3.0), (-1.2, -3.0)], 0.8))
     last = len(points) - 1
     current = JointCommand.current(lambda t: float(points.current_a[min(round(t * 1e3), last)]))
     velocity = JointCommand.velocity(lambda t: float(points.velocity_rad_s[min(round(t * 1e3), last)]))

@@ -8,12 +8,11 @@ import pytest
 from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.diagnosis.arm_motion import KINDS, RATE_HZ, Room, csv_text, motions, room_of
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import csv_text, each_joint, joint_range_of, next_experiment
 from jtqd.sysid.diagnosis.signals import JointSignals, joint_signals
-from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS
+from jtqd.sysid.planner.experiments import EXPERIMENTS, RATE_HZ, JointRange, joint_motions
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
 JOINT = load_joint(shipped("joint1.yaml"))
@@ -36,22 +35,18 @@ def swung(low: float = -0.6, high: float = 1.0, speed: float = 0.7, noise_rad: f
     return joint_signals("r", RunTable(time_s, {1: columns}), 1, JOINT, BaseLoss(JOINT))
 
 
-def test_every_kind_of_the_bench_has_one_for_an_arm() -> None:
-    assert set(KINDS) == set(EXPERIMENTS)
-
-
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EXPERIMENTS)
 @pytest.mark.parametrize(
     "room",
     [
-        Room(-0.5, 0.9, 0.7, 2.0, 40.0, 18.0),
-        Room(0.1, 0.13, 0.02, 0.05, 5.0, 1.0),
-        Room(-6.0, 6.0, 3.0, 0.8, 300.0, 100.0),
-        Room(-0.01, 0.2, 3.0, 60.0, 5.0, 1.0),
+        JointRange(-0.5, 0.9, 0.7, 2.0, 40.0, 18.0),
+        JointRange(0.1, 0.13, 0.02, 0.05, 5.0, 1.0),
+        JointRange(-6.0, 6.0, 3.0, 0.8, 300.0, 100.0),
+        JointRange(-0.01, 0.2, 3.0, 60.0, 5.0, 1.0),
     ],
 )
-def test_no_motion_leaves_its_room(kind: str, room: Room) -> None:
-    made = motions([kind], room)
+def test_no_motion_leaves_its_room(kind: str, room: JointRange) -> None:
+    made = joint_motions([kind], room)
     assert len(made) >= 2  # a run to leave out
     for motion in made:
         assert motion.position_rad.min() >= room.low_rad - 1e-9
@@ -67,7 +62,7 @@ def test_no_motion_leaves_its_room(kind: str, room: Room) -> None:
 
 
 def test_the_room_is_where_the_runs_have_been() -> None:
-    room = room_of(JOINT, [swung()])
+    room = joint_range_of(JOINT, [swung()])
     assert room is not None
     assert room.low_rad == pytest.approx(-0.6 + 0.05 * 1.6, abs=1e-3)
     assert room.high_rad == pytest.approx(1.0 - 0.05 * 1.6, abs=1e-3)
@@ -77,14 +72,14 @@ def test_the_room_is_where_the_runs_have_been() -> None:
 
 @pytest.mark.parametrize("noise_rad", [0.0, 2e-4])
 def test_noise_of_the_encoder_is_no_acceleration(noise_rad: float) -> None:
-    room = room_of(JOINT, [swung(noise_rad=noise_rad)])
+    room = joint_range_of(JOINT, [swung(noise_rad=noise_rad)])
     assert room is not None
     assert room.acceleration_rad_s2 == pytest.approx(0.7**2 / 0.8, rel=0.15)
 
 
 def test_the_limits_of_the_joint_file_make_it_smaller() -> None:
     limits = MotionLimits((-0.2, 5.0), velocity_rad_s=0.3, acceleration_rad_s2=0.1, torque_nm=10.0)
-    room = room_of(replace(JOINT, motion_limits=limits), [swung()])
+    room = joint_range_of(replace(JOINT, motion_limits=limits), [swung()])
     assert room is not None
     assert room.low_rad >= -0.2
     assert GRAVITY_NM * np.sin(room.high_rad) <= 10.0  # nowhere where gravity alone needs more
@@ -100,7 +95,7 @@ def test_the_limits_of_the_joint_file_make_it_smaller() -> None:
     ],
 )
 def test_without_room_there_is_no_motion(limits: MotionLimits) -> None:
-    assert room_of(replace(JOINT, motion_limits=limits), [swung()]) is None
+    assert joint_range_of(replace(JOINT, motion_limits=limits), [swung()]) is None
     made = next_experiment([("hysteresis",)], {3: replace(JOINT, motion_limits=limits)}, signals=[swung()])
     assert made["motion"] is made["plan"] is None
     assert "No motion is planned" in made["why"]
@@ -164,5 +159,5 @@ def test_every_joint_of_an_arm_gets_a_motion_of_its_own() -> None:
 
 
 def test_the_same_room_gives_the_same_table() -> None:
-    room = Room(-0.5, 0.9, 0.7, 2.0, 40.0, 18.0)
-    assert csv_text(motions(["excitation"], room)) == csv_text(motions(["excitation"], room))
+    room = JointRange(-0.5, 0.9, 0.7, 2.0, 40.0, 18.0)
+    assert csv_text(joint_motions(["excitation"], room)) == csv_text(joint_motions(["excitation"], room))

@@ -20,7 +20,7 @@ from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.diagnosis.experiment_choice import MOST_KINDS, PAIRS, kind_of, kinds_for
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
-from jtqd.sysid.diagnosis.towing_motion import EXPERIMENTS, reach_of
+from jtqd.sysid.planner.experiments import EXPERIMENTS, pair_range_of, pair_runs
 from jtqd.sysid.planner.plan import Plan, Plateau, Run, check_plan, expand
 
 SEED = 20261121
@@ -115,7 +115,7 @@ def test_kinds_are_few_and_those_that_serve_most_come_first() -> None:
 
 @pytest.mark.parametrize("kind", sorted(EXPERIMENTS))
 def test_a_plan_is_what_the_campaign_takes_and_moves_either_joint(kind: str) -> None:
-    runs = EXPERIMENTS[kind].runs(reach_of(SHIPPED))
+    runs = pair_runs([kind], pair_range_of(SHIPPED))
     assert {run.velocity_joint for run in runs} == {1, 2}
     assert len({run.name for run in runs}) == len(runs)
     assert 10.0 < sum(run.duration_s for run in runs) < 1300.0
@@ -281,7 +281,7 @@ def test_the_same_question_gives_the_same_plan() -> None:
 
 
 def test_every_load_is_driven_at_the_same_velocity_in_both_directions() -> None:
-    for run in EXPERIMENTS["load_at_both_directions"].runs(reach_of(SHIPPED)):
+    for run in pair_runs(["load_at_both_directions"], pair_range_of(SHIPPED)):
         points = {(s.velocity_rad_s, s.current_a) for s in run.segments if isinstance(s, Plateau)}
         assert len({i for _, i in points}) >= 10
         assert all((-v, i) in points and (v, -i) in points for v, i in points)

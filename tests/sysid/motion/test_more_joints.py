@@ -16,11 +16,11 @@ from jtqd.sysid.motion.setpoints import (
     MotionError,
     Setpoints,
     Surroundings,
-    approach,
     check_setpoints,
     way,
 )
 from jtqd.sysid.motion.stopping import Phase
+from jtqd.sysid.planner.single_joint import approach
 from tests.sysid.motion.lock_step import MS, Frames, LockStep, plateau, raised_cosine
 
 ALONE = Limits(current_a=9.0, velocity_rad_s=2.0, torque_nm=40.0, travel_rad=4.0, position_rad=(-2.0, 2.0))

@@ -188,7 +188,7 @@ def test_set_points_hold_what_the_segments_say_at_the_times_of_the_marks() -> No
     held = slice(round(fourier.start_s * 1e3), round(fourier.end_s * 1e3))
     t = np.arange(4000) * 1e-3
     assert np.array_equal(
-        points.velocity_rad_s[held], FourierTrajectory(1.5, (0.4, -0.1), (0.2, 0.3), 4.0).velocity(t)
+        points.velocity_rad_s[held], FourierTrajectory(1.5, (0.4, -0.1), (0.2, 0.3), 4.0).motion(t)[1]
     )
     assert np.array_equal(points.current_a[held], FourierSeries(1.1, (1.0,), (0.5,), 4.0, 0.5).value(t))
 

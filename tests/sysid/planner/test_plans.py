@@ -130,7 +130,7 @@ def test_excitation_alternates_and_covers_low_velocity_for_either_joint() -> Non
     for run in runs[:2]:  # already in the smallest campaign
         slow = run.segments[3]
         assert isinstance(slow, Fourier)
-        assert np.abs(slow.velocity.velocity(np.linspace(0.0, slow.duration_s, 999))).max() < 0.31
+        assert np.abs(slow.velocity.motion(np.linspace(0.0, slow.duration_s, 999))[1]).max() < 0.31
     for joint in (1, 2):
         velocity = np.concatenate([expand(run).velocity_rad_s for run in runs if run.velocity_joint == joint])
         moving = np.abs(velocity[np.abs(velocity) > 1e-3])
