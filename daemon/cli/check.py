@@ -22,7 +22,7 @@ from jtqd.daemon.cli.bus_checks import (
     check_stolen_time,
 )
 from jtqd.daemon.cli.checks import FAIL, GOOD, CheckResult, report
-from jtqd.daemon.cli.reading import Daemon, find_daemons, on_bus
+from jtqd.daemon.cli.running import Daemon, find_daemons, on_bus
 from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
 from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.loop import realtime

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.reading import NoDaemonError, choose_daemon
+from jtqd.daemon.cli.running import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
 from jtqd.drivers.bus_socket import reachable
 

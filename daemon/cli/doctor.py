@@ -15,8 +15,8 @@ from pathlib import Path
 from jtqd import __version__
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, report, share, size
-from jtqd.daemon.cli.machine import check_can, check_kernel
-from jtqd.daemon.cli.reading import DaemonSearch, find_daemons, places
+from jtqd.daemon.cli.machine_checks import check_can, check_kernel
+from jtqd.daemon.cli.running import DaemonSearch, find_daemons, places
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.process import build_estimator
 from jtqd.daemon.shared.runtime_dir import installed

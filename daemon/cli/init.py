@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.bus.boot import bus_load_of
-from jtqd.daemon.cli.draft import (
+from jtqd.daemon.cli.generated import (
     ConfigDraft,
     DraftError,
     JointDraft,

@@ -13,8 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.as_told import unit_problems
-from jtqd.daemon.cli.draft import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
+from jtqd.daemon.cli.device import unit_problems
+from jtqd.daemon.cli.generated import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
 from jtqd.daemon.cli.init import (
     MAX_JOINTS,
     VALUES,

@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, share, size
-from jtqd.daemon.cli.reading import (
+from jtqd.daemon.cli.running import (
     RUNNING,
     CurrentLog,
     Daemon,

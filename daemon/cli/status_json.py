@@ -9,7 +9,7 @@ import time
 from math import nan
 from typing import Any
 
-from jtqd.daemon.cli.reading import RUNNING, CurrentLog, Reading
+from jtqd.daemon.cli.running import RUNNING, CurrentLog, Reading
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
 from jtqd.daemon.shared.contacts import contact_of
 from jtqd.daemon.shared.notices import Notice

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from jtqd.daemon.cli.reading import Daemon, Watch
+from jtqd.daemon.cli.running import Daemon, Watch
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.counters import LastEstimate

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from jtqd.daemon.cli import control
-from jtqd.daemon.cli.reading import NoDaemonError
+from jtqd.daemon.cli.running import NoDaemonError
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, reply: dict[str, Any] | Exception) -> None:

@@ -27,7 +27,7 @@ def doctor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
     """`jtq doctor --json` in this process: exit status, and item -> finding."""
     (tmp_path / "run").mkdir()
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
-    monkeypatch.setattr("jtqd.daemon.cli.reading._SHARED", ())
+    monkeypatch.setattr("jtqd.daemon.cli.running._SHARED", ())
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
 
     def run(*arguments: str) -> tuple[int, dict[str, dict[str, str]]]:

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from jtqd.daemon.cli import init, probe
-from jtqd.daemon.cli.draft import (
+from jtqd.daemon.cli.generated import (
     ConfigDraft,
     DraftError,
     Wanted,

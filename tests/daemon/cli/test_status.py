@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from jtqd.daemon.cli.reading import Watch, find_daemons
+from jtqd.daemon.cli.running import Watch, find_daemons
 from jtqd.daemon.cli.recent import Moment, Recent
 from jtqd.daemon.cli.status import StatusView, main
 from jtqd.daemon.cli.terminal import paged
@@ -35,7 +35,7 @@ Status = Callable[..., tuple[int, str, str]]
 def status(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Status:
     """`jtq status` in this process: exit status, standard output, standard error."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    monkeypatch.setattr("jtqd.daemon.cli.reading._SHARED", ())
+    monkeypatch.setattr("jtqd.daemon.cli.running._SHARED", ())
     monkeypatch.delenv("XDG_RUNTIME_DIR", raising=False)
     monkeypatch.setenv("COLUMNS", "80")
 

@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from jtqd.daemon.cli import status
-from jtqd.daemon.cli.reading import Daemon, Watch
+from jtqd.daemon.cli.running import Daemon, Watch
 from jtqd.daemon.cli.recent import Moment, Recent
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.cli.status_json import content

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.as_told import Instead, Layout, layout_told, tpdo_lines, unit_problems, units_told
+from jtqd.daemon.cli.device import Instead, Layout, layout_told, tpdo_lines, unit_problems, units_told
 from jtqd.daemon.config import ObjectsSection
 from jtqd.daemon.profiles import INIT, Family
 from jtqd.drivers.drive import CIA_402, EVERY_SCALING_OBJECT, GEAR, DriveObjects, DriveProfile

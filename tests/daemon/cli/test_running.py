@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.cli.reading import Watch, find_daemons, on_bus
+from jtqd.daemon.cli.running import Watch, find_daemons, on_bus
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.faults import DRIVE_FAULT
 from jtqd.daemon.shared.notices import Notices
