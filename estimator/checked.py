@@ -12,6 +12,25 @@ import reprlib
 from pathlib import Path
 from typing import Final
 
+from jtqd.estimator.text import counted, finite
+
+__all__ = (
+    "ConfigError",
+    "Verbatim",
+    "check_installed",
+    "check_output",
+    "count",
+    "counted",
+    "finite",
+    "in_unit",
+    "make_directory",
+    "natural",
+    "number_as_text",
+    "range_text",
+    "seconds",
+    "shown",
+)
+
 
 class ConfigError(ValueError):
     """What an operator wrote cannot be used; the message is one line: where, what, and what instead."""
@@ -141,20 +160,3 @@ def check_installed(extra: str, *packages: str) -> None:
     if missing:
         verb = "is" if len(missing) == 1 else "are"
         raise ConfigError(f"{', '.join(missing)} {verb} not installed: pip install 'jtqd[{extra}]'")
-
-
-# Words of messages, and numbers of JSON.
-
-
-def finite(value: float) -> float | None:
-    """Return the number, or None for NaN and infinity, which JSON does not have."""
-    return value if math.isfinite(value) else None
-
-
-def counted(number: int, noun: str, plural: str = "") -> str:
-    """Return number and noun in agreement.
-
-    >>> counted(1, "run"), counted(2, "run"), counted(0, "velocity", "velocities")
-    ('1 run', '2 runs', '0 velocities')
-    """
-    return f"{number} {noun if number == 1 else plural or noun + 's'}"

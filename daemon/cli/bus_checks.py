@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from jtqd.daemon.bus.boot import bus_load_of
-from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, share
+from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult
 from jtqd.daemon.cli.traffic import NodeCount, PdoCount, TimeHistogram, Timing, Traffic, described
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import Condition
@@ -17,10 +17,10 @@ from jtqd.daemon.shared.notices import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import LIMIT
+from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
-from jtqd.drivers.pdo import SYNC_COB_ID
-from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
+from jtqd.estimator.text import counted, percent
 
 SUCCESS_GOOD, SUCCESS_FAIL = 0.99, 0.90
 """Of complete cycles, as libfranka judges its communication test: below 0.95 "many lost", below 0.90 "not sufficient"."""
@@ -208,7 +208,7 @@ def _estimate(traffic: Traffic, config: Config, cob_id: int) -> CheckResult:
         known = sum(count[code] for code in PUBLISHED) / total
         others = [(n, code) for code, n in count.items() if code not in PUBLISHED]
         worst = f" ({NAMES.get(max(others)[1], '?')} {max(others)[0]})" if others else ""
-        per_joint.append((known, f"joint {number} {share(known)}{worst}"))
+        per_joint.append((known, f"joint {number} {percent(known)}{worst}"))
     text = f"{pdo.counted / max(1, traffic.cycles):.4g} per SYNC; with a torque: " + ", ".join(
         each for _, each in per_joint
     )
@@ -272,8 +272,8 @@ def _load(traffic: Traffic, config: Config) -> CheckResult:
     if traffic.seconds <= 0:
         return CheckResult("bus load", SKIP, "nothing on the bus")
     seen = traffic.bits / traffic.seconds / config.bitrate
-    bounds = f"{share(configured.unstuffed)} to {share(configured.worst)}"
-    text = f"{share(seen)} by the bits of every frame; by configuration {bounds}"
+    bounds = f"{percent(configured.unstuffed)} to {percent(configured.worst)}"
+    text = f"{percent(seen)} by the bits of every frame; by configuration {bounds}"
     if seen > LIMIT:
         return CheckResult("bus load", FAIL, text, f"above {LIMIT:.0%} no time remains for a retransmission")
     if seen > configured.worst * (1 + RATE_TOLERANCE):
@@ -397,7 +397,7 @@ def check_loop_timing(
 def check_stolen_time(stolen_s: float, seconds: float) -> CheckResult:
     """Evaluate the processor time that a hypervisor used in `seconds` (`daemon/loop/realtime.py`)."""
     stolen = stolen_s / max(seconds, 1e-3)
-    text = f"{share(stolen)} of a processor used by the hypervisor (stolen time)"
+    text = f"{percent(stolen)} of a processor used by the hypervisor (stolen time)"
     return (
         CheckResult("processors", WARN, text, _STOLEN_HINT)
         if stolen >= STOLEN_WARN

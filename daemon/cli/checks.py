@@ -8,21 +8,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
-from math import isfinite, log1p
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.estimator.checked import counted
+from jtqd.estimator.text import counted
 
 GOOD, WARN, FAIL, SKIP = "GOOD", "WARN", "FAIL", "-"
 """SKIP: does not apply here, and says why."""
 _STYLES = {GOOD: "green", WARN: "yellow", FAIL: "bold red", SKIP: "dim"}
-_BLOCKS = " ▁▂▃▄▅▆▇█"
-_UNITS = ("B", "kB", "MB", "GB", "TB")
-NOTHING = "-"
 
 
 @dataclass(frozen=True)
@@ -87,60 +83,3 @@ def show(console: Console, results: Sequence[CheckResult]) -> None:
             f": {count[GOOD]} good, {counted(count[WARN], 'warning')}, {counted(count[FAIL], 'failure')}",
         )
     )
-
-
-def number(value: float, digits: int = 2) -> str:
-    """Format with fixed digits, or "-" if unknown."""
-    return f"{value:.{digits}f}" if isfinite(value) else NOTHING
-
-
-def share(value: float) -> str:
-    """Format a share: 0.848 -> "84.8 %"."""
-    return f"{100 * value:.1f} %" if isfinite(value) else NOTHING
-
-
-def size(count: int | None) -> str:
-    """Format bytes in decimal units with three digits."""
-    if count is None:
-        return NOTHING
-    value = float(count)
-    for unit in _UNITS:
-        if value < 999.5 or unit == _UNITS[-1]:
-            return f"{value:.0f} {unit}" if value >= 100 or unit == "B" else f"{value:.3g} {unit}"
-        value /= 1000.0
-    raise AssertionError("unreachable")
-
-
-def duration(seconds: float) -> str:
-    """Format a duration with at most two units: "45 ms", "2.3 s", "12 min 31 s", "3 h 05 min", "2 d 04 h"."""
-    if not isfinite(seconds):
-        return NOTHING
-    if seconds < 0.9995:
-        return f"{1000 * seconds:.0f} ms"
-    if seconds < 59.95:
-        return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    if whole < 86400:
-        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-    return f"{whole // 86400} d {whole % 86400 // 3600:02d} h"
-
-
-def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
-    """Format bins as a line of at most `columns` blocks between its edges, e.g. "84 ▇█▂▁ 212 us"; "" without data.
-
-    From the first bin that holds something to the last, which takes everything above it. The height is logarithmic, so that
-    one cycle in a million can be seen.
-    """
-    filled = [n for n, count in enumerate(bins) if count]
-    if not filled:
-        return ""
-    first, last = filled[0], filled[-1]
-    width = -(-(last - first + 1) // columns)
-    sums = [sum(bins[n : n + width]) for n in range(first, last + 1, width)]
-    top = log1p(max(sums))
-    blocks = "".join(_BLOCKS[0 if not each else max(1, round(8 * log1p(each) / top))] for each in sums)
-    high = min(first + len(sums) * width, len(bins)) * bin_us
-    more = " and more" if last == len(bins) - 1 else ""
-    return f"{first * bin_us:.0f} {blocks} {high:.0f} us{more}"

@@ -2,7 +2,7 @@
 
 Units (CiA 402-2): 60A8h and 60A9h name them, and 6092h says how many of them are one turn of the driving shaft. All count
 behind the gear that the drive knows (6091h); a drive whose 6091h is 1:1 counts at the motor's shaft. A word 0, and a feed
-constant of 1, are those of a drive that was not told any unit: then the objects of `drive.CIA_402` scale it.
+constant of 1, are those of a drive that was not told any unit: then the objects of `devices.CIA_402` scale it.
 
 TPDOs: those that are sent at each SYNC and carry every quantity were set up for that, and are kept. Those that an EDS says
 cannot be written are kept whatever they are.
@@ -13,28 +13,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import Any
 
-from jtqd.drivers.drive import (
+from jtqd.daemon.profiles import Family, named, of_vendor
+from jtqd.drivers.devices import CIA_402, DriveObjects, drive_layout
+from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
+from jtqd.drivers.pdo import PdoError
+from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.survey import DRIVE, IDENTITY, MAPPED, BusSurvey, Survey, Tpdo, survey_of_eds
+from jtqd.drivers.units import (
     AT_JOINT,
     AT_MOTOR,
     GEAR,
     SECOND,
-    DriveObjects,
-    LayoutError,
-    ScalingError,
-    drive_layout,
+    UnitError,
     is_increments,
-    map_of,
-    select_tpdos,
     si_per_unit,
     unit_of_position,
     unit_of_velocity,
 )
-from jtqd.drivers.pdo import ACYCLIC, EVERY_SYNC, PdoError, Tpdo
-from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.survey import Survey
 
 _POSITION_UNIT, _VELOCITY_UNIT = (0x60A8, 0), (0x60A9, 0)
 _FEED: tuple[Key, Key] = ((0x6092, 1), (0x6092, 2))
@@ -48,6 +47,85 @@ _TOLD_BY: Mapping[str, Key] = {
 _COMPARE = "turn the joint by a known angle and compare jtq status"
 _AGE_MS = 100
 """For how long a frame counts that is sent by itself, where the drive has no event timer."""
+
+
+class UsageError(Exception):
+    """Options that contradict each other, or too few of them."""
+
+
+def family_of(survey: Survey | None, name: str | None) -> Family | None:
+    """Return the profile by name ("none": no profile), else by the drive's vendor-ID. Raises ConfigError."""
+    if name is not None:
+        return None if name == "none" else named(name)
+    if survey is None or survey.profile != DRIVE:
+        return None
+    return of_vendor(survey.numbers.get(IDENTITY["vendor"]))
+
+
+def mapped_by(family: Family | None) -> tuple[Key, ...]:
+    """Return the objects that jtqd maps, with a profile or without."""
+    return MAPPED[DRIVE] if family is None else tuple(quantities_by(family).values())
+
+
+def quantities_by(family: Family | None) -> dict[str, Key]:
+    """Return the object of each quantity, with a profile or without."""
+    standard = {each.name: getattr(CIA_402, each.name) for each in fields(CIA_402)}
+    keys = {name: (each.index, each.subindex) for name, each in standard.items()}
+    return keys if family is None else {name: family.mapped(name, key) for name, key in keys.items()}
+
+
+def surveyed(reader: BusSurvey, node: int, profile: str | None) -> Survey | None:
+    """Survey one node, with the objects that its profile needs; None when it does not answer. Raises ConfigError."""
+    found = reader.read(node)
+    if found is not None:
+        found = replace(found, tpdos=reader.tpdos(node))
+    if found is None or (family := family_of(found, profile)) is None:
+        return found
+    wanted = {*family.objects, *mapped_by(family)}
+    numbers = {**found.numbers, **reader.numbers(node, wanted - set(found.numbers))}
+    return replace(found, numbers=numbers, missing=found.missing | (wanted - set(numbers)))
+
+
+def eds_survey(path: Path, node: int, profile: str | None) -> Survey:
+    """Return the survey by an EDS, with the objects that its profile needs. Raises EdsError, ConfigError."""
+    found = survey_of_eds(path, node)
+    family = family_of(found, profile)
+    return found if family is None else survey_of_eds(path, node, (*family.objects, *mapped_by(family)))
+
+
+def merged(eds: Survey, bus: Survey | None, path: Path) -> Survey:
+    """A device on the bus knows its values; its EDS knows what can be mapped, and what cannot be written.
+
+    Raises UsageError for the EDS of another vendor's device, or of another kind.
+    """
+    if bus is None:
+        return eds
+    vendor = IDENTITY["vendor"]
+    told, found = eds.numbers.get(vendor), bus.numbers.get(vendor)
+    if told and found and told != found:
+        raise UsageError(f"{path}: is of vendor {told:08X}h, but node {bus.node} says {found:08X}h (1018h:1)")
+    if eds.profile != bus.profile:
+        raise UsageError(
+            f"{path}: is of profile {eds.profile}, but node {bus.node} says {bus.profile} (1000h)"
+        )
+    known = {each.number: each for each in eds.tpdos}
+    tpdos = tuple(
+        replace(
+            each, mapping_fixed=known[each.number].mapping_fixed, type_fixed=known[each.number].type_fixed
+        )
+        if each.number in known
+        else each
+        for each in bus.tpdos
+    )
+    return replace(bus, unmappable=eds.unmappable, tpdos=tpdos)
+
+
+def description(survey: Survey) -> str:
+    """Return a device in one line: name, versions, vendor, profile, source."""
+    texts = [text for name in ("hardware", "software") if (text := survey.texts.get(name))]
+    vendor = survey.numbers.get((0x1018, 1))
+    parts = [survey.title, *texts, *([f"vendor {vendor:08X}h"] if vendor else [])]
+    return f"{', '.join(parts)} (profile {survey.profile or 'unknown'}, by {survey.source})"
 
 
 @dataclass(frozen=True)
@@ -87,7 +165,7 @@ def unit_problems(node: int, survey: Survey | None) -> list[str]:
     for key, told in ((_POSITION_UNIT, _position), (_VELOCITY_UNIT, _velocity)):
         try:
             told(survey)
-        except ScalingError as error:
+        except UnitError as error:
             found.append(
                 f"node {node} ({survey.title}): {label(*key)}, the unit of "
                 f"{'positions' if key == _POSITION_UNIT else 'velocities'}: {error}; "
@@ -97,7 +175,7 @@ def unit_problems(node: int, survey: Survey | None) -> list[str]:
 
 
 def _position(survey: Survey) -> str:
-    """Return which object tells the unit of positions: "60A8h", "6092h", or "608Fh" (counts). Raises ScalingError."""
+    """Return which object tells the unit of positions: "60A8h", "6092h", or "608Fh" (counts). Raises UnitError."""
     word = survey.number(_POSITION_UNIT)
     if word is not None:
         if is_increments(word):
@@ -109,7 +187,7 @@ def _position(survey: Survey) -> str:
 
 
 def _velocity(survey: Survey) -> str:
-    """Return which object tells the unit of velocities: "60A9h", "608Fh" (counts per second), "". Raises ScalingError."""
+    """Return which object tells the unit of velocities: "60A9h", "608Fh" (counts per second), "". Raises UnitError."""
     word = survey.number(_VELOCITY_UNIT)
     if word is None:
         return ""
@@ -122,7 +200,7 @@ def _velocity(survey: Survey) -> str:
 def units_told(
     survey: Survey | None, gear_ratio: float, quantities: Iterable[str], by_options: Iterable[str]
 ) -> dict[str, Instead]:
-    """Return by which objects a drive's positions and velocity are scaled, where not by those of `drive.CIA_402`.
+    """Return by which objects a drive's positions and velocity are scaled, where not by those of `devices.CIA_402`.
 
     gear_ratio: of the joint. quantities: those that the drive has. by_options: those that the operator has scaled.
     """
@@ -130,7 +208,7 @@ def units_told(
     velocity = ""
     if survey is None:
         return found
-    with suppress(ScalingError):
+    with suppress(UnitError):
         position = _position(survey)
         if position != "608Fh" and not _is_counts(survey, position):
             found["motor_position"] = _scaled(survey, "motor_position", position, gear_ratio)
@@ -143,7 +221,7 @@ def units_told(
             )
             if survey.number(_VELOCITY_UNIT) is None:
                 found["motor_velocity"] = _per_second(survey, position, gear_ratio)
-    with suppress(ScalingError):
+    with suppress(UnitError):
         if velocity := _velocity(survey):
             found["motor_velocity"] = _scaled(survey, "motor_velocity", velocity, gear_ratio)
     unless = set(by_options)
@@ -215,11 +293,11 @@ def layout_told(node: int, survey: Survey | None, objects: DriveObjects) -> Layo
     maps, unusable = [], []
     for each in usable:
         try:
-            maps.append(map_of(node, replace(each, transmission_type=EVERY_SYNC), objects))
+            maps.append(pdo_of_words(node, each.number, each.cob_id, each.words, EVERY_SYNC, objects))
         except PdoError as error:
             unusable.append(f"TPDO{each.number}: {error}")
     try:
-        numbers = [pdo.number for pdo in select_tpdos(objects, maps)]
+        numbers = [pdo.number for pdo in chosen(objects, maps)]
     except LayoutError as error:
         told = "; ".join((str(error), *unusable))
         problem = f"node {node} ({survey.title}): its mapping is fixed, by its EDS: {told}"
@@ -230,7 +308,7 @@ def layout_told(node: int, survey: Survey | None, objects: DriveObjects) -> Layo
     }:
         return Layout()
     wrong = [
-        each for each in used if each.type_fixed and each.transmission_type not in (EVERY_SYNC, *ACYCLIC)
+        each for each in used if each.type_fixed and each.transmission_type not in (EVERY_SYNC, *BY_ITSELF)
     ]
     if wrong:
         problem = (
@@ -243,7 +321,7 @@ def layout_told(node: int, survey: Survey | None, objects: DriveObjects) -> Layo
 
 
 def _by_itself(tpdos: Sequence[Tpdo]) -> list[Tpdo]:
-    return [each for each in tpdos if each.type_fixed and each.transmission_type in ACYCLIC]
+    return [each for each in tpdos if each.type_fixed and each.transmission_type in BY_ITSELF]
 
 
 def _age_ms(tpdos: Sequence[Tpdo]) -> int | None:

@@ -11,18 +11,31 @@ A guess is scaled from the shipped bench by the rated torque: orders of magnitud
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.device import Instead, Layout, layout_told, tpdo_lines, unit_problems, units_told
+from jtqd.daemon.cli.device import (
+    Instead,
+    Layout,
+    layout_told,
+    quantities_by,
+    tpdo_lines,
+    unit_problems,
+    units_told,
+)
 from jtqd.daemon.config import ObjectsSection
 from jtqd.daemon.profiles import INIT, Family
-from jtqd.drivers.drive import CIA_402, EVERY_SCALING_OBJECT, GEAR, DriveObjects, DriveProfile
-from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
-from jtqd.drivers.sdo import Key, label, parse_key
+from jtqd.drivers.devices import (
+    COMMANDER_NODE,
+    EVERY_SCALING_OBJECT,
+    JTQD_NODE,
+    DriveObjects,
+    DriveProfile,
+    parse_key,
+)
+from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.survey import (
-    DRIVE,
     IDENTITY,
     MAPPED,
     RATED_CURRENT,
@@ -31,6 +44,7 @@ from jtqd.drivers.survey import (
     TORQUE,
     Survey,
 )
+from jtqd.drivers.units import GEAR
 from jtqd.estimator.decoder import decode
 
 EFFICIENCY = 0.7
@@ -143,18 +157,6 @@ def plain(number: float) -> str:
     if exponential and "." not in mantissa:  # YAML 1.1 takes 1e-05 for a text
         mantissa += ".0"
     return mantissa + exponential + exponent
-
-
-def mapped_by(family: Family | None) -> tuple[Key, ...]:
-    """Return the objects that jtqd maps, with a profile or without."""
-    return MAPPED[DRIVE] if family is None else tuple(quantities_by(family).values())
-
-
-def quantities_by(family: Family | None) -> dict[str, Key]:
-    """Return the object of each quantity, with a profile or without."""
-    standard = {each.name: getattr(CIA_402, each.name) for each in fields(CIA_402)}
-    keys = {name: (each.index, each.subindex) for name, each in standard.items()}
-    return keys if family is None else {name: family.mapped(name, key) for name, key in keys.items()}
 
 
 def _instead(survey: Survey | None, wanted: Wanted, family: Family | None) -> dict[str, Instead]:
@@ -532,7 +534,7 @@ def drive_lines(joint: JointDraft) -> list[str]:
             entry = f'    "{label(*key)}": {round(value.number)}'
             lines.append(f"{entry:<25} # {'GUESS, ' * value.guess}{value.origin}")
     if joint.family is not None:
-        lines.append(f"  profile: {joint.family.name:<15}# docs/bus.md")
+        lines.append(f"  profile: {joint.family.name:<15}# docs/profiles.md")
     rest = "CiA 402" if joint.family is None else "the profile"
     if joint.own or joint.instead:
         lines.append(f"  objects:                # of this drive; all else is as in {rest}")

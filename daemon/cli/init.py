@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.cli.device import UsageError, description, eds_survey, family_of, merged, surveyed
 from jtqd.daemon.cli.generated import (
     ConfigDraft,
     DraftError,
@@ -26,17 +27,17 @@ from jtqd.daemon.cli.generated import (
     config_text,
     draft_joint,
     joint_text,
-    mapped_by,
     sensor_problems,
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
-from jtqd.daemon.profiles import Family, named, of_vendor
+from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
-from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, BusSurvey, Survey, survey_of_eds
-from jtqd.estimator.checked import ConfigError, counted
+from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
+from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.text import counted
 
 MAX_JOINTS = 4
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
@@ -158,10 +159,6 @@ def _count(text: str) -> int:
     if not text.isdecimal() or not 1 <= int(text) < 2**31:
         raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
     return int(text)
-
-
-class UsageError(Exception):
-    """Options that contradict each other, or too few of them."""
 
 
 @dataclass(frozen=True)
@@ -292,34 +289,6 @@ def _refuse_other_kinds(nodes: Sequence[int], sensor: int | None, surveys: Mappi
         raise UsageError(f"--sensor: node {sensor} is no CiA 404 sensor: {description(surveys[sensor])}")
 
 
-def family_of(survey: Survey | None, name: str | None) -> Family | None:
-    """Return the profile by name ("none": no profile), else by the drive's vendor-ID. Raises ConfigError."""
-    if name is not None:
-        return None if name == "none" else named(name)
-    if survey is None or survey.profile != DRIVE:
-        return None
-    return of_vendor(survey.numbers.get(IDENTITY["vendor"]))
-
-
-def surveyed(reader: BusSurvey, node: int, profile: str | None) -> Survey | None:
-    """Survey one node, with the objects that its profile needs; None when it does not answer. Raises ConfigError."""
-    found = reader.read(node)
-    if found is not None:
-        found = replace(found, tpdos=reader.tpdos(node))
-    if found is None or (family := family_of(found, profile)) is None:
-        return found
-    wanted = {*family.objects, *mapped_by(family)}
-    numbers = {**found.numbers, **reader.numbers(node, wanted - set(found.numbers))}
-    return replace(found, numbers=numbers, missing=found.missing | (wanted - set(numbers)))
-
-
-def eds_survey(path: Path, node: int, profile: str | None) -> Survey:
-    """Return the survey by an EDS, with the objects that its profile needs. Raises EdsError, ConfigError."""
-    found = survey_of_eds(path, node)
-    family = family_of(found, profile)
-    return found if family is None else survey_of_eds(path, node, (*family.objects, *mapped_by(family)))
-
-
 def _on_the_bus(bus: str, nodes: Sequence[int], sensor: int | None, profile: str | None) -> dict[int, Survey]:
     with _survey(bus) as reader:
         wanted = {*nodes, *([sensor] if sensor else [])}
@@ -335,41 +304,6 @@ def _survey(bus: str) -> Iterator[BusSurvey]:
         yield reader
     finally:
         reader.close()
-
-
-def merged(eds: Survey, bus: Survey | None, path: Path) -> Survey:
-    """A device on the bus knows its values; its EDS knows what can be mapped, and what cannot be written.
-
-    Raises UsageError for the EDS of another vendor's device, or of another kind.
-    """
-    if bus is None:
-        return eds
-    vendor = IDENTITY["vendor"]
-    told, found = eds.numbers.get(vendor), bus.numbers.get(vendor)
-    if told and found and told != found:
-        raise UsageError(f"{path}: is of vendor {told:08X}h, but node {bus.node} says {found:08X}h (1018h:1)")
-    if eds.profile != bus.profile:
-        raise UsageError(
-            f"{path}: is of profile {eds.profile}, but node {bus.node} says {bus.profile} (1000h)"
-        )
-    known = {each.number: each for each in eds.tpdos}
-    tpdos = tuple(
-        replace(
-            each, mapping_fixed=known[each.number].mapping_fixed, type_fixed=known[each.number].type_fixed
-        )
-        if each.number in known
-        else each
-        for each in bus.tpdos
-    )
-    return replace(bus, unmappable=eds.unmappable, tpdos=tpdos)
-
-
-def description(survey: Survey) -> str:
-    """Return a device in one line: name, versions, vendor, profile, source."""
-    texts = [text for name in ("hardware", "software") if (text := survey.texts.get(name))]
-    vendor = survey.numbers.get((0x1018, 1))
-    parts = [survey.title, *texts, *([f"vendor {vendor:08X}h"] if vendor else [])]
-    return f"{', '.join(parts)} (profile {survey.profile or 'unknown'}, by {survey.source})"
 
 
 def _others(surveys: dict[int, Survey]) -> str:

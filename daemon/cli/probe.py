@@ -13,20 +13,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.device import unit_problems
-from jtqd.daemon.cli.generated import DraftError, Wanted, draft_joint, drive_lines, sensor_lines, sensor_problems
-from jtqd.daemon.cli.init import (
-    MAX_JOINTS,
-    VALUES,
+from jtqd.daemon.cli.device import (
     UsageError,
-    add_values,
     description,
     eds_survey,
     family_of,
     merged,
-    node_id,
     surveyed,
+    unit_problems,
 )
+from jtqd.daemon.cli.generated import (
+    DraftError,
+    Wanted,
+    draft_joint,
+    drive_lines,
+    sensor_lines,
+    sensor_problems,
+)
+from jtqd.daemon.cli.init import MAX_JOINTS, VALUES, add_values, node_id
 from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.drive import EVERY_SCALING_OBJECT, drive_layout

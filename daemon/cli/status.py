@@ -10,15 +10,17 @@ import json
 import os
 import sys
 import time
+from collections import deque
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from math import isfinite, nan
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.cli.checks import NOTHING, duration, histogram, number, share, size
 from jtqd.daemon.cli.running import (
     RUNNING,
     CurrentLog,
@@ -30,29 +32,30 @@ from jtqd.daemon.cli.running import (
     find_daemons,
     on_bus,
 )
-from jtqd.daemon.cli.recent import Moment, Recent, sparkline
-from jtqd.daemon.cli.status_json import content
-from jtqd.daemon.cli.terminal import HEAD, HEADING, Columns, Keys, line, paged
+from jtqd.daemon.cli.terminal import HEAD, HEADING, Columns, Keys, histogram, line, paged, sparkline
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
 from jtqd.daemon.shared.contacts import contact_line, contact_of
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
-from jtqd.daemon.shared.reasons import joint_reason, silent_s
+from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import (
     LATE_BIN_NS,
     NMT_STATES,
     OPERATIONAL,
     WORK_BIN_NS,
+    InputView,
     SnapshotReader,
     View,
 )
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
-from jtqd.estimator.checked import counted
 from jtqd.estimator.status import NAMES, PUBLISHED
+from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
 
 _FAULTS = shown_in(Shown.STATUS)
 """Counters shown when they are not zero."""
+SCHEMA = "jtq.status/1"
+WINDOW_S = 10.0
 _LAST_NOTICES = 4
 _EXAMPLES = """examples:
   jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
@@ -187,7 +190,7 @@ def _joints(about: About, view: View, *, still: bool) -> Columns:
             _quantity(measured.current_a, "A"),
             _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
             _quantity(measured.temperature_c, "°C", 1),
-            share(sum(spent[code] for code in PUBLISHED) / max(1, sum(spent))),
+            percent(sum(spent[code] for code in PUBLISHED) / max(1, sum(spent))),
         )
     return table
 
@@ -258,7 +261,7 @@ def _bus(about: About, view: View, earlier: View) -> RenderableType:
     now = bus_load(earlier, view, about.bitrate)
     return line(
         "bus load",
-        f"{share(now)} now, with worst-case stuff bits; {share(view.worst_load)} by configuration",
+        f"{percent(now)} now, with worst-case stuff bits; {percent(view.worst_load)} by configuration",
     )
 
 
@@ -334,6 +337,195 @@ def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
     for each in notices[-_LAST_NOTICES:]:
         when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
         yield line(when, Text(each.text, style=_style_of(each.level)))
+
+
+def content(reading: Reading) -> dict[str, Any]:
+    """Return everything the view shows; null for unknown numbers."""
+    about, view = reading.daemon.about, reading.view
+    result: dict[str, Any] = {
+        "schema": SCHEMA,
+        "bus": about.bus,
+        "instance": about.instance,
+        "pid": about.pid,
+        "state": reading.state,
+        "why": reading.why or None,
+        "started": about.started,
+        "configuration": {"path": about.configuration, "sha256": about.configuration_sha256},
+        "method": about.method,
+        "versions": about.versions,
+    }
+    if view is None or reading.earlier is None:
+        return result
+    return result | {
+        "cycle": view.cycle,
+        "joints": [_joint_content(reading, number) for number in range(1, len(view.joints) + 1)],
+        "inputs": [
+            _input_content(name, each, view) for name, each in zip(about.inputs, view.inputs, strict=False)
+        ],
+        "work_us": _quantiles_content(reading.work_us),
+        "late_us": _quantiles_content(reading.late_us),
+        "bus_load": {
+            "now": finite(bus_load(reading.earlier, view, about.bitrate)),
+            "worst_case": view.worst_load,
+        },
+        "bus_state": dict(reading.bus),
+        "counters": view.counters,
+        "nodes": [_node_content(node, what, view) for node, what in sorted(about.nodes.items())],
+        "notices": [_notice_content(each) for each in reading.notices],
+        "conditions": [_condition_content(each, time.monotonic_ns()) for each in reading.conditions],
+        "recorder": reading.log and _recorder_content(reading.log),
+    }
+
+
+def _joint_content(reading: Reading, number: int) -> dict[str, Any]:
+    about, view, earlier = reading.daemon.about, reading.view, reading.earlier
+    assert view is not None
+    assert earlier is not None
+    n = number - 1
+    seen, measured = view.joints[n], view.measured[n]
+    running = reading.state == RUNNING
+    known = seen.status in PUBLISHED and running
+    return {
+        "joint": number,
+        "name": about.joints[n].name,
+        "status": NAMES.get(seen.status, str(seen.status)),
+        "reason": joint_reason(about, number, view, earlier) or None,
+        "since_s": (view.cycle - view.status_since[n]) * view.period_s,
+        "torque_nm": finite(seen.torque_nm if known else nan),
+        "sigma_nm": finite(seen.sigma_nm if known else nan),
+        "physics_nm": finite(seen.physics_nm),
+        "network_nm": finite(seen.network_nm),
+        "sensor_nm": finite(seen.sensor_nm),
+        "reference_nm": finite(seen.reference_nm),
+        "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
+        "rmse_nm": finite(view.rmse_nm[n]),
+        "age_ms": finite(seen.age_ms),
+        "zeros": view.zeros[n].content(),
+        "contact": contact_of(seen) if running else None,
+        "contact_nm": finite(seen.contact_nm if running else nan),
+        "contact_threshold_nm": about.joints[n].contact_threshold_nm,
+        "torque_rate_nm_s": finite(seen.torque_rate_nm_s if running else nan),
+        "current_a": finite(measured.current_a),
+        "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
+        "temperature_c": finite(measured.temperature_c),
+        "drive": drive_state(seen.statusword),
+        "cycles": {
+            NAMES.get(code, str(code)): count for code, count in enumerate(view.status_cycles[n]) if count
+        },
+    }
+
+
+def _input_content(name: str, each: InputView, view: View) -> dict[str, Any]:
+    return {
+        "name": name,
+        "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
+        "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
+        "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
+        "late": each.late,
+        "lost": each.lost,
+        "duplicates": each.duplicates,
+        "rejected": each.rejected,
+    }
+
+
+def _node_content(node: int, what: str, view: View) -> dict[str, Any]:
+    heard_ns = view.node_heard_ns[node]
+    return {
+        "node": node,
+        "what": what,
+        "state": NMT_STATES.get(view.node_states[node]) if heard_ns else None,
+        "heartbeat_age_s": (view.sync_realtime_ns - heard_ns) * 1e-9 if heard_ns else None,
+        "configured": node not in view.unconfigured,
+    }
+
+
+def _notice_content(each: Notice) -> dict[str, Any]:
+    return {
+        "realtime_ns": each.realtime_ns,
+        "level": each.level,
+        "node": each.node or None,
+        "topic": each.topic,
+        "text": each.text,
+    }
+
+
+def _condition_content(each: Condition, now_ns: int) -> dict[str, Any]:
+    return {
+        "name": each.name,
+        "subject": each.subject,
+        "severity": SEVERITIES[each.severity],
+        "text": each.text,
+        "for_s": (now_ns - each.since_ns) * 1e-9,
+    }
+
+
+def _recorder_content(log: CurrentLog) -> dict[str, Any]:
+    return {
+        "path": str(log.path) if log.path else None,
+        "bytes": log.size,
+        "written": log.account.written,
+        "lost": log.account.lost,
+        "let_go": log.account.let_go,
+        "disk_free": log.disk_free,
+        "disk_size": log.disk_size,
+    }
+
+
+def _quantiles_content(values: tuple[float, float, float]) -> dict[str, float | None]:
+    return dict(zip(("p50", "p99", "max"), map(finite, values), strict=True))
+
+
+def largest_bin(now: Sequence[int], before: Sequence[int]) -> int | None:
+    """Return the last bin that has grown; None where none has (or the daemon began anew)."""
+    return next((n for n in range(len(now) - 1, -1, -1) if now[n] > before[n]), None)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One reading: time of the view [s], torques [Nm] (NaN: none), histograms of work and lateness, contacts until then."""
+
+    time_s: float
+    torques: tuple[float, ...]
+    work: tuple[int, ...]
+    late: tuple[int, ...]
+    contacts: int = 0
+
+
+class Recent:
+    """Readings of the last WINDOW_S seconds."""
+
+    def __init__(self) -> None:
+        self._moments: deque[Moment] = deque()
+
+    def add(self, moment: Moment) -> None:
+        """Take a reading; older ones than the window go. A histogram that has shrunk is that of another daemon."""
+        if self._moments and sum(moment.work) < sum(self._moments[-1].work):
+            self._moments.clear()
+        self._moments.append(moment)
+        while moment.time_s - self._moments[0].time_s > WINDOW_S:
+            self._moments.popleft()
+
+    @property
+    def seconds(self) -> float:
+        """Length of what is remembered [s]."""
+        return self._moments[-1].time_s - self._moments[0].time_s if self._moments else 0.0
+
+    def torques(self, joint: int) -> list[float]:
+        """Return the torques of a joint (0, 1, ...), oldest first."""
+        return [each.torques[joint] for each in self._moments if joint < len(each.torques)]
+
+    @property
+    def contacts(self) -> int:
+        """Return how many contacts have begun in the window."""
+        return self._moments[-1].contacts - self._moments[0].contacts if self._moments else 0
+
+    def largest_us(self, bin_us: float, *, late: bool) -> float | None:
+        """Return the upper edge of the largest work time (or lateness) in the window [us]; None without a cycle."""
+        if len(self._moments) < 2:
+            return None
+        first, last = self._moments[0], self._moments[-1]
+        found = largest_bin(last.late, first.late) if late else largest_bin(last.work, first.work)
+        return None if found is None else (found + 1) * bin_us
 
 
 def parser() -> argparse.ArgumentParser:

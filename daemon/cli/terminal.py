@@ -8,7 +8,9 @@ import sys
 import termios
 import time
 import tty
-from typing import Any
+from collections.abc import Sequence
+from math import isfinite, log1p
+from typing import Any, Final, TypeVar
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.padding import Padding
@@ -16,9 +18,12 @@ from rich.segment import Segment, Segments
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.cli.recent import page
 from jtqd.daemon.supervisor.table import first_that_fits
 
+Line = TypeVar("Line")
+BLOCKS: Final = "▁▂▃▄▅▆▇█"
+GAP: Final = " "
+"""In a sparkline: no torque was published."""
 HEAD = "bold"
 HEADING = 9
 """Width of the headings of lines."""
@@ -114,3 +119,51 @@ class Keys:
         if not pressed:  # the terminal has gone
             time.sleep(wait_s)
         return sum(pressed.count(key) for key in b" n") - sum(pressed.count(key) for key in b"bp")
+
+
+def page(lines: Sequence[Line], height: int, number: int) -> tuple[list[Line], int, int]:
+    """Return one page of a picture, its number and how many there are; the last page is followed by the first.
+
+    >>> page(["a", "b", "c"], 2, 3)
+    (['c'], 1, 2)
+    """
+    height = max(height, 1)
+    count = max(1, -(-len(lines) // height))
+    number %= count
+    return list(lines[number * height : (number + 1) * height]), number, count
+
+
+def sparkline(values: Sequence[float], columns: int) -> str:
+    """Return the newest values as at most `columns` blocks between their extremes; a gap for each that is no number.
+
+    >>> sparkline([0.0, 1.0, float("nan"), 7.0], 8)
+    '▁▂ █'
+    """
+    shown = list(values)[-columns:]
+    known = [each for each in shown if isfinite(each)]
+    if not known:
+        return GAP * len(shown)
+    low, span = min(known), max(known) - min(known)
+    top = len(BLOCKS) - 1
+    return "".join(
+        BLOCKS[round(top * (each - low) / span) if span else 0] if isfinite(each) else GAP for each in shown
+    )
+
+
+def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
+    """Format bins as a line of at most `columns` blocks between its edges, e.g. "84 ▇█▂▁ 212 us"; "" without data.
+
+    From the first bin that holds something to the last, which takes everything above it. The height is logarithmic, so that
+    one cycle in a million can be seen.
+    """
+    filled = [n for n, count in enumerate(bins) if count]
+    if not filled:
+        return ""
+    first, last = filled[0], filled[-1]
+    width = -(-(last - first + 1) // columns)
+    sums = [sum(bins[n : n + width]) for n in range(first, last + 1, width)]
+    top = log1p(max(sums))
+    blocks = "".join((GAP + BLOCKS)[0 if not each else max(1, round(8 * log1p(each) / top))] for each in sums)
+    high = min(first + len(sums) * width, len(bins)) * bin_us
+    more = " and more" if last == len(bins) - 1 else ""
+    return f"{first * bin_us:.0f} {blocks} {high:.0f} us{more}"

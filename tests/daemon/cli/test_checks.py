@@ -10,14 +10,11 @@ from jtqd.daemon.cli.checks import (
     SKIP,
     WARN,
     CheckResult,
-    duration,
     exit_status,
-    histogram,
-    number,
     report,
-    share,
-    size,
 )
+from jtqd.daemon.cli.terminal import histogram
+from jtqd.estimator.text import duration, number, percent, size
 
 NAN = float("nan")
 
@@ -60,7 +57,7 @@ def test_numbers_for_people() -> None:
     assert [size(each) for each in (0, 999, 1000, 123_456, 1_230_000_000, None)] == [
         *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-"),
     ]
-    assert (number(-1.005), number(NAN), share(0.8476), share(NAN)) == ("-1.00", "-", "84.8 %", "-")
+    assert (number(-1.005), number(NAN), percent(0.8476), percent(NAN)) == ("-1.00", "-", "84.8 %", "-")
 
 
 def test_a_histogram_shows_one_cycle_in_a_million() -> None:

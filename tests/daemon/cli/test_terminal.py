@@ -4,7 +4,8 @@ from math import nan
 
 import pytest
 
-from jtqd.daemon.cli.recent import WINDOW_S, Moment, Recent, page, sparkline
+from jtqd.daemon.cli.status import WINDOW_S, Moment, Recent
+from jtqd.daemon.cli.terminal import page, sparkline
 
 
 def test_a_sparkline_spans_its_values_and_leaves_gaps():

@@ -12,9 +12,7 @@ from rich.console import Console
 
 from jtqd.daemon.cli import status
 from jtqd.daemon.cli.running import Daemon, Watch
-from jtqd.daemon.cli.recent import Moment, Recent
-from jtqd.daemon.cli.status import StatusView
-from jtqd.daemon.cli.status_json import content
+from jtqd.daemon.cli.status import Moment, Recent, StatusView, content
 from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.counters import COUNTERS
