@@ -1,4 +1,4 @@
-"""`jtq check`: a bus and this machine's timing, measured for some seconds and judged item by item."""
+"""`jtq check`: measure a bus and this machine's timing for some seconds, and judge them item by item."""
 
 from __future__ import annotations
 

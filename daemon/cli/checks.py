@@ -1,7 +1,4 @@
-"""Result of a check, its report on a terminal and as JSON, and numbers for people. Pure, but for `report`.
-
-`jtq check` and `jtq doctor` are lists of `CheckResult`: an item, GOOD, WARN or FAIL, the figures, and what to do.
-"""
+"""Result of a check: an item, GOOD, WARN or FAIL, the figures and the remedy; their report as a table or as JSON."""
 
 from __future__ import annotations
 
@@ -17,13 +14,14 @@ from rich.text import Text
 from jtqd.estimator.text import counted
 
 GOOD, WARN, FAIL, SKIP = "GOOD", "WARN", "FAIL", "-"
-"""SKIP: does not apply here, and says why."""
+"""SKIP: does not apply here; the text has the reason."""
 _STYLES = {GOOD: "green", WARN: "yellow", FAIL: "bold red", SKIP: "dim"}
+_EXIT_STATUS = {GOOD: 0, WARN: 3, FAIL: 1}
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one item. `hint` is the remedy, empty if none is needed."""
+    """Result of one item. hint: the remedy, empty if none is needed."""
 
     item: str
     level: str
@@ -31,40 +29,39 @@ class CheckResult:
     hint: str = ""
 
 
+def judge(item: str, text: str, *rules: tuple[object, str, str]) -> CheckResult:
+    """Return the result by the first rule (condition, level, hint) whose condition is true, else GOOD."""
+    for condition, level, hint in rules:
+        if condition:
+            return CheckResult(item, level, text, hint)
+    return CheckResult(item, GOOD, text)
+
+
+def worst(results: Iterable[CheckResult]) -> str:
+    """Return the worst level: FAIL, WARN or GOOD."""
+    levels = {each.level for each in results}
+    return next((level for level in (FAIL, WARN) if level in levels), GOOD)
+
+
 def report(results: Sequence[CheckResult], schema: str | None, **more: Any) -> int:
-    """Print the results on standard output and return the exit status.
+    """Print the results on standard output; return the exit status: 0 all good, 3 warnings, 1 failures.
 
     Args:
         results: in the order of the report.
         schema: print JSON of this schema; None prints a table.
-        more: what the JSON also holds.
+        more: further keys of the JSON.
     """
-    if schema is not None:
-        print(json.dumps(as_json(schema, results, **more)))
-    else:
+    level = worst(results)
+    if schema is None:
         show(Console(), results)
-    return exit_status(results)
-
-
-def exit_status(results: Iterable[CheckResult]) -> int:
-    """Return the exit status: 0 all good, 3 warnings, 1 failures."""
-    levels = {each.level for each in results}
-    return 1 if FAIL in levels else 3 if WARN in levels else 0
-
-
-def as_json(schema: str, results: Sequence[CheckResult], **more: Any) -> dict[str, Any]:
-    """Return plain data: worst level, exit status and every item."""
-    status = exit_status(results)
-    return {
-        "schema": schema,
-        "result": {0: GOOD, 3: WARN, 1: FAIL}[status],
-        **more,
-        "items": [asdict(each) for each in results],
-    }
+    else:
+        items = [asdict(each) for each in results]
+        print(json.dumps({"schema": schema, "result": level, **more, "items": items}))
+    return _EXIT_STATUS[level]
 
 
 def show(console: Console, results: Sequence[CheckResult]) -> None:
-    """Print the table and a last line."""
+    """Print the table and a last line with the counts."""
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(no_wrap=True, style="bold")
@@ -76,10 +73,6 @@ def show(console: Console, results: Sequence[CheckResult]) -> None:
         table.add_row(Text(each.level, style=_STYLES[each.level]), each.item, text)
     console.print(table)
     count = {level: sum(each.level == level for each in results) for level in (GOOD, WARN, FAIL)}
-    status = {0: GOOD, 3: WARN, 1: FAIL}[exit_status(results)]
-    console.print(
-        Text.assemble(
-            (status, _STYLES[status]),
-            f": {count[GOOD]} good, {counted(count[WARN], 'warning')}, {counted(count[FAIL], 'failure')}",
-        )
-    )
+    level = worst(results)
+    counts = f": {count[GOOD]} good, {counted(count[WARN], 'warning')}, {counted(count[FAIL], 'failure')}"
+    console.print(Text.assemble((level, _STYLES[level]), counts))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,8 +13,8 @@ from jtqd.daemon.cli.machine_checks import (
     check_directories,
     check_files,
     check_kernel,
-    check_leftovers,
     check_packages,
+    check_remains,
     check_unit,
 )
 from jtqd.daemon.cli.running import find_daemons, places
@@ -56,13 +55,13 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str]) -> int:
     """Examine and report; return the exit status."""
     arguments = parser().parse_args(argv)
-    results = list(examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
+    results = list(_examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
     return report(results, SCHEMA if arguments.json else None, bus=arguments.bus)
 
 
-def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
+def _examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
     """Run every check. An unreadable configuration is one failure; the shipped one is used instead."""
-    broken = None
+    broken = ""
     try:
         config = load_config(path)
     except ConfigError as error:
@@ -77,16 +76,10 @@ def examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[Ch
     yield from check_directories(log, places())
     yield from check_packages()
     yield check_unit()
-    yield from check_leftovers(log, find_daemons())
+    yield from check_remains(log, find_daemons())
 
 
 def _log_directory() -> Path | None:
     """Return the directory that jtqd would write to, as far as it does not depend on the working directory."""
     named = os.environ.get("LOGS_DIRECTORY", "").split(":")[0]
-    if named:
-        return Path(named)
-    return _USUAL_LOGS if _USUAL_LOGS.exists() else None
-
-
-if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    return Path(named) if named else _USUAL_LOGS if _USUAL_LOGS.exists() else None

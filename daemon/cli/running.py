@@ -1,8 +1,4 @@
-"""Running daemons of this machine: find them (`find_daemons`), read one (`Watch`), explain a status (`reason`).
-
-Everything comes from the runtime directories: snapshot, `about.json`, notices, the recorder's account. Nothing is written,
-and no lock is held that anybody waits for.
-"""
+"""Running daemons of this machine, read-only from their runtime directories: snapshot, about.json, notices, conditions."""
 
 from __future__ import annotations
 
@@ -11,7 +7,8 @@ import os
 import time
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +21,7 @@ from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
 
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
 STILL_S = 0.25
-"""A loop whose SYNC is older stands still; the snapshot is written every 8th cycle."""
+"""A loop whose last SYNC is older is stalled; the snapshot is written every 8th cycle."""
 STARTING, RUNNING, STILL = "starting", "running", "still"
 _NOTICES = 20
 _PROCESS = {
@@ -48,9 +45,9 @@ class DaemonSearch(NamedTuple):
 
     daemons: tuple[Daemon, ...]
     closed: tuple[Path, ...]
-    """Runtime directories that this user may not look into."""
-    left_over: tuple[Path, ...]
-    """Runtime directories of daemons that were killed; the next start on the same bus takes them over."""
+    """Runtime directories that this user may not read."""
+    abandoned: tuple[Path, ...]
+    """Runtime directories of killed daemons; the next start on the same bus reuses them."""
 
 
 def places() -> list[Path]:
@@ -64,7 +61,7 @@ def places() -> list[Path]:
 
 def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
     """Return every running daemon, by the name of its bus; `roots`: directories instead of `places()`."""
-    daemons, closed, left_over = [], [], []
+    daemons, closed, abandoned = [], [], []
     for root in places() if roots is None else roots:
         for directory in _subdirectories(root):
             try:
@@ -73,14 +70,14 @@ def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
             except PermissionError:
                 closed.append(directory)
             except (AboutError, OSError):
-                left_over.append(directory)
+                abandoned.append(directory)
             else:
                 if content.running():
                     daemons.append(Daemon(directory, content))
                 else:
-                    left_over.append(directory)
+                    abandoned.append(directory)
     return DaemonSearch(
-        tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(left_over)
+        tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(abandoned)
     )
 
 
@@ -132,44 +129,45 @@ def _subdirectories(root: Path) -> list[Path]:
 
 @dataclass(frozen=True)
 class CurrentLog:
-    """Log files of the recorder so far."""
+    """Account of the recorder; the file that is being written with its size, and the disk [bytes]."""
 
     account: Account
-    path: Path | None
-    """The file that is being written."""
-    size: int | None
-    """Bytes of it."""
-    disk_free: int | None
-    disk_size: int | None
+    path: Path | None = None
+    size: int | None = None
+    disk_free: int | None = None
+    disk_size: int | None = None
+
+
+_Quantiles = tuple[float, float, float]
+_NO_QUANTILES: _Quantiles = (float("nan"),) * 3
 
 
 @dataclass(frozen=True)
 class Reading:
-    """State of a daemon at one moment; `view` and what follows only when its loop has begun."""
+    """State of a daemon at one moment; `view` and what follows only once its loop has begun.
+
+    why: why it does not run; earlier: the reading before this one; work, late: histograms; work_us, late_us: their
+    quantiles 0.5, 0.99 and 1; notices: last ones about the bus; conditions: present ones, the worst first; bus: content of
+    `bus.json`, empty where it cannot be read.
+    """
 
     daemon: Daemon
     state: str
     why: str
-    """Why it does not run."""
-    view: View | None
-    earlier: View | None
-    """A reading from a moment before, for what changes."""
+    view: View | None = None
+    earlier: View | None = None
     work: tuple[int, ...] = ()
     late: tuple[int, ...] = ()
-    work_us: tuple[float, float, float] = (float("nan"),) * 3
-    late_us: tuple[float, float, float] = (float("nan"),) * 3
-    """Quantiles 0.5, 0.99 and 1."""
+    work_us: _Quantiles = _NO_QUANTILES
+    late_us: _Quantiles = _NO_QUANTILES
     log: CurrentLog | None = None
     notices: tuple[Notice, ...] = ()
-    """The daemon's last notices about the bus."""
     conditions: tuple[Condition, ...] = ()
-    """What is wrong now, the worst first."""
     bus: Mapping[str, Any] = field(default_factory=dict)
-    """`bus.json`: what the supervisor sees of the bus; empty where it cannot be read."""
 
 
 class Watch:
-    """Reads one daemon again and again."""
+    """Reads one daemon repeatedly."""
 
     def __init__(self, daemon: Daemon) -> None:
         self.daemon = daemon
@@ -182,7 +180,7 @@ class Watch:
         """Read the present state."""
         view = self._view()
         if view is None:
-            return Reading(self.daemon, STARTING, "booting its nodes", None, None)
+            return Reading(self.daemon, STARTING, "booting its nodes")
         assert self._reader is not None
         earlier, self._earlier = self._earlier or view, view
         state, why = _state(view)
@@ -229,7 +227,7 @@ def _bus(directory: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _three(values: list[float]) -> tuple[float, float, float]:
+def _three(values: list[float]) -> _Quantiles:
     return values[0], values[1], values[2]
 
 
@@ -249,20 +247,14 @@ def _log(daemon: Daemon) -> CurrentLog | None:
     if about.log_directory is None:
         return None
     directory = Path(about.log_directory)
-    account = read_account(daemon.directory / "recorded") or Account()
-    path, size, free, total = None, None, None, None
-    try:
-        files = [
-            (each.stat().st_mtime_ns, each) for each in directory.glob(f"{about.log_prefix}*.mcap.active")
-        ]
-        if files:
-            path = max(files)[1]
-            size = path.stat().st_size
-    except OSError:
-        pass  # a file that has just been renamed, or a directory that is not ours to read
-    try:
+    log = CurrentLog(read_account(daemon.directory / "recorded") or Account())
+    with suppress(OSError):  # a file that has just been renamed, or a closed directory
+        active = directory.glob(f"{about.log_prefix}*.mcap.active")
+        newest = max(active, key=lambda each: each.stat().st_mtime_ns, default=None)
+        if newest is not None:
+            log = replace(log, path=newest, size=newest.stat().st_size)
+    with suppress(OSError):
         disk = os.statvfs(directory)
         free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
-    except OSError:
-        pass
-    return CurrentLog(account, path, size, free, total)
+        log = replace(log, disk_free=free, disk_size=total)
+    return log

@@ -1,7 +1,4 @@
-"""`jtq status`: state of a running jtqd, read from shared memory without any effect on the loop.
-
-A reading is shown as a picture at the width of the terminal (`StatusView`), or as plain data (`status_json.content`).
-"""
+"""`jtq status`: state of a running jtqd on a terminal or as JSON, read from shared memory without effect on its loop."""
 
 from __future__ import annotations
 
@@ -14,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import isfinite, nan
-from typing import Any
+from typing import Any, Final
 
 from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.live import Live
@@ -44,7 +41,6 @@ from jtqd.daemon.shared.snapshot import (
     NMT_STATES,
     OPERATIONAL,
     WORK_BIN_NS,
-    InputView,
     SnapshotReader,
     View,
 )
@@ -52,12 +48,11 @@ from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
 
-_FAULTS = shown_in(Shown.STATUS)
+SCHEMA: Final = "jtq.status/1"
+_FAULTS: Final = shown_in(Shown.STATUS)
 """Counters shown when they are not zero."""
-SCHEMA = "jtq.status/1"
-WINDOW_S = 10.0
-_LAST_NOTICES = 4
-_EXAMPLES = """examples:
+_LAST_NOTICES: Final = 4
+_EXAMPLES: Final = """examples:
   jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
   jtq status --bus can0          of the daemon on can0
   jtq status --once              one text output, also for a file or a mail
@@ -65,419 +60,15 @@ _EXAMPLES = """examples:
 
 exit status: 0 running, 1 no daemon runs (or none that you may read), 2 usage, 3 stalled or still starting
 you may read your own daemons and those of your groups (usermod -a -G jtqd YOU)"""
-_PERIOD_S = 0.2
-_PLAIN_PERIOD_S = 1.0
-_BETWEEN_S = 0.3
-"""Between the two readings of one picture: bus load and causes need what has changed."""
+_PERIOD_S: Final = 0.2
+_PLAIN_PERIOD_S: Final = 1.0
+_BETWEEN_S: Final = 0.3
+"""Between the two readings of one view: bus load and reasons need what has changed."""
+WINDOW_S: Final = 10.0
+"""Of the sparklines and maxima of a live view: its counters are those since the start of the daemon."""
 
 
-class StatusView:
-    """Rich view of one reading; `recent`: with what a live view remembers of the last seconds."""
-
-    def __init__(self, reading: Reading, recent: Recent | None = None) -> None:
-        self._reading, self._recent = reading, recent
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render for the width of the terminal (called by rich)."""
-        reading, width = self._reading, options.max_width
-        yield _title(reading)
-        if reading.state != RUNNING:
-            yield Text(f"NOT RUNNING: {reading.why}" if reading.view else reading.why, style="bold red")
-        if reading.view is None or reading.earlier is None:
-            return
-        about, view = reading.daemon.about, reading.view
-        still = reading.state != RUNNING
-        yield ""
-        yield _joints(about, view, still=still)
-        if not still:
-            yield from _reasons(about, view, reading.earlier)
-            for joint, zeros in zip(about.joints, view.zeros, strict=False):
-                if zeros.tracked:
-                    yield line(
-                        f"zeros {joint.number}", Text(zeros.text, style="" if zeros.plausible else "yellow")
-                    )
-            yield from _contacts(about, view, self._recent)
-            if self._recent is not None:
-                yield from _last_seconds(self._recent, len(about.joints), width)
-        yield ""
-        yield _inputs(about, view)
-        yield ""
-        yield _loop(reading, view, width)
-        yield _bus(about, view, reading.earlier)
-        yield from _frames(reading)
-        faults = [
-            f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
-        ]
-        if faults:
-            yield line("counted", ", ".join(faults))
-        yield ""
-        yield _nodes(about, view)
-        yield ""
-        yield from _log(reading.log)
-        yield from _conditions(reading.conditions)
-        yield from _notices(reading.notices)
-
-
-def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
-    """Return a line per joint that is watched, and one with how many there were: a short one falls between two readings."""
-    watched = False
-    for joint, seen in zip(about.joints, view.joints, strict=False):
-        if joint.contact_threshold_nm is None:
-            continue
-        watched = True
-        told = contact_of(seen)
-        style = "bold red" if told else "yellow" if told is None else ""
-        yield line(
-            f"contact {joint.number}", Text(contact_line(seen, joint.contact_threshold_nm), style=style)
-        )
-    if watched:
-        count = view.counters["contacts"]
-        lately = recent.contacts if recent is not None else 0
-        text = Text(f"{count or 'none'} since the start")
-        if recent is not None:
-            text.append(f", {lately} in the last {recent.seconds:.0f} s", style="bold red" if lately else "")
-        yield line("contacts", text)
-
-
-def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
-    """Return the torque of each joint as a sparkline, and the slowest cycle, of the last seconds."""
-    columns = min(50, max(10, width - 40))
-    for joint in range(joints):
-        torques = recent.torques(joint)
-        known = [each for each in torques if isfinite(each)]
-        extent = f"{min(known):.2f} to {max(known):.2f} Nm" if known else "no torque"
-        yield line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
-    work = recent.largest_us(WORK_BIN_NS / 1000, late=False)
-    late = recent.largest_us(LATE_BIN_NS / 1000, late=True)
-    if work is not None and late is not None:
-        yield line(
-            f"last {recent.seconds:.0f} s", f"work at most {work:.0f} us, SYNC late by at most {late:.0f} us"
-        )
-
-
-def _title(reading: Reading) -> Text:
-    about, view = reading.daemon.about, reading.view
-    text = Text(f"jtqd on {about.instance}", style=HEAD)
-    text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
-    if view is not None:
-        text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
-    text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
-    text.overflow = "fold"
-    return text
-
-
-def _quantity(value: float, unit: str, digits: int = 2) -> str:
-    text = number(value, digits)
-    return text if text == NOTHING else f"{text} {unit}"
-
-
-def _joints(about: About, view: View, *, still: bool) -> Columns:
-    headings = {"joint": "left", "status": "left"} | dict.fromkeys(
-        ("torque", "sigma", "sensor", "age", "current", "motor", "temp.", "with a torque"), "right"
-    )
-    table = Columns(headings, ("age", "with a torque", "motor", "temp.", "current", "sensor", "sigma"))
-    for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
-        known = seen.status in PUBLISHED and not still
-        measured, spent = view.measured[n], view.status_cycles[n]
-        name = NAMES.get(seen.status, str(seen.status))
-        table.add(
-            f"{joint.number} {joint.name}",
-            Text(name, style="dim" if still else COLOURS.get(name, "bold red")),
-            _quantity(seen.torque_nm if known else nan, "Nm"),
-            _quantity(seen.sigma_nm if known else nan, "Nm"),
-            _quantity(seen.reference_nm, "Nm"),
-            _quantity(seen.age_ms if known else nan, "ms"),
-            _quantity(measured.current_a, "A"),
-            _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
-            _quantity(measured.temperature_c, "°C", 1),
-            percent(sum(spent[code] for code in PUBLISHED) / max(1, sum(spent))),
-        )
-    return table
-
-
-def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
-    """Return one line per joint, so that the view keeps its height."""
-    for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
-        why = joint_reason(about, joint.number, view, earlier)
-        name = NAMES.get(seen.status, str(seen.status))
-        lasting = duration((view.cycle - since) * view.period_s)
-        yield Text.assemble(
-            f"joint {joint.number} ",
-            (f"{name} for {lasting}", COLOURS.get(name, "bold red")),
-            f": {why}" if why else "",
-        )
-
-
-def _inputs(about: About, view: View) -> Columns:
-    headings = {"input": "left"} | dict.fromkeys(
-        ("age", "after SYNC", "usual", "missed", "late", "lost", "twice", "wrong"), "right"
-    )
-    table = Columns(headings, ("wrong", "twice", "usual", "lost", "late"))
-    for name, each in zip(about.inputs, view.inputs, strict=False):
-        age_s = (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else nan
-        old = not age_s <= 2 * 8 * view.period_s  # looked at every 8th cycle
-        band = f"{each.low_ns / 1000:.0f}..{each.high_ns / 1000:.0f} us"
-        table.add(
-            name,
-            Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
-            after_sync(each.delay_ns) if each.used_ns else NOTHING,
-            band if each.low_ns <= each.high_ns else NOTHING,
-            *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
-        )
-    return table
-
-
-def after_sync(delay_ns: int) -> str:
-    """Return when an input came after its SYNC; what came before it is of a drive that sends by itself, and so old.
-
-    >>> after_sync(426_000), after_sync(-4_803_000)
-    ('426 us', '4803 us old')
-    """
-    return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
-
-
-def _loop(reading: Reading, view: View, width: int) -> RenderableType:
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=HEADING, no_wrap=True, style=HEAD)
-    grid.add_column()
-    for name, values, bins, bin_ns in (
-        ("work", reading.work_us, reading.work, WORK_BIN_NS),
-        ("lateness", reading.late_us, reading.late, LATE_BIN_NS),
-    ):
-        p50, p99, worst = values
-        text = f"p50 {number(p50, 0)}  p99 {number(p99, 0)}  max {number(worst, 0)} us"
-        columns = min(60, max(10, width - 66))
-        grid.add_row(name, Text.assemble(text.ljust(31), (histogram(bins, bin_ns / 1000, columns), "cyan")))
-    counters = view.counters
-    slots = max(1, counters["cycles"] + counters["missed"])
-    missed = Text(f"{counters['missed']} of {slots} cycles", style="yellow" if counters["missed"] else "")
-    short = counters["cycles"] - counters["complete"]
-    missed.append(f", an input missing in {short}", style="yellow" if short else "default")
-    grid.add_row("missed", missed)
-    return grid
-
-
-def _bus(about: About, view: View, earlier: View) -> RenderableType:
-    now = bus_load(earlier, view, about.bitrate)
-    return line(
-        "bus load",
-        f"{percent(now)} now, with worst-case stuff bits; {percent(view.worst_load)} by configuration",
-    )
-
-
-def _frames(reading: Reading) -> Iterator[RenderableType]:
-    """State and error frames of the CAN controller."""
-    state = reading.bus.get("state")
-    if state is None:
-        return
-    counts = reading.bus.get("counts", {})
-    errors = sum(
-        counts.get(name, 0) for name in ("protocol_errors", "no_acknowledge", "overruns", "bus_offs")
-    )
-    yield line("bus state", f"{state}, {counted(errors, 'error frame')}")
-
-
-def _nodes(about: About, view: View) -> Columns:
-    table = Columns({"node": "left", "what": "left", "state": "left", "heartbeat": "right"}, ("what",))
-    for node, what in sorted(about.nodes.items()):
-        heard = view.node_heard_ns[node]
-        silence = silent_s(view, node, about.heartbeat_ms)
-        state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
-        if silence is not None:
-            state = Text(f"silent, last {state.plain}", style="bold red")
-        elif node in view.unconfigured:
-            state = Text("restarted, not configured yet", style="bold red")
-        elif heard and view.node_states[node] != OPERATIONAL:
-            state.stylize("yellow")
-        age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
-        table.add(f"{node:02X}h", what, state, age)
-    return table
-
-
-def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
-    if log is None:
-        yield line("recorder", "no recording")
-        return
-    lost = Text(f"{log.account.lost} lost", style="bold red" if log.account.lost else "")
-    held = f", {log.account.let_go} discarded (flight recorder)" if log.account.let_go else ""
-    yield line(
-        "recorder",
-        Text.assemble(
-            f"{counted(log.account.written, 'cycle')} written, ",
-            lost,
-            f"{held}, {size(log.size)} in this file",
-        ),
-    )
-    yield line("", str(log.path) if log.path else "no file is being written")
-    yield line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
-
-
-def _style_of(level: int) -> str:
-    return "bold red" if level >= ERROR else "yellow" if level >= WARNING else ""
-
-
-def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
-    """Return the present conditions and their durations."""
-    if conditions:
-        yield ""
-    now_ns = time.monotonic_ns()
-    for each in conditions:
-        yield line(
-            SEVERITIES[each.severity],
-            Text(
-                f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})",
-                style=_style_of(each.severity),
-            ),
-        )
-
-
-def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
-    if notices:
-        yield ""
-    for each in notices[-_LAST_NOTICES:]:
-        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
-        yield line(when, Text(each.text, style=_style_of(each.level)))
-
-
-def content(reading: Reading) -> dict[str, Any]:
-    """Return everything the view shows; null for unknown numbers."""
-    about, view = reading.daemon.about, reading.view
-    result: dict[str, Any] = {
-        "schema": SCHEMA,
-        "bus": about.bus,
-        "instance": about.instance,
-        "pid": about.pid,
-        "state": reading.state,
-        "why": reading.why or None,
-        "started": about.started,
-        "configuration": {"path": about.configuration, "sha256": about.configuration_sha256},
-        "method": about.method,
-        "versions": about.versions,
-    }
-    if view is None or reading.earlier is None:
-        return result
-    return result | {
-        "cycle": view.cycle,
-        "joints": [_joint_content(reading, number) for number in range(1, len(view.joints) + 1)],
-        "inputs": [
-            _input_content(name, each, view) for name, each in zip(about.inputs, view.inputs, strict=False)
-        ],
-        "work_us": _quantiles_content(reading.work_us),
-        "late_us": _quantiles_content(reading.late_us),
-        "bus_load": {
-            "now": finite(bus_load(reading.earlier, view, about.bitrate)),
-            "worst_case": view.worst_load,
-        },
-        "bus_state": dict(reading.bus),
-        "counters": view.counters,
-        "nodes": [_node_content(node, what, view) for node, what in sorted(about.nodes.items())],
-        "notices": [_notice_content(each) for each in reading.notices],
-        "conditions": [_condition_content(each, time.monotonic_ns()) for each in reading.conditions],
-        "recorder": reading.log and _recorder_content(reading.log),
-    }
-
-
-def _joint_content(reading: Reading, number: int) -> dict[str, Any]:
-    about, view, earlier = reading.daemon.about, reading.view, reading.earlier
-    assert view is not None
-    assert earlier is not None
-    n = number - 1
-    seen, measured = view.joints[n], view.measured[n]
-    running = reading.state == RUNNING
-    known = seen.status in PUBLISHED and running
-    return {
-        "joint": number,
-        "name": about.joints[n].name,
-        "status": NAMES.get(seen.status, str(seen.status)),
-        "reason": joint_reason(about, number, view, earlier) or None,
-        "since_s": (view.cycle - view.status_since[n]) * view.period_s,
-        "torque_nm": finite(seen.torque_nm if known else nan),
-        "sigma_nm": finite(seen.sigma_nm if known else nan),
-        "physics_nm": finite(seen.physics_nm),
-        "network_nm": finite(seen.network_nm),
-        "sensor_nm": finite(seen.sensor_nm),
-        "reference_nm": finite(seen.reference_nm),
-        "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
-        "rmse_nm": finite(view.rmse_nm[n]),
-        "age_ms": finite(seen.age_ms),
-        "zeros": view.zeros[n].content(),
-        "contact": contact_of(seen) if running else None,
-        "contact_nm": finite(seen.contact_nm if running else nan),
-        "contact_threshold_nm": about.joints[n].contact_threshold_nm,
-        "torque_rate_nm_s": finite(seen.torque_rate_nm_s if running else nan),
-        "current_a": finite(measured.current_a),
-        "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
-        "temperature_c": finite(measured.temperature_c),
-        "drive": drive_state(seen.statusword),
-        "cycles": {
-            NAMES.get(code, str(code)): count for code, count in enumerate(view.status_cycles[n]) if count
-        },
-    }
-
-
-def _input_content(name: str, each: InputView, view: View) -> dict[str, Any]:
-    return {
-        "name": name,
-        "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
-        "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
-        "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
-        "late": each.late,
-        "lost": each.lost,
-        "duplicates": each.duplicates,
-        "rejected": each.rejected,
-    }
-
-
-def _node_content(node: int, what: str, view: View) -> dict[str, Any]:
-    heard_ns = view.node_heard_ns[node]
-    return {
-        "node": node,
-        "what": what,
-        "state": NMT_STATES.get(view.node_states[node]) if heard_ns else None,
-        "heartbeat_age_s": (view.sync_realtime_ns - heard_ns) * 1e-9 if heard_ns else None,
-        "configured": node not in view.unconfigured,
-    }
-
-
-def _notice_content(each: Notice) -> dict[str, Any]:
-    return {
-        "realtime_ns": each.realtime_ns,
-        "level": each.level,
-        "node": each.node or None,
-        "topic": each.topic,
-        "text": each.text,
-    }
-
-
-def _condition_content(each: Condition, now_ns: int) -> dict[str, Any]:
-    return {
-        "name": each.name,
-        "subject": each.subject,
-        "severity": SEVERITIES[each.severity],
-        "text": each.text,
-        "for_s": (now_ns - each.since_ns) * 1e-9,
-    }
-
-
-def _recorder_content(log: CurrentLog) -> dict[str, Any]:
-    return {
-        "path": str(log.path) if log.path else None,
-        "bytes": log.size,
-        "written": log.account.written,
-        "lost": log.account.lost,
-        "let_go": log.account.let_go,
-        "disk_free": log.disk_free,
-        "disk_size": log.disk_size,
-    }
-
-
-def _quantiles_content(values: tuple[float, float, float]) -> dict[str, float | None]:
-    return dict(zip(("p50", "p99", "max"), map(finite, values), strict=True))
-
-
-def largest_bin(now: Sequence[int], before: Sequence[int]) -> int | None:
-    """Return the last bin that has grown; None where none has (or the daemon began anew)."""
-    return next((n for n in range(len(now) - 1, -1, -1) if now[n] > before[n]), None)
+# ---- last seconds of a live view ----
 
 
 @dataclass(frozen=True)
@@ -498,7 +89,7 @@ class Recent:
         self._moments: deque[Moment] = deque()
 
     def add(self, moment: Moment) -> None:
-        """Take a reading; older ones than the window go. A histogram that has shrunk is that of another daemon."""
+        """Add a reading and drop those older than the window; a histogram that has shrunk is that of another daemon."""
         if self._moments and sum(moment.work) < sum(self._moments[-1].work):
             self._moments.clear()
         self._moments.append(moment)
@@ -507,7 +98,7 @@ class Recent:
 
     @property
     def seconds(self) -> float:
-        """Length of what is remembered [s]."""
+        """Time from the first reading to the last [s]."""
         return self._moments[-1].time_s - self._moments[0].time_s if self._moments else 0.0
 
     def torques(self, joint: int) -> list[float]:
@@ -516,16 +107,406 @@ class Recent:
 
     @property
     def contacts(self) -> int:
-        """Return how many contacts have begun in the window."""
+        """Number of contacts that have begun in the window."""
         return self._moments[-1].contacts - self._moments[0].contacts if self._moments else 0
 
     def largest_us(self, bin_us: float, *, late: bool) -> float | None:
         """Return the upper edge of the largest work time (or lateness) in the window [us]; None without a cycle."""
-        if len(self._moments) < 2:
+        if not self._moments:
             return None
         first, last = self._moments[0], self._moments[-1]
-        found = largest_bin(last.late, first.late) if late else largest_bin(last.work, first.work)
-        return None if found is None else (found + 1) * bin_us
+        before, now = (first.late, last.late) if late else (first.work, last.work)
+        grown = [n for n, (old, new) in enumerate(zip(before, now, strict=True)) if new > old]
+        return (grown[-1] + 1) * bin_us if grown else None
+
+
+# ---- view ----
+
+
+class StatusView:
+    """Rich view of one reading; recent: the last seconds of a live view."""
+
+    def __init__(self, reading: Reading, recent: Recent | None = None) -> None:
+        self._reading, self._recent = reading, recent
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render for the width of the terminal (called by rich)."""
+        reading, width = self._reading, options.max_width
+        yield _title(reading)
+        if reading.state != RUNNING:
+            yield Text(f"NOT RUNNING: {reading.why}" if reading.view else reading.why, style="bold red")
+        if reading.view is None or reading.earlier is None:
+            return
+        about, view = reading.daemon.about, reading.view
+        still = reading.state != RUNNING
+        yield ""
+        yield _joints(about, view, still=still)
+        if not still:
+            yield from _reasons(about, view, reading.earlier)
+            for joint, zeros in zip(about.joints, view.zeros, strict=False):
+                if zeros.tracked:
+                    style = "" if zeros.plausible else "yellow"
+                    yield line(f"zeros {joint.number}", Text(zeros.text, style=style))
+            yield from _contacts(about, view, self._recent)
+            if self._recent is not None:
+                yield from _last_seconds(self._recent, len(about.joints), width)
+        yield ""
+        yield _inputs(about, view)
+        yield ""
+        yield _loop(reading, view, width)
+        load = percent(bus_load(reading.earlier, view, about.bitrate))
+        worst = percent(view.worst_load)
+        yield line("bus load", f"{load} now, with worst-case stuff bits; {worst} by configuration")
+        yield from _bus_state(reading)
+        faults = [
+            f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
+        ]
+        if faults:
+            yield line("counted", ", ".join(faults))
+        yield ""
+        yield _nodes(about, view)
+        yield ""
+        yield from _log(reading.log)
+        yield from _conditions(reading.conditions)
+        yield from _notices(reading.notices)
+
+
+def _status_name(status: int) -> str:
+    return NAMES.get(status, str(status))
+
+
+def _title(reading: Reading) -> Text:
+    about, view = reading.daemon.about, reading.view
+    text = Text(f"jtqd on {about.instance}", style=HEAD)
+    text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
+    if view is not None:
+        text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
+    text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
+    text.overflow = "fold"
+    return text
+
+
+def _quantity(value: float, unit: str, decimals: int = 2) -> str:
+    return f"{number(value, decimals)} {unit}" if isfinite(value) else NOTHING
+
+
+def _joints(about: About, view: View, *, still: bool) -> Columns:
+    headings = {"joint": "left", "status": "left"} | dict.fromkeys(
+        ("torque", "sigma", "sensor", "age", "current", "motor", "temp.", "with a torque"), "right"
+    )
+    table = Columns(headings, ("age", "with a torque", "motor", "temp.", "current", "sensor", "sigma"))
+    for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
+        known = seen.status in PUBLISHED and not still
+        measured, cycles = view.measured[n], view.status_cycles[n]
+        name = _status_name(seen.status)
+        table.add(
+            f"{joint.number} {joint.name}",
+            Text(name, style="dim" if still else COLOURS.get(name, "bold red")),
+            _quantity(seen.torque_nm if known else nan, "Nm"),
+            _quantity(seen.sigma_nm if known else nan, "Nm"),
+            _quantity(seen.reference_nm, "Nm"),
+            _quantity(seen.age_ms if known else nan, "ms"),
+            _quantity(measured.current_a, "A"),
+            _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
+            _quantity(measured.temperature_c, "°C", 1),
+            percent(sum(cycles[code] for code in PUBLISHED) / max(1, sum(cycles))),
+        )
+    return table
+
+
+def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
+    """Return one line per joint, so that the view keeps its height."""
+    for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
+        why = joint_reason(about, joint.number, view, earlier)
+        name = _status_name(seen.status)
+        lasting = duration((view.cycle - since) * view.period_s)
+        yield Text.assemble(
+            f"joint {joint.number} ",
+            (f"{name} for {lasting}", COLOURS.get(name, "bold red")),
+            f": {why}" if why else "",
+        )
+
+
+def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
+    """Return a line per joint that is watched, and their number: a short contact falls between two readings."""
+    watched = [
+        (joint, seen)
+        for joint, seen in zip(about.joints, view.joints, strict=False)
+        if joint.contact_threshold_nm is not None
+    ]
+    for joint, seen in watched:
+        contact, threshold_nm = contact_of(seen), joint.contact_threshold_nm or nan
+        style = "bold red" if contact else "yellow" if contact is None else ""
+        yield line(f"contact {joint.number}", Text(contact_line(seen, threshold_nm), style=style))
+    if watched:
+        text = Text(f"{view.counters['contacts'] or 'none'} since the start")
+        if recent is not None:
+            style = "bold red" if recent.contacts else ""
+            text.append(f", {recent.contacts} in the last {recent.seconds:.0f} s", style=style)
+        yield line("contacts", text)
+
+
+def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
+    """Return the torque of each joint as a sparkline, and the slowest cycle, of the last seconds."""
+    columns = min(50, max(10, width - 40))
+    for joint in range(joints):
+        torques = recent.torques(joint)
+        known = [each for each in torques if isfinite(each)]
+        extent = f"{min(known):.2f} to {max(known):.2f} Nm" if known else "no torque"
+        yield line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
+    work = recent.largest_us(WORK_BIN_NS / 1000, late=False)
+    late = recent.largest_us(LATE_BIN_NS / 1000, late=True)
+    if work is not None and late is not None:
+        text = f"work at most {work:.0f} us, SYNC late by at most {late:.0f} us"
+        yield line(f"last {recent.seconds:.0f} s", text)
+
+
+def _inputs(about: About, view: View) -> Columns:
+    headings = {"input": "left"} | dict.fromkeys(
+        ("age", "after SYNC", "usual", "missed", "late", "lost", "twice", "wrong"), "right"
+    )
+    table = Columns(headings, ("wrong", "twice", "usual", "lost", "late"))
+    for name, each in zip(about.inputs, view.inputs, strict=False):
+        age_s = (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else nan
+        old = not age_s <= 2 * 8 * view.period_s  # read every 8th cycle
+        band = f"{each.low_ns / 1000:.0f}..{each.high_ns / 1000:.0f} us"
+        table.add(
+            name,
+            Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
+            after_sync(each.delay_ns) if each.used_ns else NOTHING,
+            band if each.low_ns <= each.high_ns else NOTHING,
+            *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
+        )
+    return table
+
+
+def after_sync(delay_ns: int) -> str:
+    """Return the arrival of an input after its SYNC; the age of an asynchronous input, which arrived before it.
+
+    >>> after_sync(426_000), after_sync(-4_803_000)
+    ('426 us', '4803 us old')
+    """
+    return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
+
+
+def _loop(reading: Reading, view: View, width: int) -> RenderableType:
+    grid = Table.grid(padding=(0, 1))
+    grid.add_column(width=HEADING, no_wrap=True, style=HEAD)
+    grid.add_column()
+    columns = min(60, max(10, width - 66))
+    for name, values, bins, bin_ns in (
+        ("work", reading.work_us, reading.work, WORK_BIN_NS),
+        ("lateness", reading.late_us, reading.late, LATE_BIN_NS),
+    ):
+        p50, p99, largest = (number(each, 0) for each in values)
+        text = f"p50 {p50}  p99 {p99}  max {largest} us"
+        grid.add_row(name, Text.assemble(text.ljust(31), (histogram(bins, bin_ns / 1000, columns), "cyan")))
+    cycles, missed = view.counters["cycles"], view.counters["missed"]
+    incomplete = cycles - view.counters["complete"]
+    shown = Text(f"{missed} of {max(1, cycles + missed)} cycles", style="yellow" if missed else "")
+    shown.append(f", an input missing in {incomplete}", style="yellow" if incomplete else "default")
+    grid.add_row("missed", shown)
+    return grid
+
+
+def _bus_state(reading: Reading) -> Iterator[RenderableType]:
+    """Return state and error frames of the CAN controller, where they are known."""
+    state, counts = reading.bus.get("state"), reading.bus.get("counts", {})
+    if state is not None:
+        names = ("protocol_errors", "no_acknowledge", "overruns", "bus_offs")
+        errors = sum(counts.get(name, 0) for name in names)
+        yield line("bus state", f"{state}, {counted(errors, 'error frame')}")
+
+
+def _nodes(about: About, view: View) -> Columns:
+    table = Columns({"node": "left", "what": "left", "state": "left", "heartbeat": "right"}, ("what",))
+    for node, what in sorted(about.nodes.items()):
+        heard = view.node_heard_ns[node]
+        state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
+        if silent_s(view, node, about.heartbeat_ms) is not None:
+            state = Text(f"silent, last {state.plain}", style="bold red")
+        elif node in view.unconfigured:
+            state = Text("restarted, not configured yet", style="bold red")
+        elif heard and view.node_states[node] != OPERATIONAL:
+            state.stylize("yellow")
+        age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
+        table.add(f"{node:02X}h", what, state, age)
+    return table
+
+
+def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
+    if log is None:
+        yield line("recorder", "no recording")
+        return
+    account = log.account
+    lost = Text(f"{account.lost} lost", style="bold red" if account.lost else "")
+    discarded = f", {account.let_go} discarded (flight recorder)" if account.let_go else ""
+    written = f"{counted(account.written, 'cycle')} written, "
+    yield line("recorder", Text.assemble(written, lost, f"{discarded}, {size(log.size)} in this file"))
+    yield line("", str(log.path) if log.path else "no file is being written")
+    yield line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
+
+
+def _style_of(level: int) -> str:
+    return "bold red" if level >= ERROR else "yellow" if level >= WARNING else ""
+
+
+def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
+    """Return the present conditions and their durations."""
+    if conditions:
+        yield ""
+    now_ns = time.monotonic_ns()
+    for each in conditions:
+        text = f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})"
+        yield line(SEVERITIES[each.severity], Text(text, style=_style_of(each.severity)))
+
+
+def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
+    if notices:
+        yield ""
+    for each in notices[-_LAST_NOTICES:]:
+        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
+        yield line(when, Text(each.text, style=_style_of(each.level)))
+
+
+# ---- JSON ----
+
+
+def content(reading: Reading) -> dict[str, Any]:
+    """Return everything that the view shows as plain data; null for unknown numbers."""
+    about, view = reading.daemon.about, reading.view
+    result: dict[str, Any] = {
+        "schema": SCHEMA,
+        "bus": about.bus,
+        "instance": about.instance,
+        "pid": about.pid,
+        "state": reading.state,
+        "why": reading.why or None,
+        "started": about.started,
+        "configuration": {"path": about.configuration, "sha256": about.configuration_sha256},
+        "method": about.method,
+        "versions": about.versions,
+    }
+    if view is None or reading.earlier is None:
+        return result
+    now_ns = time.monotonic_ns()
+    return result | {
+        "cycle": view.cycle,
+        "joints": [_joint_content(reading, view, reading.earlier, n) for n in range(len(view.joints))],
+        "inputs": _inputs_content(about, view),
+        "work_us": _quantiles(reading.work_us),
+        "late_us": _quantiles(reading.late_us),
+        "bus_load": {
+            "now": finite(bus_load(reading.earlier, view, about.bitrate)),
+            "worst_case": view.worst_load,
+        },
+        "bus_state": dict(reading.bus),
+        "counters": view.counters,
+        "nodes": _nodes_content(about, view),
+        "notices": [
+            {
+                "realtime_ns": each.realtime_ns,
+                "level": each.level,
+                "node": each.node or None,
+                "topic": each.topic,
+                "text": each.text,
+            }
+            for each in reading.notices
+        ],
+        "conditions": [
+            {
+                "name": each.name,
+                "subject": each.subject,
+                "severity": SEVERITIES[each.severity],
+                "text": each.text,
+                "for_s": (now_ns - each.since_ns) * 1e-9,
+            }
+            for each in reading.conditions
+        ],
+        "recorder": reading.log and _log_content(reading.log),
+    }
+
+
+def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[str, Any]:
+    about, seen, measured = reading.daemon.about, view.joints[n], view.measured[n]
+    running = reading.state == RUNNING
+    known = seen.status in PUBLISHED and running
+    cycles = enumerate(view.status_cycles[n])
+    return {
+        "joint": n + 1,
+        "name": about.joints[n].name,
+        "status": _status_name(seen.status),
+        "reason": joint_reason(about, n + 1, view, earlier) or None,
+        "since_s": (view.cycle - view.status_since[n]) * view.period_s,
+        "torque_nm": finite(seen.torque_nm if known else nan),
+        "sigma_nm": finite(seen.sigma_nm if known else nan),
+        "physics_nm": finite(seen.physics_nm),
+        "network_nm": finite(seen.network_nm),
+        "sensor_nm": finite(seen.sensor_nm),
+        "reference_nm": finite(seen.reference_nm),
+        "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
+        "rmse_nm": finite(view.rmse_nm[n]),
+        "age_ms": finite(seen.age_ms),
+        "zeros": view.zeros[n].content(),
+        "contact": contact_of(seen) if running else None,
+        "contact_nm": finite(seen.contact_nm if running else nan),
+        "contact_threshold_nm": about.joints[n].contact_threshold_nm,
+        "torque_rate_nm_s": finite(seen.torque_rate_nm_s if running else nan),
+        "current_a": finite(measured.current_a),
+        "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
+        "temperature_c": finite(measured.temperature_c),
+        "drive": drive_state(seen.statusword),
+        "cycles": {_status_name(code): count for code, count in cycles if count},
+    }
+
+
+def _inputs_content(about: About, view: View) -> list[dict[str, Any]]:
+    return [
+        {
+            "name": name,
+            "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
+            "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
+            "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
+            "late": each.late,
+            "lost": each.lost,
+            "duplicates": each.duplicates,
+            "rejected": each.rejected,
+        }
+        for name, each in zip(about.inputs, view.inputs, strict=False)
+    ]
+
+
+def _nodes_content(about: About, view: View) -> list[dict[str, Any]]:
+    heard = view.node_heard_ns
+    return [
+        {
+            "node": node,
+            "what": what,
+            "state": NMT_STATES.get(view.node_states[node]) if heard[node] else None,
+            "heartbeat_age_s": (view.sync_realtime_ns - heard[node]) * 1e-9 if heard[node] else None,
+            "configured": node not in view.unconfigured,
+        }
+        for node, what in sorted(about.nodes.items())
+    ]
+
+
+def _log_content(log: CurrentLog) -> dict[str, Any]:
+    return {
+        "path": str(log.path) if log.path else None,
+        "bytes": log.size,
+        "written": log.account.written,
+        "lost": log.account.lost,
+        "let_go": log.account.let_go,
+        "disk_free": log.disk_free,
+        "disk_size": log.disk_size,
+    }
+
+
+def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
+    return dict(zip(("p50", "p99", "max"), map(finite, values), strict=True))
+
+
+# ---- command ----
 
 
 def parser() -> argparse.ArgumentParser:
@@ -561,15 +542,11 @@ def main(argv: list[str]) -> int:
         return 0
 
 
-def _twice(daemon: Daemon) -> Reading:
+def _once(daemon: Daemon, *, as_json: bool) -> int:
     watch = Watch(daemon)
     watch.read()
     time.sleep(_BETWEEN_S)
-    return watch.read()
-
-
-def _once(daemon: Daemon, *, as_json: bool) -> int:
-    reading = _twice(daemon)
+    reading = watch.read()
     if as_json:
         print(json.dumps(content(reading)))
     else:
@@ -588,9 +565,8 @@ def _live(console: Console, daemon: Daemon) -> int:
                 shown, number = paged(console, StatusView(reading, recent), number)
                 live.update(shown, refresh=True)
             else:
-                live.update(
-                    f"jtqd on {daemon.about.instance} has ended; waiting for its restart", refresh=True
-                )
+                ended = f"jtqd on {daemon.about.instance} has ended; waiting for its restart"
+                live.update(ended, refresh=True)
                 again = on_bus(find_daemons(), daemon.about.instance)
                 if again is not None:
                     daemon, watch, recent = again, Watch(again), Recent()
@@ -602,22 +578,21 @@ def _remember(recent: Recent, reading: Reading) -> None:
     if view is None or reading.state != RUNNING:
         return
     torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
-    recent.add(
-        Moment(time.monotonic(), torques, tuple(reading.work), tuple(reading.late), view.counters["contacts"])
-    )
+    moment = Moment(time.monotonic(), torques, reading.work, reading.late, view.counters["contacts"])
+    recent.add(moment)
 
 
 def _lines(daemon: Daemon) -> int:
     """Print one line per second until the daemon ends, for output that is no terminal."""
     watch = Watch(daemon)
+    watched = any(each.contact_threshold_nm is not None for each in daemon.about.joints)
     while daemon.about.running():
         reading = watch.read()
         if reading.state != RUNNING or reading.view is None or reading.earlier is None:
             print(f"not running: {reading.why}", flush=True)
         else:
             reader = SnapshotReader(daemon.directory / "snapshot")
-            watched = any(each.contact_threshold_nm is not None for each in daemon.about.joints)
-            shown = plain_line(reader, reading.earlier, reading.view, daemon.about.bitrate, contacts=watched)
-            print(shown, flush=True)
+            bitrate = daemon.about.bitrate
+            print(plain_line(reader, reading.earlier, reading.view, bitrate, contacts=watched), flush=True)
         time.sleep(_PLAIN_PERIOD_S)
     return 0

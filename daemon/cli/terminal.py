@@ -1,4 +1,4 @@
-"""How a view fills a terminal: tables and lines of its width, pages of its height, and the keys that turn them."""
+"""Views on a terminal: tables and lines of its width, pages of its height and their keys, sparklines, histograms."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import time
 import tty
 from collections.abc import Sequence
 from math import isfinite, log1p
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
 from rich.padding import Padding
@@ -20,20 +20,17 @@ from rich.text import Text
 
 from jtqd.daemon.supervisor.table import first_that_fits
 
-Line = TypeVar("Line")
-BLOCKS: Final = "▁▂▃▄▅▆▇█"
-GAP: Final = " "
-"""In a sparkline: no torque was published."""
-HEAD = "bold"
-HEADING = 9
+HEAD: Final = "bold"
+HEADING: Final = 9
 """Width of the headings of lines."""
-_FOOT_LINES = 2
+_FOOT_LINES: Final = 2
+_BLOCKS: Final = "▁▂▃▄▅▆▇█"
 
 
 class Columns:
-    """A table whose columns go, in the order of `dispensable`, where the terminal is too narrow for all.
+    """A table that drops columns, in the order of `dispensable`, where the terminal is too narrow for all.
 
-    Nothing is cut, and a line below names the columns that went.
+    Nothing is cut, and a line below names the columns that are not shown.
     """
 
     def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
@@ -53,8 +50,8 @@ class Columns:
         ]
         shown = first_that_fits(tables, console, options) or tables[-1]
         yield shown
-        if gone := self._dispensable[: tables.index(shown)]:
-            names = [name for name in self._headings if name in gone]
+        if dropped := self._dispensable[: tables.index(shown)]:
+            names = [name for name in self._headings if name in dropped]
             yield Text(f"no room for: {', '.join(names)}", style="dim")
 
     def _table(self, names: list[str]) -> Table:
@@ -78,20 +75,19 @@ def line(heading: str, text: str | Text) -> RenderableType:
     return grid
 
 
-def clock(pages: str = "") -> RenderableType:
-    """Return the line below a live view."""
-    return Padding(
-        Text(time.strftime(f"%H:%M:%S  {pages}Ctrl-C ends this view; jtqd continues"), style="dim"),
-        (1, 0, 0, 0),
-    )
+def paged(console: Console, view: RenderableType, number: int) -> tuple[RenderableType, int]:
+    """Return one page of a view, with a line below, and its number.
 
-
-def paged(console: Console, picture: RenderableType, number: int) -> tuple[RenderableType, int]:
-    """Return the page of a picture that fits the terminal, with the line below, and its number: no line is dropped."""
-    lines = console.render_lines(picture, console.options.update(height=None), pad=False)
-    shown, number, count = page(lines, console.height - _FOOT_LINES, number)
-    rows = [Segments([*line, Segment.line()]) for line in shown]
-    return Group(*rows, clock(f"page {number + 1} of {count}, SPACE turns; " if count > 1 else "")), number
+    number: of the wanted page, counted on beyond the last page, which is followed by the first.
+    """
+    lines = console.render_lines(view, console.options.update(height=None), pad=False)
+    height = max(console.height - _FOOT_LINES, 1)
+    count = max(1, -(-len(lines) // height))
+    number %= count
+    rows = [Segments([*each, Segment.line()]) for each in lines[number * height : (number + 1) * height]]
+    pages = f"page {number + 1} of {count}, SPACE turns; " if count > 1 else ""
+    foot = time.strftime(f"%H:%M:%S  {pages}Ctrl-C ends this view; jtqd continues")
+    return Group(*rows, Padding(Text(foot, style="dim"), (1, 0, 0, 0))), number
 
 
 class Keys:
@@ -116,21 +112,9 @@ class Keys:
         if not select.select([sys.stdin.fileno()], [], [], wait_s)[0]:
             return 0
         pressed = os.read(sys.stdin.fileno(), 64)
-        if not pressed:  # the terminal has gone
+        if not pressed:  # the terminal is closed
             time.sleep(wait_s)
         return sum(pressed.count(key) for key in b" n") - sum(pressed.count(key) for key in b"bp")
-
-
-def page(lines: Sequence[Line], height: int, number: int) -> tuple[list[Line], int, int]:
-    """Return one page of a picture, its number and how many there are; the last page is followed by the first.
-
-    >>> page(["a", "b", "c"], 2, 3)
-    (['c'], 1, 2)
-    """
-    height = max(height, 1)
-    count = max(1, -(-len(lines) // height))
-    number %= count
-    return list(lines[number * height : (number + 1) * height]), number, count
 
 
 def sparkline(values: Sequence[float], columns: int) -> str:
@@ -140,18 +124,14 @@ def sparkline(values: Sequence[float], columns: int) -> str:
     '▁▂ █'
     """
     shown = list(values)[-columns:]
-    known = [each for each in shown if isfinite(each)]
-    if not known:
-        return GAP * len(shown)
-    low, span = min(known), max(known) - min(known)
-    top = len(BLOCKS) - 1
-    return "".join(
-        BLOCKS[round(top * (each - low) / span) if span else 0] if isfinite(each) else GAP for each in shown
-    )
+    known = [each for each in shown if isfinite(each)] or [0.0]
+    low, span = min(known), (max(known) - min(known)) or 1.0
+    top = len(_BLOCKS) - 1
+    return "".join(_BLOCKS[round(top * (each - low) / span)] if isfinite(each) else " " for each in shown)
 
 
 def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
-    """Format bins as a line of at most `columns` blocks between its edges, e.g. "84 ▇█▂▁ 212 us"; "" without data.
+    """Return bins as a line of at most `columns` blocks between its edges, e.g. "84 ▇█▂▁ 212 us"; "" without data.
 
     From the first bin that holds something to the last, which takes everything above it. The height is logarithmic, so that
     one cycle in a million can be seen.
@@ -163,7 +143,8 @@ def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
     width = -(-(last - first + 1) // columns)
     sums = [sum(bins[n : n + width]) for n in range(first, last + 1, width)]
     top = log1p(max(sums))
-    blocks = "".join((GAP + BLOCKS)[0 if not each else max(1, round(8 * log1p(each) / top))] for each in sums)
+    heights = (max(1, round(8 * log1p(each) / top)) if each else 0 for each in sums)
+    blocks = "".join((" " + _BLOCKS)[height] for height in heights)
     high = min(first + len(sums) * width, len(bins)) * bin_us
     more = " and more" if last == len(bins) - 1 else ""
     return f"{first * bin_us:.0f} {blocks} {high:.0f} us{more}"

@@ -1,7 +1,7 @@
-"""Traffic of a bus, counted frame by frame against a configuration (`Traffic`), and the loops that listen or drive it.
+"""Traffic of a bus, counted frame by frame against a configuration; loops that listen to the bus or send SYNC.
 
-A cycle runs from one SYNC to the next. It is complete when every input PDO came in it exactly once, before the deadline. The
-cycle that was running when listening began and the one that was running when it ended count for nothing.
+A cycle runs from one SYNC to the next. It is complete when every input PDO arrived in it exactly once, before the deadline.
+The cycles that are cut off by begin and end of listening do not count.
 """
 
 from __future__ import annotations
@@ -49,11 +49,12 @@ class TimeHistogram:
         self.count = 0
         self.largest_ns = 0
 
-    def add(self, ns: int) -> None:
-        """Count one value."""
-        self.count += 1
-        self.largest_ns = max(self.largest_ns, ns)
-        self._bins[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += 1
+    def add(self, ns: int, count: int = 1) -> None:
+        """Count a value so many times."""
+        if count:
+            self.count += count
+            self.largest_ns = max(self.largest_ns, ns)
+            self._bins[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += count
 
     def quantile_us(self, share: float) -> float:
         """Return the upper edge of this quantile's bin [us], at most the maximum; NaN without data."""
@@ -67,7 +68,7 @@ class TimeHistogram:
 
 
 _SERVICES = (0x000, 0x100, 0x7E4, 0x7E5)
-"""NMT, TIME, LSS: of nobody in particular."""
+"""NMT, TIME, LSS: belong to no node."""
 _LATE = 1000
 """Added to the frames of a cycle for each that is late: more than a cycle has room for."""
 
@@ -79,7 +80,7 @@ class PdoCount:
     name: str
     length: int
     is_input: bool = True
-    """jtqd waits for it."""
+    """jtqd waits for it in each cycle."""
     frames: int = 0
     in_cycle: int = 0
     counted: int = 0
@@ -87,13 +88,13 @@ class PdoCount:
     missing: int = 0
     """Cycles without it."""
     late: int = 0
-    """... and those in which it came after the deadline."""
+    """Cycles in which it arrived after the deadline."""
     twice: int = 0
     wrong_length: int = 0
     delays: TimeHistogram = field(default_factory=TimeHistogram)
-    """Arrival after SYNC; of one that its node sends by itself, its age at SYNC."""
+    """Arrival after SYNC; of an asynchronous PDO its age at SYNC."""
     age_ns: int = 0
-    """For how long such a frame counts; 0: it is sent at each SYNC."""
+    """Longest age at which a frame of an asynchronous PDO counts; 0: it is sent at each SYNC."""
     last_ns: int = 0
     """Stamp of its last frame."""
 
@@ -116,14 +117,14 @@ class Traffic:
     """Counts of one bus.
 
     Args:
-        config: what should be on it.
+        config: configuration of the bus.
 
     Attributes:
         inputs: the input PDOs by COB-ID.
-        estimates: jtqd's own PDOs by COB-ID: one for each two joints.
+        estimates: jtqd's own PDOs by COB-ID, one for two joints.
         statuses: of each joint, how often each status was published.
         nodes: by node-ID, jtqd's own included.
-        strangers: frames by identifier that no configured node sends.
+        foreign: frames by identifier that no configured node sends.
         errors: error messages of the driver, by class bit.
     """
 
@@ -153,7 +154,7 @@ class Traffic:
         """Distance of two SYNCs from the period, absolute."""
         self._first_sync_ns = self._sync_ns = 0
         self._counter: int | None = None
-        self.strangers: Counter[int] = Counter()
+        self.foreign: Counter[int] = Counter()
         self.errors: Counter[int] = Counter()
         self.statuses: tuple[Counter[int], ...] = tuple(Counter() for _ in config.joints)
 
@@ -179,7 +180,7 @@ class Traffic:
         return round((self._sync_ns - self._first_sync_ns) / self._period_ns)
 
     def feed(self, can_id: int, data: bytes, stamp_ns: int) -> None:
-        """Take one frame in the order of arrival; `can_id` with its flags, the stamp is the kernel's."""
+        """Count one frame, in the order of arrival; can_id: with its flags; stamp_ns: by the kernel."""
         if can_id & CAN_ERR_FLAG:
             for bit in range(29):
                 if can_id >> bit & 1:
@@ -201,12 +202,12 @@ class Traffic:
                 for count, status in zip(self.statuses_in(can_id).values(), codes, strict=False):
                     count[status] += 1
         elif can_id not in self._known:
-            self.strangers[can_id] += 1
+            self.foreign[can_id] += 1
         else:
             self._node(can_id, data, stamp_ns)
 
     def end(self, now_ns: int) -> None:
-        """End listening at this time (the clock of the stamps); silence until then counts."""
+        """End the count at this time (clock of the stamps); silence until then counts."""
         for node in self.nodes.values():
             if node.last_ns:
                 node.longest_gap_ns = max(node.longest_gap_ns, now_ns - node.last_ns)
@@ -261,7 +262,7 @@ class Traffic:
         self.complete += complete
 
     def _fresh(self, pdo: PdoCount) -> bool:
-        """Count the age of what its node sends by itself, at this cycle's SYNC; return whether it still counts."""
+        """Count the age of an asynchronous PDO at this cycle's SYNC; return whether it still counts."""
         age_ns = max(0, self._sync_ns - pdo.last_ns)
         if pdo.last_ns:
             pdo.delays.add(age_ns)
@@ -285,8 +286,8 @@ class Traffic:
             node.last_emergency = int.from_bytes(data[:2], "little")
 
 
-def described(can_id: int) -> str:
-    """Format an identifier: "181h", "18FF00A0h (29 bit)", "181h (remote)"."""
+def identifier_text(can_id: int) -> str:
+    """Return an identifier as text: "181h", "18FF00A0h (29 bit)", "181h (remote)"."""
     extended = bool(can_id & CAN_EFF_FLAG)
     identifier = can_id & (CAN_EFF_MASK if extended else CAN_SFF_MASK)
     marks = [word for word, applies in (("29 bit", extended), ("remote", can_id & CAN_RTR_FLAG)) if applies]
@@ -314,8 +315,7 @@ def listen(
         traffic: counts the frames.
         seconds: how long.
         period_ns: time grid of the wake-ups.
-        timed: measure the wake-ups. Beside a daemon this is left out: its own loop is what counts, and a
-            tenth as many wake-ups do.
+        timed: measure the wake-ups; without, there are a tenth as many.
     """
     timing = Timing()
     for _ in _slots(seconds, period_ns if timed else 10 * period_ns, timing):
@@ -327,7 +327,7 @@ def listen(
 def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config) -> Timing:
     """Send SYNC and the own heartbeat for `seconds` and count the answers of booted nodes. Raises BusError.
 
-    The socket must give back own frames, so that SYNC's own echo stands among the answers in the order of arrival.
+    The socket must return own frames, so that SYNC's echo and the answers are in the order of arrival.
     """
     timing = Timing()
     overflow = config.counter_overflow
@@ -355,10 +355,10 @@ def leave(socket: FrameSocket, config: Config) -> None:
 
 
 def silent(socket: FrameSocket, seconds: float) -> bool:
-    """Return whether no SYNC is received for this time. Raises BusError."""
+    """Return whether no SYNC arrives in this time. Raises BusError."""
     until = time.monotonic() + seconds
-    while (left := until - time.monotonic()) > 0:
-        if not socket.wait(left):
+    while (rest_s := until - time.monotonic()) > 0:
+        if not socket.wait(rest_s):
             return True
         for n in range(socket.receive()):
             if int.from_bytes(socket.frames[FRAME_SIZE * n : FRAME_SIZE * n + 4], "little") == SYNC_COB_ID:
@@ -367,7 +367,7 @@ def silent(socket: FrameSocket, seconds: float) -> bool:
 
 
 def _slots(seconds: float, period_ns: int, timing: Timing) -> Iterator[int]:
-    """Yield the slots of an absolute grid at their times; late ones are counted and skipped."""
+    """Yield the slots of an absolute grid at their times; late ones are counted and skipped, as in the loop."""
     start_ns = time.monotonic_ns() + period_ns
     grid, end_ns, number = Grid(start_ns, period_ns), start_ns + round(seconds * 1e9), 0
     while grid.slot_ns < end_ns:
@@ -376,9 +376,7 @@ def _slots(seconds: float, period_ns: int, timing: Timing) -> Iterator[int]:
             time.sleep(pause_ns * 1e-9)
         now_ns = time.monotonic_ns()
         timing.lateness.add(now_ns - grid.slot_ns)
-        if grid.too_late(
-            now_ns
-        ):  # as in the loop: a SYNC that late would leave its successor less than half a cycle
+        if grid.too_late(now_ns):
             grid.missed += 1
         else:
             yield number

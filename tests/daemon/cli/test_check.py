@@ -15,7 +15,7 @@ from rich.console import Console
 from jtqd.daemon.cli.bus_checks import check_bus, check_conditions, check_own_timing, check_stolen_time
 from jtqd.daemon.cli.check import main
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, show
-from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, described
+from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, identifier_text
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import Condition
@@ -228,7 +228,7 @@ def test_strangers_look_alikes_and_error_messages(config: Config) -> None:
     for mocking in (0x181 | CAN_EFF_FLAG, 0x183 | CAN_RTR_FLAG, 0x080 | CAN_RTR_FLAG):
         found = judged(config, iter([*bus(100), (mocking, b"", 1_000_101 * MS)]))
         assert found["foreign frames"].level == FAIL, hex(mocking)
-    assert described(0x18FF0181 | CAN_EFF_FLAG) == "18FF0181h (29 bit)"
+    assert identifier_text(0x18FF0181 | CAN_EFF_FLAG) == "18FF0181h (29 bit)"
     found = judged(config, iter([*bus(100), (CAN_ERR_FLAG | 0x044, bytes(8), 1_000_101 * MS)]))
     assert (found["error frames"].level, found["error frames"].text) == (
         FAIL,

@@ -10,20 +10,19 @@ from jtqd.daemon.cli.checks import (
     SKIP,
     WARN,
     CheckResult,
-    exit_status,
     report,
+    worst,
 )
-from jtqd.daemon.cli.terminal import histogram
 from jtqd.estimator.text import duration, number, percent, size
 
 NAN = float("nan")
 
 
-def test_exit_status_is_the_worst_level() -> None:
+def test_the_result_is_the_worst_level() -> None:
     items = {level: CheckResult("x", level, "") for level in (GOOD, WARN, FAIL, SKIP)}
-    assert exit_status([items[GOOD], items[SKIP]]) == 0
-    assert exit_status([items[GOOD], items[WARN]]) == 3
-    assert exit_status([items[WARN], items[FAIL]]) == 1
+    assert worst([items[GOOD], items[SKIP]]) == GOOD
+    assert worst([items[GOOD], items[WARN]]) == WARN
+    assert worst([items[WARN], items[FAIL]]) == FAIL
 
 
 def test_the_report_is_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
@@ -58,15 +57,3 @@ def test_numbers_for_people() -> None:
         *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-"),
     ]
     assert (number(-1.005), number(NAN), percent(0.8476), percent(NAN)) == ("-1.00", "-", "84.8 %", "-")
-
-
-def test_a_histogram_shows_one_cycle_in_a_million() -> None:
-    bins = [0] * 100
-    bins[10], bins[11], bins[30] = 1_000_000, 500, 1
-    line = histogram(bins, 4.0, 60)
-    assert line.startswith("40 █▄")
-    assert line.endswith("▁ 124 us")
-    assert line.count(" ") == 18 + 3, "bins without a cycle are empty"
-    assert len(histogram(bins, 4.0, 10)) <= 10 + len("40  136 us")
-    assert histogram([0] * 9 + [1], 4.0, 10).endswith("us and more")
-    assert histogram([0] * 10, 4.0, 10) == ""

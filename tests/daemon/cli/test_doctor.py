@@ -101,8 +101,8 @@ def test_what_a_crash_has_left(doctor: Doctor, tmp_path: Path) -> None:
     _, found = doctor("--bus", "sim", "--record", str(logs))
     assert level(found, "unfinished logs") == WARN
     assert "jtq recover" in found["unfinished logs"]["hint"]
-    assert level(found, "left over") == WARN
-    assert "jtqd-0-can0" in found["left over"]["text"]
+    assert level(found, "killed daemons") == WARN
+    assert "jtqd-0-can0" in found["killed daemons"]["text"]
 
 
 def test_a_directory_that_does_not_exist_yet_and_a_disk_that_is_full(

@@ -77,7 +77,7 @@ def test_a_bus_is_found_by_its_name_or_its_instance(tmp_path: Path) -> None:
     ):  # another process has its number
         (directory / "about.json").write_text(json.dumps(content | change))
         found = find_daemons([tmp_path])
-        assert (found.daemons, found.closed, found.left_over) == ((), (), (directory,))
+        assert (found.daemons, found.closed, found.abandoned) == ((), (), (directory,))
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="becomes another user, which only root can")

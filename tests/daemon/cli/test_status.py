@@ -143,7 +143,7 @@ def test_a_daemon_that_is_booting_and_one_that_was_killed(tmp_path: Path, status
     content["pid"] = subprocess.run(["true"], check=True).returncode + 2**22 - 3  # nobody's
     (daemon.directory / "about.json").write_text(json.dumps(content))
     found = find_daemons([tmp_path])
-    assert (found.daemons, found.left_over) == ((), (daemon.directory,))
+    assert (found.daemons, found.abandoned) == ((), (daemon.directory,))
     content |= {"pid": os.getpid(), "started_ticks": 1}
     (daemon.directory / "about.json").write_text(json.dumps(content))
     assert find_daemons([tmp_path]).daemons == (), "another process got its number"

@@ -1,11 +1,14 @@
-"""What a live view remembers: sparkline, maxima of the last seconds, pages."""
+"""Live view: sparklines, histograms, maxima of the last seconds, pages."""
 
+import io
 from math import nan
 
 import pytest
+from rich.console import Console, Group
+from rich.text import Text
 
 from jtqd.daemon.cli.status import WINDOW_S, Moment, Recent
-from jtqd.daemon.cli.terminal import page, sparkline
+from jtqd.daemon.cli.terminal import histogram, paged, sparkline
 
 
 def test_a_sparkline_spans_its_values_and_leaves_gaps():
@@ -32,7 +35,7 @@ def test_a_slow_cycle_of_long_ago_is_forgotten():
     assert recent.largest_us(2.0, late=True) is None, "nothing was late"
 
 
-def test_another_daemon_begins_anew():
+def test_another_daemon_clears_the_window():
     recent = Recent()
     recent.add(moment(0.0, [500, 1, 0], torque=3.0))
     recent.add(moment(1.0, [2, 0, 0], torque=4.0))
@@ -41,10 +44,31 @@ def test_another_daemon_begins_anew():
     assert recent.largest_us(1.0, late=False) is None
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 6, 11])
+@pytest.mark.parametrize("count", [1, 5, 6, 11])
 def test_pages_hold_every_line_once(count):
-    lines = [str(n) for n in range(count)]
-    _, _, pages = page(lines, 5, 0)
-    assert [line for n in range(pages) for line in page(lines, 5, n)[0]] == lines
-    assert page(lines, 5, pages)[1] == 0, "after the last page comes the first"
-    assert page(lines, 5, -1)[1] == pages - 1
+    console = Console(file=io.StringIO(), width=80, height=7, force_terminal=True)
+    view = Group(*(f"line {n}" for n in range(count)))
+
+    def lines(number):
+        console.file = io.StringIO()
+        shown, place = paged(console, view, number)
+        console.print(shown)
+        text = Text.from_ansi(console.file.getvalue()).plain
+        return [each.rstrip() for each in text.splitlines() if each.startswith("line")], place
+
+    pages = -(-count // 5)
+    assert [each for n in range(pages) for each in lines(n)[0]] == [f"line {n}" for n in range(count)]
+    assert lines(pages)[1] == 0, "after the last page comes the first"
+    assert lines(-1)[1] == pages - 1
+
+
+def test_a_histogram_shows_one_cycle_in_a_million():
+    bins = [0] * 100
+    bins[10], bins[11], bins[30] = 1_000_000, 500, 1
+    line = histogram(bins, 4.0, 60)
+    assert line.startswith("40 █▄")
+    assert line.endswith("▁ 124 us")
+    assert line.count(" ") == 18 + 3, "bins without a cycle are empty"
+    assert len(histogram(bins, 4.0, 10)) <= 10 + len("40  136 us")
+    assert histogram([0] * 9 + [1], 4.0, 10).endswith("us and more")
+    assert histogram([0] * 10, 4.0, 10) == ""
