@@ -19,7 +19,7 @@ from typing import Any
 
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.device import UsageError, description, eds_survey, family_of, merged, surveyed
-from jtqd.daemon.cli.generated import (
+from jtqd.daemon.cli.proposal import (
     ConfigDraft,
     DraftError,
     JointDraft,

@@ -22,7 +22,7 @@ from jtqd.daemon.cli.device import (
     surveyed,
     unit_problems,
 )
-from jtqd.daemon.cli.generated import (
+from jtqd.daemon.cli.proposal import (
     DraftError,
     Wanted,
     draft_joint,

@@ -19,7 +19,7 @@ import yaml
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.device import layout_told, unit_problems, units_told
-from jtqd.daemon.cli.generated import Wanted, draft_joint, drive_lines
+from jtqd.daemon.cli.proposal import Wanted, draft_joint, drive_lines
 from jtqd.daemon.config import load_config
 from jtqd.drivers.drive import CIA_402, DriveProfile, drive_scaling
 from jtqd.drivers.pdo import Tpdo

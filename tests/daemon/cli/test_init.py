@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from jtqd.daemon.cli import init, probe
-from jtqd.daemon.cli.generated import (
+from jtqd.daemon.cli.proposal import (
     ConfigDraft,
     DraftError,
     Wanted,
