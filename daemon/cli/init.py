@@ -1,7 +1,7 @@
-"""`jtq init`: a first configuration and joint files for the bench at hand, with every guess named.
+"""`jtq init`: write a first configuration and joint files for a bench, and list every guess in them.
 
-The devices are read on the bus (nothing is written to them) or from EDS files; what neither tells is an option, or a
-question on a terminal. The files use method `tob`, which needs no fitted data, and are checked by reading them as jtqd does.
+The devices are read on the bus (nothing is written to them) or from EDS files; a value that neither has is an option, or a
+question on a terminal. The files use method `tob`, which needs no fitted data, and are read as jtqd does before they stay.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -20,13 +20,13 @@ from typing import Any
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.device import UsageError, description, eds_survey, family_of, merged, surveyed
 from jtqd.daemon.cli.proposal import (
-    ConfigDraft,
-    DraftError,
-    JointDraft,
+    ConfigProposal,
+    JointProposal,
+    MissingValueError,
     Wanted,
     config_text,
-    draft_joint,
     joint_text,
+    propose_joint,
     sensor_problems,
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
@@ -42,7 +42,7 @@ from jtqd.estimator.text import counted
 MAX_JOINTS = 4
 _PERIODS_US = (1000, 2000, 4000, 5000, 10_000)
 _EXAMPLES = """examples:
-  jtq init --bus can0 --out arm                        look on the bus, ask for what the devices do not tell
+  jtq init --bus can0 --out arm                        look on the bus, ask for missing values
   jtq init --bus can0 --out arm --node 5 --gear-ratio 101 --rated-torque 28
   jtq init --from-eds drive.eds --node 5 --node 6 --gear-ratio 101 --out arm     before the bus is there
   jtq init --bus can0 --out arm --gear-ratio 101 --gear-ratio 51                 one value for each joint
@@ -58,7 +58,7 @@ def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq init`."""
     made = argparse.ArgumentParser(
         prog="jtq init",
-        description="Write a first configuration and joint files that run at once, and say what in them is a guess.",
+        description="Write a first configuration and joint files that run at once, and list the guesses in them.",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -111,12 +111,12 @@ def parser() -> argparse.ArgumentParser:
 
 
 def add_values(made: argparse.ArgumentParser, *, action: str = "store", of_joint: bool = True) -> None:
-    """Add the options that give what a drive does not tell (fields of `Wanted`); of_joint: also those of the joint file."""
+    """Add the options for values that a drive does not have (`Wanted`); of_joint: also those of the joint file."""
     for name, kind, unit, text in (
         ("gear-ratio", _positive, "G", "motor revolutions per joint revolution"),
         ("rated-torque", _positive, "NM", "rated torque of the joint [Nm]"),
         ("torque-constant", _positive, "KT", "of the motor [Nm/A]"),
-        ("rated-current", _positive, "A", "of the motor [A], as 6075h should say"),
+        ("rated-current", _positive, "A", "of the motor [A], for 6075h"),
         ("encoder-counts", _count, "N", "counts per revolution of the motor, all edges"),
         ("link-encoder-counts", _count, "N", "counts per revolution of the joint, at the link"),
     ):
@@ -163,16 +163,17 @@ def _count(text: str) -> int:
 
 @dataclass(frozen=True)
 class Found:
-    """Devices: node-IDs of the drives in the order of the joints, what is known of each, and the sensor."""
+    """Devices: node-IDs of the drives in the order of the joints, surveys and profiles by node-ID, the sensor's node-ID.
+
+    guessed: the node-IDs are a guess, as an EDS is all that is known.
+    """
 
     nodes: list[int]
     surveys: dict[int, Survey]
     sensor: int | None
     notes: list[str]
     families: dict[int, Family | None] = field(default_factory=dict)
-    """Profile of each drive."""
     guessed: bool = False
-    """The node-IDs are: an EDS is all that is known."""
 
 
 def main(argv: list[str]) -> int:
@@ -180,7 +181,7 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     try:
         return _run(options)
-    except (UsageError, DraftError) as error:
+    except (UsageError, MissingValueError) as error:
         print(f"jtq init: {error}", file=sys.stderr)
         return 2
     except (BusError, EdsError, ConfigError, BusLoadError, ValueError) as error:
@@ -189,34 +190,38 @@ def main(argv: list[str]) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    _refuse_what_is_there(options)
+    _refuse_existing(options)
     found = _found(options)
-    joints = _drafts(options, found)
+    joints = _joints(options, found)
     files, period_us = _write(options.out, options.name, _config(options, found, joints))
     problems = [each for joint in joints for each in joint.problems]
-    less = [
-        f"joint {joint.number}: objects.{name}: {each.text} ({each.why})"
-        for joint in joints
-        for name, each in joint.instead.items()
-    ]
-    less += [
-        f"joint {joint.number}: tpdos: {counted(len(joint.layout.tpdos), 'TPDO')} of the drive "
-        f"({joint.layout.why}); without this section jtqd maps its own, where the drive lets it"
-        for joint in joints
-        if joint.layout.tpdos
-    ]
     if found.sensor is not None:
         problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
     report = {
         "files": [str(each) for each in files],
         "period_us": period_us,
-        "notes": [*found.notes, *less],
+        "notes": [*found.notes, *_notes(joints)],
         "guesses": [each for joint in joints for each in joint.guesses],
         "problems": problems,
         "next": f"jtqd --bus {options.bus or 'can0'} --config {files[-1]} --record logs",
     }
     print(json.dumps(report) if options.json else _text(report))
     return 3 if problems else 0
+
+
+def _notes(joints: list[JointProposal]) -> list[str]:
+    """Return one line for each quantity and TPDO that differs from jtqd's own."""
+    notes = [
+        f"joint {joint.number}: objects.{name}: {each.text} ({each.why})"
+        for joint in joints
+        for name, each in joint.objects.items()
+    ]
+    return notes + [
+        f"joint {joint.number}: tpdos: {counted(len(joint.kept.tpdos), 'TPDO')} of the drive ({joint.kept.why}); "
+        "without this section jtqd maps its own, where the drive lets it"
+        for joint in joints
+        if joint.kept.tpdos
+    ]
 
 
 def _text(report: dict[str, Any]) -> str:
@@ -230,10 +235,10 @@ def _text(report: dict[str, Any]) -> str:
     return "\n".join([*lines, f"next: {report['next']}"])
 
 
-def _refuse_what_is_there(options: argparse.Namespace) -> None:
+def _refuse_existing(options: argparse.Namespace) -> None:
     for name in (f"{options.name}.yaml", *(f"joint_{number}.yaml" for number in range(1, MAX_JOINTS + 1))):
         if not options.force and (options.out / name).exists():
-            raise UsageError(f"{options.out / name}: is there already; --force replaces it")
+            raise UsageError(f"{options.out / name}: exists; --force replaces it")
 
 
 # ---- devices ----
@@ -290,20 +295,11 @@ def _refuse_other_kinds(nodes: Sequence[int], sensor: int | None, surveys: Mappi
 
 
 def _on_the_bus(bus: str, nodes: Sequence[int], sensor: int | None, profile: str | None) -> dict[int, Survey]:
-    with _survey(bus) as reader:
+    with closing(BusSurvey(bus)) as reader:
         wanted = {*nodes, *([sensor] if sensor else [])}
         there = reader.nodes() if not nodes or sensor is None else sorted(wanted)
         read = {node: surveyed(reader, node, profile) for node in there}
     return {node: each for node, each in read.items() if each is not None}
-
-
-@contextmanager
-def _survey(bus: str) -> Iterator[BusSurvey]:
-    reader = BusSurvey(bus)
-    try:
-        yield reader
-    finally:
-        reader.close()
 
 
 def _others(surveys: dict[int, Survey]) -> str:
@@ -340,27 +336,27 @@ VALUES = {
 """Field of Wanted -> option."""
 
 
-def _drafts(options: argparse.Namespace, found: Found) -> list[JointDraft]:
+def _joints(options: argparse.Namespace, found: Found) -> list[JointProposal]:
     count = len(found.nodes)
     columns = {field: _each(name, getattr(options, name), count) for field, name in VALUES.items()}
     ask = sys.stdin.isatty() and not options.no_questions and not options.json
-    drafts = []
+    joints = []
     for position, node in enumerate(found.nodes):
         values = {name: column[position] for name, column in columns.items()}
         wanted = Wanted(**values, one_encoder=options.one_encoder)
-        draft = _draft((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
-        drafts.append(replace(draft, node_guessed=found.guessed))
-    return drafts
+        joint = _joint((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
+        joints.append(replace(joint, node_guessed=found.guessed))
+    return joints
 
 
-def _draft(
+def _joint(
     joint: tuple[int, int], survey: Survey | None, wanted: Wanted, ask: bool, family: Family | None
-) -> JointDraft:
-    """Return a joint's draft; on a terminal, ask for what is missing."""
+) -> JointProposal:
+    """Return the proposal of a joint (number, node); on a terminal, ask for missing values."""
     while True:
         try:
-            return draft_joint(*joint, survey, wanted, family)
-        except DraftError as error:
+            return propose_joint(*joint, survey, wanted, family)
+        except MissingValueError as error:
             option = str(error).rpartition("give --")[2].partition(",")[0]
             field = next((name for name, each in VALUES.items() if each == option.replace("-", "_")), None)
             if not ask or field is None:
@@ -387,7 +383,7 @@ def _answer(why: str, option: str) -> float | int:
 # ---- files ----
 
 
-def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft]) -> ConfigDraft:
+def _config(options: argparse.Namespace, found: Found, joints: list[JointProposal]) -> ConfigProposal:
     numbers = [joint.number for joint in joints]
     measured = options.sensor_joint if options.sensor_joint is not None else numbers
     if found.sensor is None:
@@ -396,8 +392,8 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
         measured = []
     if not set(measured) <= set(numbers):
         raise UsageError(f"--sensor-joint: found {measured}, expected among {numbers}")
-    return ConfigDraft(
-        bus=options.bus or "a bus that was not looked at",
+    return ConfigProposal(
+        bus=options.bus or "a bus that was not surveyed",
         bitrate=options.bitrate,
         period_us=_PERIODS_US[0],
         joints=joints,
@@ -407,30 +403,31 @@ def _config(options: argparse.Namespace, found: Found, joints: list[JointDraft])
     )
 
 
-def _write(directory: Path, name: str, draft: ConfigDraft) -> tuple[list[Path], int]:
+def _write(directory: Path, name: str, config: ConfigProposal) -> tuple[list[Path], int]:
     """Write the files with the shortest period whose bus load fits; returns paths and period [us].
 
-    They are made beside and put in place together: what jtqd refuses replaces nothing. Raises ConfigError, BusLoadError.
+    They are written to a temporary directory first: files that jtqd refuses replace nothing.
+    Raises ConfigError, BusLoadError.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    names = [*(f"joint_{joint.number}.yaml" for joint in draft.joints), f"{name}.yaml"]
-    with tempfile.TemporaryDirectory(dir=directory, prefix=".jtq-init-") as beside:
-        files = [Path(beside, each) for each in names]
-        for path, joint in zip(files, draft.joints, strict=False):
+    names = [*(f"joint_{joint.number}.yaml" for joint in config.joints), f"{name}.yaml"]
+    with tempfile.TemporaryDirectory(dir=directory, prefix=".jtq-init-") as temporary:
+        files = [Path(temporary, each) for each in names]
+        for path, joint in zip(files, config.joints, strict=False):
             path.write_text(joint_text(joint), encoding="utf-8")
         try:
-            period_us = _fitting_period_us(files[-1], draft)
+            period_us = _fitting_period_us(files[-1], config)
         except ConfigError as error:
-            raise ConfigError(str(error).replace(beside, str(directory))) from None
+            raise ConfigError(str(error).replace(temporary, str(directory))) from None
         for path in files:
             path.replace(directory / path.name)
     return [directory / each for each in names], period_us
 
 
-def _fitting_period_us(path: Path, draft: ConfigDraft) -> int:
+def _fitting_period_us(path: Path, config: ConfigProposal) -> int:
     """Write the configuration with the shortest period whose bus load fits. Raises ConfigError, BusLoadError."""
     for period_us in _PERIODS_US:
-        path.write_text(config_text(replace(draft, period_us=period_us)), encoding="utf-8")
+        path.write_text(config_text(replace(config, period_us=period_us)), encoding="utf-8")
         if bus_load_of(load_config(path)).worst <= LIMIT:
             return period_us
-    raise ConfigError(f"{path}: at {draft.bitrate} bit/s not even 100 Hz fit the bus")
+    raise ConfigError(f"{path}: at {config.bitrate} bit/s not even 100 Hz fit the bus")

@@ -1,7 +1,6 @@
-"""`jtq probe`: what one device on the bus tells of itself, what jtqd needs of it, and its section of the configuration.
+"""`jtq probe`: read a device on the bus: its objects, what jtqd lacks in it, and its section of the configuration.
 
-Only objects are read; nothing is written and no node is started. Which objects can be mapped is told by an EDS alone
-(`--eds`); what the TPDOs carry now is read.
+Only objects are read; nothing is written and no node is started. Only an EDS (`--eds`) has which objects can be mapped.
 """
 
 from __future__ import annotations
@@ -9,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,15 +22,15 @@ from jtqd.daemon.cli.device import (
     surveyed,
     unit_problems,
 )
+from jtqd.daemon.cli.init import MAX_JOINTS, VALUES, add_values, node_id
 from jtqd.daemon.cli.proposal import (
-    DraftError,
+    MissingValueError,
     Wanted,
-    draft_joint,
     drive_lines,
+    propose_joint,
     sensor_lines,
     sensor_problems,
 )
-from jtqd.daemon.cli.init import MAX_JOINTS, VALUES, add_values, node_id
 from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.drive import EVERY_SCALING_OBJECT, drive_layout
@@ -59,7 +59,9 @@ def parser() -> argparse.ArgumentParser:
     )
     made.add_argument("--bus", required=True, help="can0, or unix:PATH")
     made.add_argument("--node", type=node_id, metavar="N", help="node-ID (default: list the nodes)")
-    made.add_argument("--eds", type=Path, metavar="FILE", help="its EDS, which tells what can be mapped")
+    made.add_argument(
+        "--eds", type=Path, metavar="FILE", help="its EDS, which has the objects that can be mapped"
+    )
     made.add_argument(
         "--profile",
         choices=[*profile_names(), "none"],
@@ -87,11 +89,8 @@ def main(argv: list[str]) -> int:
             print(f"jtq probe: --{name} needs --node", file=sys.stderr)
             return 2
     try:
-        bus = BusSurvey(options.bus)
-        try:
+        with closing(BusSurvey(options.bus)) as bus:
             return _list(options, bus) if options.node is None else _one(options, bus)
-        finally:
-            bus.close()
     except UsageError as error:
         print(f"jtq probe: {error}", file=sys.stderr)
         return 2
@@ -147,18 +146,18 @@ def _alone(survey: Survey, wanted: Wanted, family: Family | None, joint: int) ->
         raise UsageError(f"node {survey.node} is neither a drive (402) nor a sensor (404)")
     try:
         return section(survey, family, wanted, joint)
-    except DraftError as error:
+    except MissingValueError as error:
         raise UsageError(str(error)) from None
 
 
 def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
-    """Why this version of jtqd does not work with a device."""
+    """Return why this version of jtqd does not work with a device."""
     if survey.profile == DRIVE:
         try:
-            found = draft_joint(1, survey.node, survey, _ANY, family).problems
+            found = propose_joint(1, survey.node, survey, _ANY, family).problems
             units = unit_problems(survey.node, survey) if family is None else []
             return list(dict.fromkeys((*found, *units)))
-        except DraftError as error:
+        except MissingValueError as error:
             return [str(error)]
     if survey.profile == SENSOR:
         return sensor_problems(survey.node, survey)
@@ -166,21 +165,21 @@ def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
 
 
 NOTHING = Wanted()
-"""The operator gave nothing."""
+"""No option was given."""
 _CODES = {0x1018: 8, 0x6041: 4, 0x60A8: 8, 0x60A9: 8, 0x6131: 8}
 """Objects whose values are codes (identity, statusword, units), with their hexadecimal digits."""
 _ANY = Wanted(1.0, 1.0, 1.0, 1.0, 1, 1)
-"""Of a joint whose values do not matter: only what the drive lacks is asked."""
+"""Values that do not matter where only the objects of the drive are judged."""
 
 
 def section(
     survey: Survey, family: Family | None = None, wanted: Wanted = NOTHING, joint: int = 1
 ) -> list[str]:
-    """Return its section of the configuration; `wanted`: what the operator gave. Raises DraftError."""
+    """Return its section of the configuration; wanted: values by options. Raises MissingValueError."""
     if survey.profile == SENSOR:
         return sensor_lines(survey.node, survey)
     known = replace(wanted, rated_torque_nm=1.0, torque_constant_nm_per_a=1.0)  # of the joint file alone
-    return drive_lines(draft_joint(joint, survey.node, survey, known, family))
+    return drive_lines(propose_joint(joint, survey.node, survey, known, family))
 
 
 def content(survey: Survey, problems: list[str], family: Family | None = None) -> dict[str, Any]:
@@ -221,7 +220,7 @@ _NAMES: dict[Key, str] = {
     },
     TORQUE: "torque",
 }
-"""What the objects are that are read."""
+"""Names of the objects that are read."""
 
 
 def _object(key: Key, value: str) -> str:
@@ -229,7 +228,7 @@ def _object(key: Key, value: str) -> str:
 
 
 def _value(key: Key, value: int) -> str:
-    """Codes are looked up in hexadecimal."""
+    """Return a number; a code in hexadecimal."""
     return f"{value:0{_CODES[key[0]]}X}h" if key[0] in _CODES else str(value)
 
 
@@ -256,7 +255,7 @@ def text(
                 "section of the configuration",
                 *(f"  {line}" for line in section(survey, family, wanted, joint)),
             ]
-        except DraftError as error:
+        except MissingValueError as error:
             lines += [f"no section of the configuration yet: {error}"]
     if problems:
         lines += ["jtqd does not work with it yet:", *(f"  {line}" for line in problems)]

@@ -18,8 +18,8 @@ import yaml
 
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
-from jtqd.daemon.cli.device import layout_told, unit_problems, units_told
-from jtqd.daemon.cli.proposal import Wanted, draft_joint, drive_lines
+from jtqd.daemon.cli.device import kept_tpdos, reported_units, unit_problems
+from jtqd.daemon.cli.proposal import Wanted, drive_lines, propose_joint
 from jtqd.daemon.config import load_config
 from jtqd.drivers.drive import CIA_402, DriveProfile, drive_scaling
 from jtqd.drivers.pdo import Tpdo
@@ -55,7 +55,7 @@ def drive(numbers: dict[tuple[int, int], int] | None = None, tpdos: tuple[Tpdo, 
 
 
 def entries(numbers: dict[tuple[int, int], int], gear: float = 100.0) -> dict[str, Any]:
-    found = units_told(drive(numbers), gear, QUANTITIES, ())
+    found = reported_units(drive(numbers), gear, QUANTITIES, ())
     return {name: each.keys for name, each in found.items()}
 
 
@@ -100,7 +100,7 @@ def test_the_unit_is_right_whatever_gear_the_drive_counts_with(told: int, gear: 
     numbers = {(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): velocity, (0x6091, 1): told, (0x6091, 2): told and 1}
     survey = drive(numbers)
     wanted = Wanted(gear_ratio=gear, rated_torque_nm=30.0, torque_constant_nm_per_a=0.1)
-    section = yaml.safe_load("\n".join(drive_lines(draft_joint(1, 5, survey, wanted))))["joint_1"]
+    section = yaml.safe_load("\n".join(drive_lines(propose_joint(1, 5, survey, wanted))))["joint_1"]
     given = {(int(name[:4], 16), int(name[6:])): value for name, value in section.get("given", {}).items()}
     objects = CIA_402
     for name, keys in section["objects"].items():
@@ -114,11 +114,11 @@ def test_the_unit_is_right_whatever_gear_the_drive_counts_with(told: int, gear: 
 
 def test_what_is_not_sure_is_a_guess() -> None:
     survey = drive({(0x60A8, 0): MILLIDEGREE})
-    draft = draft_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, torque_constant_nm_per_a=0.1))
-    guesses = [each for each in draft.guesses if "objects" in each]
+    joint = propose_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, torque_constant_nm_per_a=0.1))
+    guesses = [each for each in joint.guesses if "objects" in each]
     assert [each.split(": ")[1].split(" = ")[0] for each in guesses] == ["link_position", "motor_velocity"]
     assert "no 60A9h: 606Ch taken for 60A8h per second" in guesses[1]
-    assert sum("# GUESS" in line for line in drive_lines(draft)) == 2
+    assert sum("# GUESS" in line for line in drive_lines(joint)) == 2
 
 
 def test_increments_per_second_are_those_of_the_option() -> None:
@@ -128,18 +128,18 @@ def test_increments_per_second_are_those_of_the_option() -> None:
         "no section of the configuration yet: node 5: 608Fh:1 is not known: give --encoder-counts"
         in probe.text(survey, [])
     )
-    draft = draft_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, encoder_counts=4096))
-    assert {name: each.keys for name, each in draft.instead.items()} == {"motor_velocity": {"by": "608Fh"}}
-    assert draft.instead["motor_velocity"].why == "60A9h:0 is 0x00B50300, by the bus"
-    assert (0x6090, 1) not in draft.given
+    joint = propose_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, encoder_counts=4096))
+    assert {name: each.keys for name, each in joint.objects.items()} == {"motor_velocity": {"by": "608Fh"}}
+    assert joint.objects["motor_velocity"].why == "60A9h:0 is 0x00B50300, by the bus"
+    assert (0x6090, 1) not in joint.given
 
 
 def test_counts_by_an_option_go_before_what_the_drive_tells() -> None:
     survey = drive({(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): 0xFD41_0300})
     wanted = Wanted(rated_torque_nm=30.0, encoder_counts=4096, link_encoder_counts=8192)
-    draft = draft_joint(1, 5, survey, wanted)
-    assert draft.instead == {}
-    assert {key: value.number for key, value in draft.given.items()}[0x608F, 1] == 4096
+    joint = propose_joint(1, 5, survey, wanted)
+    assert joint.objects == {}
+    assert {key: value.number for key, value in joint.given.items()}[0x608F, 1] == 4096
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_a_unit_that_is_no_angle_is_told(numbers: dict[tuple[int, int], int], te
     assert problem.startswith(f"node 5 (drive): {text}")
     assert "found 0x0001" in problem
     assert probe.problems_of(survey) == [problem]
-    assert draft_joint(1, 5, survey, Wanted(rated_torque_nm=30.0)).problems == (problem,)
+    assert propose_joint(1, 5, survey, Wanted(rated_torque_nm=30.0)).problems == (problem,)
 
 
 # TPDOs --------------------------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ MAKERS = (
 
 
 def test_a_layout_that_is_sent_at_each_sync_and_carries_all_is_kept() -> None:
-    assert [each.number for each in layout_told(5, drive(tpdos=MAKERS), CIA_402).tpdos] == [1, 2, 4]
+    assert [each.number for each in kept_tpdos(5, drive(tpdos=MAKERS), CIA_402).tpdos] == [1, 2, 4]
 
 
 @pytest.mark.parametrize(
@@ -189,34 +189,34 @@ def test_a_layout_that_is_sent_at_each_sync_and_carries_all_is_kept() -> None:
     ids=["none", "jtqd's own", "no link position", "by itself", "off", "another COB-ID"],
 )
 def test_any_other_is_mapped_by_jtqd(tpdos: tuple[Tpdo, ...]) -> None:
-    layout = layout_told(5, drive(tpdos=tpdos), CIA_402)
+    layout = kept_tpdos(5, drive(tpdos=tpdos), CIA_402)
     assert (layout.tpdos, layout.problems) == ((), ())
 
 
 def test_a_tpdo_with_a_29_bit_identifier_is_not_kept() -> None:
     tpdos = (replace(MAKERS[0], cob_id=0x0123_4185), *MAKERS[1:])
-    assert layout_told(5, drive(tpdos=tpdos), CIA_402).tpdos == ()
+    assert kept_tpdos(5, drive(tpdos=tpdos), CIA_402).tpdos == ()
 
 
 def test_a_mapping_that_an_eds_says_is_fixed_is_kept_or_refused() -> None:
     fixed = tuple(replace(each, mapping_fixed=True, transmission_type=255) for each in MAKERS)
-    layout = layout_told(5, drive(tpdos=fixed), CIA_402)
+    layout = kept_tpdos(5, drive(tpdos=fixed), CIA_402)
     assert [each.number for each in layout.tpdos] == [1, 2, 4]
     assert layout.max_age_ms is None, "the type can be written"
-    (problem,) = layout_told(5, drive(tpdos=fixed[:3]), CIA_402).problems
+    (problem,) = kept_tpdos(5, drive(tpdos=fixed[:3]), CIA_402).problems
     assert problem.startswith("node 5 (drive): its mapping is fixed, by its EDS: no TPDO carries 60E4h:1")
 
 
 @pytest.mark.parametrize(("timer_ms", "age"), [(0, 100), (30, 45), (5000, 1000)])
 def test_a_type_that_cannot_be_written_needs_an_age(timer_ms: int, age: int) -> None:
     itself = {"mapping_fixed": True, "type_fixed": True, "transmission_type": 255, "timer_ms": timer_ms}
-    draft = draft_joint(1, 5, drive(tpdos=tuple(replace(each, **itself) for each in MAKERS)), Wanted())
-    section = yaml.safe_load("\n".join(drive_lines(draft)))["joint_1"]
+    joint = propose_joint(1, 5, drive(tpdos=tuple(replace(each, **itself) for each in MAKERS)), Wanted())
+    section = yaml.safe_load("\n".join(drive_lines(joint)))["joint_1"]
     assert section["max_age_ms"] == age
     assert {each["type"] for each in section["tpdos"]} == {255}
-    assert any("max_age_ms" in each for each in draft.guesses)
+    assert any("max_age_ms" in each for each in joint.guesses)
     other = tuple(replace(each, **{**itself, "transmission_type": 10}) for each in MAKERS)
-    (problem,) = layout_told(5, drive(tpdos=other), CIA_402).problems
+    (problem,) = kept_tpdos(5, drive(tpdos=other), CIA_402).problems
     assert "transmission type 10" in problem
 
 

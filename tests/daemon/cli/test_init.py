@@ -12,14 +12,14 @@ import yaml
 
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.proposal import (
-    ConfigDraft,
-    DraftError,
+    ConfigProposal,
+    MissingValueError,
     Wanted,
     config_text,
-    draft_joint,
     drive_lines,
     joint_text,
     plain,
+    propose_joint,
 )
 from jtqd.daemon.config import load_config
 from jtqd.drivers.drive import DriveProfile, drive_scaling
@@ -48,32 +48,32 @@ def drive(values=None, without=()):
 
 
 def test_what_the_drive_tells_is_taken_and_nothing_else_is_given():
-    draft = draft_joint(1, NODE, drive({(0x6075, 0): 8000, (0x6076, 0): 500}), Wanted())
-    values = {name: value.number for name, value in draft.values.items()}
+    joint = propose_joint(1, NODE, drive({(0x6075, 0): 8000, (0x6076, 0): 500}), Wanted())
+    values = {name: value.number for name, value in joint.values.items()}
     assert values["gear_ratio"] == 100.0
     assert values["torque_constant_nm_per_a"] == pytest.approx(0.5 / 8.0, rel=0.01)
     assert values["rated_torque_nm"] == pytest.approx(0.7 * 100 * 0.5)
-    assert draft.given == {}
-    assert draft.problems == ()
-    assert not draft.values["gear_ratio"].guess
-    assert len(draft.guesses) == 8
+    assert joint.given == {}
+    assert joint.problems == ()
+    assert not joint.values["gear_ratio"].guess
+    assert len(joint.guesses) == 8
 
 
 def test_an_option_goes_before_the_drive_and_says_so():
     wanted = Wanted(gear_ratio=50.5, rated_torque_nm=28.0, torque_constant_nm_per_a=0.05, rated_current_a=6.0)
-    draft = draft_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted)
-    assert {name: draft.values[name].number for name in ("gear_ratio", "rated_torque_nm")} == {
+    joint = propose_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted)
+    assert {name: joint.values[name].number for name in ("gear_ratio", "rated_torque_nm")} == {
         "gear_ratio": 50.5,
         "rated_torque_nm": 28.0,
     }
-    given = {key: value.number for key, value in draft.given.items()}
+    given = {key: value.number for key, value in joint.given.items()}
     assert given == {(0x6091, 1): 101, (0x6091, 2): 2, (0x6075, 0): 6000}
-    assert "the drive says 100" in draft.given[0x6091, 1].origin
+    assert "the drive has 100" in joint.given[0x6091, 1].origin
 
 
 def test_an_option_that_agrees_with_the_drive_gives_nothing():
     wanted = Wanted(gear_ratio=100.0, rated_current_a=8.0, encoder_counts=65536)
-    assert draft_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted).given == {}
+    assert propose_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted).given == {}
 
 
 @pytest.mark.parametrize(
@@ -87,13 +87,13 @@ def test_an_option_that_agrees_with_the_drive_gives_nothing():
     ],
 )
 def test_what_cannot_be_guessed_is_asked_for_by_its_option(without, wanted, option):
-    with pytest.raises(DraftError, match=f"give {option}"):
-        draft_joint(1, NODE, drive(without=without), wanted)
+    with pytest.raises(MissingValueError, match=f"give {option}"):
+        propose_joint(1, NODE, drive(without=without), wanted)
 
 
 def test_a_gear_of_one_to_one_is_not_believed():
-    with pytest.raises(DraftError, match="1:1"):
-        draft_joint(1, NODE, drive({(0x6091, 1): 1}), Wanted())
+    with pytest.raises(MissingValueError, match="1:1"):
+        propose_joint(1, NODE, drive({(0x6091, 1): 1}), Wanted())
 
 
 def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
@@ -109,26 +109,26 @@ def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
         (0x6091, 2),
     ]
     found = drive({(0x6075, 0): 8000}, without=missing)
-    draft = draft_joint(1, NODE, found, GIVEN)
-    given = {key: round(value.number) for key, value in draft.given.items()}
+    joint = propose_joint(1, NODE, found, GIVEN)
+    given = {key: round(value.number) for key, value in joint.given.items()}
     assert set(missing) == set(given)
     scaling, gear = drive_scaling(DriveProfile(NODE, given=given), found.numbers)
     assert gear == 101.0
     assert scaling.motor_rad_per_count * 4096 == pytest.approx(6.283185307)
     assert scaling.motor_rad_s_per_unit == scaling.motor_rad_per_count
     assert scaling.link_rad_per_count * 2**19 == pytest.approx(6.283185307)
-    assert any("606Ch" in each for each in draft.guesses)
+    assert any("606Ch" in each for each in joint.guesses)
 
 
 def test_a_drive_that_jtqd_cannot_use_is_told():
-    (problem,) = draft_joint(1, NODE, drive(without=[(0x6041, 0)]), Wanted()).problems
+    (problem,) = propose_joint(1, NODE, drive(without=[(0x6041, 0)]), Wanted()).problems
     assert problem == "node 5 (emulated joint drive): has no 6041h:0, which jtqd maps"
 
 
 def test_a_value_that_the_boot_would_refuse_is_told():
-    (problem,) = draft_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted()).problems
+    (problem,) = propose_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted()).problems
     assert problem.endswith("6075h:0 motor rated current in mA: expected 1..1000000, found 2000000")
-    assert draft_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted(rated_current_a=8.0)).problems == ()
+    assert propose_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted(rated_current_a=8.0)).problems == ()
 
 
 def test_every_number_is_one_in_yaml():
@@ -153,18 +153,18 @@ CURRENT = ((0x6078, 0), (0x6075, 0))
 def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objects, why, tmp_path):
     """And no scaling of what it does not tell; jtqd reads the section, and its boot takes the drive as it is."""
     found = drive({(0x6075, 0): 8000, (0x6076, 0): 500}, without)
-    draft = draft_joint(1, NODE, found, wanted)
-    assert draft.problems == ()
-    assert draft.given == {}
-    text = "\n".join(drive_lines(draft))
+    joint = propose_joint(1, NODE, found, wanted)
+    assert joint.problems == ()
+    assert joint.given == {}
+    text = "\n".join(drive_lines(joint))
     assert yaml.safe_load(text)["joint_1"]["objects"] == objects
     assert why in text
     assert all(line[at - 1] == " " for line in text.splitlines() if (at := line.find("#")) > 0), (
         "YAML wants it"
     )
-    (tmp_path / "joint_1.yaml").write_text(joint_text(draft))
+    (tmp_path / "joint_1.yaml").write_text(joint_text(joint))
     config = tmp_path / "c.yaml"
-    config.write_text(config_text(ConfigDraft("can0", 1_000_000, 1000, [draft], None, None, (), 2000)))
+    config.write_text(config_text(ConfigProposal("can0", 1_000_000, 1000, [joint], None, None)))
     joint = load_config(config).joints[0]
     profile = DriveProfile(NODE, objects=joint.objects, torque_constant_nm_per_a=0.05)
     scaling, _ = drive_scaling(profile, found.numbers)
@@ -257,7 +257,7 @@ def test_what_is_there_is_not_overwritten(tmp_path, capsys):
     (tmp_path / "joint_2.yaml").write_text("mine")
     status, _, err = run(capsys, "--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path)
     assert status == 2
-    assert "joint_2.yaml: is there already" in err
+    assert "joint_2.yaml: exists" in err
     assert (tmp_path / "joint_2.yaml").read_text() == "mine"
 
 
@@ -384,7 +384,7 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     other.write_text(EDS.read_text().replace("DefaultValue=1953", "DefaultValue=154"))
     status, _, err = run(capsys, "--bus", bench, "--from-eds", other, "--out", tmp_path / "other")
     assert (status, err.count("\n")) == (2, 1)
-    assert "is of vendor 0000009Ah, but node 1 says 000007A1h" in err
+    assert "is of vendor 0000009Ah, but node 1 has 000007A1h" in err
 
     for sensor, told in ((2, "node 2 is no CiA 404 sensor"), (9, "node 9 does not answer")):
         arguments = ["--bus", bench, "--node", 1, "--sensor", sensor, "--out", tmp_path / "other"]
@@ -421,7 +421,7 @@ def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
     assert probe.main(["--bus", bench, "--eds", "x.eds"]) == 2
     capsys.readouterr()
     assert probe.main(["--bus", bench, "--node", "1", "--eds", str(EDS.parent / "torque_sensor.eds")]) == 2
-    assert "is of profile 404, but node 1 says 402 (1000h)" in capsys.readouterr().err
+    assert "is of profile 404, but node 1 has 402 (1000h)" in capsys.readouterr().err
 
 
 def test_the_section_alone_goes_into_a_configuration_that_jtqd_reads(bench, tmp_path, capsys):
@@ -445,7 +445,7 @@ def test_a_drive_that_does_not_know_its_gear_has_a_section_with_the_option():
     told = probe.text(found, [])
     assert "no section of the configuration yet: " in told
     assert "give --gear-ratio" in told
-    with pytest.raises(DraftError, match="give --gear-ratio"):
+    with pytest.raises(MissingValueError, match="give --gear-ratio"):
         probe.section(found)
     lines = probe.section(found, None, Wanted(gear_ratio=101.0), 3)
     assert lines[0].startswith("joint_3:")
