@@ -10,7 +10,7 @@ A guess is scaled from the shipped bench by the rated torque: the order of magni
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
@@ -467,7 +467,8 @@ class ConfigProposal:
     def node_id(self) -> int:
         """Node-ID of jtqd: 20h, or the next that no node has."""
         used = [*(each.node for each in self.joints), self.sensor_node, COMMANDER_NODE]
-        return next(each for each in (JTQD_NODE, *range(JTQD_NODE + 2, 128)) if each not in used)
+        candidates: Iterable[int] = (JTQD_NODE, *range(JTQD_NODE + 2, 128))
+        return next(node for node in candidates if node not in used)
 
 
 def config_text(config: ConfigProposal) -> str:
@@ -514,8 +515,8 @@ def drive_lines(joint: JointProposal) -> list[str]:
         lines.append(f"  objects:                # of this drive; all else is as in {others}")
     for name, each in joint.objects.items():
         lines.append(f"{f'    {name}: {each.text}':<25} # {'GUESS, ' * bool(each.verify)}{each.why}")
-    for key, value in joint.own.items():
-        _, quantity, name = key.split(".")
+    for own, value in joint.own.items():
+        _, quantity, name = own.split(".")
         lines.append(f"    {quantity}: {{{name}: {value.number:.10e}}}  # {value.origin}")
     return [*lines, *(f"  {line}" for line in joint.kept.lines())]
 
