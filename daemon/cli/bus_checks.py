@@ -13,8 +13,8 @@ from jtqd.daemon.shared.notices import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import LIMIT
-from jtqd.drivers.devices import SYNC_COB_ID
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
+from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import counted, percent
 

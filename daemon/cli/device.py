@@ -2,7 +2,7 @@
 
 Units (CiA 402-2): 60A8h and 60A9h name them; 6092h is their number per turn of the driving shaft. All count behind the gear
 that the drive knows (6091h); a drive whose 6091h is 1:1 counts at the motor's shaft. A word 0 and a feed constant of 1 are
-those of a drive without configured units: then the objects of `devices.CIA_402` scale it.
+those of a drive without configured units: then the objects of `drive.CIA_402` scale it.
 
 TPDOs that are sent at each SYNC and carry every quantity are kept, and those that cannot be written by the EDS.
 """
@@ -17,22 +17,26 @@ from pathlib import Path
 from typing import Any, Final
 
 from jtqd.daemon.profiles import Family, named, of_vendor
-from jtqd.drivers.devices import CIA_402, DriveObjects, drive_layout
-from jtqd.drivers.layout import BY_ITSELF, EVERY_SYNC, LayoutError, chosen, pdo_of_words
-from jtqd.drivers.pdo import PdoError
-from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.survey import DRIVE, IDENTITY, BusSurvey, Survey, Tpdo, survey_of_eds
-from jtqd.drivers.units import (
+from jtqd.drivers.drive import (
     AT_JOINT,
     AT_MOTOR,
+    CIA_402,
     GEAR,
     SECOND,
-    UnitError,
+    DriveObjects,
+    LayoutError,
+    ScalingError,
+    chosen,
+    drive_layout,
     is_increments,
+    pdo_of_words,
     si_per_unit,
     unit_of_position,
     unit_of_velocity,
 )
+from jtqd.drivers.pdo import BY_ITSELF, EVERY_SYNC, PdoError
+from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.survey import DRIVE, IDENTITY, BusSurvey, Survey, Tpdo, survey_of_eds
 
 _POSITION_UNIT, _VELOCITY_UNIT = (0x60A8, 0), (0x60A9, 0)
 _FEED: tuple[Key, Key] = ((0x6092, 1), (0x6092, 2))
@@ -168,7 +172,7 @@ def unit_problems(node: int, survey: Survey | None) -> list[str]:
         ):
             try:
                 unit_of(survey)
-            except UnitError as error:
+            except ScalingError as error:
                 found.append(
                     f"node {node} ({survey.title}): {label(*key)}, the unit of {what}: {error}; "
                     "with a factor of your own in joint_N.objects it can be used"
@@ -177,7 +181,7 @@ def unit_problems(node: int, survey: Survey | None) -> list[str]:
 
 
 def _position_unit(survey: Survey) -> str:
-    """Return the object that scales positions: "60A8h", "6092h", or "608Fh" (counts). Raises UnitError."""
+    """Return the object that scales positions: "60A8h", "6092h", or "608Fh" (counts). Raises ScalingError."""
     word = survey.number(_POSITION_UNIT)
     if word is not None:
         if is_increments(word):
@@ -189,7 +193,7 @@ def _position_unit(survey: Survey) -> str:
 
 
 def _velocity_unit(survey: Survey) -> str:
-    """Return the object that scales velocities: "60A9h", "608Fh" (counts per second), "". Raises UnitError."""
+    """Return the object that scales velocities: "60A9h", "608Fh" (counts per second), "". Raises ScalingError."""
     word = survey.number(_VELOCITY_UNIT)
     if word is None:
         return ""
@@ -202,7 +206,7 @@ def _velocity_unit(survey: Survey) -> str:
 def reported_units(
     survey: Survey | None, gear_ratio: float, quantities: Iterable[str], by_options: Iterable[str]
 ) -> dict[str, ObjectEntry]:
-    """Return how a drive's positions and velocity are scaled, where other objects do so than those of `devices.CIA_402`.
+    """Return how a drive's positions and velocity are scaled, where other objects do so than those of `drive.CIA_402`.
 
     gear_ratio: of the joint. quantities: those that the drive has. by_options: those that the operator has scaled.
     """
@@ -210,7 +214,7 @@ def reported_units(
     velocity = ""
     if survey is None:
         return found
-    with suppress(UnitError):
+    with suppress(ScalingError):
         position = _position_unit(survey)
         if position != "608Fh" and not _is_counts(survey, position):
             found["motor_position"] = _scaled(survey, "motor_position", position, gear_ratio)
@@ -218,7 +222,7 @@ def reported_units(
             found["link_position"] = _scaled(survey, "link_position", position, gear_ratio, verify)
             if survey.number(_VELOCITY_UNIT) is None:
                 found["motor_velocity"] = _per_second(survey, position, gear_ratio)
-    with suppress(UnitError):
+    with suppress(ScalingError):
         if velocity := _velocity_unit(survey):
             found["motor_velocity"] = _scaled(survey, "motor_velocity", velocity, gear_ratio)
     excluded = set(by_options)

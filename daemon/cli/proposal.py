@@ -26,17 +26,10 @@ from jtqd.daemon.cli.device import (
 )
 from jtqd.daemon.config import ObjectsSection
 from jtqd.daemon.profiles import INIT, Family
-from jtqd.drivers.devices import (
-    COMMANDER_NODE,
-    EVERY_SCALING_OBJECT,
-    JTQD_NODE,
-    DriveObjects,
-    DriveProfile,
-    parse_key,
-)
-from jtqd.drivers.sdo import Key, label
+from jtqd.drivers.drive import EVERY_SCALING_OBJECT, GEAR, DriveObjects, DriveProfile
+from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
+from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.drivers.survey import IDENTITY, MAPPED, RATED_CURRENT, RATED_TORQUE, SENSOR, TORQUE, Survey
-from jtqd.drivers.units import GEAR
 from jtqd.estimator.decoder import decode
 
 EFFICIENCY: Final = 0.7
@@ -509,7 +502,7 @@ def drive_lines(joint: JointProposal) -> list[str]:
         entry = f'    "{label(*key)}": {round(value.number)}'
         lines.append(f"{entry:<25} # {'GUESS, ' * value.guess}{value.origin}")
     if joint.family is not None:
-        lines.append(f"  profile: {joint.family.name:<15}# docs/profiles.md")
+        lines.append(f"  profile: {joint.family.name:<15}# docs/bus.md")
     if joint.own or joint.objects:
         others = "CiA 402" if joint.family is None else "the profile"
         lines.append(f"  objects:                # of this drive; all else is as in {others}")
