@@ -1,8 +1,8 @@
-"""Profiles of drive families: what a section `joint_N` needs for such a drive, each line with its source.
+"""Profiles of drive families: values of a section `joint_N` for such a drive, each line with its source.
 
-A profile is one of `drivers/profiles/` or a file beside the configuration. `with_profiles` puts its values below those of
-the configuration; `jtq init` and `jtq probe` recognise a family by its vendor-ID (1018h:1), read the objects that hold what
-differs from drive to drive, and compare those that the values rest on. `python -m jtqd.daemon.profiles` prints the tables
+A profile is one of `drivers/profiles/` or a file beside the configuration. `with_profiles` adds its values to those of the
+configuration; `jtq init` and `jtq probe` recognise a family by its vendor-ID (1018h:1), read the objects whose values
+differ from drive to drive, and check those that the profile assumes. `python -m jtqd.daemon.profiles` prints the tables
 of docs/bus.md.
 """
 
@@ -21,11 +21,11 @@ from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
 from jtqd.models.files import read_yaml
 
 STATES: Final = ("by the manual", "by the EDS", "tried on the bus", "not confirmed")
-"""How far a line is known: by a document of the maker, by a data sheet (EDS, DCF) of the maker, by a drive, from hearsay."""
+"""Evidence of a line: a document of the maker, a data sheet (EDS, DCF) of the maker, a drive, none."""
 OPTIONS: Final = ("encoder_counts", "link_encoder_counts", "gear_ratio_numerator", "gear_ratio_denominator")
-"""What only the operator knows: options of `jtq init`; a gear ratio as numerator and denominator."""
+"""Values of the operator: options of `jtq init`; a gear ratio as numerator and denominator."""
 INIT: Final = "init."
-"""Keys that are no keys of the configuration: numbers that `jtq init` takes for those of CiA 402."""
+"""Prefix of numbers that `jtq init` uses for objects of CiA 402; they are no keys of the configuration."""
 _FOLDER: Final = Path(jtqd.drivers.profiles.__file__).resolve().parent
 _JOINTS: Final = tuple(f"joint_{number}" for number in range(1, 5))
 _Unsigned32 = Annotated[int, limits(ge=0, le=0xFFFF_FFFF)]
@@ -36,7 +36,7 @@ class Line:
     """One fact about a family.
 
     Attributes:
-        why, source, state: what it is, where that is written, how far it is known (`STATES`).
+        why, source, state: meaning, source, evidence (`STATES`).
         key: dotted key of the section, or of INIT. It gets a `value`, or `factor` times (`inverse`: divided by) the
             number of the object `read`, or of the `option`.
         check: an object of the drive that must be `expected`, as other lines rest on it.
@@ -94,7 +94,7 @@ def _parsed(text: str) -> Key | None:
 
 @dataclass(frozen=True)
 class Family:
-    """A drive family: name, title, vendor-ID (1018h:1), its lines, and what its drives can also do."""
+    """A drive family: name, title, vendor-ID (1018h:1), its lines, further variants."""
 
     name: str
     title: Text
@@ -129,16 +129,15 @@ class Family:
     def filled(
         self, numbers: Mapping[Key, int], options: Mapping[str, float]
     ) -> dict[str, tuple[float, str]]:
-        """Return what the drive and the operator tell: key -> (value, origin); a key that nobody tells is left out."""
+        """Return the values by drive and operator: key -> (value, origin), without keys that have none."""
         found: dict[str, tuple[float, str]] = {}
         for line in self.lines:
             if line.key is None or line.value is not None:
                 continue
             if line.option is not None:
                 number: float | None = options.get(line.option)
-                origin = "--" + line.option.removesuffix("_numerator").removesuffix("_denominator").replace(
-                    "_", "-"
-                )
+                option = line.option.removesuffix("_numerator").removesuffix("_denominator")
+                origin = f"--{option.replace('_', '-')}"
             else:
                 assert line.reads is not None
                 number, origin = numbers.get(line.reads), f"{label(*line.reads)} of the drive"
@@ -147,7 +146,7 @@ class Family:
         return found
 
     def findings(self, numbers: Mapping[Key, int]) -> list[str]:
-        """Return in what a drive differs from what the profile takes it for."""
+        """Return one line for each object of a drive that differs from the profile."""
         return [
             f"{label(*line.reads)}: expected 0x{line.expected:X}, found 0x{numbers[line.reads]:X}: {line.why}"
             for line in self.lines
@@ -201,9 +200,9 @@ def named(name: str, beside: Path | None = None) -> Family:
 
 
 def with_profiles(mapping: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return a configuration with the values of its profiles below its own. Raises ConfigError.
+    """Return a configuration with the values of its profiles added to its own.
 
-    What a profile leaves to the drive or to the operator must be in the configuration: an error says what it is.
+    Raises ConfigError, also for a value that the profile leaves to drive or operator and the configuration lacks.
     """
     merged = dict(mapping)
     for joint in _JOINTS:
@@ -226,7 +225,7 @@ def with_profiles(mapping: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
 
 def _below(profile: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `own` with what only the profile has."""
+    """Return `own` with the keys that only the profile has."""
     merged = {**profile, **own}
     for key, value in own.items():
         if isinstance(value, Mapping) and isinstance(profile.get(key), Mapping):
@@ -235,7 +234,7 @@ def _below(profile: Mapping[str, Any], own: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _has(mapping: Any, key: str) -> bool:
-    """Whether a dotted key is there, or nothing is needed there (`link_position: false`)."""
+    """Whether a dotted key is present or not needed (`link_position: false`)."""
     for name in key.split("."):
         if mapping is False:
             return True

@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
-from pathlib import Path
 from typing import Any, Final
 
 from jtqd.daemon.cli.device import (
@@ -384,7 +383,7 @@ def _drive_objects(
         section[quantity] = {**section.get(quantity, {}), name: value.number}
     for quantity, each in objects.items():
         section[quantity] = False if each.keys is None else {**section.get(quantity, {}), **each.keys}
-    return decode(ObjectsSection, section, "jtq init").of_drive("joint_N", Path("jtq init"))
+    return decode(ObjectsSection, section, "jtq init").of_drive()
 
 
 def _problems(

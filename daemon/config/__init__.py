@@ -1,19 +1,19 @@
 """Configuration of jtqd as frozen values: `load_config` reads a file.
 
-settings    sections that other modules take as they are: safety, recording, real time, ROS 2, contact
-drive       what a joint's section says of its drive: objects, TPDOs
-sections    the whole file as it is written
+drive       objects and TPDOs of a joint's drive
+sections    the whole file, section by section
 load        with joint files, networks and profiles: `Config`
 """
 
 from jtqd.daemon.config.drive import ObjectsSection
 from jtqd.daemon.config.load import Config, JointConfig, NetworkFile, SensorConfig, as_booted, load_config
-from jtqd.daemon.config.sections import MAX_NODE_ID, Identity
-from jtqd.daemon.config.settings import (
+from jtqd.daemon.config.sections import (
     HIGHEST_DOMAIN,
     LATCHED_BY_DEFAULT,
     LOOPBACK,
+    MAX_NODE_ID,
     ContactSettings,
+    Identity,
     Realtime,
     RecordingSettings,
     Ros2Settings,

@@ -1,10 +1,9 @@
-"""What a section `joint_N` says of its drive: objects (`objects`), TPDOs (`tpdos`), values of absent objects (`given`)."""
+"""Drive of a joint in section `joint_N`: objects (`objects`), TPDOs (`tpdos`), values of absent objects (`given`)."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import MISSING, dataclass, fields
 from typing import Annotated, Any, Final
 
 from jtqd.drivers.drive import (
@@ -17,14 +16,14 @@ from jtqd.drivers.drive import (
     DriveObjects,
     LayoutError,
     Temperature,
+    chosen,
     drive_layout,
-    map_of,
-    select_tpdos,
+    pdo_of_words,
 )
-from jtqd.drivers.pdo import ACYCLIC, PdoError, PdoMap, Tpdo
+from jtqd.drivers.pdo import BY_ITSELF, PdoError, PdoMap
 from jtqd.drivers.sdo import Key, label, parse_key
-from jtqd.estimator.checked import ConfigError, Verbatim, range_text
-from jtqd.estimator.decoder import FieldError, Text, choice, limits
+from jtqd.estimator.checked import Verbatim, range_text
+from jtqd.estimator.decoder import FieldError, Text, below, choice, limits
 
 _PDO_BITS: Final = 64
 _TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}
@@ -36,7 +35,7 @@ _SubIndex = Annotated[int, limits(ge=0, le=254)]
 
 @dataclass(frozen=True)
 class _Object:
-    """One object in section `joint_N.objects`; what is left out is as in CiA 402."""
+    """One object in section `joint_N.objects`; a key left out is as in CiA 402."""
 
     index: _Index | None = None
     sub: _SubIndex | None = None
@@ -67,29 +66,31 @@ class _Object:
             self.shaft or AT_JOINT,
         )
 
-    def check(self, name: str, standard: DriveObject, where: str) -> None:
-        """Raise ConfigError for what cannot be mapped or scaled."""
+    def check(self, name: str, standard: DriveObject) -> None:
+        """Raise FieldError for an object that cannot be mapped or scaled."""
         chosen = self.of_drive(standard)
+
+        def wrong(key: str, problem: str) -> FieldError:
+            return FieldError("object", key, None, "", problem)
+
         if name == "statusword":
             if chosen.bits != standard.bits or self.sign != 1 or self.factor or self.by or self.shaft:
-                raise ConfigError(f"{where}': expected an object of type U16, no sign, no factor")
+                raise wrong("", "expected an object of type U16, no sign, no factor")
             return
         scales = SCALES[name]
         another = (chosen.index, chosen.subindex) != (standard.index, standard.subindex)
         if self.by is not None and self.by not in scales:
-            raise ConfigError(f"{where}.by': found '{self.by}', expected one of {', '.join(scales)}")
+            raise FieldError("object", "by", self.by, f"one of {', '.join(scales)}")
         if self.by is not None and self.factor is not None:
-            raise ConfigError(f"{where}.by': found both by and factor, expected one of them")
+            raise wrong("by", "found both by and factor, expected one of them")
         if another and chosen.factor is None and not chosen.by:
             unit = "A" if name == "current" else "rad/s" if "velocity" in name else "rad"
-            raise ConfigError(
-                f"{where}.factor': missing, expected {unit} per unit, or 'by': "
-                f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
-            )
+            alone = f"CiA 402 scales {label(standard.index, standard.subindex)} alone"
+            raise FieldError("object", "factor", MISSING, f"{unit} per unit, or 'by': {alone}")
         if self.shaft is not None and not (self.by and scales[self.by].at_shaft and name.startswith("motor")):
-            raise ConfigError(f"{where}.shaft': expected only for the motor by 6092h, 60A8h or 60A9h")
+            raise wrong("shaft", "expected only for the motor by 6092h, 60A8h or 60A9h")
         if "position" in name and (chosen.bits, chosen.signed) != (32, True):
-            raise ConfigError(f"{where}.type': expected I32: a position rolls over at 32 bits")
+            raise wrong("type", "expected I32: a position rolls over at 32 bits")
 
 
 @dataclass(frozen=True)
@@ -113,19 +114,18 @@ class ObjectsSection:
     statusword: _Object = _Object()
     temperature: _Temperature | None = None
 
-    def of_drive(self, joint: str, path: Path) -> DriveObjects:
-        """Return the objects of the drive. Raises ConfigError for what cannot be mapped or scaled."""
-        where = f"{path}: key '{joint}.objects"
-        found: dict[str, DriveObject | None] = {}
+    def of_drive(self) -> DriveObjects:
+        """Return the objects of the drive. Raises FieldError for an object that cannot be mapped or scaled."""
+        found: dict[str, Any] = {}
         for each in fields(CIA_402):
             written: _Object | None = getattr(self, each.name)
             found[each.name] = None
             if written is not None:
                 standard: DriveObject = getattr(CIA_402, each.name)
+                with below(f"objects.{each.name}"):
+                    written.check(each.name, standard)
                 found[each.name] = written.of_drive(standard)
-                written.check(each.name, standard, f"{where}.{each.name}")
-        made: dict[str, Any] = found
-        return DriveObjects(**made)
+        return DriveObjects(**found)
 
     @property
     def of_joint(self) -> Temperature:
@@ -147,7 +147,7 @@ class TpdoSection:
 
 
 def check_given(where: str, given: Mapping[str, float], known: Mapping[Key, tuple[str, int]]) -> None:
-    """Refuse objects that scale nothing, and values that they cannot have. Raises FieldError."""
+    """Raise FieldError for objects that scale nothing, and for values that they cannot have."""
     for name, value in given.items():
         try:
             key = parse_key(name)
@@ -163,49 +163,38 @@ def check_given(where: str, given: Mapping[str, float], known: Mapping[Key, tupl
 
 
 def tpdos_of(
-    joint: str,
-    path: Path,
-    node: int,
-    objects: DriveObjects,
-    tpdos: Sequence[TpdoSection],
-    *,
-    by_itself: bool,
-    temperature: bool,
+    node: int, objects: DriveObjects, tpdos: Sequence[TpdoSection], *, asynchronous: bool, temperature: bool
 ) -> tuple[PdoMap, ...]:
-    """Return the TPDOs that shall carry the objects.
+    """Return the TPDOs that carry the objects.
 
-    by_itself: `max_age_ms` is there, so those that the drive sends by itself may be among them.
-    Raises ConfigError for what they lack, or cannot be.
+    asynchronous: `max_age_ms` is given, so TPDOs that the drive sends by itself may be among them; temperature: TPDO3
+    carries the temperature. Raises FieldError for TPDOs that are incomplete or contradict each other.
     """
     if not tpdos:
         second = (objects.motor_velocity, objects.current, objects.statusword)
         bits = sum(each.bits for each in second if each is not None)
         if bits > _PDO_BITS:
-            raise ConfigError(
-                f"{path}: key '{joint}.objects': found {bits} bits of velocity, current and statusword, "
-                f"expected at most {_PDO_BITS}: one PDO"
-            )
+            found = Verbatim(f"{bits} bits of velocity, current and statusword")
+            raise FieldError("joint", "objects", found, f"at most {_PDO_BITS}: one PDO")
         return drive_layout(node, objects)
-    where = f"{path}: key '{joint}.tpdos'"
     for each in tpdos:
-        if each.type != 1 and each.type not in ACYCLIC:
-            raise ConfigError(f"{where}: found type {each.type}, expected 1, 0, 254 or 255")
-        if each.type in ACYCLIC and not by_itself:
-            raise ConfigError(
-                f"{path}: key '{joint}.max_age_ms': missing, expected ms because TPDO{each.number} has type {each.type}"
-            )
+        if each.type != 1 and each.type not in BY_ITSELF:
+            raise FieldError("joint", "tpdos", Verbatim(f"type {each.type}"), "1, 0, 254 or 255")
+        if each.type in BY_ITSELF and not asynchronous:
+            expected = f"ms because TPDO{each.number} has type {each.type}"
+            raise FieldError("joint", "max_age_ms", MISSING, expected)
     try:
         maps = tuple(
-            map_of(node, Tpdo(each.number, each.cob_id, each.objects, each.type), objects) for each in tpdos
+            pdo_of_words(node, each.number, each.cob_id, each.objects, each.type, objects) for each in tpdos
         )
-        used = select_tpdos(objects, maps)
+        used = chosen(objects, maps)
     except (PdoError, LayoutError) as error:
-        raise ConfigError(f"{where}: {error}") from None
-    for name, taken in (("number", {3}), ("cob_id", {0x380 + node})):
+        raise FieldError("joint", "tpdos", None, "", str(error)) from None
+    for name, of_temperature in (("number", 3), ("cob_id", 0x380 + node)):
         values = [getattr(pdo, name) for pdo in maps]
-        reserved = taken if temperature else set()
+        reserved = [of_temperature] if temperature else []
         if len({*values, *reserved}) != len(values) + len(reserved):
             shown = ", ".join(str(value) if name == "number" else f"{value:03X}h" for value in values)
             rule = ", TPDO3 is that of the temperature" if reserved else ""
-            raise ConfigError(f"{where}: found {name} {shown}, expected each once{rule}")
+            raise FieldError("joint", "tpdos", Verbatim(f"{name} {shown}"), f"each once{rule}")
     return used

@@ -1,6 +1,6 @@
 """Configuration of jtqd: read once into frozen, validated objects.
 
-    YAML -> profiles put below -> `sections` (types, units, ranges) -> joint files, networks -> `Config`
+    YAML -> values of profiles added -> `sections` (types, units, ranges) -> joint files, networks -> `Config`
 
 Unknown keys and wrong values are errors of one line that name the file, the key, what was found and what was expected.
 """
@@ -8,7 +8,7 @@ Unknown keys and wrong values are errors of one line that name the file, the key
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,23 +16,20 @@ from jtqd.daemon.config.drive import tpdos_of
 from jtqd.daemon.config.sections import (
     ERROR_BEHAVIOURS,
     ConfigFile,
-    Identity,
-    JointSection,
-    NetworkSection,
-    SensorSection,
-)
-from jtqd.daemon.config.settings import (
     ContactSettings,
+    Identity,
+    NetworkSection,
     Realtime,
     RecordingSettings,
     Ros2Settings,
     SafetySettings,
+    SensorSection,
 )
 from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.drivers.drive import DriveObjects, Temperature, maps_of_json, select_tpdos
 from jtqd.drivers.pdo import PdoMap
-from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.decoder import decode
+from jtqd.estimator.checked import ConfigError, Verbatim
+from jtqd.estimator.decoder import FieldError, below, in_file, read
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 from jtqd.estimator.sha256 import sha256_hex
@@ -63,7 +60,7 @@ class JointConfig:
     node_id: int
     identity: Identity
     given: dict[str, int]
-    """Objects that the drive lacks and the boot shall take as read, e.g. {"6091h:1": 100}."""
+    """Values of objects that the drive lacks, for the boot, e.g. {"6091h:1": 100}."""
     joint_path: Path
     joint: Joint
     network: NetworkFile | None
@@ -77,9 +74,9 @@ class JointConfig:
     objects: DriveObjects
     """Which objects of the drive are mapped, with sign and factor."""
     tpdos: tuple[PdoMap, ...]
-    """TPDOs that carry them: wanted ones, and after the boot those in force (`as_booted`)."""
+    """TPDOs that carry them: configured ones, and after the boot those in force (`as_booted`)."""
     max_age_ms: float
-    """For how long a frame of a TPDO with transmission type 0, 254 or 255 counts; 0: such a TPDO is not used."""
+    """Longest age of a frame of a TPDO with transmission type 0, 254 or 255; 0: such a TPDO is not used."""
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
     profile: str | None = None
@@ -125,7 +122,7 @@ class Config:
     input_deadline_ns: int
     heartbeat_ms: int
     heartbeat_timeout_ms: int
-    """A node that was not heard for so long is lost (1016h of jtqd)."""
+    """Silence after which a node is lost (1016h of jtqd)."""
     error_behaviour: int
     """1029h:1 of every node that has it: 0 pre-operational, 1 no change, 2 stopped."""
     emcy_inhibit_ms: int
@@ -141,9 +138,9 @@ class Config:
     metrics_file: Path | None = None
     """Prometheus text file, written every 5 s; None for none."""
     ros2: Ros2Settings | None = None
-    """What is published for ROS 2; None: nothing, unless the command line asks for it."""
+    """None: no ROS 2, unless the command line asks for it."""
     contact: ContactSettings | None = None
-    """How contacts are told; None: nobody watches."""
+    """None: contacts are not detected."""
 
     @property
     def files_sha256(self) -> str:
@@ -166,8 +163,8 @@ class Config:
 def as_booted(config: Config, nodes: Mapping[str, Mapping[str, Any]]) -> Config:
     """Return the configuration with the TPDOs that the drives have.
 
-    nodes: of the boot report, or of a log's provenance, by node-ID; a drive that is not in it (it was absent) keeps those
-    that are wanted. Raises PdoError, LayoutError, KeyError or TypeError for what is no such report.
+    nodes: of the boot report, or of a log's provenance, by node-ID; a drive that is not in it keeps the configured ones.
+    Raises PdoError, LayoutError, KeyError or TypeError for anything but such a report.
     """
 
     def of(joint: JointConfig) -> JointConfig:
@@ -189,12 +186,11 @@ def load_config(path: Path | None) -> Config:
     if path is None:
         path = shipped(DEFAULT_CONFIG)
     mapping, data = read_yaml(path)
-    _check_one_sensor(path, mapping)
-    file = decode(ConfigFile, with_profiles(mapping, path), str(path))
-    joints = tuple(
-        _joint(path, number, section, file.estimator.method, file.nodes.sdo_timeout_ms)
-        for number, section in enumerate(file.joints, start=1)
-    )
+    with in_file(str(path)):
+        _check_one_sensor(mapping)
+        file = read(ConfigFile, with_profiles(mapping, path))
+        joints = tuple(_joint(path, number, file) for number in range(1, len(file.joints) + 1))
+    _check_contact(path, file.contact, joints)
     return Config(
         path=path,
         text=_text(path, data),
@@ -219,23 +215,22 @@ def load_config(path: Path | None) -> Config:
         recording=file.recording,
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
         ros2=file.ros2,
-        contact=_contact(path, file.contact, joints),
+        contact=file.contact,
     )
 
 
-_ONE_SENSOR: Final = (
-    "one section 'sensor': a bus has one sensor node with 1 or 2 channels (docs/deployment.md)"
-)
-
-
-def _check_one_sensor(path: Path, mapping: Mapping[str, object]) -> None:
-    """Refuse a second sensor node by what it is, not as an unknown key. Raises ConfigError."""
+def _check_one_sensor(mapping: Mapping[str, object]) -> None:
+    """Refuse a second sensor node by what it is, not as an unknown key. Raises FieldError."""
     for key, value in mapping.items():
         more = (
             isinstance(key, str) and key.startswith(("sensor_", "sensors")) and isinstance(value, dict | list)
         )
         if more or (key == "sensor" and isinstance(value, list)):
-            raise ConfigError(f"{path}: key '{key}': found a second sensor or a list, expected {_ONE_SENSOR}")
+            found = Verbatim("a second sensor or a list")
+            expected = (
+                "one section 'sensor': a bus has one sensor node with 1 or 2 channels (docs/deployment.md)"
+            )
+            raise FieldError("configuration", key, found, expected)
 
 
 def _sensor(section: SensorSection, sdo_timeout_ms: int) -> SensorConfig:
@@ -250,85 +245,76 @@ def _sensor(section: SensorSection, sdo_timeout_ms: int) -> SensorConfig:
     )
 
 
-def _joint(path: Path, number: int, section: JointSection, method: str, sdo_timeout_ms: int) -> JointConfig:
-    """Read what a section `joint_N` names: the joint file and, where the method uses one, the network."""
-    objects = section.objects.of_drive(f"joint_{number}", path)
-    network = None if section.network is None else _network(section.network, path)
+def _joint(path: Path, number: int, file: ConfigFile) -> JointConfig:
+    """Read the files of a section `joint_N`: the joint file and, where the method uses one, the network.
+
+    Raises FieldError for the section, ConfigError for the files.
+    """
+    section, method = file.joints[number - 1], METHODS[file.estimator.method]
     joint_path = path.parent / section.file
     profile_path = None if section.profile is None else path_of(section.profile, path.parent)
-    mapping, data = read_yaml(joint_path)
-    joint = Joint.from_mapping(mapping, str(joint_path))
-    if METHODS[method].network_required and network is None:
-        key = f"joint_{number}.network"
-        raise ConfigError(
-            f"{path}: key '{key}': missing, expected file and sha256 because estimator.method is {method}"
+    with below(f"joint_{number}"):
+        objects = section.objects.of_drive()
+        network = None if section.network is None else _network(section.network, path)
+        mapping, data = read_yaml(joint_path)
+        joint = Joint.from_mapping(mapping, str(joint_path))
+        because = f"because estimator.method is {file.estimator.method}"
+        if method.network_required and network is None:
+            raise FieldError("joint", "network", MISSING, f"file and sha256 {because}")
+        for needed in method.sections:
+            if getattr(joint, needed) is None:
+                raise ConfigError(f"{joint_path}: key '{needed}': missing, expected {because}")
+        network = network if method.network else None
+        _check_encoders(file.estimator.method, objects, joint, network)
+        tpdos = tpdos_of(
+            section.node,
+            objects,
+            section.tpdos,
+            asynchronous=section.max_age_ms is not None,
+            temperature=section.temperature,
         )
-    for needed in METHODS[method].sections:
-        if getattr(joint, needed) is None:
-            raise ConfigError(
-                f"{joint_path}: key '{needed}': missing, expected because estimator.method is {method}"
-            )
-    made = JointConfig(
+    return JointConfig(
         number=number,
         node_id=section.node,
         identity=section.identity,
         given=_whole(section.given),
         joint_path=joint_path,
         joint=joint,
-        network=network if METHODS[method].network else None,
+        network=network,
         sensor_channel=section.sensor_channel,
         temperature=section.objects.of_joint if section.temperature else None,
         mandatory=section.mandatory,
-        sdo_timeout_ms=section.sdo_timeout_ms or sdo_timeout_ms,
+        sdo_timeout_ms=section.sdo_timeout_ms or file.nodes.sdo_timeout_ms,
         objects=objects,
-        tpdos=tpdos_of(
-            f"joint_{number}",
-            path,
-            section.node,
-            objects,
-            section.tpdos,
-            by_itself=section.max_age_ms is not None,
-            temperature=section.temperature,
-        ),
+        tpdos=tpdos,
         max_age_ms=section.max_age_ms or 0.0,
         joint_data=data,
         profile=section.profile,
         profile_path=profile_path,
         profile_data=b"" if profile_path is None else read_yaml(profile_path)[1],
     )
-    _check_encoders(path, number, made, method)
-    return made
 
 
-def _contact(
-    path: Path, contact: ContactSettings | None, joints: tuple[JointConfig, ...]
-) -> ContactSettings | None:
-    """Return the section where every joint has a torsion. Raises ConfigError."""
+def _check_contact(path: Path, contact: ContactSettings | None, joints: tuple[JointConfig, ...]) -> None:
+    """Refuse section `contact` for a joint without a torsion. Raises ConfigError."""
     for joint in joints if contact is not None else ():
         if joint.joint.fused is None or joint.joint.fused.torsion is None:
             raise ConfigError(
                 f"{joint.joint_path}: key 'fused.torsion': missing, expected because of section contact of {path}"
             )
-    return contact
 
 
 def _whole(values: Mapping[str, float]) -> dict[str, int]:
     return {name: int(value) for name, value in values.items()}
 
 
-def _check_encoders(path: Path, number: int, joint: JointConfig, method: str) -> None:
-    """Refuse what needs the link position of a drive that has none. Raises ConfigError."""
-    if joint.objects.link_position is not None:
-        return
-    torsion = METHODS[method].torsion_of(joint.joint) is not None
-    if torsion or joint.network is not None:
-        what = (
-            "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
-        )
-        raise ConfigError(
-            f"{path}: key 'joint_{number}.objects.link_position': found false, expected a link position because "
-            f"estimator.method {method} {what}; tob and efficiency do without"
-        )
+def _check_encoders(method: str, objects: DriveObjects, joint: Joint, network: NetworkFile | None) -> None:
+    """Refuse a method that needs the link position of a drive without one. Raises FieldError."""
+    torsion = METHODS[method].torsion_of(joint) is not None
+    if objects.link_position is None and (torsion or network is not None):
+        use = "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
+        expected = f"a link position because estimator.method {method} {use}; tob and efficiency do without"
+        raise FieldError("joint", "objects.link_position", Verbatim("false"), expected)
 
 
 def _network(section: NetworkSection, path: Path) -> NetworkFile:
