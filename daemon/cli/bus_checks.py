@@ -111,7 +111,7 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
             return CheckResult(pdo.name, WARN, f"{pdo.frames} without any SYNC")
         return CheckResult(pdo.name, SKIP, "no SYNC on the bus")
     if pdo.age_ns:
-        return _asynchronous(pdo, traffic)
+        return _acyclic(pdo, traffic)
     if not pdo.delays.count:
         length = f", {pdo.wrong_length} of a wrong length" if pdo.wrong_length else ""
         hint = "check that the node is on the bus and operational, and that its TPDO has transmission type 1 (SYNC)"
@@ -132,7 +132,7 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
     return CheckResult(pdo.name, level, text, _hint(pdo, config))
 
 
-def _asynchronous(pdo: PdoCount, traffic: Traffic) -> CheckResult:
+def _acyclic(pdo: PdoCount, traffic: Traffic) -> CheckResult:
     """Judge a PDO of transmission type 0, 254 or 255 by its age at SYNC: it belongs to no cycle."""
     if not pdo.delays.count:
         return CheckResult(pdo.name, FAIL, "none", "check that the node is on the bus and operational")

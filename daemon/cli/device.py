@@ -26,17 +26,17 @@ from jtqd.drivers.drive import (
     DriveObjects,
     LayoutError,
     ScalingError,
-    chosen,
     drive_layout,
     is_increments,
-    pdo_of_words,
+    map_of,
+    select_tpdos,
     si_per_unit,
     unit_of_position,
     unit_of_velocity,
 )
-from jtqd.drivers.pdo import BY_ITSELF, EVERY_SYNC, PdoError
+from jtqd.drivers.pdo import ACYCLIC, EVERY_SYNC, PdoError, Tpdo
 from jtqd.drivers.sdo import Key, label
-from jtqd.drivers.survey import DRIVE, IDENTITY, BusSurvey, Survey, Tpdo, survey_of_eds
+from jtqd.drivers.survey import DRIVE, IDENTITY, BusSurvey, Survey, survey_of_eds
 
 _POSITION_UNIT, _VELOCITY_UNIT = (0x60A8, 0), (0x60A9, 0)
 _FEED: tuple[Key, Key] = ((0x6092, 1), (0x6092, 2))
@@ -49,7 +49,7 @@ _UNIT_OBJECT: Mapping[str, Key] = {
 """Object whose value decides that a quantity is scaled by 60A8h, 60A9h, 608Fh or 6092h."""
 _COMPARE: Final = "turn the joint by a known angle and compare jtq status"
 _AGE_MS: Final = 100
-"""Longest age of an asynchronous frame, where the drive has no event timer."""
+"""Longest age of an acyclic frame, where the drive has no event timer."""
 
 
 class UsageError(Exception):
@@ -275,7 +275,7 @@ def _per_second(survey: Survey, position: str, gear_ratio: float) -> ObjectEntry
 
 @dataclass(frozen=True)
 class KeptTpdos:
-    """TPDOs for section `tpdos` (none: jtqd maps its own), longest age of an asynchronous frame, reason, problems."""
+    """TPDOs for section `tpdos` (none: jtqd maps its own), longest age of an acyclic frame, reason, problems."""
 
     tpdos: tuple[Tpdo, ...] = ()
     max_age_ms: int | None = None
@@ -288,7 +288,7 @@ class KeptTpdos:
             return []
         lines = [f"tpdos:                  # {self.why}; without it jtqd maps its own"]
         for each in self.tpdos:
-            kind = f", type: {each.transmission_type}" if each in _asynchronous(self.tpdos) else ""
+            kind = f", type: {each.transmission_type}" if each in _acyclic(self.tpdos) else ""
             words = ", ".join(f"0x{word:08X}" for word in each.words)
             lines.append(
                 f"  - {{number: {each.number}, cob_id: 0x{each.cob_id:03X}{kind}, objects: [{words}]}}"
@@ -311,32 +311,32 @@ def kept_tpdos(node: int, survey: Survey | None, objects: DriveObjects) -> KeptT
     maps, errors = [], []
     for each in usable:
         try:
-            maps.append(pdo_of_words(node, each.number, each.cob_id, each.words, EVERY_SYNC, objects))
+            maps.append(map_of(node, replace(each, transmission_type=EVERY_SYNC), objects))
         except PdoError as error:
             errors.append(f"TPDO{each.number}: {error}")
     try:
-        numbers = [pdo.number for pdo in chosen(objects, maps)]
+        numbers = [pdo.number for pdo in select_tpdos(objects, maps)]
     except LayoutError as error:
         problem = f"{device}: its mapping is fixed, by its EDS: {'; '.join((str(error), *errors))}"
         return KeptTpdos(problems=(problem,) if fixed else ())
     used = tuple(each for each in usable if each.number in numbers)
     as_jtqd_maps = {(pdo.cob_id, pdo.words) for pdo in own} == {(pdo.cob_id, pdo.words) for pdo in used}
-    if as_jtqd_maps and not _asynchronous(used):
+    if as_jtqd_maps and not _acyclic(used):
         return KeptTpdos()
     for each in used:
-        if each.type_fixed and each.transmission_type not in (EVERY_SYNC, *BY_ITSELF):
+        if each.type_fixed and each.transmission_type not in (EVERY_SYNC, *ACYCLIC):
             problem = (
                 f"{device}: TPDO{each.number} has transmission type {each.transmission_type}, "
                 "which cannot be written, by its EDS: expected 1, 0, 254 or 255"
             )
             return KeptTpdos(problems=(problem,))
     why = "their mapping is fixed, by the EDS" if fixed else f"as they are, by {survey.source}"
-    return KeptTpdos(used, _age_ms(_asynchronous(used)), why)
+    return KeptTpdos(used, _age_ms(_acyclic(used)), why)
 
 
-def _asynchronous(tpdos: Sequence[Tpdo]) -> list[Tpdo]:
+def _acyclic(tpdos: Sequence[Tpdo]) -> list[Tpdo]:
     """Return those that the drive sends by itself, of a type that cannot be written."""
-    return [each for each in tpdos if each.type_fixed and each.transmission_type in BY_ITSELF]
+    return [each for each in tpdos if each.type_fixed and each.transmission_type in ACYCLIC]
 
 
 def _age_ms(tpdos: Sequence[Tpdo]) -> int | None:

@@ -281,7 +281,7 @@ def _inputs(about: About, view: View) -> Columns:
 
 
 def after_sync(delay_ns: int) -> str:
-    """Return the arrival of an input after its SYNC; the age of an asynchronous input, which arrived before it.
+    """Return the arrival of an input after its SYNC; the age of an acyclic input, which arrived before it.
 
     >>> after_sync(426_000), after_sync(-4_803_000)
     ('426 us', '4803 us old')

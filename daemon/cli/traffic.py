@@ -92,9 +92,9 @@ class PdoCount:
     twice: int = 0
     wrong_length: int = 0
     delays: TimeHistogram = field(default_factory=TimeHistogram)
-    """Arrival after SYNC; of an asynchronous PDO its age at SYNC."""
+    """Arrival after SYNC; of an acyclic PDO its age at SYNC."""
     age_ns: int = 0
-    """Longest age at which a frame of an asynchronous PDO counts; 0: it is sent at each SYNC."""
+    """Longest age at which a frame of an acyclic PDO counts; 0: it is sent at each SYNC."""
     last_ns: int = 0
     """Stamp of its last frame."""
 
@@ -262,7 +262,7 @@ class Traffic:
         self.complete += complete
 
     def _fresh(self, pdo: PdoCount) -> bool:
-        """Count the age of an asynchronous PDO at this cycle's SYNC; return whether it still counts."""
+        """Count the age of an acyclic PDO at this cycle's SYNC; return whether it still counts."""
         age_ns = max(0, self._sync_ns - pdo.last_ns)
         if pdo.last_ns:
             pdo.delays.add(age_ns)

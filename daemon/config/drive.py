@@ -16,11 +16,11 @@ from jtqd.drivers.drive import (
     DriveObjects,
     LayoutError,
     Temperature,
-    chosen,
     drive_layout,
-    pdo_of_words,
+    map_of,
+    select_tpdos,
 )
-from jtqd.drivers.pdo import BY_ITSELF, PdoError, PdoMap
+from jtqd.drivers.pdo import ACYCLIC, PdoError, PdoMap, Tpdo
 from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.estimator.checked import Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, below, choice, limits
@@ -163,11 +163,11 @@ def check_given(where: str, given: Mapping[str, float], known: Mapping[Key, tupl
 
 
 def tpdos_of(
-    node: int, objects: DriveObjects, tpdos: Sequence[TpdoSection], *, asynchronous: bool, temperature: bool
+    node: int, objects: DriveObjects, tpdos: Sequence[TpdoSection], *, acyclic: bool, temperature: bool
 ) -> tuple[PdoMap, ...]:
     """Return the TPDOs that carry the objects.
 
-    asynchronous: `max_age_ms` is given, so TPDOs that the drive sends by itself may be among them; temperature: TPDO3
+    acyclic: `max_age_ms` is given, so TPDOs of transmission type 0, 254 or 255 may be among them; temperature: TPDO3
     carries the temperature. Raises FieldError for TPDOs that are incomplete or contradict each other.
     """
     if not tpdos:
@@ -178,16 +178,16 @@ def tpdos_of(
             raise FieldError("joint", "objects", found, f"at most {_PDO_BITS}: one PDO")
         return drive_layout(node, objects)
     for each in tpdos:
-        if each.type != 1 and each.type not in BY_ITSELF:
+        if each.type != 1 and each.type not in ACYCLIC:
             raise FieldError("joint", "tpdos", Verbatim(f"type {each.type}"), "1, 0, 254 or 255")
-        if each.type in BY_ITSELF and not asynchronous:
+        if each.type in ACYCLIC and not acyclic:
             expected = f"ms because TPDO{each.number} has type {each.type}"
             raise FieldError("joint", "max_age_ms", MISSING, expected)
     try:
         maps = tuple(
-            pdo_of_words(node, each.number, each.cob_id, each.objects, each.type, objects) for each in tpdos
+            map_of(node, Tpdo(each.number, each.cob_id, each.objects, each.type), objects) for each in tpdos
         )
-        used = chosen(objects, maps)
+        used = select_tpdos(objects, maps)
     except (PdoError, LayoutError) as error:
         raise FieldError("joint", "tpdos", None, "", str(error)) from None
     for name, of_temperature in (("number", 3), ("cob_id", 0x380 + node)):

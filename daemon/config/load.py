@@ -270,7 +270,7 @@ def _joint(path: Path, number: int, file: ConfigFile) -> JointConfig:
             section.node,
             objects,
             section.tpdos,
-            asynchronous=section.max_age_ms is not None,
+            acyclic=section.max_age_ms is not None,
             temperature=section.temperature,
         )
     return JointConfig(

@@ -117,7 +117,7 @@ class JointSection:
     objects: ObjectsSection = field(default_factory=ObjectsSection)
     tpdos: tuple[TpdoSection, ...] = ()
     max_age_ms: Annotated[float, limits("ms", ge=0.1, le=1000.0)] | None = None
-    """Longest age of a frame of an asynchronous TPDO."""
+    """Longest age of a frame of an acyclic TPDO."""
     network: NetworkSection | None = None
     profile: Text | None = None
     """Of the drive's family: gives the values that the section does not have (`with_profiles`)."""
