@@ -2,12 +2,12 @@
 
 A friction or inertia that is far smaller than in the joint file is near the end of what is possible, and noise puts its
 best value beyond it as often as not. Such a value is never named (`guards`): the fit wants more than there can be. What
-is certain all the same is that it is smaller than in the file, and by how much at least. That is said where the best value
+is certain all the same is that it is smaller than in the file, and by how much at least. It is reported where the best value
 lies below zero by less than its interval, and the value of the other runs, held at zero or above, takes away
 `LARGE_FALL` of the squared error of every run left out. Source of values with such a limit: the restricted least squares
 of Judge and Takayama 1966, J. Am. Stat. Assoc. 61.
 
-An effect that a guard has refused at its limit is looked at again: the guard says that it is no cause, this what is certain.
+An effect that a guard has refused at its limit is looked at again: the guard refuses a cause, this reports the bound.
 
 What is proven is the value at its limit, and nothing else changed. So the extended joint file takes a friction there if it
 is the only bound of a joint of which nothing is named (`in_the_file`).
@@ -23,10 +23,10 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
+from jtqd.sysid.diagnosis.acceptance import Found
 from jtqd.sysid.diagnosis.causes import values_of
 from jtqd.sysid.diagnosis.findings import BoundedValue, Cause, JointName, RunGain, shows_at
 from jtqd.sysid.diagnosis.leave_one_out import LARGE_FALL, LeaveOneOut
-from jtqd.sysid.diagnosis.named import Found
 from jtqd.sysid.diagnosis.refine import parameter, set_torsions
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import ENTER, Hypothesis, Search
@@ -36,7 +36,7 @@ _LEAST: Final = 0.0
 
 
 def bounded_values(found: Found) -> list[BoundedValue]:
-    """Return what may be said of values of the joint files that these runs put below zero, beside what is named."""
+    """Return the bounds of values of the joint files that these runs put below zero, in addition to the causes."""
     best = found.named.hypothesis
     known = {c.key for c in best.chosen} | {c.key for others in found.classes for c in others}
     out: dict[tuple[str, JointName], BoundedValue] = {}
@@ -65,7 +65,7 @@ def in_the_file(bounded: Sequence[BoundedValue], causes: Sequence[Cause]) -> lis
 def _bounded(
     found: Found, best: Hypothesis, candidate: EffectCandidate, known: Collection[tuple[str, JointName]]
 ) -> BoundedValue | None:
-    """Return what may be said of one effect, None for nothing."""
+    """Return the bound of one effect, None for nothing."""
     search, joint = found.case.search, candidate.joint
     name = next((p.name for p in candidate.effect.parameters if p.key and p.low == _LEAST), None)
     if name is None or candidate.size > 1 or not search.fits_beside(candidate, best.chosen, again=True):

@@ -13,12 +13,18 @@ from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT
-from jtqd.sysid.diagnosis.leftover import Leftover, events_left, held_energies_nm2, held_nm, leftover
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, Mixed
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.refine import Refined, contributions, present_effects, refine, set_torsions
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, column_moments
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
+from jtqd.sysid.diagnosis.unexplained import (
+    Unexplained,
+    events_left,
+    held_energies_nm2,
+    held_nm,
+    unexplained_residual,
+)
 
 _PASSES: Final = 2
 
@@ -54,7 +60,7 @@ class Case:
 
     @property
     def limits(self) -> dict[Channel, float]:
-        """Rms from which what is left over matters, per channel [Nm]."""
+        """Rms from which the unexplained residual matters, per channel [Nm]."""
         rated = {n: joint.rated_torque_nm for n, joint in self.dataset.joints.items()}
         return {c: self.relevance * rated[c.joint] for c in self.dataset.runs[0].channels}
 
@@ -64,7 +70,7 @@ class Case:
         return Case(others, self.noise, self.search.without_run(number), self.relevance)
 
     def fit(self, hypothesis: Hypothesis) -> Fit:
-        """Return a set of effects with refined parameters; the signals then have the torsion that it says."""
+        """Return a set of effects with refined parameters; the signals then have the torsion that it implies."""
         return Fit(hypothesis, refine(self.dataset, present_effects(hypothesis), self.noise))
 
     def refit(self, fit: Fit, chosen: Sequence[EffectCandidate]) -> Fit:
@@ -86,16 +92,16 @@ class Case:
         """Return the energy that each effect explains, summed over channels [Nm^2]."""
         return [sum(r * r for r in rms.values()) for rms in self.rms_nm(fit)]
 
-    def left_over(self, fit: Fit) -> Leftover:
+    def unexplained(self, fit: Fit) -> Unexplained:
         """Return what the effects leave over."""
-        return leftover(self.dataset, fit.refined, self.noise)
+        return unexplained_residual(self.dataset, fit.refined, self.noise)
 
     def held_nm(self, fit: Fit) -> dict[Channel, float]:
-        """Return what the samples of held channels are off by beside the effects (`leftover.held_nm`)."""
+        """Return what the samples of held channels are off by beside the effects (`unexplained.held_nm`)."""
         return held_nm(self.dataset, fit.refined)
 
     def held_energies_nm2(self, fit: Fit) -> dict[Channel, float]:
-        """Return the same as energy over all runs (`leftover.held_energies_nm2`)."""
+        """Return the same as energy over all runs (`unexplained.held_energies_nm2`)."""
         return held_energies_nm2(self.dataset, fit.refined)
 
 

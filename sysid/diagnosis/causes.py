@@ -1,4 +1,4 @@
-"""The causes: each effect that is named with its values and intervals, its evidence, and what it cannot be told from."""
+"""The causes: each accepted effect with its values and intervals, its evidence, and what it cannot be distinguished from."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jtqd.sysid.diagnosis.guards import nothing_of
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.refine import parameter, places
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
-from jtqd.sysid.diagnosis.steadiness import steadiness
+from jtqd.sysid.diagnosis.stability import stability
 from jtqd.sysid.fit.friction import student_975
 
 _INACCURATE: Final = 0.015
@@ -35,7 +35,7 @@ Classes = Sequence[tuple[EffectCandidate, ...]]
 
 def causes_of(case: Case, fit: Fit, classes: Classes, total_nm2: float) -> list[Cause]:
     """Return the causes; total_nm2: energy of all structure, of which each explains its share."""
-    steady = steadiness(fit.refined, case.noise, nothing_of(fit.hypothesis))
+    steady = stability(fit.refined, case.noise, nothing_of(fit.hypothesis))
     causes = []
     for k, (candidate, rms) in enumerate(zip(fit.chosen, case.rms_nm(fit), strict=True)):
         without = case.search.without(fit.hypothesis, candidate)
@@ -52,7 +52,7 @@ def causes_of(case: Case, fit: Fit, classes: Classes, total_nm2: float) -> list[
                 rms[channel],
                 channel.balance,
                 explained_share=sum(r * r for r in rms.values()) / total_nm2,
-                steadiness=steady[k].ratio,
+                stability=steady[k].ratio,
             )
         )
     return causes

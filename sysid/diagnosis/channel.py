@@ -15,7 +15,7 @@ class Channel(NamedTuple):
 
 @dataclass(frozen=True)
 class Line:
-    """A line in a residual: at `order` per motor revolution, or at `order` Hz where the unit says so; ratio: its power
+    """A line in a residual: at `order` per motor revolution, or at `order` Hz by the unit; ratio: its power
     against the median of the neighbourhood.
     """
 

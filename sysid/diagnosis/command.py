@@ -114,13 +114,13 @@ def _with_limits_said(
     if experiment is None or options.limits is None:
         return experiment
     wider = {n: text for n, joint in joints.items() if (text := beyond_file(joint, options.limits))}
-    said = [f"--limits allows more than motion_limits of joint {n}: {text}." for n, text in wider.items()]
+    notes = [f"--limits allows more than motion_limits of joint {n}: {text}." for n, text in wider.items()]
     if experiment.get("plan") and "travel_rad" in options.limits:
-        said.append(
+        notes.append(
             "travel_rad of --limits is not kept: two joints on one sensor are taken for a towing bench, whose coupling "
             "turns freely; that of the plan's own limits is."
         )
-    return {**experiment, "why": " ".join([experiment["why"], *said])} if said else experiment
+    return {**experiment, "why": " ".join([experiment["why"], *notes])} if notes else experiment
 
 
 def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:
@@ -254,7 +254,7 @@ def parser() -> argparse.ArgumentParser:
         "--relevance",
         type=_percent,
         metavar="PERCENT",
-        help="of the rated torque, rms over a run: what is left over matters from here on (default 0.5)",
+        help="of the rated torque, rms over a run: the unexplained residual matters from here on (default 0.5)",
     )
     parser.add_argument(
         "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"

@@ -1,6 +1,6 @@
 """The diagnosis from run tables and joint files to findings: the order of its steps.
 
-tables -> signals -> binned dataset -> (odd runs out, again) -> noise -> search -> refinement -> (events out, again)
+tables -> signals -> binned dataset -> (outlier runs out, again) -> noise -> search -> refinement -> (events out, again)
 -> verdict
 """
 
@@ -16,6 +16,7 @@ import numpy as np
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.acceptance import named_in
 from jtqd.sysid.diagnosis.case import search_case
 from jtqd.sysid.diagnosis.dataset import (
     Dataset,
@@ -31,12 +32,11 @@ from jtqd.sysid.diagnosis.findings import (
     NO_GAP,
     UNEXPLAINED,
     Findings,
-    OddRun,
+    OutlierRun,
     shows_at,
 )
-from jtqd.sysid.diagnosis.named import named_in
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
-from jtqd.sysid.diagnosis.odd_runs import odd_run
+from jtqd.sysid.diagnosis.outlier_runs import outlier_run
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.refine import set_torsion
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
@@ -99,13 +99,13 @@ def _diagnosed(
     case, fit = search_case(dataset, relevance)
     pieces = recordings(usable)
 
-    def anew(number: int) -> Sequence[EffectCandidate]:
+    def names_without(number: int) -> Sequence[EffectCandidate]:
         part = [run for run, piece in zip(usable, pieces, strict=True) if piece != number]
         for s in (joint for run in part for joint in run):
             set_torsion(s, ())  # it is as the last fit left it
         return named_in(*search_case(build_dataset(part, joints, scope), relevance))
 
-    findings = conclude(case, fit, names, judged, anew)
+    findings = conclude(case, fit, names, judged, names_without)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
     left_out = tuple(f"joint {n}: left out" for n in numbers if n not in judged)
     unjudged = [line for line in reasons if line.startswith(left_out)]
@@ -113,22 +113,22 @@ def _diagnosed(
         findings = replace(findings, verdict=INSUFFICIENT)
     findings = replace(findings, reasons=(*unjudged, *findings.reasons))
     if findings.verdict == UNEXPLAINED:
-        findings = replace(findings, reasons=(*findings.reasons, *scope.told))
+        findings = replace(findings, reasons=(*findings.reasons, *scope.note))
     used = tuple(run[0].run for run in usable)
-    return replace(findings, channel_notes=notes, odd_runs=tuple(odd), used=used)
+    return replace(findings, channel_notes=notes, outlier_runs=tuple(odd), used=used)
 
 
 def without_odd_runs(
     signals: list[list[JointSignals]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
-) -> tuple[list[list[JointSignals]], Dataset, list[OddRun]]:
+) -> tuple[list[list[JointSignals]], Dataset, list[OutlierRun]]:
     """Return signals and dataset without the runs that differ from all others, and how those differ: one at a time, fewer
     than half of the recordings.
     """
-    odd: list[OddRun] = []
+    odd: list[OutlierRun] = []
     dataset = build_dataset(signals, joints, scope)
     count = len(set(recordings(signals)))
     while 2 * (len(odd) + 1) < count:
-        found = odd_run(dataset)
+        found = outlier_run(dataset)
         if found is None:
             break
         places, one = found
@@ -171,12 +171,12 @@ def combined(parts: Sequence[Findings]) -> Findings:
         next_experiment=each_joint(plans) if plans else None,
         traces=tuple(t for f in parts for t in f.traces),
         explained_share=math.nan if leading is None else leading.explained_share,
-        left_over=max(
-            (f.left_over for f in parts if f.left_over is not None),
+        unexplained=max(
+            (f.unexplained for f in parts if f.unexplained is not None),
             key=lambda left: (left.matters, left.of_rated),
             default=None,
         ),
-        odd_runs=tuple(odd for f in parts for odd in f.odd_runs),
+        outlier_runs=tuple(odd for f in parts for odd in f.outlier_runs),
         bounded=tuple(b for f in parts for b in f.bounded),
         used=tuple(name for name in parts[0].runs if any(name in f.used_runs for f in parts)),
     )

@@ -2,7 +2,7 @@
 
 Events are no effect of the library, and a least-squares fit gives them more weight than anything else. So they are found
 first in what the causes leave; where there are some, the search is made again without them (`Dataset.without_events`).
-Everything in Nm^2 unless a name says otherwise.
+Everything in Nm^2 unless a name has another unit.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from jtqd.sysid.diagnosis.findings import JointName, Value
 from jtqd.sysid.diagnosis.mixed_model import Mixed, explained, solve
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import ENTER, HELD_OUT, Hypothesis, Search, order_of
-from jtqd.sysid.diagnosis.steadiness import CHANCE, jackknife, needed
+from jtqd.sysid.diagnosis.stability import CHANCE, jackknife, needed
 
 RELEVANT: Final = 1e-3
 """Part of the rated torque below which a contribution (rms over the runs) is not called an effect, however certain."""
@@ -80,10 +80,10 @@ def complete_minimum(search: Search, best: Hypothesis, candidate: EffectCandidat
 
 
 def minimum_size(
-    search: Search, best: Hypothesis, candidate: EffectCandidate, *, left_over: bool = False
+    search: Search, best: Hypothesis, candidate: EffectCandidate, *, unexplained: bool = False
 ) -> dict[str, Value]:
     """Return the leading parameter at its minimum detectable size, for a key of the joint file as a difference to it;
-    infinite where no plausible size shows. left_over: something that matters is, see `steady_size`.
+    infinite where no plausible size shows. unexplained: something that matters is, see `steady_size`.
     """
     known, share = information(search.mixed, best, candidate)
     for rival in search.candidates:  # found, and at the right joint
@@ -109,7 +109,7 @@ def minimum_size(
     if per_unit <= 0.0:
         return nothing
     size = max(math.sqrt(square / known), search.least_nm / per_unit)
-    if left_over:
+    if unexplained:
         size = max(size, steady_size(search, best, candidate))
     values = candidate.term.combine([size, *([0.0] * (candidate.size - 1))])
     found = abs(values[lead.name] - none.get(lead.name, 0.0))
@@ -121,8 +121,8 @@ def minimum_size(
 
 
 def steady_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -> float:
-    """Return the leading coefficient from which a candidate would be steady over the runs (`steadiness`) beside the best
-    set: what it takes of the things left over changes by that much. For waves the worse phase; infinite for one run.
+    """Return the leading coefficient from which a candidate would be steady over the runs (`stability`) beside the best
+    set: what it takes of the things unexplained changes by that much. For waves the worse phase; infinite for one run.
     """
     runs = search.mixed.runs
     if runs < 2:
@@ -180,10 +180,11 @@ def equivalence_class(
 
 
 def class_beside(search: Search, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
-    """Return the candidates that could stand in the place of `cause` where something that matters is left over, best first.
+    """Return the candidates that could stand in the place of `cause` where a relevant residual is unexplained, best first.
 
-    What is left over is no noise, so that no likelihood says by how much one effect fits better than another. An alternative
-    is ruled out when it is worse on the runs left out by more than that differs from run to run (test of Vuong 1989,
+    The unexplained residual is no noise, so that no likelihood measures by how much one effect fits better than another.
+    An alternative
+    is ruled out when it is worse on the held-out runs by more than that differs from run to run (test of Vuong 1989,
     Econometrica 57, for models of which none is right).
     """
     found = {c.key: c for c in equivalence_class(search, best, cause)}
@@ -211,15 +212,19 @@ def class_beside(search: Search, best: Hypothesis, cause: EffectCandidate) -> tu
 
 
 def candidate_table(
-    search: Search, best: Hypothesis, rivals: Mapping[tuple[str, JointName], str], *, left_over: bool = False
+    search: Search,
+    best: Hypothesis,
+    rivals: Mapping[tuple[str, JointName], str],
+    *,
+    unexplained: bool = False,
 ) -> tuple[Evidence, ...]:
     """Return one row per effect and joint, most evidence first; rivals: (effect, joint) -> cause it could replace;
-    left_over: something that matters is, so that a size must be steady to be detected.
+    unexplained: something that matters is, so that a size must be steady to be detected.
     """
     groups: dict[tuple[str, object], list[EffectCandidate]] = {}
     for c in search.candidates:
         groups.setdefault(c.key, []).append(c)
-    rows = [_row(search, best, terms, rivals, left_over=left_over) for terms in groups.values()]
+    rows = [_row(search, best, terms, rivals, unexplained=unexplained) for terms in groups.values()]
     return tuple(sorted(rows, key=lambda row: -row.delta_bic))
 
 
@@ -229,7 +234,7 @@ def _row(
     terms: Sequence[EffectCandidate],
     rivals: Mapping[tuple[str, JointName], str],
     *,
-    left_over: bool,
+    unexplained: bool,
 ) -> Evidence:
     """Return the evidence of one effect of one joint: of the term of it that explains most."""
     nothing = search.hypothesis(())
@@ -239,7 +244,7 @@ def _row(
     delta = nothing.bic - alone.bic
     drop = nothing.model.deviance - alone.model.deviance
     held = search.held_out(alone, candidate) / drop if drop > 1.0 else 0.0
-    sizes = [minimum_size(search, best, c, left_over=left_over) for c in terms]
+    sizes = [minimum_size(search, best, c, unexplained=unexplained) for c in terms]
     minimum = _smallest(sizes)
     minimum_rms = min(_rms_of(search, c, m) for c, m in zip(terms, sizes, strict=True))
     chosen = any(c.key == candidate.key for c in best.chosen)

@@ -34,7 +34,7 @@ def extended(
     """Return the joint with the causes of joint `number` and of the sensor among its effects.
 
     sha256: hash of each run's file by name, those that were used are kept; date: ISO 8601. What an effect of a whole
-    class is written as is the first of its class, and the provenance says so: on these runs all of the class fit alike,
+    class is written as is the first of its class, and the provenance states it: on these runs all of the class fit alike,
     elsewhere they may not.
 
     Raises ConfigError for an effect or a value that joint files do not allow.

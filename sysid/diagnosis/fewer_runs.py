@@ -1,8 +1,8 @@
 """What fewer runs would have named: more data must not make a diagnosis worse without a word.
 
-Every recording is left out in turn and the others are searched anew, by the same rules. An effect that they name and all
-runs together do not is kept where it predicts the runs left out clearly better, each with the coefficients of the others
-(`FALL` of the squared error of all, and no run clearly worse); else a line says that it went, and what the runs left out
+Every recording is left out in turn and the others are searched again, by the same rules. An effect that they name and all
+runs together do not is kept where it predicts the held-out runs clearly better, each with the coefficients of the others
+(`FALL` of the squared error of all, and no run clearly worse); else a line reports that it went, and what the held-out runs
 say of it. An effect that comes and goes with single runs is unstable in the sense of Meinshausen and Buehlmann 2010,
 J. R. Stat. Soc. B 72.
 """
@@ -16,12 +16,12 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.acceptance import UNSTEADY, Found, certain, named_in
 from jtqd.sysid.diagnosis.case import Case
 from jtqd.sysid.diagnosis.dataset import FEWEST_RUNS, SHORTEST_MOVING_S, Dataset, moving_s
 from jtqd.sysid.diagnosis.findings import JointName, joint_text
 from jtqd.sysid.diagnosis.guards import objections
 from jtqd.sysid.diagnosis.leave_one_out import FALL, LeaveOneOut
-from jtqd.sysid.diagnosis.named import UNSTEADY, Found, certain, named_in
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
 
@@ -29,8 +29,8 @@ Key = tuple[str, JointName]
 Names = Callable[[int], Sequence[EffectCandidate]]
 """What is named without a recording, by its number."""
 MOST_ANEW: Final = 5
-"""Recordings up to which the others are diagnosed anew from their signals on, where it matters (few runs, or something is
-left over); else the sums of all runs are searched again, which costs a tenth.
+"""Recordings up to which the others are diagnosed again from their signals on, where it matters (few runs, or something is
+unexplained); else the sums of all runs are searched again, which costs a tenth.
 """
 _NAMED_RUNS: Final = 3
 """Runs listed in a line."""
@@ -38,7 +38,7 @@ _NAMED_RUNS: Final = 3
 
 @dataclass(frozen=True)
 class Gone:
-    """An effect that the runs without some recordings name, and all of them do not; nm: error on runs left out with it, and
+    """An effect that the runs without some recordings name, and all of them do not; nm: error on held-out runs with it, and
     with what is named [Nm rms]; why: what a guard objects to.
     """
 
@@ -54,7 +54,7 @@ class Gone:
         why = f"; {self.why}" if self.why else ""
         return (
             f"{self.candidate.effect.name} of {joint_text(self.candidate.joint)} would be named without {names}, but is not "
-            f"with all runs: the error on runs left out is {self.nm[0]:.3g} Nm rms with it, {self.nm[1]:.3g} as named{why}"
+            f"with all runs: the error on held-out runs is {self.nm[0]:.3g} Nm rms with it, {self.nm[1]:.3g} as named{why}"
         )
 
 
@@ -62,12 +62,12 @@ def kept_text(candidate: EffectCandidate, before_nm: float, after_nm: float) -> 
     """Return the line about an effect that is kept."""
     return (
         f"{candidate.effect.name} of {joint_text(candidate.joint)} is named because fewer of these runs name it and the "
-        f"error on runs left out falls with it from {before_nm:.3g} to {after_nm:.3g} Nm rms"
+        f"error on held-out runs falls with it from {before_nm:.3g} to {after_nm:.3g} Nm rms"
     )
 
 
 class Compared:
-    """Sets of effects by their errors on the runs left out, beside one that is named."""
+    """Sets of effects by their errors on the held-out runs, beside one that is named."""
 
     def __init__(self, dataset: Dataset, search: Search, named: Hypothesis) -> None:
         self.search = search
@@ -75,11 +75,11 @@ class Compared:
         self.named = named
 
     def nm(self, hypothesis: Hypothesis) -> float:
-        """Return the error on the runs left out [Nm rms], all balances together."""
+        """Return the error on the held-out runs [Nm rms], all balances together."""
         return float(np.sqrt(self._per_run(hypothesis).mean()))
 
     def clearly_better(self, hypothesis: Hypothesis) -> bool:
-        """Return whether a set predicts all runs left out together better by FALL, and none worse by that."""
+        """Return whether a set predicts all held-out runs together better by FALL, and none worse by that."""
         mine, named = self._per_run(hypothesis), self._per_run(self.named)
         falls = 1.0 - mine / np.maximum(named, 1e-30)
         return bool(
@@ -92,15 +92,15 @@ class Compared:
         return np.array([sum(run.values()) for run in self._left_out.squares(hypothesis)])
 
 
-def with_fewer(found: Found, anew: Names) -> tuple[Found, list[str]]:
-    """Return what was found, with what only fewer runs name where the runs left out bear it out, and a line about each such
-    effect; anew: what a diagnosis without a recording names.
+def with_fewer(found: Found, names_without: Names) -> tuple[Found, list[str]]:
+    """Return what was found, with what only fewer runs name where held-out runs confirm it, and a line about each such
+    effect; names_without: what a diagnosis without a recording reports.
     """
     case, best = found.case, found.named.hypothesis
     here = {c.key for c in best.chosen} | {c.key for others in found.classes for c in others}
     gone: dict[Key, tuple[EffectCandidate, list[str]]] = {}
     sets: list[Sequence[EffectCandidate]] = []
-    for without, chosen in _named_by_fewer(found, here, anew):
+    for without, chosen in _named_by_fewer(found, here, names_without):
         new = [c for c in chosen if c.key not in here]
         for c in new:
             gone.setdefault(c.key, (c, []))[1].append(without)
@@ -117,22 +117,22 @@ def with_fewer(found: Found, anew: Names) -> tuple[Found, list[str]]:
     together = [(None, case.search.hypothesis(chosen, best.model)) for chosen in sets]
     kept, why = _borne_out(found, compared, [*beside.items(), *together])
     fit = case.fit(kept)  # whatever is kept: as above
-    said = [kept_text(c, compared.nm(best), compared.nm(kept)) for c in kept.chosen if c.key in gone]
+    lines = [kept_text(c, compared.nm(best), compared.nm(kept)) for c in kept.chosen if c.key in gone]
     there = {c.key for c in kept.chosen}
     for key, (c, runs) in gone.items():
         if key not in there:
             with_it = beside.get(key) or case.search.hypothesis([c], best.model)
             errors = (compared.nm(with_it), compared.nm(kept))
-            said.append(Gone(c, tuple(runs), errors, why.get(key, "")).text)
+            lines.append(Gone(c, tuple(runs), errors, why.get(key, "")).text)
     if kept is best:
-        return found, said
+        return found, lines
     if found.whole.hypothesis is best:
-        return Found.of(case, fit, fit, found.few, found.refused), said
-    return replace(found, named=fit), said
+        return Found.of(case, fit, fit, found.few, found.refused), lines
+    return replace(found, named=fit), lines
 
 
 def _named_by_fewer(
-    found: Found, here: Collection[Key], anew: Names
+    found: Found, here: Collection[Key], names_without: Names
 ) -> Iterator[tuple[str, Sequence[EffectCandidate]]]:
     """Yield (run left out, what the others name) of every recording, where the others are enough; here: what is named with
     all runs, and its alternatives.
@@ -145,7 +145,10 @@ def _named_by_fewer(
         if moving_s(part.dataset.signals) < SHORTEST_MOVING_S:
             continue
         left_out = case.dataset.runs[int(np.argmax(case.search.mixed.pieces == number))].name
-        yield left_out, _same_candidates(case.search, anew(number)) if afresh else _named_again(part, here)
+        yield (
+            left_out,
+            _same_candidates(case.search, names_without(number)) if afresh else _named_again(part, here),
+        )
 
 
 def _named_again(part: Case, here: Collection[Key]) -> Sequence[EffectCandidate]:
@@ -170,8 +173,8 @@ def _same_candidates(search: Search, chosen: Sequence[EffectCandidate]) -> list[
 def _borne_out(
     found: Found, compared: Compared, tried: Sequence[tuple[Key | None, Hypothesis]]
 ) -> tuple[Hypothesis, dict[Key, str]]:
-    """Return the set that predicts the runs left out best, what is named included, and what speaks against an effect (by its
-    key) that would have been better. Beside what is left over all have to be as certain as any cause.
+    """Return the set that predicts the held-out runs best, what is named included, and what speaks against an effect (by its
+    key) that would have been better. in the presence of an unexplained residual all have to be as certain as any cause.
     """
     kept, why = compared.named, {}
     for key, other in tried:

@@ -1,4 +1,4 @@
-"""What the joint file says about each parameter that a diagnosis found: file value -> found value, change in percent."""
+"""Values of the joint file of each parameter that a diagnosis found: file value -> found value, change in percent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class FileValue(NamedTuple):
 def file_values(
     effect_name: str, where: int | str, parameters: Iterable[str], joints: Mapping[int, Joint]
 ) -> dict[str, FileValue]:
-    """Return what the joint file says about each parameter of an effect of joint `where` (or "sensor").
+    """Return the joint file's value of each parameter of an effect of joint `where` (or "sensor").
 
     An effect that is in the file under `effects` has its value there; else a parameter that stands for a key of the file has
     that key's; any other has the value that means no effect.

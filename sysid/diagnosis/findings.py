@@ -59,7 +59,7 @@ class Cause:
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
     balance: str  # "motor" or "torsion": where it is largest
     explained_share: float = math.nan  # of all that is structure in these runs, as squares
-    steadiness: float = math.nan  # its size in standard errors where it is least certain (`steadiness.py`)
+    stability: float = math.nan  # its size in standard errors where it is least certain (`stability.py`)
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ class RunGain(NamedTuple):
 
 @dataclass(frozen=True)
 class Gain:
-    """Held-out error before and after, runs left out one by one; ci95: of rmse_before - rmse_after [Nm].
+    """Held-out error before and after, leave-one-run-out; ci95: of rmse_before - rmse_after [Nm].
 
     plain_nm: the errors with all that each run has of its own, where they do not fall; the others are then beside it.
     """
@@ -136,12 +136,12 @@ class Gain:
 
     @property
     def judged_beside(self) -> str:
-        """Beside what the error falls, and that it does not with it; "" for the plain error."""
+        """Note on an error judged without run-to-run variation; "" for the plain error."""
         if self.plain_nm is None:
             return ""
         before, after = self.plain_nm
         return (
-            "beside what each run has of its own (zero and friction of the day), which is most of the error: with it "
+            "in the presence of run-to-run variation (offset and friction of the day), which is most of the error: with it "
             f"{before:.3g} -> {after:.3g} Nm rms"
         )
 
@@ -161,7 +161,7 @@ class Trace:
 
 
 @dataclass(frozen=True)
-class LeftOver:
+class UnexplainedResidual:
     """What the causes leave that is structure, in the balance and run where it is most: rms [Nm], part of the rated torque,
     share of all structure; where it matters, what all effects found leave, named or not. From `relevant_nm` on it matters,
     unless it is a small share or (`unconfirmed`) effects that few runs show and do not confirm explain it.
@@ -219,12 +219,12 @@ class BoundedValue:
         return (
             f"{self.name} of {joint_text(self.joint)}: at most {self.at_most:.2g} {self.unit} by these runs, "
             f"{self.file_value:.3g} in the joint file; not named as a cause, because its best value, {self.best:.2g}, is "
-            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the runs left out{taken}"
+            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the held-out runs{taken}"
         )
 
 
 @dataclass(frozen=True)
-class OddRun:
+class OutlierRun:
     """A run that differs from all others and is not used: what ("gain", "zero", "delay") of which column differs by `value`
     from the mean of the others, whose standard deviation is `usual`. others: deviations that fit nearly as well.
 
@@ -285,8 +285,8 @@ class Findings:
     traces: tuple[Trace, ...] = field(default=(), repr=False)
     joint_files: Mapping[int, Joint] = field(default_factory=dict, repr=False)  # to compare what was found
     explained_share: float = math.nan
-    left_over: LeftOver | None = None
-    odd_runs: tuple[OddRun, ...] = ()
+    unexplained: UnexplainedResidual | None = None
+    outlier_runs: tuple[OutlierRun, ...] = ()
     bounded: tuple[BoundedValue, ...] = ()
     used: tuple[str, ...] = ()
 
@@ -329,10 +329,12 @@ def to_mapping(
         "causes": [_cause(each, findings.joint_files) for each in findings.causes],
         "gain": _NO_GAIN_MEASURED if findings.gain is None else _gain(findings.gain),
         "explained_share": findings.explained_share,
-        "left_over": None if findings.left_over is None else _left_over(findings.left_over),
+        "unexplained": None if findings.unexplained is None else _unexplained(findings.unexplained),
+        "left_over": None if findings.unexplained is None else _unexplained(findings.unexplained),
         "next_experiment": _without_table(findings.next_experiment),
         "reasons": findings.reasons,
-        "odd_runs": [_odd_run(each) for each in findings.odd_runs],
+        "outlier_runs": [_outlier_run(each) for each in findings.outlier_runs],
+        "odd_runs": [_outlier_run(each) for each in findings.outlier_runs],
         "bounded": [_bounded(each) for each in findings.bounded],
         "joints": findings.joints,
         "runs": [
@@ -406,14 +408,15 @@ def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
         "class": list(cause.names),
         "parameters": _values(cause, joints),
         "evidence": {"delta_bic": cause.delta_bic, "held_out_gain": cause.held_out_gain},
-        "steadiness": cause.steadiness,
+        "stability": cause.stability,
+        "steadiness": cause.stability,
         "rms_nm": cause.rms_nm,
         "balance": cause.balance,
         "explained_share": cause.explained_share,
     }
 
 
-def _left_over(left: LeftOver) -> dict[str, Any]:
+def _unexplained(left: UnexplainedResidual) -> dict[str, Any]:
     return {
         "joint": left.joint,
         "balance": left.balance,
@@ -425,7 +428,7 @@ def _left_over(left: LeftOver) -> dict[str, Any]:
     }
 
 
-def _odd_run(odd: OddRun) -> dict[str, Any]:
+def _outlier_run(odd: OutlierRun) -> dict[str, Any]:
     return {
         "run": odd.run,
         "what": odd.what,
@@ -492,7 +495,7 @@ def summary_lines(findings: Findings) -> list[str]:
     """Return verdict, gap, causes with intervals, gain, next experiment for a terminal: one line each."""
     lines = [f"{findings.verdict}: {_VERDICTS_IN_WORDS.get(findings.verdict, '')}"]
     lines += [f"  {reason}" for reason in findings.reasons]
-    lines += [f"odd run: {odd.text}" for odd in findings.odd_runs]
+    lines += [f"outlier run: {odd.text}" for odd in findings.outlier_runs]
     for gap in findings.gaps[:1]:
         lines.append(
             f"gap: joint {gap.joint}, {gap.balance} balance: {gap.rmse_nm:.3g} Nm rms, "
@@ -501,10 +504,10 @@ def summary_lines(findings: Findings) -> list[str]:
         if findings.verdict != NO_GAP:
             lines += [f"  {each.share:4.0%} of it {_where(each)}" for each in gap.localisation[:3]]
     lines += [_summary_cause(each, findings.joint_files) for each in findings.causes]
-    left = findings.left_over
+    left = findings.unexplained
     if left is not None and (findings.causes or left.matters):
         lines.append(
-            f"left over: {left.rms_nm:.3g} Nm rms ({left.of_rated:.2%} of rated) at joint {left.joint}, {left.balance} "
+            f"unexplained: {left.rms_nm:.3g} Nm rms ({left.of_rated:.2%} of rated) at joint {left.joint}, {left.balance} "
             f"balance; {left.limit(f'{left.relevant_nm:.3g} Nm')}"
         )
     gain = findings.gain

@@ -49,8 +49,8 @@ def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
     return Gain(
         _rms(table, 0),
         _rms(table, 1),
-        f"each of {len(table)} runs left out once; {channel.balance} balance of joint {channel.joint}"
-        + ("; beside what each run has of its own" if plain else ""),
+        f"each of {len(table)} runs held out once; {channel.balance} balance of joint {channel.joint}"
+        + ("; without run-to-run variation" if plain else ""),
         (float(low), float(high)),
         *velocity,
         tuple(

@@ -1,8 +1,8 @@
 """How large the gap is in each balance, against the noise floor of the data, and where it lies.
 
-Where: which condition explains most of what is left over, and which the rest. An axis (velocity, load, an angle, ...)
+Where: which condition explains most of the unexplained residual, and which the rest. An axis (velocity, load, an angle, ...)
 explains a residual when the mean of a bin over the *other* runs predicts it in this run: the square error that goes
-away, summed over the runs left out one by one (`explained_by_bins`). Noise of another run is independent however coloured
+away, summed over the leave-one-run-out (`explained_by_bins`). Noise of another run is independent however coloured
 it is, so bins that only follow the noise explain nothing or less, and more bins are no advantage; nor is a condition that
 merely goes with the run (temperature, time), because other runs do not confirm it. Events and seconds with a deviating mean
 explain only what the best axis does not predict: a bump that makes a step on every pass is the angle's, not the moments'.
@@ -20,12 +20,11 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.sysid.diagnosis.angle_events import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
-from jtqd.sysid.diagnosis.leftover import Leftover, less_nuisances, own_changes
-from jtqd.sysid.diagnosis.passes import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.structure import (
@@ -37,6 +36,7 @@ from jtqd.sysid.diagnosis.structure import (
     directions,
     signed,
 )
+from jtqd.sysid.diagnosis.unexplained import Unexplained, less_nuisances, own_changes
 
 _SAME: Final = 0.02
 """Two runs whose velocities and loads differ by less than this part of their rms are repetitions."""
@@ -72,8 +72,8 @@ class Location:
     line: Line | None = None
 
 
-def channel_gaps(dataset: Dataset, refined: Refined, left: Leftover | None) -> tuple[Gap, ...]:
-    """Return the gaps of all channels, largest excess over the floor first; places of what is left over where `left`
+def channel_gaps(dataset: Dataset, refined: Refined, left: Unexplained | None) -> tuple[Gap, ...]:
+    """Return the gaps of all channels, largest excess over the floor first; places of the unexplained residual where `left`
     is given (nothing named), else of the whole gap.
     """
     residuals = _raw(dataset)

@@ -47,7 +47,7 @@ def nothing_of(best: Hypothesis) -> list[dict[str, float]]:
 def objections(
     dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
 ) -> list[tuple[int, str]]:
-    """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on runs left out, or
+    """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on held-out runs, or
     helps least where all of them together lower the error of no balance there; else, where no torque was measured, one that
     raises the error of the position in a free run; else the smaller of two that cancel each other. What is left must be
     fitted again before it is asked again.
@@ -63,12 +63,12 @@ def objections(
     falls = held_out_gains(dataset, refined, steps)
     worst = int(np.argmin(falls))
     if falls[worst] <= 0.0 or max(falls_nm(judged_squares(dataset, refined, steps)[0]).values()) <= 0.0:
-        return [(worst, "it raises the error on runs left out")]
+        return [(worst, "it raises the error on held-out runs")]
     if dataset.no_torque:
         harmful = [k for k in range(len(refined.present)) if free_run_fall(dataset, refined, k) < 0.0]
         if harmful:
             worst = min(harmful, key=lambda k: falls[k])
-            return [(worst, "it raises the error of the position in a free run on runs left out")]
+            return [(worst, "it raises the error of the position in a free run on held-out runs")]
     pair = cancelling(dataset, refined.present)
     if pair is None:
         return []
@@ -141,7 +141,7 @@ def held_out_gains(dataset: Dataset, refined: Refined, steps: Sequence[FloatArra
 
 
 def free_run_fall(dataset: Dataset, refined: Refined, cause: int) -> float:
-    """Return which part of the squared error of the position in a free run one cause takes away on runs left out; 0 where
+    """Return which part of the squared error of the position in a free run one cause takes away on held-out runs; 0 where
     it has no part in it (the spring is on the other side of the torque).
     """
     _, (before, after) = free_run_errors(dataset, refined, left_out_steps(refined), cause)

@@ -1,6 +1,7 @@
 """Leave-one-run-out confirmation: with fewer than four runs what is named must hold on each held-out run.
 
-With many runs the sum over runs left out says whether an effect is there. With two or three, one run can carry that sum,
+With many runs the sum over held-out runs decides whether an effect is present. With two or three, one run can carry
+that sum,
 the runs' own changes are hardly known (their variance is little more than its prior), and what the models get wrong
 passes for an effect. So what the search found is put to a harder rule: with the coefficients of the other runs an
 effect must lower both the deviance and the plain squared error of the torque on each held-out run. Where the set as
@@ -33,7 +34,7 @@ _LADDER: Final = ("coulomb_friction", "viscous_friction", "rotor_inertia", "load
 _NEARLY: Final = 0.5
 """Part of an interval's width from its end within which a value is as good as inside, with so few runs."""
 ENOUGH_LEFT: Final = 0.2
-"""Part of the error that effects could explain at all which may be left over on held-out runs without a word."""
+"""Part of the error that effects could explain at all which may stay unexplained on held-out runs."""
 _SCALES: Final = frozenset({"torque_constant", "sensor_gain"})
 
 Squares = Mapping[Channel, float]
@@ -140,7 +141,7 @@ class LeaveOneOut:
         causes: Sequence[Cause],
     ) -> list[tuple[str, JointName]]:
         """Return (effect, joint) of what these runs show without confirming it: causes whose interval holds the joint
-        file's value, and, where much is left over, what was found on all runs together but is not named, largest first.
+        file's value, and, where much is unexplained, what was found on all runs together but is not named, largest first.
         """
         out = [
             (c.effect.name, c.joint)
@@ -185,7 +186,7 @@ class LeaveOneOut:
         return out
 
     def _grown(self, parent: Hypothesis) -> list[Hypothesis]:
-        """Return all plausible extensions that lower BIC; by how much is not asked, the runs left out decide. Coulomb and
+        """Return all plausible extensions that lower BIC; by how much is not asked, the held-out runs decide. Coulomb and
         viscous friction of a joint also come together.
         """
         totals = [self.search.mixed.marginal(v)[0] for v in (parent.model.variances, self.search.mixed.prior)]

@@ -22,7 +22,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.noise import Sums
 
 ENOUGH_RUNS: Final = 4
-"""From here on the runs tell how much they usually differ, and the sum over runs left out decides."""
+"""From here on the runs show how much they usually differ, and the sum over held-out runs decides."""
 _EM_STEPS: Final = 12
 _PRIOR_RUNS: Final = 4.0
 _RIDGE: Final = 1e-10

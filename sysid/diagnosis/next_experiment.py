@@ -68,7 +68,7 @@ def next_experiment(
 
     classes: names of effects that the runs cannot distinguish, one sequence per class; a sequence of one name asks to make
     that effect visible. joints: files of the joints in the runs, whose ratings the plan keeps. why: what the
-    diagnosis says before it. velocity_rad_s: the fastest motion allowed. temperature: whether the runs have one; without
+    diagnosis states before it. velocity_rad_s: the fastest motion allowed. temperature: whether the runs have one; without
     it the plan does not supervise it. signals: of one joint, its runs so far: where it may go. Raises ValueError without
     a joint.
     """
@@ -117,9 +117,9 @@ def each_joint(experiments: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
         [only] = experiments.values()
         return dict(only)
     numbers = sorted(experiments)
-    said = [f"Joint {n}: {experiments[n]['why'].replace(f' {_TOWING}', '')}" for n in numbers]
+    reasons = [f"Joint {n}: {experiments[n]['why'].replace(f' {_TOWING}', '')}" for n in numbers]
     return {
-        "why": " ".join(said),
+        "why": " ".join(reasons),
         "plan": None,
         "motion": None,
         "joints": [

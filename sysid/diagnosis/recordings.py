@@ -25,7 +25,7 @@ _ALIKE: Final = 0.05
 """Part of the range of velocities by which it may change over a cut."""
 _WARMER_K: Final = 0.6
 _AT_MOST_RAD: Final = 2e-3
-"""Joint side: by how much positions may be off what the velocity says."""
+"""Joint side: by how much positions may differ from the integrated velocity."""
 
 
 def recordings(runs: Sequence[Sequence[JointSignals]]) -> list[int]:

@@ -188,7 +188,7 @@ _TORSION_ZERO: Final = 25.0
 _LEAST_COULOMB: Final = 0.0125
 _LEAST_SMOOTH: Final = 0.0025
 _LEAST_VISCOUS: Final = 0.01
-"""Parts of the rated torque that a usual friction is at least (viscous: at the usual speed), whatever the file says."""
+"""Parts of the rated torque that a usual friction is at least (viscous: at the usual speed), whatever the file has."""
 
 LINE: Final = "line"
 

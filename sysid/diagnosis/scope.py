@@ -33,10 +33,12 @@ class Scope:
         return (None, name) not in self.out and (where, name) not in self.out
 
     @property
-    def told(self) -> tuple[str, ...]:
-        """One line beside what is left over: which effects were not looked for; none where all were."""
+    def note(self) -> tuple[str, ...]:
+        """One line in the presence of an unexplained residual: which effects were not looked for; none where all were."""
         names = ", ".join(sorted({name for _, name in self.out}))
-        return (f"not looked for, as asked: {names}; what is left over may be theirs",) if names else ()
+        return (
+            (f"not looked for, as asked: {names}; the unexplained residual may be theirs",) if names else ()
+        )
 
 
 EVERYTHING: Final = Scope()
@@ -87,7 +89,7 @@ def named_effects(option: str, items: Iterable[str]) -> list[tuple[str, str, Joi
 
 
 def _check_given(text: str, name: str, where: JointName | None, joints: Mapping[int, Joint]) -> None:
-    """Refuse an effect that no joint file says anything about: taken as given it would be --without."""
+    """Refuse an effect that no joint file has: taken as given it would be --without."""
     asked = [joint for number, joint in joints.items() if where in (None, SENSOR, number)]
     in_file = any(effect.name == name for joint in asked for effect in joint.effects)
     if not in_file and not any(parameter.key for parameter in EFFECTS[name].parameters):

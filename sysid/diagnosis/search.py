@@ -147,8 +147,8 @@ class Search:
         return float(np.sqrt(max(squares.max(), 0.0)))
 
     def same_torques(self, one: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether two sets differ by less than what is called an effect, at rest as in motion: one says in other
-        words what the other says. A wave of the sensor, as one at either joint, fits better by as much as a wave too small
+        """Return whether two sets differ by less than what is called an effect, at rest as in motion: one is the other
+        in other words. A wave of the sensor, as one at either joint, fits better by as much as a wave too small
         to be named.
         """
         difference = np.zeros(len(self.column_rms))

@@ -167,7 +167,7 @@ _RATES: Final = ("current_rate_a_s", "link_velocity_rad_s", "torque_rate_nm_s")
 def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """Return the signals with the samples at which a column is held, and those that its smoothing reaches, not usable:
     torque in both balances, current in the motor's. `held_nm` is what they are from a straight line between those around
-    them: at rest nothing else says it.
+    them: at rest nothing else shows it.
     """
     if not held:
         return s

@@ -32,7 +32,7 @@ def calm(x: FloatArray, step_s: float) -> FloatArray:
 
     Smoothed over _SMOOTH_S where that is enough samples. An average of fewer keeps half of each sample's own noise and more,
     at 250 Hz all of it: a gain of that channel is then found by the noise beside the signal, and noise of a torsion moves
-    what slips with it. There each sample is what the cubic through its neighbours says, with none of its own noise. That
+    what slips with it. There each sample is the value of the cubic through its neighbours, with none of its own noise. That
     keeps 0.98 of what swings at 25 Hz and 0.7 of 50 Hz, at 250 Hz as at 500. The noise of the neighbours is in residuals as
     well, but of both signs: where all frequencies count alike it adds up to nothing.
     """

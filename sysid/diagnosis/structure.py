@@ -47,7 +47,7 @@ AXES: Final = (
     "time",
 )
 ORDERS: Final = np.arange(0.3, 10.0, 0.04)
-"""Per motor revolution, where lines of what is left over are looked for."""
+"""Per motor revolution, where lines of the unexplained residual are looked for."""
 _FINE: Final = 0.004
 _EXACT: Final = 0.0004
 _COHERENT: Final = 0.5

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.effects.effect import MOTOR
+from jtqd.sysid.diagnosis.acceptance import Found, found_in
 from jtqd.sysid.diagnosis.bounded import bounded_values, in_the_file
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.causes import causes_of, told_at_rest
@@ -29,27 +30,28 @@ from jtqd.sysid.diagnosis.findings import (
     Findings,
     Gap,
     JointName,
-    LeftOver,
+    UnexplainedResidual,
     joint_text,
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
-from jtqd.sysid.diagnosis.leftover import Leftover
-from jtqd.sysid.diagnosis.named import Found, found_in
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.unexplained import Unexplained
 
 RELEVANCE: Final = 0.005
 """Part of the rated torque, rms over a run, from which what the causes leave matters; the user may set another."""
 
 
-def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, ...], anew: Names) -> Findings:
+def conclude(
+    case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, ...], names_without: Names
+) -> Findings:
     """Return the findings of one diagnosis.
 
-    fit: of what the search found; names, numbers: of all runs and joints asked about; anew: what is named without a
-    recording.
+    fit: of what the search found; names, numbers: of all runs and joints asked about; names_without: what is reported
+    without a recording.
     """
-    found, became = with_fewer(found_in(case, fit), anew)
+    found, became = with_fewer(found_in(case, fit), names_without)
     bounded = bounded_values(found)
     gain = held_out_gain(case.dataset, found.named.refined)
     named, classes = told_at_rest(case, found.named, found.classes)
@@ -64,7 +66,7 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         unsure = found.few.unsure(found.whole.hypothesis, named.hypothesis, classes, causes)
         doubt = found.few.doubt(unsure) if unsure else ""
     rivals = {r.key: c.effect.name for c, others in zip(named.chosen, classes, strict=True) for r in others}
-    table = candidate_table(case.search, named.hypothesis, rivals, left_over=found.beside)
+    table = candidate_table(case.search, named.hypothesis, rivals, unexplained=found.beside)
     reasons: list[str] = []
     if found.matters:
         verdict = UNEXPLAINED
@@ -83,8 +85,8 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
     causes.sort(key=lambda c: -c.rms_nm)
     gaps = channel_gaps(case.dataset, shown.refined, left if found.left_matters else None)
     gaps = _below_bounds(gaps, bounded)
-    said = tuple(f"{b.name} of {joint_text(b.joint)} " for b in bounded)  # once, as a bound
-    refused = [line for line in found.refused if not line.startswith(said)]
+    bounds = tuple(f"{b.name} of {joint_text(b.joint)} " for b in bounded)  # once, as a bound
+    refused = [line for line in found.refused if not line.startswith(bounds)]
     if not reasons:
         reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
     return Findings(
@@ -99,13 +101,13 @@ def conclude(case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, .
         next_experiment=_settling_experiment(verdict, causes, unsure, case.dataset),
         traces=traces(case.dataset, shown.refined),
         explained_share=explained / total if causes else math.nan,
-        left_over=_left_over(found, left, remains / total),
+        unexplained=_unexplained(found, left, remains / total),
         bounded=tuple(bounded),
     )
 
 
 def _below_bounds(gaps: Sequence[Gap], bounded: Sequence[BoundedValue]) -> tuple[Gap, ...]:
-    """Return the gaps with no noise floor above what a bounded value leaves on the runs left out: where nothing is named,
+    """Return the gaps with no noise floor above what a bounded value leaves on the held-out runs: where nothing is named,
     the runs' own changes hold what all of them lack of it, and that is no noise.
     """
     return tuple(_below(gap, [b for b in bounded if b.joint == gap.joint]) for gap in gaps)
@@ -116,14 +118,16 @@ def _below(gap: Gap, bounded: Sequence[BoundedValue]) -> Gap:
     lower = min(left, default=math.inf)
     if gap.balance != MOTOR or lower >= gap.noise_floor_nm:
         return gap
-    return replace(gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on runs left out")
+    return replace(gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on held-out runs")
 
 
-def _left_over(found: Found, left: Leftover, share: float) -> LeftOver:
-    """Return what is left over in the channel where it is most, against its limit; share: of all structure, as energy."""
+def _unexplained(found: Found, left: Unexplained, share: float) -> UnexplainedResidual:
+    """Return the unexplained residual in the channel where it is most, against its limit; share: of all structure, as
+    energy.
+    """
     sizes = {c: max(left.worst_nm.get(c, 0.0), found.held_nm.get(c, 0.0)) for c in found.limits}
     worst = max(sizes, key=lambda c: sizes[c] / found.limits[c] if found.limits[c] > 0.0 else sizes[c])
-    return LeftOver(
+    return UnexplainedResidual(
         worst.joint,
         worst.balance,
         sizes[worst],
@@ -152,19 +156,21 @@ def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[s
 
 
 def _told_from(table: Sequence[CandidateEvidence], rated_nm: float) -> list[str]:
-    """Return how large an effect must be to be told beside what is left over; none is larger than the rated torque."""
+    """Return how large an effect must be to be distinguished in the presence of an unexplained residual; none is
+    larger than the rated torque.
+    """
     seen = sorted((c.minimum_rms_nm, c.name) for c in table if c.minimum_rms_nm < rated_nm)
     if not seen:
         return []
     (low, easiest), (high, hardest) = seen[0], seen[-1]
     return [
         f"on these runs an effect below {low:.2g} Nm rms ({easiest.replace('_', ' ')}) to {high:.2g} Nm rms"
-        f" ({hardest.replace('_', ' ')}) cannot be told from what is left over"
+        f" ({hardest.replace('_', ' ')}) cannot be distinguished from the unexplained residual"
     ]
 
 
-def _remaining(found: Found, named: Fit) -> tuple[Leftover, Fit]:
-    """Return what findings and report show as left over, and the fit that leaves it: that of the causes. Where something
+def _remaining(found: Found, named: Fit) -> tuple[Unexplained, Fit]:
+    """Return what findings and report show as unexplained, and the fit that leaves it: that of the causes. Where something
     matters that all effects found leave, that of all of them, or of none where that leaves less: a fit that is bent leaves
     more than there was, and in other places.
     """
@@ -172,10 +178,10 @@ def _remaining(found: Found, named: Fit) -> tuple[Leftover, Fit]:
     if not found.left_matters:
         if named.hypothesis is whole.hypothesis:
             return found.left, named
-        return case.left_over(named), named
+        return case.unexplained(named), named
     if whole.chosen:
         bare = case.fit(case.search.hypothesis(()))
-        without = case.left_over(bare)
+        without = case.unexplained(bare)
         if without.energy_nm2() <= found.left.energy_nm2():
             return without, bare
     return found.left, whole
@@ -184,8 +190,8 @@ def _remaining(found: Found, named: Fit) -> tuple[Leftover, Fit]:
 def _settling_experiment(
     verdict: str, causes: Sequence[Cause], unsure: Sequence[tuple[str, JointName]], dataset: Dataset
 ) -> dict[str, Any] | None:
-    """Return the experiment that would settle an ambiguous verdict, a class beside something left over, or one of too few
-    runs; unsure: what does not hold on every held-out run.
+    """Return the experiment that would settle an ambiguous verdict, a class in the presence of an unexplained
+    residual, or one of too few runs; unsure: what does not hold on every held-out run.
     """
     in_class = any(len(c.names) > 1 for c in causes)
     if verdict not in (AMBIGUOUS, INSUFFICIENT) and not (verdict == UNEXPLAINED and in_class):

@@ -222,7 +222,7 @@ def _summed(waves: Sequence[tuple[AngleWave, float]]) -> dict[float, tuple[float
 def knowing(
     one: Identified, torsion: Torsion, excitation: Sequence[Driven], zeros: Mapping[str, float]
 ) -> Identified:
-    """Return a joint with this torsion, its variances found anew on the runs of the fit; zeros [rad]: known, by run."""
+    """Return a joint with this torsion, its variances found again on the runs of the fit; zeros [rad]: known, by run."""
     joint, settings = one.joint, EstimatorSettings(method="fused")
     assert joint.fused is not None
     found = []

@@ -3,7 +3,7 @@
     python -m validation more_data --bench measured --sets 10 --seed 1
 
 From two runs on, a cause that is named alone on k runs is named on k + 1 (alone or in a class), or else a line says what
-became of it and what the runs left out say of it (`jtqd.sysid.diagnosis.fewer_runs`). For each cause that goes the error on
+became of it and what the held-out runs say of it (`jtqd.sysid.diagnosis.fewer_runs`). For each cause that goes the error on
 the run held out of all is printed with it and without. Bench `own` is the generator in validation/hidden, `measured` the
 Kinova runs that ship. Exit status 0: so in all sets, 3: not.
 """

@@ -65,10 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         findings = judged(drawn.runs, drawn.joints, PRESETS["full"], k)
         for name, row in rows_of(findings, drawn.joints).items():
             found[name].append(row)
-        if findings.left_over is not None:
-            left.append(100.0 * findings.left_over.of_rated)
+        if findings.unexplained is not None:
+            left.append(100.0 * findings.unexplained.of_rated)
     print(
-        f"{options.sets} sets with nothing hidden; left over, worst run: median {np.median(left):.2g} % of rated"
+        f"{options.sets} sets with nothing hidden; unexplained, worst run: median {np.median(left):.2g} % of rated"
     )
     print(
         "| effect | smallest size told | as torque, % of rated rms | visible to the oracle | largest hidden |"

@@ -53,8 +53,8 @@
         button.addEventListener("click", () => { act(); this.draw(); });
         this.bar.appendChild(button);
       }
-      this.said = document.createElement("span");
-      this.bar.appendChild(this.said);
+      this.readout = document.createElement("span");
+      this.bar.appendChild(this.readout);
       this.svg = make(this.box, "svg", { role: "img", tabindex: "0", "aria-label": figure.querySelector(".wide").getAttribute("aria-label") });
       figure.append(this.bar, this.box);
       figure.classList.add("live");
@@ -100,7 +100,7 @@
       const k = Math.round(place);
       if (k < this.from || k >= this.to) return;
       const values = this.curves.map((c) => `${c.short} ${Number.isNaN(c.values[k]) ? "–" : c.values[k].toPrecision(3)} ${c.unit}`);
-      this.said.textContent = `${(this.start + k * this.step).toFixed(3)} s: ${values.join(", ")}`;
+      this.readout.textContent = `${(this.start + k * this.step).toFixed(3)} s: ${values.join(", ")}`;
     }
     path(values, x, y) {
       const columns = Math.max(1, Math.round(x(this.to) - x(this.from))), size = Math.max(1, (this.to - this.from) / columns);
@@ -159,7 +159,7 @@
       });
       for (const t of times) make(this.svg, "text", { x: x((t - this.start) / this.step), y: top + 16, "text-anchor": "middle" }, t.toFixed(digits));
       make(this.svg, "text", { x: 0.5 * (LEFT + this.width), y: top + 32, "text-anchor": "middle" }, "time [s]");
-      this.said.textContent = this.to - this.from < this.count ? `${t0.toFixed(2)} to ${t1.toFixed(2)} s; double click: whole run` : "drag over a stretch of time to zoom";
+      this.readout.textContent = this.to - this.from < this.count ? `${t0.toFixed(2)} to ${t1.toFixed(2)} s; double click: whole run` : "drag over a stretch of time to zoom";
     }
   }
   for (const figure of document.querySelectorAll("figure[data-trace]")) new Chart(figure);

@@ -173,7 +173,7 @@ _BIC_DECADES: Final = 6.0
 @dataclass(frozen=True)
 class ParameterView:
     """One parameter: name in words, key of the joint file, value with unit, interval ("" for none); before: what the joint
-    file says, change: in percent ("" where there is nothing to compare with).
+    file has, change: in percent ("" where there is nothing to compare with).
     """
 
     title: str
@@ -202,7 +202,7 @@ class CauseView:
     equation: str
     tell_tale: str
     share: str = ""
-    steadiness: str = ""
+    stability: str = ""
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ def _cause(cause: Cause, effects: Mapping[str, Effect], joints: Mapping[int, Joi
         effect.equation if effect else "",
         effect.tell_tale if effect else "",
         _known_percent(cause.explained_share),
-        number(cause.steadiness, 2) if math.isfinite(cause.steadiness) else "",
+        number(cause.stability, 2) if math.isfinite(cause.stability) else "",
     )
 
 
@@ -285,7 +285,7 @@ def _known_percent(share: float) -> str:
 
 def left_view(findings: Findings) -> LeftView | None:
     """Return what the causes leave that is structure, None where it was not measured."""
-    left = findings.left_over
+    left = findings.unexplained
     if left is None:
         return None
     relevant = f"{number(left.relevant_nm)}{SPACE}Nm"

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, LeftOver, OddRun
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, OutlierRun, UnexplainedResidual
 from tests.sysid.diagnosis.findings_parts import (
     GAIN,
     INFINITY,
@@ -59,9 +59,9 @@ def one_cause() -> Findings:
             Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor", 0.94, 57.0),
         ),
         explained_share=0.94,
-        left_over=LeftOver(1, "motor", 0.072, 0.0018, 0.06, 0.2, matters=False),
-        odd_runs=(
-            OddRun(
+        unexplained=UnexplainedResidual(1, "motor", 0.072, 0.0018, 0.06, 0.2, matters=False),
+        outlier_runs=(
+            OutlierRun(
                 "excitation_07.csv.gz",
                 "gain",
                 "current_a",
@@ -90,7 +90,7 @@ def one_cause() -> Findings:
 
 
 def two_causes() -> Findings:
-    """Viscous friction for certain, and one of two that cannot be told apart, with the experiment that would."""
+    """Viscous friction for certain, and one of two that cannot be distinguished, with the experiment that would."""
     plan = {
         "schema": "jtq.plan/1",
         "name": "separate-link-inertia-from-delay",

@@ -69,5 +69,5 @@ def test_the_extended_file_takes_the_only_bound_of_a_joint_of_which_nothing_is_n
     assert taken([viscous], OFFSET) == [False], "of the sensor"
     assert taken([viscous, coulomb]) == [False, False], "proven one by one, not together"
     assert taken([inertia]) == [False], "a rotor without inertia cannot be simulated"
-    assert viscous.text.endswith("in the runs left out")
+    assert viscous.text.endswith("in the held-out runs")
     assert replace(viscous, in_file=True).text.endswith("; the extended joint file takes 0")

@@ -187,13 +187,13 @@ def test_what_is_explained_left_over_and_odd_is_said() -> None:
     found = examples.one_cause()
     text = Page(render(found)).text.translate(PLAIN_SPACE)
     assert "0.296 Nm rms to the motor balance (current against sensor), 94 % of the structured gap" in text
-    assert "57 times its standard error over runs left out one by one" in text
+    assert "57 times its standard error over leave-one-run-out" in text
     assert "0.18 % of rated" in text
     assert "joint 1, motor balance; it does not matter (from 0.200 Nm on it matters)" in text
     assert "Runs that differ from the others" in text
-    assert found.odd_runs[0].text in text
-    assert found.left_over is not None
-    bad = replace(found, left_over=replace(found.left_over, matters=True), odd_runs=())
+    assert found.outlier_runs[0].text in text
+    assert found.unexplained is not None
+    bad = replace(found, unexplained=replace(found.unexplained, matters=True), outlier_runs=())
     text = Page(render(bad)).text.translate(PLAIN_SPACE)
     assert "motor balance; it matters" in text
     assert "Runs that differ" not in text

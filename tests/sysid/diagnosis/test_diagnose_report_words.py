@@ -13,8 +13,8 @@ from jtqd.sysid.diagnosis.findings import (
     Findings,
     Gain,
     Gap,
-    LeftOver,
     Place,
+    UnexplainedResidual,
     Value,
     summary_lines,
     to_mapping,
@@ -109,10 +109,10 @@ def test_the_gain_is_said_with_its_interval_which_is_in_newton_metres() -> None:
 
 
 def test_a_gain_beside_what_runs_have_of_their_own_is_said_with_the_plain_errors() -> None:
-    gain = Gain(0.2, 0.1, "split; beside what each run has of its own", (0.08, 0.12), plain_nm=(0.141, 0.142))
+    gain = Gain(0.2, 0.1, "split; without run-to-run variation", (0.08, 0.12), plain_nm=(0.141, 0.142))
     findings = replace(examples.one_cause(), gain=gain)
     beside = (
-        "beside what each run has of its own (zero and friction of the day), which is most of the error: with it "
+        "in the presence of run-to-run variation (offset and friction of the day), which is most of the error: with it "
         "0.141 -> 0.142 Nm rms"
     )
     assert (
@@ -191,7 +191,7 @@ def test_names_are_words() -> None:
 
 
 def test_what_is_as_large_as_what_matters_and_does_not_is_explained() -> None:
-    left = LeftOver(1, "motor", 0.3, 0.003, 0.04, 0.2, matters=False)
+    left = UnexplainedResidual(1, "motor", 0.3, 0.003, 0.04, 0.2, matters=False)
     assert left.limit("0.2 Nm") == "more than 0.2 Nm, but 4.0% of the gap"
     assert (
         replace(left, unconfirmed=True).limit("0.2 Nm").endswith("effects that are not confirmed explain it")

@@ -1,4 +1,4 @@
-"""One more run must not take a cause away without a word, and not where it predicts the runs left out clearly better."""
+"""One more run must not take a cause away without a word, and not where it predicts the held-out runs clearly better."""
 
 from __future__ import annotations
 
@@ -10,19 +10,19 @@ from typing import cast
 import numpy as np
 import pytest
 
-from jtqd.sysid.diagnosis import fewer_runs, named
+from jtqd.sysid.diagnosis import acceptance, fewer_runs
+from jtqd.sysid.diagnosis.acceptance import UNSTEADY, Found
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _borne_out, with_fewer
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
-from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.mixed_model import Mixed
-from jtqd.sysid.diagnosis.named import UNSTEADY, Found
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.steadiness import Steadiness
+from jtqd.sysid.diagnosis.stability import Stability
+from jtqd.sysid.diagnosis.unexplained import Unexplained
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, Dense, search_of
 from tests.sysid.diagnosis.test_search import LIBRARY, problem
 from validation.worlds.judge import judged
@@ -54,7 +54,7 @@ def test_a_subset_keeps_its_pieces() -> None:
 
 
 def one_beside_none(squares: Sequence[float]) -> tuple[Compared, Hypothesis]:
-    """Nothing named, and an effect with these squared errors on the runs left out where nothing leaves 1."""
+    """Nothing named, and an effect with these squared errors on the held-out runs where nothing leaves 1."""
     search = search_of(problem(3, {0: 0.8}), LIBRARY)
     other = search.hypothesis(LIBRARY[:1])
 
@@ -95,13 +95,13 @@ class Unfitted(Case):
 def test_beside_what_is_left_over_only_what_is_steady_is_kept(
     monkeypatch: pytest.MonkeyPatch, left_nm: float, ratio: float, kept: bool
 ) -> None:
-    """However much better the runs left out are with it: what is left over may make it so."""
+    """However much better the held-out runs are with it: the unexplained residual may make it so."""
     compared, other = one_beside_none([0.5, 0.5, 0.5])
     monkeypatch.setattr(fewer_runs, "objections", lambda *_: [])
-    steady = Steadiness(ratio, 8.0, "velocity")
-    monkeypatch.setattr(named, "steadiness", lambda _, __, nothing: [steady for _ in nothing])
+    steady = Stability(ratio, 8.0, "velocity")
+    monkeypatch.setattr(acceptance, "stability", lambda _, __, nothing: [steady for _ in nothing])
     case = Unfitted(cast("Dataset", None), cast("Noise", None), compared.search, 0.005)
-    nothing, left = case.fit(compared.named), Leftover((), (), (), (), worst_nm={MOTOR1: left_nm})
+    nothing, left = case.fit(compared.named), Unexplained((), (), (), (), worst_nm={MOTOR1: left_nm})
     found = Found(case, nothing, nothing, None, left, 0.01, {MOTOR1: 0.2}, ())
     key = LIBRARY[0].key
     best, why = _borne_out(found, compared, [(key, other)])
@@ -112,7 +112,7 @@ def test_a_line_says_what_went_and_what_the_runs_left_out_say() -> None:
     text = Gone(LIBRARY[0], ("a.csv", "b.csv", "c.csv", "d.csv"), (0.5, 0.4), "it cancels x").text
     assert text == (
         "coulomb_friction of joint 1 would be named without a.csv, b.csv, c.csv, .., but is not with all runs: "
-        "the error on runs left out is 0.5 Nm rms with it, 0.4 as named; it cancels x"
+        "the error on held-out runs is 0.5 Nm rms with it, 0.4 as named; it cancels x"
     )
 
 
@@ -135,7 +135,7 @@ def test_the_signals_end_with_the_torsion_of_what_is_named(monkeypatch: pytest.M
             fitted.append(hypothesis)
             return Fit(cast(Hypothesis, hypothesis), cast(Refined, None))
 
-    def of_fewer(found: Found, here: object, anew: object) -> list[tuple[str, list[object]]]:
+    def of_fewer(found: Found, here: object, again: object) -> list[tuple[str, list[object]]]:
         cast(Recorded, found.case).fit("of fewer runs")
         return [("run_1", [])]
 
@@ -158,8 +158,8 @@ def test_what_is_left_over_is_that_of_what_is_kept(monkeypatch: pytest.MonkeyPat
     before, kept = search.hypothesis(()), search.hypothesis(LIBRARY[:1])
 
     class WithLeft(Unfitted):
-        def left_over(self, fit: Fit) -> Leftover:
-            return Leftover((), (), (), (), worst_nm={MOTOR1: 0.1 if fit.chosen else 0.5})
+        def unexplained(self, fit: Fit) -> Unexplained:
+            return Unexplained((), (), (), (), worst_nm={MOTOR1: 0.1 if fit.chosen else 0.5})
 
         def held_nm(self, fit: Fit) -> dict[Channel, float]:
             return {}

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from examples.kinova_diagnosis import diagnose_all
-from jtqd.sysid.diagnosis import bounded, named
+from jtqd.sysid.diagnosis import acceptance, bounded
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import (
@@ -71,7 +71,7 @@ def test_with_four_runs_nothing_of_this_applies(monkeypatch: pytest.MonkeyPatch)
             assert search.mixed.runs < ENOUGH_RUNS, "asked for with four runs"
             super().__init__(dataset, search)
 
-    monkeypatch.setattr(named, "LeaveOneOut", Refusing)
+    monkeypatch.setattr(acceptance, "LeaveOneOut", Refusing)
     assert found(206, runs=4).verdict == NO_GAP
 
 

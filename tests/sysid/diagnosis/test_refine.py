@@ -431,7 +431,7 @@ def test_where_no_torque_was_measured_a_cause_must_lower_the_position_error_of_a
     best = Hypothesis((), result, 0.0)  # type: ignore[arg-type]
     assert guards.objections(dataset, best, result) == []
     found = guards.objections(replace(dataset, no_torque=True), best, result)
-    assert found == [(0, "it raises the error of the position in a free run on runs left out")]
+    assert found == [(0, "it raises the error of the position in a free run on held-out runs")]
 
 
 def test_causes_that_lower_the_plain_error_nowhere_on_runs_left_out_are_none(
@@ -442,7 +442,7 @@ def test_causes_that_lower_the_plain_error_nowhere_on_runs_left_out_are_none(
     best = Hypothesis((), result, 0.0)  # type: ignore[arg-type]
     assert guards.objections(dataset, best, result) == []
     monkeypatch.setattr(guards, "falls_nm", lambda squares: dict.fromkeys(squares, 0.0))
-    assert guards.objections(dataset, best, result) == [(0, "it raises the error on runs left out")]
+    assert guards.objections(dataset, best, result) == [(0, "it raises the error on held-out runs")]
 
 
 @pytest.mark.parametrize("runs", [3, 4])
@@ -457,7 +457,7 @@ def test_a_friction_of_the_day_that_lies_against_a_cause_speaks_against_it_with_
     monkeypatch.setattr(guards, "nothing_of", lambda _: [{}])
     found = guards.objections(dataset, Hypothesis((), result, 0.0), result)  # type: ignore[arg-type]
     if runs < ENOUGH_RUNS:
-        assert found == [(0, "it raises the error on runs left out")]
+        assert found == [(0, "it raises the error on held-out runs")]
         assert gain.plain_nm is None
         assert gain.rmse_after_nm >= gain.rmse_before_nm
         return

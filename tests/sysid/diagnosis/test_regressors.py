@@ -120,7 +120,7 @@ def test_the_link_does_not_follow_an_error_of_the_teeth_that_is_quicker_than_its
 
 @pytest.mark.parametrize("inertia", [0.0, 0.5])
 def test_an_eccentric_encoder_of_the_motor_is_in_both_balances(inertia: float) -> None:
-    """The same run with that encoder true and eccentric: what is left over differs by the columns."""
+    """The same run with that encoder true and eccentric: the unexplained residual differs by the columns."""
     joint = replace(PLAIN, link_inertia_kgm2=inertia)
     table = rigid_run(joint)
     columns = table.joints[1]

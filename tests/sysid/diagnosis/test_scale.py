@@ -75,6 +75,6 @@ def test_the_same_causes_with_scaled_values(scale: float) -> None:
     (coulomb,) = (c for c in one.causes if c.name == "coulomb_friction")
     assert coulomb.parameters["coulomb_nm"].value == pytest.approx(TRUE.friction.coulomb_nm, rel=0.02)
     assert other.gaps[0].noise_floor_nm == pytest.approx(scale * one.gaps[0].noise_floor_nm, rel=1e-2)
-    assert one.left_over is not None
-    assert other.left_over is not None
-    assert other.left_over.relevant_nm == pytest.approx(scale * one.left_over.relevant_nm)
+    assert one.unexplained is not None
+    assert other.unexplained is not None
+    assert other.unexplained.relevant_nm == pytest.approx(scale * one.unexplained.relevant_nm)

@@ -98,7 +98,10 @@ def test_what_all_runs_lack_is_no_noise_where_its_name_may_not_be_said(without: 
     scope = scope_of([without] if without else [], [given] if given else [], {1: plain})
     found = diagnose(runs, {1: plain}, scope)
     assert found.verdict == UNEXPLAINED
-    assert found.reasons[-1] == "not looked for, as asked: coulomb_friction; what is left over may be theirs"
+    assert (
+        found.reasons[-1]
+        == "not looked for, as asked: coulomb_friction; the unexplained residual may be theirs"
+    )
     gap = next(g for g in found.gaps if g.balance == "motor")
     assert gap.rmse_nm == pytest.approx(0.04 * plain.rated_torque_nm, rel=0.1)
     assert gap.noise_floor_nm < 0.3 * gap.rmse_nm

@@ -21,7 +21,7 @@ from jtqd.sysid.diagnosis.evidence import (
 )
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import ENTER, Hypothesis, Search, pinned, units_changed, within
-from jtqd.sysid.diagnosis.steadiness import needed
+from jtqd.sysid.diagnosis.stability import needed
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import Dense, candidates, dense, search_of
 
@@ -328,7 +328,7 @@ def test_a_steady_size_is_that_of_its_changes_from_run_to_run() -> None:
     steady = steady_size(search, empty, viscous)
     assert steady == pytest.approx(needed(5) * sizes.std(ddof=1) / 5**0.5, rel=0.15)
     (alone,) = minimum_size(search, empty, viscous).values()
-    (beside,) = minimum_size(search, empty, viscous, left_over=True).values()
+    (beside,) = minimum_size(search, empty, viscous, unexplained=True).values()
     assert alone.value < beside.value == pytest.approx(steady)
 
 

@@ -1,4 +1,6 @@
-"""What is left over: maps, events and lines in residuals of which it is known what is in them; and in noise nothing."""
+"""The unexplained residual: maps, events and lines in residuals of which it is known what is in them; and in noise
+nothing.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,6 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis import structure
 from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.events import Burst, EventLimits, bursts, wandering
-from jtqd.sysid.diagnosis.leftover import Leftover
 from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
@@ -23,6 +24,7 @@ from jtqd.sysid.diagnosis.structure import (
     order_lines,
     sharpened,
 )
+from jtqd.sysid.diagnosis.unexplained import Unexplained
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 STEP_S = 0.005
@@ -313,9 +315,9 @@ def test_what_is_left_counts_once_per_channel() -> None:
     one = AxisMap(MOTOR1, "load", "Nm", empty, empty, empty, empty, 0.05, 1e-4)
     event = Burst(MOTOR1, 0.2, 0.5, (("run2", 3.25), ("run1", 7.0)))
     line = Line(TORSION1, 3.5, 0.4, 60.0)
-    left = Leftover((one,), (one,), (event,), (line,))
+    left = Unexplained((one,), (one,), (event,), (line,))
     assert left.significant
     assert left.by_channel() == {MOTOR1: 0.2, TORSION1: pytest.approx(0.08)}
     assert left.share(0.28) == pytest.approx(0.5)
     assert len(left.reasons) == 3
-    assert not Leftover((one,), (), (), ()).significant
+    assert not Unexplained((one,), (), (), ()).significant

@@ -15,6 +15,7 @@ from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import dataset
 from jtqd.sysid.diagnosis import diagnose as module
+from jtqd.sysid.diagnosis.acceptance import Found
 from jtqd.sysid.diagnosis.case import Case as Judged
 from jtqd.sysid.diagnosis.case import Fit
 from jtqd.sysid.diagnosis.channel import Channel, Line
@@ -22,11 +23,10 @@ from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
 from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
-from jtqd.sysid.diagnosis.leftover import Leftover
-from jtqd.sysid.diagnosis.named import Found
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.unexplained import Unexplained
 from jtqd.sysid.diagnosis.verdict import _remaining
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, search_of
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, findings
@@ -179,7 +179,7 @@ def slice_of(table: RunTable, seconds: float) -> RunTable:
 
 
 class Two(Judged):
-    """A case in which what is left over falls with every effect."""
+    """A case in which the unexplained residual falls with every effect."""
 
     @property
     def few(self) -> bool:
@@ -188,9 +188,9 @@ class Two(Judged):
     def fit(self, hypothesis: Hypothesis) -> Fit:
         return Fit(hypothesis, cast("Refined", None))
 
-    def left_over(self, fit: Fit) -> Leftover:
+    def unexplained(self, fit: Fit) -> Unexplained:
         line = Line(MOTOR1, 2.5, 0.6 - 0.5 * len(fit.chosen), 30.0)
-        return Leftover((), (), (), (line,), worst_nm={MOTOR1: line.amplitude_nm})
+        return Unexplained((), (), (), (line,), worst_nm={MOTOR1: line.amplitude_nm})
 
     def held_nm(self, fit: Fit) -> dict[Channel, float]:
         return {}
@@ -203,8 +203,8 @@ def test_what_is_left_over_is_of_the_fit_that_is_shown(limit_nm: float, matters:
     case = Two(cast("Dataset", None), cast("Noise", None), search, 0.005)
     whole, named = case.fit(search.hypothesis(LIBRARY[:1])), case.fit(search.hypothesis(()))
     few = cast("LeaveOneOut", object())
-    found = Found(case, whole, named, few, case.left_over(whole), 1.0, {MOTOR1: limit_nm}, ())
+    found = Found(case, whole, named, few, case.unexplained(whole), 1.0, {MOTOR1: limit_nm}, ())
     assert found.matters is matters
     left, shown = _remaining(found, named)
     assert shown is (whole if matters else named)
-    assert left.worst_nm == case.left_over(shown).worst_nm
+    assert left.worst_nm == case.unexplained(shown).worst_nm

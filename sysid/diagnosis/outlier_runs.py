@@ -1,6 +1,6 @@
 """Runs whose channels differ from those of the other runs: another gain, zero or delay than all the rest.
 
-A loose plug, a sensor zeroed anew or another filter of the drive belongs to one run and to no joint. An effect of the joint
+A loose plug, a sensor zeroed again or another filter of the drive belongs to one run and to no joint. An effect of the joint
 is in all runs, a change from day to day is small; what is in one run alone and beyond any day is that run's:
 
     y_r = X_r beta + Z_r u_r + w_r d_r + e          w: a unit of gain, zero or delay of one channel of run r alone
@@ -32,7 +32,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import JointName, OddRun, joint_text
+from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
 from jtqd.sysid.diagnosis.mixed_model import explained, explained_each, solve
 from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
@@ -68,7 +68,7 @@ class Deviation(NamedTuple):
     unit: str
 
 
-def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
+def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     """Return places in dataset.runs of the run (or its pieces) that differs most from all others, and how; None: none."""
     pieces = np.arange(len(dataset.runs)) if dataset.pieces is None else np.array(dataset.pieces, np.intp)
     count = int(pieces.max()) + 1
@@ -117,7 +117,7 @@ def odd_run(dataset: Dataset) -> tuple[list[int], OddRun] | None:
     kind, name = kinds[k], dataset.runs[places[0]].name
     if kind.what == "gain":
         apart = of_truth(apart)
-    return places, OddRun(name, kind.what, kind.channel, kind.joint, apart, spread, kind.unit, others)
+    return places, OutlierRun(name, kind.what, kind.channel, kind.joint, apart, spread, kind.unit, others)
 
 
 def of_truth(gain: float) -> float:

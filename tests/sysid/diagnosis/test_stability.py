@@ -13,7 +13,7 @@ from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import ORDER, Noise, run_sums
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined
 from jtqd.sysid.diagnosis.regressors import RunData
-from jtqd.sysid.diagnosis.steadiness import RUNS, Steadiness, jackknife, needed, steadiness
+from jtqd.sysid.diagnosis.stability import RUNS, Stability, jackknife, needed, stability
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, run_data
 
 NOISE_NM = 0.02
@@ -21,7 +21,7 @@ WHITE = Noise((MOTOR1,), {MOTOR1: np.zeros(ORDER)}, np.array([NOISE_NM]), np.eye
 COUNT = 3000
 
 
-def asked(more_nm: FloatArray | float, runs: int = 6, spread: float = 0.0) -> Steadiness:
+def asked(more_nm: FloatArray | float, runs: int = 6, spread: float = 0.0) -> Stability:
     """How steady a viscous friction is that is fitted to these runs: `more_nm` over the velocities -1 to 1 rad/s that all of
     them go through, and in each run another viscous friction of its own.
     """
@@ -56,7 +56,7 @@ def asked(more_nm: FloatArray | float, runs: int = 6, spread: float = 0.0) -> St
         np.zeros((runs, 1)),
         tuple(made),
     )
-    return steadiness(refined, WHITE, [{name: 2.0}])[0]
+    return stability(refined, WHITE, [{name: 2.0}])[0]
 
 
 V = np.linspace(-1.0, 1.0, COUNT)

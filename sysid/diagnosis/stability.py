@@ -1,6 +1,7 @@
-"""Whether an effect has the same size wherever it acts: what is asked of it beside something that is left over.
+"""Whether an effect has the same size wherever it acts: what is asked of it in the presence of an unexplained residual.
 
-What is left over is no noise: it is neither independent from sample to sample nor the same everywhere, and what an effect
+The unexplained residual is no noise: it is neither independent from sample to sample nor the same everywhere, and what
+an effect
 gains by imitating a part of it is not the same everywhere either. So no noise model is asked. Runs are left out one by one,
 and in each operating condition (velocity, load, current, angles, time) one of six slices that hold the same information
 on the effect; the changes of its size give a standard error (jackknife), and the size must be that many of them as
@@ -39,7 +40,7 @@ _NO_SIZE: Final = ("phase_rad", "reference_c")
 
 
 @dataclass(frozen=True)
-class Steadiness:
+class Stability:
     """ratio: size of an effect in standard errors, of what is left out where that is least; needed: ratio from which it is
     certain; left_out: `RUNS` or one of `CONDITIONS`.
     """
@@ -66,14 +67,14 @@ def jackknife(steps: FloatArray) -> FloatArray:
     return result
 
 
-def steadiness(refined: Refined, noise: Noise, nothing: Sequence[Mapping[str, float]]) -> list[Steadiness]:
+def stability(refined: Refined, noise: Noise, nothing: Sequence[Mapping[str, float]]) -> list[Stability]:
     """Return how steady each cause is where it is least; nothing: per cause the values at which it is none."""
     first_piece = np.unique(refined.mixed.pieces, return_index=True)[1]
     steps = np.array(left_out_steps(refined))[first_piece]
     out, own = [], places(refined.present)
     for p, none, mine in zip(refined.present, nothing, own, strict=True):
         ratio = _ratio(p, none, jackknife(steps)[mine]) if len(steps) > 1 else 0.0
-        out.append(Steadiness(ratio, needed(len(steps)), RUNS))
+        out.append(Stability(ratio, needed(len(steps)), RUNS))
     if not refined.present:
         return out
     rows = [whitened_rows(run, noise, refined.mixed.columns, len(refined.variances)) for run in refined.runs]
@@ -87,7 +88,7 @@ def steadiness(refined: Refined, noise: Noise, nothing: Sequence[Mapping[str, fl
                 left = _slices_left_out(refined, cells, own[k])
                 if len(left) >= _FEWEST_SLICES:
                     ratio = _ratio(refined.present[k], nothing[k], jackknife(left)[own[k]])
-                    found = Steadiness(ratio, needed(len(left)), axis)
+                    found = Stability(ratio, needed(len(left)), axis)
                     out[k] = min(out[k], found, key=lambda s: s.margin)
     return out
 

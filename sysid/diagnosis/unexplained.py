@@ -51,8 +51,9 @@ _HZ_RATIO: Final = 25.0
 
 
 @dataclass(frozen=True)
-class Leftover:
-    """maps: all axes of all channels; found: those whose structure is significant and large enough to be told; limits: by
+class Unexplained:
+    """maps: all axes of all channels; found: those whose structure is significant and large enough to be reported;
+    limits: by
     what a channel's events are judged; worst_nm: rms of what is structure in the run that has most of it, per channel.
     """
 
@@ -125,7 +126,7 @@ class Leftover:
 def own_changes(dataset: Dataset, refined: Refined) -> FloatArray:
     """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
     differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
-    left over where no cause says it.
+    unexplained where no cause covers it.
     """
     changes = np.array(refined.nuisances)
     changes[:, [g.name == LINE for g in dataset.families]] = 0.0
@@ -213,8 +214,8 @@ def _least(joint: Joint) -> float:
     return (_RELEVANT * joint.rated_torque_nm) ** 2
 
 
-def leftover(dataset: Dataset, refined: Refined, noise: Noise) -> Leftover:
-    """Return what is left over when causes and the runs' own changes are taken out."""
+def unexplained_residual(dataset: Dataset, refined: Refined, noise: Noise) -> Unexplained:
+    """Return the unexplained residual when causes and the runs' own changes are taken out."""
     joints = dataset.joints
     whole = less_nuisances(dataset, refined)
     found = _bursts(dataset, whole, noise)
@@ -238,7 +239,7 @@ def leftover(dataset: Dataset, refined: Refined, noise: Noise) -> Leftover:
     worst = _worst_runs(
         refined.runs, whole, dataset.step_s, maps=significant, events=found, bursts=burst, lines=lines
     )
-    return Leftover(tuple(maps), significant, burst, lines, limits, worst)
+    return Unexplained(tuple(maps), significant, burst, lines, limits, worst)
 
 
 def _worst_runs(

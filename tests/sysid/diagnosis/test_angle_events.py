@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.angle_events import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.events import EventLimits, events
 from jtqd.sysid.diagnosis.gaps import locate
-from jtqd.sysid.diagnosis.passes import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.structure import axis_maps
 from tests.sysid.diagnosis.diagnose_core_helpers import TORSION1, run_data

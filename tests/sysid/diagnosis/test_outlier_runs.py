@@ -13,8 +13,8 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.findings import Findings, OddRun, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.odd_runs import (
+from jtqd.sysid.diagnosis.findings import Findings, OutlierRun, summary_lines, to_mapping
+from jtqd.sysid.diagnosis.outlier_runs import (
     Comparison,
     Deviation,
     apart_from_others,
@@ -78,7 +78,7 @@ def test_one_run_is_named_and_the_joint_is_not(
     change: Callable[[RunTable, JointColumns], JointColumns], what: str, channel: str, size: float
 ) -> None:
     findings = diagnose(changed(runs(), [2], change), {1: PLAIN})
-    (odd,) = findings.odd_runs
+    (odd,) = findings.outlier_runs
     of = "joint 1" if channel == "current_a" else "the sensor"
     assert (odd.run, odd.what) == ("run2", what)
     assert odd.channel == channel or f"{what} of {channel} of {of}" in odd.others, (
@@ -87,7 +87,7 @@ def test_one_run_is_named_and_the_joint_is_not(
     assert abs(odd.value) == pytest.approx(size, rel=0.15)
     assert findings.causes == (), "nothing is wrong with the joint"
     assert findings.verdict == "no_gap"
-    assert any(line.startswith("odd run: run2: ") for line in summary_lines(findings))
+    assert any(line.startswith("outlier run: run2: ") for line in summary_lines(findings))
     (found,) = to_mapping(findings)["odd_runs"]
     assert (found["run"], found["what"], found["joint"]) == ("run2", what, odd.joint)
     assert odd.text in findings.channel_notes
@@ -96,23 +96,23 @@ def test_one_run_is_named_and_the_joint_is_not(
 
 def test_a_gain_is_a_part_of_the_true_value_and_the_other_direction_is_said() -> None:
     """What is regressed on is what was read: 8 % too much is 7.4 % of it, the other direction twice of it."""
-    (more,) = diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).odd_runs
+    (more,) = diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).outlier_runs
     assert more.value == pytest.approx(0.08, abs=0.003)
-    (back,) = diagnose(changed(runs(), [2], backward_sensor), {1: PLAIN}).odd_runs
+    (back,) = diagnose(changed(runs(), [2], backward_sensor), {1: PLAIN}).outlier_runs
     assert (back.run, back.what, back.channel) == ("run2", "gain", "torque_nm")
     assert back.value == pytest.approx(-2.0, abs=0.05)
     assert "torque_nm has the opposite direction of that in the other runs, 1" in back.text
 
 
 def test_what_all_runs_share_is_an_effect_and_days_are_none() -> None:
-    assert diagnose(runs(), {1: PLAIN}).odd_runs == ()
+    assert diagnose(runs(), {1: PLAIN}).outlier_runs == ()
     shared = diagnose(changed(runs(), list(range(COUNT)), current_gain), {1: PLAIN})
-    assert shared.odd_runs == ()
+    assert shared.outlier_runs == ()
     assert "torque_constant" in {name for cause in shared.causes for name in cause.names}
 
 
 def test_two_runs_cannot_tell_which_is_odd() -> None:
-    assert diagnose(changed(runs(count=2), [1], current_gain), {1: PLAIN}).odd_runs == ()
+    assert diagnose(changed(runs(count=2), [1], current_gain), {1: PLAIN}).outlier_runs == ()
 
 
 def test_size_of_a_deviation_beside_the_others() -> None:
@@ -131,7 +131,7 @@ def test_size_of_a_deviation_beside_the_others() -> None:
 
 @pytest.mark.parametrize(("own", "strange", "odd"), [(3.0, 1.0, True), (0.5, 5.0, False)])
 def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: bool) -> None:
-    """A brake that drags in one run is imitated by a delay that explains a little of it: no odd run, however certain."""
+    """A brake that drags in one run is imitated by a delay that explains a little of it: no outlier run, however certain."""
     rng = np.random.default_rng(4)
     rows = [rng.normal(size=(2000, 3)) for _ in range(5)]  # an effect of all, a deviation, the residual
     for k, row in enumerate(rows):
@@ -143,7 +143,7 @@ def test_a_run_is_odd_by_what_sets_it_apart(own: float, strange: float, odd: boo
 
 def test_a_run_that_is_set_apart_by_something_else_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Comparison, "explains_what_is_apart", lambda *_: False)
-    assert diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).odd_runs == ()
+    assert diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).outlier_runs == ()
 
 
 def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
@@ -163,7 +163,7 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
         return replace(c, link_position_rad=None)
 
     idle = changed(changed(runs(), [2], without_power), list(range(COUNT)), one_encoder)
-    assert diagnose(idle, {1: PLAIN}).odd_runs == ()
+    assert diagnose(idle, {1: PLAIN}).outlier_runs == ()
     table = dict(idle)["run2"]
     (signals,), _ = usable_signals([("run2", table)], {1: PLAIN}, (1,))
     gain, zero = Deviation("gain", "current_a", 1, 0.01, ""), Deviation("zero", "current_a", 1, 0.004, "")
@@ -188,9 +188,11 @@ def test_a_gain_is_told_of_the_true_value() -> None:
 
 
 def test_text_says_what_run_and_channel() -> None:
-    odd = OddRun("b.csv", "delay", "current_a", 3, -0.004, 0.0002, "s", ("delay of torque_nm of the sensor",))
+    odd = OutlierRun(
+        "b.csv", "delay", "current_a", 3, -0.004, 0.0002, "s", ("delay of torque_nm of the sensor",)
+    )
     assert odd.text == (
         "b.csv: j3.current_a is 4 ms earlier than in the other runs, which differ by 0.2 ms among themselves, or it differs "
         "in the delay of torque_nm of the sensor: a matter of this run, which is not used"
     )
-    assert Findings("no_gap", (), ("b.csv",), (3,)).odd_runs == ()
+    assert Findings("no_gap", (), ("b.csv",), (3,)).outlier_runs == ()
