@@ -15,8 +15,8 @@ from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.bus.service import nodes_of
 from jtqd.daemon.config import Config
 from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.input_pdos import input_pdos
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import input_pdos
 from jtqd.drivers import nmt
 from jtqd.drivers.emcy import EMCY_BASE
 from jtqd.drivers.frame import (

@@ -87,7 +87,7 @@ _SIZES: Final = {"b": 1, "h": 2, "i": 4, "q": 8, "B": 1, "H": 2, "I": 4, "Q": 8}
 cdef class InputState:
     """State of one synchronous PDO in the intake: frame of this cycle, missing frames, usual arrival.
 
-    pdo: an `InputPdo` (`jtqd.daemon.loop.input_pdos`): `cob_id`, `length`, `layout`, `node_id`, `name`, `age_ns`.
+    pdo: an `InputPdo` (`jtqd.daemon.core.input_pdos`): `cob_id`, `length`, `layout`, `node_id`, `name`, `age_ns`.
     """
 
     def __init__(self, pdo):

@@ -65,7 +65,7 @@ cdef class JointCycle:
 
     Args:
         number: 0 for joint 1, 1 for joint 2, ...
-        inputs: which PDOs are its inputs, and their scaling (`jtqd.daemon.loop.input_pdos.JointInputs`).
+        inputs: which PDOs are its inputs, and their scaling (`jtqd.daemon.core.input_pdos.JointInputs`).
         estimator: its estimator; one that is written in Python is called through the interpreter.
         intake: decides which PDOs are fresh.
         snapshot: counts fallbacks and squared errors.

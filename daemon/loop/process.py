@@ -23,11 +23,7 @@ from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
 from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
-from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint_safety import safety_of
-from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop import realtime
-from jtqd.daemon.loop.input_pdos import (
+from jtqd.daemon.core.input_pdos import (
     JointInputs,
     drive_places,
     first_inputs,
@@ -35,6 +31,10 @@ from jtqd.daemon.loop.input_pdos import (
     joint_temperatures,
     sensor_index,
 )
+from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.joint_safety import safety_of
+from jtqd.daemon.core.schedule import Grid
+from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.referee import judged
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring

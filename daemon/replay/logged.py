@@ -19,8 +19,8 @@ import numpy.typing as npt
 import yaml
 
 from jtqd.daemon.config import Config, as_booted, load_config
+from jtqd.daemon.core.input_pdos import JointInputs
 from jtqd.daemon.logs import LogError, LogFile, iter_messages
-from jtqd.daemon.loop.input_pdos import JointInputs
 from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.recording.schemas import ZEROS
 from jtqd.daemon.shared import cycle_record as cr
@@ -95,7 +95,7 @@ class Setup:
 
     Attributes:
         config: as it was in force; its paths lead into the private directory.
-        inputs: indices of each joint's PDOs among `jtqd.daemon.loop.input_pdos.input_pdos`, and the devices' scaling.
+        inputs: indices of each joint's PDOs among `jtqd.daemon.core.input_pdos.input_pdos`, and the devices' scaling.
         hashes: of the configuration, then joint file and network of each joint.
         versions: of the programs that made the log, e.g. {"numpy": "2.4.6"}.
         machine: kind of processor, e.g. "x86_64"; empty where the log does not say.

@@ -65,7 +65,7 @@ class Measured(NamedTuple):
 
 
 class InputView(NamedTuple):
-    """One input PDO, in the order of `daemon/loop/input_pdos.py`; every 8th cycle is looked at."""
+    """One input PDO, in the order of `daemon/core/input_pdos.py`; every 8th cycle is looked at."""
 
     used_ns: int
     """SYNC of the last cycle seen that used it, CLOCK_MONOTONIC; 0 never."""

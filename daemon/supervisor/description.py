@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 from jtqd.daemon.config import Config, JointConfig
-from jtqd.daemon.loop.input_pdos import input_pdos, names_of_inputs, sensor_index
+from jtqd.daemon.core.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint, start_ticks, versions
 from jtqd.drivers.drive import tpdos_as_json
 

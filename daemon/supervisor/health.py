@@ -13,7 +13,7 @@ from math import hypot, inf, isfinite
 from typing import NamedTuple
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures, names_of_inputs, sensor_index
+from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures, names_of_inputs, sensor_index
 from jtqd.daemon.shared.conditions import (
     DEVIATION_S,
     DEVIATION_SIGMAS,

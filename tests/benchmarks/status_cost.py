@@ -8,8 +8,8 @@ from typing import Any
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.counters import LoopCounters
+from jtqd.daemon.core.input_pdos import input_pdos
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop.input_pdos import input_pdos
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import STATUS_CODES, Snapshot
 

@@ -15,10 +15,10 @@ from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.contact_pdo import NO_RATE, ContactPdo, decode
 from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr

@@ -14,10 +14,10 @@ import pytest
 from jtqd.daemon.core import cycle as cycle_module
 from jtqd.daemon.core.clock import PythonClock
 from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot

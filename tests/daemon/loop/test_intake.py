@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from jtqd.daemon.core.counters import frame_counts
+from jtqd.daemon.core.input_pdos import InputPdo
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop.input_pdos import InputPdo
 
 PAIR = struct.Struct("<ii")
 TPDO1 = InputPdo(0x181, 8, PAIR, 1, "181h drive 1 TPDO1")

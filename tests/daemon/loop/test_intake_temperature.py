@@ -12,8 +12,8 @@ import yaml
 from jtqd.daemon.bus.boot import boot_request, bus_load_of
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.counters import frame_counts
+from jtqd.daemon.core.input_pdos import InputPdo, joint_temperatures
 from jtqd.daemon.core.intake import Intake, JointTemperature
-from jtqd.daemon.loop.input_pdos import InputPdo, joint_temperatures
 from jtqd.daemon.loop.process import joint_inputs
 from tests.shipped_bench import shipped_bench
 

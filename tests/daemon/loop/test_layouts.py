@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.config import Config, as_booted
-from jtqd.daemon.loop.input_pdos import (
+from jtqd.daemon.core.input_pdos import (
     JointInputs,
     drive_places,
     input_pdos,

@@ -4,8 +4,8 @@ import struct
 
 import pytest
 
+from jtqd.daemon.core.input_pdos import InputPdo
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop.input_pdos import InputPdo
 
 PAIR = struct.Struct("<ii")
 DRIVE_1 = InputPdo(0x181, 8, PAIR, 1, "181h drive 1 TPDO1")

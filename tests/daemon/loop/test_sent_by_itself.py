@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jtqd.daemon.core.input_pdos import InputPdo, input_pdos
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.loop.input_pdos import InputPdo, input_pdos
 from jtqd.daemon.replay.replayer import _held
 from jtqd.estimator.checked import ConfigError
 from tests.daemon.loop.one_drive import config_with

@@ -6,8 +6,8 @@ import numpy as np
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.input_pdos import JointInputs, drive_places
 from jtqd.daemon.core.joint import Unwrap
-from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.compare import SETTLED_CYCLES, bits_equal, identity
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.replayer import Pdo, offsets

@@ -19,11 +19,11 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.logs import read_attachments, read_topic
-from jtqd.daemon.loop.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CycleMessages, zeros_of
 from jtqd.daemon.recording.schemas import definitions

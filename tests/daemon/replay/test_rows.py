@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.core import estimate_pdo
+from jtqd.daemon.core.input_pdos import JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.loop.input_pdos import JointInputs, drive_places
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared.counters import COUNTERS

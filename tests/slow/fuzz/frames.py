@@ -11,9 +11,9 @@ from typing import Any
 
 from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake, JointTemperature
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.loop.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.loop.process import run
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
