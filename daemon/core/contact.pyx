@@ -1,4 +1,4 @@
-"""Contacts of all joints of a cycle, after their estimates: who explains whose load, the record's fields, the PDO's bytes.
+"""Contacts of all joints of a cycle, after their estimates: detectors, fields of the record, bytes of the PDO.
 
 The rules of one detector stand in `jtqd.estimator.contact`. Joints that turn one link against each other (`opposed`: 1 and 2, 3 and 4)
 share a detector, in the frame of the first; alone, each has its own.
@@ -7,7 +7,7 @@ share a detector, in the frame of the first; alone, each has its own.
 from libc.math cimport NAN
 from libc.stdint cimport uint8_t
 
-from jtqd.daemon.core.contact_pdo cimport NO_JOINT, encode_contact, told_of
+from jtqd.daemon.core.contact_pdo cimport NO_JOINT, contact_field, encode_contact
 from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.contact cimport (
@@ -43,14 +43,9 @@ cdef class ContactWatch:
         for n in range(self.count):
             least = min(thresholds_nm[n : n + 2]) if opposed and n % 2 == 0 else thresholds_nm[n]
             fill_contact(&self.law[n], least, period_s)
-        self.restart()
-
-    def restart(self):
-        """Forget the past: unknown until it has settled."""
-        cdef int n
         for n in range(MOST_JOINTS):
             restart_contact(&self.state[n])
-            self.told[n] = NO_JOINT
+            self.fields[n] = NO_JOINT
 
     cdef void watch(self, JointState **joints) noexcept nogil:
         """Take the loads of a cycle; sets the joints' fields of the record."""
@@ -64,31 +59,32 @@ cdef class ContactWatch:
                 watch_contact(
                     &self.law[n], s, joints[n + 1].load_nm - joints[n].load_nm, joints[n].sample.motor_position_rad
                 )
-                self.tell(joints[n + 1], n + 1, -s.residual_nm, s.told)
+                self.report(joints[n + 1], n + 1, -s.residual_nm, s.told)
             else:
                 watch_contact(&self.law[n], s, -joints[n].load_nm, joints[n].sample.motor_position_rad)
-            self.tell(joints[n], n, s.residual_nm, s.told)
+            self.report(joints[n], n, s.residual_nm, s.told)
             if s.told == CONTACT_THERE and before != CONTACT_THERE:  # a receiver stops on it, whatever was known before
                 self.begun += 1
             n += 2 if self.opposed else 1
 
-    cdef void tell(self, JointState *joint, int n, double contact_nm, int told) noexcept nogil:
+    cdef void report(self, JointState *joint, int n, double contact_nm, int state) noexcept nogil:
+        """Write one joint's fields of the record and of the PDO."""
         cdef JointBlock *record = &joint.sample
         record.contact_nm = contact_nm
         record.input_flags &= ~(KNOWN | THERE)
-        if told != CONTACT_UNKNOWN:
-            record.input_flags |= KNOWN | THERE if told == CONTACT_THERE else KNOWN
-        self.told[n] = told_of(record.torque_rate_nm_s, contact_nm, told)
+        if state != CONTACT_UNKNOWN:
+            record.input_flags |= KNOWN | THERE if state == CONTACT_THERE else KNOWN
+        self.fields[n] = contact_field(record.torque_rate_nm_s, contact_nm, state)
 
     cdef void take_back(self, JointState **joints) noexcept nogil:
         """Of a cycle whose answer came too late: nothing is known."""
         cdef int n
         for n in range(self.count):
             joints[n].sample.torque_rate_nm_s = NAN
-            self.tell(joints[n], n, NAN, CONTACT_UNKNOWN)
+            self.report(joints[n], n, NAN, CONTACT_UNKNOWN)
 
     cdef void encode(self, uint8_t *data, int pair, int sequence) noexcept nogil:
         """Write the four bytes of joints 2 pair + 1 and 2 pair + 2."""
         encode_contact(
-            data, &self.told[2 * pair], &self.told[2 * pair + 1] if 2 * pair + 1 < self.count else &NO_JOINT, sequence
+            data, &self.fields[2 * pair], &self.fields[2 * pair + 1] if 2 * pair + 1 < self.count else &NO_JOINT, sequence
         )

@@ -2,10 +2,10 @@
 
 from libc.stdint cimport uint8_t
 
-cdef struct ToldContact:  # one joint's part of the PDO
+cdef struct ContactField:  # one joint's part of the PDO
     int rate, code
 
-cdef ToldContact NO_JOINT  # of a joint that there is not
+cdef ContactField NO_JOINT  # of a joint that does not exist
 
-cdef ToldContact told_of(double torque_rate_nm_s, double contact_nm, int told) noexcept nogil
-cdef void encode_contact(uint8_t *data, const ToldContact *one, const ToldContact *two, int sequence) noexcept nogil
+cdef ContactField contact_field(double torque_rate_nm_s, double contact_nm, int state) noexcept nogil
+cdef void encode_contact(uint8_t *data, const ContactField *one, const ContactField *two, int sequence) noexcept nogil

@@ -1,6 +1,6 @@
 """The contact PDOs of node 20h: four bytes for two joints, so that they fit beside everything else at 1 kHz (docs/estimator.md).
 
-COB-ID 3A0h holds joints 1 and 2; 4A0h, of the same form, joints 3 and 4. A joint that there is not has code 0.
+COB-ID 3A0h holds joints 1 and 2; 4A0h, of the same form, joints 3 and 4. A joint that does not exist has code 0.
 
     rate_1 I8 32 Nm/s | rate_2 I8 | contact U8 (two nibbles) | sequence U8
 
@@ -35,40 +35,40 @@ class ContactPdo(NamedTuple):
     sequence: int
 
 
-cdef ToldContact told_of(double torque_rate_nm_s, double contact_nm, int told) noexcept nogil:
+cdef ContactField contact_field(double torque_rate_nm_s, double contact_nm, int state) noexcept nogil:
     """Return one joint's part; a contact without a size is none that is known."""
     cdef double counts = torque_rate_nm_s * PER_NM_S
-    cdef int rate = NONE, code = told
+    cdef int rate = NONE, code = state
     if not isnan(counts):
         rate = <int> nearbyint(-LARGEST if counts < -LARGEST else LARGEST if counts > LARGEST else counts)
-    if told == THERE:
+    if state == THERE:
         if isnan(contact_nm):
             code = UNKNOWN
         elif contact_nm < 0.0:
             code = AGAINST
-    return ToldContact(rate, code)
+    return ContactField(rate, code)
 
 
-cdef void encode_contact(uint8_t *data, const ToldContact *one, const ToldContact *two, int sequence) noexcept nogil:
+cdef void encode_contact(uint8_t *data, const ContactField *one, const ContactField *two, int sequence) noexcept nogil:
     """Write the four bytes; `sequence` is the SYNC counter of the inputs."""
     data[0], data[1] = <uint8_t> <int8_t> one.rate, <uint8_t> <int8_t> two.rate
     data[2] = one.code | two.code << 4
     data[3] = sequence
 
 
-NO_JOINT = told_of(NAN, NAN, NOT_WATCHED)
+NO_JOINT = contact_field(NAN, NAN, NOT_WATCHED)
 
 
-def field(double torque_rate_nm_s, double contact_nm, int told):
-    """Return the integers (rate, code) of one joint; told: as `jtqd.estimator.contact` has it."""
-    cdef ToldContact made = told_of(torque_rate_nm_s, contact_nm, told)
+def field(double torque_rate_nm_s, double contact_nm, int state):
+    """Return the integers (rate, code) of one joint; state: of `jtqd.estimator.contact`."""
+    cdef ContactField made = contact_field(torque_rate_nm_s, contact_nm, state)
     return made.rate, made.code
 
 
 def encode(one, two, int sequence):
     """Encode four bytes from the `field`s of two joints and the SYNC counter of the inputs."""
-    cdef ToldContact first = ToldContact(one[0], one[1])
-    cdef ToldContact second = ToldContact(two[0], two[1])
+    cdef ContactField first = ContactField(one[0], one[1])
+    cdef ContactField second = ContactField(two[0], two[1])
     cdef uint8_t data[4]
     encode_contact(data, &first, &second, sequence)
     return (<const char *> data)[:4]

@@ -17,18 +17,17 @@ from libc.string cimport memset
 from typing import Final
 
 from jtqd.daemon.core.bus cimport Bus, bus_of
-from jtqd.daemon.core.clock cimport Clock
-from jtqd.daemon.core.configured_nodes import ConfiguredNodes
 from jtqd.daemon.core.contact cimport ContactWatch
-from jtqd.daemon.core.counters cimport LoopCounters
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.drivers.frame_socket cimport Frame
-from jtqd.daemon.core.intake cimport Input, Intake, temperature_at
+from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.joint cimport JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record cimport CycleFrames, Header, RecordRing
-from jtqd.daemon.core.schedule cimport Grid, NetworkBudget, WakeUp
+from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
+from jtqd.daemon.core.snapshot cimport SnapshotWriter
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.counters import word_of
 from jtqd.drivers import nmt, own_objects
 from jtqd.drivers.frame_socket import BusDown
 from jtqd.drivers.pdo import SYNC_COB_ID
@@ -59,6 +58,10 @@ cdef uint32_t RESET = cr.FLAG_RESET
 cdef uint32_t SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
 cdef int STALE = st.STALE, OFF = st.OFF, LAST_NUMBER = _LAST_NUMBER
+cdef int BUS_ERRORS = word_of("bus_errors"), OVERRUNS = word_of("overruns")
+cdef int LATCH_RESETS = word_of("latch_resets"), CONTACTS = word_of("contacts")
+cdef int COUNTED[4]  # of the record: what came in its cycle
+COUNTED[:] = [word_of(name) for name in ("stale_inputs", "late_frames", "duplicate_frames", "rejected_frames")]
 cdef int64_t BYTE = 255, MOST_WORK_NS = 0xFFFF_FFFF, MOST_LATE_NS = 0x7FFF_FFFF
 
 cdef uint32_t ESTIMATE[MOST_ESTIMATES]
@@ -76,6 +79,46 @@ cdef Frame _frame(uint32_t can_id, int length) noexcept nogil:
     memset(&frame, 0, sizeof(Frame))
     frame.id, frame.length = can_id, length
     return frame
+
+
+class ConfiguredNodes:
+    """Nodes that restarted, were changed or were absent at the start; they are used after the supervisor configured them.
+
+    Rare, and therefore Python. A configuration counts that the supervisor noted after the node had begun to wait: a node that
+    was only stopped is configured again without ever waiting, and that must not answer for its next restart. And it must have
+    begun after the node's last boot-up message: a node may restart when its boot has just ended and is not yet noted.
+    """
+
+    def __init__(self, snapshot, intake, joints):
+        self._snapshot, self._intake, self._joints = snapshot, intake, joints
+        self._since = {node: snapshot.configured[node] for node in intake.unconfigured}
+        self._doubts = list(snapshot.doubts)
+
+    def look(self):
+        """Check for configured nodes between the inputs of a cycle and its estimate."""
+        intake, snapshot = self._intake, self._snapshot
+        for node in intake.unconfigured:
+            now = snapshot.configured[node]
+            if self._since.setdefault(node, now) == now:
+                continue
+            if snapshot.configured_for[node] != intake.restarts(node):
+                self._since[node] = now
+                continue
+            del self._since[node]
+            intake.configured(node)
+            snapshot.unconfigured[node] = 0
+            for joint in self._joints:
+                if joint.node_id == node:
+                    joint.begin_again()
+                joint.rescale(node, snapshot.factors(node))
+
+    def doubt(self):
+        """Stop using, between two cycles, the nodes that the supervisor found differently configured."""
+        doubts = self._snapshot.doubts
+        for node, (before, now) in enumerate(zip(self._doubts, doubts, strict=True)):
+            if now != before:
+                self._doubts[node] = now
+                self._intake.doubt(node)
 
 
 cdef class Cycle:
@@ -129,10 +172,10 @@ cdef class Cycle:
         if not 1 <= len(joints) <= MOST_JOINTS:
             raise ValueError(f"found {len(joints)} joints, expected 1 to {MOST_JOINTS}")
         limits = safety or [JointSafety() for _ in joints]
-        self.socket, self.intake, self.ring, self.snapshot, self.grid = socket, intake, ring, snapshot, grid
+        self.intake, self.snapshot, self.grid = intake, snapshot, grid
         self.joints = tuple([
             JointCycle(
-                n, inputs, estimator, intake=intake, snapshot=snapshot, period_ns=grid.now.period_ns, safety=limits[n]
+                n, inputs, estimator, intake=intake, snapshot=snapshot, period_ns=grid.period_ns, safety=limits[n]
             )
             for n, (inputs, estimator) in enumerate(joints)
         ])
@@ -144,7 +187,7 @@ cdef class Cycle:
         self.records, self.frames = RecordRing(ring, self.count), CycleFrames(self.count)
         self.frames.begin(self.records.slot())
         self.budget, self.wake_up = NetworkBudget(self.count), WakeUp(wait_ns, deadline_ns)
-        self.counters = LoopCounters(snapshot, intake, self.bus)
+        self.writer = SnapshotWriter(snapshot, intake, self.bus)
         self.counter_overflow, self.heartbeat_cycles = counter_overflow, heartbeat_cycles
         self.estimates = (self.count + 1) // 2
         for n in range(self.estimates):
@@ -159,44 +202,6 @@ cdef class Cycle:
         self.heartbeat_frame.data[0] = OPERATIONAL
         self.configured_nodes = ConfiguredNodes(snapshot, intake, self.joints)
 
-    @property
-    def index(self):
-        """Number of the next cycle, or of the one that is open; missed slots count."""
-        return self.now.index
-
-    @property
-    def counter(self):
-        """SYNC counter of the last cycle."""
-        return self.now.counter
-
-    @property
-    def flags(self):
-        return self.now.flags
-
-    @property
-    def sync_ns(self):
-        return self.now.sync_ns
-
-    @property
-    def late_ns(self):
-        return self.now.late_ns
-
-    @late_ns.setter
-    def late_ns(self, int64_t late_ns):
-        self.now.late_ns = late_ns
-
-    @property
-    def work_start_ns(self):
-        return self.now.work_start_ns
-
-    @work_start_ns.setter
-    def work_start_ns(self, int64_t work_start_ns):
-        self.now.work_start_ns = work_start_ns
-
-    @property
-    def sent_ns(self):
-        return self.now.sent_ns
-
     def go_on(self, int slots, int64_t end_ns):
         """Go through up to `slots` > 0 slots, from that of the grid on; return CYCLE_ENDED, SLOT_PASSED or RUN_ENDED.
 
@@ -208,17 +213,17 @@ cdef class Cycle:
         while slots:
             slots -= 1
             if outcome == ENDED:
-                self.now.index += self.grid.advance(self.clock.monotonic())
-            if self.clock.monotonic() < self.grid.now.slot_ns:
-                self.clock.sleep_until(self.grid.now.slot_ns)
+                self.index += self.grid.advance(self.clock.monotonic())
+            if self.clock.monotonic() < self.grid.slot_ns:
+                self.clock.sleep_until(self.grid.slot_ns)
             at_ns = self.clock.monotonic()
             outcome = PASSED
             if self.grid.too_late(at_ns):
-                self.now.index += self.grid.advance(at_ns) + 1
-                self.grid.now.missed += 1
-            elif end_ns and self.grid.now.slot_ns >= end_ns:
+                self.index += self.grid.advance(at_ns) + 1
+                self.grid.missed += 1
+            elif end_ns and self.grid.slot_ns >= end_ns:
                 return OVER
-            elif self.hold_back():
+            elif self.pass_slot():
                 self.grid.advance(at_ns)
             else:
                 self.begin()
@@ -231,72 +236,69 @@ cdef class Cycle:
 
     cpdef int begin(self) except -1:
         """Drain the frames received after the last cycle was closed, then send SYNC."""
-        cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
         cdef Frame sync
         cdef int64_t before_ns, realtime_ns, at_ns
         cdef int count, n
         self.frames.begin(self.records.slot())
-        now.flags, now.next_flags = now.next_flags, 0
-        now.stale_before, now.late_before = intake.now.stale_inputs, intake.now.late_frames
-        now.duplicate_before, now.rejected_before = intake.now.duplicate_frames, intake.now.rejected_frames
+        self.flags, self.next_flags = self.next_flags, 0
+        for n in range(4):
+            self.counted[n] = intake.counters[COUNTED[n]]
         count = self.receive()
         if count:
             for n in range(count):
                 intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
             intake.drained()
             self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
-        now.counter = now.counter % (self.counter_overflow or LAST_NUMBER) + 1
-        intake.begin_cycle(now.counter)
+        self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
+        intake.begin(self.counter)
         before_ns = self.clock.monotonic()
         realtime_ns = self.clock.realtime()
         at_ns = self.clock.monotonic()
-        if at_ns - before_ns < CLOCK_READING_NS or not now.realtime_offset_ns:
-            now.realtime_offset_ns = realtime_ns - at_ns  # else something came between: the last one is better
+        if at_ns - before_ns < CLOCK_READING_NS or not self.realtime_offset_ns:
+            self.realtime_offset_ns = realtime_ns - at_ns  # else something came between: the last one is better
         sync = _frame(SYNC, 1 if self.counter_overflow else 0)
-        sync.data[0] = now.counter  # of a plain SYNC behind its end: not on the wire, but in our own echo
+        sync.data[0] = self.counter  # of a plain SYNC behind its end: not on the wire, but in our own echo
         self.send(&sync)
-        now.sync_ns = at_ns
-        now.late_ns = at_ns - self.grid.now.slot_ns
+        self.sync_ns = at_ns
+        self.late_ns = at_ns - self.grid.slot_ns
 
     cpdef int gather(self) except -1:
         """Take the inputs: one wake-up for all that have come, then wait for the missing ones until the deadline."""
-        cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
-        cdef int64_t due_ns = now.sync_ns + self.wake_up.now.wait_ns, deadline_ns, left_ns
+        cdef int64_t due_ns = self.sync_ns + self.wake_up.wait_ns, deadline_ns, left_ns
         cdef int count, n
         if due_ns > self.clock.monotonic():
             self.clock.sleep_until(due_ns)
-        now.work_start_ns = self.clock.monotonic()
-        deadline_ns = min(now.sync_ns + self.wake_up.now.deadline_ns, self.grid.end_ns() - LAST_CALL_NS)
+        self.work_start_ns = self.clock.monotonic()
+        deadline_ns = min(self.sync_ns + self.wake_up.deadline_ns, self.grid.end_ns() - LAST_CALL_NS)
         while True:
             count = self.receive()
             if count:
                 for n in range(count):
                     intake.take_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
                 self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
-                if intake.now.missing == 0:
+                if intake.missing == 0:
                     break
             left_ns = deadline_ns - self.clock.monotonic()
             if left_ns <= 0 or not self.bus.wait(left_ns):
                 break
-        if intake.close_cycle():
-            now.flags |= COMPLETE
-            self.wake_up.follow(intake.now.last_delay_ns)
-        for n in range(intake.temperature_count):
-            temperature_at(intake.celsius[n], now.index)
-        if intake.nodes.now.waiting:
+        if intake.close():
+            self.flags |= COMPLETE
+            self.wake_up.follow(intake.last_delay_ns)
+        intake.age_temperatures(self.index)
+        if intake.nodes.waiting:
             self.configured_nodes.look()
-        if intake.now.sync_stamp_ns:
-            now.flags |= SYNC_CONFIRMED
-            now.sync_realtime_ns = intake.now.sync_stamp_ns
+        if intake.sync_stamp_ns:
+            self.flags |= SYNC_CONFIRMED
+            self.sync_realtime_ns = intake.sync_stamp_ns
         else:
-            now.sync_realtime_ns = now.sync_ns + now.realtime_offset_ns
+            self.sync_realtime_ns = self.sync_ns + self.realtime_offset_ns
 
     cpdef int observe(self) except -1:
         """Estimate every joint from the inputs of this cycle; without their networks if there is no time for them."""
-        cdef int64_t sync_ns = self.now.sync_realtime_ns - self.now.realtime_offset_ns
-        cdef bint starting = self.now.index < FIRST_CYCLES, wanted
+        cdef int64_t sync_ns = self.sync_realtime_ns - self.realtime_offset_ns
+        cdef bint starting = self.index < FIRST_CYCLES, wanted
         cdef int n
         self.budget.begin(self.grid.end_ns())
         for n in range(self.count):
@@ -304,97 +306,90 @@ cdef class Cycle:
             (<JointCycle> self.at[n]).observe_at(sync_ns, starting, wanted)
         if self.watches:
             self.contacts.watch(self.states)
-            self.counters.now.contacts += self.contacts.begun
+            self.writer.counters[CONTACTS] += self.contacts.begun
 
     cpdef int publish(self) except -1:
         """Send the estimate PDOs, and the heartbeat when it is due. A late estimate is withdrawn."""
-        cdef CycleState *now = &self.now
         cdef int64_t at_ns = self.clock.monotonic()
         cdef int n
         self.budget.ended(at_ns)
         if at_ns >= self.grid.end_ns():
             self.take_back(STALE)
-            now.flags |= WITHDRAWN
-            self.counters.now.overruns += 1
+            self.flags |= WITHDRAWN
+            self.writer.counters[OVERRUNS] += 1
         if self.send_estimate():
-            now.flags |= PUBLISHED
+            self.flags |= PUBLISHED
             if self.clock.monotonic() < self.grid.end_ns():
-                now.flags |= BEFORE_NEXT_SYNC
-        now.sent_ns = self.clock.monotonic()
+                self.flags |= BEFORE_NEXT_SYNC
+        self.sent_ns = self.clock.monotonic()
         for n in range(self.estimates):
-            self.frames.keep_one(&self.estimate_frames[n], now.sent_ns + now.realtime_offset_ns)
+            self.frames.keep_one(&self.estimate_frames[n], self.sent_ns + self.realtime_offset_ns)
         for n in range(self.contact_pdos):
-            self.frames.keep_one(&self.contact_frames[n], now.sent_ns + now.realtime_offset_ns)
-        if now.index >= now.heartbeat_due:
-            now.heartbeat_due = now.index + self.heartbeat_cycles
+            self.frames.keep_one(&self.contact_frames[n], self.sent_ns + self.realtime_offset_ns)
+        if self.index >= self.heartbeat_due:
+            self.heartbeat_due = self.index + self.heartbeat_cycles
             self.send(&self.heartbeat_frame)
 
     cpdef int record(self) except -1:
         """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
-        cdef CycleState *now = &self.now
         cdef Intake intake = self.intake
         cdef int n
-        cdef int64_t work_ns = self.clock.monotonic() - now.work_start_ns, missed = self.grid.now.missed
+        cdef int64_t work_ns = self.clock.monotonic() - self.work_start_ns, missed = self.grid.missed
         self.frames.record.header[0] = Header(
-            now.index,
-            now.sync_ns,
-            now.sync_realtime_ns,
-            now.flags,
+            self.index,
+            self.sync_ns,
+            self.sync_realtime_ns,
+            self.flags,
             min(work_ns, MOST_WORK_NS),
-            min(now.late_ns, MOST_LATE_NS),
+            min(self.late_ns, MOST_LATE_NS),
             missed,
-            now.counter,
+            self.counter,
             self.frames.count,
             min(self.frames.left_out, BYTE),
-            min(intake.now.stale_inputs - now.stale_before, BYTE),
-            min(intake.now.late_frames - now.late_before, BYTE),
-            min(intake.now.duplicate_frames - now.duplicate_before, BYTE),
-            min(intake.now.rejected_frames - now.rejected_before, BYTE),
+            min(intake.counters[COUNTED[0]] - self.counted[0], BYTE),
+            min(intake.counters[COUNTED[1]] - self.counted[1], BYTE),
+            min(intake.counters[COUNTED[2]] - self.counted[2], BYTE),
+            min(intake.counters[COUNTED[3]] - self.counted[3], BYTE),
             0,
         )
         for n in range(self.count):
             self.frames.record.joints[n] = self.states[n].sample
-            self.counters.count_status(n, self.states[n].status)
-        self.frames.record.tail[0] = now.index
+            self.writer.count_status(n, self.states[n].status)
+        self.frames.record.tail[0] = self.index
         self.records.commit()
-        self.counters.count(now.flags, work_ns, now.late_ns, missed)
-        if now.index % SNAPSHOT_EVERY == 0:
+        self.writer.count(self.flags, work_ns, self.late_ns, missed)
+        if self.index % SNAPSHOT_EVERY == 0:
             self.write_snapshot()
-        now.index += 1
+        self.index += 1
 
-    cpdef bint hold_back(self) except -1:
-        """Return whether this slot must pass without SYNC, to distinguish late frames from lost ones (see intake)."""
+    cpdef bint pass_slot(self) except -1:
+        """Pass the slot without SYNC where the intake asks for it, to tell late frames from lost ones; return whether it did."""
         cdef Intake intake = self.intake
         cdef int count, n
-        if not (intake.gaps.now.wanted or intake.gaps.now.open):
+        if not (intake.gap_wanted or intake.gap.open):
             return False
         count = self.receive()
         if count:
             for n in range(count):
                 intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
-                self.hold(&self.bus.frames[n], self.bus.stamps_ns[n])
+                self.keep_for_next(&self.bus.frames[n], self.bus.stamps_ns[n])
             intake.drained()
-        if not intake.gaps.now.wanted:
+        if not intake.gap_wanted:
             return False
-        intake.gaps.pass_slot()
-        self.now.index += 1
+        intake.pass_slot()
+        self.index += 1
         return True
 
     def skip(self, int64_t slots):
         """Skip missed slots: the index follows the grid, so that a gap in the log shows them."""
-        self.now.index += slots
-
-    @property
-    def complete(self):
-        """Return whether the last cycle had every input that it waited for."""
-        return bool(self.now.flags & COMPLETE)
+        self.index += slots
 
     def reset_faults(self):
         """Release latched faults before the next estimate (`jtq control reset`); the record says so."""
         for joint in self.joints:
             if joint.reset_latch():
-                self.now.next_flags = RESET
-                self.counters.now.latch_resets += 1
+                self.next_flags = RESET
+                self.writer.counters[LATCH_RESETS] += 1
 
     def leave(self):
         """Send a last estimate with status off, so that no receiver keeps the last torque."""
@@ -410,21 +405,20 @@ cdef class Cycle:
         if self.watches:
             self.contacts.take_back(self.states)
 
-    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
-        """Of a slot without a record, what belongs to no cycle goes into the next one that there is."""
+    cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
+        """Of a slot without a record, what belongs to no cycle goes into the next record."""
         cdef Input *state = self.intake.input_with(frame.id)
         if self.intake.temperature_with(frame.id) != NULL or (state != NULL and state.age_ns):
-            self.frames.hold(frame, stamp_ns)
+            self.frames.keep_for_next(frame, stamp_ns)
 
-    cdef int write_snapshot(self) except -1:
+    cpdef int write_snapshot(self) except -1:
         """Copy counters, inputs and the last estimate into the snapshot."""
-        cdef CycleState *now = &self.now
         cdef int n
-        self.counters.last.begin_telling()
-        self.counters.flush_all(self.grid.now.missed, now.sync_ns)
+        self.writer.begin()
+        self.writer.flush(self.grid.missed, self.sync_ns)
         for n in range(self.count):
-            self.counters.tell_learned(n, <JointCycle> self.at[n])
-        self.counters.tell(now.index, now.counter, now.sync_realtime_ns, now.sync_ns, self.states)
+            self.writer.write_learned(n, <JointCycle> self.at[n])
+        self.writer.end(self.index, self.counter, self.sync_realtime_ns, self.sync_ns, self.states)
         return 0
 
     cdef bint send_estimate(self) except -1:
@@ -435,11 +429,11 @@ cdef class Cycle:
         for n in range(self.estimates):
             second = &self.states[2 * n + 1].published if 2 * n + 1 < self.count else &NOBODY
             encode_into(
-                self.estimate_frames[n].data, &self.states[2 * n].published, second, self.now.counter
+                self.estimate_frames[n].data, &self.states[2 * n].published, second, self.counter
             )
             sent = self.send(&self.estimate_frames[n]) and sent
         for n in range(self.contact_pdos):
-            self.contacts.encode(self.contact_frames[n].data, n, self.now.counter)
+            self.contacts.encode(self.contact_frames[n].data, n, self.counter)
             self.send(&self.contact_frames[n])
         return sent
 
@@ -448,7 +442,7 @@ cdef class Cycle:
         try:
             return self.bus.take()
         except BusDown:
-            self.counters.now.bus_errors += 1
+            self.writer.counters[BUS_ERRORS] += 1
             return 0
 
     cdef bint send(self, const Frame *frame) except -1:
@@ -456,5 +450,5 @@ cdef class Cycle:
         try:
             return self.bus.put(frame)
         except BusDown:
-            self.counters.now.bus_errors += 1
+            self.writer.counters[BUS_ERRORS] += 1
             return False

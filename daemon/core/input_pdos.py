@@ -1,7 +1,4 @@
-"""Input PDOs of a configuration: those that the loop waits for, and temperatures that come in between.
-
-What a cycle keeps of them is in `daemon/core/intake.pyx`.
-"""
+"""Input PDOs of a configuration: those that the loop waits for, and temperatures that come in between."""
 
 from __future__ import annotations
 
@@ -10,9 +7,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.core.intake import JointTemperature
 from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
-from jtqd.drivers.drive import CIA_402, DriveObjects, Place, drive_layout, drive_tpdo3, places
+from jtqd.drivers.drive import (
+    CIA_402,
+    TEMPERATURE_C_PER_UNIT,
+    DriveObjects,
+    Place,
+    drive_layout,
+    drive_tpdo3,
+    places,
+)
 from jtqd.drivers.pdo import ACYCLIC, PdoMap
 from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
@@ -39,6 +43,23 @@ class InputPdo:
     node_id: int
     name: str
     age_ns: int = 0
+
+
+@dataclass(frozen=True)
+class TemperaturePdo:
+    """TPDO3 of a drive: the temperature of its joint, at any time.
+
+    Attributes:
+        cob_id, node_id, name: as of an `InputPdo`, e.g. "381h drive 1 TPDO3".
+        life_cycles: slots after which a value is forgotten.
+        c_per_unit: degrees Celsius per unit of its object.
+    """
+
+    cob_id: int
+    node_id: int
+    name: str
+    life_cycles: int
+    c_per_unit: float = TEMPERATURE_C_PER_UNIT
 
 
 @dataclass(frozen=True)
@@ -129,14 +150,17 @@ def sensor_index(config: Config, channel: int | None) -> int | None:
     return first_inputs(config)[-1] + config.sensor.channels.index(channel)
 
 
-def joint_temperatures(config: Config) -> list[JointTemperature]:
-    """Return the temperatures of the joints whose drive sends one, in joint order; all unknown at first."""
+def joint_temperatures(config: Config) -> list[TemperaturePdo]:
+    """Return the temperatures of the joints whose drive sends one, in joint order."""
     life = round(TEMPERATURE_LIFE_S * 1e9 / config.period_ns)
     return [
-        JointTemperature(cob_id, node, f"{cob_id:03X}h drive {node} TPDO3", life, temperature.c_per_unit)
-        for node, cob_id, temperature in (
-            (j.node_id, drive_tpdo3(j.node_id).cob_id, j.temperature)
-            for j in config.joints
-            if j.temperature is not None
+        TemperaturePdo(
+            cob_id := drive_tpdo3(joint.node_id).cob_id,
+            joint.node_id,
+            f"{cob_id:03X}h drive {joint.node_id} TPDO3",
+            life,
+            joint.temperature.c_per_unit,
         )
+        for joint in config.joints
+        if joint.temperature is not None
     ]

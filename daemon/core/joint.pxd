@@ -3,7 +3,7 @@
 from libc.stdint cimport int64_t
 
 from jtqd.daemon.core.estimate_pdo cimport Published
-from jtqd.daemon.core.intake cimport Input, Intake, Temperature
+from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.estimator.sample cimport Estimator, Learned
@@ -50,7 +50,7 @@ cdef class JointCycle:
     cdef const int64_t *current_count
     cdef const int64_t *statusword
     cdef Input *sensor  # NULL without reference
-    cdef Temperature *temperature
+    cdef const double *celsius
     cdef int64_t period_ns
     cdef Scale scale
     cdef double gear_ratio

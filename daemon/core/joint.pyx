@@ -16,8 +16,7 @@ from typing import Final
 
 from jtqd.estimator.block cimport copied
 from jtqd.daemon.core.estimate_pdo cimport Published, field_of, has_torque
-from jtqd.daemon.core.intake cimport Input, InputState, Intake, JointTemperature
-from jtqd.daemon.core.intake import UNKNOWN
+from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.core.status cimport JointRules
@@ -34,6 +33,7 @@ cdef int64_t ACCURACY_NS = STAMP_ACCURACY_NS
 cdef int POSITION = cr.FLAG_POSITION, MOTION = cr.FLAG_MOTION
 cdef int SENSOR = cr.FLAG_SENSOR, TEMPERATURE = cr.FLAG_TEMPERATURE
 cdef int STARTING = st.STARTING, STALE = st.STALE, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
+cdef double UNKNOWN = NAN  # temperature of a joint whose drive sends none
 cdef int NOT_A_REFERENCE = 0x07  # of 6150h: not valid, positive or negative overload
 
 
@@ -81,7 +81,6 @@ cdef class JointCycle:
     """
 
     def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
-        cdef JointTemperature temperature
         cdef JointBlock nothing = JointBlock(
             NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
         )
@@ -92,8 +91,7 @@ cdef class JointCycle:
         self.inputs = inputs
         self.find_inputs(inputs)
         self.sensor = NULL if inputs.sensor is None else _input(intake, inputs.sensor, 2)
-        temperature = UNKNOWN if inputs.temperature is None else intake.temperatures[inputs.temperature]
-        self.temperature = &temperature.known  # the intake, or the module, keeps it
+        self.celsius = &UNKNOWN if inputs.temperature is None else &intake.celsius[<int> inputs.temperature].celsius
         self.motor, self.link = Unwrap(), Unwrap()
         self.now.status = STARTING
         self.now.sample = nothing
@@ -245,8 +243,8 @@ cdef class JointCycle:
     cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil:
         """As `observe`."""
         cdef int flags = self.reference()
-        self.now.sample.temperature_c = self.temperature.celsius
-        if not isnan(self.temperature.celsius):
+        self.now.sample.temperature_c = self.celsius[0]
+        if not isnan(self.celsius[0]):
             flags |= TEMPERATURE
         cdef int n, missing = 0
         for n in range(self.input_count):
@@ -355,10 +353,10 @@ cdef class JointCycle:
 
 cdef Input *_input(Intake intake, int index, int count) except NULL:
     """Return the PDO of this index; raises ValueError when it does not hold at least `count` objects."""
-    cdef InputState state = intake.states[index]
-    if state.input.field_count < count:
-        raise ValueError(f"{state.pdo.name}: found {state.input.field_count} objects, expected {count}")
-    return &state.input
+    cdef Input *state = &intake.inputs[index]
+    if state.field_count < count:
+        raise ValueError(f"{intake.pdos[index].name}: found {state.field_count} objects, expected {count}")
+    return state
 
 
 cdef const int64_t *_number_at(Intake intake, place) except NULL:

@@ -45,7 +45,7 @@ cdef class RecordRing:
     cdef Record slot(self) noexcept nogil
     cdef void commit(self) noexcept nogil
 
-cdef struct HeldFrames:  # of slots without a record
+cdef struct KeptFrames:  # of slots without a record
     int64_t count
     Frame frames[MOST_FRAMES]
     int64_t stamps_ns[MOST_FRAMES]
@@ -54,8 +54,8 @@ cdef class CycleFrames:
     cdef Layout layout
     cdef Record record
     cdef readonly int count, left_out
-    cdef HeldFrames held
+    cdef KeptFrames kept
     cdef void begin(self, Record record) noexcept nogil
-    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
+    cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
     cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil
     cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil

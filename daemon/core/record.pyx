@@ -105,19 +105,19 @@ cdef class CycleFrames:
 
     cdef void begin(self, Record record) noexcept nogil:
         """Store the next frames in this record."""
-        cdef int stored = min(self.held.count, self.layout.frame_capacity)
+        cdef int stored = min(self.kept.count, self.layout.frame_capacity)
         self.record = record
         self.count = self.left_out = 0
-        self.keep(self.held.frames, self.held.stamps_ns, stored)
-        self.left_out = self.held.count - stored
-        self.held.count = 0
+        self.keep(self.kept.frames, self.kept.stamps_ns, stored)
+        self.left_out = self.kept.count - stored
+        self.kept.count = 0
 
-    cdef void hold(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
-        """Keep a frame of a slot without a record for the next one that has one."""
-        if self.held.count < self.layout.frame_capacity:
-            self.held.frames[self.held.count] = frame[0]
-            self.held.stamps_ns[self.held.count] = stamp_ns
-        self.held.count += 1
+    cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
+        """Keep a frame of a slot without a record for the next record."""
+        if self.kept.count < self.layout.frame_capacity:
+            self.kept.frames[self.kept.count] = frame[0]
+            self.kept.stamps_ns[self.kept.count] = stamp_ns
+        self.kept.count += 1
 
     cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil:
         """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""

@@ -1,9 +1,11 @@
-"""Schedule of a cycle: the time grid, when to wake up for the inputs, and whether there is time for the networks.
+"""Clocks and schedule of a cycle: the time grid, when to wake up for the inputs, and whether there is time for the networks.
 
-Pure: times are arguments, integer ns of CLOCK_MONOTONIC.
+Times are integer ns: CLOCK_MONOTONIC of the grid, CLOCK_REALTIME of the kernel's stamps. All but the clocks is pure.
 """
 
+from libc.errno cimport EINTR
 from libc.stdint cimport int64_t
+from posix.time cimport CLOCK_MONOTONIC, CLOCK_REALTIME, clock_gettime, clock_nanosleep, timespec
 
 from typing import Final
 
@@ -22,6 +24,61 @@ _SETTLE_CYCLES: Final = 16
 cdef int64_t STEP_NS = _STEP_NS, MARGIN_NS = _MARGIN_NS, SHORTEST_NS = _SHORTEST_NS
 cdef int64_t RESERVE_NS = RESERVED_NS, FORGET = FORGET_CYCLES, SETTLE = _SETTLE_CYCLES
 
+cdef enum:
+    TIMER_ABSTIME = 1
+cdef int64_t NS_PER_S = 1_000_000_000
+
+
+cdef int64_t _read(int clock) noexcept nogil:
+    cdef timespec now
+    clock_gettime(clock, &now)
+    return now.tv_sec * NS_PER_S + now.tv_nsec
+
+
+cdef class Clock:
+    """The clocks of the machine."""
+
+    cdef int64_t monotonic(self) except? -1:
+        """Return CLOCK_MONOTONIC."""
+        return _read(CLOCK_MONOTONIC)
+
+    cdef int64_t realtime(self) except? -1:
+        """Return CLOCK_REALTIME."""
+        return _read(CLOCK_REALTIME)
+
+    cdef int sleep_until(self, int64_t due_ns) except -1:
+        """Sleep until `due_ns` (CLOCK_MONOTONIC); other threads may run meanwhile."""
+        cdef timespec due
+        due.tv_sec, due.tv_nsec = due_ns // NS_PER_S, due_ns % NS_PER_S
+        with nogil:
+            while clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &due, NULL) == EINTR:
+                pass
+        return 0
+
+
+cdef class PythonClock(Clock):
+    """Clocks of a test: `monotonic_ns`, `time_ns` and `sleep` of module `time` or of what takes its place."""
+
+    cdef object time
+
+    def __init__(self, time):
+        self.time = time
+
+    cdef int64_t monotonic(self) except? -1:
+        """Return CLOCK_MONOTONIC."""
+        return self.time.monotonic_ns()
+
+    cdef int64_t realtime(self) except? -1:
+        """Return CLOCK_REALTIME."""
+        return self.time.time_ns()
+
+    cdef int sleep_until(self, int64_t due_ns) except -1:
+        """Sleep until `due_ns`."""
+        cdef int64_t left_ns = due_ns - self.monotonic()
+        if left_ns > 0:
+            self.time.sleep(left_ns * 1e-9)
+        return 0
+
 
 cdef class Grid:
     """Absolute time grid of the loop, slots at `start + n * period`; missed ones are counted and skipped, never made up.
@@ -31,55 +88,32 @@ cdef class Grid:
 
     Attributes:
         slot_ns: time of the current slot.
+        period_ns: between two slots.
         missed: slots skipped so far.
     """
 
     def __init__(self, int64_t start_ns, int64_t period_ns):
-        self.now = GridState(start_ns, period_ns, 0)
-
-    @property
-    def slot_ns(self):
-        return self.now.slot_ns
-
-    @slot_ns.setter
-    def slot_ns(self, int64_t slot_ns):
-        self.now.slot_ns = slot_ns
-
-    @property
-    def period_ns(self):
-        return self.now.period_ns
-
-    @period_ns.setter
-    def period_ns(self, int64_t period_ns):
-        self.now.period_ns = period_ns
-
-    @property
-    def missed(self):
-        return self.now.missed
-
-    @missed.setter
-    def missed(self, int64_t missed):
-        self.now.missed = missed
+        self.slot_ns, self.period_ns = start_ns, period_ns
 
     cpdef int64_t advance(self, int64_t now_ns) noexcept:
         """Go to the next slot that can still be begun in time at `now_ns`; return the slots skipped on the way."""
-        cdef int64_t half_ns = self.now.period_ns // 2, late_ns, skipped
-        self.now.slot_ns += self.now.period_ns
-        late_ns = now_ns - self.now.slot_ns
+        cdef int64_t half_ns = self.period_ns // 2, late_ns, skipped
+        self.slot_ns += self.period_ns
+        late_ns = now_ns - self.slot_ns
         if late_ns <= half_ns:
             return 0
-        skipped = (late_ns + half_ns) // self.now.period_ns
-        self.now.slot_ns += skipped * self.now.period_ns
-        self.now.missed += skipped
+        skipped = (late_ns + half_ns) // self.period_ns
+        self.slot_ns += skipped * self.period_ns
+        self.missed += skipped
         return skipped
 
     cpdef bint too_late(self, int64_t now_ns) noexcept:
         """Return whether the current slot's time has passed by more than half a period (late wake-up)."""
-        return now_ns - self.now.slot_ns > self.now.period_ns // 2
+        return now_ns - self.slot_ns > self.period_ns // 2
 
     cdef int64_t end_ns(self) noexcept:
         """Return when the next SYNC is due."""
-        return self.now.slot_ns + self.now.period_ns
+        return self.slot_ns + self.period_ns
 
 
 cdef class WakeUp:
@@ -91,22 +125,14 @@ cdef class WakeUp:
     """
 
     def __init__(self, int64_t wait_ns, int64_t deadline_ns):
-        self.now = WakeUpState(wait_ns, deadline_ns)
-
-    @property
-    def wait_ns(self):
-        return self.now.wait_ns
-
-    @property
-    def deadline_ns(self):
-        return self.now.deadline_ns
+        self.wait_ns, self.deadline_ns = wait_ns, deadline_ns
 
     cpdef void follow(self, int64_t last_delay_ns) noexcept:
         """Learn from a complete cycle: the last input arrived this long after its SYNC."""
-        if last_delay_ns + MARGIN_NS > self.now.wait_ns:
-            self.now.wait_ns = min(self.now.wait_ns + 99 * STEP_NS, self.now.deadline_ns - MARGIN_NS)
+        if last_delay_ns + MARGIN_NS > self.wait_ns:
+            self.wait_ns = min(self.wait_ns + 99 * STEP_NS, self.deadline_ns - MARGIN_NS)
         else:
-            self.now.wait_ns = max(self.now.wait_ns - STEP_NS, SHORTEST_NS)
+            self.wait_ns = max(self.wait_ns - STEP_NS, SHORTEST_NS)
 
 
 cdef class NetworkBudget:
@@ -129,31 +155,29 @@ cdef class NetworkBudget:
             raise ValueError(f"found {joints} joints, expected 1 to {MOST_JOINTS}")
         self.joints = joints
         for n in range(joints):
-            self.now.costs[n].wanted = True
+            self.costs[n].wanted = True
 
     cpdef void begin(self, int64_t next_sync_ns) noexcept:
         """Begin the estimates of a cycle; `next_sync_ns`: due time of the next SYNC."""
-        cdef BudgetState *budget = &self.now
         cdef int n
-        budget.end_ns = next_sync_ns - RESERVE_NS
-        budget.left_ns = 0
+        self.latest_ns = next_sync_ns - RESERVE_NS
+        self.left_ns = 0
         for n in range(self.joints):
-            budget.left_ns += budget.costs[n].cost_ns
+            self.left_ns += self.costs[n].cost_ns
 
     cpdef bint wanted(self, int joint, int64_t now_ns) noexcept:
         """Return whether joint number `joint` (from 0 on), whose estimate begins, may use its network."""
-        cdef BudgetState *budget = &self.now
-        cdef Cost *cost = &budget.costs[joint]
+        cdef Cost *cost = &self.costs[joint]
         if joint:
-            _took(cost - 1, now_ns - budget.since_ns)
-        budget.since_ns = now_ns
-        cost.wanted = now_ns + budget.left_ns <= budget.end_ns
-        budget.left_ns -= cost.cost_ns
+            _took(cost - 1, now_ns - self.since_ns)
+        self.since_ns = now_ns
+        cost.wanted = now_ns + self.left_ns <= self.latest_ns
+        self.left_ns -= cost.cost_ns
         return cost.wanted
 
     cpdef void ended(self, int64_t now_ns) noexcept:
         """Note the end of the last joint's estimate."""
-        _took(&self.now.costs[self.joints - 1], now_ns - self.now.since_ns)
+        _took(&self.costs[self.joints - 1], now_ns - self.since_ns)
 
 
 cdef void _took(Cost *joint, int64_t spent_ns) noexcept nogil:

@@ -21,7 +21,6 @@ from typing import Any
 
 from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
 from jtqd.daemon.core.contact import ContactWatch
-from jtqd.daemon.core.counters import frame_counts
 from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
 from jtqd.daemon.core.input_pdos import (
     JointInputs,
@@ -34,6 +33,7 @@ from jtqd.daemon.core.input_pdos import (
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint_safety import safety_of
 from jtqd.daemon.core.schedule import Grid
+from jtqd.daemon.core.snapshot import frame_counts
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.referee import judged
 from jtqd.daemon.shared.cycle_record import layout_of
@@ -216,6 +216,8 @@ def run(
     stop: Callable[[], bool],
     end_ns: int | None = None,
     duties: Callable[[], None] | None = None,
+    *,
+    slots: int = SLOTS,
 ) -> None:
     """Cycle until `stop()` or `end_ns`.
 
@@ -223,11 +225,11 @@ def run(
         cycle, grid: state of the loop; the first cycle is that of the grid's slot.
         stop: asked before a cycle.
         end_ns: no cycle begins from here on (CLOCK_MONOTONIC); None: without end.
-        duties: called in the pause after every `SLOTS` slots.
+        duties: called in the pause after every `slots` slots.
     """
     passed = False
     while not stop():
-        outcome = cycle.go_on(1 if passed or duties is None else SLOTS, end_ns or 0)
+        outcome = cycle.go_on(1 if passed or duties is None else slots, end_ns or 0)
         if outcome == RUN_ENDED:
             break
         passed = outcome == SLOT_PASSED  # then the duties wait for the very next cycle
@@ -263,7 +265,7 @@ def build_cycle(
     )
     intake = Intake(input_pdos(config), joint_temperatures(config))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
-        intake.absent(node)
+        intake.leave_out(node)
     cycle = Cycle(
         socket,
         intake,

@@ -347,14 +347,12 @@ class Replayer:
         """
         celsius: list[FloatArray] = []
         happens: dict[int, list[Callable[[], object]]] = {}
-        for index, (each, events) in enumerate(
-            zip(self._intake.temperatures, frames.temperatures, strict=True)
-        ):
+        for index, events in enumerate(frames.temperatures):
             number = next(n for n, inputs in enumerate(self._setup.inputs) if inputs.temperature == index)
             known = (joints[number]["input_flags"] & FLAG_TEMPERATURE) != 0
             celsius.append(np.where(known, joints[number]["temperature_c"], np.nan))
             for row, frame in events:
-                happens.setdefault(row, []).append(partial(each.receive, bytearray(frame), 0))
+                happens.setdefault(row, []).append(partial(self._intake.receive_temperature, index, frame))
         return celsius, happens
 
     def _marks(

@@ -10,7 +10,7 @@ import numpy as np
 from jtqd.daemon.core.cycle import STARTING_CYCLES
 from jtqd.daemon.core.contact cimport ContactWatch
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into, field_of
-from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature, temperature_at
+from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature
 from jtqd.daemon.core.joint cimport JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.estimator import status as st
@@ -144,9 +144,9 @@ cdef class CycleRows:
             self.intake.inputs[n].fresh = self.fresh[n, row]
             for m in range(MOST_FIELDS):
                 self.intake.inputs[n].values[m] = self.values[n, m, row]
+        self.intake.age_temperatures(self.cycle[row])
         for n in range(self.intake.temperature_count):
-            temperature, said = self.intake.celsius[n], self.celsius[n, row]
-            temperature_at(temperature, self.cycle[row])
+            temperature, said = &self.intake.celsius[n], self.celsius[n, row]
             if temperature.celsius != said and not (isnan(said) and isnan(temperature.celsius)):
                 self.temperatures_from_log += 1
                 temperature.celsius = said

@@ -153,8 +153,8 @@ _MAGIC = 0x4A54_5144_5354_410A  # "JTQDSTA", layout 10
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH4d")
-_ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
-_MEASURED = struct.Struct("<6d")
+ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
+MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
 PAST_WORDS = 192
@@ -165,9 +165,9 @@ _ORDERS_OFFSET = _HEAD.size
 _COUNTERS_OFFSET = _ORDERS_OFFSET + 5 * 8
 _SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
 _ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
-ESTIMATE_SIZE = _ESTIMATE.size + MOST_JOINTS * (JOINT.size + _MEASURED.size)
-_MEASURED_OFFSET = _ESTIMATE_OFFSET + _ESTIMATE.size + MOST_JOINTS * JOINT.size
-_ERRORS_OFFSET = _MEASURED_OFFSET + MOST_JOINTS * _MEASURED.size
+ESTIMATE_SIZE = ESTIMATE.size + MOST_JOINTS * (JOINT.size + MEASURED.size)
+_MEASURED_OFFSET = _ESTIMATE_OFFSET + ESTIMATE.size + MOST_JOINTS * JOINT.size
+_ERRORS_OFFSET = _MEASURED_OFFSET + MOST_JOINTS * MEASURED.size
 _WORK_OFFSET = _ERRORS_OFFSET + MOST_JOINTS * 3 * 8
 _LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
 _STATUS_OFFSET = _LATE_OFFSET + 8 * LATE_BINS
@@ -194,7 +194,7 @@ class SnapshotError(Exception):
 
 
 class Snapshot:
-    """Writer's side, one per loop: the memory that `daemon/core/counters.pyx` writes into.
+    """Writer's side, one per loop: the memory that `daemon/core/snapshot.pyx` writes into.
 
     It has room for four joints; `joints` says how many there are.
 
@@ -291,14 +291,14 @@ class SnapshotReader:
         memory = self._memory
         _, pid, period_s, worst_load, count = _HEAD.unpack_from(memory, 0)
         block = memory[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
-        index, sync_counter, realtime_ns, monotonic_ns, *since = _ESTIMATE.unpack_from(block, 0)
+        index, sync_counter, realtime_ns, monotonic_ns, *since = ESTIMATE.unpack_from(block, 0)
         numbers = range(count)
         joints = tuple(
-            JointView._make(JOINT.unpack_from(block, _ESTIMATE.size + n * JOINT.size)) for n in numbers
+            JointView._make(JOINT.unpack_from(block, ESTIMATE.size + n * JOINT.size)) for n in numbers
         )
         first = _MEASURED_OFFSET - _ESTIMATE_OFFSET
         measured = tuple(
-            Measured._make(_MEASURED.unpack_from(block, first + n * _MEASURED.size)) for n in numbers
+            Measured._make(MEASURED.unpack_from(block, first + n * MEASURED.size)) for n in numbers
         )
         words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
         cycles = struct.unpack_from(f"<{count * STATUS_CODES}Q", memory, _STATUS_OFFSET)

@@ -38,7 +38,7 @@ class Staged:
         cycle, grid = self.cycle, self.grid
         while grid.slot_ns < end_ns:
             time.sleep(max(0, grid.slot_ns - time.monotonic_ns()) * 1e-9)
-            if not (grid.too_late(time.monotonic_ns()) or cycle.hold_back()):
+            if not (grid.too_late(time.monotonic_ns()) or cycle.pass_slot()):
                 self.cycles.append({stage: self._timed(stage) for stage in STAGES if stage != "sleep"})
                 asleep = max(0, cycle.work_start_ns - self._gather_ns)
                 self.cycles[-1]["gather"] -= asleep

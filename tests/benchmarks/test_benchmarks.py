@@ -13,7 +13,7 @@ import pytest
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core import cycle as cycle_module
 from jtqd.daemon.core import estimate_pdo
-from jtqd.daemon.core.clock import PythonClock
+from jtqd.daemon.core.schedule import PythonClock
 from jtqd.daemon.loop import process as loop
 from jtqd.drivers.frame import FRAME, pack
 from tests.benchmarks import c_program, long_run, traffic

@@ -10,13 +10,13 @@ import pytest
 from jtqd.daemon.bus.errors import OwnErrors
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader, View
 from jtqd.daemon.supervisor.summary import Summary
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.status import INVALID
+from tests.daemon.snapshots import EstimateWriter
 from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import JTQD_EDS
 
@@ -76,7 +76,7 @@ def node(tmp_path: Path) -> tuple[ObjectStore, Snapshot, SnapshotReader]:
 
 def test_the_latched_faults_are_an_object(node: tuple[ObjectStore, Snapshot, SnapshotReader]) -> None:
     store, snapshot, _ = node
-    LastEstimate(snapshot).write(8, 8, 1, (faulty(JUMP, JUMP | faults.DRIVE_FAULT), WELL))
+    EstimateWriter(snapshot).write(8, 8, 1, (faulty(JUMP, JUMP | faults.DRIVE_FAULT), WELL))
     assert store.read(0x2104, 1) == struct.pack("<H", JUMP | 0x100)
     assert store.read(0x2104, 2) == bytes(2)
 

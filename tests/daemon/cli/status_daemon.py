@@ -10,11 +10,11 @@ from rich.console import Console
 from jtqd.daemon.cli.running import Daemon, Watch
 from jtqd.daemon.cli.status import StatusView
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.runtime_dir import About, write_about
 from jtqd.daemon.shared.snapshot import INPUT, Snapshot
 from jtqd.daemon.supervisor.description import about
+from tests.daemon.snapshots import EstimateWriter
 
 NAN = float("nan")
 ONE = (-117.94, 0.48, NAN, -117.0, -117.9, -118.48, 0x27, 2, 0, 15, 0, -118.48, 1.25, NAN, NAN)
@@ -33,7 +33,7 @@ def running(root: Path, bus: str = "vcan0", log: Path | None = None, *, cycling:
     content = described(bus, log)
     write_about(directory, content)
     snapshot = Snapshot(directory / "snapshot", 1e-3, 0.848)
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     for index in (0, 8):
         monotonic = time.monotonic_ns() + (60_000_000_000 if cycling else -10_000_000_000)
         told.write(

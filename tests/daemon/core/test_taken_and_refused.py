@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.core.input_pdos import InputPdo
-from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.input_pdos import InputPdo, TemperaturePdo
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record import RecordRing
@@ -49,7 +49,7 @@ def test_integers_of_every_width_and_sign(layout: str, values: tuple[int, ...]) 
     intake.begin(1)
     data = form.pack(*values)
     intake.take(bytearray(struct.pack("<IB3x8s", 0x181, form.size, data)), [5], [False], 1)
-    assert intake.values(0) == values == intake.views()[0].unpack(data)
+    assert intake.values(0) == values
 
 
 @pytest.mark.parametrize("layout", ["<f", "<d", "<4s", "<bbbbbbbbb"])
@@ -65,7 +65,7 @@ def test_more_inputs_than_there_is_room_for_are_refused() -> None:
     with pytest.raises(ValueError, match="has more than 11 bits"):
         Intake([one(0x18000, "<i")])
     with pytest.raises(ValueError, match="200 is no node-ID"):
-        Intake([PDO], [JointTemperature(0x381, 200, "x", 5)])
+        Intake([PDO], [TemperaturePdo(0x381, 200, "x", 5)])
     with pytest.raises(ValueError, match="128 is no node-ID"):
         Intake([PDO]).configured(128)
 

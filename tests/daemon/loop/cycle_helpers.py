@@ -12,12 +12,11 @@ from typing import Any
 import pytest
 
 from jtqd.daemon.core import cycle as cycle_module
-from jtqd.daemon.core.clock import PythonClock
 from jtqd.daemon.core.cycle import Cycle
-from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
-from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, drive_places
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.schedule import Grid
+from jtqd.daemon.core.schedule import Grid, PythonClock
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -153,7 +152,7 @@ def make(
     tmp_path: Path,
     script: Callable[[int], list[bytes]],
     *,
-    temperatures: Sequence[JointTemperature] = (),
+    temperatures: Sequence[TemperaturePdo] = (),
     estimators: Sequence[Any] | None = None,
     safety: Sequence[JointSafety] | None = None,
     slots: int = 64,

@@ -48,8 +48,8 @@ class OneDrive:
         self.config, joint = config, config.joints[0]
         self.number_of = number_of or NUMBER_OF
         self.intake = Intake(input_pdos(config))
-        self.intake.absent(2)
-        self.intake.absent(3)
+        self.intake.leave_out(2)
+        self.intake.leave_out(3)
         inputs = JointInputs(drive_places(0, joint.tpdos, joint.objects), None, **SCALE)
         estimator = JointEstimator(load_joint(shipped("joint1.yaml")), EstimatorSettings(method="efficiency"))
         self.cycle = JointCycle(0, inputs, estimator, intake=self.intake, snapshot=_Counters(), period_ns=MS)

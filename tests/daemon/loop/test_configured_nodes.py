@@ -13,10 +13,9 @@ import pytest
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.configured_nodes import ConfiguredNodes
-from jtqd.daemon.core.counters import LoopCounters
-from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.cycle import ConfiguredNodes, Cycle
 from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.snapshot import SnapshotWriter
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from tests.daemon.loop.cycle_helpers import I32, PDOS, ExactTime, ScriptedSocket, frame, inputs, make, turn
@@ -69,7 +68,7 @@ def test_a_node_that_restarted_waits_for_a_configuration_that_was_noted_since(lo
 
 def test_a_boot_that_began_before_the_last_restart_does_not_count(loop: Loop) -> None:
     loop.restart()
-    began = loop.cycle.intake.nodes.restarts[1]
+    began = loop.cycle.intake.restarts(1)
     loop.restart()
     loop.supervisor.note_configured(1, began)
     turn(loop.cycle, 20)
@@ -115,7 +114,7 @@ def test_a_sensor_that_restarts_leaves_the_joints_alone(loop: Loop) -> None:
 
 
 def test_the_scaling_of_a_node_that_was_absent_comes_with_its_configuration(loop: Loop) -> None:
-    loop.cycle.intake.absent(3)
+    loop.cycle.intake.leave_out(3)
     loop.supervisor.note_factors(3, (0.5,))
     turn(loop.cycle, 2)
     (one, _), before = loop.cycle.joints, 0.001
@@ -242,7 +241,7 @@ class Events:
         self.snapshot = Snapshot(directory / "snapshot", 1e-3, 0.8)
         self.reader = SnapshotReader(directory / "snapshot", supervisor=True)
         self.intake = Intake(PDOS)
-        self.counters = LoopCounters(self.snapshot, self.intake, ScriptedSocket(lambda _: []))  # type: ignore[arg-type]
+        self.writer = SnapshotWriter(self.snapshot, self.intake, ScriptedSocket(lambda _: []))  # type: ignore[arg-type]
         self.configured = ConfiguredNodes(self.snapshot, self.intake, [])
         scaling = {"scaling": {"k": 1.0}, "gear_ratio": 100.0, "serial": 7, "notes": []}
         self.node = scaling
@@ -276,7 +275,7 @@ class Events:
 
     def loop_tells(self) -> None:
         """The loop tells what it knows: every eighth cycle."""
-        self.counters.flush(0, 0)
+        self.writer.flush(0, 0)
 
     def supervisor_looks(self) -> None:
         """The supervisor looks."""

@@ -11,10 +11,11 @@ import yaml
 
 from jtqd.daemon.bus.boot import boot_request, bus_load_of
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.counters import frame_counts
-from jtqd.daemon.core.input_pdos import InputPdo, joint_temperatures
-from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.input_pdos import InputPdo, TemperaturePdo, joint_temperatures
+from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.snapshot import frame_counts
 from jtqd.daemon.loop.process import joint_inputs
+from tests.daemon.snapshots import counted
 from tests.shipped_bench import shipped_bench
 
 POSITION = InputPdo(0x181, 8, struct.Struct("<ii"), 1, "181h drive 1 TPDO1")
@@ -34,8 +35,7 @@ class Line:
     """An intake with one input and one temperature, cycle by cycle."""
 
     def __init__(self) -> None:
-        self.temperature = JointTemperature(0x381, 1, NAME, 2000)
-        self.intake = Intake([POSITION], [self.temperature])
+        self.intake = Intake([POSITION], [TemperaturePdo(0x381, 1, NAME, 2000)])
         self.cycle_number = 0
 
     def cycle(self, *frames: bytes, before: tuple[bytes, ...] = (), late: tuple[bytes, ...] = ()) -> bool:
@@ -52,7 +52,7 @@ class Line:
             "nobody waits for a temperature"
         )
         complete = intake.close()
-        self.temperature.at(number)
+        intake.age_temperatures(number)
         if late:
             intake.drain(
                 bytearray(b"".join(late)), [MS * (number + 2)] * len(late), [False] * len(late), len(late)
@@ -61,7 +61,7 @@ class Line:
 
     @property
     def value(self) -> float:
-        return self.temperature.celsius
+        return self.intake.temperature(0)
 
 
 @pytest.fixture
@@ -72,8 +72,8 @@ def line() -> Line:
 def test_unknown_until_the_first_frame_and_complete_without_any(line: Line) -> None:
     assert all(line.cycle() for _ in range(5000))
     assert math.isnan(line.value)
-    assert line.temperature.lost == 0, "what never came was not lost"
-    assert line.intake.stale_inputs == 0
+    assert counted(line.intake)["temperatures_lost"] == 0, "what never came was not lost"
+    assert counted(line.intake)["stale_inputs"] == 0
 
 
 @pytest.mark.parametrize("when", ["frames", "before", "late"])
@@ -82,13 +82,13 @@ def test_it_counts_whenever_it_comes(line: Line, when: str) -> None:
     assert line.cycle(*frames) if when == "frames" else line.cycle(**{when: frames})
     line.cycle()
     assert line.value == pytest.approx(-25.3)
-    assert (line.intake.late_frames, line.intake.duplicate_frames, line.intake.unknown_frames) == (0, 0, 0)
+    assert not any(counted(line.intake).values())
 
 
 def test_the_newest_of_several_counts(line: Line) -> None:
     line.cycle(celsius(250), celsius(251), celsius(249), before=(celsius(300),))
     assert line.value == pytest.approx(24.9)
-    assert line.intake.duplicate_frames == 0
+    assert counted(line.intake)["duplicate_frames"] == 0
 
 
 def test_lost_after_two_seconds_and_back_with_the_next_frame(line: Line) -> None:
@@ -109,14 +109,14 @@ def test_a_frame_in_time_prolongs_it(line: Line) -> None:
     for n in range(6000):
         line.cycle(*([celsius(250)] if n % 1900 == 0 else []))
         assert line.value == 25.0
-    assert line.temperature.lost == 0
+    assert counted(line.intake)["temperatures_lost"] == 0
 
 
 def test_not_measured_is_unknown_at_once_and_no_loss(line: Line) -> None:
     line.cycle(celsius(250))
     line.cycle(celsius(-0x8000))
     assert math.isnan(line.value)
-    assert (line.temperature.lost, line.temperature.rejected) == (0, 0)
+    assert frame_counts(line.intake)[NAME] == {"late": 0, "lost": 0, "duplicate": 0, "rejected": 0}
     line.cycle(celsius(-0x7FFF))
     assert line.value == pytest.approx(-3276.7)
 
@@ -127,14 +127,14 @@ def test_another_length_is_rejected_and_counted(line: Line, length: int) -> None
     assert line.cycle(frame(0x381, struct.pack("<h", 999), length))
     line.cycle(late=(frame(0x381, struct.pack("<h", 999), length),))
     assert line.value == 25.0
-    assert frame_counts(line.intake)[NAME]["rejected"] == line.intake.rejected_frames == 2
+    assert frame_counts(line.intake)[NAME]["rejected"] == counted(line.intake)["rejected_frames"] == 2
 
 
 @pytest.mark.parametrize("flag", [0x8000_0000, 0x4000_0000, 0xC000_0000])
 def test_29_bit_and_remote_frames_are_rejected_and_named(line: Line, flag: int) -> None:
     line.cycle(frame(0x381 | flag, struct.pack("<h", 999)))
     assert math.isnan(line.value)
-    assert frame_counts(line.intake)[NAME]["rejected"] == line.intake.rejected_frames == 1
+    assert frame_counts(line.intake)[NAME]["rejected"] == counted(line.intake)["rejected_frames"] == 1
 
 
 def test_a_node_that_restarted_is_not_believed_until_it_is_configured(line: Line) -> None:
@@ -155,7 +155,7 @@ def test_a_foreign_sync_says_nothing_about_it(line: Line) -> None:
 
 
 def test_two_users_of_one_identifier_are_refused() -> None:
-    one = JointTemperature(0x381, 1, "a", 10)
+    one = TemperaturePdo(0x381, 1, "a", 10)
     for pdos, temperatures in (
         ([POSITION], [one, one]),
         ([InputPdo(0x381, 8, struct.Struct("<ii"), 1, "b")], [one]),
@@ -183,9 +183,11 @@ def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None
     for number, inputs in enumerate(joint_inputs(config, report), start=1):
         node = None if inputs.temperature is None else found[inputs.temperature].node_id
         assert node == (number if number in have else None)
-    for each in found:
-        each.receive(frame(each.cob_id, struct.pack("<h", 250)), 0)
-        assert each.celsius == pytest.approx(25.0 if each.node_id == 1 else 2.5), "by the unit of its object"
+    intake = Intake([], found)
+    for n, each in enumerate(found):
+        intake.receive_temperature(n, frame(each.cob_id, struct.pack("<h", 250)))
+        unit = "by the unit of its object"
+        assert intake.temperature(n) == pytest.approx(25.0 if each.node_id == 1 else 2.5), unit
     asked = {node["node"]: node.get("temperature") for node in boot_request(config, "b")["nodes"]}
     assert (2 in have) == (asked[2] == {"index": 0x2040, "subindex": 1, "c_per_unit": 0.01})
     assert [row.cob_id for row in bus_load_of(config).rows if row.length == 2] == [0x380 + n for n in have]
@@ -197,8 +199,8 @@ def test_the_configuration_says_which_joints_have_one_and_two_seconds_are_slots(
         (0x381, 1, "381h drive 1 TPDO3"),
         (0x382, 2, "382h drive 2 TPDO3"),
     ]
-    one = found[0]
-    one.receive(bytearray(celsius(250)), 0)
+    intake = Intake([], found)
+    intake.receive_temperature(0, celsius(250))
     for cycle in (0, 2000, 2001):
-        one.at(cycle)
-        assert math.isnan(one.celsius) == (cycle > 2000)
+        intake.age_temperatures(cycle)
+        assert math.isnan(intake.temperature(0)) == (cycle > 2000)

@@ -21,6 +21,7 @@ from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
+from jtqd.daemon.shared.ring import RingReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect
@@ -156,7 +157,8 @@ def test_too_late_for_either_network_is_physics_for_both(tmp_path: Path, clock: 
     assert statuses(socket)[-1] == (DEGRADED, DEGRADED)
     pdo = decode(estimates(socket)[-1])
     assert None not in pdo.torque_nm
-    joint = [cr.joint_of(cycle.frames.slot, n) for n in (1, 2)]
+    (*_, record) = RingReader(tmp_path / "ring", cr.RECORD_SIZE).read().records
+    joint = [cr.joint_of(record, n) for n in (1, 2)]
     assert [math.isnan(each.network_nm) for each in joint] == [True, True]
     assert [each.torque_nm for each in joint] == [each.physics_nm for each in joint]
     clock.turn(cycle, 8)
@@ -283,18 +285,16 @@ def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]
         period_ns=PERIOD_NS,
         safety=JointSafety(None, SETTINGS, joint_of(1), PERIOD_NS),
     )
-    states = intake.views()
     time_ns = 1 << 60
     for n, record in enumerate(records):
         header, logged = cr.header_of(record), cr.joint_of(record, 1)
         if header.flags & cr.FLAG_RESET:
             joint.reset_latch()
         data = {int.from_bytes(each[:4], "little"): each[8:16] for each, _ in cr.frames_of(record)}
-        for state, bit in ((states[0], 1), (states[1], 2), (states[4], 4)):
-            state.fresh = bool(logged.input_flags & bit)
-            if state.fresh:
-                state.values = state.unpack(data[state.pdo.cob_id])
-        if state.fresh and not math.isnan(logged.dt_s):
+        for index, bit in ((0, 1), (1, 2), (4, 4)):
+            fresh, pdo = bool(logged.input_flags & bit), PDOS[index]
+            intake.place(index, pdo.layout.unpack_from(data[pdo.cob_id]) if fresh else None)
+        if fresh and not math.isnan(logged.dt_s):
             time_ns += round(logged.dt_s * 1e9)
         joint.observe(time_ns, n < 20, not logged.input_flags & FLAG_NETWORK_SKIPPED)
         if header.flags & cr.FLAG_WITHDRAWN:

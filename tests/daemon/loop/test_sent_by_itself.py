@@ -14,6 +14,7 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.replay.replayer import _held
 from jtqd.estimator.checked import ConfigError
 from tests.daemon.loop.one_drive import config_with
+from tests.daemon.snapshots import counted
 
 MS = 1_000_000
 I32 = struct.Struct("<ii")
@@ -53,12 +54,11 @@ def test_a_frame_counts_until_it_is_too_old() -> None:
         assert intake.values(0) == (1, 2)
     cycle(intake, 16, [])
     assert not intake.fresh(0)
-    assert intake.stale_inputs == 1
-    assert intake.states[0].debt == 0, "nothing is missing"
+    assert counted(intake)["stale_inputs"] == 1
     cycle(intake, 17, [(frame(0x181, 3, 4), 16 * MS + 900_000)])
     assert intake.values(0) == (3, 4), "also one that came before this SYNC"
     assert intake.fresh(0)
-    assert intake.late_frames == intake.duplicate_frames == 0
+    assert counted(intake)["late_frames"] == counted(intake)["duplicate_frames"] == 0
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,6 @@ def test_the_limit_is_exact_and_on_both_sides(age_ns: int, fresh: bool) -> None:
 
 def test_nobody_waits_for_it_and_the_others_keep_their_rules() -> None:
     intake = Intake([EVENT, SYNCED])
-    assert intake.nodes.wanted == 1
     for k in range(1, 30):
         assert cycle(intake, k, [(frame(0x281, k, 6), k * MS + 100)]), (
             "the other one is all that is waited for"
@@ -83,14 +82,14 @@ def test_nobody_waits_for_it_and_the_others_keep_their_rules() -> None:
     assert not cycle(intake, 30, [(frame(0x181, 1, 2), 30 * MS + 100)])
     assert intake.fresh(0)
     assert not intake.fresh(1)
-    assert [state.debt for state in intake.states] == [0, 1]
+    assert not cycle(intake, 31, [(frame(0x281, 31, 6), 31 * MS + 100)]), "it may be the missing one"
 
 
 def test_several_in_one_cycle_are_no_conflict_and_the_last_counts() -> None:
     intake = Intake([EVENT])
     cycle(intake, 1, [(frame(0x181, n, n), MS + n) for n in range(4)])
     assert intake.values(0) == (3, 3)
-    assert intake.duplicate_frames == 0
+    assert counted(intake)["duplicate_frames"] == 0
     data, stamp = frame(0x181, 9, 9), 2 * MS - 1000
     intake.drain(data, [stamp], [False], 1)
     cycle(intake, 2, [])

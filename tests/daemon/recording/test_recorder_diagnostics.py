@@ -4,7 +4,6 @@ import math
 
 import pytest
 
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.run_files import Account
@@ -13,6 +12,7 @@ from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.notices import ERROR, INFO, WARNING, Notices
 from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader
 from tests.daemon.recording.recorder_bench import DEFINITIONS, messages_of, session_on, statuses_of
+from tests.daemon.snapshots import EstimateWriter
 
 NAMES = ["loop", "bus", "joint 1", "joint 2", "node 1", "node 3", "recorder", "disk"]
 NOW = 1_700_000_000_000_000_000
@@ -24,7 +24,7 @@ class Bench:
 
     def __init__(self, directory):
         self.snapshot = Snapshot(directory / "snapshot", 1e-3, 0.85)
-        self.told = LastEstimate(self.snapshot)
+        self.told = EstimateWriter(self.snapshot)
         self.reader = SnapshotReader(directory / "snapshot")
         self.diagnostics = Diagnostics("can0", ("a", "b"), [Node(1, "drive 1"), Node(3, "torque sensor")])
         self.account = Account()

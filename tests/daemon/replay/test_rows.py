@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from array import array
 from typing import Any
 
@@ -9,8 +10,8 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.core import estimate_pdo
-from jtqd.daemon.core.input_pdos import JointInputs, drive_places
-from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.input_pdos import JointInputs, TemperaturePdo, drive_places
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.replay.logged import SAMPLE
@@ -33,7 +34,7 @@ class Counts:
 
 
 def made() -> tuple[Intake, list[JointCycle]]:
-    intake = Intake(PDOS, [JointTemperature(0x380 + n, n, f"{n}", 2000) for n in (1, 2)])
+    intake = Intake(PDOS, [TemperaturePdo(0x380 + n, n, f"{n}", 2000) for n in (1, 2)])
     counts = Counts()
     joints = [
         JointCycle(
@@ -94,12 +95,14 @@ def test_rows_are_what_the_joints_make_of_each_cycle(seed: int) -> None:
     pdos = b""
     from_log = 0
     for row in range(ROWS):
-        for view, fresh, values in zip(intake.views(), given["fresh"], given["values"], strict=True):
-            view.fresh, view.values = bool(fresh[row]), tuple(int(each[row]) for each in values)
-        for known, said in zip(intake.temperatures, given["celsius"], strict=True):
-            known.at(int(given["cycle"][row]))
-            if not np.array_equal(known.celsius, said[row], equal_nan=True):
-                known.celsius, from_log = said[row], from_log + 1
+        for n, (fresh, values) in enumerate(zip(given["fresh"], given["values"], strict=True)):
+            intake.place(n, [int(each[row]) for each in values] if fresh[row] else None)
+        intake.age_temperatures(int(given["cycle"][row]))
+        for n, logged in enumerate(given["celsius"]):
+            if not np.array_equal(intake.temperature(n), logged[row], equal_nan=True):
+                frame = struct.pack("<IB3xh", 0x381 + n, 2, round(10 * logged[row]))
+                intake.receive_temperature(n, frame)
+                from_log += 1
         for n, joint in enumerate(joints):
             joint.observe(
                 int(given["sync_ns"][n, row]), bool(given["cycle"][row] < 20), bool(given["wanted"][n, row])

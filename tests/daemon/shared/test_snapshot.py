@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import (
     INPUT,
@@ -24,8 +23,7 @@ from jtqd.daemon.shared.snapshot import (
 from jtqd.drivers import nmt
 from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import frame, inputs, make, turn
-
-pytestmark = pytest.mark.native
+from tests.daemon.snapshots import EstimateWriter
 
 ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25, 40.0, math.nan)
 TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0, math.nan, 0.3)
@@ -39,7 +37,7 @@ def test_states_of_nodes_are_those_of_the_drivers() -> None:
 
 def test_round_trip(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.848)
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     told.write(41, 17, 1_700_000_000_123_456_789, (ONE, TWO))
     for n in range(len(COUNTERS)):
         snapshot.counters[n] = n + 100
@@ -70,7 +68,7 @@ def test_quantiles_are_upper_edges_of_their_bins(tmp_path: Path) -> None:
 
 def test_an_odd_sequence_is_not_taken_for_a_whole_reading(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     told.write(1, 1, 2, (ONE, TWO))
     assert snapshot.sequence[0] == 2
 
@@ -95,7 +93,7 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
 
 def test_what_the_inputs_said_and_since_when_a_status_holds(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     assert SnapshotReader(tmp_path / "s").read().sync_monotonic_ns == 0
     measured = ((3.2, 100.0, -5.0, 1.0, 0.9, 31.0, "more", "of the sample"), (math.nan,) * 12)
     told.write(8, 8, 1, (ONE, TWO), sync_monotonic_ns=123, measured=measured)  # type: ignore[arg-type]
@@ -142,10 +140,11 @@ def test_the_loop_tells_the_age_of_each_input_its_nodes_and_its_statuses(tmp_pat
     assert bits == 40 * (65 + 135 + 4 * 135 + 105) + 41 * (65 + 135 + 3 * 135 + 105), "up to the same cycle"
 
 
+@pytest.mark.native
 def test_a_reading_is_of_one_moment_while_the_loop_writes(tmp_path: Path) -> None:
     """Counters, inputs and estimate of the same cycle, however a writer in another thread interrupts the reader."""
     snapshot, bits = Snapshot(tmp_path / "s", 1e-3, 0.5), COUNTERS.index("bits_worst_case")
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     reader, stop = SnapshotReader(tmp_path / "s"), threading.Event()
 
     def write() -> None:
@@ -179,9 +178,10 @@ def test_a_reading_is_of_one_moment_while_the_loop_writes(tmp_path: Path) -> Non
         sys.setswitchinterval(before)
 
 
+@pytest.mark.native
 def test_a_reader_waits_for_a_loop_that_was_preempted_in_its_write(tmp_path: Path) -> None:
     snapshot, bits = Snapshot(tmp_path / "s", 1e-3, 0.5), COUNTERS.index("bits_worst_case")
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     told.write(1, 1, 1, (ONE, TWO))
     told.begin()
     snapshot.counters[bits] = 2
@@ -194,7 +194,7 @@ def test_a_reader_waits_for_a_loop_that_was_preempted_in_its_write(tmp_path: Pat
 
 def test_what_a_loop_left_that_died_in_its_write_can_be_read(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    told = LastEstimate(snapshot)
+    told = EstimateWriter(snapshot)
     told.write(7, 1, 1, (ONE, TWO))
     told.begin()
     assert SnapshotReader(tmp_path / "s").read().cycle == 7

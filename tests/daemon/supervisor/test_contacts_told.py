@@ -14,7 +14,6 @@ from jtqd.daemon.cli import status
 from jtqd.daemon.cli.running import Daemon, Watch
 from jtqd.daemon.cli.status import Moment, Recent, StatusView, content
 from jtqd.daemon.config import ContactSettings, load_config
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import _COUNTERS_OFFSET, Snapshot, SnapshotReader
@@ -22,6 +21,7 @@ from jtqd.daemon.supervisor.description import about
 from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import LiveTable, plain_line
 from tests.daemon.cli import status_daemon
+from tests.daemon.snapshots import EstimateWriter
 
 WATCHED = ContactSettings(threshold_nm=1.5)
 KNOWN, THERE = FLAG_CONTACT_KNOWN, FLAG_CONTACT_KNOWN | FLAG_CONTACT
@@ -55,7 +55,7 @@ def daemon(
 def snapshot(path: Path, *joints: tuple[float, ...], contacts: int = 0) -> SnapshotReader:
     made = Snapshot(path, 1e-3, 0.8)
     made.counters[COUNTERS.index("contacts")] = contacts
-    LastEstimate(made).write(8, 8, 1, joints)
+    EstimateWriter(made).write(8, 8, 1, joints)
     return SnapshotReader(path)
 
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.daemon.supervisor.table import LiveTable
+from tests.daemon.snapshots import EstimateWriter
 
 NAN = float("nan")
 JOINTS = (
@@ -35,7 +35,7 @@ JOINTS = (
 
 @pytest.fixture
 def table(tmp_path: Path) -> LiveTable:
-    LastEstimate(Snapshot(tmp_path / "s", 1e-3, 0.8)).write(8, 8, 1, JOINTS)
+    EstimateWriter(Snapshot(tmp_path / "s", 1e-3, 0.8)).write(8, 8, 1, JOINTS)
     reader = SnapshotReader(tmp_path / "s")
     view = reader.read()
     return LiveTable(reader, view, view, 1_000_000, "jtqd on sim, node 20h")

@@ -10,7 +10,6 @@ import pytest
 
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.counters import LastEstimate
 from jtqd.daemon.recording.diagnostics import Diagnostics
 from jtqd.daemon.shared.reasons import degraded_reason
 from jtqd.daemon.shared.snapshot import LEARNED, NO_ZEROS, Snapshot, SnapshotReader
@@ -19,6 +18,7 @@ from jtqd.daemon.supervisor.summary import summary_of
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator import status
 from jtqd.estimator.status import DEGRADED, Zeros
+from tests.daemon.snapshots import EstimateWriter
 from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import ROOT
 
@@ -32,7 +32,7 @@ def snapshot(tmp_path: Path) -> SnapshotReader:
     made = Snapshot(tmp_path / "snapshot", 1e-3, 0.8)
     told = (*FOUND[:7], FOUND.flags, FOUND.jumps, 4, b"past")
     made.learned[: LEARNED.size] = LEARNED.pack(*told)
-    LastEstimate(made).write(8, 8, 1, (WELL, WELL))
+    EstimateWriter(made).write(8, 8, 1, (WELL, WELL))
     return SnapshotReader(tmp_path / "snapshot", supervisor=True)
 
 

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager
 from unittest.mock import patch
 
 from jtqd.daemon.core import cycle as cycle_module
-from jtqd.daemon.core.clock import PythonClock
+from jtqd.daemon.core.schedule import PythonClock
 from jtqd.daemon.loop import process as loop_module
 from jtqd.drivers.frame_socket import CAPACITY, BusDown
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import time
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.cycle import Cycle
-from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
-from jtqd.daemon.core.intake import Intake, JointTemperature
+from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, drive_places
+from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.process import run
 from jtqd.daemon.shared import cycle_record as cr
@@ -21,6 +20,7 @@ from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
+from tests.daemon.snapshots import counted
 from tests.slow.fuzz.bus_in_time import BusInTime, Script
 from tests.slow.fuzz.memory import rss_kb
 from tests.slow.fuzz.traffic import I32, MOTION, SENSOR, STRICT, Traffic, is_of
@@ -35,6 +35,10 @@ _PDOS = (
 )
 _SCALE = (1e-4, 1e-3, 1e-5, 0.01, 0.001)
 _NO_FIELD = (estimate_pdo.NO_TORQUE, estimate_pdo.SIGMA_UNKNOWN)
+_COUNTED = (
+    *("stale_inputs", "late_frames", "duplicate_frames", "rejected_frames", "unknown_frames", "foreign_sync"),
+    *("sync_errors", "sync_gaps", "boot_ups"),
+)
 _CONFIGURE_AFTER = 60
 """Cycles after a boot-up message until the supervisor has configured the node again."""
 
@@ -134,7 +138,7 @@ def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
     """A cycle as the daemon makes it, method efficiency, on a bus with this script."""
     bus = BusInTime(script)
     settings = EstimatorSettings(method="efficiency")
-    temperatures = [JointTemperature(0x380 + n, n, f"{380 + n}h", 2000) for n in (1, 2)]
+    temperatures = [TemperaturePdo(0x380 + n, n, f"{380 + n}h", 2000) for n in (1, 2)]
     joints = [
         (
             JointInputs(drive_places(2 * n), 4, *_SCALE, temperature=n),
@@ -159,21 +163,6 @@ def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
     return cycle, bus
 
 
-class EveryCycle:
-    """Duties of the loop that are `call` after every cycle, and nothing else."""
-
-    after_sync = None
-
-    def __init__(self, call: Callable[[], None]) -> None:
-        self._call = call
-
-    def slots(self) -> int:
-        return 1
-
-    def __call__(self) -> None:
-        self._call()
-
-
 def fuzz_frames(
     directory: Path, seed: int, count: int, *, kinds: tuple[str, ...] | None = None
 ) -> FrameReport:
@@ -196,7 +185,7 @@ def fuzz_frames(
             traffic.down = False
         for node in cycle.intake.unconfigured:
             if report.cycles > waiting.setdefault(node, report.cycles + _CONFIGURE_AFTER):
-                supervisor.note_configured(node, cycle.intake.nodes.restarts.get(node, 0))
+                supervisor.note_configured(node, cycle.intake.restarts(node))
                 del waiting[node]
         if not base_kb and bus.given > end // 5:
             base_kb = rss_kb()
@@ -204,7 +193,7 @@ def fuzz_frames(
     with bus.installed_in_loop():
         while bus.given < end:
             try:
-                run(cycle, cycle.grid, lambda: bus.given >= end, duties=EveryCycle(after))
+                run(cycle, cycle.grid, lambda: bus.given >= end, duties=after, slots=1)
             except Exception as error:
                 import traceback
 
@@ -214,21 +203,13 @@ def fuzz_frames(
                 if report.exceptions > 10:
                     break
                 cycle.grid.slot_ns = bus.now_ns + 2 * MS
-    intake = cycle.intake
     report.frames = bus.given
     report.episodes = traffic.counts
     report.growth_kb = rss_kb() - (base_kb or rss_kb())
     report.seconds = time.perf_counter() - begun
+    counts = counted(cycle.intake)
     report.counters = {
-        "stale_inputs": intake.stale_inputs,
-        "late_frames": intake.late_frames,
-        "duplicate_frames": intake.duplicate_frames,
-        "rejected_frames": intake.rejected_frames,
-        "unknown_frames": intake.unknown_frames,
-        "foreign_sync": intake.foreign_sync,
-        "sync_errors": intake.sync_errors,
-        "sync_gaps": intake.gaps.count,
-        "boot_ups": intake.nodes.boot_ups,
+        **{name: counts[name] for name in _COUNTED},
         "missed_slots": cycle.grid.missed,
         "lost_in_queue": bus.rx_dropped,
     }

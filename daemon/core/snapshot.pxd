@@ -1,4 +1,4 @@
-"""What the loop counts and tells; counters.pyx."""
+"""The loop's writer of the snapshot; snapshot.pyx. The structs lie in memory as `jtqd.daemon.shared.snapshot` has them."""
 
 from libc.stdint cimport int64_t, uint8_t, uint16_t, uint64_t
 
@@ -7,12 +7,6 @@ from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
 from jtqd.daemon.core.joint cimport JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS
 from jtqd.estimator.sample cimport Learned
-
-cdef struct CounterState:
-    int64_t bus_errors, overruns, latch_resets, contacts
-    int64_t bits
-    int64_t used_ns[MOST_INPUTS]
-    int64_t delay_ns[MOST_INPUTS]
 
 cdef struct InputBlock:  # `INPUT` of the snapshot
     int64_t used_ns, delay_ns, low_ns, high_ns
@@ -30,12 +24,12 @@ cdef struct MeasuredBlock:  # a `Measured`
     double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c
 
 cdef enum:
-    PAST_WORDS = 192  # room for the state of an estimator
+    STATE_WORDS = 192  # room for the state of an estimator
 
-cdef struct LearnedBlock:  # `LEARNED` of the snapshot: zeros, and the state after the cycle of the last estimate
-    Learned told
+cdef struct LearnedBlock:  # `LEARNED`: zeros, and the estimator's state after the cycle of the last estimate
+    Learned zeros
     uint64_t size  # of the state in bytes; 0: there is none
-    uint64_t past[PAST_WORDS]
+    uint64_t state[STATE_WORDS]
 
 cdef struct EstimateBlock:
     int64_t cycle
@@ -45,43 +39,27 @@ cdef struct EstimateBlock:
     ViewBlock joints[MOST_JOINTS]
     MeasuredBlock measured[MOST_JOINTS]
 
-cdef struct ToldState:
-    int status[MOST_JOINTS]
-    int64_t since[MOST_JOINTS]
-
-cdef class LastEstimate:
-    cdef uint64_t[::1] sequence
-    cdef uint8_t[::1] memory
-    cdef int joints
-    cdef ToldState now
-    cdef void begin_telling(self) noexcept nogil
-    cdef void tell(
-        self,
-        int64_t cycle,
-        int sync_counter,
-        int64_t sync_realtime_ns,
-        int64_t sync_monotonic_ns,
-        const ViewBlock *joints,
-        const MeasuredBlock *measured,
-    ) noexcept nogil
-
-cdef class LoopCounters:
-    cdef readonly LastEstimate last
-    cdef CounterState now
+cdef class SnapshotWriter:
+    cdef uint64_t[::1] counters, work, late, status_cycles, restarts, sequence
+    cdef int64_t[::1] node_heard
+    cdef uint8_t[::1] inputs, node_states, unconfigured, learned, estimate
     cdef Intake intake
     cdef Bus bus
-    cdef uint64_t[::1] counters, work, late, status_cycles, restarts
-    cdef int64_t[::1] node_heard
-    cdef uint8_t[::1] inputs, node_states, unconfigured, learned
+    cdef int joints
+    cdef int64_t bits, bits_complete
     cdef int64_t bits_of[MOST_INPUTS]
-    cdef int64_t bits_complete
+    cdef int64_t used_ns[MOST_INPUTS]
+    cdef int64_t delay_ns[MOST_INPUTS]
+    cdef int status[MOST_JOINTS]
+    cdef int64_t since[MOST_JOINTS]
     cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
     cdef void count_status(self, int joint, int status) noexcept nogil
-    cdef int flush_all(self, int64_t missed, int64_t sync_ns) except -1
-    cdef void flush_nodes(self) noexcept nogil
+    cdef void begin(self) noexcept nogil
+    cpdef int flush(self, int64_t missed, int64_t sync_ns) except -1
     cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
-    cdef void tell_learned(self, int number, JointCycle joint) noexcept nogil
-    cdef void tell(
+    cdef void flush_nodes(self) noexcept nogil
+    cdef void write_learned(self, int number, JointCycle joint) noexcept nogil
+    cdef void end(
         self,
         int64_t cycle,
         int sync_counter,
