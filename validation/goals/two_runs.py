@@ -1,7 +1,7 @@
 """One encoder, two short runs: what is fitted to one is judged on the other. Ours beside least squares.
 
 Ours is what `jtq fit losses` makes of one run (`sysid.fit.few_runs`, method `fused` without torsion). Beside it stand the
-joint file as it was (`tob`), `tob` with Coulomb and viscous friction fitted (`sysid.fit.friction`), the baselines of the
+joint file as it was (`tob`), `tob` with Coulomb and viscous friction fitted (`friction.py`), the baselines of the
 goals' table that need one encoder, and
 
     current and speed     tau = a0 + a1 tau_raw + a2 s + a3 v + a4 s |tau_raw|
@@ -28,10 +28,11 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.fit.few_runs import Prior, fit_few_runs
-from jtqd.sysid.fit.friction import FitError, fit_friction
+from jtqd.sysid.fit.friction import FitError
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.signals import run_signals
 from validation.goals.baselines import BASELINES, Baseline, Example, fit_baseline
+from validation.goals.friction import fit_friction
 
 INSIDE: Final = (85.0, 95.0)
 """Of an honest 90 % interval [%], as on the bench `bad_day`."""
