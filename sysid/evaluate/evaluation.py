@@ -53,7 +53,7 @@ from jtqd.sysid.evaluate.scores import (
     truth_tables,
     worst_plateau,
 )
-from jtqd.sysid.fit.efficiency import TITLES as QUADRANT_TITLES
+from jtqd.sysid.fit.efficiency import QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.channels import RunIssue
 

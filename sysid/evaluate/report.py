@@ -34,7 +34,7 @@ from jtqd.sysid.evaluate.scores import (
     speed_groups,
     worst_plateau,
 )
-from jtqd.sysid.fit.efficiency import TITLES as QUADRANT_TITLES
+from jtqd.sysid.fit.efficiency import QUADRANT_TITLES
 from jtqd.sysid.report import page
 from jtqd.sysid.report.figures import SENSOR, STANDING, page_svg, plain, shade, thinned
 from jtqd.sysid.report.numbers import DASH

@@ -1,56 +1,63 @@
-"""Calibration of sigma, the last step of a fit: `scale` of `fused.sigma` and `fused.zeros`, and `early` of the latter.
+"""Uncertainty calibration: sigma of the fused estimate from held-out runs, so that its interval holds COVERAGE of a new run.
 
-    |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in 90 % of the samples of a run left out, per quadrant q
+Quantiles over runs (split conformal prediction, Vovk et al. 2005): runs are exchangeable, samples are not. Every run has the
+same weight.
 
-error: of the estimate that service gives against the torque; more: what service adds by itself (`served.py`; where the
-torsion is tracked, `fused.tracking`, too), so that it is not counted twice. scale_q is the conformal quantile of
-sqrt(error^2 - (1.645 more)^2) over the spread.
+**Sigma** (`fit_sigma`), with residuals e_c = tau_raw - loss - sensor and e_t = tau_t - sensor:
 
-Before the zero of the day is known the error is wider than what is taken off s_t^2 says. The ratio r of the conformal
-quantiles of the samples that know less than half of it and of the others, k and k' the means of what they know, is that of
-the factors of the spread (`zeros.pyx`):
+    reference^2 = covariance of the two paths' run means, less its standard error: they share the sensor's offset
+    e_c^2 - reference^2 ~ current^2 + (viscous v)^2 + (load tau_raw)^2
+    e_t^2 - reference^2 - open^2 ~ torsion^2 + (load tau_t)^2
 
-    (1 + (early - 1) (1 - k))/(1 + (early - 1) (1 - k')) = r
+With one encoder nothing separates the sensor's offset from the error of the current path: reference is 0, sigma holds both.
 
-The campaign has a sensor, not the torque. What both paths' run means share is the sensor's zero of that run, of standard
-deviation `reference_nm`: a normal prior, and two normal measurements of it whose variance is what each path's means have
-more. The posterior's mean is taken off a run's error, and its standard deviation is spread over the samples by quantiles
-of a normal distribution (multiple imputation, Rubin 1987): a calibration against the torque, as far as the runs tell of it.
-The mean of n runs' zeros is in the fitted torques and told by nothing: reference^2/n counts beside the posterior's variance.
+**Tracking** (`fit_tracking`), the error of an estimate without delay beyond that of one with the motor path's delay:
 
-Quantiles of errors over runs that a fit had not seen: what a new run's samples are covered with.
+    sigma_undelayed^2 = sigma^2 + a^2 + (b v)^2/(1 + (v/s)^2)
 
-Split conformal prediction by runs (Vovk et al. 2005): runs are what is exchangeable, not samples. Every run is weighted
-alike.
+a, b, s: least squares of e_undelayed^2 - e^2. Above some speed the filter misses all of a wave over the motor's turn, and
+no more: a part that grows without end is too wide at rest and too narrow at the speeds of work. The sensor is taken as it
+is: its own delay against the encoders is in a and b.
 
-Fit section `fused.standstill` of a joint file: how wide the interval of a standing joint is.
+**Standstill** (`fit_standstill`), half width of the interval of a standing joint:
 
-    half = k sd + alpha open + (1 - alpha) half_f           (fusion.pyx)
+    half = k sd + alpha open + (1 - alpha) half_f           (uncertainty.pyx)
 
 open, half_f: what slip and friction leave open are bounds, not deviations, and count in full. sd: of both paths besides.
-k: so that the interval holds on a day that the fit has not seen. All standing samples of a run share its zeros and its
-pre-load: n runs are n errors, not as many as samples. With e = [|error| - bounds]+/sd on runs left out, where the slip is
-known (how a joint stood before it was switched on no campaign tells: there its bound counts),
+All standing samples of a run share its offsets and its pre-load: n runs are n errors. With e = [|error| - bounds]+/sd, where
+the slip is known (no campaign shows how a joint stood before it was switched on: there its bound counts),
 
     k^2 = max(b_n RMS(e), q)^2 - z^2 mean(reference^2/sd^2)
 
 b_n: of n normal errors, so that COVERAGE_AT_REST of other days is held on average over campaigns (Student's t_n), and
 COVERAGE of them after 19 of 20 campaigns (tolerance interval, 1.645 sqrt(n/chi^2), chi^2 the 5 % quantile of n degrees of
-freedom): 3.15 for 6 runs, 2.55 for 11, 2.08 for 32, 1.96 for many. q: quantile of e for COVERAGE_AT_REST of a run left out
-(`conformal.py`), where days are not normal. z: 1.96. The error is against the sensor: its zero is in e and taken off again,
-but what few runs add is of both, so that it cannot hide an error at rest. Every run is weighted alike; k is at least 1.
-Fewer than FEWEST_RUNS runs with a stop tell nothing: no section, and the estimator takes 3
-standard deviations. The torsion is that of the low pass of TORSION_BANDWIDTH_RAD_S: a tracked one is no noisier at rest.
+freedom): 3.15 for 6 runs, 2.55 for 11, 2.08 for 32, 1.96 for many. q: quantile of e for COVERAGE_AT_REST of a held-out run,
+where days are not normal. z: 1.96. The error is against the sensor: its offset is in e and subtracted again, but the
+allowance for few runs covers both, so that it cannot hide an error at rest. k is at least 1. Below FEWEST_RUNS runs with a
+stop there is no section, and the estimator takes 3 standard deviations. The torsion is that of the low pass of
+TORSION_BANDWIDTH_RAD_S: a tracked one is no noisier at rest.
 
-Fit section `fused.tracking` of a joint file: what an estimate of now errs by beyond one as old as the motor path.
+**Scale** (`calibrated`), the last step of a fit: factors of `fused.sigma` and `fused.zeros`, and `early` of the latter.
 
-    sigma now^2 = sigma^2 + a^2 + (b v)^2/(1 + (v/s)^2)
+    |error| <= 1.645 sqrt((scale_q spread)^2 + more^2)      in COVERAGE of the samples of a held-out run, quadrant q
 
-sigma: of an estimate as old as the motor path, whose error is e; a, b, s: least squares of e_now^2 - e^2 over runs that the
-fit had not seen. Of a wave over the motor's turn that the filter does not carry it misses all from some speed on, and no
-more: a part that grows without end is too wide at rest and too narrow at the speeds of work. The sensor is taken as it is:
-what it is older than the encoders is in a and b. That the interval of both together holds is up to the scale of sigma, found
-after (`sysid/fit/calibration.py`).
+error, spread, more: `residuals.py`; with the torsion tracked, `fused.tracking` is in more, so that it is not counted twice.
+scale_q is the conformal quantile of sqrt(error^2 - (1.645 more)^2) over the spread.
+
+Before the offset of the day is known the error is wider than the variance that its correction removes. The ratio r of the
+conformal quantiles of the samples that know less than half of it and of the others, k and k' the means of what they know, is
+that of the factors of the spread (`path_difference.pyx`):
+
+    (1 + (early - 1) (1 - k))/(1 + (early - 1) (1 - k')) = r
+
+The campaign has a sensor, not the torque. Both paths' run means share the sensor's offset in that run, of standard deviation
+`reference_nm`: a normal prior, and two normal measurements of it whose variance is the excess of each path's means. The
+posterior's mean is subtracted from a run's error, and its standard deviation is spread over the samples by quantiles of a
+normal distribution (multiple imputation, Rubin 1987): a calibration against the torque, as far as the runs show it. The mean
+of n runs' offsets is in the fitted torques and nothing shows it: reference^2/n counts beside the posterior's variance.
+
+The level is unbiased, not the conservative one that guarantees at least COVERAGE. Where a whole run shares its error (its
+offsets), n runs have not shown the largest yet: 8 of them cover 87 % of others.
 """
 
 from __future__ import annotations
@@ -64,27 +71,28 @@ from scipy.optimize import nnls
 from scipy.special import chdtri, ndtri, stdtrit
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
-from jtqd.estimator.joint import (
-    Fused,
-    FusedSigma,
-    Standstill,
-    Torsion,
-    Tracking,
-)
+from jtqd.estimator.joint import Fused, FusedSigma, Standstill, Torsion, Tracking
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
 from jtqd.estimator.uncertainty import GAUSS, Fusion
-from jtqd.sysid.fit.residuals import TRACKING_RAD_S, WAVE_RAD_S, PathResiduals, Served, served
+from jtqd.sysid.fit.residuals import FusedErrors, PathResiduals, fused_errors
 from jtqd.sysid.fit.signals import RunSignals
+from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
 
 COVERAGE: Final = 0.9
 FEWEST: Final = 50
-"""Samples of a run that a part of it needs for the run to count there."""
+"""Samples that a part of a run needs to count."""
+Scale = tuple[float, float, float, float]
+"""Factors of sigma, by quadrant."""
+_ONE: Final[Scale] = (1.0, 1.0, 1.0, 1.0)
+
+# Conformal quantiles -----------------------------------------------------------------------------------------------------
+
 _LEAST_SCALE: Final = 0.05
 _BEYOND: Final = 0.3
-"""Part of what is left out that a level may leave out at least: the largest of few says nothing."""
+"""Share of 1 - coverage that a level leaves out at least: the largest of few means nothing."""
 _STEPS: Final = 200
-"""Points of a run's distribution that the level is sought with: 0.25 % of a run between two of them at most."""
+"""Points of a run's distribution in the search of the level: 0.25 % of a run between two of them at most."""
 
 
 def conformal_scale(
@@ -92,11 +100,11 @@ def conformal_scale(
     sigmas: Sequence[FloatArray],
     quadrants: Sequence[QuadrantArray],
     coverage: float = COVERAGE,
-) -> tuple[float, float, float, float]:
-    """Return the factor per quadrant that makes value +- GAUSS sigma cover this share of unseen samples.
+) -> Scale:
+    """Return the factor per quadrant that makes value +- GAUSS sigma cover this share of the samples of a new run.
 
-    One array per run each. Runs count alike in a quadrant, whatever their length; a quadrant in which no run has 50
-    samples takes the factor of all. Raises ValueError where there are no samples at all.
+    One array per run each. A quadrant in which no run has FEWEST samples takes the factor of all. Raises ValueError where
+    there are no samples at all.
     """
     ratios = [np.abs(e) / s for e, s in zip(errors, sigmas, strict=True)]
     if not any(map(len, ratios)):
@@ -112,7 +120,7 @@ def conformal_scale(
 
 
 def quantile_by_runs(parts: Sequence[FloatArray], coverage: float = COVERAGE) -> float:
-    """Return the quantile of the samples of all parts, each part with the same weight, that covers a new part so far."""
+    """Return the quantile of the samples of all parts, of equal weight each, that covers this share of a new part."""
     values = np.concatenate(parts)
     weights = np.concatenate([np.full(len(part), 1.0 / max(len(part), 1)) for part in parts])
     order = np.argsort(values)
@@ -125,11 +133,10 @@ def quantile_by_runs(parts: Sequence[FloatArray], coverage: float = COVERAGE) ->
 def unbiased_level(parts: Sequence[FloatArray], coverage: float = COVERAGE) -> float:
     """Return the level at which the quantile of all parts but one covers this share of that one, on average over all.
 
-    Runs are what is exchangeable, not samples. Where runs are all alike the level is the coverage; where each run is one
-    error of its own, coverage (n + 1)/n, the mean of split conformal prediction without its rounding up (Lei et al.
-    2018, which guarantees at least COVERAGE and so covers more on average). Real runs lie in between, and leaving out
-    one run after the other tells where (Barber et al. 2021). At most a level that leaves out _BEYOND of what the
-    coverage leaves out.
+    Where runs are all alike the level is the coverage; where each run is one error of its own, coverage (n + 1)/n, the mean
+    of split conformal prediction without its rounding up (Lei et al. 2018, which guarantees at least COVERAGE and so covers
+    more on average). Real runs lie in between: the jackknife over runs finds where (Barber et al. 2021). At most a level
+    that leaves out _BEYOND of what the coverage leaves out.
     """
     grid = (np.arange(_STEPS) + 0.5) / _STEPS
     rows = np.array([np.quantile(part, grid) for part in parts if len(part)])
@@ -156,9 +163,13 @@ def unbiased_level(parts: Sequence[FloatArray], coverage: float = COVERAGE) -> f
     return 0.5 * (root(coverage - 1e-9) + root(coverage + 1e-9))
 
 
+# Sigma and tracking ------------------------------------------------------------------------------------------------------
+
 _FLOOR_NM: Final = 0.02
 _FAST_RAD_S: Final = 0.1
 """Slower samples do not count for sigma: near a reversal the loss is not settled, which `half` accounts for."""
+SATURATION_RAD_S: Final = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 3.0, 5.0, 10.0)
+"""Speeds among which s is chosen."""
 
 
 def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> FusedSigma:
@@ -178,26 +189,19 @@ def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> Fu
     fast = [np.abs(run.velocity_rad_s) > _FAST_RAD_S for run in runs]
     if not any(map(np.any, fast)):
         raise ValueError(f"found no held-out sample above {_FAST_RAD_S} rad/s, expected some")
-    raw, v, e_c, e_t, t, open_nm = (
-        np.concatenate([getattr(run, name)[keep] for run, keep in zip(runs, fast, strict=True)])
-        for name in (
-            "raw_nm",
-            "velocity_rad_s",
-            "current_error_nm",
-            "torsion_error_nm",
-            "torsion_nm",
-            "open_nm",
-        )
-    )
+
+    def joined(name: str) -> FloatArray:
+        return np.concatenate([getattr(run, name)[keep] for run, keep in zip(runs, fast, strict=True)])
+
+    raw, v, e_c = joined("raw_nm"), joined("velocity_rad_s"), joined("current_error_nm")
     ones = np.ones_like(v)
     a = nnls(np.column_stack((ones, v * v, raw * raw)), e_c * e_c - shared)[0]
     current_nm = max(float(np.sqrt(a[0])), _FLOOR_NM)
     # without torsion the estimator does not read its sigma; the file must have a number above 0
-    b = (
-        nnls(np.column_stack((ones, t * t)), e_t * e_t - shared - open_nm * open_nm)[0]
-        if with_torsion
-        else np.array((current_nm**2, 0.0))
-    )
+    b = np.array((current_nm**2, 0.0))
+    if with_torsion:
+        e_t, t, open_nm = joined("torsion_error_nm"), joined("torsion_nm"), joined("open_nm")
+        b = nnls(np.column_stack((ones, t * t)), e_t * e_t - shared - open_nm * open_nm)[0]
     return FusedSigma(
         current_nm=current_nm,
         viscous_nms_per_rad=float(np.sqrt(a[1])),
@@ -205,59 +209,61 @@ def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> Fu
         torsion_nm=max(float(np.sqrt(b[0])), _FLOOR_NM),
         torsion_load=float(np.sqrt(b[1])),
         reference_nm=float(np.sqrt(shared)),
-        scale=(1.0, 1.0, 1.0, 1.0),
+        scale=_ONE,
     )
 
 
-SATURATION_RAD_S: Final = (0.2, 0.3, 0.4, 0.5, 0.6, 0.8, 1.0, 1.3, 1.6, 2.0, 3.0, 5.0, 10.0)
-"""Speeds among which s is chosen."""
+def fit_tracking(runs: Sequence[PathResiduals], fused: Fused) -> Tracking | None:
+    """Return the section of held-out runs; None where the low pass of new configurations has no larger error.
+
+    Run means do not count in that comparison: the offsets of a day are in both.
+    """
+
+    def square(errors: Sequence[FloatArray]) -> float:
+        return float(sum(np.sum((run - run.mean()) ** 2) for run in errors if len(run)))
+
+    if not square([run.tracked_nm for run in runs]) < square([run.low_pass_nm for run in runs]):
+        return None
+    errors = [fused_errors(run, fused) for run in runs]
+    return tracking_section(
+        np.concatenate([run.undelayed_nm**2 - run.error_nm**2 for run in errors]),
+        np.concatenate([run.velocity_rad_s for run in errors]),
+    )
 
 
-def by_speed(velocity_rad_s: FloatArray, bend: float) -> FloatArray:
+def tracking_section(excess_nm2: FloatArray, velocity_rad_s: FloatArray) -> Tracking:
+    """Return the section from e_undelayed^2 - e^2 [n] at speeds [n]."""
+    found: list[tuple[float, Tracking]] = []
+    for saturation in SATURATION_RAD_S:
+        columns = np.column_stack(
+            (np.ones_like(velocity_rad_s), bent_square(velocity_rad_s, 1.0 / saturation**2))
+        )
+        (noise, viscous), _ = nnls(columns.T @ columns, columns.T @ excess_nm2)
+        one = Tracking(TRACKING_RAD_S, float(np.sqrt(noise)), float(np.sqrt(viscous)), WAVE_RAD_S, saturation)
+        found.append((float(np.sum((columns @ (noise, viscous) - excess_nm2) ** 2)), one))
+    return min(found, key=lambda each: each[0])[1]
+
+
+def bent_square(velocity_rad_s: FloatArray, bend: float) -> FloatArray:
     """Return the square of speeds [n], bent: `Tracking.bend`."""
     square = velocity_rad_s * velocity_rad_s
     result: FloatArray = square / (1.0 + bend * square)
     return result
 
 
-def fit_tracking(
-    errors: Sequence[FloatArray], errors_now: Sequence[FloatArray], velocity: Sequence[FloatArray]
-) -> Tracking:
-    """Return the section of runs left out, one array per run each: e, e_now [Nm], v [rad/s]."""
-    more = np.concatenate([now * now - e * e for e, now in zip(errors, errors_now, strict=True)])
-    v = np.concatenate(velocity)
-    found: list[tuple[float, Tracking]] = []
-    for saturation in SATURATION_RAD_S:
-        columns = np.column_stack((np.ones_like(v), by_speed(v, 1.0 / saturation**2)))
-        (noise, viscous), _ = nnls(columns.T @ columns, columns.T @ more)
-        one = Tracking(TRACKING_RAD_S, float(np.sqrt(noise)), float(np.sqrt(viscous)), WAVE_RAD_S, saturation)
-        found.append((float(np.sum((columns @ (noise, viscous) - more) ** 2)), one))
-    return min(found, key=lambda each: each[0])[1]
-
-
-def worth_it(errors_now: Sequence[FloatArray], errors_low_pass: Sequence[FloatArray]) -> bool:
-    """Return whether tracking beats the low pass of new configurations, over runs left out, against the sensor now.
-
-    Means of runs count for nothing: the zeros of a day are in both.
-    """
-
-    def square(runs: Sequence[FloatArray]) -> float:
-        return float(sum(np.sum((run - run.mean()) ** 2) for run in runs if len(run)))
-
-    return square(errors_now) < square(errors_low_pass)
-
+# Standstill --------------------------------------------------------------------------------------------------------------
 
 COVERAGE_AT_REST: Final = 0.95
-"""More than in motion: who leans on a standing joint is not served by nine times out of ten."""
+"""More than in motion: a controller relies on a standing joint."""
 CONFIDENCE: Final = 0.95
-"""Of campaigns, in which at least COVERAGE of other days is held."""
+"""Share of campaigns in which at least COVERAGE of other days is held."""
 FEWEST_RUNS: Final = 6
 KNOWN: Final = 0.05
-"""Part of the torsion's standard deviation that its slip may leave open where it counts as known."""
+"""Share of the torsion's standard deviation that its slip may leave open where it counts as known."""
 
 
 class Standing(NamedTuple):
-    """Standing samples of an unseen run, arrays [n]: error to the sensor, sd and bounds [Nm], known: whether the slip is."""
+    """Standing samples of a held-out run, arrays [n]: error to the sensor, sd and bounds [Nm], whether the slip is known."""
 
     error_nm: FloatArray
     spread_nm: FloatArray
@@ -265,19 +271,23 @@ class Standing(NamedTuple):
     known: BoolArray
 
 
-def ahead_nm(run: RunSignals, torsion: Torsion) -> FloatArray:
-    """Return what a torsion of TORSION_BANDWIDTH_RAD_S knows more than one of the motor path's age less the sensor's [n]."""
-    if run.as_read is None:
-        return np.zeros_like(run.sensor_nm)
+def low_pass_advance(run: RunSignals, torsion: Torsion) -> FloatArray:
+    """Return what the low pass of TORSION_BANDWIDTH_RAD_S adds to torsion less sensor of the motor path's delay [n, Nm]."""
     dt, rate = run.seen.dt_s, TORSION_BANDWIDTH_RAD_S
-    torque = torsion.stiffness_nm_per_rad * (
-        low_pass(run.as_read.torsion_rad, dt, rate) - run.seen.torsion_nm
-    )
-    result: FloatArray = torque - (low_pass(run.as_read.sensor_nm, dt, rate) - run.sensor_nm)
+    torque = torsion.stiffness_nm_per_rad * (low_pass(run.torsion_rad, dt, rate) - run.seen.torsion_nm)
+    result: FloatArray = torque - (low_pass(run.raw_sensor_nm, dt, rate) - run.sensor_nm)
     return result
 
 
-def beyond_normal(n: int) -> float:
+def standing_errors(run: PathResiduals, advance_nm: FloatArray, fused: Fused) -> Standing:
+    """Return the errors of a held-out run at rest; advance: of its samples, see `low_pass_advance`."""
+    fusion = Fusion(replace(fused.sigma, reference_nm=0.0), True)
+    spread, bound = fusion.rest_many(*run.fusion_inputs)
+    error = fused_errors(run, fused).error_nm
+    return Standing(error + advance_nm, spread, bound, run.open_nm <= KNOWN * fused.sigma.torsion_nm)
+
+
+def normal_bound(n: int) -> float:
     """Return b_n: half an interval in RMS of n normal errors that holds COVERAGE_AT_REST of others, COVERAGE at least."""
     student = stdtrit(n, 0.5 * (1.0 + COVERAGE_AT_REST))
     tolerance = ndtri(0.5 * (1.0 + COVERAGE)) * np.sqrt(n / chdtri(n, CONFIDENCE))
@@ -285,91 +295,73 @@ def beyond_normal(n: int) -> float:
 
 
 def fit_standstill(runs: Sequence[Standing], reference_nm: float = 0.0) -> Standstill | None:
-    """Return the section; None for too few runs that came to rest. reference_nm: of the sensor's zero from run to run."""
-    errors, zeros = [], []
+    """Return the section; None for too few runs that came to rest. reference_nm: of the sensor's offset from run to run."""
+    errors, offsets = [], []
     for run in runs:
         if np.count_nonzero(run.known) >= FEWEST:
             spread = run.spread_nm[run.known]
             errors.append(np.maximum(np.abs(run.error_nm) - run.bound_nm, 0.0)[run.known] / spread)
-            zeros.append(float(np.mean((reference_nm / spread) ** 2)))
+            offsets.append(float(np.mean((reference_nm / spread) ** 2)))
     n = len(errors)
     if n < FEWEST_RUNS:
         return None
     rms = np.sqrt(np.mean([np.mean(error * error) for error in errors]))
-    most = max(beyond_normal(n) * rms, quantile_by_runs(errors, COVERAGE_AT_REST))
+    most = max(normal_bound(n) * rms, quantile_by_runs(errors, COVERAGE_AT_REST))
     normal = ndtri(0.5 * (1.0 + COVERAGE_AT_REST))
-    return Standstill(float(np.sqrt(max(most * most - normal * normal * np.mean(zeros), 1.0))))
+    return Standstill(float(np.sqrt(max(most * most - normal * normal * np.mean(offsets), 1.0))))
 
 
-def tracking_of_unseen(unseen: Sequence[PathResiduals], fused: Fused) -> Tracking | None:
-    """Return what an estimate of now adds to sigma on unseen runs of a joint with torsion.
-
-    None where the low pass of new configurations errs no more, or positions are not known.
-    """
-    if not all(len(run.now.tracked_nm) == len(run.raw_nm) for run in unseen):
-        return None
-    if not worth_it([run.now.tracked_nm for run in unseen], [run.now.late_nm for run in unseen]):
-        return None
-    each = [served(run, fused) for run in unseen]
-    return fit_tracking(
-        [run.error_nm for run in each], [run.now_nm for run in each], [run.velocity_rad_s for run in each]
-    )
-
-
-def standing_errors(run: PathResiduals, ahead: FloatArray, fused: Fused) -> Standing:
-    """Return what a standing run tells of the interval at rest."""
-    spread, bound = Fusion(replace(fused.sigma, reference_nm=0.0), True).rest_many(
-        run.raw_nm, run.half_nm, run.velocity_rad_s, run.torsion_nm, run.open_nm
-    )
-    error = served(run, fused).error_nm
-    return Standing(error + ahead, spread, bound, run.open_nm <= KNOWN * fused.sigma.torsion_nm)
-
+# Scale -------------------------------------------------------------------------------------------------------------------
 
 OTHER_MOTIONS: Final = 0.02
 OTHER_MOTIONS_LEARNED: Final = 0.01
-"""What runs of the campaign are covered more than COVERAGE where zeros differ from day to day, not tracked and tracked: of
-days of other motions as much less is held. Chosen on runs that no figure is reported on."""
+"""Coverage of the campaign's runs above COVERAGE where offsets differ from day to day, not tracked and tracked: days of
+other motions are covered by as much less. Chosen on runs that no figure is reported on."""
 HALF_KNOWN: Final = 0.5
 LATEST: Final = 2.0
-"""Largest `early` that is believed."""
+"""Largest `early`."""
 _FEWEST_RUNS: Final = 8
 """That have samples of either kind, for `early`."""
 _QUANTILES: Final = 7
 _LEAST_NM2: Final = 1e-4
-"""Variance of a path's run means beside the sensor's zero: no path is free of an error of its own."""
+"""Variance of a path's run means beside the sensor's offset: no path is free of an error of its own."""
 
 
-def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float | None = None) -> Fused:
-    """Return a section with both scales and `early` found on runs left out; its other parts are final.
+def calibrated(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> Fused:
+    """Return a section with both scales and `early` found on held-out runs; its other parts are final.
 
-    Without section `fused.zeros` new configurations track zeros with the scale of sigma, which is then that of tracked ones.
+    Without section `fused.zeros` new configurations track offsets with the scale of sigma, which is then that of tracked
+    ones.
     """
-    zeros, doubt_nm = sensor_zeros(runs, fused.sigma.reference_nm)
-    plain = replace(fused, zeros=None)
+    offsets, doubt_nm = sensor_offsets(runs, fused.sigma.reference_nm)
 
-    def seen(section: Fused, *, tracked: bool) -> list[Served]:
-        return [served(run, section, rated_nm, tracked=tracked) for run in runs]
+    def errors_of(section: Fused, *, track_zeros: bool) -> list[FusedErrors]:
+        return [fused_errors(run, section, rated_nm, track_zeros=track_zeros) for run in runs]
 
-    def beyond(each: Sequence[Served]) -> list[FloatArray]:
-        return _beyond(each, zeros, doubt_nm, fused.tracking)
+    def beyond(errors: Sequence[FusedErrors]) -> list[FloatArray]:
+        return _beyond(errors, offsets, doubt_nm, fused.tracking)
 
-    each = seen(plain, tracked=fused.zeros is None)
-    coverage = COVERAGE if fused.zeros is None else COVERAGE + OTHER_MOTIONS
-    sigma = replace(fused.sigma, scale=_scale(beyond(each), each, coverage))
+    def scale(errors: Sequence[FusedErrors], coverage: float) -> Scale:
+        spreads, quadrants = [run.spread_nm for run in errors], [run.quadrant for run in errors]
+        return conformal_scale(beyond(errors), spreads, quadrants, coverage)
+
     if fused.zeros is None:
-        return replace(fused, sigma=sigma)
+        errors = errors_of(fused, track_zeros=True)
+        return replace(fused, sigma=replace(fused.sigma, scale=scale(errors, COVERAGE)))
+    errors = errors_of(replace(fused, zeros=None), track_zeros=False)
+    sigma = replace(fused.sigma, scale=scale(errors, COVERAGE + OTHER_MOTIONS))
     days = replace(fused.zeros, early=1.0)
-    each = seen(replace(fused, zeros=days), tracked=True)
-    days = replace(days, early=early(beyond(each), each, days.spread_nm))
-    each = seen(replace(fused, zeros=days), tracked=True)
-    scale = _scale(beyond(each), each, COVERAGE + OTHER_MOTIONS_LEARNED)
-    return replace(fused, sigma=sigma, zeros=replace(days, scale=scale))
+    errors = errors_of(replace(fused, zeros=days), track_zeros=True)
+    days = replace(days, early=early_factor(beyond(errors), errors, days.spread_nm))
+    errors = errors_of(replace(fused, zeros=days), track_zeros=True)
+    days = replace(days, scale=scale(errors, COVERAGE + OTHER_MOTIONS_LEARNED))
+    return replace(fused, sigma=sigma, zeros=days)
 
 
-def early(beyond: Sequence[FloatArray], runs: Sequence[Served], spread_nm: float) -> float:
-    """Return the factor of the spread where nothing is known of the day's zero; runs: with a factor of 1.
+def early_factor(beyond: Sequence[FloatArray], runs: Sequence[FusedErrors], spread_nm: float) -> float:
+    """Return the factor of the spread where nothing is known of the day's offset; runs: with a factor of 1.
 
-    beyond: what of each run's errors is to be covered by the spread [Nm]. 1 where too few runs tell.
+    beyond: what of each run's errors the spread has to cover [Nm]. 1 where too few runs show it.
     """
     known = [run.known_nm2 / spread_nm**2 for run in runs]
     kinds = ([k < HALF_KNOWN for k in known], [k >= HALF_KNOWN for k in known])
@@ -387,8 +379,8 @@ def early(beyond: Sequence[FloatArray], runs: Sequence[Served], spread_nm: float
     return 1.0 + more / less if more < (LATEST - 1.0) * less else LATEST
 
 
-def sensor_zeros(runs: Sequence[PathResiduals], reference_nm: float) -> tuple[FloatArray, float]:
-    """Return the part [runs] of each run's errors that is its sensor's zero, and the standard deviation of that [Nm]."""
+def sensor_offsets(runs: Sequence[PathResiduals], reference_nm: float) -> tuple[FloatArray, float]:
+    """Return the part [runs] of each run's errors that is its sensor's offset, and the standard deviation of that [Nm]."""
     if not reference_nm > 0.0:
         return np.zeros(len(runs)), 0.0
     means = np.array([(run.current_error_nm.mean(), run.torsion_error_nm.mean()) for run in runs])
@@ -398,24 +390,18 @@ def sensor_zeros(runs: Sequence[PathResiduals], reference_nm: float) -> tuple[Fl
 
 
 def _beyond(
-    runs: Sequence[Served], zeros: FloatArray, doubt_nm: float, tracking: Tracking | None
+    runs: Sequence[FusedErrors], offsets: FloatArray, doubt_nm: float, tracking: Tracking | None
 ) -> list[FloatArray]:
-    """Return what of the errors of runs, against the torque, is to be covered by the spread [Nm]."""
+    """Return what of the errors of runs, against the torque, the spread has to cover [Nm]."""
     normal = ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
     normal *= doubt_nm / np.sqrt(np.mean(normal**2))
-    left = []
-    for run, zero in zip(runs, zeros, strict=True):
+    beyond = []
+    for run, offset in zip(runs, offsets, strict=True):
         error, more = run.error_nm, run.more_nm2
         if tracking is not None:
-            error = run.now_nm
+            error = run.undelayed_nm
             more = more + tracking.sigma_nm**2
-            more += tracking.viscous_nms_per_rad**2 * by_speed(run.velocity_rad_s, tracking.bend)
-        error = error - zero + normal[np.arange(len(error)) % _QUANTILES]
-        left.append(np.sqrt(np.maximum(error**2 - GAUSS**2 * more, 0.0)))
-    return left
-
-
-def _scale(
-    beyond: Sequence[FloatArray], runs: Sequence[Served], coverage: float
-) -> tuple[float, float, float, float]:
-    return conformal_scale(beyond, [run.spread_nm for run in runs], [run.quadrant for run in runs], coverage)
+            more += tracking.viscous_nms_per_rad**2 * bent_square(run.velocity_rad_s, tracking.bend)
+        error = error - offset + normal[np.arange(len(error)) % _QUANTILES]
+        beyond.append(np.sqrt(np.maximum(error**2 - GAUSS**2 * more, 0.0)))
+    return beyond

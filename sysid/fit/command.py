@@ -6,107 +6,159 @@ import argparse
 import datetime as dt
 import difflib
 import json
-import math
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.checked import ConfigError, check_installed, check_output, counted
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
-from jtqd.estimator.run import RunTableError
-from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.efficiency import (
     EfficiencyFit,
     EfficiencyResult,
     as_mapping,
     default_current_min,
+    draw_fit,
     efficiency_findings,
     eta_points,
     fit_efficiency,
-    plateau_mapping,
     report_lines,
     written_findings,
 )
 from jtqd.sysid.fit.few_runs import MOST_RUNS, FewRunsFit, fit_few_runs
-from jtqd.sysid.fit.friction import FitError, NoLoadFit, fit_no_load, no_load
+from jtqd.sysid.fit.friction import fit_no_load, no_load
 from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
-from jtqd.sysid.fit.losses import PER_K_PRIOR, LossFitError
-from jtqd.sysid.fit.plateaus import Plateau, PlateauError, PlateauRules, plateaus_of
-from jtqd.sysid.fit.signals import RunSignals, run_signals
-from jtqd.sysid.fit.torsion import TorsionError
-from jtqd.sysid.progress import progress
+from jtqd.sysid.fit.losses import PER_K_PRIOR
+from jtqd.sysid.fit.plateaus import PlateauRules, mean_temperature, plateaus_of
+from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
 from jtqd.sysid.report.figures import check_picture
-from jtqd.sysid.runs.checks import channel_findings
-from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.joints import joint_number, only, with_joint
+from jtqd.sysid.report.numbers import plain_values
+from jtqd.sysid.runs.checks import RunIssue, channel_findings
+from jtqd.sysid.runs.options import add_columns, add_number, add_runs, runs_of_joint
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
 
-def fit_parser(kind: str, description: str, examples: str) -> argparse.ArgumentParser:
-    """Parser with RUNS, --joint, --number, --out, --columns and --json; the kind adds its own."""
+@dataclass(frozen=True)
+class Outcome:
+    """What one kind of fit gives: text and JSON for standard output, lines for standard error, the joint to write.
+
+    status: exit status; other than 0, nothing is written.
+    """
+
+    lines: Sequence[str] = ()
+    mapping: Mapping[str, Any] | None = None
+    log: Sequence[str] = ()
+    joint: Joint | None = None
+    status: int = 0
+
+
+class Kind(NamedTuple):
+    """One kind of fit: help, description, epilog of the parser, its own options, and the fit."""
+
+    help: str
+    description: str
+    examples: str
+    options: Callable[[argparse.ArgumentParser], None]
+    fit: Callable[[Joint, int, list[RunFile], argparse.Namespace], Outcome]
+
+
+def main(argv: list[str]) -> int:
+    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
+    if argv and argv[0] not in (*KINDS, "-h", "--help"):
+        near = difflib.get_close_matches(argv[0], KINDS, n=1)
+        hint = f"; did you mean {near[0]!r}?" if near else ""
+        print(f"jtq fit: found {argv[0]!r}, expected one of {', '.join(KINDS)}{hint}", file=sys.stderr)
+        return 2
+    if not argv or argv[0] not in KINDS:
+        print(parser().format_help(), end="")
+        return 0 if argv else 2
+    options = parser().parse_args(argv)
+    by = f"jtq fit {options.kind}"
+    if options.out is not None and options.out.resolve() == options.joint.resolve():
+        print(
+            f"{by}: --out: found {options.out}, the joint file itself, expected a new file", file=sys.stderr
+        )
+        return 2
+    try:
+        joint = load_joint(options.joint)
+        if options.out is not None:
+            check_output(options.out)
+        if getattr(options, "plot", None) is not None:
+            check_installed("analysis", "matplotlib")
+            check_picture(options.plot)
+        runs, number = runs_of_joint(options, joint)
+        outcome = KINDS[options.kind].fit(joint, number, runs, options)
+        if options.json and outcome.mapping is not None:
+            print(json.dumps(outcome.mapping, indent=1))
+        elif outcome.lines:
+            print("\n".join(outcome.lines))
+        for line in outcome.log:
+            print(f"{by}: {line}", file=sys.stderr)
+        if options.out is not None and outcome.joint is not None and not outcome.status:
+            write_joint(options.out, outcome.joint, f"Written by {by} from {counted(len(runs), 'run')}.")
+            print(f"{by}: wrote {options.out}", file=sys.stderr)
+    except (RunError, ValueError, OSError) as error:
+        print(f"{by}: {error}", file=sys.stderr)
+        return 1
+    return outcome.status
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq fit`, a subcommand for each kind."""
     parser = argparse.ArgumentParser(
-        prog=f"jtq fit {kind}",
-        description=description,
-        epilog=f"examples:\n{examples}",
+        prog="jtq fit",
+        description="Fit one section of a joint file to measured runs and write a new joint file.",
+        epilog=(
+            "examples:\n"
+            "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
+            "  jtq fit KIND --help"
+        ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "runs",
-        nargs="+",
-        type=Path,
-        metavar="RUNS",
-        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
-    )
-    parser.add_argument("--joint", type=Path, required=True, metavar="FILE", help="joint file to start from")
-    parser.add_argument(
-        "--number",
-        type=int,
-        choices=range(1, 8),
-        metavar="N",
-        help="number of the joint in the runs (default: the last digit of its name)",
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="FILE", help="joint file to write (default: only the report)"
-    )
-    parser.add_argument(
-        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
-    )
-    parser.add_argument("--json", action="store_true", help="print the result as JSON")
+    kinds = parser.add_subparsers(dest="kind", metavar="KIND")
+    for name, kind in KINDS.items():
+        own = kinds.add_parser(
+            name,
+            help=kind.help,
+            description=kind.description,
+            epilog=f"examples:\n{kind.examples}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        add_runs(own)
+        own.add_argument("--joint", type=Path, required=True, metavar="FILE", help="joint file to start from")
+        add_number(own)
+        own.add_argument(
+            "--out", type=Path, metavar="FILE", help="joint file to write (default: only the report)"
+        )
+        add_columns(own)
+        own.add_argument("--json", action="store_true", help="print the result as JSON")
+        kind.options(own)
     return parser
 
 
-def add_plateau_options(parser: argparse.ArgumentParser) -> None:
-    """--min-hold and --min-current of the fits that rest on plateaus."""
+def _plateau_options(parser: argparse.ArgumentParser) -> None:
+    """Add --min-hold and --min-current, of the fits to plateaus."""
     parser.add_argument(
         "--min-hold",
-        type=positive,
+        type=_positive,
         default=PlateauRules().shortest_s,
         metavar="S",
         help="shortest plateau in seconds (default %(default)s)",
     )
     parser.add_argument(
         "--min-current",
-        type=positive,
+        type=_positive,
         metavar="A",
         help="current below which eta is not computed (default: the current that overcomes the joint's own static friction)",
     )
 
 
-def parse_fit(parser: argparse.ArgumentParser, argv: list[str]) -> argparse.Namespace:
-    """Parse; the joint file that is read is never the one that is written."""
-    options = parser.parse_args(argv)
-    if options.out is not None and options.out.resolve() == options.joint.resolve():
-        parser.error(f"--out: found {options.out}, the joint file itself, expected a new file")
-    return options
-
-
-def positive(text: str) -> float:
+def _positive(text: str) -> float:
     """argparse type: a finite number > 0."""
     try:
         value = float(text)
@@ -117,78 +169,36 @@ def positive(text: str) -> float:
     return value
 
 
-def today() -> str:
-    """Return the date of a fit, ISO 8601, local time."""
-    return dt.datetime.now().astimezone().date().isoformat()
-
-
-EFFICIENCY_BY = "jtq fit efficiency"
-
-
-def efficiency_main(argv: list[str]) -> int:
-    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
-    options = parse_fit(efficiency_parser(), argv)
-    try:
-        joint = load_joint(options.joint)
-        if options.out is not None:
-            check_output(options.out)
-        if options.plot is not None:
-            check_installed("analysis", "matplotlib")
-            check_picture(options.plot)
-        runs = read_runs(options.runs, options.columns, joints=only(options.number))
-        number = joint_number(options.number, joint, runs)
-        runs = with_joint(runs, number)
-        result = analyse(joint, runs, number, options)
-        written = None if result.findings else _new_joint(joint, result, options)
-        if written is not None:
-            result = replace(result, findings=tuple(written_findings(written, result.points, result.fits[0])))
-        print(json.dumps(as_mapping(result), indent=1) if options.json else "\n".join(report_lines(result)))
-        if options.plot is not None and result.fits:
-            _draw(joint, result, options.plot)
-        if result.findings or written is None:
-            return _refuse(result, options)
-        if options.out is not None:
-            write_joint(options.out, written, f"Written by {EFFICIENCY_BY} from {len(runs)} runs.")
-            print(f"{EFFICIENCY_BY}: wrote {options.out}", file=sys.stderr)
-    except (ConfigError, RunError, RunTableError, PlateauError, OSError) as error:
-        print(f"{EFFICIENCY_BY}: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def analyse(joint: Joint, runs: list[RunFile], number: int, options: argparse.Namespace) -> EfficiencyResult:
-    """Everything but files: channels, plateaus, points, fits.
-
-    A run whose channels contradict each other ends it there: what follows from them is not worth a look. Raises
-    PlateauError and RunTableError.
-    """
-    hashes = {run.name: run.sha256 for run in runs}
-    current_min = options.min_current or default_current_min(joint)
-    found = channel_findings(runs, number, joint)
-    if found:
-        return EfficiencyResult(joint.name, number, hashes, (), (), current_min, (), tuple(found))
-    plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
-    points, left_out = eta_points(plateaus, joint, current_min)
-    found = efficiency_findings(points, joint)
-    fits: list[EfficiencyFit] = []
-    if not found:
-        written = options.convention, options.weighted
-        kinds = [written, (options.convention, not options.weighted), (CONVENTIONS[0], options.weighted)]
-        fits = [fit_efficiency(points, c, joint, weighted=w) for c, w in dict.fromkeys(kinds)]
-    return EfficiencyResult(
-        joint.name, number, hashes, tuple(points), tuple(left_out), current_min, tuple(fits), tuple(found)
+def _fitted(
+    joint: Joint,
+    section: str,
+    runs: Sequence[RunFile],
+    options: argparse.Namespace,
+    *,
+    temperature_c: float,
+    notes: Mapping[str, Any],
+) -> Joint:
+    """Return the joint with today's date, the command and the hashes of the runs in the provenance of a section."""
+    return with_fit(
+        joint,
+        section,
+        by=f"jtq fit {options.kind}",
+        runs={run.name: run.sha256 for run in runs},
+        date=dt.datetime.now().astimezone().date().isoformat(),
+        temperature_c=temperature_c,
+        notes=notes,
     )
 
 
-def efficiency_parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq fit efficiency`."""
-    parser = fit_parser(
-        "efficiency",
-        "Fit the paper's Eq. (8) to the plateaus of measured runs, quadrant by quadrant.",
-        "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
-        "  jtq fit efficiency runs/*.csv --joint joint2.yaml --number 2 --json",
-    )
-    add_plateau_options(parser)
+def _count(findings: Sequence[RunIssue]) -> str:
+    return counted(len(findings), "finding")
+
+
+# Efficiency --------------------------------------------------------------------------------------------------------------
+
+
+def _efficiency_options(parser: argparse.ArgumentParser) -> None:
+    _plateau_options(parser)
     parser.add_argument(
         "--convention",
         choices=CONVENTIONS,
@@ -198,7 +208,7 @@ def efficiency_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--weighted",
         action="store_true",
-        help="weight plateaus by their standard errors and the sensor's zero",
+        help="weight plateaus by their standard errors and the sensor's offset",
     )
     parser.add_argument(
         "--allow-missing",
@@ -206,14 +216,72 @@ def efficiency_parser() -> argparse.ArgumentParser:
         help="keep the joint file's coefficients for quadrants that cannot be fitted",
     )
     parser.add_argument("--plot", type=Path, metavar="FILE", help="plot like Fig. 6 (png, svg, pdf)")
-    return parser
 
 
-def _new_joint(joint: Joint, result: EfficiencyResult, options: argparse.Namespace) -> Joint | None:
-    """Return the joint with its new efficiency; None when a quadrant is refused and that was not allowed."""
-    fit = result.fits[0]
-    if fit.refused and not options.allow_missing:
-        return None
+def _fit_efficiency(joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace) -> Outcome:
+    result = _efficiency_result(joint, number, runs, options)
+    fit = result.fits[0] if result.fits else None
+    written = None
+    if fit is not None and (not fit.refused or options.allow_missing):
+        written = _with_efficiency(joint, fit, result, runs, options)
+        result = replace(result, findings=tuple(written_findings(written, result.points, fit)))
+    log = []
+    if fit is not None and options.plot is not None:
+        title = f"{joint.name}: measured efficiency and Eq. (8), convention {fit.convention}"
+        try:
+            draw_fit(result.points, fit, title, options.plot)
+        except ValueError as error:  # matplotlib's own: an ending that it does not know
+            raise ConfigError(f"--plot {options.plot}: {error}") from None
+        log.append(f"wrote {options.plot}")
+    nothing = f"nothing was written to {options.out}" if options.out is not None else "not fitted"
+    status = 0
+    if result.findings:
+        log.append(f"{_count(result.findings)}, {nothing}")
+        status = 3
+    elif fit is not None and written is None:
+        log += [
+            f"{text} (--allow-missing keeps the joint file's own); {nothing}" for text in fit.refused.values()
+        ]
+        status = 1
+    return Outcome(report_lines(result), as_mapping(result), log, written, status)
+
+
+def _efficiency_result(
+    joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace
+) -> EfficiencyResult:
+    """Return channels, plateaus, points and fits; findings end it. Raises PlateauError and RunTableError."""
+    result = EfficiencyResult(
+        joint.name,
+        number,
+        {run.name: run.sha256 for run in runs},
+        current_min_a=options.min_current or default_current_min(joint),
+        findings=tuple(channel_findings(runs, number, joint)),
+    )
+    if result.findings:
+        return result
+    plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
+    points, left_out = eta_points(plateaus, joint, result.current_min_a)
+    found = efficiency_findings(points, joint)
+    fits: list[EfficiencyFit] = []
+    if not found:
+        kinds = (
+            (options.convention, options.weighted),
+            (options.convention, not options.weighted),
+            (CONVENTIONS[0], options.weighted),
+        )
+        fits = [fit_efficiency(points, c, joint, weighted=w) for c, w in dict.fromkeys(kinds)]
+    return replace(
+        result, points=tuple(points), left_out=tuple(left_out), fits=tuple(fits), findings=tuple(found)
+    )
+
+
+def _with_efficiency(
+    joint: Joint,
+    fit: EfficiencyFit,
+    result: EfficiencyResult,
+    runs: list[RunFile],
+    options: argparse.Namespace,
+) -> Joint:
     try:
         efficiency = fit.efficiency(joint.efficiency if options.allow_missing else None)
     except ValueError as error:
@@ -221,231 +289,94 @@ def _new_joint(joint: Joint, result: EfficiencyResult, options: argparse.Namespa
     notes: dict[str, object] = {"weighted": fit.weighted, "plateaus": len(result.points)}
     if fit.refused:
         notes["kept_from_joint_file"] = list(fit.refused)
-    return with_fit(
-        replace(joint, efficiency=efficiency),
-        "efficiency",
-        by=EFFICIENCY_BY,
-        runs=result.runs,
-        date=today(),
-        temperature_c=result.temperature_c,
-        notes=notes,
-    )
+    new = replace(joint, efficiency=efficiency)
+    return _fitted(new, "efficiency", runs, options, temperature_c=result.temperature_c, notes=notes)
 
 
-def _refuse(result: EfficiencyResult, options: argparse.Namespace) -> int:
-    """Report on standard error why nothing was written; returns the exit status."""
-    nothing = f"nothing was written to {options.out}" if options.out is not None else "not fitted"
-    if result.findings:
-        count = len(result.findings)
-        print(f"{EFFICIENCY_BY}: {count} finding{'s' if count > 1 else ''}, {nothing}", file=sys.stderr)
-        return 3
-    for text in result.fits[0].refused.values():
-        print(
-            f"{EFFICIENCY_BY}: {text} (--allow-missing keeps the joint file's own); {nothing}",
-            file=sys.stderr,
-        )
-    return 1
+# Friction ----------------------------------------------------------------------------------------------------------------
 
 
-def _draw(joint: Joint, result: EfficiencyResult, path: Path) -> None:
-    from jtqd.sysid.fit.efficiency import draw_fit
-
-    title = f"{joint.name}: measured efficiency and Eq. (8), convention {result.fits[0].convention}"
-    try:
-        draw_fit(result.points, result.fits[0], title, path)
-    except ValueError as error:  # matplotlib's own: an ending that it does not know
-        raise ConfigError(f"--plot {path}: {error}") from None
-    print(f"{EFFICIENCY_BY}: wrote {path}", file=sys.stderr)
-
-
-FRICTION_BY = "jtq fit friction"
-
-
-def friction_parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq fit friction`."""
-    parser = fit_parser(
-        "friction",
-        "Fit Coulomb and viscous friction to the plateaus at no load (motor current or joint torque near zero).",
-        "  jtq fit friction campaigns/efficiency --joint joint1.yaml --out joint1.friction.yaml",
-    )
-    add_plateau_options(parser)
-    return parser
-
-
-def friction_main(argv: list[str]) -> int:
-    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
-    options = parse_fit(friction_parser(), argv)
-    try:
-        joint = load_joint(options.joint)
-        if options.out is not None:
-            check_output(options.out)
-        runs = read_runs(options.runs, options.columns, joints=only(options.number))
-        number = joint_number(options.number, joint, runs)
-        runs = with_joint(runs, number)
-        found = channel_findings(runs, number, joint)
-        if found:
-            for item in found:
-                print(f"{item.kind}: {item.text}")
-            print(
-                f"{FRICTION_BY}: {len(found)} finding{'s' if len(found) > 1 else ''}, not fitted",
-                file=sys.stderr,
-            )
-            return 3
-        plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
-        chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
-        fit = fit_no_load(chosen, joint)
-        if options.json:
-            print(json.dumps(_friction_mapping(joint, number, fit, chosen), indent=1))
-        else:
-            print("\n".join([f"{joint.name} (j{number}): friction at no load", *fit.lines()]))
-        if options.out is not None:
-            temperatures = [p.temperature_c for p in chosen if math.isfinite(p.temperature_c)]
-            new = with_fit(
-                replace(joint, friction=fit.friction),
-                "friction",
-                by=FRICTION_BY,
-                runs={run.name: run.sha256 for run in runs},
-                date=today(),
-                temperature_c=float(np.mean(temperatures)) if temperatures else math.nan,
-                notes={"plateaus": fit.plateaus},
-            )
-            write_joint(options.out, new, f"Written by {FRICTION_BY} from {len(runs)} runs.")
-            print(f"{FRICTION_BY}: wrote {options.out}", file=sys.stderr)
-    except (ConfigError, RunError, RunTableError, PlateauError, FitError, OSError) as error:
-        print(f"{FRICTION_BY}: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def _friction_mapping(
-    joint: Joint, number: int, fit: NoLoadFit, plateaus: Sequence[Plateau]
-) -> dict[str, Any]:
-    return {
+def _fit_friction(joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace) -> Outcome:
+    found = channel_findings(runs, number, joint)
+    if found:
+        lines = [f"{item.kind}: {item.text}" for item in found]
+        return Outcome(lines, log=[f"{_count(found)}, not fitted"], status=3)
+    plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
+    chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
+    fit = fit_no_load(chosen, joint)
+    mapping = {
         "schema": "jtq.friction/1",
         "joint": joint.name,
         "number": number,
-        "friction": asdict(fit.friction),
-        "terms": [{"name": t.name, "value": t.value, "ci95": t.ci95} for t in fit.terms],
+        "friction": fit.friction,
+        "terms": fit.terms,
         "rmse_nm": fit.rmse_nm,
-        "warnings": list(fit.warnings),
-        "plateaus": [plateau_mapping(plateau) for plateau in plateaus],
+        "warnings": fit.warnings,
+        "plateaus": chosen,
     }
-
-
-LOSSES_BY = "jtq fit losses"
-_EXAMPLE = (
-    "  jtq fit losses campaigns/excitation --joint joint1.yaml --out joint1.fused.yaml\n"
-    "The runs must excite load, speed and both directions; `jtq campaign excitation` records them.\n"
-    f"With one encoder one to {MOST_RUNS} runs will do, with a wider sigma."
-)
-
-
-def losses_parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq fit losses`."""
-    return fit_parser(
-        "losses", "Additive loss over load, speed, direction and temperature; torsion; sigma.", _EXAMPLE
+    new = _fitted(
+        replace(joint, friction=fit.friction),
+        "friction",
+        runs,
+        options,
+        temperature_c=mean_temperature(chosen),
+        notes={"plateaus": fit.plateaus},
     )
+    lines = [f"{joint.name} (j{number}): friction at no load", *fit.lines()]
+    return Outcome(lines, plain_values(mapping), joint=new)
 
 
-def losses_main(argv: list[str]) -> int:
-    """Fit and write; exit status 0 done, 1 failure, 2 usage, 3 findings (then nothing is written)."""
-    options = parse_fit(losses_parser(), argv)
-    try:
-        joint = load_joint(options.joint)
-        if options.out is not None:
-            check_output(options.out)
-        runs = read_runs(options.runs, options.columns, joints=only(options.number))
-        number = joint_number(options.number, joint, runs)
-        runs = with_joint(runs, number)
-        findings = channel_findings(runs, number, joint)
-        if findings:
-            for finding in findings:
-                print(f"{LOSSES_BY}: {finding.text}", file=sys.stderr)
-            return 3
-        two = two_encoders(runs, number, joint)
-        signals = signals_of(runs, number, joint)
-        if not two:
-            print(f"{LOSSES_BY}: {ONE_ENCODER}", file=sys.stderr)
-        if not two and len(runs) <= MOST_RUNS:
-            few = fit_few_runs(signals, joint)
-            print(f"{LOSSES_BY}: {FEW_RUNS}", file=sys.stderr)
-            written = _with_few(few, runs)
-            told, lines = _few_mapping(few), _few_lines(few)
-        else:
-            fit = fit_fused(signals, joint.friction, joint.rated_torque_nm, with_torsion=two)
-            written = _with_fused(joint, fit, runs)
-            told, lines = _losses_mapping(fit), _lines(joint, fit)
-        print(json.dumps(told, indent=1) if options.json else "\n".join(lines))
-        if options.out is not None:
-            write_joint(options.out, written, f"Written by {LOSSES_BY} from {counted(len(runs), 'run')}.")
-            print(f"{LOSSES_BY}: wrote {options.out}", file=sys.stderr)
-    except (ConfigError, RunError, RunTableError, LossFitError, TorsionError, ValueError, OSError) as error:
-        print(f"{LOSSES_BY}: {error}", file=sys.stderr)
-        return 1
-    return 0
-
+# Losses ------------------------------------------------------------------------------------------------------------------
 
 ONE_ENCODER: Final = (
     "the runs have one encoder of this joint: no torsion is fitted, sigma is that of motor current less loss"
 )
 FEW_RUNS: Final = (
-    f"up to {MOST_RUNS} runs: what they do not tell stays near the joint file and widens sigma "
+    f"up to {MOST_RUNS} runs: what they do not determine stays near the joint file and widens sigma "
     "(docs/results.md)"
 )
 
 
-def two_encoders(runs: list[RunFile], number: int, joint: Joint) -> bool:
-    """Return whether the runs have both encoders of a joint. Raises RunTableError where some have and some have not."""
-    without = [run.name for run in runs if not run.table.joints[number].two_encoders(joint.gear_ratio)]
-    if without and len(without) < len(runs):
-        raise RunTableError(
-            f"{without[0]}: j{number}: found one position, other runs have both, expected both in all runs or in none"
-        )
-    return not without
-
-
-def signals_of(runs: list[RunFile], number: int, joint: Joint) -> list[RunSignals]:
-    """Return what fits of the fused estimator see of one joint in all runs, with a progress bar on a terminal."""
-    settings = EstimatorSettings(method="fused")
-    return [
-        run_signals(run.name, joint, settings, run.table.time_s, run.table.joint(number, joint.gear_ratio))
-        for run in progress(runs, f"observing {joint.name}")
-    ]
-
-
-def _with_fused(joint: Joint, fit: FusedFit, runs: list[RunFile]) -> Joint:
-    return with_fit(
+def _fit_losses(joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace) -> Outcome:
+    found = channel_findings(runs, number, joint)
+    if found:
+        return Outcome(log=[item.text for item in found], status=3)
+    two = two_encoders(runs, number, joint)
+    signals = signals_of_runs(runs, number, joint)
+    if not two and len(runs) <= MOST_RUNS:
+        few = fit_few_runs(signals, joint)
+        notes = {
+            "unseen_rmse_nm": round(few.held_out_nm, 4),
+            "few_runs": few.lines(),
+            "rotor_inertia_kgm2": "fitted, too",
+        }
+        temperature_c = few.fused.loss.temperature_c
+        new = _fitted(few.joint, "fused", runs, options, temperature_c=temperature_c, notes=notes)
+        return Outcome(_few_lines(few), _few_mapping(few), [ONE_ENCODER, FEW_RUNS], new)
+    fit = fit_fused(signals, joint, two_encoders=two)
+    new = _fitted(
         replace(joint, fused=fit.fused),
         "fused",
-        by=LOSSES_BY,
-        runs={Path(run.name).name: run.sha256 for run in runs},
-        date=today(),
+        runs,
+        options,
         temperature_c=fit.fused.loss.temperature_c,
-        notes={"unseen_rmse_nm": round(_unseen(fit), 4)},
+        notes={"unseen_rmse_nm": round(_held_out_rmse(fit), 4)},
     )
-
-
-def _with_few(fit: FewRunsFit, runs: list[RunFile]) -> Joint:
-    return with_fit(
-        fit.joint,
-        "fused",
-        by=LOSSES_BY,
-        runs={Path(run.name).name: run.sha256 for run in runs},
-        date=today(),
-        temperature_c=fit.fused.loss.temperature_c,
-        notes={
-            "unseen_rmse_nm": round(fit.unseen_nm, 4),
-            "few_runs": fit.lines(),
-            "rotor_inertia_kgm2": "fitted, too",
-        },
-    )
+    mapping = {
+        "schema": "jtq.fit_losses/1",
+        "unseen_rmse_nm": list(fit.held_out_rmse_nm),
+        "samples": fit.loss.samples,
+        "viscous_per_k_sigma": fit.loss.viscous_per_k_sigma,
+        "fused": fit.fused.to_mapping(),
+    }
+    return Outcome(_fused_lines(joint, fit), mapping, [] if two else [ONE_ENCODER], new)
 
 
 def _few_mapping(fit: FewRunsFit) -> dict[str, object]:
-    """Return the mapping of `_losses_mapping`, and what few runs told of each thing."""
+    """Return the mapping of a fit of many runs, and the fitted quantities."""
     return {
         "schema": "jtq.fit_losses/1",
-        "unseen_rmse_nm": [fit.unseen_nm],
+        "unseen_rmse_nm": [fit.held_out_nm],
         "samples": fit.samples,
         "viscous_per_k_sigma": PER_K_PRIOR[1],
         "effective_samples": fit.effective,
@@ -466,126 +397,80 @@ def _few_lines(fit: FewRunsFit) -> list[str]:
     ]
 
 
-def _unseen(fit: FusedFit) -> float:
-    return float(np.sqrt(np.mean(np.square(fit.unseen_rmse_nm))))
+def _held_out_rmse(fit: FusedFit) -> float:
+    return float(np.sqrt(np.mean(np.square(fit.held_out_rmse_nm))))
 
 
-def _losses_mapping(fit: FusedFit) -> dict[str, object]:
-    return {
-        "schema": "jtq.fit_losses/1",
-        "unseen_rmse_nm": list(fit.unseen_rmse_nm),
-        "samples": fit.loss.samples,
-        "viscous_per_k_sigma": fit.loss.viscous_per_k_sigma,
-        "fused": fit.fused.to_mapping(),
-    }
-
-
-def _lines(joint: Joint, fit: FusedFit) -> list[str]:
-    sigma, torsion, loss = fit.fused.sigma, fit.fused.torsion, fit.fused.loss
+def _fused_lines(joint: Joint, fit: FusedFit) -> list[str]:
+    fused, rmse = fit.fused, _held_out_rmse(fit)
+    sigma, torsion, loss = fused.sigma, fused.torsion, fused.loss
     lines = [
-        f"{joint.name}: physics on held-out runs: RMSE {_unseen(fit):.3f} Nm "
-        f"({100 * _unseen(fit) / joint.rated_torque_nm:.2f} % of rated), worst run {max(fit.unseen_rmse_nm):.3f} Nm",
+        f"{joint.name}: physics on held-out runs: RMSE {rmse:.3f} Nm "
+        f"({100 * rmse / joint.rated_torque_nm:.2f} % of rated), worst run {max(fit.held_out_rmse_nm):.3f} Nm",
         f"  loss: {fit.loss.samples} samples, viscous friction falls {100 * loss.viscous_per_k:.1f} "
         f"+- {196 * fit.loss.viscous_per_k_sigma:.1f} % per kelvin",
         f"  sigma of the current path {sigma.current_nm:.2f} Nm, {sigma.viscous_nms_per_rad:.2f} Nms/rad, "
-        f"{100 * sigma.load:.1f} % of load"
-        + (
-            ""
-            if torsion is None
-            else f"; of the torsion {sigma.torsion_nm:.2f} Nm; of the sensor's zero {sigma.reference_nm:.2f} Nm"
-        ),
+        f"{100 * sigma.load:.1f} % of load",
     ]
-    if torsion is not None:
-        amplitude = np.hypot(torsion.cos_rad, torsion.sin_rad) * 1e6
+    if torsion is None:
+        return lines
+    lines[-1] += (
+        f"; of the torsion {sigma.torsion_nm:.2f} Nm; of the sensor's offset {sigma.reference_nm:.2f} Nm"
+    )
+    amplitude = np.hypot(torsion.cos_rad, torsion.sin_rad) * 1e6
+    lines.append(
+        f"  stiffness {torsion.stiffness_nm_per_rad:.0f} Nm/rad (file: {joint.stiffness_nm_per_rad:.0f}), kinematic "
+        f"error {amplitude[0]:.0f} urad at 2 per motor revolution, {amplitude[1]:.0f} at 4"
+    )
+    if fused.agreement is not None:
         lines.append(
-            f"  stiffness {torsion.stiffness_nm_per_rad:.0f} Nm/rad (file: {joint.stiffness_nm_per_rad:.0f}), kinematic "
-            f"error {amplitude[0]:.0f} urad at 2 per motor revolution, {amplitude[1]:.0f} at 4"
+            f"  current and torsion differ by up to {fused.agreement.slow_nm:.2f} Nm slowly and "
+            f"{fused.agreement.fast_nm:.2f} Nm over the motor's turn; sigma grows beyond"
         )
-    agreement = fit.fused.agreement
-    if agreement is not None:
+    if fused.zeros is not None:
         lines.append(
-            f"  current and torsion differ by up to {agreement.slow_nm:.2f} Nm slowly and {agreement.fast_nm:.2f} Nm "
-            "over the motor's turn; sigma grows beyond"
+            f"  the link encoder's offset differs by {1e6 * fused.zeros.spread_rad:.0f} urad, "
+            f"{fused.zeros.spread_nm:.2f} Nm, from day to day; with track_zeros it is learned"
         )
-    zeros = fit.fused.zeros
-    if zeros is not None:
-        lines.append(
-            f"  the link encoder's zero differs by {1e6 * zeros.spread_rad:.0f} urad, {zeros.spread_nm:.2f} Nm, from day to "
-            "day; with track_zeros it is learned"
-        )
-    standstill = fit.fused.standstill
-    if standstill is not None:
-        lines.append(
-            f"  at rest the interval is {standstill.sigmas:.2f} standard deviations and what slip and friction leave open"
-        )
-    elif torsion is not None:
+    if fused.standstill is None:
         lines.append("  too few runs come to rest to calibrate the interval there: 3 standard deviations")
-    tracking = fit.fused.tracking
-    if tracking is not None:
+    else:
         lines.append(
-            f"  with the torsion tracked, an estimate of now: {tracking.sigma_nm:.2f} Nm and "
-            f"{tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares, the latter bent above "
-            f"{tracking.saturation_rad_s:g} rad/s"
+            f"  at rest the interval is {fused.standstill.sigmas:.2f} standard deviations and what slip and friction "
+            "leave open"
+        )
+    if fused.tracking is not None:
+        lines.append(
+            f"  with the torsion tracked, an estimate without delay: {fused.tracking.sigma_nm:.2f} Nm and "
+            f"{fused.tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares, the latter bent above "
+            f"{fused.tracking.saturation_rad_s:g} rad/s"
         )
     return lines
 
 
 KINDS: Final = {
-    "efficiency": (efficiency_main, "efficiency: Eq. (8) per quadrant, from plateaus"),
-    "friction": (
-        friction_main,
-        "Coulomb and viscous friction at no load, from plateaus",
-    ),
-    "losses": (losses_main, "additive loss over load and velocity, from whole runs"),
-}
-"""Kind -> (its `main(argv) -> int`, one line of help)."""
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq fit`, a subcommand for each kind."""
-    parser = argparse.ArgumentParser(
-        prog="jtq fit",
-        description="Fit one section of a joint file to measured runs and write a new joint file.",
-    )
-    kinds = parser.add_subparsers(dest="kind", metavar="KIND")
-    for name, made in (
-        ("efficiency", efficiency_parser()),
-        ("friction", friction_parser()),
-        ("losses", losses_parser()),
-    ):
-        kinds.add_parser(
-            name,
-            help=KINDS[name][1],
-            description=made.description,
-            epilog=made.epilog,
-            parents=[made],
-            add_help=False,
-        )
-    return parser
-
-
-def main(argv: list[str]) -> int:
-    """Hand over to the kind's command; exit status 0 done, 1 failure, 2 usage, 3 done with findings."""
-    if not argv or argv[0] in ("-h", "--help", "help"):
-        print(_help(), end="")
-        return 0 if argv else 2
-    kind = KINDS.get(argv[0])
-    if kind is None:
-        near = difflib.get_close_matches(argv[0], KINDS, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        print(f"jtq fit: found {argv[0]!r}, expected one of {', '.join(KINDS)}{hint}", file=sys.stderr)
-        return 2
-    return kind[0](argv[1:])
-
-
-def _help() -> str:
-    width = max(map(len, KINDS))
-    rows = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in KINDS.items())
-    return (
-        "usage: jtq fit KIND RUNS... --joint JOINT.yaml --out NEW_JOINT.yaml ...\n\n"
-        "Fit one section of a joint file to measured runs and write a new joint file.\n\n"
-        f"kinds:\n{rows}\n\n"
-        "examples:\n"
+    "efficiency": Kind(
+        "efficiency: Eq. (8) per quadrant, from plateaus",
+        "Fit the paper's Eq. (8) to the plateaus of measured runs, quadrant by quadrant.",
         "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
-        "  jtq fit KIND --help\n"
-    )
+        "  jtq fit efficiency runs/*.csv --joint joint2.yaml --number 2 --json",
+        _efficiency_options,
+        _fit_efficiency,
+    ),
+    "friction": Kind(
+        "Coulomb and viscous friction at no load, from plateaus",
+        "Fit Coulomb and viscous friction to the plateaus at no load (motor current or joint torque near zero).",
+        "  jtq fit friction campaigns/efficiency --joint joint1.yaml --out joint1.friction.yaml",
+        _plateau_options,
+        _fit_friction,
+    ),
+    "losses": Kind(
+        "additive loss over load and velocity, from whole runs",
+        "Additive loss over load, speed, direction and temperature; torsion; sigma.",
+        "  jtq fit losses campaigns/excitation --joint joint1.yaml --out joint1.fused.yaml\n"
+        "The runs must excite load, speed and both directions; `jtq campaign excitation` records them.\n"
+        f"With one encoder one to {MOST_RUNS} runs will do, with a wider sigma.",
+        lambda parser: None,
+        _fit_losses,
+    ),
+}

@@ -1,17 +1,17 @@
-"""Fit the paper's Eq. (8) to measured plateaus, one polynomial per quadrant of (i, omega_m), and check what cannot be.
+"""Efficiency map: fit the paper's Eq. (8) to measured plateaus, one polynomial per quadrant of (i, omega_m), and report it.
 
     eta = p00 + p10 i + p01 v + p20 i^2 + p11 i v + p02 v^2        v = omega_m/G [rad/s], i [A], both signed
 
-eta has two names, and this file carries both: "joint_over_motor", tau_j/(G Kt i), as in Table I; "motor_over_joint",
-G Kt i/tau_j, as in Eq. (6). A point is measured once, as tau_j and i; its eta in either convention follows from these.
+eta has two conventions: "joint_over_motor", tau_j/(G Kt i), as in Table I; "motor_over_joint", G Kt i/tau_j, as in Eq. (6).
+A point is measured once, as tau_j and i; its eta in either convention follows from these.
 
 At constant velocity the motor's inertia carries nothing, so G Kt i = tau_j + loss, and the loss has the sign of v. Below
 the current that overcomes the joint's own friction, (Fc + Fs)/(G Kt), the torque of a driving joint may be of either
 sign and eta goes through 0/0: such points are left out and counted.
 
 At every plateau the loss (G Kt i - tau_j) sign(v) is positive: eta = tau_j/(G Kt i) is below 1 when driving, above 1
-when back-driven, never negative. A measurement that differs by more than its standard errors and the sensor's zero is
-not a joint with odd friction but a wrong number in the joint file or a wrong channel, and is not fitted.
+when back-driven, never negative. A measurement that differs by more than its standard errors and the sensor's offset shows a
+wrong number in the joint file or a wrong channel, and is not fitted.
 
 The report has text, plain values, and the paper's Fig. 6 (measured eta and fitted surface per quadrant).
 """
@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -36,8 +36,9 @@ from jtqd.estimator.losses import (
     LossModel,
     static_friction,
 )
-from jtqd.sysid.fit.plateaus import Mean, Plateau
+from jtqd.sysid.fit.plateaus import Plateau, mean_temperature
 from jtqd.sysid.report.figures import plain
+from jtqd.sysid.report.numbers import indented, plain_values, table
 from jtqd.sysid.runs.channels import RunIssue
 
 COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")
@@ -48,8 +49,8 @@ HIGHEST_CONDITION: Final = 3000.0
 SAME_VELOCITY_RAD_S: Final = 0.03
 SAME_CURRENT_A: Final = 0.1
 """Plateaus closer than both of these are the same operating point measured again."""
-ZERO_SHARE: Final = 0.01
-"""Share of rated torque by which the sensor's zero may be off from day to day: 0.4 Nm of 40 Nm."""
+OFFSET_SHARE: Final = 0.01
+"""Largest offset of the sensor from day to day, as a share of rated torque: 0.4 Nm of 40 Nm."""
 
 
 @dataclass(frozen=True)
@@ -161,9 +162,9 @@ def fit_efficiency(
 ) -> EfficiencyFit:
     """Fit Eq. (8) to the points of each quadrant in the named convention.
 
-    weighted: by 1/variance, of the plateau's own standard error and of the sensor's zero (ZERO_SHARE of rated torque),
+    weighted: by 1/variance, of the plateau's own standard error and of the sensor's offset (OFFSET_SHARE of rated torque),
     which is the same torque at any load: an error of eta at a small load then counts as the little torque it is.
-    Raises ValueError for a convention that has no name.
+    Raises ValueError for an unknown convention.
     """
     if convention not in CONVENTIONS:
         raise ValueError(f"convention: found {convention!r}, expected one of {', '.join(CONVENTIONS)}")
@@ -218,9 +219,9 @@ def _fit_quadrant(points: Sequence[EtaPoint], convention: str, joint: Joint, wei
         )
     weights = np.ones_like(eta)
     if weighted:
-        zero_nm = ZERO_SHARE * joint.rated_torque_nm
+        offset_nm = OFFSET_SHARE * joint.rated_torque_nm
         spread = [
-            math.hypot(p.se, zero_nm / p.motor_nm) * (1.0 if p.eta(convention) == p.ratio else p.ratio**-2)
+            math.hypot(p.se, offset_nm / p.motor_nm) * (1.0 if p.eta(convention) == p.ratio else p.ratio**-2)
             for p in points
         ]
         weights = 1.0 / np.array(spread)
@@ -273,22 +274,23 @@ Eq. (6), so that its Eq. (7) must multiply by it. Velocity omega_m/G 0.2 to 3 ra
 
 
 STANDARD_ERRORS: Final = 3.0
-"""How many of them a plateau may be beyond the border, besides the sensor's zero."""
+"""How many of them a plateau may be beyond the border, besides the sensor's offset."""
 
 
 def efficiency_findings(points: Sequence[EtaPoint], joint: Joint) -> list[RunIssue]:
     """Return where the plateaus contradict the joint file or the channels; an empty list is good."""
-    zero_nm = ZERO_SHARE * joint.rated_torque_nm
+    offset_nm = OFFSET_SHARE * joint.rated_torque_nm
     against = [
         p
         for p in points
-        if p.ratio < 0.0 and abs(p.plateau.torque.value) > _reach(p.plateau.torque.se, zero_nm)
+        if p.ratio < 0.0 and abs(p.plateau.torque.value) > _reach(p.plateau.torque.se, offset_nm)
     ]
     if against:
         return [_against_current(against, points)]
     kinds = {driving: [p for p in points if p.driving is driving] for driving in (True, False)}
     gaining = {
-        driving: [p for p in own if p.loss_nm < -_reach(p.loss_se, zero_nm)] for driving, own in kinds.items()
+        driving: [p for p in own if p.loss_nm < -_reach(p.loss_se, offset_nm)]
+        for driving, own in kinds.items()
     }
     # More than half of both: then it is not a scale, which moves eta of both kinds the same way.
     mirrored = all(2 * len(gaining[driving]) > len(own) for driving, own in kinds.items())
@@ -325,27 +327,27 @@ _SCALE: Final = (
 def written_findings(written: Joint, points: Sequence[EtaPoint], fit: EfficiencyFit) -> list[RunIssue]:
     """Compare the joint as it will be written, through the estimator's own loss law, with the measured torque.
 
-    The law holds eta outside its range and inside its bounds, so only points in its range are asked. Coefficients
-    of one convention under the name of the other give another torque altogether.
+    The law clamps eta outside its range, so only points in its range are compared. Coefficients of one convention under the
+    name of the other give another torque altogether.
     """
     model = LossModel(written)
-    asked = [p for p in points if p.quadrant in fit.quadrants and _in_range(p)]
-    if not asked:
+    compared = [p for p in points if p.quadrant in fit.quadrants and _in_range(p)]
+    if not compared:
         return []
-    current, velocity = operating_points(asked)
-    motor = np.array([p.motor_nm for p in asked])
-    measured = np.array([p.plateau.torque.value for p in asked])
+    current, velocity = operating_points(compared)
+    motor = np.array([p.motor_nm for p in compared])
+    measured = np.array([p.plateau.torque.value for p in compared])
     by_law = motor - model.loss_many(current, velocity)
     rms_nm = math.sqrt(float(np.mean((by_law - measured) ** 2)))
-    fitted_nm = max(fit.quadrants[p.quadrant].rmse_nm for p in asked)
-    if rms_nm <= 2.0 * fitted_nm + ZERO_SHARE * written.rated_torque_nm:
+    fitted_nm = max(fit.quadrants[p.quadrant].rmse_nm for p in compared)
+    if rms_nm <= 2.0 * fitted_nm + OFFSET_SHARE * written.rated_torque_nm:
         return []
     convention = "no efficiency" if written.efficiency is None else written.efficiency.convention
     return [
         RunIssue(
             "convention",
             f"{written.name}: the coefficients under the name '{convention}' miss the measured torque by {rms_nm:.2f} Nm "
-            f"(RMS of {len(asked)} plateaus), expected about {fitted_nm:.2f} Nm as in the fit: wrong convention of eta",
+            f"(RMS of {len(compared)} plateaus), expected about {fitted_nm:.2f} Nm as in the fit: wrong convention of eta",
         )
     ]
 
@@ -359,8 +361,8 @@ def _in_range(point: EtaPoint) -> bool:
     )
 
 
-def _reach(standard_error_nm: float, zero_nm: float) -> float:
-    return STANDARD_ERRORS * standard_error_nm + zero_nm
+def _reach(standard_error_nm: float, offset_nm: float) -> float:
+    return STANDARD_ERRORS * standard_error_nm + offset_nm
 
 
 def _against_current(points: Sequence[EtaPoint], of: Sequence[EtaPoint]) -> RunIssue:
@@ -393,7 +395,7 @@ def _finding(
 
 
 SCHEMA: Final = "jtq.efficiency/1"
-TITLES: Final = {
+QUADRANT_TITLES: Final = {
     "i_pos_w_pos": "i > 0, w > 0: driving",
     "i_neg_w_neg": "i < 0, w < 0: driving",
     "i_neg_w_pos": "i < 0, w > 0: back-driven",
@@ -403,55 +405,53 @@ TITLES: Final = {
 
 @dataclass(frozen=True)
 class EfficiencyResult:
-    """Result of one `jtq fit efficiency`; `fits` holds the one to be written first, then those for comparison."""
+    """Result of one `jtq fit efficiency`; `fits`: the one to be written first, then those for comparison."""
 
     joint: str
     number: int
     runs: Mapping[str, str]
-    points: tuple[EtaPoint, ...]
-    left_out: tuple[Plateau, ...]
     current_min_a: float
-    fits: tuple[EfficiencyFit, ...]
-    findings: tuple[RunIssue, ...]
+    points: tuple[EtaPoint, ...] = ()
+    left_out: tuple[Plateau, ...] = ()
+    fits: tuple[EfficiencyFit, ...] = ()
+    findings: tuple[RunIssue, ...] = ()
 
     @property
     def temperature_c(self) -> float:
         """Mean over the plateaus, NaN where it was not measured."""
-        known = [p.plateau.temperature_c for p in self.points if math.isfinite(p.plateau.temperature_c)]
-        return float(np.mean(known)) if known else math.nan
+        return mean_temperature([point.plateau for point in self.points])
 
 
 def difference_from_table(
     points: Sequence[EtaPoint], name: str, polynomial: QuadrantPolynomial
-) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
+) -> FloatArray:
     """Fitted minus Table I's eta (joint over motor) at the measured points of one quadrant, [n]."""
     own = [point for point in points if point.quadrant == name]
-    table: QuadrantPolynomial = getattr(TABLE_I, name)
+    paper: QuadrantPolynomial = getattr(TABLE_I, name)
     pairs = zip(*(column.tolist() for column in operating_points(own)), strict=True)
-    return np.array([polynomial.value(i, v) - table.value(i, v) for i, v in pairs])
+    return np.array([polynomial.value(i, v) - paper.value(i, v) for i, v in pairs])
 
 
 def report_lines(result: EfficiencyResult) -> list[str]:
     """Return the report, ready to print."""
     lines = [
         f"{result.joint} (j{result.number}): {len(result.points)} plateaus in {len(result.runs)} runs"
-        + ("" if math.isnan(result.temperature_c) else f", {result.temperature_c:.1f} degC on average")
-    ]
-    lines += [
+        + ("" if math.isnan(result.temperature_c) else f", {result.temperature_c:.1f} degC on average"),
         "",
         "measured eta (lowest to highest, with the largest standard error)",
-        *_measured_lines(result),
+        *indented(_measured_lines(result)),
     ]
     for fit in result.fits:
-        lines += ["", *_summary_lines(fit)]
+        kind = "weighted least squares" if fit.weighted else "least squares"
+        lines += ["", f"Eq. (8) in the convention {fit.convention}, {kind}", *indented(_summary_lines(fit))]
         if fit.weighted == result.fits[0].weighted:  # of the other weighting the figures are enough
-            lines += _coefficient_lines(fit, result.points)
+            lines += indented(_coefficient_lines(fit, result.points))
     if result.left_out:
         lines += [
             "",
             f"left out, {len(result.left_out)} plateaus with |i| < {result.current_min_a:.2f} A "
             "(the motor does not overcome its own friction, so eta is undefined):",
-            *(f"  {_place(plateau)}" for plateau in result.left_out),
+            *indented(map(_place, result.left_out)),
         ]
     if result.findings:
         lines += ["", "findings:", *(f"  {item.kind}: {item.text}" for item in result.findings)]
@@ -459,53 +459,54 @@ def report_lines(result: EfficiencyResult) -> list[str]:
 
 
 def _measured_lines(result: EfficiencyResult) -> list[str]:
-    lines = [f"  {'quadrant':<27}{'plateaus':>9}{'tau_j/(G Kt i)':>28}{'G Kt i/tau_j':>28}"]
+    rows = []
     for name in QUADRANTS:
         own = [point for point in result.points if point.quadrant == name]
-        cells = ""
+        cells = []
         for convention in CONVENTIONS:
             etas = [point.eta(convention) for point in own]
             errors = [point.eta_se(convention) for point in own]
-            text = f"{min(etas):.3f} to {max(etas):.3f} +- {max(errors):.3f}" if own else "none"
-            cells += f"{text:>28}"
-        lines.append(f"  {TITLES[name]:<27}{len(own):>9}{cells}")
-    return lines
+            cells.append(f"{min(etas):.3f} to {max(etas):.3f} +- {max(errors):.3f}" if own else "none")
+        rows.append([QUADRANT_TITLES[name], str(len(own)), *cells])
+    return table(["quadrant", "plateaus", "tau_j/(G Kt i)", "G Kt i/tau_j"], rows)
 
 
 def _summary_lines(fit: EfficiencyFit) -> list[str]:
-    """Return one line per quadrant; the paper's RMSE beside ours where the convention is Table I's."""
-    beside = fit.convention == TABLE_I.convention
-    kind = "weighted least squares" if fit.weighted else "least squares"
-    paper = f"{'paper':>9}" if beside else ""
-    lines = [
-        f"Eq. (8) in the convention {fit.convention}, {kind}",
-        f"  {'quadrant':<27}{'plateaus':>9}{'distinct':>10}{'RMSE':>9}{paper}{'RMSE Nm':>9}{'condition':>11}",
+    """Return one line per quadrant, with the paper's RMSE where the convention is Table I's."""
+    like_paper = fit.convention == TABLE_I.convention
+    rows = [
+        [
+            QUADRANT_TITLES[name],
+            str(quadrant.plateaus),
+            str(quadrant.distinct),
+            f"{quadrant.rmse:.4f}",
+            *([f"{getattr(TABLE_I, name).rmse:.4f}"] if like_paper else []),
+            f"{quadrant.rmse_nm:.3f}",
+            f"{quadrant.condition:.0f}",
+        ]
+        for name, quadrant in fit.quadrants.items()
     ]
-    for name, quadrant in fit.quadrants.items():
-        table = f"{getattr(TABLE_I, name).rmse:>9.4f}" if beside else ""
-        lines.append(
-            f"  {TITLES[name]:<27}{quadrant.plateaus:>9}{quadrant.distinct:>10}{quadrant.rmse:>9.4f}{table}"
-            f"{quadrant.rmse_nm:>9.3f}{quadrant.condition:>11.0f}"
-        )
-    return lines + [f"  {text}" for text in fit.refused.values()]
+    paper = ["paper"] if like_paper else []
+    header = ["quadrant", "plateaus", "distinct", "RMSE", *paper, "RMSE Nm", "condition"]
+    return table(header, rows) + list(fit.refused.values())
 
 
 def _coefficient_lines(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> list[str]:
     """Coefficients with standard errors, beside Table I where the convention is the table's."""
-    beside = fit.convention == TABLE_I.convention
+    like_paper = fit.convention == TABLE_I.convention
     lines = []
     for name, quadrant in fit.quadrants.items():
-        lines.append(f"  {TITLES[name]}")
-        table_header = f"{'Table I':>10}{'difference':>12}" if beside else ""
-        lines.append(f"    {'':<4}{'fitted':>10}{'std err':>10}{table_header}")
+        rows = []
         for key in COEFFICIENTS:
-            value, table = getattr(quadrant.polynomial, key), getattr(getattr(TABLE_I, name), key)
-            cells = f"{table:>10.4f}{value - table:>12.4f}" if beside else ""
-            lines.append(f"    {key:<4}{value:>10.4f}{quadrant.errors[key]:>10.4f}{cells}")
-        if beside:
+            value, paper = getattr(quadrant.polynomial, key), getattr(getattr(TABLE_I, name), key)
+            beside = [f"{paper:.4f}", f"{value - paper:.4f}"] if like_paper else []
+            rows.append([key, f"{value:.4f}", f"{quadrant.errors[key]:.4f}", *beside])
+        header = ["", "fitted", "std err", *(["Table I", "difference"] if like_paper else [])]
+        lines += [QUADRANT_TITLES[name], *indented(table(header, rows))]
+        if like_paper:
             off = difference_from_table(points, name, quadrant.polynomial)
             lines.append(
-                f"    eta against Table I at these points: {float(np.sqrt(np.mean(off**2))):.4f} RMS, "
+                f"  eta against Table I at these points: {float(np.sqrt(np.mean(off**2))):.4f} RMS, "
                 f"{float(np.max(np.abs(off))):.4f} at most"
             )
     return lines
@@ -520,55 +521,36 @@ def _place(plateau: Plateau) -> str:
 
 def as_mapping(result: EfficiencyResult) -> dict[str, Any]:
     """Return the same for a program (schema jtq.efficiency/1)."""
-    return {
-        "schema": SCHEMA,
-        "joint": result.joint,
-        "number": result.number,
-        "runs": dict(result.runs),
-        "temperature_c": None if math.isnan(result.temperature_c) else result.temperature_c,
-        "current_min_a": result.current_min_a,
-        "fits": [_fit_mapping(fit, result.points) for fit in result.fits],
-        "plateaus": [
-            plateau_mapping(point.plateau)
-            | {"quadrant": point.quadrant, "joint_over_motor": point.ratio, "joint_over_motor_se": point.se}
-            for point in result.points
-        ],
-        "left_out": [plateau_mapping(plateau) for plateau in result.left_out],
-        "findings": [item._asdict() for item in result.findings],
-    }
-
-
-def _fit_mapping(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> dict[str, Any]:
-    quadrants = {}
-    for name, quadrant in fit.quadrants.items():
-        entry = {item.name: getattr(quadrant, item.name) for item in fields(quadrant)} | {
-            "polynomial": {key: getattr(quadrant.polynomial, key) for key in COEFFICIENTS},
-            "errors": dict(quadrant.errors),
+    mapping: dict[str, Any] = plain_values(
+        {
+            "schema": SCHEMA,
+            "joint": result.joint,
+            "number": result.number,
+            "runs": result.runs,
+            "temperature_c": result.temperature_c,
+            "current_min_a": result.current_min_a,
+            "fits": result.fits,
+            "plateaus": [
+                plain_values(point.plateau)
+                | {
+                    "quadrant": point.quadrant,
+                    "joint_over_motor": point.ratio,
+                    "joint_over_motor_se": point.se,
+                }
+                for point in result.points
+            ],
+            "left_out": result.left_out,
+            "findings": [item._asdict() for item in result.findings],
         }
-        if fit.convention == TABLE_I.convention:
-            off = difference_from_table(points, name, quadrant.polynomial)
-            entry["paper_rmse"] = getattr(TABLE_I, name).rmse
-            entry["table_i_rms"] = float(np.sqrt(np.mean(off**2)))
-        quadrants[name] = entry
-    return {
-        "convention": fit.convention,
-        "weighted": fit.weighted,
-        "quadrants": quadrants,
-        "refused": dict(fit.refused),
-    }
-
-
-def plateau_mapping(plateau: Plateau) -> dict[str, Any]:
-    """Return one plateau as plain values; means as value and standard error, an unknown temperature as None."""
-    out: dict[str, Any] = {}
-    for item in fields(plateau):
-        value = getattr(plateau, item.name)
-        if isinstance(value, Mean):
-            value = value._asdict()
-        elif isinstance(value, float) and math.isnan(value):
-            value = None
-        out[item.name] = value
-    return out
+    )
+    for fit, values in zip(result.fits, mapping["fits"], strict=True):
+        for name, entry in values["quadrants"].items():
+            del entry["polynomial"]["rmse"]  # that of the entry, rounded
+            if fit.convention == TABLE_I.convention:
+                off = difference_from_table(result.points, name, fit.quadrants[name].polynomial)
+                entry["paper_rmse"] = getattr(TABLE_I, name).rmse
+                entry["table_i_rms"] = float(np.sqrt(np.mean(off**2)))
+    return mapping
 
 
 _RATIOS: Final = {"joint_over_motor": "τ_j / (G Kt i)", "motor_over_joint": "G Kt i / τ_j"}
@@ -656,7 +638,7 @@ def _panel(axis: Any, points: Sequence[EtaPoint], fit: EfficiencyFit, name: str,
 
 
 def _panel_title(fit: EfficiencyFit, name: str, count: int) -> str:
-    text = TITLES[name].replace("w", "ω_m", 1)
+    text = QUADRANT_TITLES[name].replace("w", "ω_m", 1)
     if name in fit.quadrants:
         paper = f" (paper {getattr(TABLE_I, name).rmse:.4f})" if fit.convention == TABLE_I.convention else ""
         return f"{text}\n{count} plateaus, RMSE {fit.quadrants[name].rmse:.4f}{paper}"

@@ -1,4 +1,4 @@
-"""What the runs of a fit covered: speeds, motor torques, temperatures, and how far torsion and current were apart."""
+"""Operating envelope of a fit: speeds, motor torques, temperatures, and the largest difference of torsion and current."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import (
-    MAX_CELLS,
-    AdditiveLoss,
-    Envelope,
-    Torsion,
-)
+from jtqd.estimator.joint import MAX_CELLS, AdditiveLoss, Envelope, Torsion
 from jtqd.estimator.uncertainty import FusedTrust
 from jtqd.sysid.fit.residuals import path_residuals
 from jtqd.sysid.fit.signals import RunSignals
@@ -23,19 +18,19 @@ VELOCITY_STEP_RAD_S: Final = 0.25
 VELOCITY_STEP_SHARE: Final = 1.0 / 12.0
 """Of the largest speed of the runs: the same 0.25 rad/s on the shipped joints (3 rad/s)."""
 _ROUND: Final = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
-"""Steps of speed, times a power of ten: a file is to be read, and the same whatever the noise of the fastest sample."""
+"""Steps of speed, times a power of ten: readable, and independent of the noise of the fastest sample."""
 TORQUE_STEP_NM: Final = 3.0
 TORQUE_STEP_SHARE: Final = 0.075
 """Of rated torque: the same 3 Nm on the shipped joints."""
-ROOM_K: Final = 0.5
-FIT_ROOM_K: Final = 3.0
+MARGIN_K: Final = 0.5
+FIT_MARGIN_K: Final = 3.0
 """A friction that is known over some days is known 3 K beyond the warmest: 2 to 3 % per kelvin of its viscous part."""
 _VISITS: Final = 20
 """Samples at 1 kHz in a cell that make it known."""
 BEYOND_SHARE: Final = 0.01
-"""Of the samples of runs left out, that may lie beyond the map of the others."""
+"""Share of a held-out run's samples that may lie beyond the map of the other runs."""
 MOST_WIDER: Final = 2
-"""Cells of load beside what was visited, 15 % of rated torque: runs that need more have not shown what they cover."""
+"""Cells of load added on either side, 15 % of rated torque: runs that need more do not show what they cover."""
 
 Table = np.ndarray[tuple[int, int], np.dtype[np.bool_]]
 Counts = np.ndarray[tuple[int, int], np.dtype[np.int64]]
@@ -49,11 +44,11 @@ def envelope_of(
     *,
     velocity_step_rad_s: float = VELOCITY_STEP_RAD_S,
     torque_step_nm: float = TORQUE_STEP_NM,
-    room_k: float = ROOM_K,
+    margin_k: float = MARGIN_K,
 ) -> Envelope:
     """Return what moving samples [n] covered: cells of velocity and motor torque with enough of them, and cells between.
 
-    apart_nm: torsion less current path [n]; temperatures_c: of the runs, NaN where one has none; room_k: known beside them.
+    apart_nm: torsion less current path [n]. temperatures_c: of the runs, NaN where unknown. margin_k: known beyond them.
     """
     rows = int(np.ceil(np.abs(velocity_rad_s).max() / velocity_step_rad_s)) + 1
     columns = int(np.ceil(np.abs(raw_nm).max() / torque_step_nm)) + 1
@@ -64,7 +59,7 @@ def envelope_of(
         *steps,
         _as_rows(known),
         1.25 * float(np.quantile(np.abs(apart_nm), 0.999)),
-        (min(temperatures) - room_k, max(temperatures) + room_k) if temperatures else None,
+        (min(temperatures) - margin_k, max(temperatures) + margin_k) if temperatures else None,
     )
 
 
@@ -82,26 +77,26 @@ def _visits(
 
 
 def widened(made: Envelope, runs: Sequence[tuple[FloatArray, FloatArray]]) -> Envelope:
-    """Return the envelope of runs, each (velocity, motor torque) [n] in motion, with as many cells more of load as it needs.
+    """Return the envelope of runs, each (velocity, motor torque) [n] in motion, with as many more cells of load as needed.
 
-    Needed is that at most BEYOND_SHARE of the samples of a run, on average, lie beyond the map of the other runs. In speed
-    nothing is added: the map ends where the runs end, as the load does by `load_nm`.
+    Needed: on average at most BEYOND_SHARE of the samples of a run lie beyond the map of the other runs. In speed nothing is
+    added: the map ends where the runs end, as the load does by `load_nm`.
     """
     steps = made.velocity_step_rad_s, made.torque_step_nm
     counts = [_visits(v, raw, steps, (len(made.known), len(made.known[0]))) for v, raw in runs]
     others = [filled(sum(counts) - own >= _VISITS) for own in counts]
     for cells in range(MOST_WIDER + 1):
-        left_out = [
+        beyond = [
             FusedTrust(replace(made, known=_as_rows(_wider(known, cells)))).weigh_map(v, raw) < 0.5
             for known, (v, raw) in zip(others, runs, strict=True)
         ]
-        if np.mean([each.mean() for each in left_out]) <= BEYOND_SHARE:
+        if np.mean([each.mean() for each in beyond]) <= BEYOND_SHARE:
             break
     return replace(made, known=_as_rows(_wider(np.array(made.known, np.bool_), cells)))
 
 
 def _wider(known: Table, cells: int) -> Table:
-    """Also call cells known beside known ones, in load, on a map so much wider."""
+    """Add so many cells of load on either side of known ones, on a map as much wider."""
     padded = np.pad(known, ((0, 0), (2 * cells, 2 * cells)))
     width = known.shape[1] + 2 * cells
     result: Table = np.logical_or.reduce([padded[:, k : k + width] for k in range(2 * cells + 1)])
@@ -120,7 +115,7 @@ def velocity_step(velocity_rad_s: FloatArray) -> float:
 
 
 def filled(known: Table) -> Table:
-    """Also call a cell known that lies between known cells in both directions: a hole, not an edge."""
+    """Add cells that lie between known ones in both directions: holes, not edges."""
 
     def between(axis: int) -> Table:
         before = np.maximum.accumulate(known, axis=axis)
@@ -140,11 +135,11 @@ def fit_envelope(
     made = envelope_of(
         velocity,
         np.concatenate([run.raw_nm for run in seen]),
-        np.concatenate([run.torsion_error_nm - run.current_error_nm for run in seen]),
+        np.concatenate([run.apart_nm for run in seen]),
         [run.temperature_c for run in runs],
         velocity_step_rad_s=velocity_step(velocity),
         torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
-        room_k=FIT_ROOM_K,
+        margin_k=FIT_MARGIN_K,
     )
     if max(len(made.known), len(made.known[0])) > MAX_CELLS - 2 * MOST_WIDER:
         return None

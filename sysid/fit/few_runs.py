@@ -1,24 +1,23 @@
-"""Fit loss and sigma of a joint with one encoder to one to five runs, where `fit_fused` wants six: a regularised fit.
+"""Regularised fit of loss, sigma and rotor inertia to one to five runs of a joint with one encoder.
 
-    tau_raw - tau + Jm G^2 alpha = loss + zero_r + J alpha
+    tau_raw - tau + Jm G^2 alpha = loss + offset_r + J alpha
     loss = (1+s)/2 L_+(tau_raw) - (1-s)/2 L_-(-tau_raw),    L_d(x) = c_d(x) + f_d |v| + Stribeck of the file
 
 alpha = dv/dt, s the observer's direction, c_d linear between loads of -R, 0 and R (R: rated torque), J the reflected rotor
-inertia. A few seconds do not hold what tells these apart: where a joint turns one way only, an offset is Coulomb friction,
-and where load and speed come together, load friction is viscous. Least squares then takes any split that fits, and errs by
-ten newton metres once the joint turns the other way. Here each has a prior in proportion to the joint, a Gaussian about the
-joint file (`Prior`): what a run tells is taken from it, what it does not tell stays near the file, and how little is known
-goes into sigma.
+inertia. A few seconds do not separate these: where a joint turns one way only, an offset looks like Coulomb friction, and
+where load and speed come together, load friction looks like viscous. Least squares then takes any split that fits, and errs
+by ten newton metres once the joint turns the other way. Here each has a Gaussian prior about the joint file, in proportion
+to the joint (`Prior`): the runs change what they determine, the rest stays near the file and widens sigma.
 
-- c_d = Fc +- o + m |x| + k x: Coulomb, offset of current and sensor, load friction, error of torque constant or sensor gain;
-  what is left over of each c and f has a prior, too: no joint is the same both ways.
-- zero_r: of the sensor on that day. It enters no result.
+- c_d = Fc +- o + m |x| + k x: Coulomb, offset of current and sensor, load friction, error of torque constant or sensor gain.
+  The deviation of each c and f from that has a prior, too: no joint is the same both ways.
+- offset_r: of the sensor on that day. It enters no result.
 - c_d and f_d are at least 0: friction takes energy.
-- **Effective samples**: the residual of a wrong law is no noise, it lasts. A run counts as n/(1 + 2 sum rho_k) samples
-  (`friction.effective_samples`), at most one per 0.1 s of motion.
-- **Sigma**: covariance of what was fitted, what the fit leaves over in fifths of each run that it had not seen, and what
-  friction changes from day to day, which one run cannot tell. As a^2 + (b v)^2 + (c tau_raw)^2 times a factor per
-  quadrant, fitted on a grid over all loads and speeds: a quadrant that no run was in gets the width of the prior.
+- **Effective samples**: the residual of a wrong law is correlated. A run counts as n/(1 + 2 sum rho_k) samples
+  (`plateaus.effective_samples`), at most one per 0.1 s of motion.
+- **Sigma**: covariance of the fitted values, the residual in held-out fifths of each run, and the change of friction from
+  day to day, which one run cannot show. As a^2 + (b v)^2 + (c tau_raw)^2 times a factor per quadrant, fitted on a grid over
+  all loads and speeds: a quadrant without a run gets the width of the prior.
 """
 
 from __future__ import annotations
@@ -39,14 +38,13 @@ from jtqd.sysid.fit.plateaus import effective_samples
 from jtqd.sysid.fit.signals import RunSignals
 
 MOST_RUNS: Final = 5
-"""From six runs on `fit_fused` leaves out whole runs."""
+"""From six runs on `fit_fused` holds out whole runs."""
 
 
 class Prior(NamedTuple):
     """Standard deviations of the prior; `_rated`: parts of the rated torque (per rad/s where it is viscous).
 
-    Those of catalogues where these have any, else estimates, settled on emulated joints; what depends on them:
-    docs/results.md (`python -m validation few_runs --priors`).
+    From catalogues where these have any, else estimates, settled on emulated joints. Their influence: docs/results.md.
     """
 
     coulomb_share: float = 0.5
@@ -75,22 +73,22 @@ class Prior(NamedTuple):
 PRIOR: Final = Prior()
 _SAMPLE_S: Final = 0.005
 _LONGEST_S: Final = 0.1
-"""A law that is not quite that of the joint errs alike for so long at least."""
+"""The error of a law that is not quite that of the joint is correlated for so long at least."""
 _SLOW_RAD_S: Final = 0.05
 """Slower, the direction of friction is not settled."""
 _LEAST_MOTION_S: Final = 0.5
 _LEAST_RATED: Final = 0.01
-"""No law of friction is better than that, whatever a few seconds say."""
+"""No law of friction is better than that."""
 _PARTS: Final = 5
 _REPETITIONS: Final = 4
 _FASTER: Final = 3.0
-"""The line of the viscous part goes on to so many times the fastest speed: it is the file's as much as the run's."""
+"""The viscous part is linear up to so many times the fastest speed: it is the file's as much as the run's."""
 _NODES: Final = 6
 _VISCOUS: Final = slice(6, 8)
 _LOSS: Final = slice(0, 8)
 _INERTIA: Final = 8
 _COMMON: Final = 9
-"""c_+ at -R, 0, R, c_- at -R, 0, R, f_+, f_-, J; the zeros of the runs follow."""
+"""c_+ at -R, 0, R, c_- at -R, 0, R, f_+, f_-, J; the offsets of the runs follow."""
 _NAMES: Final = (
     ("Coulomb friction", "Nm"),
     ("load friction", ""),
@@ -103,7 +101,7 @@ _NAMES: Final = (
 
 @dataclass(frozen=True)
 class FewTerm:
-    """What the fit has found of one thing: value, its standard deviation, and both before the fit."""
+    """One fitted quantity: value and standard deviation, after the fit and in the joint file before."""
 
     name: str
     unit: str
@@ -113,25 +111,25 @@ class FewTerm:
     file_sigma: float
 
     def line(self) -> str:
-        """Return the line of the report; what the runs have told: the part of the prior's variance that they took away."""
-        told = 1.0 - (self.sigma / self.file_sigma) ** 2
+        """Return the line of the report, with the share of the prior's variance that the runs removed."""
+        removed = 1.0 - (self.sigma / self.file_sigma) ** 2
         unit = f" {self.unit}" if self.unit else ""
         return (
             f"{self.name} {self.value:.3g} +- {self.sigma:.2g}{unit} (before: {self.file:.3g} +- {self.file_sigma:.2g}; "
-            f"the runs tell {100.0 * max(told, 0.0):.0f} %)"
+            f"the runs tell {100.0 * max(removed, 0.0):.0f} %)"
         )
 
 
 @dataclass(frozen=True)
 class FewRunsFit:
-    """joint: with section `fused` (no torsion) and rotor inertia; terms: of the report; residual_nm, unseen_nm: RMS in the
-    runs, and in fifths of them that the fit had not seen; effective: samples that count; samples: used, thinned.
+    """joint: with section `fused` (no torsion) and rotor inertia. terms: of the report. residual_nm, held_out_nm: RMS in the
+    runs, and in held-out fifths of them. effective: samples that count. samples: used, thinned.
     """
 
     joint: Joint
     terms: tuple[FewTerm, ...]
     residual_nm: float
-    unseen_nm: float
+    held_out_nm: float
     effective: float
     samples: int
 
@@ -145,7 +143,7 @@ class FewRunsFit:
         """Return the report, one fact per line."""
         return [
             *(term.line() for term in self.terms),
-            f"residual {self.residual_nm:.3f} Nm, in fifths left out {self.unseen_nm:.3f} Nm "
+            f"residual {self.residual_nm:.3f} Nm, in fifths left out {self.held_out_nm:.3f} Nm "
             f"(effective samples: {self.effective:.0f} of {self.samples})",
         ]
 
@@ -172,21 +170,20 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint, prior: Prior = PRIOR)
             f"found {motion_s:.2g} s in motion (above {_SLOW_RAD_S} rad/s), expected at least {_LEAST_MOTION_S} s"
         )
     blocks = [block for block in blocks if len(block.y)]
-    mean, spread = _prior(joint, prior)
-    known = np.asarray(np.linalg.inv(spread), np.float64)
-    zero = prior.zero_rated * rated
+    before = _before(joint, prior)
     weights = [
         block.motion_s / _LONGEST_S / len(block.y) / (2.0 * _LEAST_RATED * rated) ** 2 for block in blocks
     ]
     for _ in range(_REPETITIONS):
-        w, covariance = _solve(blocks, weights, mean, known, zero)
+        w, covariance = _solve(blocks, weights, before)
         weights = [_weight(block, w, n, rated) for n, block in enumerate(blocks)]
-    w, covariance = _solve(blocks, weights, mean, known, zero)
+    w, covariance = _solve(blocks, weights, before)
     residual = _rms([_error(block, w, n) for n, block in enumerate(blocks)])
-    unseen = _rms(_left_out(blocks, weights, mean, known, zero))
-    left = max(unseen, _LEAST_RATED * rated)
+    held_out = _rms(_held_out_errors(blocks, weights, before))
     speed = max(float(np.abs(block.v).max()) for block in blocks)
-    sigma = _sigma(w[_LOSS], covariance[_LOSS, _LOSS], left, rated, speed, prior)
+    sigma = _sigma(
+        w[_LOSS], covariance[_LOSS, _LOSS], max(held_out, _LEAST_RATED * rated), rated, speed, prior
+    )
     loss = _loss(w, joint, speed, _temperature(runs))
     fitted = replace(
         joint, rotor_inertia_kgm2=float(w[_INERTIA]) / joint.gear_ratio**2, fused=Fused(loss, None, sigma)
@@ -195,8 +192,8 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint, prior: Prior = PRIOR)
         weight * len(block.y) * _variance(block, w, n, rated)
         for n, (block, weight) in enumerate(zip(blocks, weights, strict=True))
     )
-    terms = _terms(w, covariance, mean, spread, joint)
-    return FewRunsFit(fitted, terms, residual, unseen, effective, sum(len(block.y) for block in blocks))
+    terms = _terms(w, covariance, before, joint)
+    return FewRunsFit(fitted, terms, residual, held_out, effective, sum(len(block.y) for block in blocks))
 
 
 def _block(run: RunSignals, joint: Joint) -> _Block:
@@ -243,8 +240,16 @@ def _mixing(rated: float) -> FloatArray:
     return b
 
 
-def _prior(joint: Joint, prior: Prior) -> tuple[FloatArray, FloatArray]:
-    """Return mean [9] and covariance [9, 9] of the fit's numbers before any run."""
+class _Before(NamedTuple):
+    """The fit's numbers before any run: mean [9], covariance and its inverse [9, 9]; sigma of the runs' offsets [Nm]."""
+
+    mean: FloatArray
+    covariance: FloatArray
+    precision: FloatArray
+    offset_nm: float
+
+
+def _before(joint: Joint, prior: Prior) -> _Before:
     rated, friction = joint.rated_torque_nm, joint.friction
     viscous = float(np.hypot(prior.viscous_share * friction.viscous_nms_per_rad, prior.viscous_rated * rated))
     sigmas = np.array(
@@ -263,22 +268,24 @@ def _prior(joint: Joint, prior: Prior) -> tuple[FloatArray, FloatArray]:
     side = np.array((prior.curved_rated, prior.other_way_rated, prior.curved_rated)) * rated
     own = np.concatenate((side, side, np.full(2, prior.other_way_viscous * viscous), [0.0]))
     b = _mixing(rated)
-    return b @ means, b @ np.diag(sigmas**2) @ b.T + np.diag(own**2)
+    covariance = b @ np.diag(sigmas**2) @ b.T + np.diag(own**2)
+    precision = np.asarray(np.linalg.inv(covariance), np.float64)
+    return _Before(b @ means, covariance, precision, prior.zero_rated * rated)
 
 
 def _solve(
-    blocks: Sequence[_Block], weights: Sequence[float], mean: FloatArray, known: FloatArray, zero: float
+    blocks: Sequence[_Block], weights: Sequence[float], before: _Before
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the most probable numbers, zeros of the runs behind them, and their covariance before the bounds."""
+    """Return the most probable numbers, then offsets of the runs, and their covariance before the bounds."""
     size = _COMMON + len(blocks)
     left, right = np.zeros((size, size)), np.zeros(size)
-    left[:_COMMON, :_COMMON] = known
-    right[:_COMMON] = known @ mean
+    left[:_COMMON, :_COMMON] = before.precision
+    right[:_COMMON] = before.precision @ before.mean
     for n, (block, weight) in enumerate(zip(blocks, weights, strict=True)):
         at = np.r_[:_COMMON, _COMMON + n]
         x = np.column_stack((block.x, np.ones(len(block.y))))
         left[np.ix_(at, at)] += weight * (x.T @ x)
-        left[_COMMON + n, _COMMON + n] += zero**-2
+        left[_COMMON + n, _COMMON + n] += before.offset_nm**-2
         right[at] += weight * (x.T @ block.y)
     covariance = np.asarray(np.linalg.inv(left), np.float64)
     w = covariance @ right
@@ -292,7 +299,7 @@ def _error(block: _Block, w: FloatArray, run: int) -> FloatArray:
     return error
 
 
-def _counted(block: _Block, error: FloatArray) -> float:
+def _effective(block: _Block, error: FloatArray) -> float:
     """Return how many samples of a run count."""
     return min(effective_samples(error), max(2.0, block.motion_s / _LONGEST_S))
 
@@ -300,21 +307,19 @@ def _counted(block: _Block, error: FloatArray) -> float:
 def _variance(block: _Block, w: FloatArray, run: int, rated: float) -> float:
     """Return the variance of an effective sample of a run, with the freedom that three numbers of a loss take."""
     error = _error(block, w, run)
-    counted = _counted(block, error)
-    found = float(np.mean(error**2)) * counted / max(counted - 3.0, 1.0)
+    effective = _effective(block, error)
+    found = float(np.mean(error**2)) * effective / max(effective - 3.0, 1.0)
     return max(found, (_LEAST_RATED * rated) ** 2)
 
 
 def _weight(block: _Block, w: FloatArray, run: int, rated: float) -> float:
     """Return the weight of each of a run's samples: those that count share the run."""
-    counted = _counted(block, _error(block, w, run))
-    return counted / len(block.y) / _variance(block, w, run, rated)
+    effective = _effective(block, _error(block, w, run))
+    return effective / len(block.y) / _variance(block, w, run, rated)
 
 
-def _left_out(
-    blocks: Sequence[_Block], weights: Sequence[float], mean: FloatArray, known: FloatArray, zero: float
-) -> list[FloatArray]:
-    """Return the errors in each fifth of each run, of a fit that has not seen it."""
+def _held_out_errors(blocks: Sequence[_Block], weights: Sequence[float], before: _Before) -> list[FloatArray]:
+    """Return the errors in each fifth of each run, of a fit without it."""
     found = []
     for n, block in enumerate(blocks):
         edges = np.linspace(0, len(block.y), _PARTS + 1).astype(int).tolist()
@@ -322,7 +327,7 @@ def _left_out(
             keep = np.r_[:a, b : len(block.y)]
             others = [*blocks]
             others[n] = _Block(block.x[keep], block.y[keep], block.v[keep], block.motion_s)
-            w, _ = _solve(others, weights, mean, known, zero)
+            w, _ = _solve(others, weights, before)
             found.append(_error(block, w, n)[a:b])
     return found
 
@@ -332,14 +337,14 @@ def _rms(parts: Sequence[FloatArray]) -> float:
 
 
 def _sigma(  # noqa: PLR0917
-    w: FloatArray, covariance: FloatArray, left_nm: float, rated: float, speed: float, prior: Prior
+    w: FloatArray, covariance: FloatArray, residual_nm: float, rated: float, speed: float, prior: Prior
 ) -> FusedSigma:
     """Return sigma of the current path on another day, over loads up to the rated one and speeds up to the fastest."""
     slow = min(_SLOW_RAD_S, speed)
     speeds = np.linspace(2.0 * slow if speed > 2.0 * slow else slow, speed, 8)
     raw, v = (each.ravel() for each in np.meshgrid(np.linspace(-rated, rated, 21), np.r_[-speeds, speeds]))
     x = _columns(raw, v, np.sign(v), rated)
-    variance = np.einsum("ij,jk,ik->i", x, covariance, x) + left_nm**2 + (prior.day_share * (x @ w)) ** 2
+    variance = np.einsum("ij,jk,ik->i", x, covariance, x) + residual_nm**2 + (prior.day_share * (x @ w)) ** 2
     a, b, c = nnls(np.column_stack((np.ones_like(v), v * v, raw * raw)), variance)[0]
     a = max(a, (0.5 * _LEAST_RATED * rated) ** 2)
     ratio = variance / (a + b * v * v + c * raw * raw)
@@ -376,18 +381,16 @@ def _side(constant: FloatArray, viscous: float, friction: Friction) -> LossSide:
     return LossSide((one, two, three), (float(viscous),) * 3, (0.0,) * 3, friction.stribeck_nm)
 
 
-def _terms(
-    w: FloatArray, covariance: FloatArray, mean: FloatArray, spread: FloatArray, joint: Joint
-) -> tuple[FewTerm, ...]:
-    """Return what the fit says of things with a name: least squares on its numbers."""
+def _terms(w: FloatArray, covariance: FloatArray, before: _Before, joint: Joint) -> tuple[FewTerm, ...]:
+    """Return the physical quantities of the report: least squares on the fit's numbers."""
     back = np.linalg.pinv(_mixing(joint.rated_torque_nm))
     back[np.abs(back) < 1e-12] = 0.0  # a prior of 0 is to read 0
     units = np.array((1.0, 1.0, 1.0, 1.0, 1.0, joint.gear_ratio**-2))
     columns = (
         back @ w[:_COMMON] * units,
         np.sqrt(np.diag(back @ covariance[:_COMMON, :_COMMON] @ back.T)) * units,
-        back @ mean * units,
-        np.sqrt(np.diag(back @ spread @ back.T)) * units,
+        back @ before.mean * units,
+        np.sqrt(np.diag(back @ before.covariance @ back.T)) * units,
     )
     return tuple(
         FewTerm(name, unit, *(round(float(each[n]), 12) + 0.0 for each in columns))

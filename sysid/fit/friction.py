@@ -16,7 +16,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Friction, Joint
@@ -24,10 +23,12 @@ from jtqd.estimator.losses import FrictionModel
 from jtqd.sysid.fit.efficiency import SAME_VELOCITY_RAD_S
 from jtqd.sysid.fit.plateaus import Plateau
 
-Array = NDArray[np.float64]
-
-COULOMB = "coulomb_nm"
-VISCOUS = "viscous_nms_per_rad"
+COULOMB: Final = "coulomb_nm"
+VISCOUS: Final = "viscous_nms_per_rad"
+OFFSET: Final = "zero_nm"
+NO_LOAD_SHARE: Final = 0.05
+"""Share of rated torque that still counts as no load."""
+FEWEST_VELOCITIES: Final = 3
 
 
 class FitError(ValueError):
@@ -54,15 +55,9 @@ def student_975(freedom: float) -> float:
     )
 
 
-NO_LOAD_SHARE: Final = 0.05
-"""Share of rated torque that still counts as no load."""
-FEWEST_VELOCITIES: Final = 3
-ZERO: Final = "zero_nm"
-
-
 @dataclass(frozen=True)
 class NoLoadFit:
-    """Friction for the joint file, its terms with the zero, the RMS residual [Nm] and its plateaus."""
+    """Friction for the joint file, its terms with the offset, RMS residual [Nm], number of plateaus."""
 
     friction: Friction
     terms: tuple[Term, ...]
@@ -95,8 +90,7 @@ def fit_no_load(plateaus: Sequence[Plateau], joint: Joint) -> NoLoadFit:
     if distinct < FEWEST_VELOCITIES:
         raise FitError(
             f"found {counted(distinct, 'velocity', 'velocities')} at no load ({counted(len(plateaus), 'plateau')}), "
-            f"expected at least {FEWEST_VELOCITIES}: "
-            "the other joint drives this joint at zero current"
+            f"expected at least {FEWEST_VELOCITIES}: the other joint drives this joint at zero current"
         )
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
     none = replace(joint.friction, coulomb_nm=0.0, viscous_nms_per_rad=0.0)
@@ -108,10 +102,10 @@ def fit_no_load(plateaus: Sequence[Plateau], joint: Joint) -> NoLoadFit:
     }
     warnings = []
     if bool(np.any(velocity > 0.0)) and bool(np.any(velocity < 0.0)):
-        columns[ZERO] = np.ones_like(velocity)
+        columns[OFFSET] = np.ones_like(velocity)
     else:
         warnings.append(
-            "all motion is in one direction: Coulomb friction includes the zeros of current and sensor"
+            "all motion is in one direction: Coulomb friction includes the offsets of current and sensor"
         )
     matrix = np.column_stack(list(columns.values()))
     values = np.linalg.lstsq(matrix, loss, rcond=None)[0]

@@ -1,13 +1,13 @@
-"""Fit the additive loss: penalised least squares over runs, with run-to-run differences as nuisance parameters.
+"""Fit the additive loss model: penalised least squares over runs, with run-to-run differences as nuisance parameters.
 
-    tau_raw - sensor = (1+s)/2 L_+ - (1-s)/2 L_- + kappa g(T) v + zero_r + u_r v + ripple
+    tau_raw - sensor = (1+s)/2 L_+ - (1-s)/2 L_- + kappa g(T) v + offset_r + u_r v + ripple
 
-s is the observer's direction; L_+ and L_- are linear in their node values (jtqd.estimator.losses). zero_r (the
-sensor's zero) and u_r (viscous friction of that run against the mean) are random effects with a prior width, the
-ripple waves have a wide one: none of them enters the result, all of them would bias it. Curvature over the nodes is
-penalised, and where there are no data the nodes fall back on the joint file's friction. Constant and viscous part of every
-load and the Stribeck peak are at least 0: friction takes energy, and a fit of a few runs may not say otherwise. g(T) is
-(exp(-b (T - T0)) - 1)/b with b = kappa/Fv, the viscous_per_k, found by repetition; it has a prior.
+s is the observer's direction; L_+ and L_- are linear in their node values (jtqd.estimator.losses). offset_r (of the sensor)
+and u_r (viscous friction of that run against the mean) are random effects with a prior width, the ripple waves have a wide
+one: none of them enters the result, all of them would bias it. Curvature over the nodes is penalised, and where there are no
+data the nodes fall back on the joint file's friction. Constant and viscous part of every load and the Stribeck peak are at
+least 0, because friction takes energy. g(T) is (exp(-b (T - T0)) - 1)/b with b = kappa/Fv, the viscous_per_k, found by
+repetition; it has a prior.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _NODES: Final = len(LOAD_NODES_NM)
 _ROWS: Final = 3 * _NODES + 1  # one direction: c, f, q, Stribeck
 _RIPPLE: Final = slice(2 * _ROWS, 2 * _ROWS + 4)
 _THERMAL: Final = 2 * _ROWS + 4
-_COMMON: Final = 2 * _ROWS + 5  # what all runs share; zero_r and u_r of each run follow
+_COMMON: Final = 2 * _ROWS + 5  # shared by all runs; offset_r and u_r of each run follow
 
 _SIGNED: Final = np.concatenate(
     [side * _ROWS + np.r_[: 2 * _NODES, 3 * _NODES] for side in range(2)]
@@ -48,12 +48,10 @@ _PER_K_LIMIT: Final = 0.1  # what a joint file may hold
 _REPETITIONS: Final = 3
 _NOISE_NM: Final = 0.3
 _COLOUR: Final = 4.0  # neighbours at 10 ms still share their error: so many samples count as one
-_ZERO_SIGMA_NM: Final = 0.3
+_OFFSET_SIGMA_NM: Final = 0.3
 _VISCOUS_SIGMA: Final = 0.3  # Nms/rad, of a run against the mean
 _RIPPLE_SIGMA_NM: Final = 2.0
-_NO_VISCOUS: Final = (
-    1e-6  # Nms/rad, in place of a joint file's 0: its loss has no part that falls with temperature
-)
+_NO_VISCOUS: Final = 1e-6  # Nms/rad, in place of a joint file's 0: no part of its loss falls with temperature
 # (pull towards the joint file's friction, allowed second difference per step) of c, f, q
 _PRIOR: Final = {"c": (6.0, 0.6), "f": (3.0, 0.35), "q": (0.6, 0.15)}
 
@@ -97,7 +95,7 @@ def hat_values(load_nm: FloatArray) -> FloatArray:
 
 
 def _block(run: RunSignals, stribeck_velocity: float, reference_c: float) -> _Block:
-    """Return the equations of a run's moving samples; the thermal column is still empty."""
+    """Return the equations of a run's moving samples; the thermal column is filled by `_set_thermal`."""
     keep = run.moving & (np.abs(run.seen.velocity_rad_s) > _MIN_SPEED_RAD_S)
     keep &= np.abs(run.seen.raw_nm) < _MAX_LOAD_NM
     index = np.flatnonzero(keep)[::_EVERY]
@@ -137,7 +135,7 @@ def _prior(friction: Friction, runs: int) -> tuple[FloatArray, FloatArray]:
     precision[_THERMAL, _THERMAL] += 1.0 / (viscous * PER_K_PRIOR[1]) ** 2
     mean[_THERMAL] += PER_K_PRIOR[0] / (viscous * PER_K_PRIOR[1] ** 2)
     for r in range(runs):
-        precision[_COMMON + 2 * r, _COMMON + 2 * r] += 1.0 / _ZERO_SIGMA_NM**2
+        precision[_COMMON + 2 * r, _COMMON + 2 * r] += 1.0 / _OFFSET_SIGMA_NM**2
         precision[_COMMON + 2 * r + 1, _COMMON + 2 * r + 1] += 1.0 / _VISCOUS_SIGMA**2
     return precision, mean
 

@@ -1,10 +1,9 @@
-"""Detect plateaus of a run from the data alone: settled velocity and load, with their means and standard errors.
+"""Detect plateaus of a run: stretches of settled velocity and load, with their means and standard errors.
 
 Means over cells of whole ripple periods (`cut_cells`) are compared: a harmonic drive's ripple has 2 periods per motor
-revolution, and a mean over whole ones does not contain it, however long or short they are. The longest stretch
-of them in which velocity, torque and motor torque G Kt i each stay within a band is a plateau; then the longest
-of what is left, and so on. The settling at its ends is cut off. No marks, no set-points, no threshold on the derivative
-of a noisy signal.
+revolution, and a mean over whole ones does not contain it. The longest stretch of cells in which velocity, torque and motor
+torque G Kt i each stay within a band is a plateau; then the longest of the remaining cells, and so on. The settling at its
+ends is cut off. Marks, set-points and derivatives of noisy signals are not used.
 
 Standard errors are those of means of coloured noise: the standard deviation without the ripple over the square root of
 the effective number of samples, by their autocorrelation. Noise with a memory of a twentieth of the plateau still gets
@@ -16,7 +15,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -35,7 +34,7 @@ RIPPLE_ORDERS: Final = (1.0, 2.0, 4.0)
 
 
 class PlateauError(ValueError):
-    """A run lacks a column, or nothing in it ever settled; one line: found and expected."""
+    """A run lacks a column, or nothing in it settled; one line: found and expected."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,8 @@ class PlateauRules:
     load_band_most: float = 0.05
 
 
-class Mean(NamedTuple):
+@dataclass(frozen=True)
+class Mean:
     """A mean over a plateau and its standard error."""
 
     value: float
@@ -98,10 +98,10 @@ def find_plateaus(
     missing velocity); joint: gear ratio, torque constant and rated torque are used. `name` goes into the plateaus.
 
     Raises:
-        PlateauError: a column is missing, or nothing ever settled.
+        PlateauError: a column is missing, or nothing settled.
     """
     rules = rules or PlateauRules()
-    current, omega_m, torque = needed_columns(run, name)
+    current, omega_m, torque = _needed_columns(run, name)
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
     speed = omega_m / joint.gear_ratio
     cells = cut_cells(
@@ -124,30 +124,20 @@ def find_plateaus(
         start_s, end_s = float(cells.start_s[first]), float(cells.end_s[last - 1])
         inside = slice(*np.searchsorted(time_s, (start_s, end_s)).tolist())
         whole = np.array([start_s]), np.array([end_s])
-        velocity_mean, torque_mean, current_mean = (
+        velocity_mean, current_mean, torque_mean = (
             Mean(
                 float(means_between(time_s, signal, *whole)[0]),
                 standard_error(signal[inside], angle[inside]),
             )
-            for signal in (speed, torque, current)
+            for signal in (speed, current, torque)
         )
         warm = math.nan if run.temperature_c is None else float(np.mean(run.temperature_c[inside]))
-        plateaus.append(
-            Plateau(
-                name,
-                start_s,
-                end_s,
-                velocity_mean,
-                current_mean,
-                torque_mean,
-                last - first,
-                temperature_c=warm,
-            )
-        )
+        count = last - first
+        plateaus.append(Plateau(name, start_s, end_s, velocity_mean, current_mean, torque_mean, count, warm))
     return plateaus
 
 
-def needed_columns(run: JointColumns, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _needed_columns(run: JointColumns, name: str) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return current, motor velocity and measured torque [n]. Raises PlateauError naming what is missing."""
     columns = {key: getattr(run, key) for key in ("current_a", "motor_velocity_rad_s", "torque_nm")}
     missing = [key for key, column in columns.items() if column is None]
@@ -156,6 +146,12 @@ def needed_columns(run: JointColumns, name: str) -> tuple[FloatArray, FloatArray
             f"{name}: found no {', '.join(missing)}, expected current, motor velocity and measured torque"
         )
     return columns["current_a"], columns["motor_velocity_rad_s"], columns["torque_nm"]
+
+
+def mean_temperature(plateaus: Iterable[Plateau]) -> float:
+    """Return the mean temperature of the plateaus [degC], NaN where none has one."""
+    known = [plateau.temperature_c for plateau in plateaus if math.isfinite(plateau.temperature_c)]
+    return float(np.mean(known)) if known else math.nan
 
 
 def standard_error(samples: FloatArray, motor_angle_rad: FloatArray) -> float:
@@ -167,7 +163,7 @@ def standard_error(samples: FloatArray, motor_angle_rad: FloatArray) -> float:
     angles = [order * (motor_angle_rad - motor_angle_rad[0]) for order in RIPPLE_ORDERS]
     ripple = np.column_stack([f(a) for a in angles for f in (np.cos, np.sin)])
     residual = residual - ripple @ np.linalg.lstsq(ripple, residual, rcond=None)[0]
-    # the mean is taken from the same samples: of n_eff independent ones n_eff - 1 are left to judge by
+    # the mean is from the same samples: n_eff - 1 degrees of freedom
     independent = max(effective_samples(residual) - 1.0, 1.0)
     return max(float(np.std(residual)) / math.sqrt(independent), _resolution_error(samples))
 
@@ -225,16 +221,14 @@ def _stretches(cells: Cells, rated_nm: float, rules: PlateauRules) -> tuple[list
 def _load_bands(cells: Cells, rated_nm: float, rules: PlateauRules) -> FloatArray:
     """Widths [2] of the band in Nm for torque and motor torque: of the rules, or of the noise from cell to cell."""
     moving = cells.usable & (np.abs(cells.means[:, 0]) >= rules.slowest_rad_s)
-    # Third differences of the cells: a drift and a slow swing leave next to nothing in them, noise sqrt(20) of itself.
+    # Third differences suppress a drift and a slow swing, and have sqrt(20) times the noise of the cells.
     # The lowest fifth: cells of a transition are no noise, and in a run of short holds they are many.
-    wild = np.abs(np.diff(cells.means[:, 1:], n=3, axis=0))
-    wild = wild[moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]]
-    if not len(wild):
+    steps = np.abs(np.diff(cells.means[:, 1:], n=3, axis=0))
+    steps = steps[moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]]
+    if not len(steps):
         return np.full(2, rules.load_band * rated_nm)
-    noise = np.quantile(wild, 0.2, axis=0) / (
-        0.2533 * math.sqrt(20.0)
-    )  # 20 % of a normal are within 0.2533 sigma
-    # 8 sigma hold a hundred cells of one plateau
+    # 20 % of a normal are within 0.2533 sigma; 8 sigma hold a hundred cells of one plateau
+    noise = np.quantile(steps, 0.2, axis=0) / (0.2533 * math.sqrt(20.0))
     result: FloatArray = np.clip(8.0 * noise, rules.load_band * rated_nm, rules.load_band_most * rated_nm)
     return result
 
@@ -262,7 +256,7 @@ def _reach(cells: Cells, load_bands: FloatArray, rules: PlateauRules) -> NDArray
 
 
 def _trimmed(means: FloatArray, first: int, last: int, rated_nm: float) -> tuple[int, int]:
-    """Cut the cells at both ends that differ from the rest by more than its noise: what is left of the settling."""
+    """Cut the cells at both ends that differ from the rest by more than its noise: the end of the settling."""
     while last - first >= 3:
         inside = means[first:last]
         middle = np.median(inside, axis=0)

@@ -1,27 +1,25 @@
-"""Fit the torsion: stiffness and kinematic error from both encoders and the torque sensor.
+"""Torsion calibration: the spring of the gear, its slips and the angle errors, from both encoders and the torque sensor.
 
-    sensor = K d + K3 d^3 + D d' + H z - K sum_n (c_n cos(n theta_m) + s_n sin(n theta_m)) + zero of the run
+    sensor = K d + K3 d^3 + D d' + H z - K sum_n (c_n cos(n theta_m) + s_n sin(n theta_m)) + offset of the run
 
-d is the filtered torsion angle less its offsets, and so are the waves; the fit is repeated with the fitted offsets, so
-that the cubic acts on the deflection alone. Each run has a zero of its own: the sensor's zero and the link
-encoder's cannot be told apart in one run; their mean over the runs is the torsion's zero.
+d is the filtered torsion angle less its offset, and the waves are filtered alike. The fit is repeated with the fitted
+offsets, so that the cubic acts on the deflection alone. Each run has an offset of its own: the sensor's and the link
+encoder's cannot be separated in one run. Their mean over the runs is the offset of the torsion.
 
 z is d through a Maxwell-slip element; its travel is the best of a grid. A hysteresis is written only when it removes a
 twentieth of the residual variance and dissipates (H > 0); a damping when it dissipates (D > 0). Without the damping
-the slip would take its part: ripple of 100 rad/s loses as much in either. What joints have beyond that is added by
-`torsion_extensions` where runs left out confirm it.
+the slip would take its part: ripple of 100 rad/s loses as much in either.
 
-What a torsion has beyond stiffness, cube, one slip and the waves of orders 2 and 4, where runs left out confirm it.
+Extensions are groups of columns of the same linear model, fitted where held-out runs confirm them:
 
-    hardening   the spring is stiffer (or softer) beyond deflections b_k, in straight parts, in place of the cube
+    hardening   the spring is stiffer (or softer) beyond deflections b_k, piecewise linear, in place of the cubic
     link        error of the link encoder over its own turn, orders 1 to 3
     motor       kinematic error of orders 1 and 3 of the motor's turn
     slips       several slip elements in place of one
 
-Each is a group of columns of a linear model of the sensor's torque. The group that takes most off the error on runs left out
-is taken first, and none that takes less than WORTH of it. A run's own zero is no error: it is the day's.
-
-What a torsion makes of a run's observed signals, as FusedObserver does: deflection, its rate, slips, torque."""
+The group that reduces the held-out error most is taken first, none that reduces it by less than WORTH. The offset of each
+run is no error.
+"""
 
 from __future__ import annotations
 
@@ -35,326 +33,126 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Torsion
 from jtqd.estimator.observer import RIPPLE_ORDERS, low_pass, slipped, tracked
-from jtqd.sysid.fit.signals import AsRead, RunSignals
+from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
+from jtqd.sysid.fit.signals import RunSignals
 
+TRACKING_RAD_S: Final = 400.0
+WAVE_RAD_S: Final = 160.0
+"""Rates of the tracking filter: at rest no noisier than a low pass of 800 rad/s; chosen from a table, docs/estimator.md."""
 
-def deflection(torsion: Torsion, run: RunSignals) -> FloatArray:
-    """Return d [n]: filtered torsion angle less zero and the errors of gear and link encoder.
-
-    Raises ValueError for orders beyond RIPPLE_ORDERS where the run's positions are not known.
-    """
-    d: FloatArray = run.seen.torsion_nm - torsion.zero_rad
-    for order, cos, sin in zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True):
-        d = d - _motor_waves(run, order) @ np.array((cos, sin))
-    for order, cos, sin in zip(
-        torsion.link_orders_per_rev, torsion.link_cos_rad, torsion.link_sin_rad, strict=True
-    ):
-        d = d - run.waves(_known(run.link_position_rad, order), order) @ np.array((cos, sin))
-    return d
-
-
-def _motor_waves(run: RunSignals, order: float) -> FloatArray:
-    if order in RIPPLE_ORDERS:
-        first = 2 * RIPPLE_ORDERS.index(order)  # c2, s2, c4, s4
-        return run.seen.waves[:, first : first + 2]
-    return run.waves(_known(run.motor_position_rad, order), order)
-
-
-def _known(angle_rad: FloatArray | None, order: float) -> FloatArray:
-    if angle_rad is None:
-        known = " and ".join(map(str, RIPPLE_ORDERS))
-        raise ValueError(
-            f"found a torsion of order {order:g}, expected one of {known}: no positions are known"
-        )
-    return angle_rad
-
-
-def stretched(d_rad: FloatArray, beyond_rad: float) -> FloatArray:
-    """Return by how much |d| exceeds a deflection, with the sign of d [n]."""
-    result: FloatArray = np.copysign(np.maximum(np.abs(d_rad) - beyond_rad, 0.0), d_rad)
-    return result
-
-
-def local_stiffness(torsion: Torsion, d_rad: FloatArray) -> FloatArray:
-    """Return d tau_t/d d [n, Nm/rad] of the spring at deflections [n], without slips."""
-    result: FloatArray = torsion.stiffness_nm_per_rad + 3.0 * torsion.cubic_nm_per_rad3 * d_rad * d_rad
-    for beyond, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
-        result = result + stiffness * (np.abs(d_rad) > beyond)
-    return result
-
-
-def rate_of(d_rad: FloatArray, run: RunSignals) -> FloatArray:
-    """Return d' [n, rad/s] of a filtered deflection, as FusedObserver forms it: over the step before; 0 beside a gap."""
-    dt_s = run.seen.dt_s
-    rate = np.diff(d_rad, prepend=np.nan) / np.where(dt_s > 0.0, dt_s, np.nan)
-    return np.nan_to_num(rate, nan=0.0)
-
-
-def torsion_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, FloatArray]:
-    """Return tau_t and open [n] of observed signals, as FusedObserver gives them. Raises ValueError as `deflection`."""
-    d = deflection(torsion, run)
-    return _torque(torsion, d, rate_of(d, run))
-
-
-def torsion_now(
-    torsion: Torsion, run: RunSignals, as_read: AsRead, rate_rad_s: float, wave_rad_s: float
-) -> FloatArray:
-    """Return the torsion's torque [n] as FusedObserver forms it with the torsion tracked at these rates, of now.
-
-    Raises ValueError where the run's positions are not known.
-    """
-    d, motor = _as_read(torsion, run, as_read)
-    d, rate = tracked(d, motor, as_read.motor_velocity_rad_s, run.seen.dt_s, rate_rad_s, wave_rad_s)
-    return _torque(torsion, d, rate)[0]
-
-
-def torsion_through(torsion: Torsion, run: RunSignals, as_read: AsRead, bandwidth_rad_s: float) -> FloatArray:
-    """Return the torsion's torque [n] as FusedObserver forms it through a low pass of its own, 1/g_t old.
-
-    Raises ValueError where the run's positions are not known.
-    """
-    d = low_pass(_as_read(torsion, run, as_read)[0], run.seen.dt_s, bandwidth_rad_s)
-    return _torque(torsion, d, rate_of(d, run))[0]
-
-
-def _as_read(torsion: Torsion, run: RunSignals, as_read: AsRead) -> tuple[FloatArray, FloatArray]:
-    """Return the deflection through no filter, and the motor's position [n]."""
-    motor = run.motor_position_rad
-    if run.link_position_rad is None or motor is None:
-        raise ValueError(f"{run.name}: found no positions, expected those of both encoders")
-    waves = [part(order * motor) for order in RIPPLE_ORDERS for part in (np.cos, np.sin)]
-    seen = replace(run.seen, torsion_nm=as_read.torsion_rad, waves=np.column_stack(waves))
-    return deflection(torsion, replace(run, seen=seen, bandwidth_rad_s=inf)), motor
-
-
-def _torque(torsion: Torsion, d: FloatArray, rate_rad_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return tau_t and open [n] of a deflection and its rate [n]."""
-    result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
-    result = result + torsion.damping_nms_per_rad * rate_rad_s
-    for beyond, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
-        result = result + stiffness * stretched(d, beyond)
-    open_nm = np.zeros_like(d)
-    elements = ((torsion.hysteresis_nm, torsion.hysteresis_travel_rad),)
-    for torque, travel in (*elements, *zip(torsion.slips_nm, torsion.slips_travel_rad, strict=True)):
-        if torque:
-            z, width = slipped(d, travel)
-            result, open_nm = result + torque * z, open_nm + torque * width
-    return result, open_nm
-
-
-WORTH: Final = 0.05
-"""Part of the variance on runs left out that an extension must take away to be believed."""
-EXTENSIONS: Final = ("hardening", "link", "motor", "slips")
-KNOTS: Final = (0.1, 0.25, 0.45, 0.65, 0.85)
-"""Where the spring may change its stiffness, in parts of the largest deflection."""
-LINK_ORDERS: Final = (1.0, 2.0, 3.0)
-MOTOR_ORDERS: Final = (1.0, 3.0)
-SLIP_TRAVELS_RAD: Final = (4e-5, 1e-4, 2.5e-4, 6e-4, 1.2e-3)
 _EVERY: Final = 5
-_FOLDS: Final = 4
 _REPETITIONS: Final = 3
-_SOFTEST: Final = 0.3
-"""Least slope of a spring that is believed, in parts of its stiffness at rest."""
-_RIDGE: Final = 1e-6
-"""A priori pull towards zero, in parts of each column's own power."""
-
-
-class _Table(NamedTuple):
-    """Equations of one run: target [n], its own zero taken off, and columns [n, k] by group."""
-
-    target: FloatArray
-    columns: Mapping[str, FloatArray]
-
-
-def extended(runs: Sequence[RunSignals], torsion: Torsion) -> Torsion:
-    """Return the torsion with those of EXTENSIONS that runs left out confirm; unchanged where positions are not known."""
-    if len(runs) < 2 * _FOLDS or any(run.motor_position_rad is None for run in runs):
-        return torsion
-    largest = max(float(np.abs(deflection(torsion, run)[run.moving]).max(initial=0.0)) for run in runs)
-    knots = tuple(part * largest for part in KNOTS)
-    tables = [_table(run, torsion, knots) for run in runs if np.count_nonzero(run.moving) > _EVERY]
-    chosen: tuple[str, ...] = ()
-    least = _left_out(tables, chosen)
-    while len(chosen) < len(EXTENSIONS):
-        scores = {name: _left_out(tables, (*chosen, name)) for name in EXTENSIONS if name not in chosen}
-        best = min(scores, key=scores.__getitem__)
-        if not scores[best] < (1.0 - WORTH) * least:
-            break
-        chosen, least = (*chosen, best), scores[best]
-    if not chosen:
-        return torsion
-    result = torsion
-    for _ in range(_REPETITIONS):
-        tables = [_table(run, result, knots) for run in runs if np.count_nonzero(run.moving) > _EVERY]
-        found = _solved(tables, chosen)
-        result = _refined(result, found, chosen, knots)
-    if not _hardens(result):
-        return torsion
-    below = np.mean([np.mean((run.sensor_nm - torsion_torque(result, run)[0])[run.moving]) for run in runs])
-    return replace(result, zero_rad=result.zero_rad - float(below) / result.stiffness_nm_per_rad)
-
-
-def _table(run: RunSignals, torsion: Torsion, knots: Sequence[float]) -> _Table:
-    assert run.motor_position_rad is not None
-    assert run.link_position_rad is not None
-    keep = np.flatnonzero(run.moving)[::_EVERY]
-    d = deflection(torsion, run)
-    # an error of an angle is a torque by the spring's stiffness where it is: that at rest counts as 1
-    stiffer = (local_stiffness(torsion, d) / torsion.stiffness_nm_per_rad)[:, None]
-    columns = {
-        "spring": d[:, None],
-        "cubic": d[:, None] ** 3,
-        "damping": rate_of(d, run)[:, None],
-        "ripple": stiffer * run.seen.waves,
-        "slip": slipped(d, torsion.hysteresis_travel_rad)[0][:, None],
-        "hardening": np.column_stack([stretched(d, knot) for knot in knots]),
-        "link": stiffer * np.hstack([run.waves(run.link_position_rad, order) for order in LINK_ORDERS]),
-        "motor": stiffer * np.hstack([run.waves(run.motor_position_rad, order) for order in MOTOR_ORDERS]),
-        "slips": np.column_stack([slipped(d, travel)[0] for travel in SLIP_TRAVELS_RAD]),
-    }
-    centred = {name: part[keep] - part[keep].mean(axis=0) for name, part in columns.items()}
-    sensor = run.sensor_nm[keep]
-    return _Table(sensor - sensor.mean(), centred)
-
-
-def _groups(chosen: Sequence[str]) -> tuple[str, ...]:
-    """Return the groups of the model: an extension takes the place of what it refines."""
-    first = "hardening" if "hardening" in chosen else "cubic"
-    slip = "slips" if "slips" in chosen else "slip"
-    further = [name for name in chosen if name in ("link", "motor")]
-    return ("spring", first, "damping", "ripple", slip, *further)
-
-
-def _stacked(tables: Sequence[_Table], groups: Sequence[str]) -> tuple[FloatArray, FloatArray]:
-    x = np.vstack([np.hstack([each.columns[name] for name in groups]) for each in tables])
-    return x, np.concatenate([each.target for each in tables])
-
-
-def _weights(x: FloatArray, y: FloatArray, signs: BoolArray) -> FloatArray:
-    """Return the least squares coefficients; those of `signs` that come out below zero are left out, one after the other."""
-    power = x.T @ x
-    power[np.diag_indices_from(power)] *= 1.0 + _RIDGE
-    right = x.T @ y
-    active = np.diag(power) > 0.0
-    while True:
-        w = np.zeros(x.shape[1])
-        w[active] = np.linalg.lstsq(power[np.ix_(active, active)], right[active], rcond=None)[0]
-        below = np.where(signs & active, w, 0.0)
-        worst = int(np.argmin(below))
-        if not below[worst] < 0.0:
-            return w
-        active[worst] = False
-
-
-def _signs(tables: Sequence[_Table], groups: Sequence[str]) -> BoolArray:
-    """Return which columns dissipate, and therefore have a coefficient of at least 0."""
-    return np.concatenate(
-        [np.full(tables[0].columns[name].shape[1], name in ("slip", "slips", "damping")) for name in groups]
-    )
-
-
-def _left_out(tables: Sequence[_Table], chosen: Sequence[str]) -> float:
-    """Return the mean variance [Nm^2] on runs left out, each less its own zero."""
-    groups = _groups(chosen)
-    signs = _signs(tables, groups)
-    errors = []
-    for fold in range(_FOLDS):
-        others = [each for k, each in enumerate(tables) if k % _FOLDS != fold]
-        w = _weights(*_stacked(others, groups), signs)
-        for each in tables[fold::_FOLDS]:
-            x, y = _stacked([each], groups)
-            errors.append(float(np.var(y - x @ w)))
-    return float(np.mean(errors))
-
-
-def _solved(tables: Sequence[_Table], chosen: Sequence[str]) -> dict[str, FloatArray]:
-    """Return the coefficients by group, of all runs."""
-    groups = _groups(chosen)
-    w = _weights(*_stacked(tables, groups), _signs(tables, groups))
-    ends = np.cumsum([tables[0].columns[name].shape[1] for name in groups])
-    return dict(zip(groups, np.split(w, ends[:-1]), strict=True))
-
-
-def _refined(
-    torsion: Torsion, found: Mapping[str, FloatArray], chosen: Sequence[str], knots: Sequence[float]
-) -> Torsion:
-    """Return the torsion with these coefficients; waves of a torque are waves of the angle, over the stiffness."""
-    stiffness = float(found["spring"][0])
-    result = replace(
-        torsion,
-        stiffness_nm_per_rad=stiffness,
-        cubic_nm_per_rad3=float(found["cubic"][0]) if "cubic" in found else 0.0,
-        damping_nms_per_rad=float(found["damping"][0]),
-        hysteresis_nm=float(found["slip"][0]) if "slip" in found else 0.0,
-    )
-    if "hardening" in chosen:
-        steps = tuple(found["hardening"].tolist())
-        result = replace(result, hardening_rad=tuple(knots), hardening_nm_per_rad=steps)
-    if "slips" in chosen:
-        pairs = [
-            pair for pair in zip(found["slips"].tolist(), SLIP_TRAVELS_RAD, strict=True) if pair[0] > 0.0
-        ]
-        torques, travels = zip(*pairs, strict=True) if pairs else ((), ())
-        result = replace(result, slips_nm=torques, slips_travel_rad=travels)
-    motor = dict(
-        zip(torsion.orders_per_motor_rev, zip(torsion.cos_rad, torsion.sin_rad, strict=True), strict=True)
-    )
-    link = dict(
-        zip(
-            torsion.link_orders_per_rev,
-            zip(torsion.link_cos_rad, torsion.link_sin_rad, strict=True),
-            strict=True,
-        )
-    )
-    _add_waves(motor, (2.0, 4.0), found["ripple"], stiffness)
-    if "motor" in chosen:
-        _add_waves(motor, MOTOR_ORDERS, found["motor"], stiffness)
-    if "link" in chosen:
-        _add_waves(link, LINK_ORDERS, found["link"], stiffness)
-    return replace(
-        result,
-        orders_per_motor_rev=tuple(motor),
-        cos_rad=tuple(c for c, _ in motor.values()),
-        sin_rad=tuple(s for _, s in motor.values()),
-        link_orders_per_rev=tuple(link),
-        link_cos_rad=tuple(c for c, _ in link.values()),
-        link_sin_rad=tuple(s for _, s in link.values()),
-    )
-
-
-def _add_waves(
-    waves: dict[float, tuple[float, float]], orders: Sequence[float], torque: FloatArray, stiffness: float
-) -> None:
-    for order, (c, s) in zip(orders, torque.reshape(-1, 2).tolist(), strict=True):
-        before = waves.get(order, (0.0, 0.0))
-        waves[order] = (before[0] - c / stiffness, before[1] - s / stiffness)
-
-
-def _hardens(torsion: Torsion) -> bool:
-    """Return whether the spring's torque rises everywhere."""
-    slopes = torsion.stiffness_nm_per_rad + np.cumsum((0.0, *torsion.hardening_nm_per_rad))
-    return bool(slopes.min() > _SOFTEST * torsion.stiffness_nm_per_rad > 0.0)
-
-
 _ORDERS: Final = tuple(float(order) for order in RIPPLE_ORDERS)
-_COMMON: Final = 8
-"""Columns that all runs share: d, d^3, the four waves, the zero, and d'."""
-_OFFSETS: Final = slice(2, 7)
-_RATE_PER_S: Final = 100.0  # d' counts in so many d per second: columns of one size
-_TRAVELS_RAD: Final = (3e-5, 4e-5, 5e-5, 6e-5, 7e-5, 8.5e-5, 1e-4, 1.2e-4, 1.4e-4, 1.7e-4, 2e-4, 3e-4)
-"""From a tenth of an arc minute to one: harmonic drives lose less than that (lost motion, hysteresis)."""
-_HYSTERESIS_WORTH: Final = 0.05
-"""Part of the residual variance that a hysteresis must take away to be believed."""
-_ZERO_SIGMA_NM: Final = 0.5  # a priori, per run: far more than a good sensor drifts
-_CUBIC_SHARE: Final = 0.5  # a priori sigma of K3 d^3 at the largest d, as a share of the largest torque
 
 
 class TorsionError(ValueError):
     """The runs do not give a torsion; one line."""
 
 
+# The torque of a torsion, as FusedObserver computes it -------------------------------------------------------------------
+
+
+def deflection(torsion: Torsion, run: RunSignals) -> FloatArray:
+    """Return d [n]: filtered torsion angle less offset and the errors of gear and link encoder."""
+    d: FloatArray = run.seen.torsion_nm - torsion.zero_rad
+    for order, cos, sin in zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True):
+        if order in RIPPLE_ORDERS:
+            first = 2 * RIPPLE_ORDERS.index(order)  # c2, s2, c4, s4
+            waves = run.seen.waves[:, first : first + 2]
+        else:
+            waves = run.waves(run.motor_position_rad, order)
+        d = d - waves @ np.array((cos, sin))
+    for order, cos, sin in zip(
+        torsion.link_orders_per_rev, torsion.link_cos_rad, torsion.link_sin_rad, strict=True
+    ):
+        d = d - run.waves(run.link_position_rad, order) @ np.array((cos, sin))
+    return d
+
+
+def deflection_rate(d_rad: FloatArray, run: RunSignals) -> FloatArray:
+    """Return d' [n, rad/s] of a filtered deflection: over the step before; 0 beside a gap."""
+    dt_s = run.seen.dt_s
+    rate = np.diff(d_rad, prepend=np.nan) / np.where(dt_s > 0.0, dt_s, np.nan)
+    return np.nan_to_num(rate, nan=0.0)
+
+
+def beyond_knot(d_rad: FloatArray, knot_rad: float) -> FloatArray:
+    """Return by how much |d| exceeds a knot, with the sign of d [n]."""
+    result: FloatArray = np.copysign(np.maximum(np.abs(d_rad) - knot_rad, 0.0), d_rad)
+    return result
+
+
+def local_stiffness(torsion: Torsion, d_rad: FloatArray) -> FloatArray:
+    """Return d tau_t/d d [n, Nm/rad] of the spring at deflections [n], without slips."""
+    result: FloatArray = torsion.stiffness_nm_per_rad + 3.0 * torsion.cubic_nm_per_rad3 * d_rad * d_rad
+    for knot, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
+        result = result + stiffness * (np.abs(d_rad) > knot)
+    return result
+
+
+def torsion_torque(torsion: Torsion, run: RunSignals) -> tuple[FloatArray, FloatArray]:
+    """Return tau_t [n], with the delay of the motor path, and the torque that slips leave open [n]."""
+    d = deflection(torsion, run)
+    return _torque(torsion, d, deflection_rate(d, run))
+
+
+def tracked_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
+    """Return tau_t [n] of the tracking filter, without delay."""
+    d, rate = tracked(
+        _unfiltered_deflection(torsion, run),
+        run.motor_position_rad,
+        run.motor_velocity_rad_s,
+        run.seen.dt_s,
+        TRACKING_RAD_S,
+        WAVE_RAD_S,
+    )
+    return _torque(torsion, d, rate)[0]
+
+
+def low_pass_torque(torsion: Torsion, run: RunSignals) -> FloatArray:
+    """Return tau_t [n] through the low pass of new configurations, TORSION_BANDWIDTH_RAD_S."""
+    d = low_pass(_unfiltered_deflection(torsion, run), run.seen.dt_s, TORSION_BANDWIDTH_RAD_S)
+    return _torque(torsion, d, deflection_rate(d, run))[0]
+
+
+def _unfiltered_deflection(torsion: Torsion, run: RunSignals) -> FloatArray:
+    waves = [part(order * run.motor_position_rad) for order in RIPPLE_ORDERS for part in (np.cos, np.sin)]
+    seen = replace(run.seen, torsion_nm=run.torsion_rad, waves=np.column_stack(waves))
+    return deflection(torsion, replace(run, seen=seen, bandwidth_rad_s=inf))
+
+
+def _torque(torsion: Torsion, d: FloatArray, rate_rad_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return tau_t and open [n] of a deflection and its rate [n]."""
+    result: FloatArray = d * (torsion.stiffness_nm_per_rad + torsion.cubic_nm_per_rad3 * d * d)
+    result = result + torsion.damping_nms_per_rad * rate_rad_s
+    for knot, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
+        result = result + stiffness * beyond_knot(d, knot)
+    open_nm = np.zeros_like(d)
+    torques = (torsion.hysteresis_nm, *torsion.slips_nm)
+    travels = (torsion.hysteresis_travel_rad, *torsion.slips_travel_rad)
+    for torque, travel in zip(torques, travels, strict=True):
+        if torque:
+            z, width = slipped(d, travel)
+            result, open_nm = result + torque * z, open_nm + torque * width
+    return result, open_nm
+
+
+# The fit -----------------------------------------------------------------------------------------------------------------
+
+_COMMON: Final = 8
+"""Columns that all runs share: d, d^3, the four waves, the offset, and d'."""
+_OFFSETS: Final = slice(2, 7)
+_RATE_PER_S: Final = 100.0  # d' counts in so many d per second: columns of one size
+_TRAVELS_RAD: Final = (3e-5, 4e-5, 5e-5, 6e-5, 7e-5, 8.5e-5, 1e-4, 1.2e-4, 1.4e-4, 1.7e-4, 2e-4, 3e-4)
+"""From a tenth of an arc minute to one: harmonic drives lose less than that (lost motion, hysteresis)."""
+_HYSTERESIS_WORTH: Final = 0.05
+"""Share of the residual variance that a hysteresis must remove."""
+_OFFSET_SIGMA_NM: Final = 0.5  # a priori, per run: far more than a good sensor drifts
+_CUBIC_SHARE: Final = 0.5  # a priori sigma of K3 d^3 at the largest d, as a share of the largest torque
+
+
 def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
-    """Return the torsion parameters by least squares over all moving samples; raises TorsionError."""
+    """Return the torsion by least squares over all moving samples, with extensions. Raises TorsionError."""
     largest = max(
         (float(np.abs(run.seen.torsion_nm[run.moving]).max(initial=0.0)) for run in runs), default=0.0
     )
@@ -369,11 +167,11 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
             best, least = found, found.residual_nm2
     if best.hysteresis_nm > 0.0:
         best = _fit(runs, largest, best.offsets, best.travel_rad)
-    c2, s2, c4, s4, zero = best.offsets.tolist()
+    c2, s2, c4, s4, offset = best.offsets.tolist()
     plain = Torsion(
         stiffness_nm_per_rad=best.stiffness,
         cubic_nm_per_rad3=best.cubic,
-        zero_rad=zero,
+        zero_rad=offset,
         orders_per_motor_rev=_ORDERS,
         cos_rad=(c2, c4),
         sin_rad=(s2, s4),
@@ -385,7 +183,7 @@ def fit_torsion(runs: Sequence[RunSignals]) -> Torsion:
 
 
 class _Found(NamedTuple):
-    """One solution; offsets: kinematic error (c2, s2, c4, s4) and zero [rad]; residual variance [Nm^2]."""
+    """One solution; offsets: kinematic error (c2, s2, c4, s4) and offset [rad]; residual variance [Nm^2]."""
 
     stiffness: float
     cubic: float
@@ -403,7 +201,7 @@ def _fit(
     travel_rad: float | None,
     repetitions: int = _REPETITIONS,
 ) -> _Found:
-    """Solve with the hysteresis of one travel, or without; the offsets found are taken out and the fit repeated."""
+    """Solve with the hysteresis of one travel, or without; the fitted offsets are subtracted and the fit is repeated."""
     for _ in range(repetitions):
         x, y = _equations(runs, offsets, largest, travel_rad)
         if len(y) < 10 * x.shape[1]:
@@ -429,7 +227,7 @@ def _equations(
 ) -> tuple[FloatArray, FloatArray]:
     """Return columns [n, _COMMON (+ 1) + runs] and sensor [n] of all moving samples, thinned.
 
-    d is less what is known of its offsets, and in parts of `largest`: then its cube carries no wave and no zero.
+    d is less its known offsets, and in parts of `largest`: then its cube carries neither wave nor offset.
     """
     blocks: list[FloatArray] = []
     targets: list[FloatArray] = []
@@ -437,13 +235,13 @@ def _equations(
         keep = np.flatnonzero(run.moving)[::_EVERY]
         shared = np.column_stack((run.seen.waves, np.ones(len(run.seen.waves))))
         d = run.seen.torsion_nm - shared @ offsets
-        x, rate = d[keep] / largest, rate_of(d, run)[keep] / (_RATE_PER_S * largest)
+        x, rate = d[keep] / largest, deflection_rate(d, run)[keep] / (_RATE_PER_S * largest)
         columns = [x, x**3, shared[keep], rate]
         if travel_rad is not None:
             columns.append(slipped(d, travel_rad)[0][keep])
-        zero = np.zeros((len(keep), len(runs)))
-        zero[:, n] = 1.0
-        blocks.append(np.column_stack((*columns, zero)))
+        own = np.zeros((len(keep), len(runs)))
+        own[:, n] = 1.0
+        blocks.append(np.column_stack((*columns, own)))
         targets.append(run.sensor_nm[keep])
     return np.vstack(blocks), np.concatenate(targets)
 
@@ -453,11 +251,186 @@ def _solve(x: FloatArray, y: FloatArray, shared: int) -> FloatArray:
     noise = _noise_of(x, y, shared)
     prior = np.zeros(x.shape[1])
     prior[1] = noise / max(_CUBIC_SHARE * float(np.abs(y).max()), 1e-9) ** 2
-    prior[shared:] = noise / _ZERO_SIGMA_NM**2
+    prior[shared:] = noise / _OFFSET_SIGMA_NM**2
     return np.asarray(np.linalg.lstsq(x.T @ x + np.diag(prior), x.T @ y, rcond=None)[0], np.float64)
 
 
 def _noise_of(x: FloatArray, y: FloatArray, shared: int) -> float:
-    """Return the residual variance with one zero for all runs [Nm^2]."""
+    """Return the residual variance with one offset for all runs [Nm^2]."""
     w = np.linalg.lstsq(x[:, :shared], y, rcond=None)[0]
     return float(np.mean((y - x[:, :shared] @ w) ** 2))
+
+
+# Extensions --------------------------------------------------------------------------------------------------------------
+
+WORTH: Final = 0.05
+"""Share of the held-out variance that an extension must remove."""
+EXTENSIONS: Final = ("hardening", "link", "motor", "slips")
+KNOTS: Final = (0.1, 0.25, 0.45, 0.65, 0.85)
+"""Where the spring may change its stiffness, in parts of the largest deflection."""
+LINK_ORDERS: Final = (1.0, 2.0, 3.0)
+MOTOR_ORDERS: Final = (1.0, 3.0)
+SLIP_TRAVELS_RAD: Final = (4e-5, 1e-4, 2.5e-4, 6e-4, 1.2e-3)
+_FOLDS: Final = 4
+_SOFTEST: Final = 0.3
+"""Least slope of a plausible spring, in parts of its stiffness at rest."""
+_RIDGE: Final = 1e-6
+"""A priori pull towards zero, in parts of each column's own power."""
+
+
+class _Table(NamedTuple):
+    """Equations of one run: target [n], its own offset subtracted, and columns [n, k] by group."""
+
+    target: FloatArray
+    columns: Mapping[str, FloatArray]
+
+
+def extended(runs: Sequence[RunSignals], torsion: Torsion) -> Torsion:
+    """Return the torsion with those of EXTENSIONS that held-out runs confirm; unchanged for less than eight runs."""
+    if len(runs) < 2 * _FOLDS:
+        return torsion
+    largest = max(float(np.abs(deflection(torsion, run)[run.moving]).max(initial=0.0)) for run in runs)
+    knots = tuple(part * largest for part in KNOTS)
+    usable = [run for run in runs if np.count_nonzero(run.moving) > _EVERY]
+    tables = [_table(run, torsion, knots) for run in usable]
+    chosen: tuple[str, ...] = ()
+    least = _held_out_variance(tables, chosen)
+    while len(chosen) < len(EXTENSIONS):
+        scores = {
+            name: _held_out_variance(tables, (*chosen, name)) for name in EXTENSIONS if name not in chosen
+        }
+        best = min(scores, key=scores.__getitem__)
+        if not scores[best] < (1.0 - WORTH) * least:
+            break
+        chosen, least = (*chosen, best), scores[best]
+    if not chosen:
+        return torsion
+    result = torsion
+    for _ in range(_REPETITIONS):
+        found = _solved([_table(run, result, knots) for run in usable], chosen)
+        result = _refined(result, found, knots)
+    slopes = result.stiffness_nm_per_rad + np.cumsum((0.0, *result.hardening_nm_per_rad))
+    if not slopes.min() > _SOFTEST * result.stiffness_nm_per_rad > 0.0:
+        return torsion
+    below = np.mean([np.mean((run.sensor_nm - torsion_torque(result, run)[0])[run.moving]) for run in runs])
+    return replace(result, zero_rad=result.zero_rad - float(below) / result.stiffness_nm_per_rad)
+
+
+def _table(run: RunSignals, torsion: Torsion, knots: Sequence[float]) -> _Table:
+    keep = np.flatnonzero(run.moving)[::_EVERY]
+    d = deflection(torsion, run)
+    # an angle error is a torque by the local stiffness; that at rest counts as 1
+    stiffer = (local_stiffness(torsion, d) / torsion.stiffness_nm_per_rad)[:, None]
+    columns = {
+        "spring": d[:, None],
+        "cubic": d[:, None] ** 3,
+        "damping": deflection_rate(d, run)[:, None],
+        "ripple": stiffer * run.seen.waves,
+        "slip": slipped(d, torsion.hysteresis_travel_rad)[0][:, None],
+        "hardening": np.column_stack([beyond_knot(d, knot) for knot in knots]),
+        "link": stiffer * np.hstack([run.waves(run.link_position_rad, order) for order in LINK_ORDERS]),
+        "motor": stiffer * np.hstack([run.waves(run.motor_position_rad, order) for order in MOTOR_ORDERS]),
+        "slips": np.column_stack([slipped(d, travel)[0] for travel in SLIP_TRAVELS_RAD]),
+    }
+    centred = {name: part[keep] - part[keep].mean(axis=0) for name, part in columns.items()}
+    sensor = run.sensor_nm[keep]
+    return _Table(sensor - sensor.mean(), centred)
+
+
+def _groups(chosen: Sequence[str]) -> tuple[str, ...]:
+    """Return the groups of the model: an extension takes the place of what it refines."""
+    first = "hardening" if "hardening" in chosen else "cubic"
+    slip = "slips" if "slips" in chosen else "slip"
+    further = [name for name in chosen if name in ("link", "motor")]
+    return ("spring", first, "damping", "ripple", slip, *further)
+
+
+def _stacked(tables: Sequence[_Table], groups: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+    x = np.vstack([np.hstack([each.columns[name] for name in groups]) for each in tables])
+    return x, np.concatenate([each.target for each in tables])
+
+
+def _weights(tables: Sequence[_Table], groups: Sequence[str]) -> FloatArray:
+    """Return the least squares coefficients; dissipating ones that come out below 0 are dropped, one after the other."""
+    x, y = _stacked(tables, groups)
+    dissipates: BoolArray = np.concatenate(
+        [np.full(tables[0].columns[name].shape[1], name in ("slip", "slips", "damping")) for name in groups]
+    )
+    power = x.T @ x
+    power[np.diag_indices_from(power)] *= 1.0 + _RIDGE
+    right = x.T @ y
+    active = np.diag(power) > 0.0
+    while True:
+        w = np.zeros(x.shape[1])
+        w[active] = np.linalg.lstsq(power[np.ix_(active, active)], right[active], rcond=None)[0]
+        below = np.where(dissipates & active, w, 0.0)
+        worst = int(np.argmin(below))
+        if not below[worst] < 0.0:
+            return w
+        active[worst] = False
+
+
+def _held_out_variance(tables: Sequence[_Table], chosen: Sequence[str]) -> float:
+    """Return the mean variance [Nm^2] on held-out runs, each less its own offset."""
+    groups = _groups(chosen)
+    errors = []
+    for fold in range(_FOLDS):
+        w = _weights([each for k, each in enumerate(tables) if k % _FOLDS != fold], groups)
+        for each in tables[fold::_FOLDS]:
+            x, y = _stacked([each], groups)
+            errors.append(float(np.var(y - x @ w)))
+    return float(np.mean(errors))
+
+
+def _solved(tables: Sequence[_Table], chosen: Sequence[str]) -> dict[str, FloatArray]:
+    """Return the coefficients by group, of all runs."""
+    groups = _groups(chosen)
+    ends = np.cumsum([tables[0].columns[name].shape[1] for name in groups])
+    return dict(zip(groups, np.split(_weights(tables, groups), ends[:-1]), strict=True))
+
+
+def _refined(torsion: Torsion, found: Mapping[str, FloatArray], knots: Sequence[float]) -> Torsion:
+    """Return the torsion with these coefficients; waves of a torque are waves of the angle, over the stiffness."""
+    stiffness = float(found["spring"][0])
+    motor = _waves(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad)
+    link = _waves(torsion.link_orders_per_rev, torsion.link_cos_rad, torsion.link_sin_rad)
+    for waves, orders, name in (
+        (motor, _ORDERS, "ripple"),
+        (motor, MOTOR_ORDERS, "motor"),
+        (link, LINK_ORDERS, "link"),
+    ):
+        if name in found:
+            for order, (c, s) in zip(orders, found[name].reshape(-1, 2).tolist(), strict=True):
+                cos, sin = waves.get(order, (0.0, 0.0))
+                waves[order] = cos - c / stiffness, sin - s / stiffness
+    result = replace(
+        torsion,
+        stiffness_nm_per_rad=stiffness,
+        cubic_nm_per_rad3=float(found["cubic"][0]) if "cubic" in found else 0.0,
+        damping_nms_per_rad=float(found["damping"][0]),
+        hysteresis_nm=float(found["slip"][0]) if "slip" in found else 0.0,
+        orders_per_motor_rev=tuple(motor),
+        cos_rad=tuple(c for c, _ in motor.values()),
+        sin_rad=tuple(s for _, s in motor.values()),
+        link_orders_per_rev=tuple(link),
+        link_cos_rad=tuple(c for c, _ in link.values()),
+        link_sin_rad=tuple(s for _, s in link.values()),
+    )
+    if "hardening" in found:
+        steps = tuple(found["hardening"].tolist())
+        result = replace(result, hardening_rad=tuple(knots), hardening_nm_per_rad=steps)
+    if "slips" in found:
+        slips = zip(found["slips"].tolist(), SLIP_TRAVELS_RAD, strict=True)
+        pairs = [(torque, travel) for torque, travel in slips if torque > 0.0]
+        result = replace(
+            result,
+            slips_nm=tuple(torque for torque, _ in pairs),
+            slips_travel_rad=tuple(travel for _, travel in pairs),
+        )
+    return result
+
+
+def _waves(
+    orders: Sequence[float], cos: Sequence[float], sin: Sequence[float]
+) -> dict[float, tuple[float, float]]:
+    return dict(zip(orders, zip(cos, sin, strict=True), strict=True))

@@ -16,8 +16,8 @@ from jtqd.estimator.checked import ConfigError, check_installed, count, make_dir
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint
-from jtqd.sysid.fit.command import signals_of, two_encoders
 from jtqd.sysid.fit.losses import LossFitError
+from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
 from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import channel_findings
@@ -257,7 +257,7 @@ def _train_joint(
         )
     settings = {"iterations": iterations, "seed": options.seed, "progress": say}
     if options.network == "ours":
-        result = train_fused(signals_of(runs, number, joint), joint, hashes, **settings)
+        result = train_fused(signals_of_runs(runs, number, joint), joint, hashes, **settings)
         name = f"{joint.name}.fused"
     else:
         blocks = [

@@ -163,7 +163,7 @@ def fit_physics(joints: tuple[Joint, Joint], excitation: Sequence[Driven]) -> tu
             run_signals(run.name, joint, settings, run.table.time_s, run.columns(number, joint))
             for run in excitation
         ]
-        fused = fit_fused(signals, joint.friction, joint.rated_torque_nm).fused
+        fused = fit_fused(signals, joint).fused
         found.append(
             Identified(number, replace(joint, fused=fused), b"", {}, Range.of(excitation, number, joint))
         )
