@@ -86,7 +86,7 @@ Scale = tuple[float, float, float, float]
 """Factors of sigma, by quadrant."""
 _ONE: Final[Scale] = (1.0, 1.0, 1.0, 1.0)
 
-# Conformal quantiles -----------------------------------------------------------------------------------------------------
+# Conformal quantiles -----------------------------------------------------------------------------------
 
 _LEAST_SCALE: Final = 0.05
 _BEYOND: Final = 0.3
@@ -163,7 +163,7 @@ def unbiased_level(parts: Sequence[FloatArray], coverage: float = COVERAGE) -> f
     return 0.5 * (root(coverage - 1e-9) + root(coverage + 1e-9))
 
 
-# Sigma and tracking ------------------------------------------------------------------------------------------------------
+# Sigma and tracking ------------------------------------------------------------------------------------
 
 _FLOOR_NM: Final = 0.02
 _FAST_RAD_S: Final = 0.1
@@ -251,7 +251,7 @@ def bent_square(velocity_rad_s: FloatArray, bend: float) -> FloatArray:
     return result
 
 
-# Standstill --------------------------------------------------------------------------------------------------------------
+# Standstill --------------------------------------------------------------------------------------------
 
 COVERAGE_AT_REST: Final = 0.95
 """More than in motion: a controller relies on a standing joint."""
@@ -311,7 +311,7 @@ def fit_standstill(runs: Sequence[Standing], reference_nm: float = 0.0) -> Stand
     return Standstill(float(np.sqrt(max(most * most - normal * normal * np.mean(offsets), 1.0))))
 
 
-# Scale -------------------------------------------------------------------------------------------------------------------
+# Scale -------------------------------------------------------------------------------------------------
 
 OTHER_MOTIONS: Final = 0.02
 OTHER_MOTIONS_LEARNED: Final = 0.01

@@ -194,7 +194,7 @@ def _count(findings: Sequence[RunIssue]) -> str:
     return counted(len(findings), "finding")
 
 
-# Efficiency --------------------------------------------------------------------------------------------------------------
+# Efficiency --------------------------------------------------------------------------------------------
 
 
 def _efficiency_options(parser: argparse.ArgumentParser) -> None:
@@ -293,7 +293,7 @@ def _with_efficiency(
     return _fitted(new, "efficiency", runs, options, temperature_c=result.temperature_c, notes=notes)
 
 
-# Friction ----------------------------------------------------------------------------------------------------------------
+# Friction ----------------------------------------------------------------------------------------------
 
 
 def _fit_friction(joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace) -> Outcome:
@@ -326,7 +326,7 @@ def _fit_friction(joint: Joint, number: int, runs: list[RunFile], options: argpa
     return Outcome(lines, plain_values(mapping), joint=new)
 
 
-# Losses ------------------------------------------------------------------------------------------------------------------
+# Losses ------------------------------------------------------------------------------------------------
 
 ONE_ENCODER: Final = (
     "the runs have one encoder of this joint: no torsion is fitted, sigma is that of motor current less loss"

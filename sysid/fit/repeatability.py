@@ -7,10 +7,10 @@ Offset of the link encoder (`fused.zeros`): how far it differs from day to day.
     correlation_s = long-run variance / assumed, of the residual of a day's states in the difference of the paths
 
 The mean error of a run is its offset and the sensor's; reference^2 is the sensor's (`sysid/fit/calibration.py`). The
-long-run variance is that of means over WINDOW_S, times WINDOW_S, after least squares with the states of `path_difference.pyx` in each
-run; assumed is that of both paths, less that of the offset. The same runs are then estimated as in service, each from its
-start, with offsets tracked. The section is written where that reduces the mean square error by at least WORTH;
-`sysid/fit/calibration.py` sets its scale.
+long-run variance is that of means over WINDOW_S, times WINDOW_S, after least squares with the states of
+`path_difference.pyx` in each run; assumed is that of both paths, less that of the offset. The same runs are then estimated
+as in service, each from its start, with offsets tracked. The section is written where that reduces the mean square error by
+at least WORTH; `sysid/fit/calibration.py` sets its scale.
 
 Agreement of the paths (`fused.agreement`): quantiles over samples of how far they differ on ordinary days. A difference
 beyond is doubt that grows from zero, so a run slightly beyond costs little (estimator/path_difference.pyx).
@@ -124,8 +124,8 @@ ZERO_FACTOR: Final = 1.3
 """Of `path_difference.pyx`: chosen on runs that no figure is reported on. Until the joint has moved both ways, the filter
 finds less of an offset than there is: friction takes a part."""
 GAIN_SIGMAS: Final = 1.0
-"""Of `path_difference.pyx`: chosen on runs that no figure is reported on. More hold a softer spring less; without, sigma is wider
-where a joint is always driven."""
+"""Of `path_difference.pyx`: chosen on runs that no figure is reported on. More hold a softer spring less; without, sigma is
+wider where a joint is always driven."""
 _START: Final = Agreement(1.0, 1.0, 0.0, 0.0, gain_sigmas=GAIN_SIGMAS)
 _FEWEST_BLOCKS: Final = 200
 """3 s of motion at 1 kHz."""

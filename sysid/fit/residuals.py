@@ -5,8 +5,8 @@
     error, no delay = e_tracked + (1 - alpha) (e_c - e_t')   e_t': of the tracked torsion through the motor path's filter
     more^2 = (disagreement beyond DISAGREE_SIGMAS)^2 + doubt^2
 
-With `track_zeros` the corrections of both paths are in all of them (`path_difference.pyx`, which defines early). Disagreement and
-doubt: uncertainty.pyx, path_difference.pyx.
+With `track_zeros` the corrections of both paths are in all of them. Definitions of early, disagreement and doubt:
+path_difference.pyx, uncertainty.pyx.
 """
 
 from __future__ import annotations

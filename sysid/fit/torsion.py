@@ -49,7 +49,7 @@ class TorsionError(ValueError):
     """The runs do not give a torsion; one line."""
 
 
-# The torque of a torsion, as FusedObserver computes it -------------------------------------------------------------------
+# The torque of a torsion, as FusedObserver computes it -------------------------------------------------
 
 
 def deflection(torsion: Torsion, run: RunSignals) -> FloatArray:
@@ -137,7 +137,7 @@ def _torque(torsion: Torsion, d: FloatArray, rate_rad_s: FloatArray) -> tuple[Fl
     return result, open_nm
 
 
-# The fit -----------------------------------------------------------------------------------------------------------------
+# The fit -----------------------------------------------------------------------------------------------
 
 _COMMON: Final = 8
 """Columns that all runs share: d, d^3, the four waves, the offset, and d'."""
@@ -261,7 +261,7 @@ def _noise_of(x: FloatArray, y: FloatArray, shared: int) -> float:
     return float(np.mean((y - x[:, :shared] @ w) ** 2))
 
 
-# Extensions --------------------------------------------------------------------------------------------------------------
+# Extensions --------------------------------------------------------------------------------------------
 
 WORTH: Final = 0.05
 """Share of the held-out variance that an extension must remove."""

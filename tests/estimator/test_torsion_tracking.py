@@ -17,7 +17,7 @@ from jtqd.estimator.joint import Joint, Tracking
 from jtqd.estimator.observer import TRACKED_FADE_S, low_pass, reference_of, tracked
 from jtqd.estimator.settings import EstimatorSettings, age_ms, bandwidth_of, recommended
 from jtqd.estimator.status import STANDSTILL
-from jtqd.sysid.fit.residuals import TRACKING_RAD_S, WAVE_RAD_S
+from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
 from tests.estimator.fused_helpers import fused_joint, twisted
 from tests.estimator.test_torsion_bandwidth import OWN, SLIPPING, SPEED, WEIGHTS, estimated, lossless
 

@@ -42,9 +42,9 @@ def smooth_loss(viscous_per_k: float = 0.02, temperature_c: float = 25.0) -> Add
 
 @dataclass(frozen=True)
 class Nuisance:
-    """What a run has of its own: zero of the sensor, viscous friction against the mean, temperature."""
+    """What a run has of its own: offset of the sensor, viscous friction against the mean, temperature."""
 
-    zero_nm: float = 0.0
+    offset_nm: float = 0.0
     viscous: float = 0.0
     temperature_c: float = math.nan
 
@@ -58,7 +58,7 @@ def made_run(
     noise_nm: float = 0.05,
     count: int = 6000,
 ) -> RunSignals:
-    """One run whose sensor is motor torque less loss, less the run's own nuisances, plus noise."""
+    """One run whose sensor is motor torque less loss, less the run's own nuisances, plus noise; no filter has a delay."""
     own = own or Nuisance()
     rng = np.random.default_rng(seed)
     t = np.arange(count) * 0.001
@@ -80,20 +80,48 @@ def made_run(
         slope = torsion.stiffness_nm_per_rad + 3.0 * torsion.cubic_nm_per_rad3 * d**2
         d -= (torsion.stiffness_nm_per_rad * d + torsion.cubic_nm_per_rad3 * d**3 - torque) / slope
     pairs = np.column_stack((torsion.cos_rad, torsion.sin_rad)).ravel()
+    twist = d + torsion.zero_rad + waves @ pairs + rng.normal(0.0, 2e-6, count)
     seen = ObservedRun(
         status=np.full(count, VALID, np.uint8),
         raw_nm=raw,
         velocity_rad_s=v,
-        torsion_nm=d + torsion.zero_rad + waves @ pairs + rng.normal(0.0, 2e-6, count),
+        torsion_nm=twist,
         waves=waves,
         temperature_c=temperature,
         direction=direction,
         dt_s=np.full(count, 1e-3),
         open_nm=np.zeros(count),
         ahead_nm=np.zeros(count),
+        turn=np.column_stack((np.cos(angle), np.sin(angle))),
     )
-    sensor = torque - own.zero_nm + rng.normal(0.0, noise_nm, count)
-    return RunSignals(f"run {seed}", seen, sensor, np.ones(count, bool), np.zeros(count, bool))
+    sensor = torque - own.offset_nm + rng.normal(0.0, noise_nm, count)
+    moving = np.ones(count, bool)
+    return RunSignals(
+        f"run {seed}",
+        seen,
+        sensor,
+        moving,
+        ~moving,
+        angle,
+        100.0 * v,
+        angle / 100.0 - twist,
+        twist,
+        sensor,
+        math.inf,
+    )
+
+
+def with_torsion(run: RunSignals, twist: FloatArray, sensor_nm: FloatArray | None = None) -> RunSignals:
+    """The same run with another torsion angle [n], and with another sensor."""
+    sensor = run.sensor_nm if sensor_nm is None else sensor_nm
+    return replace(
+        run,
+        seen=replace(run.seen, torsion_nm=twist),
+        link_position_rad=run.motor_position_rad / 100.0 - twist,
+        torsion_rad=twist,
+        sensor_nm=sensor,
+        raw_sensor_nm=sensor,
+    )
 
 
 def one_way(run: RunSignals, sign: float) -> RunSignals:

@@ -83,12 +83,13 @@ def test_json_holds_everything(campaign: Path, capsys: pytest.CaptureFixture[str
 
 
 def test_the_other_joint_of_the_same_runs(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Which one is told by the joint's name, or by --number."""
-    assert run("efficiency", campaign, "--joint", shipped("joint2.yaml"), "--json") == 0
-    by_name = json.loads(capsys.readouterr().out)
-    assert run("efficiency", campaign, "--joint", shipped("joint2.yaml"), "--number", 2, "--json") == 0
-    assert json.loads(capsys.readouterr().out) == by_name
-    assert by_name["number"] == 2
+    """By the end of the joint's name, or by --number."""
+    found = []
+    for more in ((), ("--number", 2)):
+        assert run("efficiency", campaign, "--joint", shipped("joint2.yaml"), "--json", *more) == 0
+        found.append(json.loads(capsys.readouterr().out))
+    assert found[0] == found[1]
+    assert found[0]["number"] == 2
 
 
 def with_joint(tmp_path: Path, **changes: float) -> Path:
@@ -105,22 +106,22 @@ def test_a_wrong_torque_constant_is_a_finding_and_nothing_is_written(
 ) -> None:
     joint, out = with_joint(tmp_path, torque_constant_nm_per_a=constant), tmp_path / "new.yaml"
     assert run("efficiency", campaign, "--joint", joint, "--out", out, "--plot", tmp_path / "p.png") == 3
-    said = capsys.readouterr()
-    assert kind in said.out
-    assert "nothing was written" in said.err
+    output = capsys.readouterr()
+    assert kind in output.out
+    assert "nothing was written" in output.err
     assert not out.exists()
     assert run("efficiency", campaign, "--joint", joint, "--json") == 3
     assert [item["kind"] for item in json.loads(capsys.readouterr().out)["findings"]] == [kind]
 
 
-def test_a_wrong_gear_ratio_is_told_by_the_positions(
+def test_a_wrong_gear_ratio_is_shown_by_the_positions(
     campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     joint = with_joint(tmp_path, gear_ratio=50.0)
     assert run("efficiency", campaign, "--joint", joint, "--out", tmp_path / "new.yaml") == 3
-    said = capsys.readouterr()
-    assert said.out.count("gear_ratio: ") == 4  # one per run
-    assert "expected gear_ratio 50 of joint1" in said.out
+    output = capsys.readouterr().out
+    assert output.count("gear_ratio: ") == 4  # one per run
+    assert "expected gear_ratio 50 of joint1" in output
     assert run("friction", campaign, "--joint", joint) == 3
 
 
@@ -164,35 +165,43 @@ def test_missing_quadrants_are_refused_by_name_unless_the_files_own_may_stay(
     assert "no efficiency" in capsys.readouterr().err
 
 
-def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    good = campaign / "forward_p.csv.gz"
-    (tmp_path / "empty").mkdir()
-    text = gzip.decompress(good.read_bytes()).decode().splitlines()
-    broken = text[100].split(",")
-    broken[1] = "nan"
-    (tmp_path / "nan.csv").write_text("\n".join([*text[:100], ",".join(broken), *text[101:]]))
+@pytest.fixture(scope="module")
+def broken(campaign: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run files that cannot be used, and forward_p.csv.gz, which can."""
+    folder = tmp_path_factory.mktemp("broken")
+    good = (campaign / "forward_p.csv.gz").read_bytes()
+    (folder / "good.csv.gz").write_bytes(good)
+    (folder / "empty").mkdir()
+    text = gzip.decompress(good).decode().splitlines()
+    cells = text[100].split(",")
+    cells[1] = "nan"
+    (folder / "nan.csv").write_text("\n".join([*text[:100], ",".join(cells), *text[101:]]))
     n = 4000
     swing = np.sin(0.003 * np.arange(n))
     moving = JointColumns(current_a=4 * swing, motor_velocity_rad_s=100 * swing, torque_nm=15 * swing)
-    write_run(tmp_path / "swing.csv", RunTable(0.001 * np.arange(n), {1: moving}))
-    cases = {
-        tmp_path / "absent.csv": "found no such file or directory",
-        tmp_path / "empty": "found no run file in it",
-        tmp_path / "nan.csv": "line 101, column",
-        tmp_path / "swing.csv": "swing.csv: found no settled plateau",
-    }
-    for path, expected in cases.items():
-        assert run("efficiency", path, "--joint", JOINT) == 1
-        error = capsys.readouterr().err
-        assert expected in error
-        assert error.count("\n") == 1
-        assert "Traceback" not in error
-    assert run("efficiency", good, good, "--joint", JOINT) == 1
-    assert "found it twice" in capsys.readouterr().err
-    assert run("efficiency", good, "--joint", JOINT, "--number", 5) == 1
-    assert "j5" in capsys.readouterr().err
-    assert run("efficiency", good, "--joint", tmp_path / "none.yaml") == 1
-    assert "none.yaml: cannot be read" in capsys.readouterr().err
+    write_run(folder / "swing.csv", RunTable(0.001 * np.arange(n), {1: moving}))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("runs", "more", "words"),
+    [
+        (["absent.csv"], (), "found no such file or directory"),
+        (["empty"], (), "found no run file in it"),
+        (["nan.csv"], (), "line 101, column"),
+        (["swing.csv"], (), "swing.csv: found no settled plateau"),
+        (["good.csv.gz", "good.csv.gz"], (), "found it twice"),
+        (["good.csv.gz"], ("--number", 5), "j5"),
+        (["good.csv.gz"], ("--joint", "none.yaml"), "none.yaml: cannot be read"),
+    ],
+)
+def test_bad_input_is_one_line(
+    broken: Path, capsys: pytest.CaptureFixture[str], runs: list[str], more: tuple[object, ...], words: str
+) -> None:
+    assert run("efficiency", *(broken / name for name in runs), "--joint", JOINT, *more) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -206,7 +215,7 @@ def test_bad_input_is_one_line(campaign: Path, tmp_path: Path, capsys: pytest.Ca
         ("efficiency", "--plot=a.xyz", "found the ending '.xyz', expected a picture: .png"),
     ],
 )
-def test_where_results_cannot_go_is_said_before_runs_are_read(
+def test_where_results_cannot_go_is_an_error_before_runs_are_read(
     capsys: pytest.CaptureFixture[str], kind: str, option: str, words: str
 ) -> None:
     assert run(kind, "absent.csv", "--joint", JOINT, option) == 1
@@ -215,14 +224,15 @@ def test_where_results_cannot_go_is_said_before_runs_are_read(
     assert error.count("\n") == 1
 
 
-def test_usage_errors(campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_usage_errors(campaign: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run() == 2
     assert run("--help") == 0
     assert "jtq fit efficiency campaigns/efficiency" in capsys.readouterr().out
     assert run("eficiency") == 2
     assert "did you mean 'efficiency'" in capsys.readouterr().err
+    assert run("efficiency", campaign, "--joint", JOINT, "--out", JOINT) == 2
+    assert "the joint file itself, expected a new file" in capsys.readouterr().err
     for arguments in (
-        ("efficiency", campaign, "--joint", JOINT, "--out", JOINT),
         ("efficiency", campaign, "--joint", JOINT, "--min-hold", "-1"),
         ("efficiency", "--joint", JOINT),
     ):

@@ -1,4 +1,4 @@
-"""What the runs of a fit covered: steps in proportion to the joint."""
+"""Operating envelope of a fit: steps in proportion to the joint, and a map as wide as held-out runs need."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def covered(made: Envelope, of: list[tuple[np.ndarray, np.ndarray]]) -> float:
     return float(np.mean([np.mean(FusedTrust(made).weigh_map(v, raw) >= 0.5) for v, raw in of]))
 
 
-def test_the_map_is_as_much_wider_in_load_as_runs_left_out_need() -> None:
+def test_the_map_is_as_much_wider_in_load_as_held_out_runs_need() -> None:
     """Few runs have shown little of what the next one will do, many have; the map never grows in speed."""
     wider = {}
     for count in (8, 60):

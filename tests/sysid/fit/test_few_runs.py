@@ -1,4 +1,4 @@
-"""The regularised fit of one to five runs: it finds what a run tells, stays near the file elsewhere, and says how wide."""
+"""Regularised fit of one to five runs: near the truth where a run determines it, near the file elsewhere, and how wide."""
 
 import json
 from dataclasses import replace
@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.daemon.jtq import main as jtq
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import JointColumns
@@ -14,7 +15,6 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.command import losses_main
 from jtqd.sysid.fit.few_runs import FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.signals import RunSignals, run_signals
@@ -67,7 +67,7 @@ def judged(fit: FewRunsFit, made: JointColumns) -> tuple[float, float]:
     return float(np.sqrt(np.mean(error**2))), float(np.mean(inside))
 
 
-def test_both_directions_tell_everything() -> None:
+def test_both_directions_determine_everything() -> None:
     fit = fitted(columns(seconds=12.0))
     found = {term.name: term for term in fit.terms}
     assert found["Coulomb friction"].value == pytest.approx(TRUE["coulomb"], abs=0.25)
@@ -89,14 +89,14 @@ def test_one_direction_is_not_taken_for_both(way: float) -> None:
     assert error < 0.04 * JOINT.rated_torque_nm
     assert inside > 0.85
     terms = {term.name: term for term in fit.terms}
-    assert terms["offset"].sigma > 0.9 * terms["offset"].file_sigma, "the run tells nothing of it"
+    assert terms["offset"].sigma > 0.9 * terms["offset"].file_sigma, "the run does not show it"
     assert abs(terms["offset"].value) < terms["offset"].file_sigma
     scale = fit.fused.sigma.scale
     seen, unseen = ((0, 2), (1, 3)) if way > 0.0 else ((1, 3), (0, 2))
     assert min(scale[q] for q in unseen) > 1.03 * max(scale[q] for q in seen)
 
 
-def test_a_second_run_the_other_way_tells_the_offset() -> None:
+def test_a_second_run_the_other_way_shows_the_offset() -> None:
     one, both = fitted(columns(way=1.0)), fitted(columns(way=1.0), columns(way=-1.0))
     before, after = ({term.name: term.sigma for term in fit.terms}["offset"] for fit in (one, both))
     assert after < 0.9 * before
@@ -137,29 +137,29 @@ def test_a_run_at_rest_is_refused() -> None:
         fitted(still)
 
 
-def test_the_report_says_what_the_runs_told() -> None:
+def test_the_report_has_values_before_and_after() -> None:
     lines = fitted(columns(way=1.0)).lines()
     offset = next(line for line in lines if line.startswith("offset"))
     assert "(before: 0 +- 0.4" in offset
-    assert "the runs tell" in offset
     assert lines[-1].startswith("residual ")
 
 
 def test_the_command_fits_one_run_of_one_encoder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The map of this arm makes the motor's position of the joint's: that is no second encoder."""
     files, out = shipped("kinova_gen3/columns.yaml").parent, tmp_path / "joint4.yaml"
-    told = [str(files / "RunTrajectory1.csv.gz"), "--columns", str(files / "columns.yaml"), "--number", "4"]
-    assert losses_main([*told, "--joint", str(files / "joint4.yaml"), "--out", str(out)]) == 0
-    said = capsys.readouterr()
-    assert "no torsion is fitted" in said.err
-    assert "up to 5 runs" in said.err
-    assert "offset" in said.out
+    given = [str(files / "RunTrajectory1.csv.gz"), "--columns", str(files / "columns.yaml"), "--number", "4"]
+    given = ["fit", "losses", *given, "--joint", str(files / "joint4.yaml")]
+    assert jtq([*given, "--out", str(out)]) == 0
+    output = capsys.readouterr()
+    assert "no torsion is fitted" in output.err
+    assert "up to 5 runs" in output.err
+    assert "offset" in output.out
     joint = load_joint(out)
     assert joint.fused is not None
     assert joint.fused.torsion is None
     assert joint.provenance["fused"]["few_runs"]
     assert out.read_text().startswith("# Written by jtq fit losses from 1 run.\n")
-    assert losses_main([*told, "--joint", str(files / "joint4.yaml"), "--json"]) == 0
+    assert jtq([*given, "--json"]) == 0
     mapping = json.loads(capsys.readouterr().out)
     assert mapping["schema"] == "jtq.fit_losses/1"
     assert mapping["rotor_inertia_kgm2"] == pytest.approx(joint.rotor_inertia_kgm2)

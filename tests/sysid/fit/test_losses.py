@@ -17,9 +17,9 @@ FRICTION = Friction(3.0, 2.0, 0.8, 0.05)
 
 
 def drawn(rng: np.random.Generator, spread_k: float = 0.0) -> Nuisance:
-    """Zeros of +-0.3 Nm, viscous friction of +-10 % and temperatures of +-spread_k from run to run."""
-    zero, viscous, warmer = rng.uniform(-1.0, 1.0, 3).tolist()
-    return Nuisance(0.3 * zero, 0.2 * viscous, 25.0 + spread_k * warmer)
+    """Offsets of +-0.3 Nm, viscous friction of +-10 % and temperatures of +-spread_k from run to run."""
+    offset, viscous, warmer = rng.uniform(-1.0, 1.0, 3).tolist()
+    return Nuisance(0.3 * offset, 0.2 * viscous, 25.0 + spread_k * warmer)
 
 
 def made_runs(seed: int, loss: AdditiveLoss, count: int, spread_k: float = 0.0) -> list[RunSignals]:
@@ -43,7 +43,7 @@ def difference(fitted: AdditiveLoss, truth: AdditiveLoss, runs: list[RunSignals]
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_a_known_loss_comes_back(seed: int) -> None:
-    """Through zeros, ripple and viscous friction of each run's own: 0.1 Nm RMS, of a loss of 3 to 20 Nm."""
+    """Through offsets, ripple and viscous friction of each run's own: 0.1 Nm RMS, of a loss of 3 to 20 Nm."""
     truth = smooth_loss()
     runs = made_runs(seed, truth, 12)
     fit = fit_loss(runs, FRICTION)

@@ -1,162 +1,110 @@
-"""Fit of the torsion on runs made from a known one, and what the fits see of a run."""
+"""Torsion calibration on runs made from a known torsion and on emulated benches; its torque is the estimator's."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import observe_run
-from jtqd.estimator.joint import Torsion
-from jtqd.estimator.observer import first_order_hold, low_pass, slipped
+from jtqd.estimator.joint import Joint, Torsion, Tracking
+from jtqd.estimator.observer import slipped
 from jtqd.estimator.run import JointColumns
-from jtqd.estimator.status import STANDSTILL
-from jtqd.sysid.fit.signals import UNIT_TORSION, RunSignals, run_signals
-from jtqd.sysid.fit.torsion import TorsionError, fit_torsion, torsion_torque
+from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S, EstimatorSettings
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.plants import AnyPlant, load_any_plant
+from jtqd.sysid.fit.signals import RunSignals, run_signals
+from jtqd.sysid.fit.torsion import (
+    TRACKING_RAD_S,
+    WAVE_RAD_S,
+    WORTH,
+    TorsionError,
+    extended,
+    fit_torsion,
+    low_pass_torque,
+    torsion_torque,
+    tracked_torque,
+)
 from tests.estimator.estimator_helpers import joint1
-from tests.estimator.fused_helpers import TORSION, twisted
-from tests.sysid.fit.fused_signals import FUSED, STIFF, Nuisance, made_run, one_way, smooth_loss
+from tests.estimator.fused_helpers import TORSION, fused_joint, twisted
+from tests.sim_can.towing.benches import TYPICAL
+from tests.sysid.fit.fused_signals import (
+    FUSED,
+    STIFF,
+    Nuisance,
+    made_run,
+    one_way,
+    smooth_loss,
+    with_torsion,
+)
+from validation.goals.sources import true_torsion
 
 
-def runs_of(seed: int, count: int = 6, torsion: Torsion = STIFF) -> list[RunSignals]:
-    zeros = np.random.default_rng(seed).uniform(-0.3, 0.3, count)
-    zeros -= zeros.mean()
+def runs_of(seed: int, count: int = 6) -> list[RunSignals]:
+    offsets = np.random.default_rng(seed).uniform(-0.3, 0.3, count)
+    offsets -= offsets.mean()
     return [
-        made_run(seed * 50 + k, smooth_loss(), torsion, Nuisance(zero))
-        for k, zero in enumerate(zeros.tolist())
+        made_run(seed * 50 + k, smooth_loss(), STIFF, Nuisance(each))
+        for k, each in enumerate(offsets.tolist())
     ]
+
+
+def deflection_of(run: RunSignals) -> FloatArray:
+    """What `made_run` bent the spring of STIFF by."""
+    pairs = np.column_stack((STIFF.cos_rad, STIFF.sin_rad)).ravel()
+    d: FloatArray = run.torsion_rad - STIFF.zero_rad - run.seen.waves @ pairs
+    return d
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_a_known_torsion_comes_back(seed: int) -> None:
-    """Stiffness to 0.3 %, zero to 0.05 Nm, kinematic error to 0.5 urad, through the sensor zero of each run."""
-    found = fit_torsion(runs_of(seed))
+    """Stiffness to 0.3 %, offset to 0.05 Nm, kinematic error to 0.5 urad, through the sensor's offset of each run."""
+    runs = runs_of(seed)
+    found = fit_torsion(runs)
     assert found.stiffness_nm_per_rad == pytest.approx(11000.0, rel=0.003)
     assert found.cubic_nm_per_rad3 == pytest.approx(1.5e8, rel=0.1)
     assert found.zero_rad == pytest.approx(-3e-5, abs=0.05 / 11000.0)
     assert found.orders_per_motor_rev == (2.0, 4.0)
     assert found.cos_rad == pytest.approx((4e-5, -5e-6), abs=5e-7)
     assert found.sin_rad == pytest.approx((-2e-5, 8e-6), abs=5e-7)
-
-
-def test_its_torque_is_the_sensor_s() -> None:
-    runs = runs_of(14)
-    found = fit_torsion(runs)
+    assert found.hysteresis_nm == 0.0
     for run in runs:
         off = torsion_torque(found, run)[0] - run.sensor_nm
         assert np.std(off) < 0.08
-        assert abs(np.mean(off)) < 0.35  # the run's own zero of the sensor stays
-
-
-def test_torque_of_other_orders_is_refused_where_positions_are_not_known() -> None:
-    run = runs_of(15, 1)[0]
-    with pytest.raises(
-        ValueError, match=r"found a torsion of order 6, expected one of 2 and 4: no positions"
-    ):
-        torsion_torque(replace(STIFF, orders_per_motor_rev=(2.0, 6.0)), run)
+        assert abs(np.mean(off)) < 0.4  # the run's own offset of the sensor stays
+    one = fit_torsion([one_way(run, 1.0) for run in runs])
+    assert one.stiffness_nm_per_rad == pytest.approx(11000.0, rel=0.01)
 
 
 def test_what_gives_no_torsion_is_refused() -> None:
     run = made_run(16, smooth_loss())
-    rigid = replace(run, seen=replace(run.seen, torsion_nm=np.zeros_like(run.sensor_nm)))
+    rigid = with_torsion(run, np.zeros_like(run.sensor_nm))
     for runs in ([rigid], [rigid, rigid], [replace(run, moving=run.standing)], []):
         with pytest.raises(TorsionError, match="found no torsion between motor and link encoder"):
             fit_torsion(runs)
-    turned = replace(run, seen=replace(run.seen, torsion_nm=-run.seen.torsion_nm))
     with pytest.raises(TorsionError, match=r"found a stiffness of -1.*e\+04 Nm/rad, expected one > 0"):
-        fit_torsion([turned])
+        fit_torsion([with_torsion(run, -run.torsion_rad)])
     few = replace(run, moving=run.moving & (np.arange(len(run.sensor_nm)) < 300))
     with pytest.raises(TorsionError, match="found 60 moving samples, expected at least 90"):
         fit_torsion([few])
 
 
-def test_one_direction_is_enough_for_a_torsion() -> None:
-    found = fit_torsion([one_way(run, 1.0) for run in runs_of(17)])
-    assert found.stiffness_nm_per_rad == pytest.approx(11000.0, rel=0.01)
-
-
-# ---- what the fits see of a run
-
-
-def columns(seed: int, count: int = 3000) -> tuple[np.ndarray, JointColumns]:
-    m = twisted(seed, count)
-    torque = 10.0 * np.sin(3.0 * np.cumsum(m.dt_s))
-    i, q, w, link = m.arrays()[1:]
-    return np.cumsum(m.dt_s), JointColumns(i, q, w, link, torque_nm=torque)
-
-
-def test_the_sensor_gets_the_age_of_the_estimate() -> None:
-    """Uneven steps, against the recursion; a ramp lags by 1/g."""
-    time, one = columns(21)
-    dt = np.diff(time, prepend=time[0])
-    assert one.torque_nm is not None
-    got = low_pass(one.torque_nm, dt, 200.0)
-    z, last = one.torque_nm[0], one.torque_nm[0]
-    for k in range(1, len(time)):
-        a, b0, b1 = first_order_hold(200.0, dt[k])
-        z, last = a * z + b0 * one.torque_nm[k] + b1 * last, one.torque_nm[k]
-        assert got[k] == pytest.approx(z, abs=1e-3)  # steps count to 0.1 us
-    ramp = low_pass(7.0 * time, dt, 200.0)
-    assert ramp[500:] == pytest.approx(7.0 * (time[500:] - 1 / 200.0), abs=2e-3)
-
-
-def test_signals_of_a_run() -> None:
-    time, one = columns(22)
-    run = run_signals("a run", joint1(), FUSED, time, one)
-    assert run.name == "a run"
-    assert np.isnan(run.temperature_c)
-    assert not np.any(run.moving & run.standing)
-    assert np.array_equal(run.standing, (run.seen.status == STANDSTILL) & (time - time[0] >= 0.1))
-    assert not run.moving[time - time[0] < 0.1].any()
-    assert one.motor_position_rad is not None
-    assert one.link_position_rad is not None
-    twist = one.motor_position_rad / 100.0 - one.link_position_rad
-    seen = low_pass(twist, np.diff(time, prepend=time[0]), 200.0)
-    running = np.isfinite(run.seen.torsion_nm)
-    assert run.seen.torsion_nm[running] == pytest.approx(seen[running], abs=2e-6)
-    assert UNIT_TORSION.stiffness_nm_per_rad == 1.0
-    warm = run_signals(
-        "b", joint1(), FUSED, time, replace(one, temperature_c=np.where(time < 1, np.nan, 31.0))
-    )
-    assert warm.temperature_c == 31.0
-
-
-def test_after_a_gap_the_filters_settle_again() -> None:
-    time, one = columns(23)
-    late = np.where(np.arange(len(time)) >= 1500, time + 0.2, time)
-    run = run_signals("gap", joint1(), FUSED, late, one)
-    after = (late >= late[1500]) & (late < late[1500] + 0.1)
-    assert not (run.moving | run.standing)[after].any()
-    assert (run.moving | run.standing)[~after & (late - late[0] >= 0.1)].all()
-
-
-def test_a_run_without_what_is_needed_is_refused() -> None:
-    time, one = columns(24)
-    with pytest.raises(ValueError, match="r7: joint joint1: the run has no link_position_rad, torque_nm"):
-        run_signals("r7", joint1(), FUSED, time, replace(one, link_position_rad=None, torque_nm=None))
-    assert one.torque_nm is not None
-    holes = np.where(np.arange(len(time)) % 1000 == 5, np.nan, one.torque_nm)
-    with pytest.raises(
-        ValueError, match="r7: joint joint1: torque_nm: found 3 gaps, expected finite numbers"
-    ):
-        run_signals("r7", joint1(), FUSED, time, replace(one, torque_nm=holes))
-
-
 def test_hysteresis_is_found_with_its_half_width() -> None:
-    """A loop of +-0.6 Nm over 0.1 mrad: half width to a tenth, stiffness not bent by it; none where there is none."""
-    true = replace(STIFF, hysteresis_nm=0.6, hysteresis_travel_rad=1e-4)
+    """A loop of +-0.6 Nm over 0.1 mrad: half width to a tenth, stiffness not bent by it."""
     runs = []
     for seed in range(4):
         run = made_run(seed, smooth_loss(), noise_nm=0.02)
-        pairs = np.column_stack((STIFF.cos_rad, STIFF.sin_rad)).ravel()
-        d = run.seen.torsion_nm - STIFF.zero_rad - run.seen.waves @ pairs
-        runs.append(replace(run, sensor_nm=run.sensor_nm + 0.6 * slipped(d, 1e-4)[0]))
+        loop = 0.6 * slipped(deflection_of(run), 1e-4)[0]
+        runs.append(with_torsion(run, run.torsion_rad, run.sensor_nm + loop))
     found = fit_torsion(runs)
     assert found.hysteresis_nm == pytest.approx(0.6, rel=0.1)
     assert found.hysteresis_travel_rad == 1e-4
-    assert found.stiffness_nm_per_rad == pytest.approx(true.stiffness_nm_per_rad, rel=0.01)
-    assert fit_torsion([made_run(seed, smooth_loss()) for seed in range(4)]).hysteresis_nm == 0.0
+    assert found.stiffness_nm_per_rad == pytest.approx(STIFF.stiffness_nm_per_rad, rel=0.01)
 
 
 def test_a_damping_is_found_and_not_taken_for_hysteresis() -> None:
@@ -164,14 +112,11 @@ def test_a_damping_is_found_and_not_taken_for_hysteresis() -> None:
     runs, still = [], []
     for seed in range(4):
         run = made_run(seed, smooth_loss(), noise_nm=0.02)
-        t = np.cumsum(run.seen.dt_s)
-        seen = replace(run.seen, torsion_nm=run.seen.torsion_nm + 1e-4 * np.sin(150.0 * t))
-        pairs = np.column_stack((STIFF.cos_rad, STIFF.sin_rad)).ravel()
-        d = seen.torsion_nm - STIFF.zero_rad - seen.waves @ pairs
-        rate = np.gradient(d, 1e-3)
+        run = with_torsion(run, run.torsion_rad + 1e-4 * np.sin(150.0 * np.cumsum(run.seen.dt_s)))
+        d = deflection_of(run)
         sensor = 11000.0 * d + 1.5e8 * d**3 + 0.4 * slipped(d, 1e-4)[0]
-        still.append(replace(run, seen=seen, sensor_nm=sensor))
-        runs.append(replace(run, seen=seen, sensor_nm=sensor + 8.0 * rate))
+        still.append(with_torsion(run, run.torsion_rad, sensor))
+        runs.append(with_torsion(run, run.torsion_rad, sensor + 8.0 * np.gradient(d, 1e-3)))
     found = fit_torsion(runs)
     assert found.damping_nms_per_rad == pytest.approx(8.0, rel=0.1)
     assert found.hysteresis_travel_rad == 1e-4
@@ -180,23 +125,191 @@ def test_a_damping_is_found_and_not_taken_for_hysteresis() -> None:
 
 
 def test_slip_follows_saturates_and_comes_back() -> None:
-    """Between bounds from -1 to 1 at first, that meet after twice the travel one way; a gap begins anew."""
+    """Between bounds from -1 to 1 at first, that meet after twice the travel one way; a gap begins again."""
     d = np.array([0.0, 0.5, 1.0, 3.0, 2.5, np.nan, 2.0, 0.0, 0.25])
     middle, width = slipped(d, 1.0)
     assert middle.tolist() == [0.0, 0.25, 0.5, 1.0, 0.5, 0.0, 0.0, -1.0, -0.75]
     assert width.tolist() == [1.0, 0.75, 0.5, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0]
 
 
-def test_torsion_torque_is_the_observer_s() -> None:
-    """Of observed signals, through the filter, its offsets, cube, damping and slip: as step by step."""
-    torsion = replace(TORSION, hysteresis_nm=0.6, damping_nms_per_rad=7.0)
+# The torque of a torsion is the estimator's ------------------------------------------------------------
+
+RICH = replace(
+    TORSION,
+    cubic_nm_per_rad3=0.0,
+    orders_per_motor_rev=(2.0, 4.0, 1.0),
+    cos_rad=(*TORSION.cos_rad, 2e-5),
+    sin_rad=(*TORSION.sin_rad, -1e-5),
+    link_orders_per_rev=(1.0, 2.0),
+    link_cos_rad=(3e-5, 1e-5),
+    link_sin_rad=(-1e-5, 2e-5),
+    hardening_rad=(2e-4, 8e-4),
+    hardening_nm_per_rad=(2000.0, -700.0),
+    hysteresis_nm=0.3,
+    slips_nm=(0.2, 0.1),
+    slips_travel_rad=(3e-5, 4e-4),
+)
+SLIPPING = replace(TORSION, hysteresis_nm=0.6, damping_nms_per_rad=7.0)
+
+
+def twisted_run(joint: Joint, dt_s: float | None = None) -> tuple[RunSignals, tuple[FloatArray, ...]]:
+    """A run of a joint in motion with torsion, and the inputs of the observer."""
     m = twisted(25)
-    raw = observe_run(joint1(), FUSED, UNIT_TORSION, *m.arrays())
-    run = RunSignals("a", raw, np.zeros(3000), np.ones(3000, bool), np.zeros(3000, bool))
+    dt, current, motor, velocity, link, *more = m.arrays()
+    if dt_s is not None:
+        dt = np.full(len(dt), dt_s)
+    columns = JointColumns(
+        current_a=current,
+        motor_position_rad=motor,
+        motor_velocity_rad_s=velocity,
+        link_position_rad=link,
+        torque_nm=np.zeros(len(dt)),
+    )
+    time_s = np.cumsum(dt) - dt[0]
+    return run_signals("a", joint, FUSED, time_s, columns), (
+        np.diff(time_s, prepend=time_s[0]), current, motor, velocity, link, *more
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("torsion", [SLIPPING, RICH], ids=["plain", "with every extension"])
+def test_torsion_torque_is_the_observers(torsion: Torsion) -> None:
+    run, inputs = twisted_run(joint1())
     torque, width = torsion_torque(torsion, run)
-    seen = observe_run(joint1(), FUSED, torsion, *m.arrays())
-    assert torque[2:] == pytest.approx(seen.torsion_nm[2:], abs=0.05)  # the start counts a step later
+    seen = observe_run(joint1(), FUSED, torsion, *inputs)
     settled = np.flatnonzero(width == 0.0)[0]
-    assert 10 < settled < 1500
+    assert 10 < settled < 2000
     assert seen.open_nm[settled:] == pytest.approx(0.0, abs=1e-12)
     assert torque[settled:] == pytest.approx(seen.torsion_nm[settled:], abs=1e-9)
+    if torsion is RICH:
+        plain = observe_run(joint1(), FUSED, TORSION, *inputs)
+        assert np.abs(seen.torsion_nm - plain.torsion_nm)[settled:].max() > 0.5
+
+
+@pytest.mark.parametrize("tracked", [True, False])
+def test_the_torque_without_delay_is_the_estimators(tracked: bool) -> None:
+    """Tracked, and through the low pass of new configurations."""
+    torsion = replace(RICH, hysteresis_nm=0.7, slips_nm=(), slips_travel_rad=(), damping_nms_per_rad=9.0)
+    joint = fused_joint(3, torsion)
+    assert joint.fused is not None
+    tracking = Tracking(TRACKING_RAD_S, 0.1, 0.1, WAVE_RAD_S)
+    joint = replace(joint, fused=replace(joint.fused, tracking=tracking))
+    run, inputs = twisted_run(joint, 0.001)
+    settings = EstimatorSettings(method="fused", track_torsion=True)
+    if not tracked:
+        settings = EstimatorSettings(method="fused", torsion_bandwidth_rad_s=TORSION_BANDWIDTH_RAD_S)
+    found = tracked_torque(torsion, run) if tracked else low_pass_torque(torsion, run)
+    seen = observe_run(joint, settings, torsion, *inputs)
+    np.testing.assert_allclose(found[300:], (seen.torsion_nm + seen.ahead_nm)[300:], atol=1e-6)
+
+
+# Extensions --------------------------------------------------------------------------------------------
+
+
+def signals(bench: AnyPlant, days: range) -> list[RunSignals]:
+    joint = load_joint(shipped("joint1.yaml"))
+    runs = []
+    for day in days:
+        f = 0.17 + 0.03 * (day % 7)
+        commands = (
+            JointCommand.velocity(
+                lambda t, f=f: 1.4 * math.sin(2 * math.pi * f * t) + 0.7 * math.sin(9.1 * f * t)
+            ),
+            JointCommand.current(
+                lambda t, f=f: 4.5 * math.sin(5.3 * f * t) * math.sin(2.7 * f * t) * min(t, 1.0)
+            ),
+        )
+        table = emulate_run(bench, commands, 8.0, seed=3, day=day)
+        runs.append(run_signals(f"day {day}", joint, FUSED, table.time_s, table.joints[1]))
+    return runs
+
+
+def error(torsion: Torsion, runs: list[RunSignals]) -> float:
+    """RMS [Nm] against the sensor, each run less its own offset."""
+    parts = [(torsion_torque(torsion, run)[0] - run.sensor_nm)[run.moving] for run in runs]
+    return float(np.sqrt(np.mean(np.concatenate([part - part.mean() for part in parts]) ** 2)))
+
+
+def has_extensions(torsion: Torsion) -> bool:
+    parts = (torsion.link_orders_per_rev, torsion.hardening_rad, torsion.slips_nm)
+    return any(map(len, parts)) or torsion.orders_per_motor_rev != (2.0, 4.0)
+
+
+@pytest.fixture(scope="module")
+def typical() -> tuple[Torsion, list[RunSignals]]:
+    """The torsion of a bench with another spring, slips and encoder errors; its runs."""
+    runs = signals(TYPICAL, range(12))
+    return fit_torsion(runs), runs
+
+
+def test_on_a_bench_with_another_spring_the_error_of_other_days_falls_by_half(
+    typical: tuple[Torsion, list[RunSignals]],
+) -> None:
+    found, runs = typical
+    held_out = signals(TYPICAL, range(20, 24))
+    plain = fit_torsion(runs[:7])  # too few runs for extensions
+    assert not has_extensions(plain)
+    assert error(found, held_out) < 0.5 * error(plain, held_out)
+    assert extended(held_out, TORSION) is TORSION
+    assert 0.0 < WORTH < 0.2
+
+
+def test_spring_slips_and_encoder_errors_are_found_as_they_are(
+    typical: tuple[Torsion, list[RunSignals]],
+) -> None:
+    found, law = typical[0], TYPICAL.joints[0]
+    slip = sum(each.torque_nm for each in law.gear.slips)
+    k, corner = law.gear.stiffness_nm_per_rad, law.gear.corners_nm
+    for torque in (15.0, 30.0):  # below, the slips are not yet all the way
+        d = np.linspace(0.0, 4e-3, 4001)
+        spring = d * (found.stiffness_nm_per_rad + found.cubic_nm_per_rad3 * d * d)
+        for knot, stiffness in zip(found.hardening_rad, found.hardening_nm_per_rad, strict=True):
+            spring += stiffness * np.maximum(d - knot, 0.0)
+        spring += sum(found.slips_nm) + found.hysteresis_nm  # the slips hold on top of the spring
+        true = torque - slip
+        parts = min(true, corner[0]), max(min(true, corner[1]) - corner[0], 0.0), max(true - corner[1], 0.0)
+        twist = sum(part / each for part, each in zip(parts, k, strict=True))
+        assert float(np.interp(torque, spring, d)) == pytest.approx(twist, rel=0.03)
+    assert sum(found.slips_nm) == pytest.approx(slip, rel=0.35)
+    first = law.measurement.link_errors[0]
+    # the deflection has the link encoder's error with the other sign
+    c, s = -math.cos(first.phase_rad), math.sin(first.phase_rad)
+    expected = first.amplitude_rad * c, first.amplitude_rad * s
+    assert (found.link_cos_rad[0], found.link_sin_rad[0]) == pytest.approx(expected, abs=1e-5)
+
+
+def test_waves_of_the_motor_turn_are_found_as_they_are_although_the_spring_hardens(
+    typical: tuple[Torsion, list[RunSignals]],
+) -> None:
+    """With one stiffness for all deflections those of order 1 are too large by 3 urad."""
+    found, true = typical[0], true_torsion(TYPICAL.joints[0])
+    for order in (1.0, 2.0):
+        (c, s), expected = (
+            (each.cos_rad[at], each.sin_rad[at])
+            for each in (found, true)
+            for at in (each.orders_per_motor_rev.index(order),)
+        )
+        assert (c, s) == pytest.approx(expected, abs=5e-7)
+
+
+def test_on_a_bench_without_them_nothing_is_added() -> None:
+    runs = signals(load_any_plant(shipped("campaign_plant.yaml")), range(10))
+    assert not has_extensions(fit_torsion(runs))
+
+
+def test_file_keeps_them_and_refuses_what_does_not_fit() -> None:
+    mapping = load_joint(shipped("trained/joint1.yaml")).to_mapping()
+    assert "slips_nm" not in mapping["fused"]["torsion"]
+    mapping["fused"]["torsion"] |= {"slips_nm": [0.2, 0.1], "slips_travel_rad": [3e-5, 4e-4]}
+    joint = Joint.from_mapping(mapping, "j.yaml")
+    assert Joint.from_mapping(joint.to_mapping(), "j.yaml") == joint
+    for change, expected in (
+        ({"slips_nm": [0.2]}, "slips_travel_rad"),
+        ({"slips_nm": [0.2, -0.1]}, "slips_nm"),
+        ({"hardening_rad": [1e-3]}, "hardening_nm_per_rad"),
+    ):
+        broken = {
+            **mapping,
+            "fused": {**mapping["fused"], "torsion": {**mapping["fused"]["torsion"], **change}},
+        }
+        with pytest.raises(ConfigError, match=f"j.yaml: key 'fused.torsion.{expected}'"):
+            Joint.from_mapping(broken, "j.yaml")

@@ -1,13 +1,13 @@
-"""`jtq train` and `jtq fit losses` say what is wrong before they spend minutes: one line, exit status 1, 2 or 3."""
+"""`jtq train` and `jtq fit losses` report what is wrong before they spend minutes: one line, exit status 1, 2 or 3."""
 
 import importlib.util
 
 import numpy as np
 import pytest
 
+from jtqd.daemon.jtq import main as jtq
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import shipped
-from jtqd.sysid.fit import command as loss_fit_command
 from jtqd.sysid.runs.tables import write_run
 from jtqd.sysid.train import command as train_command
 
@@ -86,20 +86,17 @@ def test_our_network_needs_the_fitted_section(run, tmp_path, capsys):
     assert "found no section 'fused'" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", [train_command.main, loss_fit_command.losses_main])
+@pytest.mark.parametrize("command", [["train", "--network", "paper"], ["fit", "losses"]])
 def test_dead_sensor_is_named_and_nothing_is_written(run, tmp_path, capsys, command):
     out = tmp_path / "out.yaml"
-    if command is train_command.main:
-        given = arguments(run(sensor=3.5), tmp_path)
-    else:
-        given = [run(sensor=3.5), "--joint", JOINT, "--out", str(out)]
-    assert command(given) == 3
+    where = out if command[0] == "fit" else tmp_path / "out"
+    assert jtq([*command, run(sensor=3.5), "--joint", JOINT, "--out", str(where)]) == 3
     assert "torque_nm" in capsys.readouterr().err
     assert not out.exists()
 
 
 def test_missing_run_and_too_few_runs_of_the_loss_fit(run, tmp_path, capsys):
-    assert loss_fit_command.losses_main([str(tmp_path / "no.csv"), "--joint", JOINT]) == 1
+    assert jtq(["fit", "losses", str(tmp_path / "no.csv"), "--joint", JOINT]) == 1
     assert "no.csv: found no such file or directory" in capsys.readouterr().err
-    assert loss_fit_command.losses_main([run(), "--joint", JOINT]) == 1
+    assert jtq(["fit", "losses", run(), "--joint", JOINT]) == 1
     assert "found 1 run, expected at least 6" in capsys.readouterr().err

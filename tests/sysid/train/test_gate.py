@@ -87,7 +87,7 @@ def train(tmp_path, monkeypatch, capsys):
         monkeypatch.setattr(
             train_command, "read_runs", lambda *_, **__: [SimpleNamespace(name="a", sha256="0")]
         )
-        for name in ("channel_findings", "signals_of", "progress"):
+        for name in ("channel_findings", "signals_of_runs", "progress"):
             monkeypatch.setattr(train_command, name, lambda *_, **__: [])
         monkeypatch.setattr(train_command, "two_encoders", lambda *_: True)
         for name in ("train_fused", "train_paper"):
