@@ -38,7 +38,8 @@ from jtqd.sysid.fit.plateaus import PlateauRules, mean_temperature, plateaus_of
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
 from jtqd.sysid.report.figures import check_picture
 from jtqd.sysid.report.numbers import plain_values
-from jtqd.sysid.runs.checks import RunIssue, channel_findings
+from jtqd.sysid.runs.channels import RunIssue
+from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, runs_of_joint
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
