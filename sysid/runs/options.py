@@ -41,9 +41,9 @@ def add_number(parser: argparse.ArgumentParser) -> None:
 
 
 def runs_of_joint(
-    options: argparse.Namespace, joint: Joint, *, in_pieces: bool = False
+    options: argparse.Namespace, joint: Joint, *, segments: bool = False
 ) -> tuple[list[RunFile], int]:
     """Return the runs that have columns of the joint, and its number. Raises RunError, RunTableError, ConfigError."""
-    runs = read_runs(options.runs, options.columns, in_pieces=in_pieces, joints=only(options.number))
+    runs = read_runs(options.runs, options.columns, segments=segments, joints=only(options.number))
     number = joint_number(options.number, joint, runs)
     return with_joint(runs, number), number
