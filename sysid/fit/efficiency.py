@@ -36,9 +36,10 @@ from jtqd.estimator.losses import (
     LossModel,
     static_friction,
 )
+from jtqd.estimator.text import table_lines
 from jtqd.sysid.fit.plateaus import Plateau, mean_temperature
 from jtqd.sysid.report.figures import plain
-from jtqd.sysid.report.numbers import indented, plain_values, table
+from jtqd.sysid.report.numbers import plain_values
 from jtqd.sysid.runs.channels import RunIssue
 
 COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")
@@ -439,23 +440,27 @@ def report_lines(result: EfficiencyResult) -> list[str]:
         + ("" if math.isnan(result.temperature_c) else f", {result.temperature_c:.1f} degC on average"),
         "",
         "measured eta (lowest to highest, with the largest standard error)",
-        *indented(_measured_lines(result)),
+        *_indented(_measured_lines(result)),
     ]
     for fit in result.fits:
         kind = "weighted least squares" if fit.weighted else "least squares"
-        lines += ["", f"Eq. (8) in the convention {fit.convention}, {kind}", *indented(_summary_lines(fit))]
+        lines += ["", f"Eq. (8) in the convention {fit.convention}, {kind}", *_indented(_summary_lines(fit))]
         if fit.weighted == result.fits[0].weighted:  # of the other weighting the figures are enough
-            lines += indented(_coefficient_lines(fit, result.points))
+            lines += _indented(_coefficient_lines(fit, result.points))
     if result.left_out:
         lines += [
             "",
             f"left out, {len(result.left_out)} plateaus with |i| < {result.current_min_a:.2f} A "
             "(the motor does not overcome its own friction, so eta is undefined):",
-            *indented(map(_place, result.left_out)),
+            *_indented(map(_place, result.left_out)),
         ]
     if result.findings:
         lines += ["", "findings:", *(f"  {item.kind}: {item.text}" for item in result.findings)]
     return lines
+
+
+def _indented(lines: Iterable[str]) -> list[str]:
+    return [f"  {line}" for line in lines]
 
 
 def _measured_lines(result: EfficiencyResult) -> list[str]:
@@ -468,7 +473,7 @@ def _measured_lines(result: EfficiencyResult) -> list[str]:
             errors = [point.eta_se(convention) for point in own]
             cells.append(f"{min(etas):.3f} to {max(etas):.3f} +- {max(errors):.3f}" if own else "none")
         rows.append([QUADRANT_TITLES[name], str(len(own)), *cells])
-    return table(["quadrant", "plateaus", "tau_j/(G Kt i)", "G Kt i/tau_j"], rows)
+    return table_lines([["quadrant", "plateaus", "tau_j/(G Kt i)", "G Kt i/tau_j"], *rows])
 
 
 def _summary_lines(fit: EfficiencyFit) -> list[str]:
@@ -488,7 +493,7 @@ def _summary_lines(fit: EfficiencyFit) -> list[str]:
     ]
     paper = ["paper"] if like_paper else []
     header = ["quadrant", "plateaus", "distinct", "RMSE", *paper, "RMSE Nm", "condition"]
-    return table(header, rows) + list(fit.refused.values())
+    return table_lines([header, *rows]) + list(fit.refused.values())
 
 
 def _coefficient_lines(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> list[str]:
@@ -502,7 +507,7 @@ def _coefficient_lines(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> list[s
             beside = [f"{paper:.4f}", f"{value - paper:.4f}"] if like_paper else []
             rows.append([key, f"{value:.4f}", f"{quadrant.errors[key]:.4f}", *beside])
         header = ["", "fitted", "std err", *(["Table I", "difference"] if like_paper else [])]
-        lines += [QUADRANT_TITLES[name], *indented(table(header, rows))]
+        lines += [QUADRANT_TITLES[name], *_indented(table_lines([header, *rows]))]
         if like_paper:
             off = difference_from_table(points, name, quadrant.polynomial)
             lines.append(

@@ -1,9 +1,9 @@
-"""Numbers as text, with as many digits as the interval supports; tables of text; plain values for JSON."""
+"""Numbers as text, with as many digits as the interval supports; values for JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import msgspec
@@ -104,31 +104,6 @@ def _text(value: float, decimals: int) -> str:
 
 def _raised(power: int) -> str:
     return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-def table(
-    header: Sequence[str], rows: Iterable[Sequence[str]], left: Collection[int] = (0,), *, rule: bool = False
-) -> list[str]:
-    """Return the lines of a table, each column as wide as its widest cell.
-
-    left: columns that are flush left, the others are flush right. rule: dashes below the header.
-    """
-    every = [list(header), *map(list, rows)]
-    widths = [max(len(row[k]) for row in every) for k in range(len(header))]
-    if rule:
-        every.insert(1, ["-" * width for width in widths])
-    return [
-        "  ".join(
-            cell.ljust(width) if k in left else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in every
-    ]
-
-
-def indented(lines: Iterable[str]) -> list[str]:
-    """Return the lines two spaces to the right."""
-    return [f"  {line}" for line in lines]
 
 
 def plain_values(value: Any) -> Any:
