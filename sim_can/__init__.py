@@ -6,7 +6,7 @@ Imports estimator, drivers, models and, to play a run (`play`), `jtqd.sysid.runs
 
 | module | what it has |
 |---|---|
-| `plant_file`, `days` | plant files as values: `load_plant`, `PlantParameters`; what differs from day to day |
+| `plant_file` | plant files as values: `load_plant`, `PlantParameters`; how days differ |
 | `towing`, `plants` | benches with laws of their own, and any of the three kinds of file: `load_any_plant` |
 | `plant`, `effect_plant` | the equations, without (compiled) and with effects of joint files |
 | `source`, `plant_source`, `play` | what the nodes measure: `Source`, from the plant or from a measured run |

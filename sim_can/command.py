@@ -143,7 +143,7 @@ def _run(options: argparse.Namespace) -> int:
             sources: list[Source] = [_played(options)]
             profile = "rest"
         else:
-            from jtqd.sim_can.side_by_side import sources_of
+            from jtqd.sim_can.plant_source import sources_of
 
             parameters = load_any_plant(options.plant or shipped(PLANT))
             sources = sources_of(parameters, options.seed, options.drives)

@@ -2,7 +2,7 @@
 
 cimport cython
 
-from jtqd.sim_can.noise cimport Noise
+from jtqd.sim_can.signals cimport Noise
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
 
 @cython.final

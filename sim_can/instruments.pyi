@@ -1,10 +1,9 @@
 from typing import Any
 
 from jtqd.sim_can.drive_file import SensorParameters
-from jtqd.sim_can.noise import Noise
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
-from jtqd.sim_can.signals import ChannelSignal, DriveSignals
+from jtqd.sim_can.signals import ChannelSignal, DriveSignals, Noise
 
 class Encoders:
     link_zero_rad: float

@@ -2,7 +2,7 @@
 
 from libc.math cimport M_PI, exp, rint
 
-from jtqd.sim_can.noise cimport Noise
+from jtqd.sim_can.signals cimport Noise
 from jtqd.sim_can.plant cimport Plant
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
 

@@ -1,6 +1,16 @@
-"""Losses of a true joint by what it transmits; the laws stand in losses.pyx."""
+"""Losses and temperature of a true joint; the laws stand in losses.pyx."""
 
 cimport cython
+
+
+@cython.final
+cdef class JointTemperature:
+    cdef double usual, reference, kelvin_per_w, time_constant, viscous_per_k, coulomb_per_k
+    cdef double ambient, heat_j, time_s
+    cdef public double celsius
+    cdef readonly double viscous, coulomb
+    cpdef bint add(self, double power_w, double dt_s) noexcept
+    cdef void factors(self) noexcept
 
 @cython.final
 cdef class LossTable:

@@ -1,6 +1,18 @@
 from collections.abc import Callable
 from typing import Final
 
+from jtqd.sim_can.plant_file import Thermal
+
+UPDATE_S: Final[float]
+
+class JointTemperature:
+    celsius: float
+    viscous: float
+    coulomb: float
+    def __init__(self, thermal: Thermal) -> None: ...
+    def start(self, difference_k: float) -> None: ...
+    def add(self, power_w: float, dt_s: float) -> bool: ...
+
 LOWEST_TABLE_VELOCITY_RAD_S: Final[float]
 VELOCITY_STEP_RAD_S: Final[float]
 HIGHEST_TABLE_VELOCITY_RAD_S: Final[float]

@@ -4,7 +4,7 @@ cimport cython
 
 from jtqd.sim_can.drive_control cimport DriveControl
 from jtqd.sim_can.losses cimport JointFriction
-from jtqd.sim_can.temperature cimport JointTemperature
+from jtqd.sim_can.losses cimport JointTemperature
 
 cdef struct Constants:  # `JointConstants` as a block
     double gear_ratio, torque_constant, rotor_inertia, stiffness, damping

@@ -2,9 +2,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from jtqd.sim_can.drive_control import DriveControl
-from jtqd.sim_can.losses import JointFriction, LossTable
+from jtqd.sim_can.losses import JointFriction, JointTemperature, LossTable
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
-from jtqd.sim_can.temperature import JointTemperature
 
 CONTROL_CYCLE_S: Final[float]
 

@@ -25,13 +25,13 @@ from libc.math cimport ceil, cos, fabs, fmax, fmin, isfinite, rint, sin
 
 from jtqd.sim_can.drive_control cimport DriveControl
 from jtqd.sim_can.losses cimport JointFriction, LossTable
-from jtqd.sim_can.temperature cimport JointTemperature
+from jtqd.sim_can.losses cimport JointTemperature
 
 from dataclasses import replace
 from typing import Final, NamedTuple
 
 from jtqd.estimator.losses import LossModel
-from jtqd.sim_can.days import NOMINAL_DAY
+from jtqd.sim_can.plant_file import NOMINAL_DAY
 from jtqd.sim_can.plant_file import substep_limit
 
 CONTROL_CYCLE_S: Final = 0.001

@@ -1,15 +1,14 @@
-"""The plant measured by its encoders, current measurement and torque sensor: the default `source.Source`. Pure.
+"""Sources of the bench's measurements from plants: one pair of joints, and any number of joints side by side.
 
-Encoders round and add noise, the sensor has gain, offset and noise; a bench whose joint files have effects also has errors
-by the hooks current_a, link_rad and sensor_nm (`Readings`). Encoders and current measurement belong to their joint's file.
-There is one sensor: its effects are those of joint 1's file, and joint 2's only where joint 1's has none.
+Each pair is a plant of its own. A last joint without a partner turns a passive load: the second joint of its pair, without
+current and without a node on the bus.
 """
 
 from __future__ import annotations
 
 import random
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from jtqd.estimator.effects.effect import Effect, ScalarFunctions, State, Values
@@ -17,11 +16,11 @@ from jtqd.estimator.joint import Joint
 from jtqd.sim_can.effect_plant import EffectPlant
 from jtqd.sim_can.instruments import Instruments
 from jtqd.sim_can.joint_effects import effects_of
-from jtqd.sim_can.noise import Noise
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters
 from jtqd.sim_can.plants import AnyDay, AnyPlant
-from jtqd.sim_can.source import OFF, DriveRatings
+from jtqd.sim_can.signals import Noise
+from jtqd.sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals, Source
 from jtqd.sim_can.towing.bench_file import TowedJoint, TowingBench
 from jtqd.sim_can.towing.instruments import Instruments as TowingInstruments
 from jtqd.sim_can.towing.plant import TowingPlant
@@ -299,3 +298,45 @@ class PlantSource:
     def interpolate(self, drive: int, period_s: float) -> None:
         """Set the time between two velocity targets of drive 0 or 1 [s]."""
         self.plant.drives[drive].interpolation_s = period_s
+
+
+_SEEDS_APART = 1_000_003
+"""Between the seeds of two pairs: noise and days of each are its own."""
+
+
+class SingleJoint:
+    """`Source` of the first joint of a pair; the second one is its load.
+
+    pair: whose drive 0 it is.
+    """
+
+    def __init__(self, pair: Source) -> None:
+        self._pair = pair
+        self.ratings: Sequence[DriveRatings] = tuple(pair.ratings[:1])
+        self.drives: Sequence[DriveSignals] = tuple(pair.drives[:1])
+        self.channels: Sequence[ChannelSignal] = tuple(pair.channels[:1])
+
+    def advance(self, dt_s: float) -> bool:
+        """As `Source.advance`."""
+        return self._pair.advance(dt_s)
+
+    def command(self, drive: int, mode: int, target: float) -> None:
+        """As `Source.command`; there is drive 0 only."""
+        self._pair.command(drive, mode, target)
+
+    def resume(self) -> None:
+        """As `Source.resume`."""
+        self._pair.resume()
+
+    def interpolate(self, drive: int, period_s: float) -> None:
+        """As `Source.interpolate`; there is drive 0 only."""
+        self._pair.interpolate(drive, period_s)
+
+
+def sources_of(parameters: AnyPlant, seed: int, joints: int) -> list[Source]:
+    """Return the plants of a bench with so many joints; with two it is the one pair of this seed."""
+    sources: list[Source] = []
+    for number in range((joints + 1) // 2):
+        pair = PlantSource(parameters, seed + number * _SEEDS_APART)
+        sources.append(pair if 2 * number + 1 < joints else SingleJoint(pair))
+    return sources

@@ -5,12 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from jtqd.models.files import load_joint, load_yaml
-from jtqd.sim_can import days, plant_file
+from jtqd.sim_can import plant_file
 from jtqd.sim_can.towing import bench_file
-from jtqd.sim_can.towing import days as towing_days
 
 AnyPlant = plant_file.PlantParameters | bench_file.TowingBench
-AnyDay = days.Day | towing_days.Day
+AnyDay = plant_file.Day | bench_file.Day
 
 
 def load_any_plant(path: Path) -> AnyPlant:

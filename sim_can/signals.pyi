@@ -1,3 +1,8 @@
+from collections.abc import Callable
+
+class Noise:
+    def __init__(self, uniform: Callable[[], float]) -> None: ...
+
 class DriveSignals:
     motor_position_rad: float
     motor_velocity_rad_s: float

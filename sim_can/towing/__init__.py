@@ -5,12 +5,7 @@ benches is not judged by its own equations. From a joint file: name, gear ratio,
 
 | module | what it has |
 |---|---|
-| `bench_file` | bench files as values: `TowingBench` |
-| `waves` | sums of cosines over an angle: ripple, errors of gear and encoders |
-| `friction` | bristle friction |
-| `gear` | hardening spring, slips, transmission error |
-| `warmth` | temperatures of grease and housing |
-| `plant` | one joint, and two of them with the sensor between |
+| `bench_file` | bench files as values: `TowingBench`, and how days differ |
+| `plant` | bristle friction, gear, temperatures, one joint, and two of them with the sensor between |
 | `instruments` | encoders, current measurement, sensor |
-| `days` | what differs from one day to the next |
 """

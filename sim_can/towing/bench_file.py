@@ -1,21 +1,89 @@
-"""Bench files: what a towing bench is. `models/plants/typical.yaml` has every key with its unit and its source.
+"""Bench files as frozen values: two joints with laws of their own, their instruments, and how days differ.
 
-Unknown keys and values out of range are errors that name file, key, what was found and what was expected.
+Days are drawn independently and uniformly within half widths. `models/plants/typical.yaml` has every key with its unit and
+source.
 """
 
 from __future__ import annotations
 
 import math
+import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 from jtqd.estimator.checked import Verbatim
 from jtqd.estimator.decoder import FieldError, Text, below, in_file, limits, parsed, read
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.drive_file import USUAL_DRIVE, DriveParameters, SensorParameters
-from jtqd.sim_can.towing.days import DayWidths
+
+
+@dataclass(frozen=True, slots=True)
+class DayWidths:
+    """Half widths of the spread of each value over the days (`run_to_run` of a bench file).
+
+    viscous, coulomb: share of the usual friction; temperature_k: of the room; current_gain: share.
+    """
+
+    viscous: Annotated[float, limits(ge=0.0, le=0.9)] = 0.0
+    coulomb: Annotated[float, limits(ge=0.0, le=0.9)] = 0.0
+    temperature_k: Annotated[float, limits("K", ge=0.0, le=60.0)] = 0.0
+    motor_zero_rad: Annotated[float, limits("rad", ge=0.0, le=1.0)] = 0.0
+    link_zero_rad: Annotated[float, limits("rad", ge=0.0, le=0.1)] = 0.0
+    current_zero_a: Annotated[float, limits("A", ge=0.0)] = 0.0
+    current_gain: Annotated[float, limits(ge=0.0, le=0.5)] = 0.0
+    sensor_zero_nm: Annotated[float, limits("Nm", ge=0.0)] = 0.0
+
+    @property
+    def varies(self) -> bool:
+        """Whether one day differs from another."""
+        return self != DayWidths()
+
+    @property
+    def nominal_day(self) -> Day:
+        """The day without any difference."""
+        return Day()
+
+    def day(self, seed: int, number: int) -> Day:
+        """Return day 0, 1, 2, ... of a bench with this seed."""
+
+        def joint(side: int) -> JointDay:
+            return JointDay(
+                **{
+                    name: getattr(self, name) * _uniform(f"{seed} day {number} joint {side} {name}")
+                    for name in JointDay._fields
+                }
+            )
+
+        zero = self.sensor_zero_nm * _uniform(f"{seed} day {number} sensor")
+        return Day((joint(1), joint(2)), zero)
+
+
+def _uniform(text: str) -> float:
+    """Return the number of -1 .. 1 that belongs to a text."""
+    return random.Random(text).uniform(-1.0, 1.0)
+
+
+class JointDay(NamedTuple):
+    """Values of one joint on one day, as differences to the usual ones."""
+
+    viscous: float = 0.0
+    coulomb: float = 0.0
+    temperature_k: float = 0.0
+    motor_zero_rad: float = 0.0
+    link_zero_rad: float = 0.0
+    current_zero_a: float = 0.0
+    current_gain: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Day:
+    """One day; the default is the nominal one."""
+
+    joints: tuple[JointDay, JointDay] = field(default=(JointDay(), JointDay()))
+    sensor_zero_nm: float = 0.0
+
 
 KEY: Final = "towing"
 """Key that tells a bench file from other files: number of joints, 2."""
@@ -81,7 +149,7 @@ class Motor:
 
 @dataclass(frozen=True)
 class Friction:
-    """Friction of a joint, joint side: `jtqd.sim_can.towing.friction`."""
+    """Friction of a joint, joint side: `jtqd.sim_can.towing.plant`."""
 
     coulomb_nm: Annotated[float, limits("Nm", gt=0.0)]
     static_ratio: Annotated[float, limits(ge=1.0, le=3.0)]
@@ -99,7 +167,7 @@ class Friction:
 
 @dataclass(frozen=True)
 class Gear:
-    """Gear of a joint: `jtqd.sim_can.towing.gear`. stiffness K1, K2, K3; corners T1, T2."""
+    """Gear of a joint: `jtqd.sim_can.towing.plant`. stiffness K1, K2, K3; corners T1, T2."""
 
     stiffness_nm_per_rad: Annotated[tuple[float, ...], limits("Nm/rad", length=(3, 3))]
     corners_nm: Annotated[tuple[float, ...], limits("Nm", length=(2, 2))]
@@ -127,7 +195,7 @@ class Gear:
 
 @dataclass(frozen=True)
 class Warmth:
-    """Temperatures of a joint: `jtqd.sim_can.towing.warmth`. ambient_c: room of the usual day."""
+    """Temperatures of a joint: `jtqd.sim_can.towing.plant`. ambient_c: room of the usual day."""
 
     reference_c: Annotated[float, limits("degC", ge=-40.0, le=100.0)] = 25.0
     ambient_c: Annotated[float, limits("degC", ge=-40.0, le=80.0)] = 25.0

@@ -2,9 +2,9 @@
 
 cimport cython
 
-from jtqd.sim_can.noise cimport Noise
+from jtqd.sim_can.signals cimport Noise
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
-from jtqd.sim_can.towing.waves cimport Waves
+from jtqd.sim_can.towing.plant cimport Waves
 
 @cython.final
 cdef class Readings:

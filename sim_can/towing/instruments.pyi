@@ -1,7 +1,6 @@
 from typing import Any
 
-from jtqd.sim_can.noise import Noise
-from jtqd.sim_can.signals import ChannelSignal, DriveSignals
+from jtqd.sim_can.signals import ChannelSignal, DriveSignals, Noise
 from jtqd.sim_can.towing.bench_file import Measurement, TowingBench
 from jtqd.sim_can.towing.plant import TowingPlant
 

@@ -8,10 +8,10 @@ The motor's velocity is the difference of two counts through a first-order low p
 
 from libc.math cimport M_PI, exp, rint
 
-from jtqd.sim_can.noise cimport Noise
+from jtqd.sim_can.signals cimport Noise
 from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
 from jtqd.sim_can.towing.plant cimport TowingPlant
-from jtqd.sim_can.towing.waves cimport waves_at, waves_of
+from jtqd.sim_can.towing.plant cimport waves_at, waves_of
 
 
 cdef class Readings:

@@ -11,12 +11,19 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.days import Day, Thermal
 from jtqd.sim_can.demo import demo_current, demo_velocity
 from jtqd.sim_can.effect_plant import EffectPlant
 from jtqd.sim_can.joint_effects import EffectFriction, JointEffects
 from jtqd.sim_can.plant import Plant, joint_friction
-from jtqd.sim_can.plant_file import Deviations, JointPlant, PlantParameters, load_plant, plant_of_joint
+from jtqd.sim_can.plant_file import (
+    Day,
+    Deviations,
+    JointPlant,
+    PlantParameters,
+    Thermal,
+    load_plant,
+    plant_of_joint,
+)
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, VELOCITY
 

@@ -14,13 +14,13 @@ from jtqd.estimator.effects.effect import State
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.command import main
-from jtqd.sim_can.days import Thermal
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import (
     DriveParameters,
     JointPlant,
     MeasurementParameters,
     PlantParameters,
+    Thermal,
     load_plant,
 )
 from jtqd.sim_can.plant_source import PlantSource

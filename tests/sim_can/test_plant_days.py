@@ -7,13 +7,12 @@ import numpy as np
 import pytest
 
 from jtqd.models.files import shipped
-from jtqd.sim_can.days import NOMINAL_DAY, Day, RunToRun, Thermal
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.losses import JointTemperature
 from jtqd.sim_can.plant import Plant, joint_friction
-from jtqd.sim_can.plant_file import load_plant
+from jtqd.sim_can.plant_file import NOMINAL_DAY, Day, RunToRun, Thermal, load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
-from jtqd.sim_can.temperature import JointTemperature
 
 WIDTHS = RunToRun(viscous=0.15, sensor_zero_nm=0.3, temperature_k=4.0, link_zero_rad=1e-5)
 CAMPAIGN = load_plant(shipped("campaign_plant.yaml"))

@@ -7,8 +7,7 @@ import yaml
 
 from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.days import RunToRun, Thermal
-from jtqd.sim_can.plant_file import load_plant, plant_from_mapping
+from jtqd.sim_can.plant_file import RunToRun, Thermal, load_plant, plant_from_mapping
 
 CAMPAIGN = "campaign_plant.yaml"
 

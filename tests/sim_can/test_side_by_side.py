@@ -6,8 +6,7 @@ from jtqd.drivers.frame import FRAME
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench, bench_filters
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sim_can.plant_source import PlantSource
-from jtqd.sim_can.side_by_side import sources_of
+from jtqd.sim_can.plant_source import PlantSource, sources_of
 from jtqd.sim_can.source import CURRENT, Source
 
 PLANT = load_plant(shipped("campaign_plant.yaml"))

@@ -5,8 +5,7 @@ from pathlib import Path
 
 import jtqd.models
 from jtqd.sim_can.plants import load_any_plant
-from jtqd.sim_can.towing.bench_file import TowedJoint, TowingBench
-from jtqd.sim_can.towing.days import DayWidths
+from jtqd.sim_can.towing.bench_file import DayWidths, TowedJoint, TowingBench
 from jtqd.sim_can.towing.plant import TowingPlant
 
 FOLDER = Path(jtqd.models.__file__).parent / "plants"

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from jtqd.sim_can.source import CURRENT, VELOCITY
-from jtqd.sim_can.towing.friction import BristleFriction
+from jtqd.sim_can.towing.plant import BristleFriction
 from tests.sim_can.towing.benches import PLAIN, plant_of
 
 LAW = PLAIN.joints[0].friction

@@ -11,10 +11,8 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.models.files import load_joint, load_yaml
 from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run
 from jtqd.sim_can.source import CURRENT, VELOCITY
-from jtqd.sim_can.towing.bench_file import bench_from_mapping
-from jtqd.sim_can.towing.days import DayWidths, JointDay
-from jtqd.sim_can.towing.gear import Gear
-from jtqd.sim_can.towing.warmth import UPDATE_S, Warmth
+from jtqd.sim_can.towing.bench_file import DayWidths, JointDay, bench_from_mapping
+from jtqd.sim_can.towing.plant import UPDATE_S, Gear, Warmth
 from tests.sim_can.towing.benches import BAD_DAY, FOLDER, PLAIN, TYPICAL, plant_of
 
 

@@ -14,9 +14,8 @@ from jtqd.estimator.run import ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.days import Day
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
-from jtqd.sim_can.plant_file import PlantParameters, load_plant
+from jtqd.sim_can.plant_file import Day, PlantParameters, load_plant
 from jtqd.sysid.fit.losses import LOAD_NODES_NM
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 

@@ -18,7 +18,7 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sim_can.side_by_side import sources_of
+from jtqd.sim_can.plant_source import sources_of
 from jtqd.sysid.motion.commander import Commander
 from jtqd.sysid.motion.drives import CST, CSV, sensor_units, set_up, switch_off, turns
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Surroundings, Timing
