@@ -20,9 +20,9 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import bandwidth_of, recommended
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.plant_file import Day
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate, emulate_run
 from jtqd.sim_can.plant import joint_friction
+from jtqd.sim_can.plant_file import Day
 from jtqd.sysid.fit import fused as fits
 from jtqd.sysid.fit.calibration import calibrated
 from jtqd.sysid.fit.fused import FOLDS, FusedFit, fit_fused, folds
