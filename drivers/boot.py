@@ -1,21 +1,13 @@
 """Boot of the bus as a short-lived process: `python -m jtqd.drivers.boot [EDS NODE-ID] < request.json > report.json`.
 
-The request is checked into frozen profiles:
+The request is a `BootRequest`; all keys but "bus", "nodes", "node" and "kind" have defaults:
 
     {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
      "error_behaviour": 0, "reset": true,
      "sync": {"cob_id": 128, "counter_overflow": 0, "check_foreign": true},
      "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
-               {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": true, "sdo_timeout_ms": 1000},
-               {"node": 3, "kind": "sensor", "channels": [1], "unit_words": {"0x00560000": 1.0}, "mandatory": false}]}
-
-Only "bus" and "nodes" with "node" and "kind" are needed. `given` replaces objects that are then not read; `temperature` of a
-drive (true: 3001h, or fields of `drive.Temperature`) asks for TPDO3; a node that is not `mandatory` may be absent.
-"error_behaviour" is 1029h:1; without it the nodes keep theirs. "reset": NMT reset communication comes first.
-`sdo_timeout_ms`: silence of the node after which a request is repeated.
-`objects` of a drive: fields of `drive.DriveObjects`, each with those of `DriveObject`, or null; `tpdos`: TPDOs that
-shall carry them (`drive.tpdos_as_json`), without it TPDO1 and TPDO2 as jtqd maps them. `torque_constant_nm_per_a`: for a
-current by its torque (6077h). `acyclic`: TPDOs of transmission types 0, 254 and 255 are accepted.
+               {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": {"index": 12289}},
+               {"node": 3, "kind": "sensor", "channels": [1], "mandatory": false}]}
 
 The report is
     {"ok": true, "duration_s", "nodes": {"1": {...}}, "absent": {"3": error}}               exit status 0
@@ -31,284 +23,204 @@ taken over.
 from __future__ import annotations
 
 import json
+import re
 import select
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
-from typing import Any, Self
+from typing import Annotated, Any, Self
+
+import msgspec
+from msgspec import Meta, Struct
 
 from jtqd.drivers import nmt
 from jtqd.drivers.boot_node import BootedNode, BootError, BusSettings, NodeBoot, Profile, reset_during_boot
-from jtqd.drivers.drive import (
-    BY_TORQUE,
-    DriveObject,
-    DriveObjects,
-    DriveProfile,
-    Temperature,
-    maps_of_json,
-    tpdos_as_json,
-)
+from jtqd.drivers.drive import BY_TORQUE, CIA_402, DriveObjects, DriveProfile, Temperature, map_of
 from jtqd.drivers.emcy import EMCY_BASE, HISTORY_INDEX, Emergency, name_of, parse, register_text
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
-from jtqd.drivers.object_dictionary import Identity, entries_to_json, read_eds
+from jtqd.drivers.object_dictionary import ANY_IDENTITY, Identity, entries_to_json, read_eds
 from jtqd.drivers.own_objects import JTQD_NODE
-from jtqd.drivers.pdo import SYNC_COB_ID, PdoError, PdoMap
+from jtqd.drivers.pdo import SYNC_COB_ID, Tpdo
 from jtqd.drivers.sdo import ANSWER_S, RESPONSE_ID, Key, SdoAbort, SdoClient, SdoTimeout, parse_key
 from jtqd.drivers.sensor import SensorProfile
 
 # The request
 
-_TOP = {
-    "bus",
-    "nodes",
-    "master_node",
-    "sync",
-    "heartbeat_ms",
-    "master_timeout_ms",
-    "answer_timeout_s",
-    "error_behaviour",
-    "reset",
-}
-_SYNC = {"cob_id", "counter_overflow", "check_foreign"}
-_NODE = {"node", "kind", "identity", "channels", "given", "unit_words", "temperature", "mandatory"}
-_NODE |= {"sdo_timeout_ms", "objects", "tpdos", "torque_constant_nm_per_a", "acyclic"}
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
+_NodeId = Annotated[int, Meta(ge=1, le=127)]
+_Word = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
+_Ms = Annotated[int, Meta(ge=1, le=0xFFFF)]
 
 
 class RequestError(ValueError):
-    """The request itself is wrong; the message names the key, what was found and what is expected."""
+    """A request that cannot be carried out; the message has the key, what was found and what is expected."""
 
 
-@dataclass(frozen=True)
-class BootRequest:
+class _Node(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_field="kind"):
+    """A node of a request.
+
+    Attributes:
+        given: values of scaling objects that are then not read, by object: {"6091h:1": 100}.
+        sdo_timeout_ms: silence of the node after which a request is repeated.
+        mandatory: the boot fails without it.
+    """
+
+    node: _NodeId
+    identity: Identity = ANY_IDENTITY
+    given: dict[str, _Word] = {}
+    sdo_timeout_ms: Annotated[int, Meta(ge=10, le=10_000)] | None = None
+    mandatory: bool = True
+
+
+class DriveNode(_Node, frozen=True, kw_only=True, tag="drive"):
+    """A drive of a request, with the fields of a `DriveProfile`. `tpdos`: those that carry its quantities; none: jtqd's."""
+
+    temperature: Temperature | None = None
+    objects: DriveObjects = CIA_402
+    tpdos: tuple[Tpdo, ...] = ()
+    torque_constant_nm_per_a: float = 0.0
+    acyclic: bool = False
+
+    @property
+    def profile(self) -> DriveProfile:
+        """The drive as the boot configures it. Raises PdoError, ValueError."""
+        current = self.objects.current
+        if current.by == BY_TORQUE and not current.factor and self.torque_constant_nm_per_a <= 0.0:
+            found = self.torque_constant_nm_per_a
+            raise ValueError(f"torque_constant_nm_per_a: found {found}, expected a number above 0")
+        return DriveProfile(
+            self.node,
+            self.identity,
+            {parse_key(key): value for key, value in self.given.items()},
+            self.temperature,
+            self.objects,
+            tuple(map_of(self.node, each, self.objects) for each in self.tpdos),
+            self.torque_constant_nm_per_a,
+            self.acyclic,
+        )
+
+
+class SensorNode(_Node, frozen=True, kw_only=True, tag="sensor"):
+    """A torque sensor of a request, with the fields of a `SensorProfile`; `unit_words`: keys such as "0x00560000"."""
+
+    channels: tuple[int, ...] = (1,)
+    unit_words: dict[str, float] = {}
+
+    @property
+    def profile(self) -> SensorProfile:
+        """The sensor as the boot configures it. Raises ValueError."""
+        given = {parse_key(key): value for key, value in self.given.items()}
+        words = {int(word, 0): nm for word, nm in self.unit_words.items()}
+        return SensorProfile(self.node, self.identity, self.channels, given, words)
+
+
+class Sync(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SYNC of the bus.
+
+    Attributes:
+        counter_overflow: 1019h (0: SYNC without counter); None: left alone.
+        check_foreign: refuse a bus with another SYNC producer; off beside jtqd's own SYNC.
+    """
+
+    cob_id: Annotated[int, Meta(ge=1, le=0x7FF)] = SYNC_COB_ID
+    counter_overflow: Annotated[int, Meta(ge=0, le=240)] | None = None
+    check_foreign: bool = True
+
+
+class BootRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which nodes to boot on which bus.
 
     Attributes:
         bus: CAN interface or unix:PATH.
-        check_foreign_sync: refuse a bus with another SYNC producer; off when jtqd's own SYNC already runs.
+        master_timeout_ms: for so long a drive waits for jtqd's heartbeat (1016h:1).
+        heartbeat_ms: 1017h of all nodes, and period of jtqd's own heartbeat.
         answer_timeout_s: longest wait for the answer of a mandatory node.
-        optional: nodes that may be absent.
+        error_behaviour: 1029h:1; None: left alone.
         reset: begin with NMT reset communication.
-        sdo_answer_s: silence of a node after which a request is repeated, by node; ANSWER_S for the others.
     """
 
-    bus: str
-    profiles: tuple[Profile, ...]
-    settings: BusSettings
-    check_foreign_sync: bool = True
-    answer_timeout_s: float = 0.5
-    optional: frozenset[int] = frozenset()
+    bus: Annotated[str, Meta(min_length=1)]
+    nodes: Annotated[tuple[DriveNode | SensorNode, ...], Meta(min_length=1)]
+    master_node: _NodeId = JTQD_NODE
+    heartbeat_ms: _Ms = 100
+    master_timeout_ms: _Ms = 500
+    answer_timeout_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 0.5
+    error_behaviour: Annotated[int, Meta(ge=0, le=2)] | None = None
     reset: bool = True
-    sdo_answer_s: Mapping[int, float] = field(default_factory=dict)
+    sync: Sync = Sync()
+
+    def __post_init__(self) -> None:
+        numbers = [each.node for each in self.nodes]
+        if len({*numbers, self.master_node}) != len(numbers) + 1:
+            found = f"found {numbers} and master {self.master_node}"
+            raise ValueError(f"nodes: {found}, expected different node numbers")
+        for at, each in enumerate(self.nodes):
+            try:
+                _ = each.profile
+            except ValueError as error:
+                raise ValueError(f"nodes[{at}]: {error}") from None
+
+    def as_json(self) -> Any:
+        """Return it as plain data, of which `parse_request` makes it again."""
+        return msgspec.to_builtins(self, str_keys=True)
+
+    @property
+    def profiles(self) -> tuple[Profile, ...]:
+        """The nodes as the boot configures them, in its order."""
+        return tuple(each.profile for each in self.nodes)
+
+    @property
+    def settings(self) -> BusSettings:
+        """What all nodes have in common."""
+        return BusSettings(
+            master_node=self.master_node,
+            master_timeout_ms=self.master_timeout_ms,
+            heartbeat_ms=self.heartbeat_ms,
+            sync_cob_id=self.sync.cob_id,
+            counter_overflow=self.sync.counter_overflow,
+            error_behaviour=self.error_behaviour,
+        )
 
     def timeout_s(self, node: int) -> float:
         """Return how long a node may take for its first answer."""
-        longest = _OPTIONAL_TIMEOUT_S if node in self.optional else self.answer_timeout_s
-        return max(min(self.answer_timeout_s, longest), self.sdo_answer_s.get(node, 0.0))
+        (found,) = (each for each in self.nodes if each.node == node)
+        longest = (
+            self.answer_timeout_s if found.mandatory else min(_OPTIONAL_TIMEOUT_S, self.answer_timeout_s)
+        )
+        return max(longest, (found.sdo_timeout_ms or 0) * 1e-3)
 
     def answer_s(self, node: int) -> float:
         """Return the silence of a node after which a request is repeated."""
-        return self.sdo_answer_s.get(node, ANSWER_S)
+        (found,) = (each for each in self.nodes if each.node == node)
+        return ANSWER_S if found.sdo_timeout_ms is None else found.sdo_timeout_ms * 1e-3
 
 
 def parse_request(raw: object) -> BootRequest:
     """Check a request as it comes from JSON. Raises RequestError."""
-    top = _mapping(raw, "request", _TOP)
-    bus = top.get("bus")
-    if not isinstance(bus, str) or not bus:
-        raise RequestError(f"bus: found {bus!r}, expected a name like can0 or unix:PATH")
-    nodes = top.get("nodes")
-    if not isinstance(nodes, list) or not nodes:
-        raise RequestError(f"nodes: found {nodes!r}, expected a list of at least one node")
-    profiles = tuple(_profile(node, f"nodes[{position}]") for position, node in enumerate(nodes))
-    numbers = [profile.node_id for profile in profiles]
-    master = _integer(top, "master_node", 1, 127, JTQD_NODE)
-    if len({*numbers, master}) != len(numbers) + 1:
-        raise RequestError(f"nodes: {numbers} and master {master}, expected different node numbers")
-    sync = _mapping(top.get("sync", {}), "sync", _SYNC)
-    settings = BusSettings(
-        master_node=master,
-        master_timeout_ms=_integer(top, "master_timeout_ms", 1, 0xFFFF, 500),
-        heartbeat_ms=_integer(top, "heartbeat_ms", 1, 0xFFFF, 100),
-        sync_cob_id=_integer(sync, "cob_id", 1, 0x7FF, SYNC_COB_ID),
-        counter_overflow=_optional_integer(sync, "counter_overflow", 0, 240),
-        error_behaviour=_optional_integer(top, "error_behaviour", 0, 2),
-    )
-    timeout = top.get("answer_timeout_s", 0.5)
-    if isinstance(timeout, bool) or not isinstance(timeout, int | float) or not 0 < timeout <= 60:
-        raise RequestError(f"answer_timeout_s: found {timeout!r}, expected seconds above 0 and at most 60")
-    optional = frozenset(
-        profile.node_id
-        for profile, node in zip(profiles, nodes, strict=True)
-        if not _boolean(node, "mandatory", default=True)
-    )
-    foreign = bool(sync.get("check_foreign", True))
-    answers = {
-        profile.node_id: _integer(node, "sdo_timeout_ms", 10, 10_000, None) * 1e-3
-        for profile, node in zip(profiles, nodes, strict=True)
-        if "sdo_timeout_ms" in node
-    }
-    reset = _boolean(top, "reset", default=True, where="request")
-    return BootRequest(
-        bus, profiles, settings, foreign, float(timeout), optional, reset=reset, sdo_answer_s=answers
-    )
-
-
-def _profile(raw: object, where: str) -> Profile:
-    node = _mapping(raw, where, _NODE)
-    number = _integer(node, "node", 1, 127, None, where=where)
-    identity = _identity(node.get("identity"), f"{where}.identity")
-    given = _given(node.get("given"), f"{where}.given")
-    kind = node.get("kind")
-    if kind == "drive":
-        temperature = _temperature(node, where)
-        objects = _objects(node.get("objects"), f"{where}.objects")
-        layout = _layout(node.get("tpdos", []), number, objects, f"{where}.tpdos")
-        constant = node.get("torque_constant_nm_per_a", 0.0)
-        itself = _boolean(node, "acyclic", default=False, where=where)
-        by_torque = objects.current.by == BY_TORQUE and not objects.current.factor
-        if isinstance(constant, bool) or not isinstance(constant, int | float) or constant <= 0.0 < by_torque:
-            raise RequestError(
-                f"{where}.torque_constant_nm_per_a: found {constant!r}, expected a number above 0"
-            )
-        return DriveProfile(number, identity, given, temperature, objects, layout, float(constant), itself)
-    if kind != "sensor":
-        raise RequestError(f"{where}.kind: found {kind!r}, expected 'drive' or 'sensor'")
-    channels = node.get("channels", [1])
-    if channels not in ([1], [1, 2]):
-        raise RequestError(f"{where}.channels: found {channels!r}, expected [1] or [1, 2]")
-    return SensorProfile(number, identity, tuple(channels), given, _unit_words(node, where))
-
-
-def _identity(raw: object, where: str) -> Identity:
-    fields = set(asdict(Identity()))
-    mapping = dict(_mapping({} if raw is None else raw, where, fields))
-    software = mapping.pop("software", None)
-    if software is not None and not isinstance(software, str):
-        raise RequestError(f"{where}.software: found {software!r}, expected a text")
-    return Identity(**_integers(mapping, where, fields), software=software)
-
-
-def _objects(raw: object, where: str) -> DriveObjects:
-    """Return the objects of a drive from what `asdict` made of them; None: those of CiA 402."""
-    if raw is None:
-        return DriveObjects()
-    names = {each.name for each in fields(DriveObjects)}
-    known = {each.name for each in fields(DriveObject)}
-    found = _mapping(raw, where, names)
     try:
-        chosen: dict[str, Any] = {
-            name: None if each is None else DriveObject(**_mapping(each, f"{where}.{name}", known))
-            for name, each in found.items()
-        }
-        return DriveObjects(**chosen)
-    except TypeError as error:
-        raise RequestError(f"{where}: {error}") from error
+        return msgspec.convert(raw, BootRequest, str_keys=True)
+    except msgspec.ValidationError as error:
+        text, _, path = str(error).partition(" - at `$")
+        key = path.strip(".`") or "request"
+        raise RequestError(f"{key}: {_found(raw, path)}{text[0].lower()}{text[1:]}") from None
 
 
-def _layout(raw: object, node: int, objects: DriveObjects, where: str) -> tuple[PdoMap, ...]:
-    """Return the TPDOs of a request. Raises RequestError."""
-    if not isinstance(raw, list):
-        raise RequestError(f"{where}: found {raw!r}, expected a list")
+def _found(raw: Any, path: str) -> str:
+    """Return "found VALUE, " of the place `.nodes[0].node` in a request; "" for an object or a place that is not there."""
     try:
-        return maps_of_json(node, raw, objects)
-    except (PdoError, KeyError, TypeError, AttributeError) as error:
-        raise RequestError(f"{where}: {error}") from error
-
-
-def _given(raw: object, where: str) -> dict[Key, int]:
-    """Return values by object: {"6091h:1": 100}."""
-    try:
-        return {parse_key(key): value for key, value in _integers(raw, where).items()}
-    except RequestError:
-        raise
-    except ValueError as error:
-        raise RequestError(f"{where}: {error}") from error
-
-
-def _unit_words(node: Mapping[str, Any], where: str) -> dict[int, float]:
-    words = _mapping(node.get("unit_words", {}), f"{where}.unit_words", None)
-    try:
-        return {int(word, 0): float(nm) for word, nm in words.items()}
-    except (TypeError, ValueError) as error:
-        raise RequestError(f"{where}.unit_words: {error}, expected words and Nm per unit") from error
-
-
-def _mapping(raw: object, where: str, known: set[str] | None) -> Mapping[str, Any]:
-    """Return a mapping with keys of `known` only; None: any."""
-    if not isinstance(raw, dict):
-        raise RequestError(f"{where}: found {raw!r}, expected a mapping")
-    unknown = sorted(set(raw) - known) if known is not None else []
-    if unknown:
-        raise RequestError(f"{where}: unknown key {unknown[0]!r}, expected one of {sorted(known or ())}")
-    return raw
-
-
-def _temperature(node: Mapping[str, Any], where: str) -> Temperature | None:
-    """Return the object of the joint's temperature: true for 3001h, false for none, or a mapping."""
-    value = node.get("temperature", False)
-    if not isinstance(value, dict):
-        return Temperature() if _boolean(node, "temperature", default=False, where=where) else None
-    where = f"{where}.temperature"
-    known = _mapping(value, where, {"index", "subindex", "c_per_unit"})
-    factor = known.get("c_per_unit")
-    if isinstance(factor, bool) or not isinstance(factor, int | float) or not factor > 0.0:
-        raise RequestError(f"{where}.c_per_unit: found {factor!r}, expected a number above 0")
-    index = _integer(known, "index", 0x1000, 0xFFFF, None, where=where)
-    return Temperature(index, _integer(known, "subindex", 0, 254, 0, where=where), float(factor))
-
-
-def _boolean(mapping: Mapping[str, Any], key: str, *, default: bool, where: str = "node") -> bool:
-    value = mapping.get(key, default)
-    if not isinstance(value, bool):
-        raise RequestError(f"{where}.{key}: found {value!r}, expected true or false")
-    return value
-
-
-def _integer(
-    mapping: Mapping[str, Any], key: str, low: int, high: int, default: int | None, *, where: str = ""
-) -> int:
-    value = mapping.get(key, default)
-    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
-        path = f"{where}.{key}" if where else key
-        raise RequestError(f"{path}: found {value!r}, expected a whole number {low}..{high}")
-    return value
-
-
-def _optional_integer(mapping: Mapping[str, Any], key: str, low: int, high: int) -> int | None:
-    return None if mapping.get(key) is None else _integer(mapping, key, low, high, None)
-
-
-def _integers(raw: object, where: str, known: set[str] | None = None) -> dict[str, int]:
-    """Return a mapping of 32-bit numbers; null entries are left out."""
-    mapping = _mapping({} if raw is None else raw, where, known)
-    kept = {key: value for key, value in mapping.items() if value is not None}
-    return {key: _integer(kept, key, 0, 0xFFFF_FFFF, None, where=where) for key in kept}
-
-
-def node_report(node: BootedNode) -> dict[str, object]:
-    """Return one node of the report; `scaling` holds the fields of DriveScaling or SensorScaling."""
-    return {
-        "name": node.name,
-        "device_type": node.device_type,
-        "serial": node.serial,
-        "scaling": asdict(node.scaling),
-        "gear_ratio": node.gear_ratio,
-        "tpdos": tpdos_as_json(node.tpdos),
-        "configuration_sha256": node.configuration_sha256,
-        "signed": node.signed,
-        "watched": [list(each) for each in node.watched],
-        "notes": list(node.notes),
-        "boot_ups": node.boot_ups,
-    }
+        for part in re.findall(r"[^.`\[\]]+", path):
+            raw = raw[int(part)] if isinstance(raw, list) else raw[part]
+    except (KeyError, IndexError, TypeError, ValueError):
+        return ""
+    return "" if isinstance(raw, dict) else f"found {raw!r}, "
 
 
 # The boot
@@ -338,7 +250,7 @@ class BootReport:
 
     def as_json(self) -> dict[str, Any]:
         """Return the report for JSON."""
-        nodes = {str(number): node_report(node) for number, node in self.nodes.items()}
+        nodes = {str(number): node.as_json() for number, node in self.nodes.items()}
         absent = {str(number): error.report() for number, error in self.absent.items()}
         return {"ok": True, "duration_s": round(self.duration_s, 4), "nodes": nodes, "absent": absent}
 
@@ -358,7 +270,7 @@ class BootBus:
     """
 
     def __init__(self, request: BootRequest) -> None:
-        self._settings, self._first = request.settings, request.check_foreign_sync
+        self._settings, self._first = request.settings, request.sync.check_foreign
         self.states: dict[int, int] = {}
         self.restarted: set[int] = set()
         self.boot_ups: Counter[int] = Counter()
@@ -489,6 +401,7 @@ def boot(request: BootRequest, bus: BootBus) -> BootReport:
     wait_s = max(3 * request.settings.heartbeat_ms, 100) * 1e-3
     booted: dict[int, BootedNode] = {}
     absent: dict[int, BootError] = {}
+    mandatory = {each.node for each in request.nodes if each.mandatory}
 
     def attempt(node: int, step: Callable[[], None]) -> None:
         """Do one step; an optional node that fails is absent from then on."""
@@ -496,7 +409,7 @@ def boot(request: BootRequest, bus: BootBus) -> BootReport:
             step()
         except BootError as error:
             why = error if error.letter == "B" else error.explained(_own_words(bus, node))
-            if node not in request.optional or error.node != node:
+            if node in mandatory or error.node != node:
                 raise why from error
             absent[node] = why
             booted.pop(node, None)
@@ -539,7 +452,7 @@ def _configure(bus: BootBus, request: BootRequest, profile: Profile, *, ran: Col
     """Identify and configure one node, which stays pre-operational; `ran`: nodes that were operational before."""
     node = profile.node_id
     notes = []
-    if node in ran and request.check_foreign_sync:
+    if node in ran and request.sync.check_foreign:
         notes.append("it was already operational (status L): stopped and configured again")
     answer_s = request.answer_s(node)
     sdo = SdoClient(bus, node, request.timeout_s(node), answer_s)

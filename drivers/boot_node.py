@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 from jtqd.drivers.drive import (
@@ -26,6 +26,7 @@ from jtqd.drivers.drive import (
     drive_scaling,
     map_of,
     select_tpdos,
+    tpdos_as_json,
 )
 from jtqd.drivers.pdo import (
     ACYCLIC,
@@ -257,6 +258,22 @@ class BootedNode:
     watched: tuple[tuple[int, int, int], ...] = ()
     notes: tuple[str, ...] = ()
     boot_ups: int = 0
+
+    def as_json(self) -> dict[str, object]:
+        """Return it for a report; `scaling` holds the fields of DriveScaling or SensorScaling."""
+        return {
+            "name": self.name,
+            "device_type": self.device_type,
+            "serial": self.serial,
+            "scaling": asdict(self.scaling),
+            "gear_ratio": self.gear_ratio,
+            "tpdos": tpdos_as_json(self.tpdos),
+            "configuration_sha256": self.configuration_sha256,
+            "signed": self.signed,
+            "watched": [list(each) for each in self.watched],
+            "notes": list(self.notes),
+            "boot_ups": self.boot_ups,
+        }
 
 
 # TPDOs

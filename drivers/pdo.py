@@ -110,6 +110,11 @@ class PdoMap:
         return (self.cob_id - 0x80) // 0x100 if self.given_number is None else self.given_number
 
     @property
+    def tpdo(self) -> Tpdo:
+        """Its parameters as a TPDO."""
+        return Tpdo(self.number, self.cob_id, self.words, self.transmission_type)
+
+    @property
     def length(self) -> int:
         """Bytes of the PDO."""
         return self.layout.size

@@ -13,6 +13,7 @@ is read here is long enough. `SdoClient` blocks until an exchange has ended.
 
 from __future__ import annotations
 
+import re
 import struct
 import time
 from collections import deque
@@ -33,11 +34,10 @@ def label(index: int, subindex: int = 0) -> str:
 
 def parse_key(text: str) -> Key:
     """Return (index, sub-index) of "608Fh:1" or "6075h". Raises ValueError."""
-    index, _, subindex = text.partition("h")
-    key = int(index, 16), int(subindex.removeprefix(":") or "0")
-    if text not in (label(*key), f"{key[0]:04X}h"):
+    found = re.fullmatch(r"([0-9A-F]{4})h(?::(0|[1-9][0-9]{0,2}))?", text)
+    if found is None:
         raise ValueError(f"{text!r} is not an object like 608Fh:1")
-    return key
+    return int(found[1], 16), int(found[2] or 0)
 
 
 # Abort codes (CiA 301, 7.2.4.3.17, table 22)

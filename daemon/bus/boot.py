@@ -15,9 +15,10 @@ from jtqd.daemon.config import Config, as_booted
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
+from jtqd.drivers.boot import BootRequest, DriveNode, SensorNode, Sync
 from jtqd.drivers.bus_load import BusLoad, configured_load
-from jtqd.drivers.drive import tpdos_as_json
 from jtqd.drivers.emcy import COMMUNICATION
+from jtqd.drivers.object_dictionary import Identity
 from jtqd.drivers.own_objects import own_sheet
 
 _EDS = Path(__file__).resolve().parents[2] / "drivers" / "eds"
@@ -30,54 +31,52 @@ def own_eds(config: Config) -> list[str]:
 
 def boot_request(
     config: Config, bus: str, only: int | None = None, *, reset: bool | None = None
-) -> dict[str, Any]:
-    """Return the request to the boot process (`python -m jtqd.drivers.boot`, as JSON) for all nodes, or for `only` one.
+) -> BootRequest:
+    """Return the request to the boot process for all nodes, or for `only` one.
 
     reset: begin with NMT reset communication; None: as configured.
     """
-    nodes: list[dict[str, Any]] = [
-        {
-            "node": joint.node_id,
-            "kind": "drive",
-            "identity": asdict(joint.identity),
-            "given": joint.given,
-            "temperature": False if joint.temperature is None else asdict(joint.temperature),
-            "sdo_timeout_ms": joint.sdo_timeout_ms,
-            "objects": asdict(joint.objects),
-            "tpdos": tpdos_as_json(joint.tpdos),
-            "acyclic": joint.max_age_ms > 0.0,
-            "torque_constant_nm_per_a": joint.joint.torque_constant_nm_per_a,
-            "mandatory": joint.mandatory or only is not None,
-        }
+    nodes: list[DriveNode | SensorNode] = [
+        DriveNode(
+            node=joint.node_id,
+            identity=Identity(**asdict(joint.identity)),
+            given=joint.given,
+            sdo_timeout_ms=joint.sdo_timeout_ms,
+            mandatory=joint.mandatory or only is not None,
+            temperature=joint.temperature,
+            objects=joint.objects,
+            tpdos=tuple(pdo.tpdo for pdo in joint.tpdos),
+            torque_constant_nm_per_a=joint.joint.torque_constant_nm_per_a,
+            acyclic=joint.max_age_ms > 0.0,
+        )
         for joint in config.joints
     ]
     if config.sensor is not None:
         sensor = config.sensor
         nodes.append(
-            {
-                "node": sensor.node_id,
-                "kind": "sensor",
-                "identity": asdict(sensor.identity),
-                "channels": list(sensor.channels),
-                "given": sensor.given,
-                "unit_words": sensor.unit_words,
-                "sdo_timeout_ms": sensor.sdo_timeout_ms,
-                "mandatory": sensor.mandatory or only is not None,
-            }
+            SensorNode(
+                node=sensor.node_id,
+                identity=Identity(**asdict(sensor.identity)),
+                given=sensor.given,
+                sdo_timeout_ms=sensor.sdo_timeout_ms,
+                mandatory=sensor.mandatory or only is not None,
+                channels=sensor.channels,
+                unit_words=sensor.unit_words,
+            )
         )
-    return {
-        "bus": bus,
-        "nodes": [node for node in nodes if only in (None, node["node"])],
-        "master_node": config.node_id,
-        "heartbeat_ms": config.heartbeat_ms,
-        "error_behaviour": config.error_behaviour,
-        "reset": config.reset_communication if reset is None else reset,
+    return BootRequest(
+        bus=bus,
+        nodes=tuple(each for each in nodes if only in (None, each.node)),
+        master_node=config.node_id,
+        heartbeat_ms=config.heartbeat_ms,
         # Drives that watch our heartbeat allow two to be lost.
-        "master_timeout_ms": min(max(500, 3 * config.heartbeat_ms), 0xFFFF),
+        master_timeout_ms=min(max(500, 3 * config.heartbeat_ms), 0xFFFF),
         # In service the node has just been heard.
-        "answer_timeout_s": config.boot_timeout_s if only is None else min(config.boot_timeout_s, 0.5),
-        "sync": {"counter_overflow": config.counter_overflow, "check_foreign": only is None},
-    }
+        answer_timeout_s=config.boot_timeout_s if only is None else min(config.boot_timeout_s, 0.5),
+        error_behaviour=config.error_behaviour,
+        reset=config.reset_communication if reset is None else reset,
+        sync=Sync(counter_overflow=config.counter_overflow, check_foreign=only is None),
+    )
 
 
 def bus_load_of(config: Config) -> BusLoad:
@@ -211,7 +210,7 @@ class ReturningNodes:
         # A node that has just restarted needs no reset; one that could not be booted, or tells an error of it, may.
         reset = self._config.reset_communication and (node in self._retry_s or node in self._in_error)
         self._in_error.discard(node)
-        self._child.tell(boot_request(self._config, self._bus, only=node, reset=reset))
+        self._child.tell(boot_request(self._config, self._bus, only=node, reset=reset).as_json())
         self._child.end_of_input()
 
     def _put_off(self, node: int, now_s: float) -> None:

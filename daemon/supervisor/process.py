@@ -129,7 +129,7 @@ def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict
 
     The child sends jtqd's heartbeat until its input ends.
     """
-    child.tell(boot_request(config, bus))
+    child.tell(boot_request(config, bus).as_json())
     waits_ms = [joint.sdo_timeout_ms for joint in config.joints]
     if config.sensor is not None:
         waits_ms.append(config.sensor.sdo_timeout_ms)

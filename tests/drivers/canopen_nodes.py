@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, Self
 
-from jtqd.drivers.boot import BootBus, BootReport, boot, parse_request
+from jtqd.drivers.boot import BootBus, BootReport, BootRequest, boot, parse_request
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
@@ -165,9 +165,9 @@ class HubResponder(_Answering):
 
 
 @contextmanager
-def booted(request: dict[str, Any]) -> Iterator[BootReport]:
+def booted(request: BootRequest | dict[str, Any]) -> Iterator[BootReport]:
     """Boot, and send jtqd's heartbeat as long as the context lasts. Raises BootError."""
-    parsed = parse_request(request)
+    parsed = request if isinstance(request, BootRequest) else parse_request(request)
     ended = threading.Event()
     with BootBus(parsed) as bus:
         report = boot(parsed, bus)
@@ -180,7 +180,7 @@ def booted(request: dict[str, Any]) -> Iterator[BootReport]:
             thread.join()
 
 
-def boot_all(request: dict[str, Any]) -> BootReport:
+def boot_all(request: BootRequest | dict[str, Any]) -> BootReport:
     """Boot the nodes of a request. Raises BootError."""
     with booted(request) as report:
         return report

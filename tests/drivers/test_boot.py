@@ -162,7 +162,7 @@ def test_mapping_is_written_in_the_order_of_cia_301():
 def test_temperature_is_mapped_where_it_is_asked_for(bench):
     bench.drive1.store.set_number(0x1802, 5, 0)  # left without its timer, and off, by somebody else
     bench.drive1.store.set_number(0x1802, 1, 0xC0000381)
-    nodes = [{"node": 1, "kind": "drive", "temperature": True}, {"node": 2, "kind": "drive"}]
+    nodes = [{"node": 1, "kind": "drive", "temperature": {}}, {"node": 2, "kind": "drive"}]
     report = bench.boot(nodes=nodes)
     one, two = bench.drive1.parameters, bench.drive2.parameters
     assert one.tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
@@ -191,7 +191,7 @@ def test_a_temperature_in_another_object_is_mapped_as_3001h_would_be(bench):
 
 def test_a_node_without_an_inhibit_time_is_mapped_all_the_same(bench):
     del bench.drive1.store.entries[0x1802, 3]
-    bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": True}])
+    bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": {}}])
     assert bench.drive1.parameters.tpdos()[2] == drive_tpdo3(1)
 
 
@@ -314,7 +314,7 @@ def test_transmission_type_that_does_not_stick(bench):
 def test_a_drive_without_the_temperature_that_is_asked_for(bench):
     del bench.drive2.store.entries[0x3001, 0]
     bench.drive2.store._indices.discard(0x3001)
-    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "temperature": True}])
+    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "temperature": {}}])
     assert str(error) == (
         "node 2: 3001h:0 joint temperature: expected a value (required by the configuration), "
         "found no such object (status J)"
@@ -334,7 +334,7 @@ def test_a_drive_without_the_temperature_that_is_asked_for(bench):
 )
 def test_a_temperature_that_is_not_taken_as_written(bench, key, value, text):
     bench.drive1.store.on_read(*key, lambda: value)
-    error = bench.fails(nodes=[{"node": 1, "kind": "drive", "temperature": True}])
+    error = bench.fails(nodes=[{"node": 1, "kind": "drive", "temperature": {}}])
     assert str(error) == f"node 1: {text} (status J)"
 
 
@@ -464,35 +464,53 @@ def test_a_drive_that_leaves_operational_once_is_started_again(bench) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "key", "text"),
     [
-        ({"bus": 3}, "bus: found 3"),
-        ({"nodes": []}, "nodes: found []"),
+        ({"bus": 3}, "bus", "found 3, expected `str`"),
+        ({"nodes": []}, "nodes", "found [], expected `array` of length >= 1"),
+        ({"nodes": [{"node": 1, "kind": "motor"}]}, "nodes[0].kind", "invalid value 'motor'"),
+        ({"nodes": [{"node": 200, "kind": "drive"}]}, "nodes[0].node", "found 200, expected `int` <= 127"),
+        ({"nodes": [{"node": 1, "kind": "drive"}] * 2}, "request", "found [1, 1] and master 32"),
+        ({"nodes": [{"node": 1, "kind": "drive", "speed": 1}]}, "nodes[0]", "unknown field `speed`"),
+        ({"nodes": [{"node": 1, "kind": "drive", "given": {"x": 1}}]}, "request", "nodes[0]: 'x' is not an"),
+        ({"nodes": [{"node": 3, "kind": "sensor", "channels": [2]}]}, "request", "channels (2,), expected"),
+        ({"nodes": [{"node": 1, "kind": "drive", "temperature": 1}]}, "nodes[0].temperature", "found 1"),
         (
-            {"nodes": [{"node": 1, "kind": "motor"}]},
-            "nodes[0].kind: found 'motor', expected 'drive' or 'sensor'",
+            {
+                "nodes": [
+                    {"node": 1, "kind": "drive", "tpdos": [{"number": 1, "cob_id": 0x191, "words": [0]}]}
+                ]
+            },
+            "request",
+            "nodes[0]: TPDO1 has COB-ID 191h, expected one of 181h, 281h, 381h, 481h",
         ),
         (
-            {"nodes": [{"node": 200, "kind": "drive"}]},
-            "nodes[0].node: found 200, expected a whole number 1..127",
+            {
+                "nodes": [
+                    {"node": 1, "kind": "drive", "objects": {"current": {"index": 0x6077, "by": "6076h"}}}
+                ]
+            },
+            "request",
+            "nodes[0]: torque_constant_nm_per_a: found 0.0, expected a number above 0",
         ),
-        ({"nodes": [{"node": 1, "kind": "drive"}] * 2}, "expected different node numbers"),
-        ({"nodes": [{"node": 1, "kind": "drive", "speed": 1}]}, "nodes[0]: unknown key 'speed'"),
-        ({"nodes": [{"node": 1, "kind": "drive", "given": {"x": 1}}]}, "nodes[0].given"),
-        ({"nodes": [{"node": 3, "kind": "sensor", "channels": [2]}]}, "nodes[0].channels: found [2]"),
-        ({"nodes": [{"node": 1, "kind": "drive", "temperature": 1}]}, "nodes[0].temperature: found 1"),
+        ({"nodes": [{"node": 1, "kind": "drive", "mandatory": "no"}]}, "nodes[0].mandatory", "found 'no'"),
         (
-            {"nodes": [{"node": 1, "kind": "drive", "temperature": {"index": 0x2040}}]},
-            "nodes[0].temperature.c_per_unit: found None",
+            {"nodes": [{"node": 1, "kind": "drive", "identity": {"software": 2}}]},
+            "nodes[0].identity.software",
+            "found 2, expected `str | null`",
         ),
-        ({"answer_timeout_s": 0}, "answer_timeout_s: found 0"),
-        ({"heartbeat_ms": True}, "heartbeat_ms: found True"),
+        ({"answer_timeout_s": 0}, "answer_timeout_s", "found 0, expected `float` > 0.0"),
+        ({"heartbeat_ms": True}, "heartbeat_ms", "found True, expected `int`"),
+        ({"error_behaviour": 3}, "error_behaviour", "found 3, expected `int` <= 2"),
+        ({"sync": {"counter_overflow": 241}}, "sync.counter_overflow", "found 241, expected `int` <= 240"),
     ],
 )
-def test_wrong_requests_are_named(change, message):
+def test_wrong_requests_are_named(change, key, text):
     with pytest.raises(RequestError) as caught:
         parse_request({**REQUEST, **change})
-    assert message in str(caught.value)
+    message = str(caught.value)
+    assert message.startswith(f"{key}: ")
+    assert text in message
 
 
 def test_request_becomes_profiles():
@@ -503,6 +521,7 @@ def test_request_becomes_profiles():
         SensorProfile(3),
     )
     assert request.settings == BusSettings(0x20, heartbeat_ms=30, counter_overflow=240)
+    assert parse_request(json.loads(json.dumps(request.as_json()))) == request
 
 
 def test_an_optional_node_is_waited_for_half_a_second_at_most():
@@ -706,7 +725,7 @@ def test_a_temperature_in_a_fixed_mapping_is_used_where_it_is_alone_in_tpdo3(ben
     fixed(bench.drive1, *ELSEWHERE[:2], (0x3001_0010,))
     bench.drive1.store.set_number(0x1802, 2, 255)
     objects = {"link_position": None}
-    nodes = [{"node": 1, "kind": "drive", "temperature": True, "objects": objects}]
+    nodes = [{"node": 1, "kind": "drive", "temperature": {}, "objects": objects}]
     used = bench.boot(nodes=nodes).nodes[1].tpdos
     assert [pdo.words for pdo in used][2:] == [(0x3001_0010,)]
     assert used[2].transmission_type == 255

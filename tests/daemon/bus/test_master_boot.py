@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.drivers.boot import BootReport, RequestError, parse_request
+from jtqd.drivers.boot import BootReport
 from jtqd.drivers.boot_node import BootError, signature
 from jtqd.drivers.drive import drive_tpdo1
 from jtqd.drivers.frame import FRAME
@@ -229,23 +229,3 @@ def test_g_and_h_software_version(bus: Bus, present: bool, letter: str) -> None:
     assert str(error) == f"node 1: 100Ah:0 software version: expected 2.7, found {found} (status {letter})"
     if present:
         bus.boot(nodes=[{**node, "identity": {"software": "1.0"}}])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"error_behaviour": 3}, "error_behaviour: found 3, expected a whole number 0..2"),
-        (
-            {"nodes": [{"node": 1, "kind": "drive", "mandatory": "no"}]},
-            "mandatory: found 'no', expected true or false",
-        ),
-        (
-            {"nodes": [{"node": 1, "kind": "drive", "identity": {"software": 2}}]},
-            "nodes[0].identity.software: found 2, expected a text",
-        ),
-    ],
-)
-def test_wrong_requests(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(RequestError) as caught:
-        parse_request({**REQUEST, **change})
-    assert message in str(caught.value)

@@ -173,7 +173,8 @@ def test_what_the_configuration_says_of_the_boot_is_in_its_request(tmp_path: Pat
 
     def asked(**nodes: object) -> dict[str, Any]:
         path.write_text(yaml.safe_dump(content | {"nodes": nodes}))
-        return boot_request(load_config(path), "b")
+        found: dict[str, Any] = boot_request(load_config(path), "b").as_json()
+        return found
 
     assert asked()["reset"] is True
     assert asked()["sync"]["counter_overflow"] == 0, "a drive comes back with 1019h = 0"

@@ -15,6 +15,8 @@ from jtqd.daemon.core.input_pdos import InputPdo, TemperaturePdo, joint_temperat
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.snapshot import frame_counts
 from jtqd.daemon.loop.process import joint_inputs
+from jtqd.drivers.boot import DriveNode
+from jtqd.drivers.drive import Temperature
 from tests.daemon.snapshots import counted
 from tests.shipped_bench import shipped_bench
 
@@ -188,8 +190,10 @@ def test_each_joint_finds_its_own(tmp_path: Path, have: tuple[int, ...]) -> None
         intake.receive_temperature(n, frame(each.cob_id, struct.pack("<h", 250)))
         unit = "by the unit of its object"
         assert intake.temperature(n) == pytest.approx(25.0 if each.node_id == 1 else 2.5), unit
-    asked = {node["node"]: node.get("temperature") for node in boot_request(config, "b")["nodes"]}
-    assert (2 in have) == (asked[2] == {"index": 0x2040, "subindex": 1, "c_per_unit": 0.01})
+    asked = {
+        each.node: each.temperature for each in boot_request(config, "b").nodes if isinstance(each, DriveNode)
+    }
+    assert (2 in have) == (asked[2] == Temperature(0x2040, 1, 0.01))
     assert [row.cob_id for row in bus_load_of(config).rows if row.length == 2] == [0x380 + n for n in have]
 
 

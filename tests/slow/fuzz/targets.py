@@ -114,7 +114,7 @@ def targets(directory: Path) -> list[Target]:
 
     configuration = _configuration(directory)
     request = directory / "request.json"
-    request.write_text(json.dumps(boot_request(load_config(configuration), "vcan0")))
+    request.write_text(json.dumps(boot_request(load_config(configuration), "vcan0").as_json()))
     plan = directory / "plan.yaml"
     plan.write_text(make_plan("efficiency", Scale()).to_yaml())
     log = directory / "log.mcap"
