@@ -1,18 +1,19 @@
 """Everything between a wire and numbers: CAN frames, frame sockets, CANopen services, the devices on the bus, their boot.
 
 Frames come in and go out as 16 bytes (`struct can_frame`); numbers are those of object dictionaries and PDOs.
-It imports nothing else of jtqd. canopen and python-can are imported by `boot` (a process of its own) and `can_unix` alone,
-and canopen's EDS parser by `object_dictionary.read_eds` when it is called. Import the modules themselves:
+It imports nothing else of jtqd. python-can is imported by `can_unix` alone, and canopen's EDS parser by
+`object_dictionary.read_eds` when it is called. Import the modules themselves:
 
     frame, filters              the 16 bytes, kernel filters
-    frame_socket, bus_socket    SocketCAN or a unix socket, alike to use, all frames by one system call; opening them
-    hub, relay, wire            hub of a unix bus, `python -m jtqd.drivers.hub`; its members; a wire's times
-    object_dictionary, pdo      objects typed by an EDS, PDO mappings as `struct`, rules for changing them
-    sdo, sdo_client, sdo_server the protocol and a queue; blocking clients; the server
-    nmt, emcy, cia402           NMT commands and states, EMCY codes, states of a drive
-    devices, survey, bus_load   what drives and sensor must map and scale; what a device tells; load of a configuration
-    boot_procedure, boot        one node by SDO (CiA 302-2); the whole bus, `python -m jtqd.drivers.boot`
-    can_unix, eds               unix bus for python-can; data sheets
+    frame_socket, bus_socket    SocketCAN or a unix socket, all frames by one system call; opening them
+    hub, relay                  hub of a unix bus with a modelled wire, `python -m jtqd.drivers.hub`; its members
+    object_dictionary, pdo      objects typed by an EDS and their SDO server; PDO mappings as `struct`
+    sdo, nmt, emcy              SDO client, NMT commands and states, EMCY codes (CiA 301)
+    drive, sensor               objects, TPDOs and scaling of a drive (CiA 402) and of a torque sensor (CiA 404)
+    own_objects, eds            jtqd as a node; data sheets that ship
+    boot, boot_node             boot of the bus, `python -m jtqd.drivers.boot`; of one node (CiA 302-2)
+    survey, bus_load            identity, scaling and TPDOs of a device; load of a configuration
+    can_unix                    unix bus for python-can
 
 >>> from jtqd.drivers.drive import drive_tpdo2
 >>> pdo = drive_tpdo2(node=1)

@@ -47,8 +47,8 @@ from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import ANY_IDENTITY, Identity, entries_to_json, read_eds
 from jtqd.drivers.own_objects import JTQD_NODE
-from jtqd.drivers.pdo import SYNC_COB_ID, Tpdo
-from jtqd.drivers.sdo import ANSWER_S, RESPONSE_ID, Key, SdoAbort, SdoClient, SdoTimeout, parse_key
+from jtqd.drivers.pdo import SYNC_COB_ID, SYNC_LISTEN_S, Tpdo
+from jtqd.drivers.sdo import ANSWER_S, PATIENCE, RESPONSE_ID, Key, SdoAbort, SdoClient, SdoTimeout, parse_key
 from jtqd.drivers.sensor import SensorProfile
 
 # The request
@@ -235,9 +235,6 @@ _LONGEST_HOLD_S = 60.0
 """After its report this process sends heartbeats for so long at most."""
 _POLL_S = 0.02
 """Between two looks at standard input."""
-SYNC_LISTEN_S = 0.12  # a little more than the longest period that jtqd itself may have
-_SILENCES = 2.6
-"""Of a node's longest silence: two repetitions of a request, and half of it again."""
 
 
 @dataclass(frozen=True)
@@ -461,7 +458,7 @@ def _configure(bus: BootBus, request: BootRequest, profile: Profile, *, ran: Col
         bus.command(nmt.ENTER_PRE_OPERATIONAL, node)
         procedure = NodeBoot(sdo, profile, request.settings)
         device_type = procedure.check_device_type()
-        sdo.wait_longer(_SILENCES * answer_s)
+        sdo.wait_longer(PATIENCE * answer_s)
         bus.forget(node)  # a boot-up message up to its first answer is its own start
         booted = procedure.run(device_type)
         if not (request.reset and node in bus.restarted and attempt < _ATTEMPTS):

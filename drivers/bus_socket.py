@@ -1,7 +1,7 @@
 """Sockets of a bus, opened with filters and time stamps: AF_CAN raw (`can0`) or a client of a unix bus (`unix:PATH`).
 
-What goes wrong is a BusError, in one of three classes that their user must treat differently. `jtqd.drivers.frame_socket`
-sends and receives on them.
+An error is a BusError, in one of three classes that need different reactions. `jtqd.drivers.frame_socket` sends and
+receives on these sockets.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SO_RXQ_OVFL = 40
 
 
 class BusError(Exception):
-    """The bus cannot be used; the message is one line that names the bus and says what to do."""
+    """The bus cannot be used; the message is one line with the name of the bus and what to do."""
 
 
 class BusDown(BusError):  # noqa: N818 - a state of the bus
@@ -67,8 +67,8 @@ def reachable(path: Path | str) -> Iterator[str]:
     /proc/self/fd/N/NAME.
 
     Raises:
-        OSError: a path is too long and its directory cannot be opened. A name that alone is too long stays as it is, and
-            `bind` says so.
+        OSError: a path is too long and its directory cannot be opened. A name that alone is too long stays as it is: `bind`
+            refuses it.
     """
     text = os.fspath(path)
     directory, name = os.path.split(text)
@@ -83,7 +83,7 @@ def reachable(path: Path | str) -> Iterator[str]:
 
 
 def require_directory(path: str) -> None:
-    """Raise BusError when a bus cannot be at `path` for want of the directory, and name that."""
+    """Raise BusError when there is no directory for a bus at `path`."""
     directory = os.path.dirname(path) or "."
     if not os.path.isdir(directory):
         what = "is not a directory" if os.path.lexists(directory) else "does not exist"
@@ -93,7 +93,7 @@ def require_directory(path: str) -> None:
 def open_unix(path: str, filters: Sequence[CanFilter], error_frames: bool) -> socket.socket:
     """Return a non-blocking socket connected to the hub at `path`; its filters are on before it connects.
 
-    Raises BusError: nobody there, no such directory, something else than a hub there, a hub that does not answer within 2 s.
+    Raises BusError: no hub, no such directory, another kind of socket, a hub that does not answer within 2 s.
     """
     bus = PREFIX + path
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)

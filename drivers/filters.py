@@ -128,7 +128,7 @@ def program(filters: Sequence[CanFilter], error_frames: bool) -> list[tuple[int,
 
 
 def attach(sock: socket.socket, filters: Sequence[CanFilter], error_frames: bool) -> None:
-    """Attach the program for `filters` to `sock`; it replaces the one before. Raises OSError."""
+    """Attach the program for `filters` to `sock` in place of the present one. Raises OSError."""
     code = program(filters, error_frames)
     memory = ctypes.create_string_buffer(b"".join(_INSTRUCTION.pack(*each) for each in code))
     # The kernel copies the program within setsockopt; `memory` outlives the call by being a local name.

@@ -1,7 +1,7 @@
-"""Frame socket: 16-byte CAN frames over AF_CAN raw (`can0`) or a unix bus (`unix:PATH`), alike to use.
+"""Frame socket: 16-byte CAN frames over AF_CAN raw (`can0`) or a unix bus (`unix:PATH`), with one interface for both.
 
-`open_frame_socket` opens either (bus_socket.py); what goes wrong is a BusError in one of three classes that their user must
-treat differently. `FrameReceiver` takes all frames that have arrived by one recvmmsg(2) into memory that is laid out once, for
+`open_frame_socket` opens either (bus_socket.py); an error is a BusError in one of three classes that need different
+reactions. `FrameReceiver` takes all frames that have arrived by one recvmmsg(2) into memory that is laid out once, for
 any socket; `FrameSocket` is one open bus. `take`, `put` and `ready` are `receive`, `send` and `wait` for compiled callers: no
 Python object is made but for an error.
 """
@@ -277,7 +277,7 @@ cdef class FrameSocket:
         cdef timespec left
         cdef int n, number
         cdef int64_t end_ns = 0
-        if self.fd < 0:  # closed: poll would never say so
+        if self.fd < 0:  # closed: poll would never report it
             return True
         waited.fd, waited.events = self.fd, POLLIN
         if timeout_ns <= 0:

@@ -1,7 +1,7 @@
 """Hub of a unix bus: `python -m jtqd.drivers.hub unix:PATH [--bitrate 1000000]`, or embedded beside local nodes.
 
-Who is connected and what each receives is compiled (`relay`); here are the socket's file and the command. With a bit rate,
-frames first cross a modelled wire (`WireModel`).
+`relay` (compiled) passes the frames on; here are the socket's file, the command, and the model of a wire that frames cross
+first when a bit rate is given.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class WireModel:
     """A classic CAN wire of `bitrate` bit/s. Times are integer nanoseconds on any one clock, and arguments.
 
     Each sender is a controller with a first-in first-out queue of `queue_limit` frames; the head of its queue takes part in
-    arbitration. A frame starts when the wire is free and somebody has one; whatever had been submitted by then arbitrates.
+    arbitration. A frame starts when the wire is free and a sender has one; all that is submitted by then arbitrates.
     Submissions may come late (a hub reads its sockets late, with the kernel's stamp of the send): only a frame already
     started by an earlier `advance` keeps the wire.
 
@@ -184,7 +184,7 @@ def _remove_dead(path: str, address: str) -> None:
             os.unlink(path)
             return
         except OSError:
-            pass  # a full backlog or another kind of socket: somebody lives there
+            pass  # a full backlog or another kind of socket: a process has it
     raise BusError(f"{PREFIX}{path}: another hub is running there")
 
 
@@ -205,7 +205,7 @@ class Hub(Relay):
         self._inode = os.stat(path).st_ino
 
     def close(self) -> None:
-        """Disconnect everybody and remove the socket file, unless it is another hub's by now."""
+        """Disconnect all members and remove the socket file, unless another hub has replaced it."""
         for client in list(self._clients.values()):
             self.remove(client)
         self._listener.close()

@@ -1,4 +1,4 @@
-"""Network management of CiA 301 (7.2.8): commands of the master, and the states that a heartbeat tells.
+"""Network management (CiA 301, 7.2.8): commands of the master, and the states in a heartbeat.
 
 >>> command(START, 2)[:4].hex(), STATES[PRE_OPERATIONAL]
 ('00000000', 'pre-operational')
@@ -20,7 +20,7 @@ STATES: Final = {
     OPERATIONAL: "operational",
     PRE_OPERATIONAL: "pre-operational",
 }
-"""What a heartbeat may say."""
+"""By the byte of a heartbeat."""
 
 START, STOP, ENTER_PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 0x01, 0x02, 0x80, 0x81, 0x82
 COMMANDS: Final = {

@@ -1,8 +1,9 @@
-"""Object dictionary of a node: values by (index, sub-index), typed and guarded by its EDS (CiA 301, CiA 306).
+"""Object dictionary of a node, typed and guarded by its EDS (CiA 301, CiA 306), its EDS, and its SDO server.
 
-`read` and `write` are those of a remote SDO client: access rights, lengths and limits hold, and a refusal
-is an `SdoAbort` with the code of CiA 301 table 22. `number`, `set_number`, `set_text` are the device's own
-access to the same values, without rights. Pure: no bus and no clock.
+`read` and `write` are those of a remote SDO client: access rights, lengths and limits hold, and a refusal is an `SdoAbort`
+with the code of CiA 301 table 22. `number`, `set_number`, `set_text` are the device's own access to the same values,
+without rights. `SdoServer` answers requests by expedited and segmented transfers (CiA 301, 7.2.4.3.3 to 7.2.4.3.8); it has
+no block transfer. No bus and no clock.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import os
 import stat
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,9 +38,9 @@ from jtqd.drivers.sdo import (
     label,
 )
 
-# Data types of CiA 301 7.4.7 that are numbers, with their struct letters. A BOOLEAN takes a byte in an SDO.
+# Data types (CiA 301, 7.4.7)
 BOOLEAN, REAL32, VISIBLE_STRING, REAL64 = 0x01, 0x08, 0x09, 0x11
-_LETTERS = {
+_INTEGERS = {
     BOOLEAN: "B",
     0x02: "b",
     0x03: "h",
@@ -50,10 +51,13 @@ _LETTERS = {
     0x15: "q",
     0x1B: "Q",
 }
-_FLOAT_LETTERS = {REAL32: "f", REAL64: "d"}
+"""Struct letters; a BOOLEAN takes a byte in an SDO."""
+_LAYOUTS = {
+    data_type: struct.Struct("<" + letter)
+    for data_type, letter in {**_INTEGERS, REAL32: "f", REAL64: "d"}.items()
+}
 _SIGNED = frozenset({0x02, 0x03, 0x04, 0x15})
 _FIRST_REAL_INDEX = 0x1000  # below: dummy entries of [DummyUsage], which are types and not objects
-
 _LARGEST_EDS = 16_000_000
 """Bytes; those of large drives have one million."""
 
@@ -90,7 +94,16 @@ class Entry:
     low: int | None
     high: int | None
     default: bytes
-    layout: struct.Struct | None = field(compare=False)
+
+    @property
+    def layout(self) -> struct.Struct | None:
+        """Of its bytes; None for strings and domains."""
+        return _LAYOUTS.get(self.data_type)
+
+    @property
+    def title(self) -> str:
+        """The object and its name, for messages."""
+        return f"{label(self.index, self.subindex)} {self.name}"
 
     @property
     def readable(self) -> bool:
@@ -105,7 +118,7 @@ class Entry:
     @property
     def is_integer(self) -> bool:
         """Whether it is a whole number of 8..64 bits, which a PDO may map."""
-        return self.data_type in _LETTERS and self.data_type != BOOLEAN
+        return self.data_type in _INTEGERS and self.data_type != BOOLEAN
 
     @property
     def signed(self) -> bool:
@@ -151,7 +164,7 @@ class ObjectStore:
         return self._value(entry)
 
     def write(self, index: int, subindex: int, data: bytes) -> None:
-        """Store an SDO download after rights, length, limits and hook. Raises SdoAbort, as the hook may."""
+        """Store an SDO download after rights, length, limits and hook, which may refuse it too. Raises SdoAbort."""
         entry = self.check_write(index, subindex, len(data))
         if entry.layout is not None and (entry.low is not None or entry.high is not None):
             (value,) = entry.layout.unpack(data)
@@ -165,7 +178,7 @@ class ObjectStore:
         self._values[index, subindex] = data
 
     def check_write(self, index: int, subindex: int, length: int | None) -> Entry:
-        """Refuse what can be refused before the data: absent, not writable, wrong length (None: not announced)."""
+        """Refuse a write before its data: absent, not writable, wrong length (None: not announced). Raises SdoAbort."""
         entry = self.entry(index, subindex)
         if not entry.writable:
             raise SdoAbort(WRITE_OF_READ_ONLY)
@@ -180,8 +193,8 @@ class ObjectStore:
     def number(self, index: int, subindex: int = 0) -> int:
         """Return an integer, regardless of rights; a read hook is called."""
         entry = self.entry(index, subindex)
-        if entry.data_type not in _LETTERS or entry.layout is None:
-            raise ValueError(f"{label(index, subindex)} is not an integer")
+        if entry.data_type not in _INTEGERS or entry.layout is None:
+            raise ValueError(f"{entry.title} is not an integer")
         (value,) = entry.layout.unpack(self._value(entry))
         return int(value)
 
@@ -189,19 +202,17 @@ class ObjectStore:
         """Set a number (integer or REAL32/64). No hook is called. Raises ValueError when it does not fit."""
         entry = self.entry(index, subindex)
         if entry.layout is None:
-            raise ValueError(f"{label(index, subindex)} is not a number")
+            raise ValueError(f"{entry.title} is not a number")
         try:
             self._values[index, subindex] = entry.layout.pack(value)
         except (struct.error, OverflowError) as error:
-            raise ValueError(
-                f"{label(index, subindex)} {entry.name}: {value!r} does not fit: {error}"
-            ) from error
+            raise ValueError(f"{entry.title}: {value!r} does not fit: {error}") from error
 
     def set_text(self, index: int, subindex: int, text: str) -> None:
         """Set a VISIBLE_STRING."""
         entry = self.entry(index, subindex)
         if entry.data_type != VISIBLE_STRING:
-            raise ValueError(f"{label(index, subindex)} {entry.name} is not a string")
+            raise ValueError(f"{entry.title} is not a string")
         self._values[index, subindex] = text.encode("ascii")
 
     def on_read(self, index: int, subindex: int, hook: ReadHook) -> None:
@@ -239,9 +250,7 @@ class ObjectStore:
         if isinstance(value, bytes):
             return value
         if entry.layout is None:
-            raise ValueError(
-                f"{label(entry.index, entry.subindex)} {entry.name}: hook returned a number for a string"
-            )
+            raise ValueError(f"{entry.title}: hook returned a number for a string")
         return entry.layout.pack(value)
 
 
@@ -253,7 +262,7 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     """Read the entries of an EDS file, with $NODEID filled in.
 
     The parser is canopen's. It is loaded here and not with this module: it takes 20 MB, and a process that is
-    handed its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError.
+    given its entries as JSON (`entries_to_json`, `entries_from_json`) does without. Raises EdsError.
     """
     from canopen.objectdictionary import eds as parser
 
@@ -261,7 +270,7 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     text = _eds_text(eds, name)
     logger = logging.getLogger(parser.__name__)
     level = logger.level
-    logger.setLevel(logging.CRITICAL)  # what matters of it is told in one line
+    logger.setLevel(logging.CRITICAL)  # an EdsError has the reason in one line
     try:
         return [_entry(variable) for variable in _variables(parser.import_eds(io.StringIO(text), node_id))]
     except Exception as error:  # the parser has no exception class of its own
@@ -295,27 +304,18 @@ def _eds_text(eds: Path | str, name: str) -> str:
         return data.decode("cp1252", "replace")
 
 
-_JSON_FIELDS = ("index", "subindex", "name", "data_type", "access", "mappable", "low", "high")
-
-
-def entries_to_json(entries: Iterable[Entry]) -> list[list[Any]]:
+def entries_to_json(entries: Iterable[Entry]) -> Any:
     """Return entries as plain data for JSON."""
-    return [[*(getattr(each, name) for name in _JSON_FIELDS), each.default.hex()] for each in entries]
+    import msgspec
+
+    return msgspec.to_builtins(list(entries))
 
 
-def entries_from_json(rows: Iterable[list[Any]]) -> list[Entry]:
-    """Return entries from plain data: the inverse of `entries_to_json`."""
-    result = []
-    for *values, default in rows:
-        fields = dict(zip(_JSON_FIELDS, values, strict=True))
-        layout = _layout(fields["data_type"])
-        result.append(Entry(**fields, default=bytes.fromhex(default), layout=layout))
-    return result
+def entries_from_json(rows: Any) -> list[Entry]:
+    """Return the entries of `entries_to_json`."""
+    import msgspec
 
-
-def _layout(data_type: int) -> struct.Struct | None:
-    letter = _LETTERS.get(data_type) or _FLOAT_LETTERS.get(data_type)
-    return struct.Struct("<" + letter) if letter else None
+    return msgspec.convert(rows, list[Entry])
 
 
 def _variables(dictionary: Any) -> list[Any]:
@@ -330,7 +330,6 @@ def _variables(dictionary: Any) -> list[Any]:
 
 def _entry(variable: Any) -> Entry:
     data_type = int(variable.data_type)
-    layout = _layout(data_type)
     name = variable.name if variable.subindex == 0 else f"{variable.parent.name}: {variable.name}"
     return Entry(
         index=variable.index,
@@ -341,8 +340,7 @@ def _entry(variable: Any) -> Entry:
         mappable=bool(variable.pdo_mappable),
         low=variable.min,
         high=variable.max,
-        default=_default_bytes(variable.default, layout),
-        layout=layout,
+        default=_default_bytes(variable.default, _LAYOUTS.get(data_type)),
     )
 
 
@@ -356,26 +354,30 @@ def _default_bytes(default: Any, layout: struct.Struct | None) -> bytes:
 
 # SDO server
 
-MAX_DOWNLOAD_BYTES = 4096  # bounds the memory a client that never ends its transfer can take
+MAX_DOWNLOAD_BYTES = 4096
+"""Bounds the memory that a client takes which never ends its transfer."""
 
 # Client command specifiers, bits 7..5 of byte 0
 _DOWNLOAD_SEGMENT, _DOWNLOAD_INITIATE, _UPLOAD_INITIATE, _UPLOAD_SEGMENT, _ABORT = range(5)
 
 
+@dataclass
 class _Transfer:
     """A segmented transfer under way; `size` is what was announced in a download, None when it was not."""
 
-    def __init__(
-        self, index: int, subindex: int, upload: bool, data: bytes = b"", size: int | None = None
-    ) -> None:
-        self.index, self.subindex, self.upload = index, subindex, upload
-        self.data = bytearray(data)
-        self.size = size
-        self.toggle = 0
+    index: int
+    subindex: int
+    upload: bool
+    data: bytearray
+    size: int | None = None
+    toggle: int = 0
 
 
 class SdoServer:
-    """SDO server of one `ObjectStore`. It never raises for what a client sends."""
+    """SDO server of one `ObjectStore`. It never raises for what a client sends.
+
+    It holds one transfer; a new initiate request ends the running one, as a client that lost its answer starts again.
+    """
 
     def __init__(self, store: ObjectStore) -> None:
         self.store = store
@@ -415,7 +417,7 @@ class SdoServer:
         data = self.store.read(index, subindex)
         if 1 <= len(data) <= 4:  # expedited; it has no code for an empty object
             return HEADER.pack(0x43 | (4 - len(data)) << 2, index, subindex) + data.ljust(4, b"\0")
-        self._transfer = _Transfer(index, subindex, upload=True, data=data)
+        self._transfer = _Transfer(index, subindex, True, bytearray(data))
         return INITIATE.pack(0x41, index, subindex, len(data))
 
     def _upload_segment(self, command: int) -> bytes:
@@ -440,7 +442,7 @@ class SdoServer:
             self.store.check_write(index, subindex, size)
             if size is not None and size > MAX_DOWNLOAD_BYTES:
                 raise SdoAbort(OUT_OF_MEMORY)
-            self._transfer = _Transfer(index, subindex, upload=False, size=size)
+            self._transfer = _Transfer(index, subindex, False, bytearray(), size)
         return INITIATE.pack(0x60, index, subindex, 0)
 
     def _own_length(self, index: int, subindex: int) -> int:

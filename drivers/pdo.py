@@ -25,6 +25,8 @@ LOWEST_PDO_ID, HIGHEST_PDO_ID = 0x181, 0x57F
 LAST_SYNC_TYPE = 240
 """Transmission types 1..240: every n-th SYNC."""
 SYNC_COB_ID = 0x080
+SYNC_LISTEN_S = 0.12
+"""Within this a SYNC arrives where there is a producer: a little more than the longest period of jtqd."""
 TPDO_COUNT = 4
 TPDO_BASES = (0x180, 0x280, 0x380, 0x480)
 """COB-IDs of a node's TPDOs 1 to 4 in the predefined connection set (CiA 301, 7.3.5), without the node-ID."""

@@ -1,4 +1,4 @@
-"""Members of a unix bus and what each of them receives; the socket's file and the command are hub.py's.
+"""Members of a unix bus and the frames that each receives; hub.py has the socket's file and the command.
 
 A client is an AF_UNIX SOCK_SEQPACKET connection; one message is one 16-byte `struct can_frame`. What a member sends, every
 other member receives; the sender too when it asks for the echo (bit 0 of byte 5). All members see the same order of frames.
@@ -69,7 +69,7 @@ cdef class HubCounters:
 
 
 cdef class Member:
-    """Who receives frames."""
+    """A receiver of frames."""
 
     cdef bint take(self, const Frame *frame, int64_t stamp_ns) except -1:
         """Take a frame; False when it is lost."""
@@ -133,7 +133,7 @@ cdef class Client(Member):
         if send(self.fd, &marked, sizeof(Frame), MSG_DONTWAIT | MSG_NOSIGNAL) < 0 and errno == EAGAIN:
             self.dropped += 1
             return False
-        return True  # where it has ended, the next read sees that and removes it
+        return True  # a client that has ended is removed by the next read
 
 
 cdef class Relay:

@@ -1,14 +1,15 @@
-"""SDO protocol, client side: abort codes, one transfer, its repetition, and a queue for a master in service. Pure.
+"""SDO protocol (CiA 301, 7.2.4.3), client side: abort codes, one transfer, its repetition, a queue, a blocking client.
 
-CiA 301, 7.2.4.3: a client asks on 600h+n, the server of node n answers on 580h+n, both with 8 bytes. From parts up:
+A client asks on 600h+n, the server of node n answers on 580h+n, both with 8 bytes.
 
-    Transfer    one upload or download, expedited or segmented: which request is next, and is this its answer
-    Exchange    a transfer with waiting times: asked again until it is answered, refused, or the time is over
-    SdoQueue    exchanges with one node, one after the other, without blocking
+    Transfer    one upload or download, expedited or segmented: the next request, and whether a frame is its answer
+    Exchange    a transfer with waiting times: repeated until it is answered, refused, or the time is over
+    SdoQueue    uploads from one node, one after the other, without blocking
+    SdoClient   uploads and downloads that block until they have ended
 
-Times are arguments, in seconds of one steady clock. An answer to another request is passed over and counted, never taken: a
-late one to a request that was given up, one with another index, a flood of them. Block transfer is not used: no object that
-is read here is long enough. `SdoClient` blocks until an exchange has ended.
+Times are arguments of all but SdoClient, in seconds of one monotonic clock. An answer to another request is ignored and
+counted: a late one to a request that was given up, one with another index, a flood of them. Block transfer is not used: no
+object that is read here is long enough.
 """
 
 from __future__ import annotations
@@ -18,7 +19,6 @@ import struct
 import time
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
@@ -28,7 +28,7 @@ Key = tuple[int, int]
 
 
 def label(index: int, subindex: int = 0) -> str:
-    """Return an object as people write it: "1018h:2"."""
+    """Return an object in the notation of CiA: "1018h:2"."""
     return f"{index:04X}h:{subindex}"
 
 
@@ -142,11 +142,11 @@ def abort_frame(index: int, subindex: int, code: int) -> bytes:
 
 
 MAX_BYTES = 65536
-"""An upload that announces or sends more is given up: nothing that is read here is so long."""
+"""An upload that announces or sends more is given up: no object that is read here is so long."""
 
 
 class TransferError(Exception):
-    """The transfer cannot go on, but may be begun again; `code` is the abort code for the server."""
+    """The transfer cannot go on, but may be repeated; `code` is the abort code for the server."""
 
     def __init__(self, code: int) -> None:
         super().__init__(describe_abort(code))
@@ -201,7 +201,7 @@ class Transfer:
         return self._downloaded(specifier, reply, self._data)
 
     def abort(self, code: int) -> bytes:
-        """Return the frame that tells the server that its client gives up."""
+        """Return the frame by which the client gives up."""
         return abort_frame(self.index, self.subindex, code)
 
     def _uploaded(self, specifier: int, reply: bytes) -> bool:
@@ -263,6 +263,8 @@ class Transfer:
 
 ANSWER_S = 0.6
 """Most devices answer within milliseconds, some in 500; a longer silence is a lost frame, so the request is repeated."""
+PATIENCE = 2.6
+"""Longest wait for an answer, in silences: two repetitions of a request, and half of it again."""
 _LONGEST = 10.0
 """A transfer of many segments may take so many times the waiting time of one answer."""
 
@@ -275,7 +277,7 @@ class Exchange:
 
     Args:
         index, subindex, data: of the transfer.
-        now: time of its begin.
+        now: time of its start.
         timeout_s: for an answer, and for all repetitions of the first request together.
         answer_s: silence after which the first request is repeated.
 
@@ -284,7 +286,7 @@ class Exchange:
         refusal: the server's abort code; None: none.
         timed_out: no answer came in time.
         ignored: answers to other requests that came meanwhile.
-        repeats: how often it was begun again.
+        repeats: of the first request.
     """
 
     def __init__(
@@ -358,31 +360,14 @@ class Exchange:
         return [self._transfer.request]
 
 
-@dataclass(frozen=True)
-class SdoResult:
-    """How a request ended: one of `value` (b"" for a write), `refusal` (abort code), or neither when it timed out."""
-
-    index: int
-    subindex: int
-    value: bytes | None
-    refusal: int | None
-
-
-@dataclass(frozen=True)
-class _Request:
-    index: int
-    subindex: int
-    data: bytes | None
-    timeout_s: float
-    done: Callable[[SdoResult], None]
+Done = Callable[[bytes | None, int | None], None]
+"""Takes the value of an upload, or the abort code of a refusal; both None: no answer."""
 
 
 class SdoQueue:
-    """Requests to one node, one after the other, for a master in service that must not wait.
+    """Uploads from one node, one after the other, for a master in service that must not wait.
 
     A node has one default SDO server, which holds one transfer: requests to it queue, those to different nodes need not.
-    The queue is bounded, each request has its own timeout, and its result is given to the function it was submitted with.
-    Frames are the 8 bytes of 600h+n and 580h+n.
 
     Args:
         limit: requests that may wait.
@@ -394,89 +379,63 @@ class SdoQueue:
     """
 
     def __init__(self, limit: int = 32, answer_s: float = ANSWER_S) -> None:
-        self._waiting: deque[_Request] = deque()
-        self._answer_s = answer_s
-        self._limit = limit
-        self._exchange: Exchange | None = None
-        self._done: Callable[[SdoResult], None] = lambda _result: None
+        self._waiting: deque[tuple[Key, float, Done]] = deque()
+        self._answer_s, self._limit = answer_s, limit
+        self._running: tuple[Exchange, Done] | None = None
         self.ignored = self.repeats = self.timeouts = self.refusals = 0
 
     @property
     def busy(self) -> bool:
         """Whether a request is under way or waits."""
-        return self._exchange is not None or bool(self._waiting)
+        return self._running is not None or bool(self._waiting)
 
-    def read(
-        self, index: int, subindex: int, done: Callable[[SdoResult], None], timeout_s: float = 0.5
-    ) -> bool:
+    def read(self, key: Key, done: Done, timeout_s: float = 0.5) -> bool:
         """Queue an upload; return False when the queue is full."""
-        return self._submit(_Request(index, subindex, None, timeout_s, done))
-
-    def write(
-        self,
-        index: int,
-        subindex: int,
-        data: bytes,
-        done: Callable[[SdoResult], None],
-        timeout_s: float = 0.5,
-    ) -> bool:
-        """Queue a download; return False when the queue is full."""
-        return self._submit(_Request(index, subindex, data, timeout_s, done))
+        if len(self._waiting) >= self._limit:
+            return False
+        self._waiting.append((key, timeout_s, done))
+        return True
 
     def clear(self) -> None:
-        """Forget every request, without a result: another client (the boot) has the node now."""
+        """Discard every request, without a result: another client (the boot) uses the node's server."""
         self._waiting.clear()
-        self._exchange = None
+        self._running = None
 
     def on_reply(self, reply: bytes, now: float) -> list[bytes]:
         """Take a frame of the node; return what to send."""
-        if self._exchange is None:
+        if self._running is None:
             self.ignored += 1
             return []
-        return self._finish(self._exchange.on_reply(reply, now), now)
+        return self._finish(self._running[0].on_reply(reply, now), now)
 
     def tick(self, now: float) -> list[bytes]:
-        """Let time pass; return what to send. To be called often."""
-        if self._exchange is None:
+        """Let time pass; return what to send. Call it often."""
+        if self._running is None:
             return self._begin_next(now)
-        return self._finish(self._exchange.tick(now), now)
-
-    def _submit(self, request: _Request) -> bool:
-        if len(self._waiting) >= self._limit:
-            return False
-        self._waiting.append(request)
-        return True
+        return self._finish(self._running[0].tick(now), now)
 
     def _finish(self, frames: list[bytes], now: float) -> list[bytes]:
         """Hand out the result of an exchange that has ended, and begin the next one."""
-        exchange = self._exchange
-        if exchange is None or not exchange.ended:
+        if self._running is None or not self._running[0].ended:
             return frames
-        self._exchange = None
+        (exchange, done), self._running = self._running, None
         self.ignored += exchange.ignored
         self.repeats += exchange.repeats
         self.timeouts += exchange.timed_out
         self.refusals += exchange.refusal is not None
-        self._done(SdoResult(exchange.index, exchange.subindex, exchange.value, exchange.refusal))
+        done(exchange.value, exchange.refusal)
         return frames + self._begin_next(now)
 
     def _begin_next(self, now: float) -> list[bytes]:
-        if not self._waiting or self._exchange is not None:
+        if not self._waiting or self._running is not None:
             return []
-        request = self._waiting.popleft()
-        self._done = request.done
-        self._exchange = Exchange(
-            request.index,
-            request.subindex,
-            request.data,
-            now=now,
-            timeout_s=request.timeout_s,
-            answer_s=self._answer_s,
-        )
-        return self._exchange.begin()
+        key, timeout_s, done = self._waiting.popleft()
+        exchange = Exchange(*key, None, now=now, timeout_s=timeout_s, answer_s=self._answer_s)
+        self._running = exchange, done
+        return exchange.begin()
 
 
-# Client that waits
+# Blocking client
 
 
 class Socket(Protocol):
@@ -494,7 +453,7 @@ class Socket(Protocol):
         """Take what has arrived."""
 
 
-class SdoTimeout(Exception):  # noqa: N818  (the node's fault, not one of this side)
+class SdoTimeout(Exception):  # noqa: N818  (a state of the node)
     """No answer within the waiting time."""
 
     def __init__(self, waited_s: float) -> None:

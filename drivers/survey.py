@@ -1,4 +1,4 @@
-"""What a device tells of itself, read by SDO or from its EDS: identity, scaling, the objects that jtqd maps.
+"""Survey of a device by SDO or by its EDS: identity, scaling, the objects that jtqd maps, its TPDOs.
 
 Reading changes nothing in a device and starts nothing. Objects: CiA 301 (1000h, 1008h to 100Ah, 1018h), CiA 402-2
 (6075h, 6076h, 6077h, 608Fh, 6090h, 6091h, 60E6h, 60EBh, units by 6092h, 60A8h and 60A9h where there are such, and what the
@@ -18,9 +18,10 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
-from jtqd.drivers.pdo import SYNC_COB_ID, TPDO_COUNT, Tpdo, read_tpdos, tpdo_parameters
+from jtqd.drivers.pdo import SYNC_COB_ID, SYNC_LISTEN_S, TPDO_COUNT, Tpdo, read_tpdos, tpdo_parameters
 from jtqd.drivers.sdo import (
     ANSWER_S,
+    PATIENCE,
     REQUEST_ID,
     RESPONSE_ID,
     Key,
@@ -52,14 +53,10 @@ _READ: Mapping[int, tuple[Key, ...]] = {
     SENSOR: ((UNIT_OBJECT, 1), (DECIMALS_OBJECT, 1), *MAPPED[SENSOR]),
 }
 UNITS: tuple[Key, ...] = tuple(key for key in OTHER_SCALING_OBJECTS if key not in _READ[DRIVE])
-"""Objects that tell in which units a drive counts, where it has such; none of them is missed."""
+"""Objects with the units in which a drive counts; a drive need not have them."""
 _NODES = range(1, 128)
-_LISTEN_S = 0.12
-"""A SYNC comes within this, where there is one."""
 _PRESENT_S = 1.0
-"""For the first sign of a node that nobody has named."""
-_SILENCES = 2.6
-"""Of `ANSWER_S`: two repetitions of a request, and half of it again; as at the boot."""
+"""For the first answer of a node."""
 
 
 class SurveyError(ValueError):
@@ -72,11 +69,11 @@ class Survey:
 
     Attributes:
         source: where the values are from: "the bus", or "defaults of NAME.eds".
-        profile: 402, 404 or another device profile; 0 where it names none.
+        profile: 402, 404 or another device profile; 0: none.
         texts: 1008h to 100Ah by the names of TEXTS, where it has them.
         numbers: objects that it has, with their values (of an EDS: the defaults).
         missing: objects of its profile that it does not have.
-        unmappable: objects that its EDS says cannot be mapped; empty when read on a bus, which does not tell.
+        unmappable: objects that cannot be mapped by its EDS; empty when read on a bus, where this is not known.
         defaults: the numbers are defaults; the device itself may have others.
         tpdos: as they are configured, where they were read.
     """
@@ -102,8 +99,8 @@ class Survey:
         value = self.numbers.get(key)
         return value if value is not None and value >= 1 else None
 
-    def tells(self, key: Key) -> bool:
-        """Whether the device itself will scale with it: it has a value, or it is only known by an EDS and has the object."""
+    def scales_by(self, key: Key) -> bool:
+        """Whether the device has the scaling object: with a value, or in its EDS, of which the value does not count."""
         return self.number(key) is not None or (self.defaults and key in self.numbers)
 
 
@@ -210,7 +207,7 @@ class BusSurvey:
     def __init__(self, bus: str) -> None:
         identifiers = [SYNC_COB_ID, *(RESPONSE_ID + node for node in _NODES)]
         self._socket: FrameSocket = open_frame_socket(bus, [exact(each) for each in identifiers])
-        end = time.monotonic() + _LISTEN_S
+        end = time.monotonic() + SYNC_LISTEN_S
         while (left := end - time.monotonic()) > 0.0:
             if SYNC_COB_ID in self._received(left):
                 self._socket.close()
@@ -240,17 +237,17 @@ class BusSurvey:
         """Survey one node; None when it does not answer. Raises SurveyError."""
         try:
             with _of(node):
-                return survey(self.access(node), node)
+                return survey(self._access(node), node)
         except SdoTimeout:
             return None
 
-    def access(self, node: int) -> SdoClient:
+    def _access(self, node: int) -> SdoClient:
         """Return the SDO client of one node, which repeats a request as the boot does."""
-        return SdoClient(self._socket, node, _SILENCES * ANSWER_S)
+        return SdoClient(self._socket, node, PATIENCE * ANSWER_S)
 
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
         """Read further numbers of one node; those that it does not have are left out. Raises SurveyError."""
-        access = self.access(node)
+        access = self._access(node)
         with _of(node):
             found = {key: _number(access, key) for key in keys}
         return {key: number for key, number in found.items() if number is not None}
@@ -258,7 +255,7 @@ class BusSurvey:
     def tpdos(self, node: int) -> tuple[Tpdo, ...]:
         """Read the TPDOs of one node. Raises SurveyError."""
         with _of(node):
-            return tpdos(self.access(node))
+            return tpdos(self._access(node))
 
     def _answers(self, timeout_s: float) -> set[int]:
         return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}
@@ -280,5 +277,5 @@ def _of(node: int) -> Iterator[None]:
 
 
 def _text(raw: bytes) -> str:
-    """Return a VISIBLE_STRING without what a terminal would obey."""
+    """Return a VISIBLE_STRING without control characters."""
     return "".join(each for each in raw.decode("ascii", "replace") if each.isprintable()).strip()

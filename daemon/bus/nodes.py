@@ -17,7 +17,7 @@ from jtqd.daemon.shared.log_lines import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.boot_node import VERIFY_CONFIGURATION, signature
 from jtqd.drivers.nmt import STATES
-from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue, SdoResult
+from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoQueue
 
 NOT_WATCHED, WAITING, ACTIVE, LOST = 0, 1, 2, 3
 """States of a watch, as in CANopenNode: unconfigured, unknown, active, timeout."""
@@ -423,7 +423,7 @@ class NodeCare:
             for node in returning.waiting(view, now_s):
                 queue = self._queues.get(node)
                 if queue is not None and not queue.busy and not self._others_talk_to(node, now_s):
-                    queue.read(0x1000, 0, _nothing, _SDO_TIMEOUT_S)  # a later answer shows it, too
+                    queue.read((0x1000, 0), _ignore, _SDO_TIMEOUT_S)  # a later answer shows it, too
         if now_s >= self._check_due:
             self._check_due = now_s + _CHECK_S
             self._check_one(view, now_s)
@@ -452,14 +452,15 @@ class NodeCare:
         self._check_turn += 1
         node = nodes[self._check_turn % len(nodes)]
         check, watch = self._checks[node].next(), self._checks[node]
-        self._queues[node].read(
-            check.index, check.subindex, partial(self._on_check, node, watch), self._timeouts_s[node]
-        )
+        done = partial(self._on_check, node, watch)
+        self._queues[node].read((check.index, check.subindex), done, self._timeouts_s[node])
 
-    def _on_check(self, node: int, watch: ConfigurationWatch, result: SdoResult) -> None:
+    def _on_check(
+        self, node: int, watch: ConfigurationWatch, value: bytes | None, refusal: int | None
+    ) -> None:
         if self._checks.get(node) is not watch:
             return
-        finding = watch.result(result.value, result.refusal)
+        finding = watch.result(value, refusal)
         if finding is None:
             return
         if not finding.changed:
@@ -471,5 +472,5 @@ class NodeCare:
         self._returning.request(node, finding.text)
 
 
-def _nothing(_result: SdoResult) -> None:
-    """Of a question whose answer matters only by coming."""
+def _ignore(_value: bytes | None, _refusal: int | None) -> None:
+    """Take the result of a request of which only the answer as such matters."""

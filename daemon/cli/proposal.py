@@ -356,7 +356,7 @@ def _encoders(
 
     def give(keys: tuple[Key, Key], counts: int | None, option: str) -> None:
         if counts is None:
-            if not all(survey.tells(key) for key in keys):
+            if not all(survey.scales_by(key) for key in keys):
                 raise MissingValueError(f"node {node}: {label(*keys[0])} is not known: give {option}")
         elif [survey.number(key) for key in keys] != [counts, 1]:
             given[keys[0]] = Value(counts, option)
@@ -364,7 +364,7 @@ def _encoders(
 
     if "motor_position" in by_standard:
         give(POSITION, wanted.encoder_counts, "--encoder-counts")
-    if "motor_velocity" in by_standard and not all(survey.tells(key) for key in VELOCITY):
+    if "motor_velocity" in by_standard and not all(survey.scales_by(key) for key in VELOCITY):
         for ours, of_position in zip(VELOCITY, POSITION, strict=True):
             number = given[of_position].number if of_position in given else survey.number(of_position)
             verify = "turn the motor at a known speed and compare jtq status; 606Ch may be in rpm"

@@ -20,7 +20,6 @@ from jtqd.drivers.sdo import (
     SdoAbort,
     SdoClient,
     SdoQueue,
-    SdoResult,
     SdoTimeout,
     Transfer,
     TransferError,
@@ -237,64 +236,65 @@ def test_silence_is_asked_again_and_then_given_up():
 # The queue --------------------------------------------------------------------------------------------------
 
 
+def results_of(queue, *requests):
+    """Queue uploads; return the list that takes their (value, refusal)."""
+    results = []
+    for key, timeout_s in requests:
+        assert queue.read(key, lambda value, refusal: results.append((value, refusal)), timeout_s)
+    return results
+
+
 def test_requests_to_one_node_go_one_after_the_other_and_each_gets_its_own_answer():
-    queue, results = SdoQueue(), []
-    for subindex in (1, 2):
-        assert queue.read(0x1018, subindex, results.append)
+    queue = SdoQueue()
+    results = results_of(queue, ((0x1018, 1), 0.5), ((0x1018, 2), 0.5))
     assert queue.tick(0.0) == [frame("40 18 10 01 00 00 00 00")]
     assert queue.tick(0.01) == [], "the second waits"
     assert queue.on_reply(frame("43 18 10 02 02 04 00 00"), 0.02) == [], "an answer to what was not asked yet"
     assert queue.on_reply(frame("43 18 10 01 a1 07 00 00"), 0.03) == [frame("40 18 10 02 00 00 00 00")]
     queue.on_reply(frame("43 18 10 02 02 04 00 00"), 0.04)
-    assert results == [
-        SdoResult(0x1018, 1, frame("a1 07 00 00"), None),
-        SdoResult(0x1018, 2, frame("02 04 00 00"), None),
-    ]
+    assert results == [(frame("a1 07 00 00"), None), (frame("02 04 00 00"), None)]
     assert (queue.ignored, queue.busy) == (1, False)
 
 
 def test_a_request_that_is_never_answered_keeps_the_next_one_waiting_and_no_longer():
-    queue, results = SdoQueue(answer_s=0.1), []
-    queue.read(0x1000, 0, results.append, timeout_s=0.2)
-    queue.write(0x1017, 0, frame("64 00"), results.append)
+    queue = SdoQueue(answer_s=0.1)
+    results = results_of(queue, ((0x1000, 0), 0.2), ((0x1017, 0), 0.5))
     sent = [each for step in range(60) for each in queue.tick(0.01 * step)]
     assert sent[0] == sent[1] == frame("40 00 10 00 00 00 00 00")
-    assert results[0] == SdoResult(0x1000, 0, None, None)
+    assert results == [(None, None)]
     late = queue.on_reply(frame("43 00 10 00 92 01 02 00"), 0.31)  # of the one that was given up
     assert late == []
-    queue.on_reply(frame("60 17 10 00 00 00 00 00"), 0.32)
-    assert results[1] == SdoResult(0x1017, 0, b"", None)
+    queue.on_reply(frame("4b 17 10 00 64 00 00 00"), 0.32)
+    assert results[1] == (frame("64 00"), None)
     assert (queue.timeouts, queue.ignored, queue.repeats >= 1) == (1, 1, True)
 
 
 def test_a_flood_of_answers_fills_nothing_and_the_right_one_is_found():
-    queue, results = SdoQueue(), []
-    queue.read(0x1000, 0, results.append)
+    queue = SdoQueue()
+    results = results_of(queue, ((0x1000, 0), 0.5))
     queue.tick(0.0)
     for _ in range(10_000):
         assert queue.on_reply(frame("43 18 10 01 a1 07 00 00"), 0.01) == []
     queue.on_reply(frame("43 00 10 00 92 01 02 00"), 0.02)
-    assert results == [SdoResult(0x1000, 0, frame("92 01 02 00"), None)]
+    assert results == [(frame("92 01 02 00"), None)]
     assert queue.ignored == 10_000
 
 
 def test_the_queue_is_bounded_and_can_be_cleared():
     queue = SdoQueue(limit=4)
-    taken = [queue.read(0x1000, 0, lambda _result: None) for _ in range(6)]
+    taken = [queue.read((0x1000, 0), lambda _value, _refusal: None) for _ in range(6)]
     assert taken == [True] * 4 + [False] * 2
     queue.clear()
     assert not queue.busy
     assert queue.tick(0.0) == []
 
 
-def test_a_refused_write_is_reported():
-    queue, results = SdoQueue(), []
-    queue.write(0x1000, 0, bytes(4), results.append)
+def test_a_refusal_is_reported():
+    queue = SdoQueue()
+    results = results_of(queue, ((0x5000, 0), 0.5))
     (request,) = queue.tick(0.0)
-    reply = SdoServer(drive_store(1)).handle(request)
-    assert reply == frame("80 00 10 00 02 00 01 06")  # 06010002h: read only
-    queue.on_reply(reply, 0.01)
-    assert results[0].refusal == 0x0601_0002
+    queue.on_reply(SdoServer(drive_store(1)).handle(request), 0.01)
+    assert results == [(None, 0x0602_0000)]
     assert queue.refusals == 1
 
 

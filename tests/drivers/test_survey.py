@@ -42,7 +42,7 @@ def test_what_is_missing_or_zero_is_told_apart_from_a_value():
     found = survey(store, 5)
     assert found.missing == {(0x60E4, 1), (0x6090, 1), (0x6090, 2)}
     assert found.number((0x6091, 1)) is None
-    assert not found.tells((0x6091, 1))
+    assert not found.scales_by((0x6091, 1))
     assert found.title == "drive"
 
 
@@ -122,7 +122,7 @@ def test_an_eds_tells_defaults_and_what_can_be_mapped(tmp_path):
     assert found.numbers[0x1018, 1] == 0x7A1
     zero = replace(found, numbers={**found.numbers, (0x608F, 1): 0})
     assert zero.number((0x608F, 1)) is None
-    assert zero.tells((0x608F, 1)), "the device itself will"
+    assert zero.scales_by((0x608F, 1)), "the device itself will"
 
 
 def test_no_eds(tmp_path):
