@@ -33,10 +33,10 @@ from jtqd.estimator.uncertainty cimport (
     at_rest,
     fill_fusion,
     fuse_paths,
-    keep,
-    share_by_speed,
-    sharpen,
-    widening,
+    fading,
+    network_share,
+    reweigh,
+    disagreement,
 )
 from jtqd.estimator.losses cimport (
     AdditiveLaw,
@@ -460,14 +460,14 @@ cdef class FusedEstimator(Estimator):
             s.temperature = x.temperature_c
             s.thermal = thermal_friction(&law.loss, x.temperature_c)
         loss = additive_loss(&law.loss, raw, v, s.thermal, seen.direction)
-        s.half = keep(loss.half, s.half, x.dt_s)
+        s.half = fading(loss.half, s.half, x.dt_s)
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
         lowered = self.foreign(&physics, x.dt_s)
         if law.zeros.watched:
             self.learn(seen, x, &physics, loss.nm, out.status)
         if law.zeros.spread > 0.0:
             known = known_nm2(&law.zeros, &s.zeros)
-            sharpen(&physics, known)
+            reweigh(&physics, known)
             physics.sigma *= early_factor(&law.zeros, known)
         out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
         scale = law.physics_scale[quadrant]
@@ -487,7 +487,7 @@ cdef class FusedEstimator(Estimator):
                     weight = fused_trust(&law.trust, v, raw, apart, x.temperature_c)
                     if size > law.fade:
                         weight = fmin(weight, (law.network_limit - size) * law.inverse_fade)
-                    out.torque_nm += weight * share_by_speed(v) * correction
+                    out.torque_nm += weight * network_share(v) * correction
                     scale += weight * (law.network_scale[quadrant] - scale)
             if weight < 1.0:
                 lowered = True
@@ -497,7 +497,7 @@ cdef class FusedEstimator(Estimator):
                 lowered = True
         out.sigma_nm = scale * physics.sigma
         # a zero that is not taken off counts once: as doubt, where the file has what is usual
-        wider = widening(&physics, 0.0 if law.agreement.used else s.zeros.left_nm)
+        wider = disagreement(&physics, 0.0 if law.agreement.used else s.zeros.left_nm)
         if wider > 0.0:
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
         if law.agreement.used:

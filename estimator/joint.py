@@ -372,42 +372,28 @@ _MOST: Final = 1e6
 """Limits of steps and distance, far beyond any joint: their reciprocals stay numbers."""
 
 
-def finite(value: object) -> bool:
-    """Return whether a value from JSON is a finite number; a bool is none."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _checked_map(known: Any) -> tuple[tuple[int, ...], ...]:
-    """Return the map; ValueError unless it is a table with a middle cell, of 0 and 1."""
-    if not (isinstance(known, list) and known and all(isinstance(row, list) for row in known)):
-        raise ValueError(f"known: found {str(known)[:40]}, expected a list of rows")
-    widths = {len(row) for row in known}
-    if len(widths) != 1 or len(known) % 2 == 0 or min(widths) % 2 == 0:
-        found = f"{len(known)} rows of {', '.join(map(str, sorted(widths)))} cells"
-        raise ValueError(f"known: found {found}, expected odd numbers of rows and of cells in each row")
-    if not all(finite(cell) and cell in (0, 1) for row in known for cell in row):
-        raise ValueError("known: found other cells, expected 0 and 1")
-    return tuple(tuple(int(cell) for cell in row) for row in known)
-
-
-def _checked_range(value: Any) -> tuple[float, float] | None:
-    """Return the range of temperatures; ValueError unless it is None or two numbers that do not fall."""
-    if value is None:
-        return None
-    if isinstance(value, list) and len(value) == 2 and all(map(finite, value)) and value[0] <= value[1]:
-        return float(value[0]), float(value[1])
-    raise ValueError(f"temperature_c: found {str(value)[:40]}, expected null or [lowest, highest]")
-
-
-def _rows(value: Any) -> tuple[tuple[int, ...], ...]:
-    """Return the map of a joint file, in which a row is a text such as "0110"."""
-    if not (isinstance(value, list) and all(isinstance(row, str) and row.strip("01") == "" for row in value)):
-        raise ValueError("found no texts of 0 and 1")
-    known = _checked_map([[int(cell) for cell in row] for row in value])
-    if max(len(known), len(known[0])) > MAX_CELLS:
-        found = Verbatim(f"{len(known)} rows of {len(known[0])} cells")
+def _map(rows: Any) -> tuple[tuple[int, ...], ...]:
+    """Return the map of rows of 0 and 1: texts such as "0110" in joint files, lists in networks. Raises ValueError."""
+    if not (isinstance(rows, list) and all(isinstance(row, str | list) for row in rows)):
+        raise ValueError("found no rows")
+    if len({len(row) for row in rows}) != 1 or not len(rows) % 2 == len(rows[0]) % 2 == 1:
+        raise ValueError("found no middle cell")
+    if not all(type(cell) in (int, str) and str(cell) in ("0", "1") for row in rows for cell in row):
+        raise ValueError("found other cells")
+    if max(len(rows), len(rows[0])) > MAX_CELLS:
+        found = Verbatim(f"{len(rows)} rows of {len(rows[0])} cells")
         raise FieldError("envelope", "", found, f"at most {MAX_CELLS} of either")
-    return known
+    return tuple(tuple(map(int, row)) for row in rows)
+
+
+def _range(value: Any) -> tuple[float, float]:
+    """Return the lowest and highest of a range. Raises ValueError."""
+    if not isinstance(value, list):
+        raise ValueError("found no list")
+    low, high = (float(each) for each in value if type(each) in (int, float))
+    if not -math.inf < low <= high < math.inf:
+        raise ValueError("found no range")
+    return low, high
 
 
 _Torque = Annotated[float, limits("Nm", ge=_LEAST, le=_MOST)]
@@ -426,46 +412,15 @@ class Envelope:
     torque_step_nm: _Torque
     known: Annotated[
         tuple[tuple[int, ...], ...],
-        parsed(_rows, 'odd numbers of rows and of cells in each, rows as texts such as "0110"'),
+        parsed(_map, 'odd numbers of rows and of cells in each, rows as texts such as "0110"'),
     ]
     distance_nm: _Torque
-    temperature_c: (
-        Annotated[tuple[float, float], parsed(_checked_range, "[lowest, highest] in degC, or none")] | None
-    )
+    temperature_c: Annotated[tuple[float, float], parsed(_range, "[lowest, highest] in degC, or none")] | None
     load_nm: _Torque | None = None
 
-    @classmethod
-    def from_mapping(cls, mapping: Any) -> Envelope:
-        """Build from the network's metadata; raises ValueError with what was found and expected."""
-        keys = ("velocity_step_rad_s", "torque_step_nm", "known", "distance_nm", "temperature_c")
-        if not isinstance(mapping, dict) or set(mapping) != set(keys):
-            raise ValueError(f"found {str(mapping)[:80]}, expected the keys {', '.join(keys)}")
-        for key in ("velocity_step_rad_s", "torque_step_nm", "distance_nm"):
-            if not finite(mapping[key]) or not _LEAST <= mapping[key] <= _MOST:
-                raise ValueError(f"{key}: found {mapping[key]!r}, expected {_LEAST:g} to {_MOST:g}")
-        return cls(
-            float(mapping["velocity_step_rad_s"]),
-            float(mapping["torque_step_nm"]),
-            _checked_map(mapping["known"]),
-            float(mapping["distance_nm"]),
-            _checked_range(mapping["temperature_c"]),
-        )
-
-    def as_section(self) -> dict[str, Any]:
-        """Return `fused.envelope` of a joint file."""
-        rows = ["".join(map(str, row)) for row in self.known]
-        values = self.to_mapping() | {"known": rows, "load_nm": self.load_nm}
-        return {key: value for key, value in values.items() if value is not None}
-
     def to_mapping(self) -> dict[str, Any]:
-        """Return plain values for a network's JSON, which knows no load."""
-        return {
-            "velocity_step_rad_s": self.velocity_step_rad_s,
-            "torque_step_nm": self.torque_step_nm,
-            "known": [list(row) for row in self.known],
-            "distance_nm": self.distance_nm,
-            "temperature_c": None if self.temperature_c is None else list(self.temperature_c),
-        }
+        """Return plain values for the metadata of a network, which has no load."""
+        return {each.name: getattr(self, each.name) for each in fields(self) if each.name != "load_nm"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -594,20 +549,16 @@ class Joint:
 
 
 def _plain(value: Any) -> Any:
-    if isinstance(value, Envelope):
-        return value.as_section()
+    """Return the plain form of a section; what is None, and what a torsion may leave out, is not written."""
     if is_dataclass(value):
-        items = ((each.name, getattr(value, each.name)) for each in fields(value))
-        # what a torsion may leave out is not written
-        return {
-            name: _plain(item)
-            for name, item in items
-            if item is not None
-            and not (
-                isinstance(value, Torsion)
-                and (item == () or (name == "zero_limit_rad" and item == ZERO_LIMIT_RAD))
-            )
-        }
+        items = {each.name: getattr(value, each.name) for each in fields(value)}
+        if isinstance(value, Envelope):
+            items["known"] = tuple("".join(map(str, row)) for row in value.known)
+        if isinstance(value, Torsion):
+            items = {name: None if item == () else item for name, item in items.items()}
+            if value.zero_limit_rad == ZERO_LIMIT_RAD:
+                del items["zero_limit_rad"]
+        return {name: _plain(item) for name, item in items.items() if item is not None}
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     return dict(value) if isinstance(value, Mapping) else value

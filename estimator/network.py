@@ -18,8 +18,16 @@ from typing import ClassVar, Final
 import numpy as np
 
 from jtqd.estimator.checked import ConfigError
-from jtqd.estimator.joint import Envelope, Joint, finite
-from jtqd.estimator.onnx_graph import GraphFile, NativeGraph, NetworkError, OnnxGraph, RuntimeCheck
+from jtqd.estimator.decoder import FieldError, read
+from jtqd.estimator.joint import Envelope, Joint
+from jtqd.estimator.onnx_graph import (
+    GraphFile,
+    NativeGraph,
+    NetworkError,
+    OnnxGraph,
+    RuntimeCheck,
+    finite,
+)
 from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 
@@ -132,9 +140,11 @@ class FusedNetwork(Network):
         super().__init__(source, sha256, check)
         graph = self._graph
         try:
-            self.envelope: Final = Envelope.from_mapping(graph.metadata["envelope"])
-        except ValueError as error:
-            raise graph.error(f"metadata 'envelope': {error}") from None
+            self.envelope: Final = read(Envelope, graph.metadata["envelope"])
+        except FieldError as error:
+            raise graph.error(
+                f"metadata 'envelope': {f'{error.key}: ' if error.key else ''}{error.problem}"
+            ) from None
         a, b, c, d = graph.numbers("sigma_scale", 4)
         if min(a, b, c, d) <= 0.0:
             raise graph.error(f"metadata 'sigma_scale': found {[a, b, c, d]}, expected numbers > 0")

@@ -30,7 +30,6 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import finite
 from jtqd.estimator.perceptron import Perceptron
 from jtqd.estimator.sha256 import sha256_hex
 
@@ -46,6 +45,11 @@ _PROBES: Final = 256
 """Inputs at which native evaluation is compared: in the range of the training data, and a quarter of it beyond."""
 _SAME: Final = 1e-9
 """Relative and absolute difference [Nm] up to which weights read from a graph are those that it evaluates."""
+
+
+def finite(value: object) -> bool:
+    """Return whether a value from JSON is a finite number; a bool is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 class NetworkError(ValueError):

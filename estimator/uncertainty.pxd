@@ -40,16 +40,6 @@ cdef double fused_trust(
     const FusedTrustLaw *law, double velocity, double raw, double distance, double temperature
 ) noexcept nogil
 
-cdef class Uncertainty:
-    cdef UncertaintyLaw law
-    cdef EfficiencyLaw losses
-
-cdef class Trust:
-    cdef TrustLaw law
-
-cdef class FusedTrust:
-    cdef FusedTrustLaw law
-
 # Fusion
 
 cdef struct FusionLaw:
@@ -61,13 +51,13 @@ cdef struct Fused:
     double apart, variance  # torsion less current, and its variance; 0 and 1 without torsion
 
 cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1
-cdef double share_by_speed(double velocity) noexcept nogil
-cdef double keep(double half, double before, double dt) noexcept nogil
+cdef double network_share(double velocity) noexcept nogil
+cdef double fading(double half, double before, double dt) noexcept nogil
 cdef Fused fuse_paths(
     const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
 ) noexcept nogil
 
-cdef void sharpen(Fused *fused, double known) noexcept nogil
+cdef void reweigh(Fused *fused, double known) noexcept nogil
 
 cdef struct Rest:
     double spread, bound
@@ -76,7 +66,7 @@ cdef Rest at_rest(
     const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
 ) noexcept nogil
 
-cdef double widening(const Fused *fused, double left_nm) noexcept nogil
+cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil
 
 cdef class Fusion:
     cdef FusionLaw law

@@ -1,29 +1,37 @@
-"""Uncertainty of an estimate: fusion of both paths by their variances, standard deviations, trust in networks.
+"""Uncertainty of an estimate: fusion of both torque paths, standard deviations, weights of the networks.
 
-Fusion of two independent measurements of one torque by their variances: motor current less loss, and torsion.
+**Fusion** of two independent measurements of one torque by their variances, motor current less loss and torsion:
 
-    tau_c = tau_raw - loss                 knows fast changes and any load; fails with friction
-    tau_t = K d + K3 d^3 + D d' + H z      knows nothing of friction; fails with hysteresis and encoder errors
+    tau_c = tau_raw - loss                 follows fast changes and any load; errors: friction
+    tau_t = K d + K3 d^3 + D d' + H z      independent of friction; errors: hysteresis, encoders
     alpha = s_c^2/(s_c^2 + s_t^2)          physics = tau_c + alpha (tau_t - tau_c)
-    s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2        half: what friction leaves open near v = 0
-    s_t^2 = e^2 + (f tau_t)^2 + open^2     open: what the slip leaves open until its bounds have met
-    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2      reference: of the sensor of a comparison; 0 for the torque itself
-    at rest = k sd + alpha open + (1 - alpha) half      half the interval of a standing joint, k: `fused.standstill`; sd: as sigma,
-                                           without `half` and `open`, with the weight as it is
-    widened by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)) where that is above 0
+    s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2      half: half width of the friction interval near v = 0
+    s_t^2 = e^2 + (f tau_t)^2 + open^2     open: half width of the slip's unknown torque, until its bounds meet
+    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2      reference: of the sensor in a comparison, 0 for the torque itself
 
-Towards standstill `half` grows to the half width of the friction interval and the torsion takes over: continuous,
-and the value there no longer depends on which way friction happens to point.
+A, b, c, e, f, reference: section `fused.sigma`. Towards standstill `half` grows to the half width of the friction interval and
+the torsion takes over: continuous, and the value at rest does not depend on the direction of friction. Of a standing joint
+the half width of the interval is
 
-How far an estimate can be trusted: standard deviations, standstill, and where a network was trained.
+    k sd + alpha open + (1 - alpha) half   k: `fused.standstill`; sd: sigma without `half` and `open`, with the same alpha
 
-| class | gives | method |
-|---|---|---|
-| `Uncertainty` | sigma of the physics in motion, value and sigma at standstill | `tob`, `efficiency`, `network` |
-| `Trust` | weight of the network: a range per feature, and the distance to physics | `network` |
-| `FusedTrust` | weight of the network: a map over speed and motor torque (`Envelope`) | `fused` |
+A disagreement of the paths widens sigma by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)),
+where that is above 0: which path is wrong is not known, so the worse case counts.
 
-A weight is 1 where the network is alone in charge and 0 where nothing of it is left.
+**Standard deviation** of the paper's methods in motion and at standstill: u_f, u_l, floor from the settings,
+
+    moving        sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
+                  load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
+    standstill    tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
+                  value: the middle; sigma: half the width, wider by u_f, + floor
+
+**Weight of a network**, 1 where it alone counts and 0 where only physics does, continuous in all arguments:
+
+    network       1 inside the training range of every feature and near physics, 0 at a margin beside a range, or at the limit
+                  of the distance to physics
+    fused         a table over (v, tau_raw), 1 in cells that several training runs have visited and 0 in others, bilinear
+                  between cell centres (a range per feature would count fast and heavy as known when the data has only fast or
+                  heavy); times 1 inside the training range of temperature and of |tau_t - tau_c|, falling to 0 beside it
 """
 
 from libc.math cimport INFINITY, NAN, fabs, fmax, fmin, isnan, sqrt
@@ -32,76 +40,89 @@ from libc.string cimport memset
 from jtqd.estimator.losses cimport (
     EfficiencyLaw,
     Interval,
-    LossModel,
     efficiency_rmse,
     efficiency_standstill,
     friction_torque,
 )
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.joint import MAX_CELLS
 
-# Fusion ---------------------------------------------------------------------------------------------------------------
+if MAX_CELLS + 2 > MOST_CELLS:
+    raise ImportError(f"{MAX_CELLS} cells may be in an envelope, the compiled map has room for {MOST_CELLS - 2}")
 
 SLOW_RAD_S: Final = 0.05
 FAST_RAD_S: Final = 0.2
-"""The network fades in between these speeds: slower, a wave of the motor angle looks like an offset."""
+"""The fused network fades in between these speeds: at lower ones a wave of the motor angle looks like an offset."""
 
 HOLD_S: Final = 0.05
 """Time constant with which the friction interval is forgotten after a reversal."""
 
 DISAGREE_SIGMAS: Final = 3.0
-"""Distance of the two paths in its own standard deviations from which what is more counts as an error of the fusion."""
+"""Distance of the two paths in its own standard deviations up to which it is noise."""
 
 FOREIGN_SIGMAS: Final = 4.0
-"""Distance from which the status is lowered: at least one of the paths is not what the joint file says."""
+"""Distance from which the status is lowered: at least one of the paths contradicts the joint file."""
 
 GAUSS: Final = 1.6448536269514722
 """Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
 
 LEAST_TORSION: Final = 0.05
-"""Part of the torsion's variance that is left, whatever is known of its zero."""
+"""Part of the torsion's variance that remains, however well its offset is known."""
+
+FADE_START: Final = 0.75
+"""Part of the network's limit from which it fades into physics; at the limit only physics is used."""
+
+TEMPERATURE_MARGIN_K: Final = 1.0
+"""Distance to the range of temperatures over which the weight falls to 0."""
+
+DISTANCE_MARGIN: Final = 0.25
+"""The same of the distance between torsion and current, as a part of its range."""
 
 cdef double SLOW = SLOW_RAD_S, FAST = FAST_RAD_S, HOLD = HOLD_S
 cdef double DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS
 cdef double LEAST = LEAST_TORSION
 cdef double INVERSE_RANGE = 1.0 / (FAST_RAD_S - SLOW_RAD_S)
+cdef double PER_KELVIN = 1.0 / TEMPERATURE_MARGIN_K
 
 
-cdef double share_by_speed(double v) noexcept nogil:
-    """Return the network's share at this speed, 0 to 1."""
+# Fusion ---------------------------------------------------------------------------------------------------------------
+
+
+cdef double network_share(double v) noexcept nogil:
+    """Return the fused network's share at this speed, 0 to 1."""
     cdef double a = fabs(v)
     if a >= FAST:
         return 1.0
     return (a - SLOW) * INVERSE_RANGE if a > SLOW else 0.0
 
 
-def turning(velocity_rad_s):
-    """Return the network's share at these speeds [n], 0 to 1."""
+def network_shares(velocity_rad_s):
+    """Return the fused network's shares at these speeds [n], 0 to 1."""
     cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
     out = np.empty(len(v))
     cdef double[::1] to = out
     cdef Py_ssize_t k
     for k in range(v.shape[0]):
-        to[k] = share_by_speed(v[k])
+        to[k] = network_share(v[k])
     return out
 
 
-cdef double keep(double half, double before, double dt) noexcept nogil:
-    """Return `half` [Nm] with the memory of the sample before, dt [s] ago.
+cdef double fading(double half, double before, double dt) noexcept nogil:
+    """Return the friction interval's half width [Nm] with that of the sample before, dt [s] ago, fading.
 
     Between rest and motion the weight moves from one path to the other. Their errors differ, so it must not move within
-    a few milliseconds: what friction left open at a reversal counts for HOLD_S longer.
+    a few milliseconds: the interval at a reversal counts for HOLD_S longer.
     """
     cdef double faded = before * (HOLD / (HOLD + dt))
     return half if half >= faded else faded
 
 
-def held(half_nm, dt_s, running):
-    """Return `half_nm` [n] with its memory (`keep`), which starts again after every sample that is not `running`."""
+def faded(half_nm, dt_s, running):
+    """Return half widths [n] with their memory (`fading`), which starts again after every sample that is not `running`."""
     cdef const double[::1] half = np.ascontiguousarray(half_nm, np.float64)
     cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
     cdef const unsigned char[::1] on = np.ascontiguousarray(running, np.bool_).view(np.uint8)
@@ -110,7 +131,7 @@ def held(half_nm, dt_s, running):
     cdef double memory = 0.0
     cdef Py_ssize_t k
     for k in range(half.shape[0]):
-        memory = keep(half[k], memory, dt[k]) if on[k] else 0.0
+        memory = fading(half[k], memory, dt[k]) if on[k] else 0.0
         to[k] = memory
     return out
 
@@ -141,11 +162,8 @@ cdef Fused fuse_paths(
     return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t)
 
 
-cdef void sharpen(Fused *fused, double known) noexcept nogil:
-    """Weigh anew with a torsion whose variance is less by `known` [Nm^2]; `variance` stays that of the file.
-
-    For a reference of 0.
-    """
+cdef void reweigh(Fused *fused, double known) noexcept nogil:
+    """Weigh with a torsion whose variance is less by `known` [Nm^2]; `variance` stays that of the file. For a reference of 0."""
     cdef double c = fused.alpha * fused.variance, t = fused.variance - c, alpha
     t = fmax(t - known, LEAST * t)
     alpha = c / (c + t)
@@ -158,8 +176,8 @@ cdef Rest at_rest(
 ) noexcept nogil:
     """Return standard deviation and bound [Nm] of the fused value of a standing joint.
 
-    What friction and slip leave open is no error that is small on most days: a push from outside changes the torque and not
-    the current, and a joint may have stopped at the end of its hysteresis. Both are bounds, counted by their weights.
+    The friction interval and the unknown slip are no errors that are small on most days: a push from outside changes the torque
+    and not the current, and a joint may have stopped at the end of its hysteresis. Both are bounds, counted by their weights.
     """
     cdef double rest = 1.0 - alpha
     cdef double c = law.current + law.viscous * v * v + law.load * raw * raw
@@ -167,75 +185,59 @@ cdef Rest at_rest(
     return Rest(sqrt(alpha * alpha * t + rest * rest * c + law.reference), alpha * open_nm + rest * half)
 
 
-cdef double widening(const Fused *fused, double left_nm) noexcept nogil:
-    """Return what a disagreement of the paths adds to sigma [Nm]; left_nm: known zero of the torsion that is not taken off.
+cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil:
+    """Return what a disagreement of the paths adds to sigma [Nm]; uncorrected_nm: known offset that is not corrected yet.
 
-    Which path is wrong is not known: the worse for the fused value counts. Both are errors of a known size, not of a
-    known variance: the 90 % interval, not sigma, is to hold them.
+    Both are errors of a known size, not of a known variance: the 90 % interval, not sigma, is to hold them.
     """
     cdef double more = fabs(fused.apart) - DISAGREE * sqrt(fused.variance)
-    cdef double zero = fused.alpha * left_nm
+    cdef double offset = fused.alpha * uncorrected_nm
     if more > 0.0:
         more *= fmax(fused.alpha, 1.0 - fused.alpha)
-        return INTERVAL * sqrt(more * more + zero * zero)
-    return INTERVAL * zero
+        return INTERVAL * sqrt(more * more + offset * offset)
+    return INTERVAL * offset
+
+
+class FusedPaths(NamedTuple):
+    """Fused physics of a run, arrays [n]: share of the torsion, value and standard deviation [Nm], variance of the paths'
+    difference [Nm^2]."""
+
+    alpha: object
+    value_nm: object
+    sigma_nm: object
+    variance_nm2: object
 
 
 cdef class Fusion:
-    """Value and standard deviation of the fused physics [Nm, joint side].
-
-    with_torsion False: the current path alone, whatever the torsion.
-    """
+    """Fusion of whole runs; sigma: `joint.FusedSigma`; with_torsion False: the current path alone, whatever the torsion."""
 
     def __init__(self, sigma, bint with_torsion):
         fill_fusion(&self.law, sigma, with_torsion)
 
-    def fuse(
-        self,
-        double raw_nm,
-        double loss_nm,
-        double half_nm,
-        double velocity_rad_s,
-        double torsion_nm,
-        double open_nm=0.0,
-    ):
-        """Return (physics, sigma) [Nm]; half_nm: `AdditiveLossModel.loss`; open_nm: `FusedObservedSample`."""
-        cdef Fused fused = fuse_paths(&self.law, raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
-        return fused.value, fused.sigma
+    def fuse(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0, loss_nm=0.0, known_nm2=None):
+        """Return the `FusedPaths` of arrays [n] (or numbers for all n).
 
-    def fuse_many(self, raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
-        """Return the same for arrays [n]."""
-        _, value, sigma, _ = self._run(raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
-        return value, sigma
-
-    def weigh_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
-        """Return (alpha, sigma), arrays [n]: share of the torsion, and standard deviation of the fused value [Nm]."""
-        alpha, _, sigma, _ = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)
-        return alpha, sigma
-
-    def variance_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
-        """Return the variance of the difference of the two paths [n], Nm^2."""
-        return self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)[3]
-
-    def weigh_known(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, known_nm2):
-        """Return the same as `weigh_many` where known_nm2 [n] of the torsion's variance is known: `sharpen`."""
-        alpha, _, sigma, variance = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)
-        known = np.ascontiguousarray(known_nm2, np.float64)
-        cdef double[::1] share = alpha
-        cdef double[::1] spread = sigma
-        cdef const double[::1] whole = variance
-        cdef const double[::1] less = known
+        half_nm: `AdditiveLossModel.loss_many`; open_nm: `ObservedRun`; known_nm2: part of the torsion's variance that is known.
+        """
+        given = (raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, 0.0 if known_nm2 is None else known_nm2)
+        laid = np.ascontiguousarray(np.broadcast_arrays(*given), np.float64)
+        out = np.empty((4, laid.shape[1]))
+        cdef bint known = known_nm2 is not None
+        cdef const double[:, ::1] x = laid
+        cdef double[:, ::1] to = out
         cdef Fused fused
         cdef Py_ssize_t k
-        for k in range(share.shape[0]):
-            fused = Fused(share[k], 0.0, 0.0, 0.0, whole[k])
-            sharpen(&fused, less[k])
-            share[k], spread[k] = fused.alpha, sqrt(fused.sigma * fused.sigma + self.law.reference)
-        return alpha, sigma
+        for k in range(x.shape[1]):
+            fused = fuse_paths(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+            if known:
+                reweigh(&fused, x[6, k])
+                fused.sigma = sqrt(fused.sigma * fused.sigma + self.law.reference)
+            to[0, k], to[1, k], to[2, k], to[3, k] = fused.alpha, fused.value, fused.sigma, fused.variance
+        return FusedPaths(*out)
 
-    def rest_many(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
+    def at_rest(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
         """Return (standard deviation, bound) [Nm] of the value of a standing joint, arrays [n]."""
-        alpha = self._run(raw_nm, 0.0, half_nm, velocity_rad_s, torsion_nm, open_nm)[0]
+        alpha = self.fuse(raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm).alpha
         columns = (alpha, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
         cdef const double[:, ::1] x = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
         out = np.empty((2, x.shape[1]))
@@ -247,35 +249,8 @@ cdef class Fusion:
             to[0, k], to[1, k] = rest.spread, rest.bound
         return out[0], out[1]
 
-    def _run(self, *columns):
-        laid = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
-        out = np.empty((4, laid.shape[1]))
-        cdef const double[:, ::1] x = laid
-        cdef double[:, ::1] to = out
-        cdef Fused fused
-        cdef Py_ssize_t k
-        for k in range(x.shape[1]):
-            fused = fuse_paths(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
-            to[0, k], to[1, k], to[2, k], to[3, k] = fused.alpha, fused.value, fused.sigma, fused.variance
-        return out
 
-
-if MAX_CELLS + 2 > MOST_CELLS:
-    raise ImportError(f"{MAX_CELLS} cells may be in an envelope, the compiled map has room for {MOST_CELLS - 2}")
-
-FADE_START: Final = 0.75
-"""Part of the network's limit from which it fades into physics; at the limit nothing of it is left."""
-
-TEMPERATURE_MARGIN_K: Final = 1.0
-"""Beside the range of temperatures over which trust is lost."""
-
-DISTANCE_MARGIN: Final = 0.25
-"""Part of the range beyond which a larger distance between torsion and current counts as unknown."""
-
-cdef double PER_KELVIN = 1.0 / TEMPERATURE_MARGIN_K
-
-
-# Uncertainty of the physics -------------------------------------------------------------------------------------------
+# Standard deviation of the paper's methods ----------------------------------------------------------------------------
 
 
 cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1:
@@ -291,7 +266,7 @@ cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficie
 
 
 cdef double sigma_moving(const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double i, double v) noexcept nogil:
-    """Return sigma of a moving joint; i: acceleration-corrected current tau_raw/(G Kt)."""
+    """Return sigma of a moving joint; i: current without acceleration, tau_raw/(G Kt)."""
     cdef double load = efficiency_rmse(losses, i, v) if law.with_efficiency else law.load * raw
     cdef double friction = law.u_friction * friction_torque(&losses.friction, v)
     return sqrt(load * load + friction * friction + law.floor * law.floor)
@@ -308,30 +283,7 @@ cdef Spread standing(const UncertaintyLaw *law, const EfficiencyLaw *losses, dou
     )
 
 
-cdef class Uncertainty:
-    """Standard deviations and standstill intervals of the physics estimates of one joint [Nm, joint side].
-
-    moving        sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
-                  load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
-    standstill    tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
-                  value: the middle; sigma: half the width, wider by u_f, + floor
-    """
-
-    def __init__(self, joint, settings, LossModel losses):
-        self.losses = losses.law
-        fill_uncertainty(&self.law, joint, settings, losses.law.has_efficiency)
-
-    def moving(self, double raw_nm, double current_a, double velocity_rad_s):
-        """Return sigma of a moving joint; current_a is the acceleration-corrected current tau_raw/(G Kt)."""
-        return sigma_moving(&self.law, &self.losses, raw_nm, current_a, velocity_rad_s)
-
-    def standing(self, double raw_nm, double current_a):
-        """Return (value, sigma) of a standing joint: middle and half width of what friction can hold."""
-        cdef Spread spread = standing(&self.law, &self.losses, raw_nm, current_a)
-        return spread.value, spread.sigma
-
-
-# Trust in the paper's network -----------------------------------------------------------------------------------------
+# Weight of the paper's network ---------------------------------------------------------------------------------------
 
 
 cdef int fill_trust(TrustLaw *law, low, high, double margin, double limit) except -1:
@@ -372,26 +324,20 @@ cdef double trust(const TrustLaw *law, const double *x, double difference) noexc
     return 0.0
 
 
-cdef class Trust:
-    """Weight of the network in [0, 1]: 1 inside its envelope and near physics, 0 far from either, continuous.
+def network_weights(low, high, double margin, double limit_nm, features, difference_nm):
+    """Return the weights [n] of the paper's network for features [n, 6] and network minus physics [n] (NaN gives 0).
 
-    low, high: training range per feature (6 each); margin: part of the span over which the weight falls to
-    0 outside; limit_nm: largest |network - physics|; the weight falls from FADE_START of it.
+    low, high: training range per feature; margin: part of the span beside a range over which the weight falls to 0; limit_nm:
+    largest |network - physics|, the weight falls from FADE_START of it.
     """
-
-    def __init__(self, low, high, double margin, double limit_nm):
-        fill_trust(&self.law, low, high, margin, limit_nm)
-
-    def weight(self, *values):
-        """Return the weight for FEATURES x0..x5 and network minus physics; a difference of NaN gives 0."""
-        cdef double x[FEATURES]
-        *features, difference_nm = values
-        for n in range(FEATURES):
-            x[n] = features[n]
-        return trust(&self.law, x, difference_nm)
+    cdef const double[:, ::1] x = np.ascontiguousarray(features, np.float64)
+    cdef const double[::1] difference = np.ascontiguousarray(difference_nm, np.float64)
+    cdef TrustLaw law
+    fill_trust(&law, low, high, margin, limit_nm)
+    return np.array([trust(&law, &x[k, 0], difference[k]) for k in range(x.shape[0])])
 
 
-# Trust in a fused network ---------------------------------------------------------------------------------------------
+# Weight of a fused network -------------------------------------------------------------------------------------------
 
 
 cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1:
@@ -419,10 +365,7 @@ cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1:
 
 
 cdef double fused_trust(const FusedTrustLaw *law, double v, double raw, double distance, double temperature) noexcept nogil:
-    """Return the weight; a temperature of NaN is unknown, hence 0 where the data had one.
-
-    raw: motor torque; distance: torsion less current path; finite both, as is the velocity.
-    """
+    """Return the weight; raw: motor torque; distance: torsion less current path; as `envelope_weights`."""
     cdef double x = v * law.inverse_velocity + law.velocity_0
     cdef double y = raw * law.inverse_torque + law.torque_0
     cdef double a, b, weight
@@ -444,34 +387,15 @@ cdef double fused_trust(const FusedTrustLaw *law, double v, double raw, double d
     return weight * fmax(0.0, 1.0 - fmax(law.low - temperature, temperature - law.high) * PER_KELVIN)
 
 
-cdef class FusedTrust:
-    """Weight of a fused network in [0, 1], continuous in all arguments.
+def envelope_weights(envelope, velocity_rad_s, raw_nm, distance_nm=0.0, temperature_c=None):
+    """Return the weights [n] in an envelope, by velocity, motor torque, torsion less current path and temperature, arrays [n].
 
-    A box per feature would count fast and heavy as known when the data has only fast or heavy. So the weight is a table
-    over (v, tau_raw), 1 in cells that several training runs have visited and 0 in others, bilinear between cell centres;
-    times 1 inside the training range of temperature and of the distance between torsion and current, falling to 0 beside
-    it.
+    temperature_c: None: not looked at; NaN: not known, hence 0 where the data had one. The others must be finite.
     """
-
-    def __init__(self, envelope):
-        fill_fused_trust(&self.law, envelope)
-
-    def weight(self, double velocity_rad_s, double raw_nm, double distance_nm, double temperature_c):
-        """Return the weight; a temperature of NaN is unknown, hence 0 where the data had one.
-
-        raw_nm: motor torque; distance_nm: torsion less current path; finite both, as is the velocity.
-        """
-        return fused_trust(&self.law, velocity_rad_s, raw_nm, distance_nm, temperature_c)
-
-    def weigh_map(self, velocity_rad_s, raw_nm):
-        """Return the weights [n] by speed and motor torque alone."""
-        cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
-        cdef const double[::1] raw = np.ascontiguousarray(raw_nm, np.float64)
-        cdef FusedTrustLaw law = self.law
+    columns = (velocity_rad_s, raw_nm, distance_nm, NAN if temperature_c is None else temperature_c)
+    cdef const double[:, ::1] x = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
+    cdef FusedTrustLaw law
+    fill_fused_trust(&law, envelope)
+    if temperature_c is None:
         law.with_temperature = False
-        out = np.empty(len(v))
-        cdef double[::1] to = out
-        cdef Py_ssize_t k
-        for k in range(v.shape[0]):
-            to[k] = fused_trust(&law, v[k], raw[k], 0.0, NAN)
-        return out
+    return np.array([fused_trust(&law, x[0, k], x[1, k], x[2, k], x[3, k]) for k in range(x.shape[1])])

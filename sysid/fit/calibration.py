@@ -282,7 +282,7 @@ def low_pass_advance(run: RunSignals, torsion: Torsion) -> FloatArray:
 def standing_errors(run: PathResiduals, advance_nm: FloatArray, fused: Fused) -> Standing:
     """Return the errors of a held-out run at rest; advance: of its samples, see `low_pass_advance`."""
     fusion = Fusion(replace(fused.sigma, reference_nm=0.0), True)
-    spread, bound = fusion.rest_many(*run.fusion_inputs)
+    spread, bound = fusion.at_rest(*run.fusion_inputs)
     error = fused_errors(run, fused).error_nm
     return Standing(error + advance_nm, spread, bound, run.open_nm <= KNOWN * fused.sigma.torsion_nm)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import MAX_CELLS, AdditiveLoss, Envelope, Torsion
-from jtqd.estimator.uncertainty import FusedTrust
+from jtqd.estimator.uncertainty import envelope_weights
 from jtqd.sysid.fit.residuals import path_residuals
 from jtqd.sysid.fit.signals import RunSignals
 
@@ -87,7 +87,7 @@ def widened(made: Envelope, runs: Sequence[tuple[FloatArray, FloatArray]]) -> En
     others = [filled(sum(counts) - own >= _VISITS) for own in counts]
     for cells in range(MOST_WIDER + 1):
         beyond = [
-            FusedTrust(replace(made, known=_as_rows(_wider(known, cells)))).weigh_map(v, raw) < 0.5
+            envelope_weights(replace(made, known=_as_rows(_wider(known, cells))), v, raw) < 0.5
             for known, (v, raw) in zip(others, runs, strict=True)
         ]
         if np.mean([each.mean() for each in beyond]) <= BEYOND_SHARE:

@@ -95,7 +95,7 @@ def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: flo
             run.velocity_rad_s,
             run.torsion_nm,
         )
-        variance = Fusion(sigma, True).variance_many(*run.fusion_inputs) - spread_nm**2
+        variance = Fusion(sigma, True).fuse(*run.fusion_inputs).variance_nm2 - spread_nm**2
         rows = np.column_stack((*states, run.apart_nm, variance))[keep]
         length = max(round(WINDOW_S / float(np.mean(run.dt_s))), 1)
         windows = len(rows) // length
@@ -148,7 +148,7 @@ def fit_agreement(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) 
                 run.direction,
                 run.velocity_rad_s,
                 run.torsion_nm,
-                fusion.variance_many(*run.fusion_inputs),
+                fusion.fuse(*run.fusion_inputs).variance_nm2,
                 run.slope,
             )
             for run in moving

@@ -22,7 +22,7 @@ from jtqd.estimator.joint import AdditiveLoss, Fused, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.path_difference import followed
-from jtqd.estimator.uncertainty import DISAGREE_SIGMAS, GAUSS, Fusion, held
+from jtqd.estimator.uncertainty import DISAGREE_SIGMAS, GAUSS, Fusion, faded
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import (
     deflection,
@@ -122,7 +122,7 @@ def loss_and_width(run: RunSignals, loss: AdditiveLoss) -> tuple[FloatArray, Flo
     running = ~np.isnan(seen.raw_nm)
     raw, v, s = (np.where(running, x, 0.0) for x in (seen.raw_nm, seen.velocity_rad_s, seen.direction))
     value, half = AdditiveLossModel(loss).loss_many(raw, v, seen.temperature_c, s)
-    return value, held(half, seen.dt_s, running)
+    return value, faded(half, seen.dt_s, running)
 
 
 class FusedErrors(NamedTuple):
@@ -149,7 +149,7 @@ def fused_errors(
     rated_nm None, or a joint without torsion: nothing is learned in the run, neither offsets nor doubt.
     """
     fusion = Fusion(replace(fused.sigma, reference_nm=0.0), fused.torsion is not None)
-    variance = fusion.variance_many(*run.fusion_inputs)
+    paths = fusion.fuse(*run.fusion_inputs)
     torsion, current, known, doubt, gain = np.zeros((5, len(run.raw_nm)))
     early = np.ones(len(run.raw_nm))
     if rated_nm is not None and fused.torsion is not None and len(run.dt_s):
@@ -161,15 +161,14 @@ def fused_errors(
             run.direction,
             run.velocity_rad_s,
             run.torsion_nm,
-            variance,
+            paths.variance_nm2,
             run.slope,
             run.stiffness_nm_per_rad,
             track_zeros,
         )
     if known.any():
-        alpha, spread = fusion.weigh_known(*run.fusion_inputs, known)
-    else:
-        alpha, spread = fusion.weigh_many(*run.fusion_inputs)
+        paths = fusion.fuse(*run.fusion_inputs, known_nm2=known)
+    alpha, _, spread, variance = paths
     e_c, e_t = run.current_error_nm + current, run.torsion_error_nm + torsion
     share = np.maximum(alpha, 1.0 - alpha)
     more = (doubt + (gain * (run.torsion_nm + torsion)) ** 2) * share**2 + alpha**2 * np.minimum(known, doubt)

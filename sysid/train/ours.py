@@ -24,7 +24,7 @@ from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Join
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.onnx_graph import perceptron_content
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.uncertainty import Fusion, turning
+from jtqd.estimator.uncertainty import Fusion, network_shares
 from jtqd.sysid.fit.calibration import conformal_scale
 from jtqd.sysid.fit.envelope import envelope_of
 from jtqd.sysid.fit.fused import folds
@@ -186,12 +186,12 @@ class Seen:
         torque, open_nm = torsion_torque(torsion, run)
         seen = replace(run.seen, torsion_nm=torque, open_nm=open_nm)
         value, wide = loss_and_width(run, loss)
-        physics, spread = Fusion(sigma, True).fuse_many(
-            seen.raw_nm, value, wide, seen.velocity_rad_s, seen.torsion_nm, seen.open_nm
+        _, physics, spread, _ = Fusion(sigma, True).fuse(
+            seen.raw_nm, wide, seen.velocity_rad_s, seen.torsion_nm, seen.open_nm, loss_nm=value
         )
         self.name = run.name
         self.features: FloatArray = FusedEstimator(plain, _SETTINGS).run_observed(seen).features[keep]
-        self.waves: FloatArray = self.features[:, _CORE:] * turning(seen.velocity_rad_s[keep])[:, None]
+        self.waves: FloatArray = self.features[:, _CORE:] * network_shares(seen.velocity_rad_s[keep])[:, None]
         self.residual_nm: FloatArray = (run.sensor_nm - physics)[keep]
         self.sigma_nm: FloatArray = spread[keep]
         self.quadrant = quadrants(seen.raw_nm[keep], seen.velocity_rad_s[keep])

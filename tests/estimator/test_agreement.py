@@ -18,7 +18,7 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.path_difference import DOWN_S, followed, levels
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.uncertainty import Fusion, held
+from jtqd.estimator.uncertainty import Fusion, faded
 from tests.estimator.test_fused_estimator import NARROW
 from tests.estimator.test_zeros import OFF, ON, K, driven
 
@@ -153,11 +153,10 @@ def test_sigma_is_the_formula_of_the_levels() -> None:
     raw, v, s = (np.where(np.isnan(x), 0.0, x) for x in (seen.raw_nm, seen.velocity_rad_s, seen.direction))
     loss, half = model.loss_many(raw, v, temperature, s)
     more, _ = model.loss_many(raw + SLOPE_NM, v, temperature, s)
-    half = held(half, dt, ~np.isnan(seen.raw_nm))
+    half = faded(half, dt, ~np.isnan(seen.raw_nm))
     apart = np.where(on, seen.torsion_nm - (raw - loss), 0.0)
     parts = (raw, half, v, np.where(on, seen.torsion_nm, 0.0), np.where(on, seen.open_nm, 0.0))
-    alpha, _ = Fusion(fused.sigma, True).weigh_many(*parts)
-    variance = Fusion(fused.sigma, True).variance_many(*parts)
+    alpha, _, _, variance = Fusion(fused.sigma, True).fuse(*parts)
     # `levels` tracks zeros: in so short a run, and with so small a zero, nothing is taken off
     slow, fast, gain, left, sure = levels(
         fused,

@@ -13,7 +13,7 @@ from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
 from jtqd.estimator.joint import DayZeros, Joint
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.path_difference import followed, levels
-from jtqd.estimator.uncertainty import Fusion, held
+from jtqd.estimator.uncertainty import Fusion, faded
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_fused_estimator import NARROW
@@ -94,9 +94,9 @@ def test_fits_see_what_the_loop_does() -> None:
     model = AdditiveLossModel(both.fused.loss)
     loss, half = model.loss_many(raw, v, temperature[on], s)
     slope = (model.loss_many(raw + SLOPE_NM, v, temperature[on], s)[0] - loss) / SLOPE_NM
-    parts = (raw, held(half, half_dt, np.ones(len(raw), bool)), v, torsion, open_nm)
+    parts = (raw, faded(half, half_dt, np.ones(len(raw), bool)), v, torsion, open_nm)
     fusion = Fusion(both.fused.sigma, True)
-    signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.variance_many(*parts), slope)
+    signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.fuse(*parts).variance_nm2, slope)
     taken, _, known, *_ = followed(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
     slow, fast, gain, left, _ = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
 
@@ -104,7 +104,7 @@ def test_fits_see_what_the_loop_does() -> None:
     doubted, _ = tracked(columns, both)
     assert taken[-1] / K == pytest.approx(zeros.link_used_rad, rel=2e-3)
     last = int(np.flatnonzero(on)[-1])
-    alpha = float(fusion.weigh_known(*parts, known)[0][-1])
+    alpha = float(fusion.fuse(*parts, known_nm2=known).alpha[-1])
     doubt = AGREEMENT.level_factor**2 * (
         max(slow - AGREEMENT.slow_nm**2, 0.0) + max(fast - AGREEMENT.fast_nm**2, 0.0)
     )
@@ -183,20 +183,6 @@ def test_without_the_key_nothing_is_wider() -> None:
         old.fused, 40.0, dt, 0.1 * on / K, np.sign(v), v, 5.0 * on / K, 0.3 * on / K, 0.0 * on, on
     )
     assert np.array_equal(early, np.ones(len(dt)))
-
-
-def test_what_is_known_of_the_torsion_moves_the_weight_and_never_all_of_it() -> None:
-    fusion = Fusion(SIGMA, True)
-    one = np.ones(3)
-    seen = (5.0 * one, 0.0 * one, 1.0 * one, 5.0 * one, 0.0 * one)
-    alpha, sigma = fusion.weigh_known(*seen, np.array([0.0, 0.05, 1e6]))
-    np.testing.assert_allclose((alpha[0], sigma[0]), [each[0] for each in fusion.weigh_many(*seen)])
-    assert alpha[0] < alpha[1] < alpha[2] < 1.0
-    assert sigma[0] > sigma[1] > sigma[2] > SIGMA.reference_nm
-    c = 0.2**2 + 0.1**2 + (0.02 * 5.0) ** 2
-    t = 0.35**2 + (0.015 * 5.0) ** 2 - 0.05
-    assert alpha[1] == pytest.approx(c / (c + t))
-    assert sigma[1] == pytest.approx(np.sqrt(c * t / (c + t) + 0.15**2))
 
 
 def test_a_file_says_it_and_one_that_cannot_be_is_refused() -> None:

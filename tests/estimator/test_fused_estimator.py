@@ -78,7 +78,8 @@ def physics(
     model = AdditiveLossModel(joint.fused.loss)
     loss, half = model.loss(GAIN * i, v, model.thermal(temperature_c))
     sigma = replace(joint.fused.sigma, reference_nm=0.0)
-    return (*Fusion(sigma, True).fuse(GAIN * i, loss, half, v, torsion_nm), half)
+    found = Fusion(sigma, True).fuse(*np.atleast_1d(GAIN * i, half, v, torsion_nm), loss_nm=loss)
+    return float(found.value_nm[0]), float(found.sigma_nm[0]), half
 
 
 # ---- values

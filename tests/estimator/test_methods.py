@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.decoder import decode
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Effect
 from jtqd.estimator.methods import estimate_columns, make_estimator
@@ -74,3 +75,15 @@ def test_the_papers_estimator_does_not_apply_ours() -> None:
         JointEstimator(JOINT, FUSED)
     with pytest.raises(ConfigError, match=words):
         JointEstimator(JOINT, FUSED, None).run(*[np.full(3, 0.001)] * 5)
+
+
+def test_settings_are_checked() -> None:
+    assert decode(EstimatorSettings, {}, "c.yaml", "estimator") == EstimatorSettings()
+    settings = decode(EstimatorSettings, {"method": "tob", "bandwidth_rad_s": 80}, "c.yaml", "e")
+    assert (settings.method, settings.bandwidth_rad_s) == ("tob", 80.0)
+    for bad in ({"method": "magic"}, {"bandwidth_rad_s": 0}, {"bandwith_rad_s": 80}, {"max_gap_s": np.nan}):
+        with pytest.raises(ConfigError, match=r"^c\.yaml: key 'e\."):
+            decode(EstimatorSettings, bad, "c.yaml", "e")
+    for wrong in ({"method": "x"}, {"sigma_floor": -1.0}, {"torque_limit": np.inf}):
+        with pytest.raises(ConfigError):
+            EstimatorSettings(**wrong)  # type: ignore[arg-type]

@@ -354,7 +354,7 @@ FUSED_KEYS = fused_network().metadata
             everywhere().to_mapping() | {"distance_nm": 0},
             "metadata 'envelope': distance_nm: found 0",
         ),
-        ("fused", "envelope", 7, "metadata 'envelope': found 7, expected the keys"),
+        ("fused", "envelope", 7, "metadata 'envelope': found 7, expected a mapping"),
         ("fused", "sigma_scale", [1.0] * 3, "found [1.0, 1.0, 1.0], expected 4 finite numbers"),
         ("fused", "sigma_scale", [1.0, 1.0, -0.1, 1.0], "found [1.0, 1.0, -0.1, 1.0], expected numbers"),
         ("fused", "sigma_scale", [1.0, 1.0, math.nan, 1.0], "expected 4 finite numbers"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.joint import Envelope
-from jtqd.estimator.uncertainty import FusedTrust
+from jtqd.estimator.uncertainty import envelope_weights
 from jtqd.sysid.fit.envelope import BEYOND_SHARE, MOST_WIDER, envelope_of, velocity_step, widened
 
 
@@ -44,7 +44,7 @@ def runs(count: int, most_nm: float, seed: int = 1) -> list[tuple[np.ndarray, np
 
 
 def covered(made: Envelope, of: list[tuple[np.ndarray, np.ndarray]]) -> float:
-    return float(np.mean([np.mean(FusedTrust(made).weigh_map(v, raw) >= 0.5) for v, raw in of]))
+    return float(np.mean([np.mean(envelope_weights(made, v, raw) >= 0.5) for v, raw in of]))
 
 
 def test_the_map_is_as_much_wider_in_load_as_held_out_runs_need() -> None:
