@@ -37,7 +37,7 @@ _FRAME_ID = struct.pack("<I4s", 4, b"can\0")
 
 
 class McapCanReader(MessageReader):  # type: ignore[misc]
-    """Frames of a log of jtqd, of `McapCanWriter`, or of ROS (`can_msgs/Frame`), in the order of the log.
+    """Frames of a log of jtqd or of `McapCanWriter`, in the order of the log.
 
     Args:
         file: path of the log, or of a directory with the parts of one run.

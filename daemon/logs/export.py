@@ -13,7 +13,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -21,7 +21,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.can_frames import ERROR, EXTENDED, REMOTE, Frames, can_topics, iter_frames
+from jtqd.daemon.logs.can_frames import can_topics, candump_lines, iter_frames
 from jtqd.daemon.logs.log_file import LogError, LogFile
 from jtqd.daemon.logs.read import (
     Records,
@@ -394,33 +394,46 @@ def topic_blocks(
         raise LogError(f"{_named(path)}: found no message on {topic}{when}, expected one at least")
 
 
-def _flatten(prefix: str, values: Records | NDArray[Any], columns: Columns) -> None:
+def _flatten(prefix: str, values: NDArray[Any], columns: Columns) -> None:
     kind = values.dtype
     if kind.names is not None:
         for name in kind.names:
-            _flatten(f"{prefix}.{name}" if prefix else name, values[name], columns)
+            _flatten(_below(prefix, name), values[name], columns)
     elif values.ndim > 1:
         for n in range(values.shape[1]):
             _flatten(f"{prefix}[{n}]", values[:, n], columns)
     elif kind.kind == "S":
         columns[prefix] = np.array([each.decode("utf-8", "replace") for each in values.tolist()], object)
     elif kind.kind == "O":
-        columns[prefix] = np.array([_as_text(each) for each in values.tolist()], object)
+        _flatten_objects(prefix, values.tolist(), columns)
     else:
         columns[prefix] = values
+
+
+def _flatten_objects(prefix: str, values: list[Any], columns: Columns) -> None:
+    """Take the attributes of the decoder's objects; a sequence becomes text."""
+    names = getattr(values[0], "__slots__", None)
+    if names is not None:
+        for name in names:
+            _flatten_objects(_below(prefix, name), [getattr(each, name) for each in values], columns)
+    elif isinstance(values[0], int | float):
+        columns[prefix] = np.array(values)
+    else:
+        columns[prefix] = np.array([_as_text(each) for each in values], object)
+
+
+def _below(prefix: str, name: str) -> str:
+    return f"{prefix}.{name}" if prefix else name
 
 
 def _as_text(value: Any) -> str:
     if isinstance(value, str):
         return value
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return " ".join(map(_as_text, value)) if isinstance(value, list) else _of_mapping(value)
-
-
-def _of_mapping(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return " ".join(f"{name}={_as_text(each)}" for name, each in value.items())
+    names = getattr(value, "__slots__", None)
+    if names is not None:
+        return " ".join(f"{name}={_as_text(getattr(value, name))}" for name in names)
+    if isinstance(value, Iterable):
+        return " ".join(map(_as_text, value))
     return repr(value) if isinstance(value, float) else str(value)
 
 
@@ -508,7 +521,7 @@ def write_parquet(path: Path, blocks: Iterable[Columns]) -> TableSize:
             for block in _gathered(blocks):
                 table = pa.table({name: pa.array(np.ascontiguousarray(v)) for name, v in block.items()})
                 writer = writer or parquet.ParquetWriter(file, table.schema, compression="zstd")
-                writer.write_table(table)
+                writer.write_table(table.cast(writer.schema))
                 rows, columns = rows + _length(block), len(block)
         finally:
             if writer is not None:
@@ -534,18 +547,3 @@ def _joined(blocks: list[Columns]) -> Columns:
 
 def _length(block: Columns) -> int:
     return len(next(iter(block.values())))
-
-
-# ---- candump ----
-
-
-def candump_lines(frames: Frames, interface: str) -> Iterator[str]:
-    """Yield frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
-    rows = zip(
-        frames.stamps_ns.tolist(), frames.ids.tolist(), frames.lengths.tolist(), frames.data, strict=True
-    )
-    for stamp, can_id, length, data in rows:
-        seconds, rest = divmod(stamp, 1_000_000_000)
-        number = f"{can_id & 0x3FFFFFFF:08X}" if can_id & (EXTENDED | ERROR) else f"{can_id & 0x7FF:03X}"
-        content = f"R{length or ''}" if can_id & REMOTE else data[:length].tobytes().hex().upper()
-        yield f"({seconds}.{rest // 1000:06d}) {interface} {number}#{content}"

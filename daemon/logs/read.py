@@ -1,15 +1,15 @@
 """Recorded messages as structured arrays: those of a topic of one file, or of the parts of one run.
 
 The layout of a message follows from the ros2msg schema in the file and CDR's alignment, not from jtqd's code. Messages of
-equal form are copied as rows, without a loop. Messages whose texts or sequences change in length are decoded one by one by
-the `mcap` project's ROS 2 decoder (extra `ros2`).
+equal form are copied as rows, without a loop. Messages with sequences, or texts of changing length, are objects of the
+`mcap` project's ROS 2 decoder (extra `ros2`), at its speed.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pieces
 from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
 
-Records = NDArray[np.void]
-"""Messages as rows of a structured array [n]."""
+Records = NDArray[Any]
+"""Messages as rows of a structured array [n]; as an array of the decoder's objects where they have no fixed form."""
 _ENDINGS = (".mcap", f".mcap{ACTIVE}")
 
 
@@ -225,7 +225,7 @@ def _in_order(paths: Iterable[Path]) -> list[Path]:
     return [path for *_, path in sorted(starts)]
 
 
-# ---- schemas ----
+# ---- fixed rows ----
 
 _PRIMITIVES = {
     "bool": "?",
@@ -238,71 +238,31 @@ _PRIMITIVES = {
 """Type -> numpy's code."""
 _MAX_DEPTH = 32
 """Levels of nested types."""
-_FIELD = re.compile(
-    r"(?P<kind>[\w/]+)(?:<=\d+)?(?P<array>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[a-z]\w*)(?:\s+[^\s=].*)?$"
-)
-"""Type, array, name, default value."""
+_FIELD = re.compile(r"(?P<kind>[\w/]+)(?:\[(?P<elements>\d+)\])?\s+(?P<name>[a-z]\w*)")
 _CONSTANT = re.compile(r"[\w<=/]+\s+[A-Z]\w*\s*=")
 _NESTED = re.compile(r"^=+\s*\nMSG: (\S+)[^\n]*\n", re.MULTILINE)
-_TIME = "int32 sec\nuint32 nanosec\n"
-
-
-class _Field(NamedTuple):
-    """One field. `elements`: of a fixed array; `sequence`: as many as the message says."""
-
-    name: str
-    kind: str
-    elements: int | None
-    sequence: bool
-
-
-class _Types:
-    """Fields of the message ("") and of every type nested in it.
-
-    Raises:
-        LogError: a line that is no field, two fields of one name, or a type without a definition.
-    """
-
-    def __init__(self, text: str) -> None:
-        first, *rest = _NESTED.split(text.replace("\r\n", "\n"))
-        # Some writers leave the texts of builtin_interfaces out.
-        texts = {"builtin_interfaces/Time": _TIME, "builtin_interfaces/Duration": _TIME, "": first}
-        texts |= {name.replace("/msg/", "/"): body for name, body in zip(rest[::2], rest[1::2], strict=True)}
-        self._fields = {name: _fields(body) for name, body in texts.items()}
-        self._by_last = {name.rsplit("/", 1)[-1]: fields for name, fields in self._fields.items()}
-
-    def fields(self, name: str) -> list[_Field]:
-        """Return the fields of a type."""
-        bare = name.replace("/msg/", "/")
-        found = self._fields.get(bare) or (None if "/" in bare else self._by_last.get(bare))
-        if found is None:
-            raise LogError(f"found type {name!r} in a schema, expected its definition")
-        return found
-
-
-def _fields(text: str) -> list[_Field]:
-    fields = []
-    for line in (line.partition("#")[0].strip() for line in text.splitlines()):
-        if not line or _CONSTANT.match(line):
-            continue
-        found = _FIELD.match(line)
-        if found is None:
-            raise LogError(f"found {line!r} in a schema, expected a field")
-        sequence = bool(found["array"]) and (found["bound"] is not None or not found["count"])
-        count = int(found["count"]) if found["array"] and not sequence else None
-        fields.append(_Field(found["name"], found["kind"], count, sequence))
-    if len({field.name for field in fields}) != len(fields):
-        raise LogError("found two fields of one name in a schema")
-    return fields or [_Field("structure_needs_at_least_one_member", "uint8", None, False)]
-
-
-@lru_cache(maxsize=16)
-def _types_of(text: str) -> _Types:
-    return _Types(text)
+_Fields = list[tuple[str, int | None, str]]
+"""Type, elements of a fixed array, name."""
 
 
 class _VariableError(LogError):
-    """Messages of this type have no fixed rows."""
+    """Messages of this type have no fixed rows: sequences, texts in arrays, or what only the library's parser knows."""
+
+
+@lru_cache(maxsize=16)
+def _types_of(text: str) -> dict[str, _Fields | None]:
+    """Fields of the message ("") and of every nested type; None where a line is not a plain field."""
+    first, *rest = _NESTED.split(text.replace("\r\n", "\n"))
+    nested = {name.replace("/msg/", "/"): body for name, body in zip(rest[::2], rest[1::2], strict=True)}
+    return {name: _fields(body) for name, body in {"": first, **nested}.items()}
+
+
+def _fields(text: str) -> _Fields | None:
+    lines = [line.partition("#")[0].strip() for line in text.splitlines()]
+    found = [_FIELD.fullmatch(line) for line in lines if line and not _CONSTANT.match(line)]
+    fields = [(f["kind"], int(f["elements"]) if f["elements"] else None, f["name"]) for f in found if f]
+    names = {name for *_, name in fields}
+    return fields if fields and len(names) == len(found) else None
 
 
 class _Layout:
@@ -316,16 +276,16 @@ class _Layout:
         example: payload of one message.
 
     Raises:
-        _VariableError: a sequence, or texts in an array.
+        _VariableError: messages of this schema have no fixed form.
         LogError: the example does not fit the schema.
     """
 
-    def __init__(self, types: _Types, example: bytes) -> None:
+    def __init__(self, types: Mapping[str, _Fields | None], example: bytes) -> None:
         self._types, self._example = types, example
         self.size = len(example)
-        self.lengths: list[tuple[int, int]] = [(0, 0x0000_0100)]
-        """(offset, value) in every payload, unsigned 32 bit: the encapsulation is plain CDR, little endian."""
-        if example[:4] != b"\x00\x01\x00\x00":
+        self.lengths: list[tuple[int, int]] = []
+        """(offset, value) of every length in a payload, unsigned 32 bit."""
+        if example[:2] != _LITTLE_ENDIAN:
             raise _VariableError("found another encapsulation, expected little endian CDR")
         names, formats, offsets, end = self._members("", 4, 0)
         if not 0 <= self.size - end < 8:  # what is left can only be padding
@@ -333,32 +293,30 @@ class _Layout:
         self.dtype = _struct(names, formats, offsets, self.size)
 
     def _members(self, name: str, at: int, depth: int) -> tuple[list[str], list[Any], list[int], int]:
-        if depth > _MAX_DEPTH:
-            raise LogError(f"found types nested deeper than {_MAX_DEPTH} in a schema")
+        fields = self._types.get(name.replace("/msg/", "/"))
+        if fields is None or depth > _MAX_DEPTH:
+            raise _VariableError(f"found {name!r}, expected plain fields")
         names, formats, offsets = [], [], []
-        for field in self._types.fields(name):
-            begin, kind = self._field(field, at, depth)
-            names.append(field.name)
-            formats.append(kind)
+        for kind, elements, field in fields:
+            begin, layout = self._one(kind, at, depth)
+            if elements is not None:
+                layout = self._array(kind, begin, layout, elements, depth)
+            names.append(field)
+            formats.append(layout)
             offsets.append(begin)
-            at = begin + kind.itemsize
+            at = begin + layout.itemsize
         return names, formats, offsets, at
 
-    def _field(self, field: _Field, at: int, depth: int) -> tuple[int, np.dtype[Any]]:
-        if field.sequence or (field.elements is not None and field.kind == "string"):
-            raise _VariableError(f"found {field.name}, a sequence or an array of texts")
-        begin, kind = self._one(field.kind, at, depth)
-        if field.elements is None:
-            return begin, kind
-        if field.elements * max(kind.itemsize, 1) > self.size:
-            raise LogError(
-                f"found an array of {field.elements} {field.kind} in a message of {self.size - 4} bytes"
-            )
+    def _array(
+        self, kind: str, begin: int, layout: np.dtype[Any], elements: int, depth: int
+    ) -> np.dtype[Any]:
+        if elements * max(layout.itemsize, 1) > self.size:
+            raise LogError(f"found an array of {elements} {kind} in a message of {self.size - 4} bytes")
         known = len(self.lengths)
-        again = self._one(field.kind, begin + kind.itemsize, depth)
-        if again != (begin + kind.itemsize, kind) or len(self.lengths) != known:
-            raise _VariableError(f"found an array of {field.kind} whose elements differ in form")
-        return begin, np.dtype((kind, (field.elements,)))
+        again = self._one(kind, begin + layout.itemsize, depth)
+        if kind == "string" or again != (begin + layout.itemsize, layout) or len(self.lengths) != known:
+            raise _VariableError(f"found an array of {kind} whose elements differ in form")
+        return np.dtype((layout, (elements,)))
 
     def _one(self, kind: str, at: int, depth: int) -> tuple[int, np.dtype[Any]]:
         """Return where a value that follows byte `at` begins, and its type."""
@@ -381,8 +339,8 @@ def _struct(names: list[str], formats: list[Any], offsets: list[int], size: int)
     return np.dtype(made)  # type: ignore[call-overload,no-any-return]
 
 
-# ---- rows ----
-
+_LITTLE_ENDIAN = b"\0\1"
+"""First bytes of a payload in plain CDR."""
 _PAYLOAD = MESSAGE_HEAD.itemsize
 _FIRST_ROWS = 4096
 
@@ -394,7 +352,7 @@ class _Table:
         self._topic = topic
         self._first: _Piece | None = None
         self._layout: _Layout | None = None
-        self._decoder: _Decoder | None = None
+        self._decode: Callable[[bytes], Any] | None = None
         self._rows: NDArray[Any] = np.empty(0, "V1")
         self._times = np.empty(0, np.uint64)
         self.count = 0
@@ -411,10 +369,8 @@ class _Table:
                 self._begin(piece)
             rows = None if self._layout is None else self._rows_of(piece.batch, self._layout)
             if rows is None:
-                if self._decoder is None:
-                    self._decode_singly(first.schema)
-                assert self._decoder is not None
-                rows = self._decoder.rows(_payloads(piece.batch))
+                self._decode_singly(first.schema)
+                rows = self._decoded(_payloads(piece.batch))
         except LogError as error:
             raise LogError(f"{piece.path}: {self._topic}: {error}") from None
         self._put(rows, piece.batch.log_times, self.count + piece.expected)
@@ -423,8 +379,8 @@ class _Table:
         batch, self._first = piece.batch, piece
         begin = int(batch.offsets[0]) + _PAYLOAD
         try:
-            text = piece.schema.data.decode()
-            self._layout = _Layout(_types_of(text), batch.data[begin : begin + int(batch.lengths[0])])
+            types = _types_of(piece.schema.data.decode())
+            self._layout = _Layout(types, batch.data[begin : begin + int(batch.lengths[0])])
         except UnicodeDecodeError:
             raise LogError("found a schema that is no text") from None
         except _VariableError:
@@ -446,17 +402,29 @@ class _Table:
             rows: NDArray[np.void] = np.ndarray((count,), f"V{layout.size}", batch.data, begin, (batch.step,))
         else:
             rows = pieces(batch.data, batch.offsets + _PAYLOAD, layout.size)
-        for place, value in layout.lengths:
-            found = rows.view(_struct(["it"], ["<u4"], [place], layout.size))["it"]
-            if ((found & 0xFFFF if place == 0 else found) != value).any():
+        expected = [(0, "<u2", 0x0100), *((place, "<u4", length) for place, length in layout.lengths)]
+        for place, kind, value in expected:
+            if (rows.view(_struct(["it"], [kind], [place], layout.size))["it"] != value).any():
                 return None
         return rows
 
     def _decode_singly(self, schema: Schema) -> None:
         """Decode the messages so far, and all that follow, one by one: they differ in form."""
-        self._decoder = _Decoder(schema)
-        rows = self._decoder.rows([row.tobytes() for row in self._rows[: self.count]])
-        self._rows, self._layout = rows, None
+        if self._decode is None:
+            self._decode = _decoder(schema)
+            self._rows = self._decoded([row.tobytes() for row in self._rows[: self.count]])
+            self._layout = None
+
+    def _decoded(self, payloads: list[bytes]) -> NDArray[Any]:
+        assert self._decode is not None
+        found = np.empty(len(payloads), object)
+        try:
+            for n, payload in enumerate(payloads):
+                found[n] = self._decode(payload)
+        except Exception as error:  # of the library's decoder: whatever bytes can do to it
+            what = str(error) or type(error).__name__
+            raise LogError(f"found a message that cannot be decoded: {what}") from None
+        return found
 
     def _put(self, rows: NDArray[Any], times: NDArray[np.uint64], expected: int) -> None:
         end = self.count + len(rows)
@@ -469,6 +437,22 @@ class _Table:
         self.count = end
 
 
+def _decoder(schema: Schema) -> Callable[[bytes], Any]:
+    """Return the library's decoder of one message. Raises LogError: it is not installed, or does not take the schema."""
+    try:
+        from mcap_ros2.decoder import DecoderFactory
+    except ImportError:
+        raise LogError(
+            "found messages of changing length, expected a decoder for them: pip install 'jtqd[ros2]'"
+        ) from None
+    try:
+        decode = DecoderFactory().decoder_for("cdr", schema)
+    except Exception as error:  # of the library's parser: whatever a text can do to it
+        raise LogError(f"found a schema that cannot be decoded: {error}") from None
+    assert decode is not None, "the schema is ros2msg, the messages are CDR"
+    return decode
+
+
 def _grown(old: NDArray[Any], kind: np.dtype[Any], least: int, used: int) -> NDArray[Any]:
     """Return a longer array; what is not written yet takes no memory."""
     new = np.empty(max(least, 2 * len(old)), kind)
@@ -479,77 +463,6 @@ def _grown(old: NDArray[Any], kind: np.dtype[Any], least: int, used: int) -> NDA
 def _payloads(batch: Batch) -> list[bytes]:
     begins = (batch.offsets + _PAYLOAD).tolist()
     return [batch.data[at : at + size] for at, size in zip(begins, batch.lengths.tolist(), strict=True)]
-
-
-class _Decoder:
-    """Messages of one type as rows, each decoded on its own by the library.
-
-    Numbers, and fixed arrays of them, are columns of their type; texts, and sequences, are objects (str, numpy array, list).
-    Nested messages are nested fields; within an array they are dictionaries.
-
-    Raises:
-        LogError: the library is not installed, or does not take the schema.
-    """
-
-    def __init__(self, schema: Schema) -> None:
-        try:
-            from mcap_ros2.decoder import DecoderFactory
-        except ImportError:
-            raise LogError(
-                "found messages of changing length, expected a decoder for them: pip install 'jtqd[ros2]'"
-            ) from None
-        self._types = _types_of(schema.data.decode())
-        self.dtype = self._columns("")
-        try:
-            self._decode: Any = DecoderFactory().decoder_for("cdr", schema)
-        except Exception as error:  # of the library's parser: whatever a text can do to it
-            raise LogError(f"found a schema that cannot be decoded: {error}") from None
-
-    def rows(self, payloads: list[bytes]) -> NDArray[np.void]:
-        """Return the messages [n]. Raises LogError."""
-        found = np.empty(len(payloads), self.dtype)
-        try:
-            for n, payload in enumerate(payloads):
-                found[n] = self._row("", self._decode(payload))
-        except Exception as error:  # of the library's decoder: whatever bytes can do to it
-            what = str(error) or type(error).__name__
-            raise LogError(f"found a message that cannot be decoded: {what}") from None
-        return found
-
-    def _columns(self, name: str) -> np.dtype[Any]:
-        columns: list[tuple[str, Any]] = []
-        for field in self._types.fields(name):
-            kind: Any = object
-            if field.kind in _PRIMITIVES and not field.sequence:
-                code = _PRIMITIVES[field.kind]
-                kind = code if field.elements is None else (code, (field.elements,))
-            elif field.kind not in {*_PRIMITIVES, "string"} and not field.sequence and field.elements is None:
-                kind = self._columns(field.kind)
-            columns.append((field.name, kind))
-        return np.dtype(columns)
-
-    def _row(self, name: str, message: Any) -> tuple[Any, ...]:
-        return tuple(self._value(field, getattr(message, field.name)) for field in self._types.fields(name))
-
-    def _value(self, field: _Field, value: Any) -> Any:
-        several = field.sequence or field.elements is not None
-        if field.kind in _PRIMITIVES and several:
-            code = _PRIMITIVES[field.kind]
-            is_bytes = isinstance(value, bytes | bytearray | memoryview)
-            return np.frombuffer(value, code) if is_bytes else np.asarray(value, code)
-        if field.kind == "char":  # the library reads it with a sign
-            return value % 256
-        if field.kind in {*_PRIMITIVES, "string"}:
-            return value
-        return _mapping(value) if several else self._row(field.kind, value)
-
-
-def _mapping(message: Any) -> Any:
-    """Return a message of the library as nested dictionaries."""
-    if isinstance(message, list):
-        return [_mapping(each) for each in message]
-    names = getattr(message, "__slots__", None)
-    return message if names is None else {name: _mapping(getattr(message, name)) for name in names}
 
 
 # ---- parts ----

