@@ -9,8 +9,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from jtqd.daemon.shared.notices import FILE as NOTICES
-from jtqd.daemon.shared.side_process import SideProcess, StartChild, say
+from jtqd.daemon.shared.side_process import SideProcess, StartChild
 
 if TYPE_CHECKING:
     from jtqd.daemon.config import Config
@@ -71,28 +70,13 @@ class LiveView(SideProcess):
         super().__init__(start_child, "jtqd.daemon.live.process", "live view", "listening")
         self._address = address
 
-    def start(self, config: Config, directory: Path, bus: str) -> None:
-        """Start the live view of the daemon's runtime directory.
+    def start(self, config: Config, runtime: Path, bus: str) -> None:
+        """Start the live view of the daemon with this runtime directory; `bus`: its name."""
+        from jtqd.daemon.recording.launch import loop_request
 
-        Args:
-            config: in force.
-            directory: holds `ring`, `snapshot` and `notices`.
-            bus: name of the bus.
-        """
-        from jtqd.daemon.recording.launch import nodes_of
-
-        self._request = {
-            "ring": str(directory / "ring"),
-            "snapshot": str(directory / "snapshot"),
-            "notices": str(directory / NOTICES),
-            "host": self._address.host,
-            "port": self._address.port,
-            "bus": bus,
-            "nodes": nodes_of(config),
-            "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
-        }
-        if not self._address.loopback:
-            say(
-                f"the live view accepts connections from every host that can reach {self._address.host}; it is read-only"
-            )
-        self._run()
+        where = self._address
+        reach = (
+            f"the live view accepts connections from every host that can reach {where.host}; it is read-only"
+        )
+        request = loop_request(config, runtime, bus) | {"host": where.host, "port": where.port}
+        self.begin(request, "" if where.loopback else reach)

@@ -5,23 +5,19 @@ every cycle and sent as events, so that nothing that lasts less than 20 ms stays
 
 It maps ring, snapshot and notices read-only, and nothing that a viewer sends goes anywhere: the server has no capability
 (no publishing, no parameters, no services). A viewer that is too slow loses its oldest messages, not others theirs.
-It ends on SIGTERM, which it also gets when its parent has gone.
 
-REQUEST is JSON: {"ring", "snapshot", "notices": paths, "host", "port", "bus": name, "nodes": [[node-ID, name]],
-"gear_ratios": [two]}.
-One line of JSON on stdout says how it began: {"listening": URL} or {"failed": why}. Exit status 0 ended in order,
-1 could not begin.
+REQUEST is the JSON of `recording.launch.loop_request` with "host" and "port". The answer is {"listening": URL} or {"failed":
+why} (`shared.side_process`).
 """
 
 from __future__ import annotations
 
-import json
-import os
 import socket
 import sys
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,32 +26,19 @@ import foxglove
 from jtqd.daemon.live.gateway import Gateway
 from jtqd.daemon.live.launch import Address
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.diagnostics import Diagnostics, Node
-from jtqd.daemon.recording.messages import (
-    CycleMessages,
-    JointStateMessage,
-    diagnostics,
-    event,
-    log,
-    zeros_of,
-)
-from jtqd.daemon.recording.recording import SCANNED
+from jtqd.daemon.recording.diagnostics import LoopReader
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros_of
+from jtqd.daemon.recording.recording import SCANNED, EventLog
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.conditions import Condition, read_conditions
-from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
-from jtqd.daemon.shared.ring import RingError, RingReader
-from jtqd.daemon.shared.side_process import Stop, answer
-from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
+from jtqd.daemon.shared.notices import NoticesError, NoticesReader
+from jtqd.daemon.shared.ring import RingError
+from jtqd.daemon.shared.side_process import CannotBegin, Stop, run_side_process
+from jtqd.daemon.shared.snapshot import SnapshotError
 
 # ---- messages ----
 
 PERIOD_NS = 20_000_000
 """50 Hz."""
-_RECORD_HEAD = 31
-"""Bytes before the payload of an MCAP Message record, as `cycle_block` makes it."""
-_INFO, _WARN = 20, 30
-_QUIET_STATUSES = (1, 2, 6)
-"""Starting, valid and standstill are what a healthy joint goes through."""
 
 
 class Message(NamedTuple):
@@ -70,127 +53,50 @@ class LiveStream:
     """Thins out the cycles of one run.
 
     Args:
-        bus: name of the bus, for /diagnostics.
-        nodes: whose heartbeats /diagnostics shows.
         names: of the joints.
         gear_ratios: motor revolutions per joint revolution; None where not known.
-        period_ns: one set of messages in each such stretch of CLOCK_MONOTONIC [ns].
+
+    Attributes:
+        events: makes messages of what happens.
     """
 
-    def __init__(
-        self,
-        bus: str,
-        nodes: Sequence[Node],
-        names: Sequence[str],
-        gear_ratios: Sequence[float | None],
-        period_ns: int = PERIOD_NS,
-    ) -> None:
-        self._diagnostics = Diagnostics(bus, names, nodes)
+    def __init__(self, names: Sequence[str], gear_ratios: Sequence[float | None]) -> None:
         self._overview = JointStateMessage(names, gear_ratios)
-        self._messages = CycleMessages(len(names))
+        self._cycles = CycleMessages(len(names))
         self._scan = cycle.selection(*SCANNED, len(names)).unpack_from
-        self._period_ns = period_ns
-        self._newest = (0, 0)
+        self._made: list[Message] = []
+        self.events = EventLog(self.add)
         self.forget()
 
     def forget(self) -> None:
         """Forget the last state after a pause without viewers, so that old changes are not reported."""
         self._slot = -1
-        self._statuses: tuple[int, ...] | None = None
-        self._missed: int | None = None
+        self.events.forget()
 
-    def take(self, records: Iterable[bytes]) -> list[Message]:
-        """Return the messages of these cycle records, in the order of time."""
-        made: list[Message] = []
+    def add(self, topic: int, time_ns: int, payload: bytes) -> None:
+        """Add a message."""
+        self._made.append(Message(topic, time_ns, payload))
+
+    def take(self, records: Iterable[bytes] = ()) -> list[Message]:
+        """Return the messages added, and those of these cycle records, in the order of time."""
         for record in records:
             index, monotonic, realtime, flags, missed, counter, count, *statuses = self._scan(record)
             realtime = max(realtime, 0)
-            self._newest = (index, realtime)
-            made += self._changes(tuple(statuses), missed)
-            slot = monotonic // self._period_ns
+            self.events.newest = (index, realtime)
+            self.events.cycle(tuple(statuses), missed)
+            slot = monotonic // PERIOD_NS
             if slot == self._slot:
                 continue
             self._slot = slot
-            block = self._messages.block(
+            block = self._cycles.block(
                 record, index, realtime, flags=flags, sync_counter=counter, frames=count
             )
-            parts = self._messages.parts
-            starts = [start for _, start in parts]
-            for (topic, start), end in zip(parts, [*starts[1:], len(block)], strict=True):
-                made.append(Message(topic, realtime, block[start + _RECORD_HEAD : end]))
-            overview = self._overview.payload(record, realtime)
-            made.append(Message(schemas.JOINT_STATES.number, realtime, overview))
+            for topic, payload in self._cycles.payloads(block):
+                self.add(topic, realtime, payload)
+            self.add(schemas.JOINT_STATES.number, realtime, self._overview.payload(record, realtime))
+        self.events.new_span()
+        made, self._made = self._made, []
         return made
-
-    def _changes(self, statuses: tuple[int, ...], missed: int) -> list[Message]:
-        made: list[Message] = []
-        before, self._statuses = self._statuses, statuses
-        for joint, (old, new) in enumerate(zip(before or statuses, statuses, strict=True), start=1):
-            if old != new:
-                names = [schemas.STATUS_NAMES.get(code, str(code)) for code in (old, new)]
-                text = f"joint {joint}: {names[0]} -> {names[1]}"
-                level = _INFO if new in _QUIET_STATUSES else _WARN
-                made += self.note(schemas.STATUS_CHANGED, text, level, joint=joint, change=(old, new))
-        slots = missed - (missed if self._missed is None else self._missed)
-        self._missed = missed
-        if slots > 0:
-            made += self.note(
-                schemas.SLOTS_MISSED,
-                f"the loop missed {slots} {'slot' if slots == 1 else 'slots'}",
-                _WARN,
-                count=slots,
-            )
-        return made
-
-    def notices(self, news: Iterable[Notice]) -> list[Message]:
-        """Return the messages of the supervisor's notices."""
-        made: list[Message] = []
-        for notice in news:
-            made += self.note(
-                schemas.NOTICE, notice.text, notice.level, time_ns=notice.realtime_ns, count=notice.node
-            )
-        return made
-
-    def note(
-        self,
-        kind: int,
-        text: str,
-        level: int,
-        *,
-        time_ns: int | None = None,
-        count: int = 0,
-        joint: int = 0,
-        change: tuple[int, int] = (0, 0),
-    ) -> list[Message]:
-        """One occurrence as a message on /events and one on /log, at the time of the newest cycle unless one is given."""
-        index, newest = self._newest
-        when = newest if time_ns is None else time_ns
-        payload = event(when, kind, text, index=index, count=count, joint=joint, change=change)
-        return [
-            Message(schemas.EVENTS.number, when, payload),
-            Message(schemas.LOG.number, when, log(when, level, text)),
-        ]
-
-    def diagnose(
-        self,
-        view: View,
-        work_us: Sequence[float],
-        late_us: Sequence[float],
-        now_ns: int,
-        conditions: Sequence[Condition] = (),
-    ) -> Message:
-        """The once-per-second /diagnostics of loop, bus, joints and nodes; what the recorder does is in the log only.
-
-        Args:
-            view: of the loop's counters.
-            work_us, late_us: p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us].
-            now_ns: CLOCK_REALTIME.
-            conditions: that are present.
-        """
-        statuses = self._diagnostics.of_the_loop(
-            view, work_us=work_us, late_us=late_us, now_ns=now_ns, conditions=conditions
-        )
-        return Message(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
 
 
 # ---- websocket server ----
@@ -257,14 +163,8 @@ class LiveServer:
         self._server.stop()
 
 
-_POLL_S = 0.02
-_DIAGNOSIS_S = 1.0
-_QUANTILES = (0.5, 0.99, 1.0)
-_NICE = 10
-
-
-def _free(address: Address) -> str | None:
-    """None, or why nobody can listen there: the server's own message does not always say."""
+def _obstacle(address: Address) -> str:
+    """Return why nobody can listen there, or nothing: the server's own message does not always tell."""
     try:
         family, _, _, _, where = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -272,7 +172,12 @@ def _free(address: Address) -> str | None:
             probe.bind(where)
     except OSError as error:
         return error.strerror or str(error)
-    return None
+    return ""
+
+
+# ---- the process ----
+
+_POLL_S = 0.02
 
 
 class Source:
@@ -286,76 +191,69 @@ class Source:
     """
 
     def __init__(self, request: dict[str, Any]) -> None:
-        ratios = request["gear_ratios"]
-        names = [f"joint_{number}" for number in range(1, len(ratios) + 1)]
-        self._ring = RingReader(Path(request["ring"]), cycle.layout_of(len(ratios)).size)
-        self._snapshot = SnapshotReader(Path(request["snapshot"]))
-        self._directory = Path(request["snapshot"]).parent
-        nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
-        self._stream = LiveStream(request["bus"], nodes, names, ratios)
+        self._loop = LoopReader(request)
+        self._stream = LiveStream(self._loop.joints, request["gear_ratios"])
         self._notices: NoticesReader | None = None
         with suppress(NoticesError):
             self._notices = NoticesReader(Path(request["notices"]))
-        self._diagnosed = time.monotonic()
         self.skip()
 
     def skip(self) -> None:
         """Skip to the newest record while there is no viewer."""
-        self._ring.position += self._ring.backlog
+        self._loop.skip()
         self._stream.forget()
         if self._notices is not None:
             self._notices.read()
 
     def read(self) -> list[Message]:
         """Return the new messages."""
-        made = self._stream.take(self._ring.read().records)
-        if self._notices is not None:
-            made += self._stream.notices(self._notices.read()[0])
-        now = time.monotonic()
-        if now - self._diagnosed >= _DIAGNOSIS_S:
-            self._diagnosed = now
-            work, late = self._snapshot.work_us(*_QUANTILES), self._snapshot.late_us(*_QUANTILES)
-            view, conditions = self._snapshot.read(), read_conditions(self._directory)
-            made.append(self._stream.diagnose(view, work, late, time.time_ns(), conditions))
-            made += [Message(topic.number, view.sync_realtime_ns, text) for topic, text in zeros_of(view)]
-        return made
+        stream, now_ns = self._stream, time.time_ns()
+        made = stream.take(self._loop.ring.read().records)
+        for notice in () if self._notices is None else self._notices.read()[0]:
+            stream.events.note(
+                schemas.NOTICE,
+                notice.text,
+                level=notice.level,
+                time_ns=notice.realtime_ns,
+                count=notice.node,
+            )
+        found = self._loop.diagnosis(time.monotonic_ns(), now_ns)
+        if found is not None:
+            view, statuses = found
+            stream.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
+            for topic, payload in zeros_of(view):
+                stream.add(topic.number, view.sync_realtime_ns, payload)
+        return made + stream.take()
 
 
-def serve(source: Source, server: LiveServer, stop: Stop) -> None:
+def serve(source: Source, server: LiveServer, stop: Stop) -> int:
     """Serve until stopped. Without a viewer it only follows the ring."""
-    while not stop.requested:
-        if server.watched:
-            for message in source.read():
-                server.send(message)
-        else:
-            source.skip()
-        time.sleep(_POLL_S)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Command line of the process; returns the exit status."""
-    request = json.loads((sys.argv[1:] if arguments is None else arguments)[0])
-    stop = Stop()
-    with suppress(OSError):
-        os.nice(_NICE)
-    address = Address(request["host"], request["port"])
-    problem = _free(address)
-    if problem is not None:
-        answer(failed=f"{address.host}:{address.port}: {problem}")
-        return 1
     try:
-        source = Source(request)
-        server = LiveServer(f"jtqd on {request['bus']}", address, len(request["gear_ratios"]))
-    except (ImportError, RingError, SnapshotError, RuntimeError, OSError, ValueError) as error:
-        answer(failed=f"{address.host}:{address.port}: {error}")
-        return 1
-    answer(listening=server.address.url)
-    try:
-        serve(source, server, stop)
+        while not stop.requested:
+            if server.watched:
+                for message in source.read():
+                    server.send(message)
+            else:
+                source.skip()
+            time.sleep(_POLL_S)
     finally:
         server.stop()
     return 0
 
 
+def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
+    """Open memory and server; returns the URL, and what serves viewers. Raises CannotBegin."""
+    address = Address(request["host"], request["port"])
+    obstacle = _obstacle(address)
+    if obstacle:
+        raise CannotBegin(f"{address.host}:{address.port}: {obstacle}")
+    try:
+        source = Source(request)
+        server = LiveServer(f"jtqd on {request['bus']}", address, len(request["joint_names"]))
+    except (RingError, SnapshotError, RuntimeError, OSError, ValueError) as error:
+        raise CannotBegin(f"{address.host}:{address.port}: {error}") from None
+    return server.address.url, partial(serve, source, server)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_side_process(None, "listening", begin))

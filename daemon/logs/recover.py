@@ -26,7 +26,7 @@ import msgspec
 
 from jtqd.daemon.logs.log_file import Contents, LogError, Source, scan, sealed_chunk
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
-from jtqd.daemon.recording.run_files import ACTIVE, OwnFile, free_bytes, own_files
+from jtqd.daemon.recording.run_files import ACTIVE, PartFile, free_bytes, part_files
 from jtqd.estimator.checked import counted
 
 _PARTIAL = ".recovering"
@@ -333,7 +333,7 @@ def _sync_directory(directory: Path) -> None:
 # ---- files of earlier runs of the recorder ----
 
 
-def recover_unfinished(file: OwnFile, keep_free: int = 0) -> tuple[str, bool] | None:
+def recover_unfinished(file: PartFile, keep_free: int = 0) -> tuple[str, bool] | None:
     """Recover one file of an earlier run: what was done, and whether something was lost. None: it is being written."""
     path = file.path
     if _is_being_written(path):
@@ -370,7 +370,7 @@ def _recover_earlier_runs(arguments: list[str]) -> int:
         return 2
     with suppress(OSError):
         os.nice(19)
-    for file in own_files(Path(arguments[0]), arguments[1]):
+    for file in part_files(Path(arguments[0]), arguments[1]):
         result = recover_unfinished(file, int(arguments[2])) if file.active else None
         if result is not None:
             print(json.dumps({"file": str(file.path), "text": result[0], "lossy": result[1]}), flush=True)

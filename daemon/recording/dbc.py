@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from jtqd.daemon.core.contact_pdo import CODE_NAMES, NO_RATE, RATE_UNIT_NM_S
 from jtqd.daemon.core.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
-from jtqd.daemon.recording.schemas import STATUS_NAMES
 from jtqd.drivers.drive import NOT_MEASURED, drive_tpdo3, places
 from jtqd.drivers.emcy import EMCY_BASE
 from jtqd.drivers.nmt import HEARTBEAT_BASE, STATES
 from jtqd.drivers.own_objects import contact_tpdos, estimate_tpdos
 from jtqd.drivers.pdo import SYNC_COB_ID, PdoMap
 from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
+from jtqd.estimator.status import NAMES
 
 if TYPE_CHECKING:
     from jtqd.daemon.config import Config
@@ -138,26 +138,16 @@ def _pdo_signals(pdo: PdoMap, quantities: Mapping[Key, Quantity]) -> list[_Signa
     return signals
 
 
-def estimate_quantities(pdo: PdoMap, first: int = 1) -> dict[Key, Quantity]:
-    """Return the estimate PDO that begins with joint `first`; see `jtqd.daemon.core.estimate_pdo`."""
+def _own_quantities(pdo: PdoMap, first: int) -> dict[Key, Quantity]:
+    """Return the objects of jtqd's estimate or contact PDO that begins with joint `first` (`daemon.core`)."""
+    pair = (first, first + 1)
     torque = Quantity(TORQUE_UNIT_NM, "Nm", {NO_TORQUE: "no_torque"})
     sigma = Quantity(SIGMA_UNIT_NM, "Nm", {SIGMA_UNKNOWN: "unknown"})
-    names = {code: name.lower() for code, name in STATUS_NAMES.items()}
-    status = Quantity(values=names, fields=tuple((f"status_{joint}", 4) for joint in (first, first + 1)))
-    by_index = {0x2100: torque, 0x2101: sigma, 0x2102: status, 0x2105: status}
-    return {
-        (pdo.cob_id, each.index, each.subindex): by_index[each.index]
-        for each in pdo.objects
-        if each.index in by_index
-    }
-
-
-def contact_quantities(pdo: PdoMap, first: int = 1) -> dict[Key, Quantity]:
-    """Return the contact PDO that begins with joint `first`; see `jtqd.daemon.core.contact_pdo`."""
+    status = Quantity(values=NAMES, fields=tuple((f"status_{joint}", 4) for joint in pair))
     rate = Quantity(RATE_UNIT_NM_S, "Nm/s", {NO_RATE: "no_rate"})
-    fields = tuple((f"contact_{joint}", 4) for joint in (first, first + 1))
-    contact = Quantity(values=CODE_NAMES, fields=fields)
-    by_index = {0x2106: rate, 0x2107: contact, 0x2108: contact}
+    contact = Quantity(values=CODE_NAMES, fields=tuple((f"contact_{joint}", 4) for joint in pair))
+    by_index = {0x2100: torque, 0x2101: sigma, 0x2102: status, 0x2105: status}
+    by_index |= {0x2106: rate, 0x2107: contact, 0x2108: contact}
     return {
         (pdo.cob_id, each.index, each.subindex): by_index[each.index]
         for each in pdo.objects
@@ -173,14 +163,14 @@ def dbc_text(config: Config, report: Mapping[str, Any] | None) -> str:
         report: boot report; `nodes[n].scaling` of each drive and of the sensor. None: the devices are not known, what
             they send is plain integers.
     """
-    maps, names = list(estimate_tpdos(len(config.joints), config.node_id)), {config.node_id: "jtqd"}
+    count, names = len(config.joints), {config.node_id: "jtqd"}
+    maps: list[PdoMap] = []
     quantities: dict[Key, Quantity] = {}
-    for pair, own in enumerate(maps):
-        quantities |= estimate_quantities(own, 2 * pair + 1)
-    if config.contact is not None and config.contact.pdo:
-        for pair, own in enumerate(contact_tpdos(len(config.joints), config.node_id)):
-            quantities |= contact_quantities(own, 2 * pair + 1)
-            maps.append(own)
+    with_contacts = config.contact is not None and config.contact.pdo
+    for own in (estimate_tpdos, contact_tpdos) if with_contacts else (estimate_tpdos,):
+        for pair, pdo in enumerate(own(count, config.node_id)):
+            maps.append(pdo)
+            quantities |= _own_quantities(pdo, 2 * pair + 1)
     for joint in config.joints:
         node = joint.node_id
         names[node] = f"drive_{joint.number}"

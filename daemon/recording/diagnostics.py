@@ -1,4 +1,4 @@
-"""Statuses of /diagnostics, once a second: loop, bus, every joint, every node, recorder and disk. Pure.
+"""Statuses of /diagnostics, once a second: loop, bus, every joint, every node, recorder and disk.
 
 A view of the conditions (`jtqd.daemon.shared.conditions`): the worst one of a subject is its level and its text. A condition
 that shows by a counter counts when the counter has risen since the last message: a slot that was missed an hour ago is in
@@ -7,22 +7,27 @@ the count, not in the level.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import Status
 from jtqd.daemon.recording.run_files import MEGABYTE, Account
 from jtqd.daemon.shared import notices
-from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, worst
+from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, read_conditions, worst
 from jtqd.daemon.shared.counters import Shown, shown_in
-from jtqd.daemon.shared.snapshot import NMT_STATES, OPERATIONAL, View
+from jtqd.daemon.shared.cycle_record import layout_of
+from jtqd.daemon.shared.ring import RingReader
+from jtqd.daemon.shared.snapshot import NMT_STATES, OPERATIONAL, SnapshotReader, View
 
 OK, WARN, ERROR, STALE = range(4)
 _OF_THE_BUS = shown_in(Shown.BUS)
 _JOINT_LEVELS = {"VALID": OK, "STANDSTILL": OK, "STALE": STALE, "DRIVE_FAULT": ERROR, "INVALID": ERROR}
 _LEVELS = {notices.INFO: OK, notices.WARNING: WARN, notices.ERROR: ERROR}
 """Of severities."""
+_QUANTILES = (0.5, 0.99, 1.0)
+_PERIOD_NS = 1_000_000_000
 _SILENT_S = 1.0
 _NEAR = 2.0
 """Times the reserve: less free space than this is a warning."""
@@ -54,15 +59,21 @@ class RecorderState(NamedTuple):
 
 
 class Diagnostics:
-    """Builds the statuses; remembers the previous counts.
+    """Statuses of loop, bus, joints and nodes by the loop's snapshot, and of the recorder; remembers the previous counts.
 
     Args:
+        snapshot: of the loop; the supervisor's conditions lie in the same directory. None: there is none.
         bus: name of the bus.
         joints: names of the joints.
         nodes: whose heartbeats are watched.
+
+    Raises:
+        SnapshotError: the snapshot is none.
     """
 
-    def __init__(self, bus: str, joints: Sequence[str], nodes: Sequence[Node]) -> None:
+    def __init__(self, snapshot: Path | None, bus: str, joints: Sequence[str], nodes: Sequence[Node]) -> None:
+        self._directory = Path() if snapshot is None else snapshot.parent
+        self._snapshot = None if snapshot is None else SnapshotReader(snapshot)
         self._bus = bus
         self._joints = joints
         self._nodes = nodes
@@ -70,49 +81,27 @@ class Diagnostics:
         self._lost = 0
         self._cycle: int | None = None
 
-    def statuses(
-        self,
-        view: View | None,
-        account: Account,
-        recorder: RecorderState,
-        *,
-        work_us: Sequence[float],
-        late_us: Sequence[float],
-        now_ns: int,
-        conditions: Sequence[Condition] = (),
-    ) -> list[Status]:
-        """Return all statuses; those of the loop only if there is a snapshot.
+    def of_loop(self, now_ns: int) -> tuple[View | None, list[Status]]:
+        """Read the snapshot: its view and the statuses of loop, bus, joints and nodes; nothing without a snapshot.
 
-        Args:
-            view: of the loop.
-            work_us, late_us: its p50, p99 and maximum.
-            now_ns: CLOCK_REALTIME.
-            conditions: that are present.
+        now_ns: CLOCK_REALTIME.
         """
-        result = []
-        if view is not None:
-            result = self.of_the_loop(
-                view, work_us=work_us, late_us=late_us, now_ns=now_ns, conditions=conditions
-            )
-        result += [self._recorder(account, recorder), self._disk(recorder)]
-        self._lost = account.lost
-        return result
-
-    def of_the_loop(
-        self,
-        view: View,
-        *,
-        work_us: Sequence[float],
-        late_us: Sequence[float],
-        now_ns: int,
-        conditions: Sequence[Condition] = (),
-    ) -> list[Status]:
-        """Return the statuses of loop, bus, joints and nodes; arguments as of `statuses`."""
-        found = [*conditions, *self._risen(view)]
+        snapshot = self._snapshot
+        if snapshot is None:
+            return None, []
+        work_us, late_us = snapshot.work_us(*_QUANTILES), snapshot.late_us(*_QUANTILES)
+        view = snapshot.read()
+        found = [*read_conditions(self._directory), *self._risen(view)]
         result = [self._loop(view, work_us, late_us, found), self._bus_status(view, found)]
         result += [self._joint(view, number, found) for number in range(1, len(view.joints) + 1)]
         result += [self._node(view, node, now_ns, found) for node in self._nodes]
         self._before, self._cycle = dict(view.counters), view.cycle
+        return view, result
+
+    def of_recorder(self, account: Account, state: RecorderState) -> list[Status]:
+        """Return the statuses of recorder and disk."""
+        result = [self._recorder(account, state), self._disk(state)]
+        self._lost = account.lost
         return result
 
     def _risen(self, view: View) -> list[Condition]:
@@ -233,3 +222,43 @@ def _level(found: Sequence[Condition], subject: str, otherwise: str) -> tuple[in
     """Return level and text of the worst condition of a subject; OK and `otherwise` without one."""
     condition = worst(found, subject)
     return (OK, otherwise) if condition is None else (_LEVELS[condition.severity], condition.text)
+
+
+class LoopReader:
+    """The loop's memory for a process beside it: cycle records, and /diagnostics once a second.
+
+    Args:
+        request: made by `launch.loop_request`.
+
+    Attributes:
+        ring: cycle records; reading begins behind those that are there.
+
+    Raises:
+        RingError, SnapshotError: the memory is not there.
+    """
+
+    def __init__(self, request: Mapping[str, Any]) -> None:
+        self.joints: tuple[str, ...] = tuple(request["joint_names"])
+        self.ring = RingReader(Path(request["ring"]), layout_of(len(self.joints)).size)
+        nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
+        self._diagnostics = Diagnostics(Path(request["snapshot"]), request["bus"], self.joints, nodes)
+        self._diagnosed_ns = 0
+        self.skip()
+
+    def skip(self) -> None:
+        """Skip to the newest record."""
+        self.ring.position += self.ring.backlog
+
+    def diagnosis(self, now_ns: int, realtime_ns: int) -> tuple[View, list[Status]] | None:
+        """Return view and statuses of the loop, once a second.
+
+        Args:
+            now_ns: CLOCK_MONOTONIC.
+            realtime_ns: CLOCK_REALTIME.
+        """
+        if now_ns - self._diagnosed_ns < _PERIOD_NS:
+            return None
+        self._diagnosed_ns = now_ns
+        view, statuses = self._diagnostics.of_loop(realtime_ns)
+        assert view is not None, "the snapshot is open"
+        return view, statuses

@@ -11,15 +11,17 @@ import platform
 import signal
 import sys
 import time
-from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.recording.dbc import dbc_text
-from jtqd.daemon.recording.run_files import Account, ProgressFile, free_run, own_files
+from jtqd.daemon.recording.run_files import Account, ProgressFile, free_run, part_files
 from jtqd.daemon.shared.child_process import Child, ChildError
+from jtqd.daemon.shared.notices import FILE as NOTICES
 from jtqd.daemon.shared.runtime_dir import versions
+from jtqd.daemon.shared.side_process import StartChild
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.own_objects import own_sheet
 
@@ -27,24 +29,23 @@ _STARTS = 5
 """A recorder that has been started more often than this in a minute waits for `_LONG_PAUSE_S`."""
 _PAUSE_S, _LONG_PAUSE_S = 1.0, 60.0
 _END_LIMIT_S = 10.0
+_PROGRESS = "recorded"
+"""File of the account, in the runtime directory."""
 
 
-class Keeper:
-    """The recorder child of one run of jtqd.
+class RecorderProcess:
+    """The recorder of one run of jtqd, as the supervisor has it.
 
     Args:
         start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
-        runtime_directory: where request and progress lie.
-        snapshot: the loop's counters.
+        runtime: jtqd's runtime directory, with ring and snapshot; request and progress of the recorder go there.
     """
 
-    def __init__(
-        self, start_child: Callable[[str, list[str], str], Child], runtime_directory: Path, snapshot: Path
-    ) -> None:
+    def __init__(self, start_child: StartChild, runtime: Path) -> None:
         self._start_child = start_child
-        self._request = runtime_directory / "recorder.json"
-        self.progress = runtime_directory / "recorded"
-        self._snapshot = snapshot
+        self._request = runtime / "recorder.json"
+        self.progress = runtime / _PROGRESS
+        self._snapshot = runtime / "snapshot"
         self._child: Child | None = None
         self._starts: list[float] = []
         self._waits = False
@@ -120,7 +121,7 @@ class Keeper:
             except ChildError as error:
                 self._result = self._account(str(error))
             self._child = None
-        return None if self._result is None else self._result | {"left": self._leftovers()}
+        return None if self._result is None else self._result | {"left": self._unfinished()}
 
     def _warn(self, what: str) -> None:
         assert self._child is not None
@@ -130,7 +131,7 @@ class Keeper:
     def _run(self) -> None:
         now = time.monotonic()
         self._starts = [*(start for start in self._starts if now - start < 60.0), now]
-        # Told to end before it has set up its handlers, it must still record what there is: it unblocks this by itself.
+        # A SIGTERM before it has set up its handlers waits: it still records what is in the ring.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
             self._child = self._start_child(
@@ -154,11 +155,11 @@ class Keeper:
             "error": error,
         }
 
-    def _leftovers(self) -> list[str]:
+    def _unfinished(self) -> list[str]:
         """Return unfinished files of this run left by killed recorders."""
         if self._directory is None:
             return []
-        files = own_files(self._directory, self._prefix)
+        files = part_files(self._directory, self._prefix)
         return [str(each.path) for each in files if each.active and each.run == self._run_name]
 
 
@@ -167,77 +168,61 @@ class Keeper:
 _EDS_DIRECTORY = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 
 
-def recording_request(
-    config: Config,
-    report: dict[str, Any],
-    *,
-    directory: Path,
-    ring: Path,
-    progress: Path,
-    snapshot: Path,
-    notices: Path,
-    instance: str,
-) -> dict[str, Any]:
-    """Return the request for the recorder: configuration, joint files, EDS, DBC, networks and versions attached.
+def loop_request(config: Config, runtime: Path, bus: str) -> dict[str, Any]:
+    """Return the part that is common to the requests of all processes that read the loop's memory.
 
     Args:
         config: configuration in force.
-        report: boot report with the scaling read from the devices.
-        directory: where logs go.
-        ring: the loop's ring of cycle records.
-        progress: file in which the recorder stores how far it is.
-        snapshot: the loop's counters.
-        notices: the supervisor's notices.
-        instance: name of the bus as it can stand in a file name.
+        runtime: jtqd's runtime directory.
+        bus: name of the bus as it can stand in a file name.
     """
-    attachments: list[dict[str, str]] = [
-        {"name": "configuration.yaml", "media_type": "application/yaml", "text": config.text},
-        {"name": "bus.dbc", "media_type": "text/plain", "text": dbc_text(config, report)},
-        {
-            "name": "provenance.json",
-            "media_type": "application/json",
-            "text": json.dumps(_provenance(config, report)),
-        },
-    ]
-    # By their content: what is in force, whatever becomes of the files, even if the recorder must be started again.
-    for name, kind, data in _attached_files(config):
-        attachments.append(
-            {"name": name, "media_type": kind, "base64": base64.b64encode(data).decode("ascii")}
-        )
-    attachments += [
-        {"name": path.name, "media_type": "text/plain", "path": str(path)}
-        for path in sorted(
-            _EDS_DIRECTORY / name
-            for name in ("drive.eds", own_sheet(len(config.joints)), "torque_sensor.eds")
-        )
-    ]
-    settings = config.recording
+    nodes = [(joint.node_id, f"drive {joint.number}") for joint in config.joints]
+    if config.sensor is not None:
+        nodes.append((config.sensor.node_id, "torque sensor"))
     return {
-        "ring": str(ring),
-        "progress": str(progress),
-        "snapshot": str(snapshot),
-        "notices": str(notices),
-        "bus": instance,
-        "nodes": nodes_of(config),
-        "chunk_s": settings.chunk_s,
-        "rotate_s": settings.rotate_s,
-        "rotate_mb": settings.rotate_mb,
-        "budget_mb": settings.budget_mb,
-        "keep_run": settings.keep_run,
-        "reserve_mb": settings.reserve_mb,
-        "flight_recorder_s": settings.flight_recorder_s,
-        "directory": str(directory),
-        "prefix": f"jtqd-{instance}",
-        "attachments": attachments,
+        "ring": str(runtime / "ring"),
+        "snapshot": str(runtime / "snapshot"),
+        "notices": str(runtime / NOTICES),
+        "bus": bus,
+        "nodes": nodes,
         "joint_names": [f"joint_{joint.number}" for joint in config.joints],
         "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
     }
 
 
-def nodes_of(config: Config) -> list[tuple[int, str]]:
-    """(node-ID, name) of the nodes whose heartbeats /diagnostics shows."""
-    nodes = [(joint.node_id, f"drive {joint.number}") for joint in config.joints]
-    return nodes if config.sensor is None else [*nodes, (config.sensor.node_id, "torque sensor")]
+def recording_request(
+    config: Config, report: dict[str, Any], *, runtime: Path, directory: Path, bus: str
+) -> dict[str, Any]:
+    """Return the request for the recorder: configuration, joint files, EDS, DBC, networks and versions attached.
+
+    Args:
+        report: boot report with the scaling read from the devices.
+        directory: where logs go.
+        config, runtime, bus: as of `loop_request`.
+    """
+    provenance = json.dumps(_provenance(config, report))
+    attachments: list[dict[str, str]] = [
+        {"name": "configuration.yaml", "media_type": "application/yaml", "text": config.text},
+        {"name": "bus.dbc", "media_type": "text/plain", "text": dbc_text(config, report)},
+        {"name": "provenance.json", "media_type": "application/json", "text": provenance},
+    ]
+    # By their content: a recorder that is started later attaches what is in force, even if the files have changed.
+    for name, kind, data in _attached_files(config):
+        content = base64.b64encode(data).decode("ascii")
+        attachments.append({"name": name, "media_type": kind, "base64": content})
+    for name in sorted(("drive.eds", own_sheet(len(config.joints)), "torque_sensor.eds")):
+        path = str(_EDS_DIRECTORY / name)
+        attachments.append({"name": name, "media_type": "text/plain", "path": path})
+    settings = asdict(config.recording)
+    del settings["ring_cycles"]
+    return {
+        **loop_request(config, runtime, bus),
+        **settings,
+        "progress": str(runtime / _PROGRESS),
+        "directory": str(directory),
+        "prefix": f"jtqd-{bus}",
+        "attachments": attachments,
+    }
 
 
 def _attachment_names(config: Config) -> dict[Path, str]:

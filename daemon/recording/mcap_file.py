@@ -1,10 +1,10 @@
 """Write MCAP files out of whole spans: what is on disk is always a valid beginning of the file (https://mcap.dev/spec).
 
-A span is a stretch of recorded time: a chunk for each topic of the cycles, and one with everything else. Whoever wants one
-joint unpacks no other. `ChunkBuilder` collects messages into a `Span` of `SealedChunk`s: compressed, with CRC and message
-indexes. `McapFile` writes header, the metadata `jtqd`, attachments, schemas and channels first, outside any chunk; each span
-is one write, then `fdatasync`. A write that fails is taken back and only that span is gone. Blocks for the summary are taken
-from the disk before they are needed, so that a file can be ended on a disk that has become full.
+A span is a stretch of recorded time: a chunk for each topic of the cycles, and one with everything else, so that a reader
+of one joint unpacks no other. `ChunkBuilder` collects messages into a `Span` of `SealedChunk`s: compressed, with CRC and
+message indexes. `McapFile` writes header, the metadata `jtqd`, attachments, schemas and channels first, outside any chunk;
+each span is one write, then `fdatasync`. A write that fails is taken back and only that span is gone. Blocks for the summary
+are taken from the disk before they are needed, so that a file can be ended on a disk that has become full.
 
 Compared with the library's Writer, the messages of a cycle enter as ready-made bytes: 0.5 us a message instead of 3.5, and a
 span that could not be written leaves no entry in the index.
@@ -113,7 +113,7 @@ class Appender:
 
     What raises OSError leaves in it what it held before.
 
-    It is locked (`flock`) as long as it is open: whoever finds it unlocked may take it for left behind.
+    It is locked (`flock`) as long as it is open: an unlocked one was left by a killed process.
 
     Args:
         name: of the file, which must not exist.
@@ -300,7 +300,7 @@ class ChunkBuilder:
         return self._length
 
     def add_block(self, block: bytes, time_ns: int) -> None:
-        """Add one cycle's Message records (laid out as `block_parts` says), all of the same log time."""
+        """Add one cycle's Message records (laid out as in `block_parts`), all of the same log time."""
         self._times.append(time_ns)
         self._blocks.append(block)
         self._length += len(block)
@@ -390,7 +390,7 @@ def index_record(channel: int, entries: Sequence[int]) -> bytes:
 # ---- the MCAP file ----
 
 METADATA = "jtqd"
-"""Name of the record that says which run and part a file is."""
+"""Name of the record with run and part of a file."""
 _ROOM_FOR_NEXT = 2048
 """Of the summary that one more span makes longer (six chunks with four joints), and of statistics and footer."""
 

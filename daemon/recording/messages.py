@@ -107,7 +107,6 @@ class CycleMessages:
 
     Attributes:
         parts: channel and start of each Message record within the bytes of `block`.
-        size: of these bytes.
     """
 
     def __init__(self, joints: int) -> None:
@@ -118,7 +117,7 @@ class CycleMessages:
         frames_code = f"4sII8s16s{cycle.HEADER.size - 24}s{16 * capacity}s{8 * capacity}s"
         self.frames_size = struct.calcsize("<" + frames_code)
         packed = struct.Struct("<" + joints * ("11sIqq" + _JOINT_CODE) + "11sIqq" + frames_code)
-        self._pack, self.size = packed.pack, packed.size
+        self._pack = packed.pack
         topics = schemas.joint_topics(joints)
         step = _RECORD_HEAD.size + JOINT_ESTIMATE_SIZE
         self.parts = tuple((topic.number, n * step) for n, topic in enumerate((*topics, schemas.CAN_FRAMES)))
@@ -140,7 +139,7 @@ class CycleMessages:
         """Joint messages and frames message of one cycle: MCAP Message records in a row.
 
         Args:
-            record: the cycle record, as long as `cycle_record.Layout` says.
+            record: the cycle record.
             index, realtime_ns, flags, sync_counter, frames: of its header, which the caller has read already; more frames
                 than there is room for are left out.
         """
@@ -162,10 +161,11 @@ class CycleMessages:
             record[self._stamps : self._stamps + 8 * frames],
         )
 
-
-PAIR = CycleMessages(2)
-"""Of two joints: the messages of most buses."""
-CAN_FRAMES_SIZE, BLOCK_SIZE, BLOCK_PARTS, cycle_block = PAIR.frames_size, PAIR.size, PAIR.parts, PAIR.block
+    def payloads(self, block: bytes) -> Iterator[tuple[int, bytes]]:
+        """Yield channel and payload of each message of a block."""
+        ends = [start for _, start in self.parts[1:]] + [len(block)]
+        for (channel, start), end in zip(self.parts, ends, strict=True):
+            yield channel, block[start + _RECORD_HEAD.size : end]
 
 
 # ---- the slow topics ----

@@ -1,4 +1,4 @@
-"""The files ("parts") of one run: rotation, disk budget and reserve, and what happens when the disk is full.
+"""The files ("parts") of one run: rotation, disk budget, reserve, full disk; and the flight recorder in front of them.
 
 A file that cannot go on is ended with its summary; its cycles from then on are counted as lost, the obstacle is reported
 once, and another part is begun as soon as that is possible. Nothing here raises for a disk that fails.
@@ -14,16 +14,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, Span
-from jtqd.daemon.recording.recording import ERROR, INFO, WARN, Journal
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
+from jtqd.daemon.recording.recording import ERROR, INFO, WARN, EventLog
 from jtqd.daemon.recording.run_files import (
     ACTIVE,
     MEGABYTE,
     Account,
     free_bytes,
-    own_files,
+    part_files,
     part_name,
-    sized,
     to_remove,
 )
 
@@ -52,18 +51,27 @@ class Parts:
 
     Args:
         rules: of this run.
-        head: what every part begins with.
-        journal: for what must be noted.
+        head: beginning of every part.
+        builder: of the spans: a part begins with the definitions, and may end with a span of its own.
+        events: takes what must be noted.
         account: kept up to date.
+
+    Attributes:
+        part: number of the newest part; 0 before the first.
+        obstacle: why nothing is being written; empty while a file is.
+        all_ended: every part got its summary and its name.
     """
 
-    def __init__(self, rules: Rules, head: Head, journal: Journal, account: Account) -> None:
+    def __init__(
+        self, rules: Rules, head: Head, builder: ChunkBuilder, events: EventLog, account: Account
+    ) -> None:
         self._rules = rules
         self._head = head
-        self._journal = journal
+        self._builder = builder
+        self._events = events
         self._account = account
         self._file: McapFile | None = None
-        self._part = 0
+        self.part = 0
         self._previous = ""
         self._began_ns: int | None = None
         self._cycles = 0
@@ -72,16 +80,7 @@ class Parts:
         self._now_ns, self._retry_ns = 0, 0
         self._missed = 0
         self.obstacle = ""
-        """Why nothing is being written; empty while all is well."""
         self.all_ended = True
-        """Every part got its summary and its name."""
-
-    # ---- for /diagnostics ----
-
-    @property
-    def part(self) -> int:
-        """Number of the newest part; 0 before the first."""
-        return self._part
 
     @property
     def size(self) -> int:
@@ -90,7 +89,7 @@ class Parts:
 
     @property
     def total_size(self) -> int:
-        """Bytes of all our files, as far as they were looked at."""
+        """Bytes of all files of the prefix, as far as they were looked at."""
         return self._others + self.size
 
     @property
@@ -115,8 +114,8 @@ class Parts:
             if free_bytes(rules.directory) < rules.reserve * (_ROOM_AGAIN if self.obstacle else 1.0):
                 return self._no_room()
             rules.directory.mkdir(parents=True, exist_ok=True)
-            earlier = [each for each in own_files(rules.directory, rules.prefix) if each.run == rules.run]
-            part = max([self._part, *(each.part for each in earlier)]) + 1
+            earlier = [each for each in part_files(rules.directory, rules.prefix) if each.run == rules.run]
+            part = max([self.part, *(each.part for each in earlier)]) + 1
             name = part_name(rules.prefix, rules.run, part)
             previous = self._previous or (
                 part_name(rules.prefix, rules.run, earlier[-1].part) if earlier else ""
@@ -133,9 +132,9 @@ class Parts:
         except OSError as error:
             self._stop_for(f"cannot record to {rules.directory}: {error.strerror or error}")
             return False
-        self._part, self._previous = part, name
+        self.part, self._previous = part, name
         self._began_ns, self._cycles = self._now_ns or None, 0
-        self._journal.builder.restart()
+        self._builder.restart()
         self._enforce_budget()
         return True
 
@@ -151,11 +150,11 @@ class Parts:
             file.abandon(remove=True)
             return
         try:
-            file.finish(part_name(self._rules.prefix, self._rules.run, self._part))
+            file.finish(part_name(self._rules.prefix, self._rules.run, self.part))
         except OSError as error:
             self.all_ended = False
-            self._journal.warn(
-                f"part {self._part} could not be ended and keeps its name {ACTIVE}: {error.strerror or error}"
+            self._events.warn(
+                f"part {self.part} could not be ended and keeps its name {ACTIVE}: {error.strerror or error}"
             )
 
     def attach(self, attachments: Sequence[NamedData]) -> None:
@@ -224,8 +223,8 @@ class Parts:
         count, self._cycles = self._cycles, 0
         self._account.written -= count
         self._account.unwritten += count
-        text = f"part {self._part} was removed while it was being written: cycles lost with it: {count}"
-        self._journal.report(schemas.FILE_REMOVED, text, level=ERROR, count=count)
+        text = f"part {self.part} was removed while it was being written: cycles lost with it: {count}"
+        self._events.report(schemas.FILE_REMOVED, text, level=ERROR, count=count)
 
     # ---- obstacles ----
 
@@ -236,8 +235,8 @@ class Parts:
             f"recording pauses: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
         )
         if not self.obstacle and self._file is not None:
-            self._journal.note(schemas.SPACE_LOW, text, level=ERROR)
-            last = self._journal.builder.seal()
+            self._events.note(schemas.SPACE_LOW, text, level=ERROR)
+            last = self._builder.seal()
             with suppress(OSError):
                 if last is not None:
                     self._file.append(last)
@@ -248,44 +247,43 @@ class Parts:
     def _stop_for(self, obstacle: str) -> None:
         """Report an obstacle once, and wait a little before the next attempt."""
         if not self.obstacle:
-            self._journal.warn(f"{obstacle}; cycles are counted as lost until it continues")
+            self._events.warn(f"{obstacle}; cycles are counted as lost until it continues")
         self.obstacle = obstacle
         self._retry_ns = self._now_ns + _RETRY_NS
 
     def _try_again(self) -> bool:
         if self.obstacle and self._now_ns < self._retry_ns:
             return False
-        return self.open("recording continues" if self._part else "start")
+        return self.open("recording continues" if self.part else "start")
 
     def _went_on(self) -> None:
         self.obstacle = ""
         count, self._missed = self._missed, 0
-        text = f"recording continues in part {self._part}; cycles not written: {count}"
-        self._journal.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
+        text = f"recording continues in part {self.part}; cycles not written: {count}"
+        self._events.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
     # ---- budget ----
 
     def _enforce_budget(self) -> None:
         """Remove files to meet the budget, oldest first."""
         rules = self._rules
-        active = part_name(rules.prefix, rules.run, self._part) + ACTIVE
-        files = [each for each in own_files(rules.directory, rules.prefix) if each.path.name != active]
-        found = sized(files)
+        active = part_name(rules.prefix, rules.run, self.part) + ACTIVE
+        found = [each for each in part_files(rules.directory, rules.prefix) if each.path.name != active]
         if rules.budget is not None:
             for each in to_remove(found, rules.budget, self.size, rules.run, keep_run=rules.keep_run):
                 try:
-                    each.file.path.unlink()
+                    each.path.unlink()
                 except OSError as error:
-                    self._journal.warn(f"{each.file.path} cannot be removed: {error.strerror}")
+                    self._events.warn(f"{each.path} cannot be removed: {error.strerror}")
                     continue
                 found.remove(each)
-                text = f"removed {each.file.path.name}: budget of {rules.budget / MEGABYTE:g} MB"
-                self._journal.report(schemas.FILE_RETIRED, text, level=INFO)
+                text = f"removed {each.path.name}: budget of {rules.budget / MEGABYTE:g} MB"
+                self._events.report(schemas.FILE_RETIRED, text, level=INFO)
         self._others = sum(each.size for each in found)
         over = rules.budget is not None and self.total_size > rules.budget
         if over and not self._over_budget:
             text = "the budget is exceeded by files that are not removed; recording continues"
-            self._journal.report(schemas.FILE_RETIRED, text, level=WARN)
+            self._events.report(schemas.FILE_RETIRED, text, level=WARN)
         self._over_budget = over
 
 
@@ -311,9 +309,9 @@ class FlightRecorder:
         keep_s: how much memory holds.
     """
 
-    def __init__(self, parts: Parts, journal: Journal, account: Account, keep_s: float) -> None:
+    def __init__(self, parts: Parts, events: EventLog, account: Account, keep_s: float) -> None:
         self._parts = parts
-        self._journal = journal
+        self._events = events
         self._account = account
         self._keep_ns = round((keep_s + _NOTICED_S) * _NS)
         self._memory: deque[tuple[Span, int]] = deque()
@@ -357,7 +355,7 @@ class FlightRecorder:
         if not begun:
             return
         self.saved += 1
-        self._journal.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
+        self._events.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
         self._parts.open(why)
         while self._memory:
             span, at_ns = self._memory.popleft()

@@ -1,9 +1,9 @@
 """The recorder process: `python -m jtqd.daemon.recording.recorder REQUEST.json` turns the ring of cycles into MCAP files.
 
-It runs beside the loop and can only read what the loop leaves in shared memory, so that nothing it meets (a
-full disk, a stop, a kill) reaches the loop. It ends on SIGTERM or when its parent has gone: it then reads on
-until the loop writes no more, ends the file and prints one line of JSON on stdout. SIGUSR1: write the flight
-recording, or begin the next part; SIGUSR2: the loop has failed; SIGHUP: the attachments of REQUEST.json have changed.
+It runs beside the loop and can only read what the loop leaves in shared memory, so that nothing it meets (a full disk, a
+stop, a kill) reaches the loop. It ends on SIGTERM or when its parent has gone: it then reads on until the loop writes no
+more, ends the file and prints one line of JSON on stdout. SIGUSR1: write the flight recording, or begin the next part;
+SIGUSR2: the loop has failed; SIGHUP: the attachments of REQUEST.json have changed.
 
 Exit status: 0 every cycle is in a file (or let go by the flight recorder), 1 shared memory is not there, 2 the request
 is wrong, 3 cycles were lost or a file could not be ended.
@@ -29,33 +29,28 @@ from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, NamedData
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros_of
 from jtqd.daemon.recording.parts import FlightRecorder, Parts, Rules
-from jtqd.daemon.recording.recording import INFO, WARN, Journal, Recording
+from jtqd.daemon.recording.recording import INFO, WARN, EventLog, Recording
 from jtqd.daemon.recording.run_files import (
     MEGABYTE,
     RUN_PATTERN,
     Account,
     ProgressFile,
     free_run,
-    own_files,
-    sized,
+    part_files,
 )
-from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared.child_process import Child, ChildError
-from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS, layout_of
 from jtqd.daemon.shared.notices import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
-from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
+from jtqd.daemon.shared.snapshot import SnapshotError
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
 """Spans after which schemas and channels are repeated; a flight recording begins with any span."""
-_QUANTILES = (0.5, 0.99, 1.0)
-
 
 # ---- the request ----
 
 _SOURCES = {"path", "text", "base64"}
-_PATHS = ("progress", "snapshot", "notices")
+_PATHS = ("ring", "directory", "progress", "snapshot", "notices")
 _LISTS = ("attachments", "joint_names", "gear_ratios")
 
 
@@ -65,26 +60,25 @@ class RequestError(ValueError):
 
 @dataclass(frozen=True)
 class RecorderRequest:
-    """Paths and constants of one recording; megabytes are of 1 000 000 bytes.
+    """Paths and constants of one recording; megabytes are of 1 000 000 bytes. The supervisor writes it as JSON.
 
     Attributes:
         ring: file of the ring of cycle records (`jtqd.daemon.shared.ring`).
         directory: where the MCAP files go; made when it does not exist.
-        prefix: what their names begin with (`jtqd.daemon.recording.parts`).
+        prefix: beginning of their names (`jtqd.daemon.recording.run_files`).
         run: name of the run; another recorder of the same run goes on with its numbers. None: a new one.
         chunk_s: length of a chunk [s]; a crash costs at most this and 0.1 s.
         rotate_s, rotate_mb, budget_mb, keep_run, reserve_mb, flight_recorder_s: see `jtqd.daemon.config`.
         wait_s: how long to wait for the ring to appear [s].
-        repair: finish files that a crash has left behind.
+        repair: recover the unfinished files of earlier runs.
         attachments: each {"name", "media_type", and one of "path", "text" and "base64"}.
-        progress: file of `jtqd.daemon.recording.run_files`; an older recorder's account in it is carried on. None: none.
+        progress: `ProgressFile`; an older recorder's account in it is carried on. None: none.
         snapshot: the loop's `jtqd.daemon.shared.snapshot`, for /diagnostics. None: without it.
         notices: the supervisor's `jtqd.daemon.shared.notices`, for /events and /log. None: without them.
         bus: name of the bus, for /diagnostics.
         nodes: [node-ID, name] of those in /diagnostics.
         joint_names: of the joints, joint 1 first, for /joint_states; there are as many joints as names.
         gear_ratios: of the joints; null where not known.
-        channel_metadata: topic -> {key: text}, e.g. the PDO map of /can/frames.
     """
 
     ring: Path
@@ -108,7 +102,6 @@ class RecorderRequest:
     nodes: tuple[Node, ...] = ()
     joint_names: tuple[str, ...] = ("joint_1", "joint_2")
     gear_ratios: tuple[float | None, ...] = (None, None)
-    channel_metadata: dict[str, dict[str, str]] | None = None
 
     def __post_init__(self) -> None:
         if not 0.01 <= self.chunk_s <= 60.0:
@@ -126,6 +119,9 @@ class RecorderRequest:
         for ratio in self.gear_ratios:
             if ratio is not None and not (math.isfinite(ratio) and ratio != 0.0):
                 raise RequestError(f"gear_ratios: found {ratio!r}, expected a number other than 0, or null")
+        for item in self.attachments:
+            if not isinstance(item, dict) or "name" not in item or len(_SOURCES & item.keys()) != 1:
+                raise RequestError(f"attachment {item!r:.200}: expected a name and a path, a text or base64")
 
     @property
     def joints(self) -> int:
@@ -144,14 +140,14 @@ class RecorderRequest:
         except (OSError, ValueError) as error:
             raise RequestError(f"{path}: cannot be read as JSON: {error}") from None
         try:
-            return cls._from_mapping(content)
+            return cls._of(content)
         except RequestError as error:
             raise RequestError(f"{path}: {error}") from None
         except (TypeError, ValueError, KeyError, AttributeError) as error:
             raise RequestError(f"{path}: {type(error).__name__}: {error}") from None
 
     @classmethod
-    def _from_mapping(cls, content: Any) -> RecorderRequest:
+    def _of(cls, content: Any) -> RecorderRequest:
         if not isinstance(content, dict):
             raise RequestError("expected a mapping")
         unknown = content.keys() - {field.name for field in fields(cls)}
@@ -160,34 +156,38 @@ class RecorderRequest:
         for key in ("ring", "directory"):
             if not isinstance(content.get(key), str):
                 raise RequestError(f"key {key!r}: expected a path")
-        values = dict(content, ring=Path(content["ring"]), directory=Path(content["directory"]))
-        for key in _PATHS:
-            if values.get(key) is not None:
-                values[key] = Path(values[key])
-        for key in _LISTS:
-            if key in values:
-                values[key] = tuple(values[key])
-        values["nodes"] = tuple(Node(int(number), str(name)) for number, name in values.get("nodes", ()))
-        for item in values.get("attachments", ()):
-            if not isinstance(item, dict) or "name" not in item or len(_SOURCES & item.keys()) != 1:
-                raise RequestError(f"attachment {item!r:.200}: expected a name and a path, a text or base64")
+        values = content | {key: Path(content[key]) for key in _PATHS if content.get(key) is not None}
+        values |= {key: tuple(content[key]) for key in _LISTS if key in content}
+        values["nodes"] = tuple(Node(int(number), str(name)) for number, name in content.get("nodes", ()))
         return cls(**values)
 
-    def load_attachments(self) -> tuple[list[NamedData], list[str]]:
-        """Attachments, and a line for each that is not what it should be: a missing one must not end a recording."""
-        loaded, problems = [], []
+    def load_attachments(self, warn: Callable[[str], None]) -> list[NamedData]:
+        """Return the attachments; one that cannot be read is a line for the operator, and does not end a recording."""
+        loaded = []
         for item in self.attachments:
-            media_type = item.get("media_type", "application/octet-stream")
             try:
                 data = _content(item)
             except OSError as error:
-                problems.append(f"attachment {item['name']}: {error.strerror}: {item['path']}")
-                continue
+                warn(f"attachment {item['name']}: {error.strerror}: {item['path']}")
             except ValueError as error:
-                problems.append(f"attachment {item['name']}: its base64: {error}")
-                continue
-            loaded.append(NamedData(item["name"], media_type, data))
-        return loaded, problems
+                warn(f"attachment {item['name']}: its base64: {error}")
+            else:
+                media_type = item.get("media_type", "application/octet-stream")
+                loaded.append(NamedData(item["name"], media_type, data))
+        return loaded
+
+    def rules(self, run: str) -> Rules:
+        """Return the rules of the files of this run."""
+        return Rules(
+            directory=self.directory,
+            prefix=self.prefix,
+            run=run,
+            rotate_ns=round(self.rotate_s * 1e9),
+            rotate_bytes=round(self.rotate_mb * MEGABYTE),
+            budget=None if self.budget_mb is None else round(self.budget_mb * MEGABYTE),
+            keep_run=self.keep_run,
+            reserve=round(self.reserve_mb * MEGABYTE),
+        )
 
 
 def _content(item: dict[str, str]) -> bytes:
@@ -201,7 +201,7 @@ def _content(item: dict[str, str]) -> bytes:
 
 
 class Session:
-    """One recording, put together from its request: files or flight recorder, journal, diagnostics, repair.
+    """One recording, put together from its request: files or flight recorder, events, diagnostics, repair.
 
     Args:
         request: what to do.
@@ -214,39 +214,39 @@ class Session:
 
     def __init__(self, request: RecorderRequest, account: Account, warn: Callable[[str], None]) -> None:
         self._request = request
+        self._warn = warn
         self.account = account
         now_ns = time.time_ns()
         self.run = request.run or free_run(request.directory, request.prefix, now_ns)
-        attachments, problems = request.load_attachments()
-        for problem in problems:
-            warn(problem)
-        self._warn = warn
-        schema_records, channel_records = definitions(request.channel_metadata, request.joints)
-        head = Head(schema_records, channel_records, attachments)
-        in_flight = request.flight_recorder_s is not None
-        repeat = _REPEAT_EVERY_IN_MEMORY if in_flight else _REPEAT_EVERY
-        builder = ChunkBuilder(schema_records, channel_records, CycleMessages(request.joints).parts, repeat)
-        self.journal = Journal(builder, warn)
-        self.parts = Parts(_rules(request, self.run), head, self.journal, account)
-        self._flight: FlightRecorder | None = None
-        if request.flight_recorder_s is not None:
-            self._flight = FlightRecorder(self.parts, self.journal, account, request.flight_recorder_s)
-        overview = JointStateMessage(request.joint_names, request.gear_ratios)
-        sink = self._flight or self.parts
-        self.recording = Recording(self.journal, sink, overview, int(request.chunk_s * 1e9), account)
-        self._snapshot = None if request.snapshot is None else SnapshotReader(request.snapshot)
-        self._diagnostics = Diagnostics(request.bus, request.joint_names, request.nodes)
+        self._rules = request.rules(self.run)
+        definitions, channels = schemas.definitions(request.joints)
+        head = Head(definitions, channels, request.load_attachments(warn))
+        keep_s = request.flight_recorder_s
+        repeat = _REPEAT_EVERY if keep_s is None else _REPEAT_EVERY_IN_MEMORY
+        self._builder = ChunkBuilder(definitions, channels, CycleMessages(request.joints).parts, repeat)
+        self.events = EventLog(self._builder.add, warn)
+        self.parts = Parts(self._rules, head, self._builder, self.events, account)
+        self._flight = None if keep_s is None else FlightRecorder(self.parts, self.events, account, keep_s)
+        self.recording = Recording(
+            self._builder,
+            self.events,
+            self._flight or self.parts,
+            JointStateMessage(request.joint_names, request.gear_ratios),
+            chunk_ns=int(request.chunk_s * 1e9),
+            account=account,
+        )
+        self._diagnostics = Diagnostics(request.snapshot, request.bus, request.joint_names, request.nodes)
         self._zeros_cycle = -1
         self._notices: NoticesReader | None = None
         self._repair: Child | None = None
         self._repair_due = request.repair
-        self.journal.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=now_ns)
+        self.events.note(schemas.RECORDER_STARTED, "recorder started", level=INFO, time_ns=now_ns)
         if self._flight is None:
-            earlier = any(each.run == self.run for each in own_files(request.directory, request.prefix))
+            earlier = any(each.run == self.run for each in part_files(request.directory, request.prefix))
             self.parts.open("recorder restarted" if earlier else "start")
 
     def save(self, why: str) -> None:
-        """Write the flight recording; without a flight recorder: begin the next part, so that this one can be had."""
+        """Write the flight recording; without a flight recorder begin the next part, so that this one is complete."""
         self.recording.flush()
         if self._flight is None:
             self.parts.rotate(why)
@@ -254,10 +254,8 @@ class Session:
             self._flight.save(why)
 
     def renew(self, request: RecorderRequest) -> None:
-        """Other files are in force in the loop: they are attached to the part that begins now, and to all after it."""
-        attachments, problems = request.load_attachments()
-        for problem in problems:
-            self._warn(problem)
+        """Attach other files to the part that begins now, and to all after it."""
+        attachments = request.load_attachments(self._warn)
         self.recording.flush()
         self.parts.attach(attachments)
         if self._flight is None:
@@ -279,43 +277,36 @@ class Session:
     def diagnose(self, backlog: int, cpu_percent: float) -> None:
         """Write /diagnostics, once a second."""
         now_ns = time.time_ns()
-        parts, flight, request = self.parts, self._flight, self._request
+        parts, flight, rules = self.parts, self._flight, self._rules
         mode = "recording" if flight is None else "saving" if flight.saving else "in memory"
         state = RecorderState(
             mode="waiting" if parts.obstacle else mode,
             obstacle=parts.obstacle,
             backlog=backlog,
             cpu_percent=cpu_percent,
-            events_left_out=self.journal.left_out,
+            events_left_out=self.events.left_out,
             part=parts.part,
             part_bytes=parts.size,
             total_bytes=parts.total_size,
             free=parts.free_bytes,
-            reserve=round(request.reserve_mb * MEGABYTE),
-            budget=-1 if request.budget_mb is None else round(request.budget_mb * MEGABYTE),
+            reserve=rules.reserve,
+            budget=-1 if rules.budget is None else rules.budget,
             memory_bytes=0 if flight is None else flight.memory_bytes,
             memory_s=0.0 if flight is None else flight.memory_s,
         )
-        snapshot = self._snapshot
-        nothing = [float("nan")] * len(_QUANTILES)
-        work = nothing if snapshot is None else snapshot.work_us(*_QUANTILES)
-        late = nothing if snapshot is None else snapshot.late_us(*_QUANTILES)
-        view = None if snapshot is None else snapshot.read()
-        conditions = [] if request.snapshot is None else read_conditions(request.snapshot.parent)
-        statuses = self._diagnostics.statuses(
-            view, self.account, state, work_us=work, late_us=late, now_ns=now_ns, conditions=conditions
-        )
-        self.journal.builder.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
+        view, statuses = self._diagnostics.of_loop(now_ns)
+        statuses += self._diagnostics.of_recorder(self.account, state)
+        self._builder.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
         if view is not None and view.cycle != self._zeros_cycle:
             self._zeros_cycle = view.cycle
             for topic, message in zeros_of(view):
-                self.journal.builder.add(topic.number, now_ns, message)
+                self._builder.add(topic.number, now_ns, message)
 
     def finish(self) -> dict[str, Any]:
         """End everything; returns the summary of the run."""
         account = self.account
         text = f"recorder stopped: cycles {account.cycles}, lost {account.lost}"
-        self.journal.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
+        self.events.note(schemas.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
         self._read_notices()
         self.recording.flush()
         if self._flight is None:
@@ -325,17 +316,11 @@ class Session:
         if self._repair is not None:
             self._repair.process.kill()  # it may be interrupted anywhere, and goes on at the next start
             self._repair.process.wait()
-        files = sized(
-            [
-                each
-                for each in own_files(self._request.directory, self._request.prefix)
-                if each.run == self.run
-            ]
-        )  # one that could not be ended among them
-        paths = [each.file.path for each in files]
+        files = part_files(self._request.directory, self._request.prefix)
+        own = [each for each in files if each.run == self.run]  # one that could not be ended among them
         return {
-            "path": str(paths[-1]) if paths else None,
-            "paths": [str(path) for path in paths],
+            "path": str(own[-1].path) if own else None,
+            "paths": [str(each.path) for each in own],
             "run": self.run,
             "cycles": account.cycles,
             "written": account.written,
@@ -344,7 +329,7 @@ class Session:
             "lost_unwritten": account.unwritten,
             "let_go": account.let_go,
             "flight_recordings": None if self._flight is None else self._flight.saved,
-            "bytes": sum(each.size for each in files),
+            "bytes": sum(each.size for each in own),
         }
 
     def _read_notices(self) -> None:
@@ -358,7 +343,7 @@ class Session:
                 return
         news, _ = self._notices.read()
         for notice in news:
-            self.journal.note(
+            self.events.note(
                 schemas.NOTICE,
                 notice.text,
                 level=notice.level,
@@ -371,11 +356,10 @@ class Session:
         request = self._request
         if self._repair_due and self._has_begun():
             self._repair_due = False
-            files = own_files(request.directory, request.prefix)
+            files = part_files(request.directory, request.prefix)
             current = self.parts.part if self.parts.is_open else 0
             if any(each.active and (each.run, each.part) != (self.run, current) for each in files):
-                reserve = round(request.reserve_mb * MEGABYTE)
-                arguments = [str(request.directory), request.prefix, str(reserve)]
+                arguments = [str(request.directory), request.prefix, str(self._rules.reserve)]
                 self._repair = Child("jtqd.daemon.logs.recover", arguments, name="the repair")
         if self._repair is None:
             return
@@ -386,26 +370,13 @@ class Session:
             answer = {"text": str(error), "lossy": True}
         if answer is not None:
             level = WARN if answer["lossy"] else INFO
-            self.journal.report(schemas.FILE_REPAIRED, str(answer["text"]), level=level)
+            self.events.report(schemas.FILE_REPAIRED, str(answer["text"]), level=level)
         elif ended:
             self._repair = None
 
     def _has_begun(self) -> bool:
         """Return whether a span has been through; a repair delays nothing any more."""
         return self.account.written > 0 or self.account.let_go > 0 or bool(self.parts.obstacle)
-
-
-def _rules(request: RecorderRequest, run: str) -> Rules:
-    return Rules(
-        directory=request.directory,
-        prefix=request.prefix,
-        run=run,
-        rotate_ns=round(request.rotate_s * 1e9),
-        rotate_bytes=round(request.rotate_mb * MEGABYTE),
-        budget=None if request.budget_mb is None else round(request.budget_mb * MEGABYTE),
-        keep_run=request.keep_run,
-        reserve=round(request.reserve_mb * MEGABYTE),
-    )
 
 
 # ---- the process ----
@@ -428,23 +399,22 @@ class _Signals:
 
     def __init__(self) -> None:
         self._parent = os.getppid()
-        self._stop = False
-        self.save = False
-        self.failed = False
-        self.renew = False
-        signal.signal(signal.SIGHUP, self._on_signal)
-        signal.signal(signal.SIGTERM, self._on_signal)
-        signal.signal(signal.SIGUSR1, self._on_signal)
-        signal.signal(signal.SIGUSR2, self._on_signal)
+        self._received: set[int] = set()
+        for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):
+            signal.signal(number, self._on_signal)
         # Ctrl-C reaches every process of the terminal; the supervisor ends the loop, then sends SIGTERM.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # `Keeper` starts us with it blocked
+        # `launch.RecorderProcess` starts us with it blocked
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
 
     def _on_signal(self, number: int, _frame: object) -> None:
-        self._stop |= number == signal.SIGTERM
-        self.save |= number == signal.SIGUSR1
-        self.failed |= number == signal.SIGUSR2
-        self.renew |= number == signal.SIGHUP
+        self._received.add(number)
+
+    def take(self, number: int) -> bool:
+        """Return whether this signal came since the last call."""
+        came = number in self._received
+        self._received.discard(number)
+        return came
 
     @property
     def orphaned(self) -> bool:
@@ -452,7 +422,7 @@ class _Signals:
 
     @property
     def stop(self) -> bool:
-        return self._stop or self.orphaned
+        return signal.SIGTERM in self._received or self.orphaned
 
 
 def _open_ring(request: RecorderRequest, signals: _Signals) -> RingReader:
@@ -467,25 +437,27 @@ def _open_ring(request: RecorderRequest, signals: _Signals) -> RingReader:
 
 
 class Recorder:
-    """The polling loop around one `Session`."""
+    """The polling loop around one `Session`.
+
+    Args:
+        progress: takes how far the recording is; None: nothing does.
+        request_path: read again on SIGHUP.
+    """
 
     def __init__(
         self,
         reader: RingReader,
         session: Session,
-        *,
-        chunk_s: float,
         signals: _Signals,
         progress: ProgressFile | None,
-        request_path: Path | None = None,
+        request_path: Path,
     ) -> None:
         self._reader = reader
         self._session = session
         self._recording = session.recording
-        self._chunk_s = chunk_s
         self._signals = signals
-        self._request_path = request_path
         self._progress = progress
+        self._request_path = request_path
 
     def _take(self) -> int:
         """Take everything that is in the ring now; returns how many cycles that were."""
@@ -501,8 +473,8 @@ class Recorder:
                 return taken
             self.settle()
 
-    def run(self) -> None:
-        """Record until told to end, then until the loop is quiet."""
+    def run(self, chunk_s: float) -> None:
+        """Record until an order to end, then until the loop is quiet."""
         settled = self._recording.account.cycles
         if self._reader.position > settled:
             self._recording.count_lost(self._reader.position - settled, time.time_ns())
@@ -535,7 +507,7 @@ class Recorder:
             # Spans end by recorded time; this is for a loop that stands still.
             if taken:
                 last_flush = now
-            elif now - last_flush >= self._chunk_s:
+            elif now - last_flush >= chunk_s:
                 self._recording.flush()
                 last_flush = now
             self.settle()
@@ -543,25 +515,15 @@ class Recorder:
 
     def _answer_signals(self) -> None:
         signals = self._signals
-        if signals.failed:
-            signals.failed = False
+        if signals.take(signal.SIGUSR2):
             self._session.fault("the loop failed")
-        if signals.save:
-            signals.save = False
+        if signals.take(signal.SIGUSR1):
             self._session.save("on request")
-        if signals.renew:
-            signals.renew = False
-            self._renew()
-
-    def _renew(self) -> None:
-        if self._request_path is None:
-            return
-        try:
-            request = RecorderRequest.from_file(self._request_path)
-        except RequestError as error:
-            _warn(str(error))
-            return
-        self._session.renew(request)
+        if signals.take(signal.SIGHUP):
+            try:
+                self._session.renew(RecorderRequest.from_file(self._request_path))
+            except RequestError as error:
+                _warn(str(error))
 
     def settle(self) -> None:
         """Store how far the recording is."""
@@ -569,14 +531,19 @@ class Recorder:
             self._progress.store(self._recording.progress)
 
 
-def record(request: RecorderRequest, request_path: Path | None = None) -> int:
-    """Record one run; returns the exit status and prints the summary. SIGHUP reads `request_path` again.
+def record(path: Path) -> int:
+    """Record one run; returns the exit status and prints the summary. SIGHUP reads the request again.
+
+    Args:
+        path: of the request.
 
     Raises:
+        RequestError: the request is wrong.
         RingError: no ring at that path within `wait_s`.
-        SnapshotError: no snapshot where the request says.
+        SnapshotError: no snapshot at the path of the request.
         OSError: the file of the progress cannot be made.
     """
+    request = RecorderRequest.from_file(path)
     signals = _Signals()
     with suppress(OSError):
         os.nice(_NICE)
@@ -584,20 +551,13 @@ def record(request: RecorderRequest, request_path: Path | None = None) -> int:
     progress = None if request.progress is None else ProgressFile(request.progress)
     account = Account() if progress is None else progress.load()
     session = Session(request, account, _warn)
-    recorder = Recorder(
-        reader,
-        session,
-        chunk_s=request.chunk_s,
-        signals=signals,
-        progress=progress,
-        request_path=request_path,
-    )
-    recorder.run()
+    recorder = Recorder(reader, session, signals, progress, path)
+    recorder.run(request.chunk_s)
     summary = session.finish()
     recorder.settle()
     try:
         print(json.dumps(summary), flush=True)
-    except OSError:  # whoever read it has gone, and the interpreter would say so at its end
+    except OSError:  # its reader has gone, and the interpreter would report that at its end
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     return 0 if session.parts.all_ended and not account.lost else 3
 
@@ -608,9 +568,9 @@ def main(arguments: list[str] | None = None) -> int:
     if len(arguments) != 1 or arguments[0].startswith("-"):
         _warn("usage: python -m jtqd.daemon.recording.recorder REQUEST.json (see docs/logs.md)")
         return 2
+    path = Path(arguments[0])
     try:
-        path = Path(arguments[0])
-        return record(RecorderRequest.from_file(path), path)
+        return record(path)
     except RequestError as error:
         _warn(str(error))
         return 2

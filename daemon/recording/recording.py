@@ -1,7 +1,7 @@
-"""Turn cycle records into spans: messages of each cycle, the overview, events, and the account of cycles.
+"""Turns cycle records into spans of messages: each cycle, the 50 Hz overview, events, and the account of cycles.
 
-Records and times come in; spans go to a sink: the files of the run (`jtqd.daemon.recording.parts`), or the flight
-recorder, which keeps them in memory until something happens. Nothing raises for a disk that fails.
+Spans go to a sink: the files of the run, or the flight recorder (`jtqd.daemon.recording.parts`). Nothing raises for a disk
+that fails.
 """
 
 from __future__ import annotations
@@ -14,33 +14,44 @@ from jtqd.daemon.recording.mcap_file import ChunkBuilder, Span
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, event, log
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record as cycle
+from jtqd.estimator.status import DRIVE_FAULT, INVALID, STALE, STANDSTILL, STARTING, VALID
+
+_NS = 1_000_000_000
 
 # ---- events ----
 
+INFO, WARN, ERROR = 20, 30, 40
 _PER_SPAN = 50
 """A status that flaps every cycle must not fill the disk; what is left out is counted."""
 _BOUNDED = (schemas.STATUS_CHANGED, schemas.SLOTS_MISSED, schemas.NOTICE)
-INFO, WARN, ERROR = 20, 30, 40
+_GOOD = (STARTING, VALID, STANDSTILL)
+"""Statuses that a healthy joint goes through."""
 
 
-class Journal:
-    """Adds events to the span that is being collected.
+class EventLog:
+    """Makes a message on /events and one on /log of every occurrence.
 
     Args:
-        builder: of the spans.
-        warn: called with one line for the operator.
+        add: takes channel, log time [ns] and payload of each message.
+        warn: takes one line for the operator.
 
     Attributes:
-        newest: index and CLOCK_REALTIME of the newest cycle.
-        left_out: events for which there was no room.
+        newest: index and CLOCK_REALTIME [ns] of the newest cycle.
+        left_out: events beyond the number that a span may hold.
     """
 
-    def __init__(self, builder: ChunkBuilder, warn: Callable[[str], None]) -> None:
-        self.builder = builder
+    def __init__(self, add: Callable[[int, int, bytes], None], warn: Callable[[str], None] = print) -> None:
+        self._add = add
         self.warn = warn
         self.newest = (0, 0)
         self.left_out = 0
         self._in_span = 0
+        self.forget()
+
+    def forget(self) -> None:
+        """Take the next cycle as the first one: its status and missed slots are no change."""
+        self._statuses: tuple[int, ...] | None = None
+        self._missed: int | None = None
 
     def new_span(self) -> None:
         """Reset the number of events for a new span."""
@@ -65,21 +76,36 @@ class Journal:
         index, newest = self.newest
         when = newest if time_ns is None else time_ns
         payload = event(when, kind, text, index=index, count=count, joint=joint, change=change)
-        self.builder.add(schemas.EVENTS.number, when, payload)
-        self.builder.add(schemas.LOG.number, when, log(when, level, text))
+        self._add(schemas.EVENTS.number, when, payload)
+        self._add(schemas.LOG.number, when, log(when, level, text))
 
     def report(self, kind: int, text: str, *, level: int, count: int = 0) -> None:
         """Note an event and report its text to the operator."""
         self.warn(text)
         self.note(kind, text, level=level, count=count)
 
+    def cycle(self, statuses: tuple[int, ...], missed: int) -> bool:
+        """Note what differs from the cycle before; returns whether a status does."""
+        before, self._statuses = self._statuses, statuses
+        if statuses != before:
+            for joint, (old, new) in enumerate(zip(before or statuses, statuses, strict=True), start=1):
+                if old != new:
+                    names = [schemas.STATUS_NAMES.get(code, str(code)) for code in (old, new)]
+                    text = f"joint {joint}: {names[0]} -> {names[1]}"
+                    level = INFO if new in _GOOD else WARN
+                    self.note(schemas.STATUS_CHANGED, text, level=level, joint=joint, change=(old, new))
+        if missed != self._missed:
+            slots = missed - (missed if self._missed is None else self._missed)
+            self._missed = missed
+            if slots > 0:
+                text = f"the loop missed {slots} {'slot' if slots == 1 else 'slots'}"
+                self.note(schemas.SLOTS_MISSED, text, level=WARN, count=slots)
+        return statuses != before
+
 
 # ---- faults ----
 
 STALE_S = 1.0
-_NS = 1_000_000_000
-_AT_ONCE = [code for code, name in schemas.STATUS_NAMES.items() if name in ("DRIVE_FAULT", "INVALID")]
-_STALE = next(code for code, name in schemas.STATUS_NAMES.items() if name == "STALE")
 
 
 class FaultTrigger:
@@ -98,8 +124,8 @@ class FaultTrigger:
         why = ""
         for n, (old, new) in enumerate(zip(before, statuses, strict=True)):
             if new != old:
-                self._stale_since[n] = at_ns if new == _STALE else None
-                if new in _AT_ONCE:
+                self._stale_since[n] = at_ns if new == STALE else None
+                if new in (DRIVE_FAULT, INVALID):
                     why = f"joint {n + 1}: {schemas.STATUS_NAMES[new]}"
         return why
 
@@ -137,28 +163,31 @@ class Recording:
     """One run of the loop on its way into files.
 
     Args:
-        journal: with the builder of the spans.
-        sink: takes them.
+        builder: of the spans.
+        events: what happens becomes messages of the span.
+        sink: takes the spans.
         overview: makes /joint_states; it knows the number of joints.
         chunk_ns: length of a span in recorded time [ns].
         account: of an earlier recorder of the same run, or a new one; shared with the sink.
 
     Attributes:
-        fault: why a flight recording is wanted; empty for no reason. Whoever reads it empties it.
+        fault: why a flight recording is wanted, until a reader empties it; empty for no reason.
     """
 
     def __init__(
         self,
-        journal: Journal,
+        builder: ChunkBuilder,
+        events: EventLog,
         sink: Sink,
         overview: JointStateMessage,
+        *,
         chunk_ns: int,
         account: Account,
     ) -> None:
         self.account = account
-        self.journal = journal
+        self.events = events
         self.fault = ""
-        self._builder = journal.builder
+        self._builder = builder
         self._sink = sink
         self._overview = overview
         self._chunk_ns = chunk_ns
@@ -166,12 +195,9 @@ class Recording:
         self._chunk_end_ns: int | None = None
         self._newest_ns = 0
         self._overview_slot = -1
-        self._statuses: tuple[int, ...] | None = None
         self._faults = FaultTrigger(overview.joints)
         self._block = CycleMessages(overview.joints).block
         self._scan = cycle.selection(*SCANNED, overview.joints).unpack_from
-        self.missed: int | None = None
-        """Slots missed as the newest cycle says; None before the first."""
 
     def add(self, record: bytes) -> None:
         """Take one cycle record. Costs about 3 us: this is the path of every cycle."""
@@ -180,17 +206,14 @@ class Recording:
         index, monotonic, realtime, flags, missed, counter, count, *statuses = self._scan(record)
         realtime = max(realtime, 0)
         builder.add_block(
-            self._block(record, index, realtime, flags=flags, sync_counter=counter, frames=count),
-            realtime,
+            self._block(record, index, realtime, flags=flags, sync_counter=counter, frames=count), realtime
         )
         self._pending += 1
         self._newest_ns = monotonic
-        self.journal.newest = (index, realtime)
+        self.events.newest = (index, realtime)
         found = tuple(statuses)
-        if found != self._statuses:
-            self._status_events(found, monotonic)
-        if missed != self.missed:
-            self._missed_event(missed)
+        if self.events.cycle(found, missed):
+            self.fault = self._faults.changed(found, monotonic) or self.fault
         slot = monotonic // OVERVIEW_PERIOD_NS
         if slot != self._overview_slot:
             self._overview_slot = slot
@@ -207,41 +230,18 @@ class Recording:
         settled = account.cycles - self._pending
         return Account(settled, account.written, account.overwritten, account.unwritten, account.let_go)
 
-    def _status_events(self, statuses: tuple[int, ...], monotonic: int) -> None:
-        before, self._statuses = self._statuses, statuses
-        self.fault = self._faults.changed(statuses, monotonic) or self.fault
-        if before is None:
-            return
-        for joint, (old, new) in enumerate(zip(before, statuses, strict=True), start=1):
-            if old != new:
-                names = [schemas.STATUS_NAMES.get(code, str(code)) for code in (old, new)]
-                self.journal.note(
-                    schemas.STATUS_CHANGED,
-                    f"joint {joint}: {names[0]} -> {names[1]}",
-                    level=INFO if new in (1, 2, 6) else WARN,
-                    joint=joint,
-                    change=(old, new),
-                )
-
-    def _missed_event(self, missed: int) -> None:
-        before, self.missed = self.missed, missed
-        if before is not None and missed > before:
-            count = missed - before
-            text = f"the loop missed {count} {'slot' if count == 1 else 'slots'}"
-            self.journal.note(schemas.SLOTS_MISSED, text, level=WARN, count=count)
-
     def count_lost(self, count: int, time_ns: int) -> None:
         """Count cycles that the ring overwrote before they were read."""
         self.account.cycles += count
         self.account.overwritten += count
         text = f"{count} cycle{'' if count == 1 else 's'} overwritten before the recorder read them"
-        self.journal.note(schemas.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
+        self.events.note(schemas.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
 
     def flush(self) -> None:
         """End the span and hand it on."""
         self.fault = self._faults.passed(self._newest_ns) or self.fault
         self._chunk_end_ns, self._pending = None, 0
-        self.journal.new_span()
+        self.events.new_span()
         span = self._builder.seal()
         if span is not None:
             self._sink.write(span, self._newest_ns)

@@ -2,7 +2,7 @@
 
 A file is named PREFIX-RUN-PART.mcap, with `.active` behind it while it is being written. RUN is the time at which the run
 began, `YYYYmmddTHHMMSSZ` (UTC), with `_2`, `_3` ... where another run of that prefix has it already; PART counts from 0001.
-Nothing else in a directory is ours: it is neither repaired nor removed.
+A file with another name is neither repaired nor removed.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import mmap
 import os
 import re
+import stat
 import struct
 import time
 from collections.abc import Sequence
@@ -25,18 +26,23 @@ PART_PATTERN = re.compile(
     rf"(?P<prefix>.+)-(?P<run>{_RUN})-(?P<part>\d{{4,}})\.mcap(?P<active>{re.escape(ACTIVE)})?", re.ASCII
 )
 """Name of a part, of any prefix."""
+MEGABYTE = 1_000_000
 
 
-class OwnFile(NamedTuple):
-    """One of our files; they sort in the order of their writing, as long as no run began before the clock was set back."""
+class PartFile(NamedTuple):
+    """One part; parts sort in the order of their writing, as long as no run began before the clock was set back.
+
+    again: number of the run among those of the same second, 1 for the first.
+    size: [byte].
+    """
 
     stamp: str
     again: int
-    """Number of the run among those of the same second, 1 for the first."""
     part: int
     active: bool
     path: Path
     run: str
+    size: int = 0
 
 
 def part_name(prefix: str, run: str, part: int) -> str:
@@ -44,67 +50,55 @@ def part_name(prefix: str, run: str, part: int) -> str:
     return f"{prefix}-{run}-{part:04d}.mcap"
 
 
-def parse(prefix: str, path: Path) -> OwnFile | None:
-    """Parse a name; None for a foreign file."""
+def parse_part(prefix: str, path: Path, size: int = 0) -> PartFile | None:
+    """Return the part of this name; None for another file."""
     found = PART_PATTERN.fullmatch(path.name)
     if found is None or found["prefix"] != prefix:
         return None
-    again = int(found["again"] or 1)
-    return OwnFile(found["stamp"], again, int(found["part"]), bool(found["active"]), path, found["run"])
+    again, part = int(found["again"] or 1), int(found["part"])
+    return PartFile(found["stamp"], again, part, bool(found["active"]), path, found["run"], size)
 
 
-def own_files(directory: Path, prefix: str) -> list[OwnFile]:
-    """Return our regular files in a directory, oldest first; empty if it cannot be read."""
-    try:
-        found = [parse(prefix, path) for path in directory.iterdir()]
-        return sorted(each for each in found if each and each.path.is_file() and not each.path.is_symlink())
-    except OSError:
-        return []
+def part_files(directory: Path, prefix: str) -> list[PartFile]:
+    """Return the parts in a directory, oldest first, regular files only; empty if it cannot be read."""
+    found = []
+    with suppress(OSError):
+        for path in directory.iterdir():
+            part = parse_part(prefix, path)
+            with suppress(OSError):
+                status = path.lstat() if part is not None else None
+                if part is not None and status is not None and stat.S_ISREG(status.st_mode):
+                    found.append(part._replace(size=status.st_size))
+    return sorted(found)
 
 
 def free_run(directory: Path, prefix: str, time_ns: int) -> str:
     """Return an unused name for a run that begins at this time."""
     stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(time_ns // 1_000_000_000))
-    taken = [each.again for each in own_files(directory, prefix) if each.stamp == stamp]
+    taken = [each.again for each in part_files(directory, prefix) if each.stamp == stamp]
     return f"{stamp}_{max(taken) + 1}" if taken else stamp
 
 
 # ---- disk space ----
 
-MEGABYTE = 1_000_000
 
-
-class Sized(NamedTuple):
-    """One of our files with its length [byte]."""
-
-    file: OwnFile
-    size: int
-
-
-def sized(files: Sequence[OwnFile]) -> list[Sized]:
-    """Return the existing files with their lengths."""
-    found = []
-    for file in files:
-        with suppress(OSError):
-            found.append(Sized(file, file.path.stat().st_size))
-    return found
-
-
-def to_remove(files: Sequence[Sized], budget: int, growing: int, run: str, *, keep_run: bool) -> list[Sized]:
+def to_remove(
+    files: Sequence[PartFile], budget: int, growing: int, run: str, *, keep_run: bool
+) -> list[PartFile]:
     """Return the files to remove for a budget; the budget may stay exceeded. Pure.
 
     Only finished files, those of earlier runs first, the oldest first. Of the run being written finished parts go only where
     `keep_run` is false, after all others, and never the newest of them.
 
     Args:
-        files: all of ours, oldest first, without the file being written.
+        files: all parts, oldest first, without the file being written.
         budget: all together [byte].
         growing: the file being written [byte].
         run: the run being written.
     """
     excess = sum(each.size for each in files) + growing - budget
-    others = [each for each in files if each.file.run != run and not each.file.active]
-    own = [each for each in files if each.file.run == run and not each.file.active]
+    others = [each for each in files if each.run != run and not each.active]
+    own = [each for each in files if each.run == run and not each.active]
     chosen = []
     for each in [*others, *([] if keep_run else own[:-1])]:
         if excess <= 0:
@@ -129,17 +123,20 @@ _LAYOUT = struct.Struct("<QQQQQ")
 
 @dataclass
 class Account:
-    """Every cycle of the ring up to a position is written, lost, or let go: `written + lost + let_go == cycles`."""
+    """Every cycle of the ring up to a position is written, lost, or let go: `written + lost + let_go == cycles`.
+
+    Attributes:
+        written: on the disk, in all files of this run.
+        overwritten: lost because the ring went round before they were read.
+        unwritten: lost because the disk did not take them, or because another program removed the file.
+        let_go: not written because nothing had happened (flight recorder only); those in its memory are among them.
+    """
 
     cycles: int = 0
     written: int = 0
-    """On the disk, in all files of this run."""
     overwritten: int = 0
-    """Lost because the ring went round before they were read."""
     unwritten: int = 0
-    """Lost because the disk did not take them, or because somebody removed the file."""
     let_go: int = 0
-    """Not written because nothing had happened (flight recorder only); those in its memory are among them."""
 
     @property
     def lost(self) -> int:
@@ -148,7 +145,7 @@ class Account:
 
 
 class ProgressFile:
-    """The file that holds the `Account` of what is settled; made empty when it does not exist. Raises OSError."""
+    """The `Account` of what is settled, in shared memory: another recorder continues where one died. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         with open(path, "a+b") as file:
@@ -165,7 +162,7 @@ class ProgressFile:
 
 
 def read_account(path: Path) -> Account | None:
-    """Return what was stored last, for those who only look; None where there is no such file, or it cannot be read."""
+    """Return what was stored last; None where there is no such file, or it cannot be read."""
     try:
         return Account(*_LAYOUT.unpack_from(path.read_bytes()))
     except (OSError, struct.error):

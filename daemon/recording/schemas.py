@@ -6,54 +6,39 @@ that follow these definitions are made in `jtqd.daemon.recording.messages`; the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, layout_of
 from jtqd.daemon.shared.snapshot import PAST_WORDS
+from jtqd.estimator.status import NAMES
 
-STATUS_NAMES = {
-    0: "OFF",
-    1: "STARTING",
-    2: "VALID",
-    3: "DEGRADED",
-    4: "STALE",
-    5: "DRIVE_FAULT",
-    6: "STANDSTILL",
-    15: "INVALID",
-}
+STATUS_NAMES = {code: name.upper() for code, name in NAMES.items()}
 """Status codes of the estimate PDO; the same names are constants of the JointEstimate definition."""
 
-EVENT_NAMES = {
-    1: "RECORDER_STARTED",
-    2: "RECORDER_STOPPED",
-    3: "RECORDS_LOST",
-    4: "STATUS_CHANGED",
-    5: "SLOTS_MISSED",
-    6: "WRITE_FAILED",
-    7: "SPACE_LOW",
-    8: "FILE_RETIRED",
-    9: "FILE_REMOVED",
-    10: "FILE_REPAIRED",
-    11: "FLIGHT_SAVED",
-    12: "NOTICE",
-}
-(
-    RECORDER_STARTED,
-    RECORDER_STOPPED,
-    RECORDS_LOST,
-    STATUS_CHANGED,
-    SLOTS_MISSED,
-    WRITE_FAILED,
-    SPACE_LOW,
-    FILE_RETIRED,
-    FILE_REMOVED,
-    FILE_REPAIRED,
-    FLIGHT_SAVED,
-    NOTICE,
-) = EVENT_NAMES
+EVENT_NAMES = dict(
+    enumerate(
+        (
+            "RECORDER_STARTED",
+            "RECORDER_STOPPED",
+            "RECORDS_LOST",
+            "STATUS_CHANGED",
+            "SLOTS_MISSED",
+            "WRITE_FAILED",
+            "SPACE_LOW",
+            "FILE_RETIRED",
+            "FILE_REMOVED",
+            "FILE_REPAIRED",
+            "FLIGHT_SAVED",
+            "NOTICE",
+        ),
+        start=1,
+    )
+)
+"""Kinds of events; the same names are constants of the Event definition."""
+RECORDER_STARTED, RECORDER_STOPPED, RECORDS_LOST, STATUS_CHANGED, SLOTS_MISSED, WRITE_FAILED = range(1, 7)
+SPACE_LOW, FILE_RETIRED, FILE_REMOVED, FILE_REPAIRED, FLIGHT_SAVED, NOTICE = range(7, 13)
 
 _TIME = "int32 sec\nuint32 nanosec\n"
 _HEADER = "builtin_interfaces/Time stamp\nstring frame_id\n"
@@ -310,23 +295,11 @@ def topics_of(joints: int) -> tuple[Topic, ...]:
 TOPICS = topics_of(2)
 
 
-def definitions(
-    metadata: Mapping[str, Mapping[str, str]] | None, joints: int = 2
-) -> tuple[list[Schema], list[Channel]]:
-    """Schema and channel records of every topic; `metadata` adds to a topic's own."""
+def definitions(joints: int = 2) -> tuple[list[Schema], list[Channel]]:
+    """Return the schema and channel records of every topic."""
     texts = schemas_of(joints)
     numbers = {name: number for number, name in enumerate(texts, start=1)}
-    channels = [
-        Channel(
-            id=topic.number,
-            topic=topic.name,
-            message_encoding="cdr",
-            metadata={str(key): str(text) for key, text in (metadata or {}).get(topic.name, {}).items()},
-            schema_id=numbers[topic.schema],
-        )
-        for topic in topics_of(joints)
+    records = [Schema(numbers[name], text.encode(), "ros2msg", name) for name, text in texts.items()]
+    return records, [
+        Channel(topic.number, topic.name, "cdr", {}, numbers[topic.schema]) for topic in topics_of(joints)
     ]
-    return [
-        Schema(id=numbers[name], name=name, encoding="ros2msg", data=text.encode())
-        for name, text in texts.items()
-    ], channels

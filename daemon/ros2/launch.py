@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from jtqd.daemon.config import HIGHEST_DOMAIN, LOOPBACK, Config, Ros2Settings
-from jtqd.daemon.recording.launch import nodes_of
-from jtqd.daemon.shared.side_process import SideProcess, StartChild, say
+from jtqd.daemon.recording.launch import loop_request
+from jtqd.daemon.shared.side_process import SideProcess, StartChild
 from jtqd.estimator.checked import ConfigError
 
 _WHEELS_FOR = "x86_64"
@@ -59,34 +59,15 @@ class Ros2Publisher(SideProcess):
         super().__init__(start_child, "jtqd.daemon.ros2.process", "ROS 2 publisher", "publishing")
         self._settings = settings
         self._domain_id = domain_id(settings.domain_id, os.environ)
-        self._directory, self._bus = Path(), ""
 
-    def start(self, config: Config, directory: Path, bus: str) -> None:
-        """Start the publisher of the daemon's runtime directory.
-
-        Args:
-            config: in force.
-            directory: holds `ring` and `snapshot`.
-            bus: name of the bus.
-        """
-        self._directory, self._bus = directory, bus
-        self._request = self._request_of(config)
-        if self._settings.interface != LOOPBACK:
-            say(
-                f"ROS 2: torques, positions and diagnostics go to every host that is reached by {self._settings.interface}"
-            )
-        self._run()
-
-    def _request_of(self, config: Config) -> dict[str, object]:
+    def start(self, config: Config, runtime: Path, bus: str) -> None:
+        """Start the publisher of the daemon with this runtime directory; `bus`: its name."""
         settings = self._settings
-        return {
-            "ring": str(self._directory / "ring"),
-            "snapshot": str(self._directory / "snapshot"),
+        request = loop_request(config, runtime, bus) | {
             "domain_id": self._domain_id,
             "interface": settings.interface,
             "rate_hz": settings.rate_hz,
-            "names": settings.names_of(len(config.joints)),
-            "bus": self._bus,
-            "nodes": nodes_of(config),
-            "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
+            "joint_names": settings.names_of(len(config.joints)),
         }
+        reach = f"ROS 2: torques, positions and diagnostics go to every host that is reached by {settings.interface}"
+        self.begin(request, "" if settings.interface == LOOPBACK else reach)

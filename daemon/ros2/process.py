@@ -6,28 +6,25 @@ Topics, all reliable, volatile, keep last 10, in XCDR1:
     rt/joint_torque_states   jtqd_msgs/JointTorqueState    `rate_hz`
     rt/diagnostics           diagnostic_msgs/DiagnosticArray   1 Hz
 
-A joint state is sent once per new cycle at most: while the loop stands still there is none. The torque state goes on and
-says so: STALE, no torque, a growing age. Nothing that the network sends reaches the loop: ring and snapshot are mapped
+A joint state is sent once per new cycle at most: while the loop stands still there is none. The torque state goes on as
+STALE, without torque, with a growing age. Nothing that the network sends reaches the loop: ring and snapshot are mapped
 read-only.
 
-REQUEST is JSON: {"ring", "snapshot": paths, "domain_id", "interface", "rate_hz", "names": of the joints, "bus": name,
-"nodes": [[node-ID, name]], "gear_ratios"}. One line of JSON on stdout says how it began: {"publishing": what} or
-{"failed": why}. It ends on SIGTERM. Exit status 0 ended in order, 1 could not begin.
+REQUEST is the JSON of `recording.launch.loop_request` with "domain_id", "interface" and "rate_hz". The answer is
+{"publishing": what} or {"failed": why} (`shared.side_process`).
 """
 
 from __future__ import annotations
 
 import fcntl
-import json
 import math
-import os
 import socket
 import struct
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from pathlib import Path
+from functools import partial
 from typing import Any, Final
 
 from cyclonedds.core import DDSException
@@ -38,7 +35,7 @@ from cyclonedds.topic import Topic
 from cyclonedds.util import duration
 
 from jtqd.daemon.config import LOOPBACK
-from jtqd.daemon.recording.diagnostics import Diagnostics, Node
+from jtqd.daemon.recording.diagnostics import LoopReader
 from jtqd.daemon.ros2.messages import (
     TYPE_HASHES,
     DiagnosticArray,
@@ -48,11 +45,9 @@ from jtqd.daemon.ros2.messages import (
     Message,
     diagnostic_array,
 )
-from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.conditions import read_conditions
-from jtqd.daemon.shared.ring import RingError, RingReader
-from jtqd.daemon.shared.side_process import Stop, answer
-from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
+from jtqd.daemon.shared.ring import RingError
+from jtqd.daemon.shared.side_process import CannotBegin, Stop, run_side_process
+from jtqd.daemon.shared.snapshot import SnapshotError
 
 TOPICS: Final[dict[type[Message], str]] = {
     JointState: "joint_states",
@@ -63,11 +58,6 @@ TOPICS: Final[dict[type[Message], str]] = {
 DEPTH = 10
 STALLED_S = 0.1
 """A loop without a new cycle for so long stands still."""
-_DIAGNOSIS_S = 1.0
-_QUANTILES = (0.5, 0.99, 1.0)
-_NICE = 10
-
-
 _SIOCGIFADDR = 0x8915
 
 
@@ -163,16 +153,10 @@ class Source:
     """
 
     def __init__(self, request: dict[str, Any]) -> None:
-        names, self._bus = request["names"], request["bus"]
-        self._ring = RingReader(Path(request["ring"]), cycle.layout_of(len(names)).size)
-        self._snapshot = SnapshotReader(Path(request["snapshot"]))
-        self._directory = Path(request["snapshot"]).parent
-        nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
-        self._diagnostics = Diagnostics(self._bus, names, nodes)
-        self._joints = JointMessages(names, request["gear_ratios"])
-        self._ring.position += self._ring.backlog  # what was before us is old
+        self._bus = request["bus"]
+        self._loop = LoopReader(request)
+        self._joints = JointMessages(self._loop.joints, request["gear_ratios"])
         self._newest_ns: int | None = None
-        self._diagnosed_ns = 0
 
     def read(self, now_ns: int, realtime_ns: int) -> Iterator[Message]:
         """Return the messages that are due.
@@ -181,7 +165,8 @@ class Source:
             now_ns: CLOCK_MONOTONIC.
             realtime_ns: CLOCK_REALTIME.
         """
-        records = self._ring.read(self._ring.backlog).records
+        ring = self._loop.ring
+        records = ring.read(ring.backlog).records
         self._joints.take(records)
         if records:
             self._newest_ns = now_ns
@@ -189,67 +174,49 @@ class Source:
         made = self._joints.joint_state() if records else None
         state = self._joints.torque_state(now_ns, stalled=stalled) if records or stalled else None
         yield from (message for message in (made, state) if message is not None)
-        if now_ns - self._diagnosed_ns >= _DIAGNOSIS_S * 1e9:
-            self._diagnosed_ns = now_ns
-            yield self._diagnosis(now_ns, realtime_ns)
-
-    def _diagnosis(self, now_ns: int, realtime_ns: int) -> DiagnosticArray:
-        view = self._snapshot.read()
-        statuses = self._diagnostics.of_the_loop(
-            view,
-            work_us=self._snapshot.work_us(*_QUANTILES),
-            late_us=self._snapshot.late_us(*_QUANTILES),
-            now_ns=realtime_ns,
-            conditions=read_conditions(self._directory),
-        )
-        age_s = (now_ns - view.sync_monotonic_ns) * 1e-9 if view.sync_monotonic_ns else math.nan
-        return diagnostic_array(realtime_ns, self._bus, statuses, view, age_s)
+        found = self._loop.diagnosis(now_ns, realtime_ns)
+        if found is not None:
+            view, statuses = found
+            age_s = (now_ns - view.sync_monotonic_ns) * 1e-9 if view.sync_monotonic_ns else math.nan
+            yield diagnostic_array(realtime_ns, self._bus, statuses, view, age_s)
 
 
-def publish(source: Source, writers: Writers, rate_hz: float, stop: Stop) -> None:
-    """Publish until stopped. Turns follow a grid; one that is missed is not made up."""
+def publish(source: Source, writers: Writers, rate_hz: float, stop: Stop) -> int:
+    """Publish until stopped; returns the exit status. Turns follow a grid; one that is missed is not made up."""
     period_s = 1.0 / rate_hz
     due = time.monotonic()
-    while not stop.requested:
-        for message in source.read(time.monotonic_ns(), time.time_ns()):
-            writers.write(message)
-        left = (due := due + period_s) - time.monotonic()
-        if left < 0.0:
-            due += math.ceil(-left / period_s) * period_s
-        time.sleep(max(0.0, due - time.monotonic()))
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Command line of the process; returns the exit status."""
-    request = json.loads((sys.argv[1:] if arguments is None else arguments)[0])
-    stop = Stop()
-    with suppress(OSError):
-        os.nice(_NICE)
-    domain_id, interface, rate_hz = request["domain_id"], request["interface"], request["rate_hz"]
-    where = f"domain {domain_id}, interface {interface}"
     try:
-        source = Source(request)
-        if interface not in (name for _, name in socket.if_nameindex()):
-            answer(failed=f"{where}: there is no such network interface")
-            return 1
-        writers = Writers(domain_id, interface)
-    except (RingError, SnapshotError) as error:
-        answer(failed=str(error))
-        return 1
-    except OSError as error:  # a service whose unit forbids them
-        answer(failed=f"{where}: no network sockets: {error.strerror or error}")
-        return 1
-    except DDSException as error:
-        answer(failed=f"{where}: Cyclone DDS: {error.msg or error}")
-        return 1
-    answer(publishing=f"/{', /'.join(TOPICS.values())} at {rate_hz:g} Hz, {where}")
-    try:
-        publish(source, writers, rate_hz, stop)
+        while not stop.requested:
+            for message in source.read(time.monotonic_ns(), time.time_ns()):
+                writers.write(message)
+            left = (due := due + period_s) - time.monotonic()
+            if left < 0.0:
+                due += math.ceil(-left / period_s) * period_s
+            time.sleep(max(0.0, due - time.monotonic()))
     except DDSException as error:
         print(f"jtqd: ROS 2 publisher: {error.msg or error}", file=sys.stderr, flush=True)
         return 1
     return 0
 
 
+def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
+    """Open memory and domain; returns what is published, and what publishes it. Raises CannotBegin."""
+    number, interface, rate_hz = request["domain_id"], request["interface"], request["rate_hz"]
+    where = f"domain {number}, interface {interface}"
+    try:
+        source = Source(request)
+        if interface not in (name for _, name in socket.if_nameindex()):
+            raise CannotBegin(f"{where}: there is no such network interface")
+        writers = Writers(number, interface)
+    except (RingError, SnapshotError) as error:
+        raise CannotBegin(str(error)) from None
+    except OSError as error:  # a service whose unit forbids them
+        raise CannotBegin(f"{where}: no network sockets: {error.strerror or error}") from None
+    except DDSException as error:
+        raise CannotBegin(f"{where}: Cyclone DDS: {error.msg or error}") from None
+    text = f"/{', /'.join(TOPICS.values())} at {rate_hz:g} Hz, {where}"
+    return text, partial(publish, source, writers, rate_hz)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(run_side_process(None, "publishing", begin))

@@ -1,12 +1,13 @@
 """A process beside the loop that only reads its shared memory (live view, ROS 2 publisher): the loop does not feel it fail.
 
-The supervisor's side starts it, reports what it says, and restarts it when it dies. It says one line of JSON on its standard
-output: how it began, or {"failed": why}.
+The supervisor's side starts it, reports its answer, and restarts it when it dies. The process prints one line of JSON on its
+standard output: how it began, or {"failed": why}.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import signal
 import sys
 import time
@@ -20,6 +21,7 @@ from jtqd.daemon.shared.child_process import Child, ChildError
 _STARTS = 5
 """One that dies more often than this in a minute is not started again."""
 _PAUSE_S = 1.0
+_NICE = 10
 
 StartChild = Callable[[str, list[str], str], Child]
 
@@ -31,7 +33,7 @@ class SideProcess:
         start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
         module: run with the request as its only argument.
         title: in the lines for the operator, such as "live view".
-        began: key of the answer that says how it began.
+        began: key of the answer that tells how it began.
     """
 
     def __init__(self, start_child: StartChild, module: str, title: str, began: str) -> None:
@@ -46,29 +48,34 @@ class SideProcess:
         """Return the process-ID, or None."""
         return self._child.pid if self._child is not None and self._child.alive() else None
 
+    def begin(self, request: dict[str, Any], warning: str = "") -> None:
+        """Start the process with this request; `warning`: a line for the operator."""
+        self._request = request
+        if warning:
+            _report(warning)
+        self._run()
+
     def watch(self) -> None:
         """Report its output; restart it when it died, at most once a second and five times a minute."""
         if self._child is None:
             return
-        ended = not self._child.alive()  # asked first: what it said before its end is then in the pipe
+        ended = not self._child.alive()  # asked first: its last output is then in the pipe
         try:
             answer = self._child.poll_answer() or {}
         except (ChildError, ValueError) as error:
             answer = {"failed": str(error)}
         if self._began in answer:
-            say(f"{self._title}: {answer[self._began]}")
+            _report(f"{self._title}: {answer[self._began]}")
         if "failed" in answer:
-            say(f"no {self._title}: {answer['failed']}; the loop continues")
+            _report(f"no {self._title}: {answer['failed']}; the loop continues")
             self._child = None
         elif ended and time.monotonic() - self._starts[-1] > _PAUSE_S:
-            code = self._child.process.returncode
+            how = f"the {self._title} ended with exit status {self._child.process.returncode}"
             if len(self._starts) > _STARTS:
-                say(
-                    f"the {self._title} ended with exit status {code}, too often; the loop continues without it"
-                )
+                _report(f"{how}, too often; the loop continues without it")
                 self._child = None
                 return
-            say(f"the {self._title} ended with exit status {code}; restarted, the loop continues")
+            _report(f"{how}; restarted, the loop continues")
             self._run()
 
     def _run(self) -> None:
@@ -77,7 +84,7 @@ class SideProcess:
         self._child = self._start_child(self._module, [json.dumps(self._request)], f"the {self._title}")
 
 
-def say(text: str) -> None:
+def _report(text: str) -> None:
     """Print a line for the operator."""
     print(f"jtqd: {text}", file=sys.stderr, flush=True)
 
@@ -97,7 +104,35 @@ class Stop:
         self.requested = True
 
 
-def answer(**content: Any) -> None:
-    """Say how the process began."""
+class CannotBegin(Exception):  # noqa: N818 - an answer, not an error of the program
+    """The process cannot begin; the message is for the operator."""
+
+
+def run_side_process(
+    arguments: list[str] | None,
+    began: str,
+    begin: Callable[[dict[str, Any]], tuple[str, Callable[[Stop], int]]],
+) -> int:
+    """Run the process with the request in its command line; returns the exit status: 0 ended in order, 1 a failure.
+
+    Args:
+        arguments: None: those of this process.
+        began: key of the answer.
+        begin: request -> (answer, serve until stopped). Raises CannotBegin.
+    """
+    request = json.loads((sys.argv[1:] if arguments is None else arguments)[0])
+    stop = Stop()
+    with suppress(OSError):
+        os.nice(_NICE)
+    try:
+        text, serve = begin(request)
+    except CannotBegin as error:
+        _answer({"failed": str(error)})
+        return 1
+    _answer({began: text})
+    return serve(stop)
+
+
+def _answer(content: dict[str, str]) -> None:
     with suppress(OSError):
         print(json.dumps(content), flush=True)

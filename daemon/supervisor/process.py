@@ -24,7 +24,7 @@ from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
 from jtqd.daemon.config import Config, Ros2Settings, as_booted
 from jtqd.daemon.live.launch import Address, LiveView
 from jtqd.daemon.loop.realtime import stolen_s
-from jtqd.daemon.recording.launch import Keeper, recording_request
+from jtqd.daemon.recording.launch import RecorderProcess, recording_request
 from jtqd.daemon.ros2.launch import Ros2Publisher
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
@@ -261,7 +261,7 @@ class Supervisor:
         self._ring = self._directory / "ring"
         self._snapshot = self._directory / "snapshot"
         self._children: list[Child] = []
-        self._recorder = Keeper(self._child, self._directory, self._snapshot)
+        self._recorder = RecorderProcess(self._child, self._directory)
         self._live = None if live is None else LiveView(self._child, live)
         self._log = OperatorLog()
         self._log_event = EventLog(self._log)
@@ -404,12 +404,9 @@ class Supervisor:
         request = recording_request(
             self._config,
             report,
+            runtime=self._directory,
             directory=self._log_directory,
-            ring=self._ring,
-            progress=self._recorder.progress,
-            snapshot=self._snapshot,
-            notices=self._directory / NOTICES,
-            instance=self._instance,
+            bus=self._instance,
         )
         if again:
             self._recorder.renew(request)

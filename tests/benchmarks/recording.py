@@ -22,7 +22,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.messages import BLOCK_PARTS, BLOCK_SIZE, cycle_block
+from jtqd.daemon.recording.messages import CycleMessages
 from jtqd.daemon.recording.recorder import RecorderRequest, Session
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record
@@ -37,8 +37,6 @@ _HOUR = 3_600_000
 _SETTLE_S = 2.0
 _LAPS = 5
 _TIMES = struct.Struct("<Qqq")
-_HEAD = 31
-"""Bytes of an MCAP Message record before its payload."""
 
 
 def run(directory: Path, *, seconds: float = 30.0, rounds: int = 3) -> dict[str, Any]:
@@ -146,33 +144,37 @@ def _ours(records: list[bytes], directory: Path) -> float:
 
 def _library(records: list[bytes], path: Path) -> float:
     """The same messages of the cycles by the library, chunks of the same length [s]."""
-    laps = _laps(records)
+    laps, messages = _laps(records), CycleMessages(2)
     with open(path, "wb") as file:
-        writer = Writer(file, chunk_size=500 * BLOCK_SIZE, compression=CompressionType.ZSTD)
+        writer = Writer(
+            file, chunk_size=500 * len(_block(messages, laps[0])), compression=CompressionType.ZSTD
+        )
         writer.start("ros2")
         channels = {}
         for topic in (schemas.JOINT_1, schemas.JOINT_2, schemas.CAN_FRAMES):
             text = schemas.SCHEMAS[topic.schema].encode()
             schema = writer.register_schema(topic.schema, "ros2msg", text)
             channels[topic.number] = writer.register_channel(topic.name, "cdr", schema)
-        starts = [start for _, start in BLOCK_PARTS]
-        spans = list(zip(channels.values(), starts, [*starts[1:], BLOCK_SIZE], strict=True))
         begin = time.process_time()
         for record in laps:
             header = cycle_record.header_of(record)
-            block = cycle_block(
-                record,
-                header.cycle,
-                header.sync_realtime_ns,
-                flags=header.flags,
-                sync_counter=header.sync_counter,
-                frames=header.frame_count,
-            )
-            stamp = header.sync_realtime_ns
-            for channel, start, end in spans:
-                writer.add_message(channel, stamp, block[start + _HEAD : end], stamp, header.cycle)
+            block, stamp = _block(messages, record), header.sync_realtime_ns
+            for number, payload in messages.payloads(block):
+                writer.add_message(channels[number], stamp, payload, stamp, header.cycle)
         writer.finish()
         return time.process_time() - begin
+
+
+def _block(messages: CycleMessages, record: bytes) -> bytes:
+    header = cycle_record.header_of(record)
+    return messages.block(
+        record,
+        header.cycle,
+        header.sync_realtime_ns,
+        flags=header.flags,
+        sync_counter=header.sync_counter,
+        frames=header.frame_count,
+    )
 
 
 def text(result: dict[str, Any]) -> str:

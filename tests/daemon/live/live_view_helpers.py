@@ -65,6 +65,7 @@ def request_of(directory, **changes):
         "port": 0,
         "bus": "vcan7",
         "nodes": [[1, "drive 1"]],
+        "joint_names": ["joint_1", "joint_2"],
         "gear_ratios": [100.0, None],
     }
     return content | changes

@@ -12,7 +12,7 @@ from jtqd.daemon.live.gateway import OLDER, PROTOCOL
 from jtqd.daemon.live.launch import Address, address
 from jtqd.daemon.live.process import LiveStream
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.messages import CAN_FRAMES_SIZE, JOINT_ESTIMATE_SIZE
+from jtqd.daemon.recording.messages import JOINT_ESTIMATE_SIZE, CycleMessages
 from jtqd.daemon.shared import cycle_record
 from tests.daemon.live.live_view_helpers import LiveProcess, Memory, Viewer
 from tests.daemon.recording.cdr_decoder import Definition
@@ -29,8 +29,8 @@ def memory(tmp_path):
 # ---- what is made of the cycles: no process ----
 
 
-def stream(period_ns=20_000_000):
-    return LiveStream("vcan7", [], ("joint_1", "joint_2"), (100.0, None), period_ns)
+def stream():
+    return LiveStream(("joint_1", "joint_2"), (100.0, None))
 
 
 def of(messages, topic):
@@ -42,7 +42,7 @@ def test_one_set_of_messages_in_20_ms_with_the_bytes_of_the_log():
     for topic, size in (
         (schemas.JOINT_1, JOINT_ESTIMATE_SIZE),
         (schemas.JOINT_2, JOINT_ESTIMATE_SIZE),
-        (schemas.CAN_FRAMES, CAN_FRAMES_SIZE),
+        (schemas.CAN_FRAMES, CycleMessages(2).frames_size),
     ):
         found = of(messages, topic)
         assert [len(message.payload) for message in found] == [size] * 5

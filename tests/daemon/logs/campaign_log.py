@@ -10,7 +10,7 @@ from mcap.records import Channel, Schema
 
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
-from jtqd.daemon.recording.recording import Journal, Recording
+from jtqd.daemon.recording.recording import EventLog, Recording
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
@@ -56,17 +56,13 @@ class _Together(ChunkBuilder):
 
     def __init__(self, schemas: Sequence[Schema], channels: Sequence[Channel], joints: int) -> None:
         super().__init__(schemas, channels, [], 60)
-        messages = CycleMessages(joints)
-        starts = [start for _, start in messages.parts]
-        self._spans = list(
-            zip((channel for channel, _ in messages.parts), starts, [*starts[1:], messages.size], strict=True)
-        )
+        self._messages = CycleMessages(joints)
 
     def add_block(self, block: bytes, time_ns: int) -> None:
         """Add the messages one by one."""
         (sequence,) = struct.unpack_from("<I", block, 11)
-        for channel, start, end in self._spans:
-            self.add(channel, time_ns, block[start + 31 : end], sequence)
+        for channel, payload in self._messages.payloads(block):
+            self.add(channel, time_ns, payload, sequence)
 
 
 def builder_of(
@@ -87,13 +83,14 @@ def write_log(
     together: bool = False,
 ) -> Path:
     """An MCAP file of these cycles, each of so many joints; `configuration` is attached to it."""
-    schemas, channels = definitions(None, joints)
+    schemas, channels = definitions(joints)
     attached = [NamedData("configuration.yaml", "application/yaml", configuration.encode())]
     head = Head(schemas, channels, attached if configuration else [])
     file = McapFile(path, head, {"run": "test", "part": "1"}, 1)
-    journal = Journal(builder_of(schemas, channels, joints, together=together), print)
+    builder = builder_of(schemas, channels, joints, together=together)
     overview = JointStateMessage("abcd"[:joints], (1.0,) * joints)
-    recording = Recording(journal, _OneFile(file), overview, 500_000_000, Account())
+    events = EventLog(builder.add)
+    recording = Recording(builder, events, _OneFile(file), overview, chunk_ns=500_000_000, account=Account())
     for cycle in cycles:
         recording.add(_record(cycle))
     recording.flush()

@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from jtqd.daemon.logs.can_io import McapCanWriter
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import JointStateMessage
-from jtqd.daemon.recording.recording import Journal, Recording
+from jtqd.daemon.recording.recording import EventLog, Recording
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.recording.schemas import definitions
 from tests.daemon.logs.campaign_log import Cycle, Joint, builder_of, write_log
@@ -37,7 +37,7 @@ def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
     """A log by the recorder's own code, with attachments; `together`: all topics in one chunk, as before 0.2."""
     from tests.daemon.logs import campaign_log
 
-    schemas, channels = definitions(None)
+    schemas, channels = definitions()
     partial = path.with_name(path.name + ".active")
     file = McapFile(partial, Head(schemas, channels, ATTACHMENTS), {"run": "test", "part": "1"}, 1)
 
@@ -45,8 +45,10 @@ def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
         def write(self, chunk, at_ns):
             file.append(chunk)
 
-    journal = Journal(builder_of(schemas, channels, together=together), print)
-    recording = Recording(journal, OneFile(), JointStateMessage(("a", "b"), (1.0, 1.0)), chunk_ns, Account())
+    builder = builder_of(schemas, channels, together=together)
+    overview = JointStateMessage(("a", "b"), (1.0, 1.0))
+    events = EventLog(builder.add)
+    recording = Recording(builder, events, OneFile(), overview, chunk_ns=chunk_ns, account=Account())
     for cycle in cycles(count, seed):
         recording.add(campaign_log._record(cycle))
     recording.flush()

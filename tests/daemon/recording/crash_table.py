@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jtqd.daemon.recording.run_files import own_files
+from jtqd.daemon.recording.run_files import part_files
 from tests.daemon.recording.recorder_bench import START_NS, RecorderProcess, cycles_of, put, record_of
 from tests.paths import ROOT
 
@@ -114,7 +114,7 @@ class Bench:
         self.run(0.6)
         self.recorder.wait_for(lambda: len(list(self.logs.glob("*.active"))) <= 1)
         self.end()
-        files = own_files(self.logs, "test")
+        files = part_files(self.logs, "test")
         assert not any(file.active for file in files)
         found = [n for file in files for n in cycles_of(file.path) if n < _NEXT]
         assert len(found) == len(set(found)), "a cycle is there twice"
@@ -232,7 +232,7 @@ def full_to_the_last_byte(directory: Path) -> Row:
                 pass
         begin = bench.cycles
         bench.run(2.5)
-        finished = [each for each in own_files(bench.logs, "test") if not each.active]
+        finished = [each for each in part_files(bench.logs, "test") if not each.active]
         assert finished, "the part was not ended on the full disk"
         filler.unlink()
         lasted = bench.cycles - begin

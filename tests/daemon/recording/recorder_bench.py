@@ -13,9 +13,9 @@ from mcap.reader import make_reader
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile
-from jtqd.daemon.recording.messages import BLOCK_PARTS, JointStateMessage
+from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
 from jtqd.daemon.recording.recorder import RecorderRequest, Session
-from jtqd.daemon.recording.recording import Journal, Recording
+from jtqd.daemon.recording.recording import EventLog, Recording
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
@@ -190,11 +190,12 @@ class SimpleFile:
 
 def one_file(path, chunk_ns=99_000_000):
     """(recording, sink) into one file."""
-    schema_records, channels = definitions(None)
+    schema_records, channels = definitions()
     sink = SimpleFile(path, Head(schema_records, channels, []))
-    journal = Journal(ChunkBuilder(schema_records, channels, BLOCK_PARTS, 60), print)
+    builder = ChunkBuilder(schema_records, channels, CycleMessages(2).parts, 60)
     overview = JointStateMessage(("a", "b"), (1.0, 1.0))
-    return Recording(journal, sink, overview, chunk_ns, Account()), sink
+    events = EventLog(builder.add)
+    return Recording(builder, events, sink, overview, chunk_ns=chunk_ns, account=Account()), sink
 
 
 def session_on(directory, warn=lambda _: None, **request):

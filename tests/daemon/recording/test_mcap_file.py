@@ -155,7 +155,7 @@ def test_directory_that_is_moved_meanwhile(tmp_path):
 
 
 def test_metadata_and_attachments_come_before_the_messages(tmp_path):
-    schema_records, channels = definitions(None)
+    schema_records, channels = definitions()
     head = Head(schema_records, channels, [NamedData("a.yaml", "application/yaml", b"a: 1\n")])
     file = McapFile(tmp_path / "log.mcap", head, {"run": "r", "part": "7"}, 5)
     builder = ChunkBuilder(schema_records, channels, [], 60)

@@ -97,8 +97,7 @@ def test_file_as_a_whole(recorder, tmp_path):
         {"name": "joint1.yaml", "media_type": "application/yaml", "path": str(tmp_path / "joint1.yaml")},
         {"name": "gone.eds", "path": str(tmp_path / "gone.eds")},
     ]
-    metadata = {"/can/frames": {"bus": "can0"}}
-    process = recorder(attachments=attachments, channel_metadata=metadata, gear_ratios=[50.0, None])
+    process = recorder(attachments=attachments, gear_ratios=[50.0, None])
     for n in range(3000):
         put(process.ring, record_of(n))
     status, summary, errors = process.end()
@@ -126,8 +125,6 @@ def test_file_as_a_whole(recorder, tmp_path):
     counts = {whole.channels[number].topic: n for number, n in numbers.items()}
     assert (counts["/joint/1/state"], counts["/joint/2/state"], counts["/can/frames"]) == (3000, 3000, 3000)
     assert whole.statistics.message_count == sum(counts.values())
-    kept = {channel.topic: channel.metadata for channel in whole.channels.values() if channel.metadata}
-    assert kept == metadata
     assert {channel.message_encoding for channel in whole.channels.values()} == {"cdr"}
     velocity = messages_of(summary["path"])["/joint_states"][0][1]["velocity"]
     assert velocity[0] == pytest.approx(joint_values(0, 1)[2] / 50.0)
@@ -355,7 +352,7 @@ def test_stays_small(recorder):
         "*sorted(each for each in sys.modules if each.startswith('jtqd.estimator.')))"
     )
     found = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert found.stdout == "jtqd.estimator.learned\n"
+    assert found.stdout == "jtqd.estimator.learned jtqd.estimator.status\n"
     process = recorder()
     process.paced(0, 3000, 2000)
     status = Path(f"/proc/{process.process.pid}/status").read_text()

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from jtqd.daemon.recording.run_files import own_files
+from jtqd.daemon.recording.run_files import part_files
 from tests.daemon.recording.crash_table import CASES, NEED_ROOT, Bench
 from tests.daemon.recording.recorder_bench import RecorderProcess, cycles_of, put, record_of, session_on
 
@@ -88,7 +88,7 @@ def test_repair_leaves_alone_what_is_written_or_not_ours(tmp_path):
     second.wait_until_ready()
     for n in range(600):
         put(second.ring, record_of(n))
-    second.wait_for(lambda: len(own_files(bench.logs, "test")) == 3)
+    second.wait_for(lambda: len(part_files(bench.logs, "test")) == 3)
     second.end()
     assert living.exists()
     assert foreign.read_bytes() == b"\x89MCAP0\r\nnonsense"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.recording.run_files import own_files
+from jtqd.daemon.recording.run_files import part_files
 from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.ring import RingReader
 from jtqd.models.files import shipped
@@ -142,7 +142,7 @@ def test_everything_is_killed_and_the_next_start_repairs(start, tmp_path) -> Non
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
     daemon.process.communicate()
-    left = [each for each in own_files(logs, PREFIX) if each.active]
+    left = [each for each in part_files(logs, PREFIX) if each.active]
     assert len(left) == 1
     time.sleep(1)
     second = start(4, logs, "rotate_s: 2")
@@ -150,7 +150,7 @@ def test_everything_is_killed_and_the_next_start_repairs(start, tmp_path) -> Non
     assert status == 0, err
     check_loop(summary)
     assert f"{left[0].path.with_suffix('').name} repaired" in err
-    files = own_files(logs, PREFIX)
+    files = part_files(logs, PREFIX)
     assert not any(each.active for each in files)
     first = [each.path for each in files if each.run == left[0].run]
     assert len(first) >= 2

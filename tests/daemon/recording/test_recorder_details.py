@@ -13,11 +13,11 @@ from mcap.stream_reader import StreamReader
 from jtqd.daemon.config import load_config
 from jtqd.daemon.logs.recover import recover_unfinished
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.recording.launch import Keeper, recording_request
+from jtqd.daemon.recording.launch import RecorderProcess, recording_request
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
 from jtqd.daemon.recording.recorder import RecorderRequest, main
-from jtqd.daemon.recording.recording import ERROR, WARN, Journal
-from jtqd.daemon.recording.run_files import own_files, parse
+from jtqd.daemon.recording.recording import ERROR, WARN, EventLog
+from jtqd.daemon.recording.run_files import parse_part, part_files
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
@@ -61,7 +61,7 @@ def test_what_is_heard_of_late_stands_at_its_time(tmp_path):
         recording.add(record_of(n))
         if n in (60, 61):
             late_ns = START_NS + (30 - n % 2) * MS + 500
-            recording.journal.note(schemas.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
+            recording.events.note(schemas.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
     recording.flush()
     sink.end()
     cycles = {topic.name for topic in (*schemas.JOINTS, schemas.CAN_FRAMES)}
@@ -86,7 +86,7 @@ def test_cycles_keep_their_order_when_the_clock_is_set_back(tmp_path):
     for n in range(50):
         recording.add(record_of(n, start_ns=START_NS - (3600 * 10**9 if n >= 25 else 0)))
         if n == 40:
-            recording.journal.note(schemas.NOTICE, "late", level=WARN, time_ns=START_NS)
+            recording.events.note(schemas.NOTICE, "late", level=WARN, time_ns=START_NS)
     recording.flush()
     sink.end()
     assert cycles_of(path) == list(range(50))
@@ -108,7 +108,7 @@ def unpacked(sealed):
 
 
 def test_each_file_has_the_definitions_in_its_first_span_and_every_so_many():
-    builder = ChunkBuilder(*definitions(None), [], 3)
+    builder = ChunkBuilder(*definitions(), [], 3)
     assert repeated(builder, 7) == [True, False, False, True, False, False, True]
     builder.restart()  # nothing collected yet
     assert repeated(builder, 4) == [True, False, False, True]
@@ -116,7 +116,7 @@ def test_each_file_has_the_definitions_in_its_first_span_and_every_so_many():
     builder.restart()
     assert repeated(builder, 5) == [False, True, False, False, True]
     builder.seal()
-    builder = ChunkBuilder(*definitions(None), [], 3)
+    builder = ChunkBuilder(*definitions(), [], 3)
     builder.add(1, 5, bytes(8))  # a chunk with them has begun: that will do
     builder.restart()
     assert repeated(builder, 4) == [True, False, False, True]
@@ -124,12 +124,12 @@ def test_each_file_has_the_definitions_in_its_first_span_and_every_so_many():
 
 def test_what_tells_of_loss_is_written_however_much_happens(tmp_path):
     """Statuses that flap are bounded in a chunk; a loss after them is not left out."""
-    builder = ChunkBuilder(*definitions(None), [], 60)
-    journal = Journal(builder, print)
+    builder = ChunkBuilder(*definitions(), [], 60)
+    events = EventLog(builder.add)
     for n in range(80):
-        journal.note(schemas.STATUS_CHANGED, f"{n}", level=WARN)
-    journal.note(schemas.RECORDS_LOST, "lost", level=ERROR)
-    assert journal.left_out == 30
+        events.note(schemas.STATUS_CHANGED, f"{n}", level=WARN)
+    events.note(schemas.RECORDS_LOST, "lost", level=ERROR)
+    assert events.left_out == 30
     assert builder.seal().chunks[0].counts[schemas.EVENTS.number] == 51
 
 
@@ -138,9 +138,7 @@ def test_a_recorder_that_is_told_to_end_before_it_has_begun_records_what_there_i
     for n in range(500):
         put(ring, record_of(n))
     Snapshot(tmp_path / "snapshot", 1e-3, 0.5)
-    keeper = Keeper(
-        lambda module, arguments, name: Child(module, arguments, name=name), tmp_path, tmp_path / "snapshot"
-    )
+    keeper = RecorderProcess(lambda module, arguments, name: Child(module, arguments, name=name), tmp_path)
     request = {"ring": str(tmp_path / "ring"), "directory": str(tmp_path / "logs"), "prefix": "test"}
     keeper.start(request | {"progress": str(keeper.progress)})
     result = keeper.end()  # its imports take half a second: this comes before them
@@ -176,7 +174,7 @@ def test_leftovers_that_are_being_written_or_empty(tmp_path):
     names = [f"test-20260101T000000Z-{n:04d}.mcap.active" for n in (1, 2)]
     for name in names:
         (tmp_path / name).touch()
-    held, empty = own_files(tmp_path, "test")
+    held, empty = part_files(tmp_path, "test")
     with open(held.path, "rb") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         assert recover_unfinished(held) is None
@@ -200,7 +198,7 @@ def test_leftovers_that_are_being_written_or_empty(tmp_path):
     ],
 )
 def test_only_names_of_exactly_our_form_are_ours(tmp_path, name, found):
-    each = parse("a", tmp_path / name)
+    each = parse_part("a", tmp_path / name)
     assert (each and (each.run, each.again, each.part, each.active)) == found
 
 
@@ -215,14 +213,14 @@ def test_two_joints_with_files_of_one_name_have_two_attachments(tmp_path):
     for number in (1, 2):
         content[f"joint_{number}"]["file"] = f"arm{number}/joint.yaml"
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
-    where = {name: tmp_path / name for name in ("directory", "ring", "progress", "snapshot", "notices")}
+    where = {"runtime": tmp_path, "directory": tmp_path / "logs", "bus": "can0"}
     scaling = dict.fromkeys(
         ("motor_rad_per_count", "link_rad_per_count", "motor_rad_s_per_unit", "ampere_per_unit"), 1.0
     )
     nodes = {str(n): {"scaling": scaling} for n in (1, 2)}
-    request = recording_request(load_config(tmp_path / "c.yaml"), {"nodes": nodes}, **where, instance="can0")
+    request = recording_request(load_config(tmp_path / "c.yaml"), {"nodes": nodes}, **where)
     (tmp_path / "request.json").write_text(json.dumps(request))
-    loaded, _ = RecorderRequest.from_file(tmp_path / "request.json").load_attachments()
+    loaded = RecorderRequest.from_file(tmp_path / "request.json").load_attachments(pytest.fail)
     files = {item.name: item.data for item in loaded}
     assert len(files) == len(loaded)
     provenance = json.loads(files["provenance.json"])["joints"]

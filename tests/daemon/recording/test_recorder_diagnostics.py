@@ -4,13 +4,13 @@ import math
 
 import pytest
 
-from jtqd.daemon.recording import messages, schemas
+from jtqd.daemon.recording import diagnostics, messages, schemas
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.notices import ERROR, INFO, WARNING, Notices
-from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader
+from jtqd.daemon.shared.snapshot import JointView, Snapshot
 from tests.daemon.recording.recorder_bench import DEFINITIONS, messages_of, session_on, statuses_of
 from tests.daemon.snapshots import EstimateWriter
 
@@ -22,11 +22,13 @@ OK, WARN, FAULT, STALE = range(4)
 class Bench:
     """A snapshot to be written, and what /diagnostics makes of it."""
 
-    def __init__(self, directory):
+    def __init__(self, directory, monkeypatch):
         self.snapshot = Snapshot(directory / "snapshot", 1e-3, 0.85)
-        self.told = EstimateWriter(self.snapshot)
-        self.reader = SnapshotReader(directory / "snapshot")
-        self.diagnostics = Diagnostics("can0", ("a", "b"), [Node(1, "drive 1"), Node(3, "torque sensor")])
+        self.estimate = EstimateWriter(self.snapshot)
+        nodes = [Node(1, "drive 1"), Node(3, "torque sensor")]
+        self.diagnostics = Diagnostics(directory / "snapshot", "can0", ("a", "b"), nodes)
+        self.conditions = []
+        monkeypatch.setattr(diagnostics, "read_conditions", lambda _: self.conditions)
         self.account = Account()
         self.cycle = 0
         self.sizes = set()
@@ -43,19 +45,13 @@ class Bench:
         self.cycle += 1000
         joint = JointView(*[0] * len(JointView._fields))._replace(torque_nm=1.0, sensor_nm=1.1)
         joints = [joint._replace(network_nm=math.nan, status=status) for status in statuses]
-        self.told.write(self.cycle, 1, NOW, tuple(joints))
+        self.estimate.write(self.cycle, 1, NOW, tuple(joints))
         state = {"mode": "recording", "obstacle": "", "backlog": 50, "cpu_percent": 1.5, "events_left_out": 0}
         state |= {"part": 1, "part_bytes": 10**6, "total_bytes": 10**7, "free": 10**9, "reserve": 10**8}
         state |= {"budget": -1, "memory_bytes": 0, "memory_s": 0.0}
-        found = self.diagnostics.statuses(
-            self.reader.read(),
-            self.account,
-            RecorderState(**state | recorder),
-            work_us=self.reader.work_us(0.5, 0.99, 1.0),
-            late_us=self.reader.late_us(0.5, 0.99, 1.0),
-            now_ns=NOW,
-            conditions=conditions,
-        )
+        self.conditions = conditions
+        _, found = self.diagnostics.of_loop(NOW)
+        found += self.diagnostics.of_recorder(self.account, RecorderState(**state | recorder))
         payload = messages.diagnostics(NOW, found)
         self.sizes.add(len(payload))
         message = DEFINITIONS["diagnostic_msgs/msg/DiagnosticArray"].decode(payload)
@@ -63,8 +59,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path):
-    result = Bench(tmp_path)
+def bench(tmp_path, monkeypatch):
+    result = Bench(tmp_path, monkeypatch)
     result.heartbeat(1, 5)
     result.heartbeat(3, 5)
     return result
@@ -168,7 +164,7 @@ def test_recorder_and_disk(bench):
     assert found["disk"][2]["budget_mb"] == "5000"
 
 
-def test_one_size_whatever_it_says(bench):
+def test_one_size_for_every_content(bench):
     bench.look()
     for name in COUNTERS:
         bench.count(name, 2**50)
@@ -189,11 +185,11 @@ def test_notices_of_the_supervisor_become_events_and_log_lines(tmp_path):
     session.poll()
     path = session.finish()["path"]
     found = messages_of(path)
-    told = [
+    texts = [
         (event["count"], event["text"].rstrip())
         for _, event in found["/events"]
         if event["kind"] == schemas.NOTICE
     ]
-    assert told == [(2, "node 2: boot-up"), (1, "node 1: EMCY 8611h following error")]
+    assert texts == [(2, "node 2: boot-up"), (1, "node 1: EMCY 8611h following error")]
     lines = [(line["level"], line["msg"].rstrip()) for _, line in found["/log"]]
     assert (40, "node 1: EMCY 8611h following error") in lines

@@ -8,7 +8,7 @@ import time
 import pytest
 
 from jtqd.daemon.recording import launch
-from jtqd.daemon.recording.launch import Keeper
+from jtqd.daemon.recording.launch import RecorderProcess
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.counters import COUNTERS
@@ -20,14 +20,14 @@ _SLOTS = 256
 
 
 class Kept:
-    """A Keeper with real recorders on a ring without a loop."""
+    """A RecorderProcess with real recorders on a ring without a loop."""
 
     def __init__(self, directory, capfd):
         self.ring = Ring(directory / "ring", _SLOTS, cr.RECORD_SIZE)
         self.snapshot = Snapshot(directory / "snapshot", 0.001, 0.5)
         self.children, self.capfd, self.said, self.cycles = [], capfd, "", 0
         self.logs = directory / "logs"
-        self.keeper = Keeper(self._child, directory, directory / "snapshot")
+        self.keeper = RecorderProcess(self._child, directory)
         self.keeper.start({"ring": str(directory / "ring"), "directory": str(self.logs), "prefix": "test"})
 
     def _child(self, module, arguments, name):

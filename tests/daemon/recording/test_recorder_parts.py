@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 
 from jtqd.daemon.recording import mcap_file as appender
 from jtqd.daemon.recording import parts
-from jtqd.daemon.recording.run_files import Sized, free_run, own_files, parse, part_name, to_remove
+from jtqd.daemon.recording.run_files import free_run, parse_part, part_files, part_name, to_remove
 from tests.daemon.recording.recorder_bench import (
     DEFINITIONS,
     RecorderProcess,
@@ -118,7 +118,7 @@ def test_request_ends_the_part(tmp_path):
     ],
 )
 def test_names_that_are_not_ours(name):
-    assert parse("test", Path(name)) is None
+    assert parse_part("test", Path(name)) is None
 
 
 def test_own_names_sort_by_run_and_part(tmp_path):
@@ -134,8 +134,8 @@ def test_own_names_sort_by_run_and_part(tmp_path):
         (tmp_path / name).touch()
     (tmp_path / "test-20270102T030406Z-0001.mcap").mkdir()
     (tmp_path / "test-20270102T030406Z-0002.mcap").symlink_to(tmp_path / names[0])
-    assert [each.path.name for each in own_files(tmp_path, "test")] == names
-    assert own_files(tmp_path / "none", "test") == []
+    assert [each.path.name for each in part_files(tmp_path, "test")] == names
+    assert part_files(tmp_path / "none", "test") == []
 
 
 def test_run_of_the_same_second_gets_another_name(tmp_path):
@@ -151,7 +151,7 @@ def test_run_of_the_same_second_gets_another_name(tmp_path):
 
 
 def sized_file(name, size):
-    return Sized(parse("p", Path(name)), size)
+    return parse_part("p", Path(name), size)
 
 
 def test_budget_takes_the_oldest_first_and_no_more_than_needed():

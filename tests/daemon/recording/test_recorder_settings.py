@@ -64,19 +64,15 @@ def test_request_carries_all_that_a_log_must_hold(tmp_path):
     content = recording_request(
         config,
         {"nodes": nodes},
+        runtime=tmp_path,
         directory=tmp_path / "logs",
-        ring=tmp_path / "ring",
-        progress=tmp_path / "recorded",
-        snapshot=tmp_path / "snapshot",
-        notices=tmp_path / "notices",
-        instance="can0",
+        bus="can0",
     )
     (tmp_path / "request.json").write_text(json.dumps(content))
     request = RecorderRequest.from_file(tmp_path / "request.json")
     assert (request.prefix, request.rotate_s, request.reserve_mb) == ("jtqd-can0", 600.0, 256.0)
     assert [tuple(node) for node in request.nodes] == [(1, "drive 1"), (2, "drive 2"), (3, "torque sensor")]
-    loaded, problems = request.load_attachments()
-    assert problems == []
+    loaded = request.load_attachments(pytest.fail)
     files = {item.name: item.data for item in loaded}
     assert len(files) == len(loaded), "two attachments of one name"
     assert files["configuration.yaml"] == Path(shipped("bench_paper.yaml")).read_bytes()
@@ -103,11 +99,10 @@ def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_pat
         network.unlink()
     (tmp_path / "bench.yaml").write_text("node_id: 1\n")
     nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
-    where = {name: tmp_path / name for name in ("directory", "ring", "progress", "snapshot", "notices")}
-    content = recording_request(config, {"nodes": nodes}, **where, instance="can0")
+    where = {"runtime": tmp_path, "directory": tmp_path / "logs", "bus": "can0"}
+    content = recording_request(config, {"nodes": nodes}, **where)
     (tmp_path / "request.json").write_text(json.dumps(content))
-    loaded, problems = RecorderRequest.from_file(tmp_path / "request.json").load_attachments()
-    assert problems == []
+    loaded = RecorderRequest.from_file(tmp_path / "request.json").load_attachments(pytest.fail)
     files = {item.name: item.data for item in loaded}
     assert files["joint1.yaml"] == read["joint1.yaml"]
     joint = json.loads(files["provenance.json"])["joints"]["1"]

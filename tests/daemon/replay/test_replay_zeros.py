@@ -142,7 +142,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
 
 def written(path: Path, run: Recorded, first: int = 0, end: int = CYCLES, *, told: bool = True) -> Path:
     """The log of the cycles `first` to `end`; without `told` no state of an estimator is in it."""
-    schemas, channels = definitions(None)
+    schemas, channels = definitions()
     messages = CycleMessages(2)
     builder = ChunkBuilder(schemas, channels, messages.parts, 10)
     attachments = [NamedData(name, "text/plain", data) for name, data in run.attachments.items()]

@@ -24,7 +24,7 @@ def request_of(directory, **changes):
         "domain_id": own_domain(),
         "interface": "lo",
         "rate_hz": 100.0,
-        "names": ["shoulder", "elbow"],
+        "joint_names": ["shoulder", "elbow"],
         "bus": "vcan7",
         "nodes": [[1, "drive 1"]],
         "gear_ratios": [100.0, 160.0],

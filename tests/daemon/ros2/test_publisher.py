@@ -170,8 +170,9 @@ def test_a_unit_that_forbids_network_sockets_is_said(memory):
         "import socket, sys\n"
         "def refused(*_): raise OSError(97, 'Address family not supported by protocol')\n"
         "socket.if_nameindex = refused\n"
-        "from jtqd.daemon.ros2.process import main\n"
-        "sys.exit(main([sys.argv[1]]))"
+        "from jtqd.daemon.ros2.process import begin\n"
+        "from jtqd.daemon.shared.side_process import run_side_process\n"
+        "sys.exit(run_side_process([sys.argv[1]], 'publishing', begin))"
     )
     with Process("-c", forbidden, _request(memory)) as publisher:
         assert "no network sockets: Address family not supported by protocol" in publisher.first()["failed"]

@@ -91,13 +91,10 @@ def test_they_are_metrics_of_the_joints_that_track_them(snapshot: SnapshotReader
     assert not re.search(r'jtqd_link_zero.*joint="2"', text)
 
 
-def test_they_are_in_diagnostics_and_in_the_summary(snapshot: SnapshotReader) -> None:
+def test_they_are_in_diagnostics_and_in_the_summary(snapshot: SnapshotReader, tmp_path: Path) -> None:
     reading = snapshot.read()
     assert reading.pasts == (b"past", b"")
-    nothing = [float("nan")] * 3
-    statuses = Diagnostics("can0", ["a", "b"], []).of_the_loop(
-        reading, work_us=nothing, late_us=nothing, now_ns=0
-    )
+    _, statuses = Diagnostics(tmp_path / "snapshot", "can0", ["a", "b"], []).of_loop(0)
     one, two = (each.values for each in statuses if each.name.startswith("jtqd: joint"))
     assert (one["link_zero_rad"], one["zero_learned"]) == (FOUND.link_rad, "yes")
     assert "link_zero_rad" not in two
