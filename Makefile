@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo hidden-effect docs dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -85,6 +85,10 @@ soak-exact: $(VENV)/.installed-dev ## the same in the bench kernel: as much gues
 
 bench-kernel: $(VENV)/.installed ## build the kernel with SocketCAN into the cache, once
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build
+
+docs: $(VENV)/.created ## the documentation as a site: build/site/index.html
+	$(PIP) install 'mkdocs-material>=9.5,<10'
+	$(BIN)/mkdocs build --strict --quiet
 
 dist: $(VENV)/.installed-dev ## wheel and sdist into dist/
 	$(PIP) install build

@@ -34,6 +34,33 @@ def test_files_and_links_are_there(page: Path) -> None:
     assert not missing
 
 
+HEADING = re.compile(r"^#+ (.*)$", re.MULTILINE)
+
+
+def anchors(page: Path) -> set[str]:
+    """Names of the headings of a page, as GitHub and mkdocs make them."""
+    return {
+        re.sub(r"[^\w\- ]", "", text.lower()).strip().replace(" ", "-")
+        for text in HEADING.findall(page.read_text())
+    }
+
+
+@pytest.mark.parametrize("page", PAGES, ids=IDS)
+def test_every_link_ends_at_a_heading(page: Path) -> None:
+    broken = [
+        link + anchor
+        for link, anchor in LINK.findall(page.read_text())
+        if anchor and anchor[1:] not in anchors(page.parent / link if link else page)
+    ]
+    assert not broken
+
+
+def test_the_documentation_is_short() -> None:
+    """A reader finds an answer in minutes; details of a method stand in the docstring of its file."""
+    assert len(PAGES) <= 15
+    assert sum(len(page.read_text().split()) for page in PAGES) <= 30_000
+
+
 @pytest.mark.parametrize("page", PAGES, ids=IDS)
 def test_modules_that_are_run_are_there(page: Path) -> None:
     for name in MODULE.findall(page.read_text()):
