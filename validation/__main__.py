@@ -1,51 +1,87 @@
-"""`python -m validation [STUDY [OPTION ...]]`: list the studies, or run one."""
+"""`python -m validation [STUDY [OPTION ...]]`: list the studies, or run one and print its tables."""
 
 from __future__ import annotations
 
-import importlib
 import os
-import sys
-from collections.abc import Sequence
-from typing import Final
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: one process per core is faster
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import argparse
+import importlib
+import signal
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from jtqd.estimator.checked import check_output
+from validation.study import UsageError, json_of, text_of
+
 STUDIES: Final = {
-    "frozen": ("validation.frozen", "results that a restructuring must not change, beside the stored ones"),
-    "goals": ("validation.goals.__main__", "three plants: error and interval against the true torque"),
+    "goals": ("validation.goals.goals", "three plants: error and interval against the true torque"),
     "sources": ("validation.goals.sources", "what the error of the estimate is made of on a bench"),
     "other_plant": ("validation.goals.other_plant", "joint files of another plant: how soon it is flagged"),
-    "kinova": ("validation.goals.kinova", "the measured arm: fitted to one run, judged on the other"),
-    "few_runs": ("validation.goals.few_runs", "two short runs of one encoder on the three plants"),
-    "few_runs_mujoco": ("validation.worlds.few_runs", "two short runs of one encoder in MuJoCo"),
-    "measured": ("validation.measured.command", "the measured arm: joint files as shipped and fitted"),
+    "two_runs": (
+        "validation.goals.two_runs",
+        "one encoder, two short runs: fitted to one, judged on the other",
+    ),
+    "measured": (
+        "validation.measured",
+        "the measured arm: joint files as shipped and fitted, offline or on a bus",
+    ),
     "reproduce": ("validation.reproduce", "all campaigns, fits, training and evaluation"),
-    "trials": ("validation.hidden.campaign", "diagnosis: hidden effects of the project's generator"),
-    "benches": ("validation.worlds.campaign", "diagnosis: hidden effects in MuJoCo and in measured runs"),
-    "oracle": ("validation.worlds.oracle", "size from which an effect is visible in a bench"),
-    "smallest": ("validation.worlds.smallest", "size from which the diagnosis reports each effect"),
-    "more_data": ("validation.worlds.more_data", "what one more run changes in the findings"),
+    "trials": ("validation.diagnosis.trials", "diagnosis: effects hidden by the project's generator"),
+    "benches": (
+        "validation.diagnosis.bench_trials",
+        "diagnosis: effects hidden in MuJoCo and in measured runs",
+    ),
+    "oracle": ("validation.diagnosis.oracle", "size from which an effect is visible, or would be reported"),
+    "more_data": ("validation.diagnosis.more_data", "diagnosis: what one more run changes"),
+    "frozen": ("validation.frozen", "results that a restructuring must not change, beside the stored ones"),
 }
 """Study -> (module, one line of help)."""
+DONE, FAILED, USAGE, MISSED, INTERRUPTED = 0, 1, 2, 3, 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a study; exit status 0 done, 1 failure, 2 usage, 3 done and targets missed, 130 Ctrl-C."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
-        print("usage: python -m validation STUDY [OPTION ...]\n")
         width = max(map(len, STUDIES))
-        print("\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in STUDIES.items()))
-        return 0
-    if words[0] not in STUDIES:
-        print(f"validation: found {words[0]!r}, expected one of {', '.join(STUDIES)}", file=sys.stderr)
-        return 2
+        studies = "\n".join(f"  {name:<{width}}  {text}" for name, (_, text) in STUDIES.items())
+        print(f"usage: python -m validation STUDY [--json FILE] [OPTION ...]\n\n{studies}")
+        return DONE
+    name = words[0]
+    if name not in STUDIES:
+        print(f"validation: found {name!r}, expected one of {', '.join(STUDIES)}", file=sys.stderr)
+        return USAGE
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends what a study has started, as Ctrl-C
+    study = importlib.import_module(STUDIES[name][0])
+    parser = argparse.ArgumentParser(
+        prog=f"python -m validation {name}",
+        description=study.__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    study.options(parser)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write tables and values as JSON")
+    options = parser.parse_args(words[1:])
     try:
-        status: int = importlib.import_module(STUDIES[words[0]][0]).main(words[1:])
+        if options.json is not None:
+            check_output(options.json)
+        report = study.run(options)
+        if options.json is not None:
+            options.json.write_bytes(json_of(name, report))
     except KeyboardInterrupt:
-        return 130
-    return status
+        return INTERRUPTED
+    except UsageError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return USAGE
+    except (ValueError, RuntimeError, OSError, ModuleNotFoundError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return FAILED
+    print(text_of(report))
+    return DONE if report.reached else MISSED
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Compare the results of this tree, number by number, with the ones stored in frozen.txt.
 
-    python -m validation frozen                   compare; exit status 1 where a line differs
+    python -m validation frozen                   compare; exit status 3 where a line differs
     python -m validation frozen findings replay   some sections only
     python -m validation frozen --store           store the results of this tree as the reference
     python -m validation frozen --out DIR         also keep full dumps, for a diff between two trees
@@ -16,14 +16,17 @@ import argparse
 import difflib
 import hashlib
 import json
-import os
 import re
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Final
+
+import numpy as np
+
+from validation.study import Report, Table, UsageError
 
 STORED: Final = Path(__file__).with_name("frozen.txt")
 SEEDS: Final = (3301, 3302, 3303)
@@ -35,7 +38,7 @@ PLAIN: Final = frozenset({"unexplained", "outlier_runs", "one_sided"})
 """Keys that repeat another one under the standard term."""
 
 
-def run(*arguments: str, allowed: tuple[int, ...] = (0, 3), cwd: Path | None = None) -> str:
+def called(*arguments: str, allowed: tuple[int, ...] = (0, 3), cwd: Path | None = None) -> str:
     """Return what a Python module of this tree prints. Raises RuntimeError for another exit status."""
     done = subprocess.run(
         [sys.executable, "-m", *arguments], capture_output=True, text=True, check=False, cwd=cwd
@@ -47,7 +50,7 @@ def run(*arguments: str, allowed: tuple[int, ...] = (0, 3), cwd: Path | None = N
 
 def jtq(*arguments: str) -> str:
     """Return what `jtq` prints."""
-    return run("jtqd.daemon.jtq", *arguments)
+    return called("jtqd.daemon.jtq", *arguments)
 
 
 def digest(text: str | bytes) -> str:
@@ -81,11 +84,14 @@ def findings_lines(label: str, text: str, out: Path) -> Iterator[str]:
 
 def _trials(directory: Path) -> Iterator[Path]:
     """Write the runs and joint files of the trials; yield the folder of each."""
-    from validation.hidden import Hidden, draw, write
-    from validation.worlds.benches import BENCHES
-    from validation.worlds.campaign import Counts, jobs
-    from validation.worlds.judge import write as write_set
-    from validation.worlds.recorder import PRESETS
+    import yaml
+
+    from validation.diagnosis.bench_trials import Counts, jobs
+    from validation.diagnosis.benches import BENCHES
+    from validation.diagnosis.entries import Hidden
+    from validation.diagnosis.recorder import PRESETS
+    from validation.diagnosis.scores import write
+    from validation.generator.draw import draw
 
     hidden = (
         (),
@@ -94,15 +100,21 @@ def _trials(directory: Path) -> Iterator[Path]:
     )
     for seed, effects in zip(SEEDS, hidden, strict=True):
         folder = directory / f"own_{seed}"
-        write(draw(seed, effects), folder)
-        (folder / "truth.json").unlink()
+        folder.mkdir()
+        case = draw(seed, effects)
+        for number, columns in enumerate(case.runs, 1):
+            table = np.column_stack(list(columns.values()))
+            path = folder / f"run{number}.csv"
+            np.savetxt(path, table, "%.9g", ",", header=",".join(columns), comments="")
+        for number, joint in case.joints.items():
+            (folder / f"joint{number}.yaml").write_text(yaml.safe_dump(joint, sort_keys=False))
         yield folder
     bench = BENCHES["mujoco"]()
     for number, job in enumerate(jobs(bench, MUJOCO_SEED, Counts())[:3]):
         folder = directory / f"mujoco_{MUJOCO_SEED}_{number}"
         folder.mkdir()
         drawn = bench.draw(job.seed, job.hidden)
-        write_set(folder, drawn.runs, drawn.joints, PRESETS["full"], job.seed)
+        write(folder, drawn.runs, drawn.joints, PRESETS["full"], job.seed)
         yield folder
 
 
@@ -141,8 +153,6 @@ def joint_files(out: Path) -> Iterator[str]:
 
 def replay(out: Path) -> Iterator[str]:
     """Replay the golden logs with every method, bit by bit."""
-    import numpy as np
-
     from tests.golden.reference import CASES, replayed
 
     for name, case in CASES.items():
@@ -157,7 +167,7 @@ def fresh_log(out: Path) -> Iterator[str]:
     from mcap.reader import make_reader
 
     with tempfile.TemporaryDirectory() as scratch:
-        run("jtqd.daemon.jtqd", "--bus", "sim", "--duration", "20", "--record", scratch)
+        called("jtqd.daemon.jtqd", "--bus", "sim", "--duration", "20", "--record", scratch)
         (log,) = Path(scratch).glob("*.mcap")
         identity = json.loads(jtq("replay", str(log), "--json"))
         (out / "replay.json").write_text(json.dumps(identity, indent=1), encoding="utf-8")
@@ -196,7 +206,7 @@ def wire(out: Path) -> Iterator[str]:
 def kinova(out: Path) -> Iterator[str]:
     """Diagnose the seven joints of the measured arm."""
     with tempfile.TemporaryDirectory() as scratch:
-        content = json.loads(run("examples.kinova_diagnosis", "--out", scratch, "--json"))
+        content = json.loads(called("examples.kinova_diagnosis", "--out", scratch, "--json"))
         for each in content["joints"]:
             yield from findings_lines(f"kinova_{each['joint']}", json.dumps(each["findings"]), out)
 
@@ -205,8 +215,16 @@ def goals(out: Path) -> Iterator[str]:
     """Compute the goals' table on few days: campaign, fits, every method, beside its baselines."""
     with tempfile.TemporaryDirectory() as scratch:
         file = Path(scratch) / "goals.json"
-        run("validation", "goals", "--quick", "--json", str(file))
-        full = "\n".join(numbers(json.loads(file.read_text(encoding="utf-8"))))
+        called("validation", "goals", "--quick", "--json", str(file))
+        found = json.loads(file.read_text(encoding="utf-8"))
+        seeds, columns = found["seeds"], found["values"]["columns"]
+        content = {
+            "schema": "jtq.goals/1",
+            "seed": seeds["judge"],
+            "fit_seed": seeds["fit"],
+            "columns": columns,
+        }
+        full = "\n".join(numbers(content))
         (out / "goals.txt").write_text(full + "\n", encoding="utf-8")
         yield f"goals --quick: {len(full.splitlines())} numbers, {digest(full)}"
 
@@ -247,37 +265,29 @@ def stored_sections() -> dict[str, list[str]]:
     return sections
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Compare or store; see the module."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the study."""
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}")
     parser.add_argument("--store", action="store_true", help="store the results as the reference")
     parser.add_argument("--out", type=Path, metavar="DIR", help="keep full dumps")
-    options = parser.parse_args(arguments)
-    unknown = set(options.sections) - set(SECTIONS)
-    if unknown:
-        parser.error(f"found {', '.join(sorted(unknown))}, expected {', '.join(SECTIONS)}")
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ[variable] = "1"
-    reference, status = stored_sections(), 0
+
+
+def run(options: argparse.Namespace) -> Report:
+    """Compare or store; see the module."""
+    if unknown := set(options.sections) - set(SECTIONS):
+        raise UsageError(f"found {', '.join(sorted(unknown))}, expected {', '.join(SECTIONS)}")
+    reference, rows, differences = stored_sections(), [], []
     with tempfile.TemporaryDirectory() as scratch:
         out = options.out or Path(scratch)
         out.mkdir(parents=True, exist_ok=True)
         for name in options.sections or SECTIONS:
             lines = list(SECTIONS[name](out))
+            found = list(difflib.unified_diff(reference.get(name, []), lines, lineterm="", n=0))[2:]
+            differences += [f"{name}: {line}" for line in found]
+            rows.append((name, str(len(lines)), f"{len(found)} lines differ" if found else "equal"))
+            print(": ".join(rows[-1]), file=sys.stderr, flush=True)
             if options.store:
                 reference[name] = lines
-                print(f"{name}: stored {len(lines)} lines")
-                continue
-            difference = list(
-                difflib.unified_diff(reference.get(name, []), lines, "stored", "this tree", lineterm="", n=0)
-            )
-            status |= bool(difference)
-            print(f"{name}: {'DIFFERS' if difference else 'equal'}, {len(lines)} lines", flush=True)
-            for line in difference[2:]:
-                print(f"  {line}")
     if options.store:
         head = f"# {(__doc__ or '').splitlines()[0]} Written by `python -m validation frozen --store`.\n"
         body = "".join(
@@ -286,4 +296,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if name in reference
         )
         STORED.write_text(head + body, encoding="utf-8")
-    return status
+    seeds = {"generator": ", ".join(map(str, SEEDS)), "mujoco": MUJOCO_SEED}
+    table = Table(("section", "results", "beside the stored ones"), rows)
+    return Report([table], seeds, differences, reached=options.store or not differences)

@@ -1,8 +1,11 @@
-"""`python -m validation reproduce`: run the paper's whole procedure and ours: campaigns, fits, training, evaluation, report.
+"""The paper's whole procedure and ours on a bench: campaigns, fits, training, evaluation, report.
 
-Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. A step begins when all
-that it reads is there; with --jobs several are at work at once. Campaigns go on where they were interrupted; fits and
-training give the same files from the same runs. With `--plant` the bench is another one
+    python -m validation reproduce --out reproduction            everything, about 85 minutes, 41 of them motion of the bench
+    python -m validation reproduce --out /tmp/quick --quick      the same steps with shorter runs, too few for good figures
+    python -m validation reproduce --plant models/plants/typical.yaml --out typical     another bench, without a bus
+
+Every step is a `jtq` command of its own, printed before it runs, so that it can be repeated alone. Campaigns go on where
+they were interrupted; fits and training give the same files from the same runs. With --plant the bench is another one
 (docs/testing.md), and its campaigns are emulated without a bus, with the true torques beside the runs.
 """
 
@@ -12,42 +15,33 @@ import argparse
 import hashlib
 import json
 import re
-import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+import time
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
-from types import FrameType
-from typing import Final, NamedTuple, NoReturn
+from typing import Final, NamedTuple
 
 import yaml
 
-from jtqd.estimator.checked import ConfigError, check_installed, count, make_directory, natural
+from jtqd.estimator.checked import check_installed, make_directory, natural
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.state import DONE, STATE_FILE
 from jtqd.sysid.planner.campaigns import outside_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan
+from validation.study import Report, Table
 
 _OUTSIDE_PLANT: Final = "campaign_plant_outside.yaml"
 _FINDINGS: Final = 3
 _OTHER_DAYS: Final = 7
 """Added to the seed: days and trajectories that no campaign has."""
 _NEEDED: Final = ("torch", "onnx", "scipy", "matplotlib", "jinja2")
-_QUICK_JOBS: Final = 2
-"""Campaigns mostly wait, fits and training mostly compute."""
-_WRITTEN: Final = ("--out", "--plot")
 _VALIDATION_DAYS: Final = 1000
 """Added to the seed of emulated runs that judge."""
 _EMULATED: Final = "jtqd.sysid.campaign.emulated"
-TRAINED: Final = "trained"
-"""Folder in models/ with what this command has made; beside the configuration in a directory of its own."""
-_EXAMPLES: Final = """examples:
-  python -m validation reproduce --out reproduction            everything, about 85 minutes, 41 of them motion of the bench
-  python -m validation reproduce --out /tmp/quick --quick      the same steps with shorter runs, too few for good figures
-  python -m validation reproduce --plant models/plants/typical.yaml --out typical     another bench, without a bus"""
+_TRAINED: Final = "trained"
+"""Folder in models/ with what this study has made; beside the configuration in a directory of its own."""
 
 
 class Step(NamedTuple):
@@ -64,146 +58,13 @@ class Step(NamedTuple):
         return " ".join((name, *self.arguments))
 
     @property
-    def name(self) -> str:
-        """Its first words: "jtq fit"."""
-        return " ".join(self.text.split()[: 2 if self.module == "jtqd.daemon.jtq" else 3])
-
-    @property
     def out(self) -> Path:
         """What it writes: a file, or a directory."""
         return Path(self.arguments[self.arguments.index("--out") + 1])
 
-    def reads(self, earlier: Step) -> bool:
-        """Return whether it needs what an earlier step writes: that very file or directory, or a file in a directory."""
-        pairs = zip(("", *self.arguments), self.arguments, strict=False)
-        return any(earlier.out.is_relative_to(word) for before, word in pairs if before not in _WRITTEN)
 
-
-def main(argv: list[str]) -> int:
-    """Run all steps; exit status 0 done, 1 a step failed, 2 usage, 3 done with findings."""
-    options = parser().parse_args(argv)
-    out: Path = options.out
-    jobs = options.jobs or (_QUICK_JOBS if options.quick else 1)
-    try:
-        make_directory(out)
-        check_installed("train", *_NEEDED)  # a step asks for it only after an hour of campaigns
-        (out / "models").mkdir(parents=True, exist_ok=True)
-        _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
-        worst = run_steps(tuple(steps(out, options.bus, options.quick, options.seed, options.plant)), jobs)
-        if worst == 1:
-            return 1
-        for name in ("bench.yaml", "bench_paper.yaml"):
-            write_config(out / "models" / name, name)
-    except ConfigError as error:
-        print(f"reproduce: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f"reproduce: {error.filename or out}: {error.strerror or error}", file=sys.stderr)
-        return 1
-    print(
-        f"report: {out / 'report' / 'evaluation.html'}, of many days {out / 'report_days' / 'evaluation.html'}\n"
-        f"configuration for jtqd: {out / 'models' / 'bench.yaml'}"
-    )
-    return worst
-
-
-class Commands:
-    """Commands of the steps that are at work, up to `jobs` at once.
-
-    Several have no terminal of their own: each line that they tell begins with their name.
-    """
-
-    def __init__(self, jobs: int) -> None:
-        self.jobs = jobs
-        self.ended = False
-        self._lock = Lock()
-        self._processes: list[subprocess.Popen[str]] = []
-
-    def run(self, name: str, command: Sequence[str]) -> int:
-        """Return the exit status of a command; 1 without running it once all were ended."""
-        told = None if self.jobs == 1 else subprocess.PIPE
-        with self._lock:
-            if self.ended:
-                return 1
-            process = subprocess.Popen(command, stderr=told, text=True, errors="replace")
-            self._processes.append(process)
-        for line in process.stderr or ():
-            print(f"[{name}] {line}", end="", file=sys.stderr, flush=True)
-        return process.wait()
-
-    def end(self) -> None:
-        """End what is at work; nothing begins any more."""
-        with self._lock:
-            self.ended = True
-            for process in self._processes:
-                process.terminate()
-
-
-def run_steps(wanted: Sequence[Step], jobs: int) -> int:
-    """Run steps, up to `jobs` at once, each when the earlier ones that it reads are done.
-
-    Returns the worst status; 1 when one failed: the others are ended then.
-    """
-    commands, worst = Commands(jobs), 0
-    before = signal.signal(signal.SIGTERM, _terminated)
-    left, under_way = dict(enumerate(wanted)), dict[Future[int], int]()
-    with ThreadPoolExecutor(jobs) as pool:
-        try:
-            while left or under_way:
-                unfinished = {*left, *under_way.values()}
-                for at, step in list(left.items()):
-                    waits = any(step.reads(wanted[one]) for one in unfinished if one < at)
-                    if len(under_way) < jobs and not waits:
-                        print(f"$ {step.text}", file=sys.stderr, flush=True)
-                        under_way[pool.submit(_run, left.pop(at), commands)] = at
-                for done in wait(under_way, return_when=FIRST_COMPLETED).done:
-                    step, status = wanted[under_way.pop(done)], done.result()
-                    if status and not (status == _FINDINGS and step.findings_are_fine):
-                        print(f"reproduce: {step.name} ended with status {status}", file=sys.stderr)
-                        return 1
-                    worst = max(worst, status)
-        finally:
-            commands.end()
-            signal.signal(signal.SIGTERM, before)
-    return worst
-
-
-def _terminated(number: int, frame: FrameType | None) -> NoReturn:
-    """SIGTERM ends the steps as Ctrl-C does."""
-    raise KeyboardInterrupt
-
-
-def _run(step: Step, commands: Commands) -> int:
-    """Run a step; a campaign that ended early goes on for as long as each attempt gets at least one more run done."""
-    done = -1
-    while True:
-        status = commands.run(step.out.name, [sys.executable, "-m", step.module, *step.arguments])
-        if status != 1 or step.arguments[0] != "campaign" or commands.ended:
-            return status
-        now = _runs_done(step.out)
-        if now <= done:
-            return status
-        done = now
-        print(f"reproduce: runs done: {now}; the campaign continues", file=sys.stderr, flush=True)
-
-
-def _runs_done(campaign: Path) -> int:
-    """Return how many runs of a campaign are done; -1 where no campaign was begun."""
-    try:
-        runs = json.loads((campaign / STATE_FILE).read_text(encoding="utf-8"))["runs"]
-    except (OSError, ValueError, KeyError):
-        return -1
-    return sum(run["status"] == DONE for run in runs)
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `python -m validation reproduce`."""
-    parser = argparse.ArgumentParser(
-        prog="python -m validation reproduce",
-        description="Run all campaigns, fits, training and evaluation on the emulated bench, over the bus.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the study."""
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
     )
@@ -223,12 +84,63 @@ def parser() -> argparse.ArgumentParser:
         "--quick", action="store_true", help="small campaigns and short training, to test the steps"
     )
     parser.add_argument(
-        "--jobs", type=count, metavar="N", help="steps at work at once (default 1, with --quick 2)"
-    )
-    parser.add_argument(
         "--seed", type=natural, default=0, help="of trajectories, days and weights (default 0)"
     )
-    return parser
+
+
+def run(options: argparse.Namespace) -> Report:
+    """Run all steps. Raises RuntimeError with the step that failed, ConfigError, OSError."""
+    out: Path = options.out
+    make_directory(out)
+    check_installed("train", *_NEEDED)  # a step asks for it only after an hour of campaigns
+    (out / "models").mkdir(parents=True, exist_ok=True)
+    _write_outside_plan(out / "outside.plan.yaml", options.seed, 2 if options.quick else 6)
+    rows = run_steps(steps(out, options.bus, options.quick, options.seed, options.plant))
+    for name in ("bench.yaml", "bench_paper.yaml"):
+        write_config(out / "models" / name, name)
+    notes = [
+        f"report: {out / 'report' / 'evaluation.html'}, of many days {out / 'report_days' / 'evaluation.html'}",
+        f"configuration for jtqd: {out / 'models' / 'bench.yaml'}",
+    ]
+    reached = all(status == 0 for _, status, _ in rows)
+    table = Table(("step", "status", "time"), [(text, str(s), f"{t:.0f} s") for text, s, t in rows])
+    return Report([table], {"seed": options.seed}, notes, reached=reached)
+
+
+def run_steps(wanted: Iterable[Step]) -> list[tuple[str, int, float]]:
+    """Run steps one after the other; return (command, exit status, seconds). Raises RuntimeError with one that fails."""
+    rows = []
+    for step in wanted:
+        print(f"$ {step.text}", file=sys.stderr, flush=True)
+        begin = time.monotonic()
+        status = _run(step)
+        if status and not (status == _FINDINGS and step.findings_are_fine):
+            raise RuntimeError(f"{' '.join(step.text.split()[:3])} ended with status {status}")
+        rows.append((step.text, status, time.monotonic() - begin))
+    return rows
+
+
+def _run(step: Step) -> int:
+    """Run a step; a campaign that ended early goes on for as long as each attempt gets at least one more run done."""
+    done = -1
+    while True:
+        status = subprocess.run([sys.executable, "-m", step.module, *step.arguments], check=False).returncode
+        if status != 1 or step.arguments[0] != "campaign":
+            return status
+        now = _runs_done(step.out)
+        if now <= done:
+            return status
+        done = now
+        print(f"reproduce: runs done: {now}; the campaign continues", file=sys.stderr, flush=True)
+
+
+def _runs_done(campaign: Path) -> int:
+    """Return how many runs of a campaign are done; -1 where no campaign was begun."""
+    try:
+        runs = json.loads((campaign / STATE_FILE).read_text(encoding="utf-8"))["runs"]
+    except (OSError, ValueError, KeyError):
+        return -1
+    return sum(run["status"] == DONE for run in runs)
 
 
 def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None) -> Iterator[Step]:
@@ -303,7 +215,7 @@ def _write_outside_plan(path: Path, seed: int, count: int) -> None:
 
 def write_config(path: Path, name: str) -> None:
     """Write a shipped configuration beside the models that are there, with the networks of its method, if there are some."""
-    text = shipped(name).read_text(encoding="utf-8").replace(f" {TRAINED}/", " ")
+    text = shipped(name).read_text(encoding="utf-8").replace(f" {_TRAINED}/", " ")
     text = re.sub(r"  network:\n    file: .*\n    sha256: .*\n", "", text)
     ending = ".fused.onnx" if "  method: fused" in text else ".onnx"
 

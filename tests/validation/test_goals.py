@@ -1,4 +1,4 @@
-"""The goals' table: its figures against closed forms, changes of the plants, baselines, and the command in small."""
+"""The goals' table, the sources of its error and joint files of another plant: figures against closed forms, the steps."""
 
 from __future__ import annotations
 
@@ -12,31 +12,59 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import ObservedRun
 from jtqd.estimator.status import DEGRADED, VALID
+from jtqd.models.files import shipped
+from jtqd.sim_can.emulated_run import JointCommand, emulate
 from jtqd.sim_can.plant_file import PlantParameters
+from jtqd.sim_can.towing.bench_file import TowingBench
 from jtqd.sysid.evaluate.methods import OURS, PAPERS
+from jtqd.sysid.fit.signals import run_signals
+from jtqd.sysid.fit.torsion import deflection
 from jtqd.sysid.planner.plan import Plateau, Rest, Run
 from tests.estimator.fused_helpers import fused
-from validation.goals.__main__ import main
-from validation.goals.baselines import BASELINES, Example, fit_baseline
-from validation.goals.figures import (
+from tests.sysid.fit.fused_signals import FUSED
+from validation.__main__ import FAILED, USAGE, main
+from validation.goals.goals import goal_rows, goal_table
+from validation.goals.identify import (
+    BASELINES,
+    CHANGES,
+    FIT_SEED,
+    JUDGE_SEED,
+    Driven,
+    Example,
+    Identified,
+    Range,
+    drive,
+    fit_baseline,
+    nominal_joints,
+    plant_file,
+    the_three,
+)
+from validation.goals.judge import (
+    OWN,
     REGRESSION,
+    TITLES,
+    ZEROS,
+    Changed,
     Column,
     Figure,
-    _beyond,
+    Judged,
+    Outside,
+    Result,
     _outside,
     _worse,
     interval,
+    judge,
+    judged_beyond,
     ratio,
     root,
     share,
     standstill,
 )
-from validation.goals.identify import FIT_SEED, JUDGE_SEED, Driven, Identified, Range, drive, nominal_joints
-from validation.goals.judge import OWN, TITLES, ZEROS, Judged, Result, judge
-from validation.goals.plants import CHANGES, the_three
-from validation.goals.table import goal_lines, goal_rows, markdown
+from validation.goals.other_plant import figures, first_s
+from validation.goals.sources import PARTS, SOURCES, day_zeros, parts_of, true_torsion
 
 N = 1000
 YES, NO = np.ones(N, np.bool_), np.zeros(N, np.bool_)
@@ -151,7 +179,7 @@ def test_a_change_of_the_link_reaches_the_estimate_and_not_the_truth() -> None:
     assert -1.5 < np.median(moved) < -0.2
     assert not plain.beyond.any()
     slow = replace(one, driven=Range(1000.0, 0.1, (-50.0, 200.0)))
-    beyond = _beyond({"speed": [run]}, [slow])["speed"][0]
+    beyond = judged_beyond({"speed": [run]}, [slow])["speed"][0]
     assert beyond.beyond[600]
     assert not beyond.beyond[100]
 
@@ -163,9 +191,7 @@ def test_days_that_judge_are_of_no_fit() -> None:
 
 
 def test_the_same_seed_for_both_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as caught:
-        main(["--seed", "3", "--fit-seed", "3"])
-    assert caught.value.code == 2
+    assert main(["goals", "--seed", "3", "--fit-seed", "3"]) == USAGE
     assert "found 3 for both" in capsys.readouterr().err
 
 
@@ -173,8 +199,6 @@ def column(name: str) -> Column:
     one = Figure(1.0, 0.1)
     whole = interval([judged("a"), judged("b")], OURS)
     rest = standstill([judged(standing=YES)], OURS)
-    from validation.goals.figures import Changed, Outside
-
     return Column(
         name,
         3,
@@ -188,25 +212,25 @@ def column(name: str) -> Column:
     )
 
 
-def test_the_table_says_what_is_reached() -> None:
-    lines = goal_lines([column(name) for name in ("Table I", "typical", "bad day")])
-    by_name = {cells[0]: cells[1:] for cells in lines[1:]}
-    assert len(lines) == 1 + len(goal_rows())
+def test_the_table_has_what_is_reached() -> None:
+    table, reached = goal_table([column(name) for name in ("Table I", "typical", "bad day")])
+    by_name = {cells[0]: list(cells[1:]) for cells in table.rows}
+    assert len(table.rows) == len(goal_rows())
+    assert not reached
     now = by_name["RMSE in motion against the true torque now, % of rated: ours"]
     assert now == ["1.00 ± 0.10", "0.5 missed", "1.00 ± 0.10", "1 ok", "1.00 ± 0.10", "1.5 ok"]
     chain = by_name["MSE to that of the paper's chain identified on the same runs: ours"]
     assert chain[0:2] == ["0.100", "0.15 ok"]
     outside = by_name["outside, flagged, %; inside, falsely flagged, %: ours"]
     assert outside[1] == "95; 2 missed", "the kind that is flagged least counts"
-    assert {len(line) for line in markdown(lines)} == {len(markdown(lines)[0])}
 
 
 @pytest.mark.campaign
 def test_the_command_in_small(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "goals.json"
-    assert main(["--tiny", "--seed", "11", "--json", str(file)]) == 0
+    assert main(["goals", "--tiny", "--seed", "11", "--json", str(file)]) != FAILED
     assert "| figure" in capsys.readouterr().out
-    made = json.loads(file.read_text())
+    made = json.loads(file.read_text())["values"]
     assert [each["name"] for each in made["columns"]] == ["Table I", "typical", "bad day"]
     for each in made["columns"]:
         mse = each["mse_nm2"]
@@ -217,3 +241,99 @@ def test_driven_runs_have_the_truth_of_both_joints() -> None:
     run: Driven = drive(the_three()[0].bench(), [short_run()], 5)[0]
     assert run.true_nm.shape == (len(run.table.time_s), 2)
     assert run.columns(2, nominal_joints(the_three()[0])[1]).torque_nm is not None
+
+
+# Joint files of another plant.
+
+
+def test_time_counts_in_motion() -> None:
+    moving = np.array([False] * 500 + [True] * 1500)
+    flags = np.zeros(2000, bool)
+    assert first_s(flags, moving, 1e-3) == np.inf
+    flags[:500] = True
+    assert first_s(flags, moving, 1e-3) == np.inf, "at rest it does not count"
+    flags[1400:] = True
+    assert first_s(flags, moving, 1e-3) == pytest.approx(0.9)
+
+
+def flagged_at(first: int | None) -> Judged:
+    n = 3000
+    status = np.full(n, VALID, np.uint8)
+    if first is not None:
+        status[first:] = DEGRADED
+    zero, moving = np.zeros(n), np.ones(n, bool)
+    result = Result(np.full(n, 0.5), zero, np.full(n, 1.0), status)
+    return Judged("a", 1, 40.0, zero, moving, ~moving, ~moving, np.zeros(n, np.uint8), {ZEROS: result})
+
+
+def test_joints_in_runs_that_are_flagged_soon_are_counted() -> None:
+    found = figures([flagged_at(0), flagged_at(900), flagged_at(1500), flagged_at(None)], 1e-3)
+    assert found.within == (50.0, 75.0, 75.0)
+    assert found.degraded == pytest.approx(25.0 * (1.0 + 0.7 + 0.5))
+    assert found.inside == 100.0
+    assert found.rmse_nm == pytest.approx(0.5)
+
+
+# What the error is made of.
+
+BAD_DAY = plant_file("bad_day", shipped("plants/bad_day.yaml"))
+
+
+def test_parts_are_found_as_they_were_put_in_and_add_up() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(8000) * 1e-3
+    link = 1.6 * np.sin(1.9 * t) + 0.9 * np.sin(0.7 * t)
+    motor = 101.0 * link
+    noise = rng.normal(0.0, 0.1, len(t))
+    error = 0.5 + 0.4 * np.cos(2.0 * motor + 0.3) + 0.3 * np.sin(2.0 * link) + noise
+    found = parts_of(error, motor, link, 1e-3)
+    assert found.sum() == pytest.approx(float(np.mean(error * error)))
+    named = dict(zip(PARTS, found, strict=True))
+    assert named["constant in a run"] == pytest.approx(float(error.mean()) ** 2)
+    assert named["motor's turn"] == pytest.approx(0.08, rel=0.1)
+    assert named["link's turn"] == pytest.approx(float(np.var(0.3 * np.sin(2.0 * link))), rel=0.15)
+    assert named["the rest"] == pytest.approx(0.01, rel=0.1)
+    wave = np.sin(2.0 * math.pi * 0.3 * t)
+    slow = parts_of(wave, 50.0 * t, 0.0 * t, 1e-3)
+    assert slow[PARTS.index("slower than 1 Hz")] > 0.7 * float(np.mean(wave * wave))
+
+
+def test_the_true_torsion_deflects_as_the_bench_does() -> None:
+    """Without noise and slips: the deflection of the true parameters, through the spring, is the torque but for damping."""
+    changed = BAD_DAY.changed(SOURCES["noise of link encoder and current"]).changed(
+        SOURCES["slips of the gear"]
+    )
+    bench = changed.bench()
+    assert isinstance(bench, TowingBench)
+    commands = (
+        JointCommand.velocity(lambda t: 0.8 * math.sin(2.0 * t)),
+        JointCommand.current(lambda t: 5.0 * math.sin(1.3 * t)),
+    )
+    run = emulate(bench, commands, 4.0, seed=3, day=bench.run_to_run.nominal_day)
+    for number, side in enumerate(bench.joints, start=1):
+        torsion = replace(true_torsion(side), zero_rad=0.0)
+        signals = run_signals("a", side.joint, FUSED, run.table.time_s, run.table.joints[number])
+        d = deflection(torsion, signals)[signals.moving]
+        k1, k2, k3 = side.gear.stiffness_nm_per_rad
+        first, second = torsion.hardening_rad
+        size = np.abs(d)
+        spring = (
+            k1 * size + (k2 - k1) * np.maximum(size - first, 0) + (k3 - k2) * np.maximum(size - second, 0)
+        )
+        torque = np.ascontiguousarray(run.joint_torque_nm[:, number - 1])
+        true = low_pass(torque, run.table.dt_s, FUSED.bandwidth_rad_s)[signals.moving]
+        assert np.sqrt(np.mean((np.sign(d) * spring - true) ** 2)) < 0.3
+
+
+def test_zeros_of_the_days_are_those_of_the_bench() -> None:
+    bench = BAD_DAY.bench()
+    assert isinstance(bench, TowingBench)
+    assert BAD_DAY.changed(SOURCES["zeros of the encoders, by day"]).bench().run_to_run.link_zero_rad == 0.0  # type: ignore[union-attr]
+    assert not day_zeros(bench, [], 500, 1)
+
+
+@pytest.mark.campaign
+def test_the_command_prints_its_tables(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sources", "--tiny"]) == 0
+    printed = capsys.readouterr().out
+    assert all(name in printed for name in (*PARTS, "the true torsion", "the torque itself, as old as ours"))

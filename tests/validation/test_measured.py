@@ -8,7 +8,7 @@ import pytest
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
-from validation.measured.offline import JOINTS, RUNS, Case, evaluate, fit, score
+from validation.measured import JOINTS, RUNS, Case, evaluate, fit, score
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,8 @@ from jtqd.models.files import load_yaml, shipped
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
 from tests.daemon.recording.cdr_decoder import Definition
-from validation.measured import offline as measured
-from validation.measured.bus import Played, config_file, configured, record, score_log
+from validation import measured
+from validation.measured_bus import Played, config_file, configured, record, score_log
 
 pytestmark = pytest.mark.native
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jtqd.sysid.runs.files import read_runs
-from validation.worlds.judge import write
-from validation.worlds.recorder import PRESETS, Recorder, csv_text, record
-from validation.worlds.sets import Columns
+from validation.diagnosis.entries import Columns
+from validation.diagnosis.recorder import PRESETS, Recorder, csv_text, record
+from validation.diagnosis.scores import write
 
 N = 2000
 JOINT = {

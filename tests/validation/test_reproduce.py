@@ -2,11 +2,8 @@
 
 import hashlib
 import json
-import os
-import signal
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -17,8 +14,9 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.campaign import command as campaign_command
 from jtqd.sysid.planner.plan import check_plan, load_plan
 from tests.estimator.fused_configuration import networks
-from validation import reproduce as reproduce_command
-from validation.reproduce import Step, steps, write_config
+from validation import reproduce
+from validation.__main__ import FAILED, main
+from validation.reproduce import steps, write_config
 
 
 def test_every_step_comes_after_what_it_reads(tmp_path):
@@ -70,12 +68,12 @@ def scripted(monkeypatch):
     def put(answer):
         called = []
 
-        def run(self, name, command):
+        def run(command, **_):
             called.append(command[3])
-            return answer(command[3], len(called))
+            return subprocess.CompletedProcess(command, answer(command[3], len(called)))
 
-        monkeypatch.setattr(reproduce_command.Commands, "run", run)
-        monkeypatch.setattr(reproduce_command, "check_installed", lambda *_: None)  # nothing is trained here
+        monkeypatch.setattr(reproduce.subprocess, "run", run)
+        monkeypatch.setattr(reproduce, "check_installed", lambda *_: None)  # nothing is trained here
         return called
 
     return put
@@ -83,9 +81,9 @@ def scripted(monkeypatch):
 
 def test_failed_step_ends_it_and_findings_of_a_campaign_do_not(tmp_path, scripted, capsys):
     called = scripted(lambda name, _: 3 if name == "campaign" else 1)
-    assert reproduce_command.main(["--out", str(tmp_path), "--quick", "--jobs", "1"]) == 1
+    assert main(["reproduce", "--out", str(tmp_path), "--quick"]) == FAILED
     assert called == ["campaign", "campaign", "fit"]
-    assert "jtq fit ended with status 1" in capsys.readouterr().err
+    assert "reproduce: jtq fit efficiency ended with status 1" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("done", "calls"), [([1, 2, 2], 3), ([0, 0], 2), ([], 1)])
@@ -102,111 +100,29 @@ def test_campaign_that_ended_early_goes_on_while_runs_get_done(tmp_path, scripte
         return 1
 
     called = scripted(answer)
-    assert reproduce_command.main(["--out", str(tmp_path), "--quick", "--jobs", "1"]) == 1
+    assert main(["reproduce", "--out", str(tmp_path), "--quick"]) == FAILED
     assert called == ["campaign"] * calls
-    assert "jtq campaign ended with status 1" in capsys.readouterr().err
-
-
-def step(out, *reads, words="pass", **options):
-    """A step that runs Python; what it reads are arguments that Python does not look at."""
-    return Step(("-c", words, *map(str, reads), "--out", str(out)), module="ignored", **options)
-
-
-@pytest.fixture
-def python(monkeypatch):
-    """Steps are what `python -c` makes of them: `-m MODULE` is left out."""
-    started = subprocess.Popen
-    monkeypatch.setattr(
-        reproduce_command.subprocess,
-        "Popen",
-        lambda command, **more: started([command[0], *command[3:]], **more),
-    )
-
-
-def test_steps_run_at_once_unless_one_reads_what_another_writes(tmp_path, python, capfd):
-    """a and b wait for each other, so neither ends alone; c reads both, one by its file and one by its directory."""
-    meet = (
-        "import pathlib, sys, time; end = time.monotonic() + 60; pathlib.Path(sys.argv[-1]).touch()\n"
-        "while not pathlib.Path('{other}').exists():\n"
-        "    if time.monotonic() > end: sys.exit(1)\n"
-        "    time.sleep(0.01)"
-    )
-    a, b, c, d = (tmp_path / name for name in ("a", "models/b", "c", "d"))
-    b.parent.mkdir()
-    one = step(a, words=meet.format(other=b))
-    two = step(b, words=meet.format(other=a))
-    three = step(c, a, b.parent)
-    assert reproduce_command.run_steps((one, two, three, step(d, words="print('said', flush=True)")), 2) == 0
-    told = capfd.readouterr()
-    assert "said" in told.out
-    assert told.err.count("$ ") == 4
-    assert [three.reads(one), three.reads(two), two.reads(one), one.reads(three)] == [
-        True,
-        True,
-        False,
-        False,
-    ]
-
-
-def test_a_step_waits_for_what_it_reads_although_there_is_room(tmp_path, python):
-    late = "import pathlib, sys, time; time.sleep(0.5); pathlib.Path(sys.argv[-1]).touch()"
-    check = "import pathlib, sys; sys.exit(0 if pathlib.Path(sys.argv[1]).exists() else 1)"
-    writer = step(tmp_path / "a", words=late)
-    reader = step(tmp_path / "b", tmp_path / "a", words=check)
-    assert reproduce_command.run_steps((writer, reader), 2) == 0
-
-
-def test_a_step_that_fails_ends_those_beside_it(tmp_path, python, capfd):
-    forever = step(tmp_path / "a", words="import time; time.sleep(600)")
-    fails = step(tmp_path / "b", words="import sys; print('no', file=sys.stderr); sys.exit(2)")
-    after = step(tmp_path / "c", tmp_path / "a")
-    begun = time.monotonic()
-    assert reproduce_command.run_steps((forever, fails, after), 2) == 1
-    assert time.monotonic() - begun < 60
-    told = capfd.readouterr().err
-    assert "[b] no\n" in told
-    assert "ended with status 2" in told
-    assert f"--out {tmp_path / 'c'}" not in told
-
-
-def test_sigterm_ends_the_steps(tmp_path, python):
-    before = signal.getsignal(signal.SIGTERM)
-    tells = f"import os, signal, time; os.kill({os.getpid()}, signal.SIGTERM); time.sleep(600)"
-    begun = time.monotonic()
-    with pytest.raises(KeyboardInterrupt):
-        reproduce_command.run_steps((step(tmp_path / "a", words=tells),), 1)
-    assert time.monotonic() - begun < 60
-    assert signal.getsignal(signal.SIGTERM) is before
-
-
-def test_nothing_waits_for_what_it_writes_itself(tmp_path):
-    """Else two steps that write into one directory would wait for each other's files."""
-    made = list(steps(tmp_path, "sim", True, 0))
-    paper, ours = (each for each in made if each.arguments[0] == "train")
-    assert not ours.reads(paper)
-    judged = made[-1]
-    assert judged.reads(ours)
-    assert judged.reads(paper)
+    assert "jtq campaign excitation ended with status 1" in capsys.readouterr().err
 
 
 def test_out_that_cannot_be_made_is_one_line(tmp_path, capsys):
     file = tmp_path / "file"
     file.touch()
-    assert reproduce_command.main(["--out", str(file)]) == 1
+    assert main(["reproduce", "--out", str(file)]) == FAILED
     assert capsys.readouterr().err == f"reproduce: --out {file}: cannot be created: it is a file\n"
-    assert reproduce_command.main(["--out", str(file / "below")]) == 1
+    assert main(["reproduce", "--out", str(file / "below")]) == FAILED
     assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_packages_that_training_needs_are_asked_for_before_the_first_campaign(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
-    assert reproduce_command.main(["--quick", "--out", str(tmp_path / "out")]) == 1
+    assert main(["reproduce", "--quick", "--out", str(tmp_path / "out")]) == FAILED
     assert capsys.readouterr().err == "reproduce: torch is not installed: pip install 'jtqd[train]'\n"
 
 
 def test_outside_plan_has_half_as_much_load_again_and_is_within_its_limits(tmp_path):
     path = tmp_path / "outside.plan.yaml"
-    reproduce_command._write_outside_plan(path, 0, 2)
+    reproduce._write_outside_plan(path, 0, 2)
     plan = load_plan(path)
     peaks = [np.abs(points.current_a).max() for points in check_plan(plan).values()]
     assert max(peaks) > 1.3 * 5.0  # the peak of every other campaign is 5 A

@@ -1,26 +1,42 @@
-"""Identify both joints of a plant as its user would, and drive the runs that judge.
+"""Plants, one thing changed in a plant, both joints of a plant identified as its user would, and the runs that judge.
 
 All runs are emulated in memory; those that judge have days and motions of other seeds and are drawn, not designed. The true
-torque goes into no fit.
+torque goes into no fit. A change of the plant is one of its file's numbers; a change of what is measured acts on the link
+encoder's position, which no drive is controlled by: the joint moves as before.
+
+Baselines are what an engineer would try first: least squares with a handful of coefficients, on the runs that ours is fitted
+to.
+
+    torsion and current   tau = a0 + a1 d + a2 d^3 + a3 tau_raw + a4 s + a5 v + a6 s |tau_raw|
+    TOB, fitted friction  tau = tau_raw - (c0 + c1 s + c2 v)
+    TOB, load friction    tau = tau_raw - (c0 + c1 s + c2 v + c3 s |tau_raw| + c4 s tau_raw^2 + c5 v |tau_raw| + c6 tau_raw)
+
+d: torsion angle of both encoders, s: direction (-1 to 1), v: velocity, tau_raw: motor torque less the rotor's share, joint
+side, all of the observer (`estimator.observer`). The torsion is as young as ours; what comes of the current alone is as old
+as the motor path.
 """
 
 from __future__ import annotations
 
+import copy
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import observe_run
-from jtqd.estimator.joint import CONVENTIONS, Joint
+from jtqd.estimator.joint import CONVENTIONS, Effect, Joint
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns, ObservedRun, RunTable
 from jtqd.estimator.settings import EstimatorSettings, recommended
-from jtqd.models.files import load_joint
+from jtqd.models.files import load_joint, load_yaml, shipped
+from jtqd.sim_can.plant_file import plant_from_mapping
 from jtqd.sim_can.plants import AnyPlant
+from jtqd.sim_can.towing import bench_file
 from jtqd.sysid.campaign.emulated import emulated_with_truth
 from jtqd.sysid.fit.efficiency import default_current_min, eta_points, fit_efficiency
 from jtqd.sysid.fit.fused import fit_fused
@@ -29,8 +45,222 @@ from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.planner.campaigns import Scale, make_plan, outside_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Run
 from jtqd.sysid.train.paper import paper_block, train_paper
-from validation.goals.baselines import BASELINES, Example, fit_baseline
-from validation.goals.plants import SIDES, Mapped, PlantFile
+
+SIDES: Final = ("joint_1", "joint_2")
+Mapped = dict[str, Any]
+
+
+class PlantFile(NamedTuple):
+    """A plant of the table: its column's name and its file as a mapping; `directory` has the joint files."""
+
+    name: str
+    mapping: Mapping[str, Any]
+    directory: Path
+
+    @property
+    def has_own_laws(self) -> bool:
+        """Whether it is a bench of docs/testing.md, which shares no equation with the estimator."""
+        return bench_file.KEY in self.mapping
+
+    def bench(self, effects: tuple[Effect, ...] = ()) -> AnyPlant:
+        """Return the plant, its joints with these effects. Raises ConfigError."""
+
+        def joint_of(name: str) -> Joint:
+            joint = load_joint(self.directory / name)
+            return replace(joint, effects=effects) if effects else joint
+
+        if self.has_own_laws:
+            return bench_file.bench_from_mapping(self.mapping, self.name, joint_of)
+        return plant_from_mapping(self.mapping, self.name, joint_of)
+
+    def changed(self, change: Callable[[Mapped], None]) -> PlantFile:
+        """Return the plant with a change of its file."""
+        mapping = copy.deepcopy(dict(self.mapping))  # YAML anchors: joints may share a section
+        for side in SIDES:
+            mapping[side] = copy.deepcopy(mapping[side])
+        change(mapping)
+        return self._replace(mapping=mapping)
+
+
+def plant_file(name: str, path: Path) -> PlantFile:
+    """Return the plant of a file. Raises ConfigError."""
+    return PlantFile(name, load_yaml(path), path.parent)
+
+
+def the_three() -> tuple[PlantFile, PlantFile, PlantFile]:
+    """Return the columns of the table: the paper's Table I, an ordinary joint, a bad day."""
+    return (
+        plant_file("Table I", shipped("campaign_plant.yaml")),
+        plant_file("typical", shipped("plants/typical.yaml")),
+        plant_file("bad day", shipped("plants/bad_day.yaml")),
+    )
+
+
+class Change(NamedTuple):
+    """One thing changed: in the plant's file, by an effect of its joints, or in the link position (angle, motor's share
+    motor/G). A kind of plant that has no such thing has None in its place.
+    """
+
+    name: str
+    table_i: Callable[[Mapped], None] | Effect | None = None
+    own_laws: Callable[[Mapped], None] | None = None
+    link: Callable[[FloatArray, FloatArray], FloatArray] | None = None
+
+    def possible(self, plant: PlantFile) -> bool:
+        """Whether the plant has what is changed."""
+        return self.link is not None or (self.own_laws if plant.has_own_laws else self.table_i) is not None
+
+    def bench(self, plant: PlantFile) -> AnyPlant:
+        """Return the changed plant; the plant itself for a change of what is measured."""
+        how = None if self.link is not None else self.own_laws if plant.has_own_laws else self.table_i
+        if isinstance(how, Effect):
+            return plant.bench((how,))
+        return (plant if how is None else plant.changed(how)).bench()
+
+
+def _scaled(part: str, keys: tuple[str, ...], factor: float) -> Callable[[Mapped], None]:
+    def change(mapping: Mapped) -> None:
+        for side in SIDES:
+            for key in keys:
+                value = mapping[side][part].get(key, 1.0)
+                scaled = [factor * each for each in value] if isinstance(value, list) else factor * value
+                mapping[side][part][key] = scaled
+
+    return change
+
+
+def _harder(mapping: Mapped) -> None:
+    for side in SIDES:
+        k1, k2, k3 = mapping[side]["gear"]["stiffness_nm_per_rad"]
+        mapping[side]["gear"]["stiffness_nm_per_rad"] = [k1, 1.1 * k2, 1.2 * k3]
+
+
+def _wider(mapping: Mapped) -> None:
+    for side in SIDES:
+        mapping[side]["gear"]["slips"].append({"torque_nm": 0.6, "travel_rad": 3.0e-4})
+
+
+def _wider_table_i(mapping: Mapped) -> None:
+    for side in SIDES:
+        mapping[side]["deviations"]["hysteresis"] = {"torque_nm": 1.0, "travel_rad": 2.5e-4}
+
+
+def _wavier(mapping: Mapped) -> None:
+    for side in SIDES:
+        mapping[side]["gear"]["errors"][0]["amplitude_rad"] += 1.1e-4
+
+
+def _wavier_table_i(mapping: Mapped) -> None:
+    for side in SIDES:
+        mapping[side]["deviations"]["kinematic_error"]["amplitude_rad"] += 1.1e-4
+
+
+def _steeper_load(mapping: Mapped) -> None:
+    for side in SIDES:
+        mapping[side]["friction"]["load_exponent"] += 0.15
+
+
+CHANGES: Final = (
+    Change("nothing", link=lambda link, motor: link),
+    Change(
+        "stiffness -5 %",
+        _scaled("deviations", ("stiffness_scale",), 0.95),
+        _scaled("gear", ("stiffness_nm_per_rad",), 0.95),
+    ),
+    Change(
+        "spring hardens more",
+        Effect("nonlinear_stiffness", {"cubic_nm_per_rad3": 2.5e8}),  # 1.67 times as stiff at rated torque
+        _harder,
+    ),
+    Change("hysteresis 1.2 Nm wider", _wider_table_i, _wider),
+    Change("kinematic error +110 urad", _wavier_table_i, _wavier),
+    Change(
+        "friction +30 %",
+        _scaled("deviations", ("friction_scale",), 1.3),
+        _scaled("friction", ("coulomb_nm", "viscous_nm", "load_nm"), 1.3),
+    ),
+    Change("friction by load, exponent +0.15", None, _steeper_load),
+    Change("link eccentricity 60 urad", link=lambda link, motor: link + 60e-6 * np.sin(link + 1.0)),
+    Change("link zero 100 urad", link=lambda link, motor: link + 100e-6),
+    Change("gear ratio +0.02 %", link=lambda link, motor: link - 2e-4 * motor),
+)
+"""What was measured to break the estimate: `nothing` stands beside, on the same days."""
+
+
+_EVERY: Final = 5
+"""Neighbours at 1 kHz are alike."""
+
+
+class Baseline(NamedTuple):
+    """A linear model: its regressors [n, k] of an observed run; young: whether its age is the torsion's.
+
+    residual: it models tau_raw - tau, not tau.
+    """
+
+    title: str
+    young: bool
+    residual: bool
+    regressors: Callable[[ObservedRun], FloatArray]
+
+    def estimate(self, seen: ObservedRun, coefficients: FloatArray) -> FloatArray:
+        """Return the torque [n]; NaN where nothing was observed."""
+        modelled: FloatArray = self.regressors(seen) @ coefficients
+        return seen.raw_nm - modelled if self.residual else modelled
+
+
+def _torsion_and_current(seen: ObservedRun) -> FloatArray:
+    d = seen.torsion_nm + seen.ahead_nm  # observed with a torsion of 1 Nm/rad: the angle itself
+    raw, s, v = seen.raw_nm, seen.direction, seen.velocity_rad_s
+    return np.column_stack((np.ones_like(d), d, d**3, raw, s, v, s * np.abs(raw)))
+
+
+def _friction(seen: ObservedRun) -> FloatArray:
+    return np.column_stack((np.ones_like(seen.raw_nm), seen.direction, seen.velocity_rad_s))
+
+
+def _load_friction(seen: ObservedRun) -> FloatArray:
+    raw, s, v = seen.raw_nm, seen.direction, seen.velocity_rad_s
+    return np.column_stack((np.ones_like(raw), s, v, s * np.abs(raw), s * raw * raw, v * np.abs(raw), raw))
+
+
+BASELINES: Final = {
+    "regression": Baseline(
+        "least squares on torsion and current, 7 coefficients", True, False, _torsion_and_current
+    ),
+    "tob_load": Baseline("TOB, friction by load fitted, 7 coefficients", False, True, _load_friction),
+    "tob_fitted": Baseline("TOB, friction fitted, 3 coefficients", False, True, _friction),
+}
+
+
+class Example(NamedTuple):
+    """A run to fit to: observed with a torsion of 1 Nm/rad; sensor [n] as old as the motor path, and as the torsion;
+    moving [n]: which samples count.
+    """
+
+    seen: ObservedRun
+    sensor_nm: FloatArray
+    young_sensor_nm: FloatArray
+    moving: np.ndarray[tuple[int], np.dtype[np.bool_]]
+
+
+def fit_baseline(baseline: Baseline, examples: Sequence[Example], rcond: float | None = None) -> FloatArray:
+    """Return the coefficients [k] of ordinary least squares over the moving samples of all runs; ValueError without any.
+
+    rcond: singular values below this part of the largest one count as 0, None: those of rounding size alone.
+    """
+    rows, targets = [], []
+    for each in examples:
+        keep = np.flatnonzero(each.moving)[::_EVERY]
+        sensor = each.young_sensor_nm if baseline.young else each.sensor_nm
+        rows.append(baseline.regressors(each.seen)[keep])
+        targets.append((each.seen.raw_nm - sensor if baseline.residual else sensor)[keep])
+    if not sum(map(len, rows)):
+        raise ValueError("found no samples in motion, expected some to fit a baseline to")
+    x, y = np.concatenate(rows), np.concatenate(targets)
+    size = np.sqrt(np.mean(x * x, axis=0))
+    found: FloatArray = np.linalg.lstsq(x / size, y, rcond=rcond)[0] / size
+    return found
+
 
 FIT_SEED: Final = 1
 JUDGE_SEED: Final = 7020

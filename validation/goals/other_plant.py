@@ -1,14 +1,13 @@
-"""`python -m validation other_plant`: whether a joint file of another plant is told, and how soon.
+"""Whether a joint file of another plant is flagged, and how soon.
 
 The joints of each plant of docs/testing.md are identified on campaigns of that plant and run on days of every other, zeros
-tracked, as new configurations have it. A joint in a run is told within a time where the status is degraded, or there is no
-value, within the first of its motion that is as long.
+tracked, as new configurations have it. A joint in a run is flagged within a time where the status is degraded, or there is
+no value, within the first of its motion that is as long.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -23,22 +22,23 @@ from validation.goals.identify import (
     QUICK,
     Driven,
     Identified,
+    PlantFile,
     Sizes,
     drive,
     identify_physics,
     judging_runs,
     nominal_joints,
+    the_three,
 )
 from validation.goals.judge import ZEROS, Judged, flagged, judge
-from validation.goals.plants import PlantFile, the_three
+from validation.study import Report, Table
 
-BY: Final = "python -m validation other_plant"
 WITHIN_S: Final = (1.0, 3.0, 10.0)
-"""The first one is the goal; the others tell how long it takes where that is missed."""
+"""The first one is the goal; the others show how long it takes where that is missed."""
 
 
-class Told(NamedTuple):
-    """Told within WITHIN_S: % of joints in runs; degraded, inside the 90 % interval: % of samples in motion; RMSE now."""
+class Flagged(NamedTuple):
+    """Flagged within WITHIN_S: % of joints in runs; degraded, inside the 90 % interval: % of samples in motion; RMSE now."""
 
     within: tuple[float, ...]
     degraded: float
@@ -52,7 +52,7 @@ def first_s(flags: BoolArray, moving: BoolArray, dt_s: float) -> float:
     return float(np.argmax(seen)) * dt_s if seen.any() else np.inf
 
 
-def told(judged: Sequence[Judged], dt_s: float) -> Told:
+def figures(judged: Sequence[Judged], dt_s: float) -> Flagged:
     """Return the figures of joints in runs that moved."""
     rows = []
     for one in judged:
@@ -70,14 +70,14 @@ def told(judged: Sequence[Judged], dt_s: float) -> Told:
                 )
             )
     degraded, inside, square, *within = np.mean(np.array(rows, np.float64), axis=0)
-    return Told(
+    return Flagged(
         tuple(100.0 * one for one in within), 100.0 * degraded, 100.0 * inside, float(np.sqrt(square))
     )
 
 
 def crossed(
     plants: Sequence[PlantFile], sizes: Sizes, fit_seed: int, seed: int
-) -> dict[tuple[str, str], Told]:
+) -> dict[tuple[str, str], Flagged]:
     """Return the figures by (plant of the joint files, plant of the days). Raises as `identify`."""
     models: dict[str, tuple[Identified, ...]] = {}
     days: dict[str, list[Driven]] = {}
@@ -85,7 +85,7 @@ def crossed(
         models[plant.name] = identify_physics(plant, sizes, fit_seed)[0]
         days[plant.name] = drive(plant.bench(), judging_runs(sizes, nominal_joints(plant), seed), seed)
     return {
-        (of, on): told(
+        (of, on): figures(
             [judge(run, one, None, (ZEROS,)) for run in runs for one in files],
             float(np.median(runs[0].table.dt_s)),
         )
@@ -94,25 +94,25 @@ def crossed(
     }
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Print the table; exit status 0 done."""
-    parser = argparse.ArgumentParser(
-        prog=BY, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the study."""
     parser.add_argument("--seed", type=natural, default=JUDGE_SEED, help="of the days (default %(default)s)")
     parser.add_argument("--fit-seed", type=natural, default=FIT_SEED, help="of the campaigns (%(default)s)")
-    options = parser.parse_args(argv)
+
+
+def run(options: argparse.Namespace) -> Report:
+    """Return the table."""
     found = crossed(the_three(), QUICK, options.fit_seed, options.seed)
     times = ", ".join(f"{limit:g}" for limit in WITHIN_S)
-    print(f"| joint files of | days of | told within {times} s | degraded | inside 90 % | RMSE now |")
-    print("|---|---|---|---|---|---|")
-    for (of, on), one in found.items():
-        told_by = ", ".join(f"{share:.0f}" for share in one.within)
-        print(
-            f"| {of} | {on} | {told_by} % | {one.degraded:.0f} % | {one.inside:.0f} % | {one.rmse_nm:.2f} Nm |"
+    head = ("joint files of", "days of", f"flagged within {times} s", "degraded", "inside 90 %", "RMSE now")
+    rows = [
+        (
+            *(of, on),
+            ", ".join(f"{share:.0f}" for share in one.within) + " %",
+            f"{one.degraded:.0f} %",
+            f"{one.inside:.0f} %",
+            f"{one.rmse_nm:.2f} Nm",
         )
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        for (of, on), one in found.items()
+    ]
+    return Report([Table(head, rows)], {"judge": options.seed, "fit": options.fit_seed})

@@ -1,4 +1,4 @@
-"""`python -m validation sources`: what the error of our estimate on a bench of docs/testing.md is made of.
+"""What the error of our estimate on a bench of docs/testing.md is made of.
 
 Three tables, in % of rated torque, RMSE in motion:
 
@@ -15,9 +15,7 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -25,36 +23,37 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, count
+from jtqd.estimator.checked import count
 from jtqd.estimator.joint import Fused, Torsion
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import EstimatorSettings, bandwidth_of
 from jtqd.models.files import shipped
 from jtqd.sim_can.towing.bench_file import AngleWave, TowedJoint, TowingBench
 from jtqd.sysid.fit.calibration import calibrated, fit_sigma
-from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.repeatability import fit_zeros
 from jtqd.sysid.fit.residuals import path_residuals
 from jtqd.sysid.fit.signals import run_signals
-from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.planner.campaigns import make_plan
 from jtqd.sysid.planner.plan import Run
 from validation.goals.identify import (
     QUICK,
+    SIDES,
     TINY,
     Driven,
     Identified,
+    Mapped,
+    PlantFile,
     Sizes,
     drive,
     fit_physics,
     judging_runs,
     nominal_joints,
+    plant_file,
     scale_of,
 )
 from validation.goals.judge import LOW_PASS, ZEROS, Judged, judge, settings_of
-from validation.goals.plants import SIDES, Mapped, PlantFile, plant_file
+from validation.study import Report, Table, in_processes
 
-BY: Final = "python -m validation sources"
 SIZES: Final = {"usual": QUICK._replace(fit_runs=16, evaluations=40, judge_runs=12), "tiny": TINY}
 PLANTS: Final = ("typical", "bad_day")
 SEED, FIT_SEED = 500, 2
@@ -295,15 +294,16 @@ def without(plant: PlantFile, plans: Plans, names: Sequence[str]) -> Scored:
     return scored(_judged(drive(bench, plans.judging, SEED), models))
 
 
-def _row(name: str, found: Scored) -> str:
-    return f"| {name} | {found.aligned:.2f} | {found.now:.2f} | {found.tracked:.2f} |"
+def _row(name: str, found: Scored) -> tuple[str, ...]:
+    return (name, f"{found.aligned:.2f}", f"{found.now:.2f}", f"{found.tracked:.2f}")
 
 
-_HEAD: Final = "| {} | low pass: aligned | now | torsion tracked: now |\n|---|---|---|---|"
+def _table(what: str, rows: Sequence[tuple[str, ...]]) -> Table:
+    return Table((what, "low pass: aligned", "now", "torsion tracked: now"), rows)
 
 
-def known_table(plant: PlantFile, plans: Plans) -> list[str]:
-    """Return the lines of the tables `parts` and `known`. Raises as `identify`."""
+def known_tables(plant: PlantFile, plans: Plans) -> list[Table]:
+    """Return the tables `parts` and `known`. Raises as `identify`."""
     bench = plant.bench()
     assert isinstance(bench, TowingBench)
     excitation, runs = drive(bench, plans.campaign, FIT_SEED), drive(bench, plans.judging, SEED)
@@ -316,74 +316,63 @@ def known_table(plant: PlantFile, plans: Plans) -> list[str]:
     judging = [day_zeros(bench, runs, SEED, one.number) for one in models]
     judged = _judged(runs, models)
     parts = table_of_parts(judged, runs, models)
-    lines = ["| part of the aligned error | % of rated, RMS | share of its square |", "|---|---|---|"]
-    lines += [
-        f"| {name} | {np.sqrt(max(part, 0.0)):.2f} | {100 * part / parts.sum():.0f} % |"
-        for name, part in zip(PARTS, parts, strict=True)
-    ]
-    lines += ["", _HEAD.format("what is known")]
-    lines.append(_row("ours", scored(judged)))
+    shares = Table(
+        ("part of the aligned error", "% of rated, RMS", "share of its square"),
+        [
+            (name, f"{np.sqrt(max(part, 0.0)):.2f}", f"{100 * part / parts.sum():.0f} %")
+            for name, part in zip(PARTS, parts, strict=True)
+        ],
+    )
     # zero 0 is the mean day's: a fit's own zero_rad stands for it where days are known
     free = [replace(torsion, zero_rad=0.0) for torsion in torsions]
-    made = [knowing(one, t, excitation, z) for one, t, z in zip(models, free, in_fit, strict=True)]
-    lines.append(_row("the zeros of the day", scored(_judged(runs, made, judging))))
-    made = [knowing(one, t, excitation, {}) for one, t in zip(models, true, strict=True)]
-    lines.append(_row("the true torsion", scored(_judged(runs, made))))
-    made = [knowing(one, t, excitation, z) for one, t, z in zip(models, true, in_fit, strict=True)]
-    lines.append(_row("both", scored(_judged(runs, made, judging))))
-    age = age_alone(judged, models, runs)
-    lines.append(f"| the torque itself, as old as ours | 0 | {age:.2f} | - |")
-    return lines
+    none: list[dict[str, float]] = [{} for _ in models]
+    rows = [_row("ours", scored(judged))]
+    for name, given, zeros, off in (
+        ("the zeros of the day", free, in_fit, judging),
+        ("the true torsion", true, none, None),
+        ("both", true, in_fit, judging),
+    ):
+        made = [knowing(one, t, excitation, z) for one, t, z in zip(models, given, zeros, strict=True)]
+        rows.append(_row(name, scored(_judged(runs, made, off))))
+    rows.append(("the torque itself, as old as ours", "0", f"{age_alone(judged, models, runs):.2f}", "-"))
+    return [shares, _table("what is known", rows)]
 
 
-def parser() -> argparse.ArgumentParser:
-    """Return the arguments of the command."""
-    made = argparse.ArgumentParser(
-        prog=BY, description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+def source_tables(plant: PlantFile, plans: Plans, only: bool, jobs: int) -> list[Table]:
+    """Return the table `sources`; only: and that of each source alone. Raises as `identify`."""
+    work = partial(without, plant, plans)
+    out: dict[str, tuple[str, ...]] = {"nothing": (), **{name: (name,) for name in SOURCES}}
+    out["all of these"] = tuple(SOURCES)
+    others = {name: tuple(each for each in SOURCES if each != name) for name in SOURCES if only}
+    tables = []
+    for what, names in (("taken out", out), ("left in alone", others)):
+        found = in_processes(work, list(names.values()), jobs, what)
+        if names:
+            rows = [_row(name, each) for name, each in zip(names, found, strict=True)]
+            tables.append(_table(what, rows))
+    return tables
+
+
+def options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the study."""
+    parser.add_argument("--plant", choices=PLANTS, default="bad_day", help="default %(default)s")
+    parser.add_argument("--sources", action="store_true", help="also take out one source after the other")
+    parser.add_argument(
+        "--only", action="store_true", help="--sources, and each source alone, all others out"
     )
-    made.add_argument("--plant", choices=PLANTS, default="bad_day", help="default %(default)s")
-    made.add_argument("--sources", action="store_true", help="also take out one source after the other")
-    made.add_argument(
-        "--only", action="store_true", help="with --sources: also each source alone, all others out"
-    )
-    made.add_argument("--tiny", action="store_true", help="to test the steps")
-    made.add_argument("--jobs", type=count, default=1, metavar="N", help="sources at a time (default 1)")
-    return made
+    parser.add_argument("--tiny", action="store_true", help="to test the steps")
+    parser.add_argument("--jobs", type=count, default=1, metavar="N", help="sources at a time (default 1)")
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Print the tables; exit status 0 done, 1 failure, 2 usage."""
-    options = parser().parse_args(argv)
+def run(options: argparse.Namespace) -> Report:
+    """Return the tables."""
     plant = plant_file(options.plant, shipped(f"plants/{options.plant}.yaml"))
-    sizes = SIZES["tiny" if options.tiny else "usual"]
-    try:
-        plans = planned(plant, sizes)
-        print(
-            f"{plant.name}: campaign of {len(plans.campaign)} runs, seed {FIT_SEED}; {len(plans.judging)} runs of two "
-            f"joints judge, seed {SEED}; % of rated torque\n"
-        )
-        print("\n".join((*known_table(plant, plans), "")), flush=True)
-        if options.sources or options.only:
-            _print_sources(plant, plans, options.only, options.jobs)
-    except (ConfigError, LossFitError, TorsionError, ValueError, OSError) as error:
-        print(f"sources: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-def _print_sources(plant: PlantFile, plans: Plans, only: bool, jobs: int) -> None:
-    rows = [("nothing", ()), *((name, (name,)) for name in SOURCES), ("all of these", tuple(SOURCES))]
-    print(_HEAD.format("taken out"), flush=True)
-    with ProcessPoolExecutor(jobs) as pool:
-        work = partial(without, plant, plans)
-        for (name, _), found in zip(rows, pool.map(work, [names for _, names in rows]), strict=True):
-            print(_row(name, found), flush=True)
-        if only:
-            others = [tuple(each for each in SOURCES if each != name) for name in SOURCES]
-            print("\n" + _HEAD.format("left in alone"), flush=True)
-            for name, found in zip(SOURCES, pool.map(work, others), strict=True):
-                print(_row(name, found), flush=True)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    plans = planned(plant, SIZES["tiny" if options.tiny else "usual"])
+    tables = known_tables(plant, plans)
+    if options.sources or options.only:
+        tables += source_tables(plant, plans, options.only, options.jobs)
+    note = (
+        f"{plant.name}: campaign of {len(plans.campaign)} runs; {len(plans.judging)} runs of two joints judge; "
+        "% of rated torque"
+    )
+    return Report(tables, {"judge": SEED, "fit": FIT_SEED}, [note])

@@ -1,4 +1,4 @@
-"""The effect library against an independent bench: `validation.hidden` has equations and an integrator of its own.
+"""The effect library against an independent bench: `validation.generator` has equations and an integrator of its own.
 
 A quiet bench (no noise, no drift) with one effect hidden leaves in the balances what the library's hooks say, and the
 estimator of the extended joint is as good as that of a bench with nothing hidden. The seed is printed on failure.
@@ -25,8 +25,8 @@ from jtqd.estimator.observer import first_order_hold
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.effects.effect_signals import balances
-from validation.hidden.case import Case, draw_many
-from validation.hidden.order import Hidden, Order
+from validation.diagnosis.entries import Hidden
+from validation.generator.draw import Case, Order, draw_many
 
 SEED = 8
 DURATION_S = 12.0

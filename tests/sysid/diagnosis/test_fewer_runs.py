@@ -25,11 +25,11 @@ from jtqd.sysid.diagnosis.stability import Stability
 from jtqd.sysid.diagnosis.unexplained import Unexplained
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, Dense, search_of
 from tests.sysid.diagnosis.test_search import LIBRARY, problem
-from validation.worlds.judge import judged
-from validation.worlds.measured_bench import MeasuredBench
-from validation.worlds.oracle import hidden_size
-from validation.worlds.recorder import Recorder
-from validation.worlds.sets import Hidden
+from validation.diagnosis.benches import hidden_size
+from validation.diagnosis.entries import Hidden
+from validation.diagnosis.measured_bench import MeasuredBench
+from validation.diagnosis.recorder import Recorder
+from validation.diagnosis.scores import judged
 
 
 def test_a_search_without_a_run_is_the_search_of_the_others() -> None:

@@ -22,8 +22,8 @@ from jtqd.sysid.diagnosis.findings import (
 from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.search import Search
-from validation.hidden.case import draw
-from validation.hidden.trials import joint_files, tables
+from validation.diagnosis.trials import joint_files, tables
+from validation.generator.draw import draw
 
 
 def found(seed: int, *effects: tuple[str, int | str, float | None], runs: int = 2) -> Findings:

@@ -14,8 +14,8 @@ from jtqd.sysid.diagnosis.gain import left_out_steps
 from jtqd.sysid.diagnosis.mixed_model import _MARGINALS_KEPT, _PRIOR_RUNS, explained, explained_each, solve
 from jtqd.sysid.diagnosis.refine import Refined
 from tests.sysid.diagnosis.diagnose_core_helpers import Dense, dense
-from validation.hidden.case import draw
-from validation.hidden.trials import joint_files, tables
+from validation.diagnosis.trials import joint_files, tables
+from validation.generator.draw import draw
 
 PROBLEM = dense(1, [1.5, -0.7, 0.0], [0.8, 0.3])
 VARIANCES = np.array([0.5, 0.07])

@@ -1,6 +1,6 @@
 """Whole diagnoses of small sets with something hidden, of which the truth is known, and of data that cannot serve.
 
-The large campaign with sets drawn afresh is `validation.hidden.campaign`; here one seed, so that changes show.
+The large campaign with sets drawn afresh is `python -m validation trials`; here one seed, so that changes show.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from jtqd.sysid.diagnosis.verdict import _remaining
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, search_of
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, findings
 from tests.sysid.diagnosis.test_search import LIBRARY, problem
-from validation.hidden.case import Case, draw_many
-from validation.hidden.order import Hidden, Order
-from validation.hidden.scores import score
-from validation.hidden.trials import joint_files, tables
+from validation.diagnosis.entries import Hidden
+from validation.diagnosis.scores import score
+from validation.diagnosis.trials import joint_files, tables
+from validation.generator.draw import Case, Order, draw_many
 
 SEED = 3
 KINDS = {
