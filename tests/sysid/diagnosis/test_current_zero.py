@@ -71,7 +71,7 @@ def alike(one: Cause) -> set[str]:
 
 
 def test_a_reading_without_power_settles_which_of_the_two_it_is() -> None:
-    """Without the mark both names stay together: the trials of validation/hidden show that."""
+    """Without the mark both names stay together: the trials of the generator show that."""
     (one,) = found(asymmetry_nm=1.0)
     assert alike(one) == {"friction_asymmetry"}
 
