@@ -17,5 +17,5 @@ cdef class ContactWatch:
     cdef int begun  # contacts that began in the last cycle
     cdef void watch(self, JointState **joints) noexcept nogil
     cdef void report(self, JointState *joint, int n, double contact_nm, int state) noexcept nogil
-    cdef void take_back(self, JointState **joints) noexcept nogil
+    cdef void withdraw(self, JointState **joints) noexcept nogil
     cdef void encode(self, uint8_t *data, int pair, int sequence) noexcept nogil

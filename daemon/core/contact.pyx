@@ -76,7 +76,7 @@ cdef class ContactWatch:
             record.input_flags |= KNOWN | THERE if state == CONTACT_THERE else KNOWN
         self.fields[n] = contact_field(record.torque_rate_nm_s, contact_nm, state)
 
-    cdef void take_back(self, JointState **joints) noexcept nogil:
+    cdef void withdraw(self, JointState **joints) noexcept nogil:
         """Of a cycle whose answer came too late: nothing is known."""
         cdef int n
         for n in range(self.count):

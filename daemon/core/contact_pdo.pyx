@@ -28,7 +28,7 @@ cdef double PER_NM_S = 1.0 / RATE_UNIT_NM_S, LARGEST = 127.0
 
 
 class ContactPdo(NamedTuple):
-    """Decoded content; a rate is None where the PDO says that there is none. contact: see CODE_NAMES."""
+    """Decoded content; a rate is None where the PDO has none. contact: see CODE_NAMES."""
 
     torque_rate_nm_s: tuple[float | None, float | None]
     contact: tuple[int, int]

@@ -53,7 +53,7 @@ cdef class Cycle:
     cpdef int record(self) except -1
     cpdef bint pass_slot(self) except -1
     cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
-    cdef void take_back(self, int status) noexcept
+    cdef void withdraw(self, int status) noexcept
     cpdef int write_snapshot(self) except -1
     cdef bint send_estimate(self) except -1
     cdef int receive(self) except -1

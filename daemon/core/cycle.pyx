@@ -1,10 +1,10 @@
 """One cycle of the loop, stage by stage. The stages are methods of `Cycle`, so that a benchmark can time each of them.
 
-    begin    take what came late, send SYNC
-    gather   one wake-up for all inputs, then wait for stragglers until the deadline
+    begin    count late frames, send SYNC
+    gather   one wake-up for all inputs, then wait for missing ones until the deadline
     observe  scale, estimate, decide the status of every joint
     publish  send the estimate PDO, or two of them with more than two joints, and every n-th cycle the heartbeat
-    record   hand the cycle to the ring, and every n-th cycle the snapshot
+    record   write the cycle to the ring, and every 8th cycle the snapshot
 
 `go_on` goes from slot to slot without the interpreter. No stage raises because of what is on the bus; a bus that is down is a
 counter and a stale estimate.
@@ -70,7 +70,7 @@ cdef uint32_t CONTACT[MOST_ESTIMATES]
 CONTACT[:] = own_objects.CONTACT_BASES
 
 clock = Clock()
-"""Of all cycles that are made from here on; tests put another one in its place."""
+"""Of all cycles that are made from here on; tests replace it."""
 
 
 cdef Frame _frame(uint32_t can_id, int length) noexcept nogil:
@@ -126,7 +126,7 @@ cdef class Cycle:
 
     Args:
         socket: frame socket with filters for SYNC, the inputs and the nodes' heartbeats, own echo on.
-        intake: the rule that says which frame belongs to which cycle.
+        intake: decides which frame belongs to which cycle.
         joints: inputs and estimator of each joint, 1 to 4 of them.
         ring, snapshot: shared memory towards recorder and viewers.
         safety: limits and checks of each joint; None for those that need no joint file.
@@ -303,7 +303,7 @@ cdef class Cycle:
         self.budget.begin(self.grid.end_ns())
         for n in range(self.count):
             wanted = self.budget.wanted(n, self.clock.monotonic())
-            (<JointCycle> self.at[n]).observe_at(sync_ns, starting, wanted)
+            (<JointCycle> self.at[n]).observe(sync_ns, starting, wanted)
         if self.watches:
             self.contacts.watch(self.states)
             self.writer.counters[CONTACTS] += self.contacts.begun
@@ -314,7 +314,7 @@ cdef class Cycle:
         cdef int n
         self.budget.ended(at_ns)
         if at_ns >= self.grid.end_ns():
-            self.take_back(STALE)
+            self.withdraw(STALE)
             self.flags |= WITHDRAWN
             self.writer.counters[OVERRUNS] += 1
         if self.send_estimate():
@@ -385,7 +385,7 @@ cdef class Cycle:
         self.index += slots
 
     def reset_faults(self):
-        """Release latched faults before the next estimate (`jtq control reset`); the record says so."""
+        """Release latched faults before the next estimate (`jtq control reset`); the record has a flag."""
         for joint in self.joints:
             if joint.reset_latch():
                 self.next_flags = RESET
@@ -393,17 +393,17 @@ cdef class Cycle:
 
     def leave(self):
         """Send a last estimate with status off, so that no receiver keeps the last torque."""
-        self.take_back(OFF)
+        self.withdraw(OFF)
         self.send_estimate()
         self.write_snapshot()
 
-    cdef void take_back(self, int status) noexcept:
+    cdef void withdraw(self, int status) noexcept:
         """Withdraw the estimates of all joints (`JointCycle.withdraw`)."""
         cdef int n
         for n in range(self.count):
-            (<JointCycle> self.at[n]).take_back(status)
+            (<JointCycle> self.at[n]).withdraw(status)
         if self.watches:
-            self.contacts.take_back(self.states)
+            self.contacts.withdraw(self.states)
 
     cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
         """Of a slot without a record, what belongs to no cycle goes into the next record."""

@@ -1,6 +1,6 @@
 """The estimate PDOs of node 20h: eight bytes for two joints that never carry a stale or unfounded number.
 
-COB-ID 1A0h holds joints 1 and 2; 2A0h, of the same form, joints 3 and 4. A joint that there is not has status 0 (off).
+COB-ID 1A0h holds joints 1 and 2; 2A0h, of the same form, joints 3 and 4. A joint that does not exist has status 0 (off).
 
     torque_1 I16 0.01 Nm | torque_2 I16 | sigma_1 U8 0.05 Nm | sigma_2 U8 | status U8 (two nibbles) | sequence U8
 
@@ -38,7 +38,7 @@ for _code in range(16):
 
 
 class EstimatePdo(NamedTuple):
-    """Decoded content; torque and sigma are None where the PDO says that there is none."""
+    """Decoded content; torque and sigma are None where the PDO has none."""
 
     torque_nm: tuple[float | None, float | None]
     sigma_nm: tuple[float | None, float | None]
@@ -77,7 +77,7 @@ NOBODY = field_of(NAN, INFINITY, st.OFF)
 
 
 def field(double torque_nm, double sigma_nm, int status):
-    """Return the integers (torque, sigma, status) of one joint; an invalid torque or sigma becomes status 15."""
+    """Return the integers (torque, sigma, status) of one joint; an invalid torque or sigma gives status 15."""
     cdef Published made = field_of(torque_nm, sigma_nm, status)
     return made.torque, made.sigma, made.status
 

@@ -11,19 +11,16 @@ from jtqd.estimator.sample cimport Estimator, Learned
 cdef enum:
     MOST_TPDOS = 4  # of a drive
 
-cdef struct UnwrapState:
+cdef struct Unwrap:  # of a 32-bit position: last counts, and whole ranges that it has rolled over
     int64_t last, offset
-
-cdef class Unwrap:
-    cdef UnwrapState now
 
 cdef struct Scale:  # SI per count or unit
     double motor_rad, motor_rad_s, link_rad, ampere, sensor_nm
 
-cdef struct Derived:  # velocity of a drive that tells none
+cdef struct Derived:  # velocity of a drive that sends none
     int64_t last_ns
     double last_rad, rad_s
-    bint is_replayed  # by the log, whose steps tell no time of cycles without inputs
+    bint is_replayed  # by the log, which has no time of cycles without inputs
     double replayed_rad_s
 
 cdef struct JointState:
@@ -34,12 +31,11 @@ cdef struct JointState:
     double load_nm  # of the link, for `contact`
 
 cdef class JointCycle:
-    cdef object given, given_inputs, limits
-    cdef tuple pdos
+    cdef readonly object inputs, estimator
     cdef Intake intake
     cdef Estimator core
-    cdef readonly JointRules rules
-    cdef readonly Unwrap motor, link
+    cdef JointRules rules
+    cdef Unwrap motor, link
     cdef int input_count
     cdef Input *input[MOST_TPDOS]  # of its drive, and which flags of the record stand for them
     cdef int flags[MOST_TPDOS]
@@ -57,7 +53,8 @@ cdef class JointCycle:
     cdef Derived derived
     cdef JointState now
     cdef int find_inputs(self, inputs) except -1
-    cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
+    cdef int set_scale(self, inputs) except -1
+    cpdef void observe(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
     cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil
     cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil
     cdef void miss(self, int flags) noexcept nogil
@@ -65,4 +62,4 @@ cdef class JointCycle:
     cdef double since_last(self, int64_t sync_ns) noexcept nogil
     cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil
     cdef bint derive(self, int64_t sync_ns) noexcept nogil
-    cdef void take_back(self, int status) noexcept nogil
+    cpdef void withdraw(self, int status) noexcept nogil

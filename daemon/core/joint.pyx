@@ -1,6 +1,6 @@
-"""One joint in the loop: counts of this cycle into SI units, the estimate, its status, and what goes out and is recorded.
+"""One joint in the loop: counts of this cycle into SI units, estimate, status, its fields of PDO and record.
 
-What a drive does not tell:
+Quantities that a drive may not send:
 
     link position     one encoder. The estimator is given theta_m/G, a gear without torsion; the record has NaN. Methods that
                       live on the torsion are refused by the configuration.
@@ -8,6 +8,7 @@ What a drive does not tell:
                       time, half a period older than the position. The first cycle of all has none, and is without inputs.
 """
 
+cimport cython
 from libc.math cimport INFINITY, NAN, isnan
 from libc.stdint cimport int64_t
 
@@ -37,22 +38,8 @@ cdef double UNKNOWN = NAN  # temperature of a joint whose drive sends none
 cdef int NOT_A_REFERENCE = 0x07  # of 6150h: not valid, positive or negative overload
 
 
-cdef class Unwrap:
-    """Counts of a 32-bit position without its wrap at 2^31 (object 6064h is an INTEGER32 that rolls over).
-
-    offset: whole ranges that it had rolled over before the first sample [counts].
-    """
-
-    def __init__(self, int64_t offset=0):
-        self.now.offset = offset
-
-    def counts(self, int64_t raw):
-        """Return continuous counts; correct if two samples are less than 2^31 counts apart."""
-        return _counts(&self.now, raw)
-
-
-cdef int64_t _counts(UnwrapState *unwrap, int64_t raw) noexcept nogil:
-    """As `Unwrap.counts`."""
+cdef int64_t _counts(Unwrap *unwrap, int64_t raw) noexcept nogil:
+    """Return continuous counts of an INTEGER32 that rolls over; correct if two samples are less than 2^31 counts apart."""
     cdef int64_t step = raw - unwrap.last
     if not -HALF_RANGE <= step < HALF_RANGE:
         unwrap.offset += -FULL_RANGE if step > 0 else FULL_RANGE
@@ -60,13 +47,14 @@ cdef int64_t _counts(UnwrapState *unwrap, int64_t raw) noexcept nogil:
     return raw + unwrap.offset
 
 
+@cython.final
 cdef class JointCycle:
     """State of one joint from cycle to cycle, in the loop or in a replay of its log.
 
     Args:
         number: 0 for joint 1, 1 for joint 2, ...
         inputs: which PDOs are its inputs, and their scaling (`jtqd.daemon.core.input_pdos.JointInputs`).
-        estimator: its estimator; one that is written in Python is called through the interpreter.
+        estimator: its estimator; one in Python is called through the interpreter.
         intake: decides which PDOs are fresh.
         snapshot: counts fallbacks and squared errors.
         period_ns: of the SYNC.
@@ -75,24 +63,22 @@ cdef class JointCycle:
     Attributes:
         published: its fields of the estimate PDO, see `estimate_pdo.field`.
         status: as published.
-        safety: its limits and checks.
         sample: its block of the cycle record, a `JointRecord`.
-        view: its block of the snapshot, a `JointView`.
     """
 
     def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
         cdef JointBlock nothing = JointBlock(
             NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
         )
-        self.limits = safety or JointSafety()
-        self.rules = JointRules(number, snapshot, self.limits, estimator.with_network)
-        self.estimator = estimator
-        self.intake, self.pdos, self.period_ns = intake, intake.pdos, period_ns
-        self.inputs = inputs
+        joint = getattr(estimator, "joint", None)
+        self.rules = JointRules(number, snapshot, safety or JointSafety(), estimator.with_network)
+        self.estimator, self.gear_ratio = estimator, 1.0 if joint is None else joint.gear_ratio
+        self.core = estimator if isinstance(estimator, Estimator) else PythonEstimator(estimator)
+        self.intake, self.period_ns = intake, period_ns
         self.find_inputs(inputs)
+        self.set_scale(inputs)
         self.sensor = NULL if inputs.sensor is None else _input(intake, inputs.sensor, 2)
         self.celsius = &UNKNOWN if inputs.temperature is None else &intake.celsius[<int> inputs.temperature].celsius
-        self.motor, self.link = Unwrap(), Unwrap()
         self.now.status = STARTING
         self.now.sample = nothing
         self.now.load_nm = NAN
@@ -126,12 +112,8 @@ cdef class JointCycle:
         """Node-ID of its drive."""
         return self.input[0].node_id
 
-    @property
-    def inputs(self):
-        return self.given_inputs
-
-    @inputs.setter
-    def inputs(self, inputs):
+    cdef int set_scale(self, inputs) except -1:
+        """Take the scaling of the inputs."""
         self.scale = Scale(
             inputs.motor_rad_per_count,
             inputs.motor_rad_s_per_unit,
@@ -139,22 +121,8 @@ cdef class JointCycle:
             inputs.ampere_per_unit,
             inputs.sensor_nm_per_unit,
         )
-        self.given_inputs = inputs
-
-    @property
-    def estimator(self):
-        return self.given
-
-    @estimator.setter
-    def estimator(self, estimator):
-        joint = getattr(estimator, "joint", None)
-        self.gear_ratio = 1.0 if joint is None else joint.gear_ratio
-        self.core = estimator if isinstance(estimator, Estimator) else PythonEstimator(estimator)
-        self.given = estimator
-
-    @property
-    def safety(self):
-        return self.limits
+        self.inputs = inputs
+        return 0
 
     @property
     def status(self):
@@ -168,28 +136,12 @@ cdef class JointCycle:
     def sample(self):
         return cr.JOINT.unpack(copied(&self.now.sample, sizeof(JointBlock)))
 
-    @property
-    def view(self):
-        cdef JointBlock *s = &self.now.sample
-        values = s.torque_nm, s.sigma_nm, s.tob_nm, s.physics_nm, s.network_nm, s.sensor_torque_nm
-        return *values, s.statusword, s.status, s.sensor_status, s.input_flags, self.now.latched, s.reference_nm, s.age_ms
-
-    @property
-    def last_ns(self):
-        """SYNC of the last cycle with inputs, CLOCK_MONOTONIC; 0 where there was none."""
-        return self.now.last_ns
-
     def begin_again(self):
         """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
-        self.motor, self.link = Unwrap(), Unwrap()
+        self.motor = self.link = Unwrap(0, 0)
         self.now.last_ns = self.derived.last_ns = 0
-        self.given.reset()
+        self.estimator.reset()
         self.rules.begin_again()
-
-    @property
-    def latched(self):
-        """Return the bits of the latched faults (`daemon/shared/cycle_record.py`)."""
-        return self.rules.status.now.latched
 
     def reset_latch(self):
         """Release the latched faults and restart with the present encoder positions; return whether there was one."""
@@ -198,50 +150,43 @@ cdef class JointCycle:
         self.begin_again()
         return True
 
-    def resume(self, motor_offset, link_offset):
+    def resume(self, int64_t motor_offset, int64_t link_offset):
         """Continue a log in the middle of a run, with the roll-over of the positions so far [counts]."""
-        self.motor, self.link = Unwrap(motor_offset), Unwrap(link_offset)
+        self.motor, self.link = Unwrap(0, motor_offset), Unwrap(0, link_offset)
 
     def rescale(self, node_id, factors):
         """Set the scaling of a node that was absent at the start (`SnapshotReader.note_factors`); zeros: none."""
-        inputs, pdos = self.inputs, self.pdos
+        inputs, pdos = self.inputs, self.intake.pdos
         if not any(factors):
             return
         if self.node_id == node_id:
             motor, speed, link, ampere = factors
-            self.inputs = replace(
+            scaled = replace(
                 inputs,
                 motor_rad_per_count=motor,
                 motor_rad_s_per_unit=speed,
                 link_rad_per_count=link,
                 ampere_per_unit=ampere,
             )
+            self.set_scale(scaled)
         elif inputs.sensor is not None and pdos[inputs.sensor].node_id == node_id:
             first = min([n for n, pdo in enumerate(pdos) if pdo.node_id == node_id])
-            self.inputs = replace(inputs, sensor_nm_per_unit=factors[inputs.sensor - first])
+            self.set_scale(replace(inputs, sensor_nm_per_unit=factors[inputs.sensor - first]))
 
-    def withdraw(self, int status=st.STALE):
+    cpdef void withdraw(self, int status) noexcept nogil:
         """Withdraw the estimate: it is neither sent nor logged as published. With status 4 it was too late."""
-        self.take_back(status)
+        if status == STALE:
+            status = self.rules.status.late()
+        self.now.published = field_of(NAN, INFINITY, status)
+        self.now.status = self.now.sample.status = status
+        self.now.sample.torque_nm = self.now.sample.sigma_nm = NAN
 
-    def observe(self, int64_t sync_ns, bint starting, bint network_wanted=True):
+    cpdef void observe(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil:
         """Estimate from the inputs of the cycle whose SYNC went out at `sync_ns` (CLOCK_MONOTONIC).
 
         While `starting`, an estimate that would be published has status 1 instead. Without `network_wanted` there is no time
         for the network in this cycle, and it is physics only.
         """
-        self.observe_at(sync_ns, starting, network_wanted)
-
-    cdef void take_back(self, int status) noexcept nogil:
-        """As `withdraw`."""
-        if status == STALE:
-            status = self.rules.status.withdrawn()
-        self.now.published = field_of(NAN, INFINITY, status)
-        self.now.status = self.now.sample.status = status
-        self.now.sample.torque_nm = self.now.sample.sigma_nm = NAN
-
-    cdef void observe_at(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil:
-        """As `observe`."""
         cdef int flags = self.reference()
         self.now.sample.temperature_c = self.celsius[0]
         if not isnan(self.celsius[0]):
@@ -268,12 +213,12 @@ cdef class JointCycle:
         sample.dt_s = self.since_last(sync_ns)
         sample.current_a = self.current_count[0] * scale.ampere
         if self.motor_speed != NULL:
-            sample.motor_position_rad = _counts(&self.motor.now, self.motor_count[0]) * scale.motor_rad
+            sample.motor_position_rad = _counts(&self.motor, self.motor_count[0]) * scale.motor_rad
             sample.motor_velocity_rad_s = self.motor_speed[0] * scale.motor_rad_s
         else:
             sample.motor_position_rad, sample.motor_velocity_rad_s = self.derived.last_rad, self.derived.rad_s
         if self.link_count != NULL:
-            sample.link_position_rad = _counts(&self.link.now, self.link_count[0]) * scale.link_rad
+            sample.link_position_rad = _counts(&self.link, self.link_count[0]) * scale.link_rad
         else:
             sample.link_position_rad = sample.motor_position_rad / self.gear_ratio
         sample.temperature_c = record.temperature_c
@@ -293,7 +238,7 @@ cdef class JointCycle:
         record.torque_nm, record.sigma_nm, record.tob_nm = e.torque_nm, e.sigma_nm, e.tob_nm
         record.physics_nm, record.network_nm = e.physics_nm, e.network_nm
         record.dt_s = sample.dt_s
-        if status == INVALID:  # what its inputs say is not believed: no rate, and no word about contacts
+        if status == INVALID:  # its inputs are not believed: no rate, and contacts are unknown
             e.torque_rate_nm_s = e.load_nm = NAN
         record.torque_rate_nm_s, self.now.load_nm = e.torque_rate_nm_s, e.load_nm
         record.statusword, record.input_flags = statusword, flags
@@ -339,7 +284,7 @@ cdef class JointCycle:
 
     cdef bint derive(self, int64_t sync_ns) noexcept nogil:
         """Derive the motor's velocity from its position, which has come; return whether there is one."""
-        cdef double position = _counts(&self.motor.now, self.motor_count[0]) * self.scale.motor_rad
+        cdef double position = _counts(&self.motor, self.motor_count[0]) * self.scale.motor_rad
         cdef int64_t dt_ns = self.on_grid(sync_ns - self.derived.last_ns)
         cdef bint known = self.derived.last_ns != 0 and dt_ns > 0
         if known:

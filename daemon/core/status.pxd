@@ -7,8 +7,9 @@ from jtqd.estimator.plausibility cimport Plausibility
 from jtqd.estimator.sample cimport Sample, Values
 
 cdef struct StatusState:
-    int held, asked
-    int found, news, reasons, latched  # bits of faults
+    int held, asked  # the status that stays until a better one was asked for long enough; the worst of those
+    # bits of faults: of the last cycle, begun since they were counted, since a torque was last published, latched
+    int found, news, reasons, latched
     int64_t latches
     int64_t needed, calm, run
     int64_t since, window, factor
@@ -17,8 +18,8 @@ cdef class JointStatus:
     cdef StatusState now
     cdef int latching
     cdef int64_t stale_limit  # -1: none
-    cdef int following(self, int status, int found) noexcept nogil
-    cdef int withdrawn(self) noexcept nogil
+    cpdef int update(self, int status, int found) noexcept nogil
+    cpdef int late(self) noexcept nogil
     cdef int another(self) noexcept nogil
     cdef int published(self, int status, int found) noexcept nogil
     cdef void fall(self, int status) noexcept nogil
@@ -35,7 +36,7 @@ cdef class JointTally:
 
 cdef class JointRules:
     cdef JointTally tally
-    cdef readonly JointStatus status
+    cdef JointStatus status
     cdef Plausibility plausibility
     cdef bint is_checked, with_network
     cdef double torque_limit_nm, network_limit_nm, deviation_sigmas, sensor_variance
@@ -54,5 +55,5 @@ cdef class JointRules:
         int *flags,
     ) noexcept nogil
     cdef int stale(self, int *flags) noexcept nogil
-    cdef int told(self) noexcept nogil
+    cdef int fault_flags(self) noexcept nogil
     cdef int faults_of(self, const Values *estimate, double reference_nm, bint network_wanted) noexcept nogil

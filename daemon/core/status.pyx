@@ -23,6 +23,7 @@ The statuses have an order, from good to bad:
 No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
 """
 
+cimport cython
 from libc.math cimport INFINITY, NAN, fabs, isnan, sqrt
 from libc.stdint cimport int8_t, int64_t, uint64_t
 
@@ -103,17 +104,16 @@ cdef int _status_of(int latched) noexcept nogil:
     return STALE if latched == FAULT_STALE else INVALID
 
 
-# What is held and what is latched -------------------------------------------------------------------------------------
+# Hysteresis and latches ------------------------------------------------------------------------------------------------
 
 
+@cython.final
 cdef class JointStatus:
     """State of one joint.
 
     Attributes:
         latched: bits of the faults that are latched (`daemon/shared/cycle_record.py`).
-        reasons: faults since a number was last published; 0 while one is.
-        held: the status that stays until a better one has been asked for long enough; a standstill is told meanwhile.
-        news, latches: faults that began, and how often one was latched, since whoever counts them set these to 0.
+        latches: how often a fault was latched, since the tally set it to 0.
     """
 
     def __init__(self, settings):
@@ -129,40 +129,16 @@ cdef class JointStatus:
         return self.now.latched
 
     @property
-    def reasons(self):
-        return self.now.reasons
-
-    @property
-    def held(self):
-        return self.now.held
-
-    @property
-    def news(self):
-        return self.now.news
-
-    @property
     def latches(self):
         return self.now.latches
-
-    def update(self, int status, int found=0):
-        """Return the status to publish for the requested `status` and the faults `found` (`shared/cycle_record.py`)."""
-        return self.following(status, found)
-
-    def pass_over(self, int64_t cycles):
-        """Repeat the last cycle this many times: it got the requested status, and no fault."""
-        self.now.since += cycles
-
-    def late(self):
-        """Return the status to publish if the estimate of this cycle was not ready in time, after `update`."""
-        return self.withdrawn()
 
     def reset_latch(self):
         """Release latched faults; an existing fault latches again in the next cycle. Return whether there was one."""
         was, self.now.latched = self.now.latched, 0
         return bool(was)
 
-    cdef int following(self, int status, int found) noexcept nogil:
-        """As `update`."""
+    cpdef int update(self, int status, int found) noexcept nogil:
+        """Return the status to publish for the requested `status` and the faults `found` (`shared/faults.py`)."""
         self.now.since += 1
         if status == self.now.held and not found and not self.now.latched and _rank(status) <= WITH_NUMBER:
             self.now.calm = self.now.run = self.now.found = 0
@@ -180,8 +156,8 @@ cdef class JointStatus:
             found |= FAULT_DRIVE if status == DRIVE_FAULT else 0
         return self.published(status, found)
 
-    cdef int withdrawn(self) noexcept nogil:
-        """As `late`."""
+    cpdef int late(self) noexcept nogil:
+        """Return the status to publish if the estimate of this cycle was not ready in time, after `update`."""
         return self.published(STALE, self.another())
 
     cdef int another(self) noexcept nogil:
@@ -190,7 +166,7 @@ cdef class JointStatus:
         return FAULT_STALE if 0 <= self.stale_limit <= self.now.run else 0
 
     cdef int published(self, int status, int found) noexcept nogil:
-        """Latch what is to be latched, and hold what is to be held."""
+        """Apply latches and hysteresis; return the status to publish."""
         cdef int fresh = found & self.latching & ~self.now.latched
         cdef int held, rank, worst
         if fresh:
@@ -314,19 +290,13 @@ cdef int _forced_status(int statusword) noexcept nogil:
     return OF_STATE[statusword & STATE_BITS]
 
 
-def drive_status(int statusword):
-    """Return the status forced by a drive's statusword (6041h), or None if the motor carries current."""
-    cdef int forced = _forced_status(statusword)
-    return None if forced == POWERED else forced
-
-
 cdef class JointRules:
     """The rules for joint `number` (from 0 on), one cycle after the other.
 
     number, tally: where it counts; safety: limits and checks (`JointSafety`); with_network: the estimator uses one.
 
     Attributes:
-        status: what is held and what is latched.
+        status: hysteresis and latches.
     """
 
     def __init__(self, int number, tally, safety, bint with_network):
@@ -387,18 +357,18 @@ cdef class JointRules:
                 status = STARTING
         elif status == INVALID:
             found |= FAULT_OUT_OF_RANGE
-        status = self.status.following(status, found)
-        flags[0] |= self.told()
+        status = self.status.update(status, found)
+        flags[0] |= self.fault_flags()
         return status
 
     cdef int stale(self, int *flags) noexcept nogil:
         """An input of this cycle is missing: return the status to publish and set its bits of `input_flags`."""
-        cdef int status = self.status.following(STALE, 0)
-        flags[0] |= self.told()
+        cdef int status = self.status.update(STALE, 0)
+        flags[0] |= self.fault_flags()
         return status
 
-    cdef int told(self) noexcept nogil:
-        """Bits of `input_flags` that say why there is no number."""
+    cdef int fault_flags(self) noexcept nogil:
+        """Bits of `input_flags` for the reason that there is no torque."""
         if self.status.now.reasons or self.status.now.latched:
             return self.tally.faults(&self.status.now)
         return 0

@@ -124,9 +124,9 @@ cdef class CycleRows:
                 self.contacts.watch(self.states)
             if self.withdrawn[row]:
                 for n in range(self.count):
-                    (<JointCycle> at[n]).take_back(STALE)
+                    (<JointCycle> at[n]).withdraw(STALE)
                 if self.watches:
-                    self.contacts.take_back(self.states)
+                    self.contacts.withdraw(self.states)
             for n in range(self.count):
                 memcpy(&self.to_samples[n, row, 0], &self.states[n].sample, sizeof(JointBlock))
             for n in range(self.pdos):
@@ -155,7 +155,7 @@ cdef class CycleRows:
         """Estimate one joint in a row."""
         joint.derived.is_replayed = self.with_velocity
         joint.derived.replayed_rad_s = self.velocity[number, row]
-        joint.observe_at(self.sync_ns[number, row], self.cycle[row] < FIRST_CYCLES, self.wanted[number, row])
+        joint.observe(self.sync_ns[number, row], self.cycle[row] < FIRST_CYCLES, self.wanted[number, row])
 
 
 def _checked(values, kind, shape):

@@ -19,10 +19,14 @@ from jtqd.daemon.core.status import JointRules
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.ring import Ring
+from jtqd.estimator.estimator import JointEstimator
+from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import INVALID
+from jtqd.models.files import load_joint, shipped
 from tests.daemon.loop.cycle_helpers import I32, SENSOR, frame, inputs, make, turn
 
 PDO = InputPdo(0x181, 8, I32, 1, "181h")
+SETTINGS = EstimatorSettings(method="efficiency")
 
 
 def one(can_id: int, layout: str) -> InputPdo:
@@ -95,18 +99,23 @@ def test_a_ring_of_other_records_is_refused(tmp_path: Path) -> None:
 def test_an_estimator_that_raises_is_invalid_and_the_loop_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    class Broken:
+    class Calling:
         with_network = False
 
-        def step(self, *_: float) -> Any:
-            raise ZeroDivisionError
+        def __init__(self) -> None:
+            self.inner, self.left = JointEstimator(load_joint(shipped("joint1.yaml")), SETTINGS), 30
+
+        def step(self, *sample: float) -> Any:
+            self.left -= 1
+            if self.left < 0:
+                raise ZeroDivisionError
+            return self.inner.step(*sample)
 
     seen: list[Any] = []
     monkeypatch.setattr("sys.unraisablehook", seen.append)
-    cycle, _, reader = make(tmp_path, lambda n: inputs())
-    turn(cycle, 30)
-    cycle.joints[0].estimator = Broken()  # type: ignore[assignment]
-    turn(cycle, 5)
+    estimators = [Calling(), JointEstimator(load_joint(shipped("joint2.yaml")), SETTINGS)]
+    cycle, _, reader = make(tmp_path, lambda n: inputs(), estimators=estimators)
+    turn(cycle, 35)
     assert [joint.status for joint in cycle.joints] == [INVALID, 2]
     assert len(seen) == 5
     joint = cr.joint_of(reader.read(limit=64).records[-1], 1)

@@ -71,5 +71,5 @@ class OneDrive:
         own = [True] + [False] * (len(frames) - 1)
         self.intake.take(b"".join(frames), [at + n for n in range(len(frames))], own, len(frames))
         self.intake.close()
-        self.cycle.observe(at, False)
+        self.cycle.observe(at, False, True)
         return cr.JointRecord._make(self.cycle.sample)

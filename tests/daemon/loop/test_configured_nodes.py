@@ -18,6 +18,7 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.snapshot import SnapshotWriter
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
+from jtqd.estimator.status import INVALID
 from tests.daemon.loop.cycle_helpers import I32, PDOS, ExactTime, ScriptedSocket, frame, inputs, make, turn
 
 BOOT_UP = frame(0x701, b"\0")
@@ -98,10 +99,9 @@ def test_the_joint_of_a_drive_begins_again_and_no_other_one(loop: Loop) -> None:
     loop.answers[0] = frame(0x181, I32.pack(90_000, 2000))
     loop.supervisor.note_configured(1, 1)
     turn(loop.cycle)
-    assert one.last_ns == 0
     turn(loop.cycle)
     assert (one.sample[11], two.sample[11] > 0) == (0.0, True)
-    assert one.latched == 0, "no jump"
+    assert one.status != INVALID, "no jump"
 
 
 def test_a_sensor_that_restarts_leaves_the_joints_alone(loop: Loop) -> None:

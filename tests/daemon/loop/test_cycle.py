@@ -4,16 +4,25 @@ import itertools
 import math
 import struct
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
 from jtqd.daemon.core.estimate_pdo import decode
-from jtqd.daemon.core.joint import Unwrap
 from jtqd.daemon.core.schedule import WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from tests.daemon.loop.cycle_helpers import I32, SENSOR, ExactTime, estimates, frame, inputs, make, turn
+from jtqd.estimator.status import VALID, Estimate
+from tests.daemon.loop.cycle_helpers import (
+    I32,
+    SCALE,
+    SENSOR,
+    ExactTime,
+    estimates,
+    frame,
+    inputs,
+    make,
+    turn,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -164,11 +173,13 @@ def test_the_wake_up_follows_the_arrival_of_the_inputs() -> None:
     assert wake_up.wait_ns <= 90_000, "never beyond the deadline"
 
 
-def test_a_position_that_rolls_over_goes_on() -> None:
-    unwrap = Unwrap()
-    truth = [0, 2**31 - 5, 2**31 + 5, 2**32 - 7, 2**31 + 5, 2**31 - 5, 0, -(2**31) + 3, -(2**31) - 3, -5]
-    wire = [(value + 2**31) % 2**32 - 2**31 for value in truth]
-    assert [unwrap.counts(raw) for raw in wire] == truth
+def test_a_position_that_rolls_over_goes_on(tmp_path: Path) -> None:
+    counts = [0, 2**31 - 5, 2**31 + 5, 2**32 - 7, 2**31 + 5, 2**31 - 5, 0, -(2**31) + 3, -(2**31) - 3, -5]
+    wire = [(value + 2**31) % 2**32 - 2**31 for value in counts]
+    cycle, _, reader = make(tmp_path, lambda n: [frame(0x181, I32.pack(wire[n - 1], 0)), *inputs()[1:]])
+    turn(cycle, len(counts))
+    recorded = [cr.joint_of(record, 1).motor_position_rad for record in reader.read().records]
+    assert recorded == [value * SCALE["motor_rad_per_count"] for value in counts]
 
 
 def test_the_estimate_does_not_see_the_roll_over(tmp_path: Path) -> None:
@@ -219,15 +230,14 @@ def test_a_stall_of_minutes_is_recorded_and_not_fatal(tmp_path: Path) -> None:
 
 
 def test_log_and_bus_agree_on_a_torque_that_does_not_fit_the_field(tmp_path: Path) -> None:
-    cycle, socket, reader = make(tmp_path, lambda n: inputs())
+    class Huge:
+        with_network = False
+
+        def step(self, *_: float) -> Estimate:
+            return Estimate(400.0, 1.0, VALID, 1.0, 1.0, math.nan)
+
+    cycle, socket, reader = make(tmp_path, lambda n: inputs(), estimators=[Huge(), Huge()])
     turn(cycle, 25)
-    huge = (
-        cycle.joints[0]
-        .estimator.step(1e-3, 1.0, 1.0, 1.0, 1.0)
-        ._replace(torque_nm=400.0, sigma_nm=1.0, status=2)
-    )
-    cycle.joints[0].estimator = SimpleNamespace(step=lambda *_: huge)  # type: ignore[assignment]
-    turn(cycle, 1)
     assert decode(estimates(socket)[-1]).status[0] == 15
     joint = cr.joint_of(reader.read().records[-1], 1)
     assert joint.status == 15

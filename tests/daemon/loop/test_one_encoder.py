@@ -172,7 +172,7 @@ def test_cycles_and_their_stamps(tmp_path: Path) -> None:
     frames = [struct.pack("<IB3x8s", 0x80, 0, bytes([2])), *drive.frames(1)]
     drive.intake.take(b"".join(frames), [2 * MS + 4000] * 3, [True, False, False], 3)
     drive.intake.close()
-    drive.cycle.observe(2 * MS + 4000, False)
+    drive.cycle.observe(2 * MS + 4000, False, True)
     record = cr.JointRecord._make(drive.cycle.sample)
     step = SWING["motor_position"](1) - SWING["motor_position"](0)
     assert record.motor_velocity_rad_s == pytest.approx(

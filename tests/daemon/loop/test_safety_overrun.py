@@ -301,7 +301,7 @@ def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]
             time_ns += round(logged.dt_s * 1e9)
         joint.observe(time_ns, n < 20, not logged.input_flags & FLAG_NETWORK_SKIPPED)
         if header.flags & cr.FLAG_WITHDRAWN:
-            joint.withdraw()
+            joint.withdraw(STALE)
         yield joint.sample
 
 

@@ -35,12 +35,12 @@ JUMP = faults.BITS["motor_jump"]
 def settled(safety: SafetySettings | None = None) -> JointStatus:
     """One that has been valid for long."""
     state = JointStatus(safety or SafetySettings())
-    assert [state.update(VALID) for _ in range(2000)] == [VALID] * 2000
+    assert [state.update(VALID, 0) for _ in range(2000)] == [VALID] * 2000
     return state
 
 
 def asked(state: JointStatus, statuses: Iterable[int]) -> list[int]:
-    return [state.update(status) for status in statuses]
+    return [state.update(status, 0) for status in statuses]
 
 
 def returns(statuses: Iterable[int]) -> int:
@@ -51,7 +51,7 @@ def returns(statuses: Iterable[int]) -> int:
 @pytest.mark.parametrize("bad", [OFF, STALE, DRIVE_FAULT, INVALID, DEGRADED])
 def test_bad_at_once_and_good_after_so_many_cycles(bad: int) -> None:
     state = settled()
-    assert state.update(bad) == bad
+    assert state.update(bad, 0) == bad
     assert asked(state, [VALID] * (NEEDED[bad] + 1)) == [bad] * (NEEDED[bad] - 1) + [VALID] * 2
 
 
@@ -223,12 +223,12 @@ def test_late_cycles_count_as_missed_ones() -> None:
     state = settled(SafetySettings(latch=faults.STALE, stale_latch_cycles=3))
     for _ in range(3):
         assert state.latched == 0
-        assert (state.update(VALID), state.late())[1] == STALE
+        assert (state.update(VALID, 0), state.late())[1] == STALE
     state = settled(SafetySettings(latch=faults.STALE, stale_latch_cycles=20))
-    assert state.update(VALID) == VALID
+    assert state.update(VALID, 0) == VALID
     assert state.late() == STALE
     assert asked(state, [VALID] * 4) == [STALE] * 4
-    assert state.update(VALID) == VALID
+    assert state.update(VALID, 0) == VALID
 
 
 def test_the_same_input_gives_the_same_output_again() -> None:

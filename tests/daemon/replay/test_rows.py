@@ -20,6 +20,7 @@ from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import ENABLED, PDOS, SCALE
 from tests.estimator.fused_configuration import joint_of, network_of
 
@@ -108,7 +109,7 @@ def test_rows_are_what_the_joints_make_of_each_cycle(seed: int) -> None:
                 int(given["sync_ns"][n, row]), bool(given["cycle"][row] < 20), bool(given["wanted"][n, row])
             )
             if given["withdrawn"][row]:
-                joint.withdraw()
+                joint.withdraw(STALE)
             samples[n].append(joint.sample)
         pdos += estimate_pdo.encode(joints[0].published, joints[1].published, int(given["counter"][row]))
     again, others = made()
