@@ -210,7 +210,7 @@ class ReturningNodes:
         # A node that has just restarted needs no reset; one that could not be booted, or tells an error of it, may.
         reset = self._config.reset_communication and (node in self._retry_s or node in self._in_error)
         self._in_error.discard(node)
-        self._child.tell(boot_request(self._config, self._bus, only=node, reset=reset).as_json())
+        self._child.send(boot_request(self._config, self._bus, only=node, reset=reset).as_json())
         self._child.end_of_input()
 
     def _put_off(self, node: int, now_s: float) -> None:

@@ -199,7 +199,7 @@ def _boot(bus: str, config: Config) -> tuple[CheckResult, dict[str, Any]]:
     """Return how the boot went, and what it found, by node-ID."""
     child = Child("jtqd.drivers.boot", name="the boot")
     try:
-        child.tell(boot_request(config, bus).as_json())
+        child.send(boot_request(config, bus).as_json())
         child.end_of_input()
         answer = child.answer(60.0)
     finally:

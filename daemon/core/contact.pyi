@@ -1,5 +1,7 @@
 from collections.abc import Sequence
 
+from jtqd.daemon.config import Config
+
 class ContactWatch:
     def __init__(
         self,
@@ -13,3 +15,5 @@ class ContactWatch:
     def count(self) -> int: ...
     @property
     def sends(self) -> bool: ...
+
+def contacts_of(config: Config) -> ContactWatch | None: ...

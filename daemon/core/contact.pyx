@@ -88,3 +88,14 @@ cdef class ContactWatch:
         encode_contact(
             data, &self.fields[2 * pair], &self.fields[2 * pair + 1] if 2 * pair + 1 < self.count else &NO_JOINT, sequence
         )
+
+
+def contacts_of(config):
+    """Return the detectors of contacts as configured; None for none."""
+    contact = config.contact
+    if contact is None:
+        return None
+    thresholds = [contact.threshold_of(joint.joint.rated_torque_nm) for joint in config.joints]
+    return ContactWatch(
+        thresholds, opposed=contact.opposed, sends=contact.pdo, period_s=config.period_ns * 1e-9
+    )

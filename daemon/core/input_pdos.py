@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.cycle_record import TEMPERATURE_LIFE_S
@@ -20,6 +21,7 @@ from jtqd.drivers.drive import (
 from jtqd.drivers.pdo import ACYCLIC, PdoMap
 from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
+_DRIVE_FACTORS = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
 POSITIONS = ("motor_position", "link_position")
 """Quantities whose PDOs are FLAG_POSITION of a record; the others are FLAG_MOTION."""
 
@@ -164,3 +166,31 @@ def joint_temperatures(config: Config) -> list[TemperaturePdo]:
         for joint in config.joints
         if joint.temperature is not None
     ]
+
+
+def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[str, Any]:
+    """Return the factors of a node; zeros for an absent one, whose factors come with its configuration."""
+    booted = report["nodes"].get(str(node))
+    return dict.fromkeys(names, 0.0) if booted is None else booted["scaling"]
+
+
+def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
+    """Return the inputs of each joint: places in `input_pdos`, and the scaling of the boot report."""
+    result, firsts = [], first_inputs(config)
+    measured = [joint.number for joint in config.joints if joint.temperature]
+    for number, joint in enumerate(config.joints):
+        drive = _scaling(report, joint.node_id, _DRIVE_FACTORS)
+        sensor_nm = 0.0
+        if joint.sensor_channel is not None and config.sensor is not None:
+            scaling = _scaling(report, config.sensor.node_id, ("nm_per_unit",))
+            sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)] if scaling["nm_per_unit"] else 0.0
+        result.append(
+            JointInputs(
+                places=drive_places(firsts[number], joint.tpdos, joint.objects),
+                sensor=sensor_index(config, joint.sensor_channel),
+                **drive,
+                sensor_nm_per_unit=sensor_nm,
+                temperature=measured.index(joint.number) if joint.temperature else None,
+            )
+        )
+    return result

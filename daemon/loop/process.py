@@ -1,6 +1,6 @@
-"""The loop process: everything is made and warmed up first, then one cycle after the other until told to stop.
+"""The loop process: build and warm up everything, then run one cycle after the other until the stop request.
 
-Started by the supervisor as `python -m jtqd.daemon.loop.process` with a JSON request as its only argument. It answers on
+The supervisor starts it as `python -m jtqd.daemon.loop.process` with a JSON request as its only argument. It answers on
 standard output with one JSON line when it is ready, reads the boot report as one JSON line from standard input, runs, and
 ends with one JSON line of results. It has no second thread, logs nothing while it runs, and shares only memory with
 other processes.
@@ -20,22 +20,15 @@ from types import FrameType
 from typing import Any
 
 from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
-from jtqd.daemon.core.contact import ContactWatch
+from jtqd.daemon.core.contact import contacts_of
 from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
-from jtqd.daemon.core.input_pdos import (
-    JointInputs,
-    drive_places,
-    first_inputs,
-    input_pdos,
-    joint_temperatures,
-    sensor_index,
-)
+from jtqd.daemon.core.input_pdos import input_pdos, joint_inputs, joint_temperatures
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint_safety import safety_of
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.core.snapshot import frame_counts
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.loop.referee import judged
+from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -51,7 +44,7 @@ from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
 from jtqd.estimator.settings import METHODS
 
 _PATIENCE_S = 1.0
-"""The supervisor turns twenty times a second; after so long without a turn the watchdog is fed no more."""
+"""Without a sign of life of the supervisor, which comes twenty times a second, the watchdog is fed no longer than this."""
 SLOTS = 8
 """Slots that pass without the interpreter: so late at most are signals, requests and the watchdog."""
 
@@ -59,10 +52,9 @@ SLOTS = 8
 class Duties:
     """Duties in the pauses of the loop: the watchdog, and requests of the supervisor.
 
-    The watchdog is fed only while the supervisor turns as well: a stopped one serves no node, no order and no log.
+    The watchdog is fed only while the supervisor runs as well: a stopped one serves no node, no request and no log.
 
-    Call it in the pause after every `SLOTS` cycles. Costs one look at shared memory and now and then a datagram
-    (docs/deployment.md).
+    Call it in the pause after every `SLOTS` cycles. It costs one look at shared memory and now and then a datagram.
 
     Args:
         cycle: the loop's.
@@ -72,36 +64,29 @@ class Duties:
     def __init__(self, cycle: Cycle, watchdog: LoopWatchdog) -> None:
         self._cycle, self._orders = cycle, cycle.snapshot.orders
         self._advanced, self._index = watchdog.advanced, cycle.index
-        self._turn, self._turned = self._orders[4], self._index
+        self._sign, self._sign_at = self._orders[4], self._index
         self._patience = round(_PATIENCE_S * 1e9 / cycle.grid.period_ns)
 
     def __call__(self) -> None:
         """Run the duties after some cycles."""
         index = self._cycle.index
         orders = self._orders
-        if orders[4] != self._turn:
-            self._turn, self._turned = orders[4], index
-        if index - self._turned <= self._patience:
+        if orders[4] != self._sign:
+            self._sign, self._sign_at = orders[4], index
+        if index - self._sign_at <= self._patience:
             self._advanced(index - self._index)
         self._index = index
-        if orders[0] != orders[1]:
-            self._reset()
-        if orders[2] != orders[3]:
-            self._doubt()
-
-    def _reset(self) -> None:
-        number = self._orders[0]
-        self._cycle.reset_faults()
-        self._orders[1] = number
-
-    def _doubt(self) -> None:
-        number = self._orders[2]
-        self._cycle.configured_nodes.doubt()
-        self._orders[3] = number
+        if (number := orders[0]) != orders[1]:
+            self._cycle.reset_faults()
+            orders[1] = number
+        if (number := orders[2]) != orders[3]:
+            self._cycle.configured_nodes.doubt()
+            orders[3] = number
 
 
 _WARM_UP_STEPS = 300
-_DRIVE_FACTORS = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
+CHECK_PROGRAM = "jtqd.estimator.network"
+_CHECK_S = 60.0
 
 
 class Stop:
@@ -126,23 +111,54 @@ def physics_only(joint: JointConfig, network: AnyNetwork | None) -> str:
     return ""
 
 
+def check_networks(config: Config) -> list[RuntimeCheck | str | None]:
+    """Have ONNX Runtime check the networks of a start in a process of its own, which has ended before the loop begins.
+
+    A graph of ours then runs natively on the bytes that were checked (their SHA-256 is part of the check). The loop loads
+    ONNX Runtime (40 MB, and a library that may fail with a file it was not made for) only for other graphs.
+
+    Returns:
+        Per joint the check of its network, or why the network is refused; None: it has none.
+    """
+    networks = [joint.network for joint in config.joints]
+    if not any(networks):
+        return [None] * len(networks)
+    child = Child(CHECK_PROGRAM, name="the check by ONNX Runtime")
+    try:
+        for each in networks:
+            if each is not None:
+                child.send([config.estimator.method, str(each.path), each.sha256])
+        return [None if each is None else _check_of(child, str(each.path)) for each in networks]
+    finally:
+        child.end()
+
+
+def _check_of(child: Child, path: str) -> RuntimeCheck | str:
+    """Return the child's next answer."""
+    try:
+        answer = child.answer(_CHECK_S)
+    except ChildError as error:
+        return f"{path}: {error}"
+    return str(answer["refused"]) if "refused" in answer else RuntimeCheck(**answer)
+
+
 def build_estimator(
     config: Config,
     joint: JointConfig,
-    verdict: RuntimeCheck | str | None = None,
+    check: RuntimeCheck | str | None = None,
     notes: list[str] | None = None,
 ) -> AnyEstimator:
     """Build the estimator of one joint as configured; raises ConfigError or NetworkError.
 
-    verdict: of `referee.judged` on its network, or why it is refused; None: ONNX Runtime judges in this process.
-    notes: takes what the operator is to know of it.
+    check: of its network by `check_networks`, or why it is refused; None: ONNX Runtime checks it in this process.
+    notes: takes lines for the operator.
     """
     method, network = config.estimator.method, None
     try:
-        if isinstance(verdict, str):
-            raise NetworkError(verdict)
+        if isinstance(check, str):
+            raise NetworkError(check)
         if joint.network is not None:
-            network = load_network(method, str(joint.network.path), joint.network.sha256, verdict)
+            network = load_network(method, str(joint.network.path), joint.network.sha256, check)
         note = physics_only(joint, network) if METHODS[method].network_optional else ""
         if note and notes is not None:
             notes.append(note)
@@ -150,45 +166,6 @@ def build_estimator(
     except (ConfigError, NetworkError) as error:
         key = f"joint_{joint.number}"
         raise type(error)(f"{error} ({config.path}: '{key}', estimator.method is {method})") from None
-
-
-def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """Return the factors of a node; zeros for an absent one, whose factors come with its configuration."""
-    booted = report["nodes"].get(str(node))
-    return dict.fromkeys(names, 0.0) if booted is None else booted["scaling"]
-
-
-def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
-    """Return places in `input_pdos` and the scaling that the boot read from the devices."""
-    result, firsts = [], first_inputs(config)
-    measured = [joint.number for joint in config.joints if joint.temperature]
-    for number, joint in enumerate(config.joints):
-        drive = _scaling(report, joint.node_id, _DRIVE_FACTORS)
-        sensor_nm = 0.0
-        if joint.sensor_channel is not None and config.sensor is not None:
-            scaling = _scaling(report, config.sensor.node_id, ("nm_per_unit",))
-            sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)] if scaling["nm_per_unit"] else 0.0
-        result.append(
-            JointInputs(
-                places=drive_places(firsts[number], joint.tpdos, joint.objects),
-                sensor=sensor_index(config, joint.sensor_channel),
-                **drive,
-                sensor_nm_per_unit=sensor_nm,
-                temperature=measured.index(joint.number) if joint.temperature else None,
-            )
-        )
-    return result
-
-
-def contacts_of(config: Config) -> ContactWatch | None:
-    """Return the detectors of contacts as configured; None for none."""
-    contact = config.contact
-    if contact is None:
-        return None
-    thresholds = [contact.threshold_of(joint.joint.rated_torque_nm) for joint in config.joints]
-    return ContactWatch(
-        thresholds, opposed=contact.opposed, sends=contact.pdo, period_s=config.period_ns * 1e-9
-    )
 
 
 def loop_filters(config: Config) -> list[CanFilter]:
@@ -295,8 +272,8 @@ def build_estimators(
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")
     estimators = [
-        build_estimator(config, joint, verdict, notes)
-        for joint, verdict in zip(config.joints, judged(config), strict=True)
+        build_estimator(config, joint, check, notes)
+        for joint, check in zip(config.joints, check_networks(config), strict=True)
     ]
     warm_up(estimators)
     return config, estimators

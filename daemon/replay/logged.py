@@ -19,9 +19,8 @@ import numpy.typing as npt
 import yaml
 
 from jtqd.daemon.config import Config, as_booted, load_config
-from jtqd.daemon.core.input_pdos import JointInputs
+from jtqd.daemon.core.input_pdos import JointInputs, joint_inputs
 from jtqd.daemon.logs import LogError, LogFile, iter_messages
-from jtqd.daemon.loop.process import joint_inputs
 from jtqd.daemon.recording.schemas import ZEROS
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS

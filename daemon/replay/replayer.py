@@ -20,11 +20,11 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
+from jtqd.daemon.core.contact import contacts_of
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, input_pdos, joint_temperatures
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.loop.process import contacts_of
 from jtqd.daemon.replay.logged import NO_STATES, SAMPLE, EstimatorStates, Setup
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.replay.runs import Steps

@@ -84,7 +84,7 @@ class Child:
         """Return True while the process runs."""
         return self.process.poll() is None
 
-    def tell(self, message: Any) -> None:
+    def send(self, message: Any) -> None:
         """Send one JSON line; a child that has gone is noticed by whoever waits for its answer."""
         assert self.process.stdin is not None
         try:

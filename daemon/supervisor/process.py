@@ -129,7 +129,7 @@ def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict
 
     The child sends jtqd's heartbeat until its input ends.
     """
-    child.tell(boot_request(config, bus).as_json())
+    child.send(boot_request(config, bus).as_json())
     waits_ms = [joint.sdo_timeout_ms for joint in config.joints]
     if config.sensor is not None:
         waits_ms.append(config.sensor.sdo_timeout_ms)
@@ -330,7 +330,7 @@ class Supervisor:
             return None
         for line in ready["notes"]:
             self._log(line, INFO)
-        loop.tell({**report, "worst_load": self._load.worst})
+        loop.send({**report, "worst_load": self._load.worst})
         running = wait_for(loop, self._stopped)
         if running is None:
             return None

@@ -25,7 +25,7 @@ class Boot:
         self._said: dict[str, Any] | None = said
         self.request: dict[str, Any] = {}
 
-    def tell(self, request: dict[str, Any]) -> None:
+    def send(self, request: dict[str, Any]) -> None:
         self.request = request
 
     def end_of_input(self) -> None:

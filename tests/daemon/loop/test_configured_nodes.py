@@ -216,7 +216,7 @@ class Boot:
         self.running, self.heard_restart = True, False
         self.said: dict[str, Any] | None = None
 
-    def tell(self, _request: object) -> None:
+    def send(self, _request: object) -> None:
         pass
 
     def end_of_input(self) -> None:

@@ -51,7 +51,7 @@ class _EndedBoot:
     def poll_answer(self) -> None:
         return None
 
-    def tell(self, _request: dict[str, Any]) -> None:
+    def send(self, _request: dict[str, Any]) -> None:
         pass
 
     def end_of_input(self) -> None:

@@ -1,4 +1,4 @@
-"""ONNX Runtime judges in a process of its own: the same refusals, the very bytes, and no runtime in the loop."""
+"""ONNX Runtime checks networks in a process of its own: the same refusals, the same bytes, and no runtime in the loop."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import pytest
 from onnx import helper
 
 from jtqd.daemon.config import Config, load_config
-from jtqd.daemon.loop import referee
-from jtqd.daemon.loop.process import build_estimator, build_estimators
-from jtqd.daemon.loop.referee import judged
+from jtqd.daemon.loop import process
+from jtqd.daemon.loop.process import build_estimator, build_estimators, check_networks
 from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
 from tests.estimator.estimator_helpers import small_network
@@ -33,7 +32,7 @@ print(json.dumps([["onnxruntime" in sys.modules, all(each.with_network for each 
 
 
 def loaded(path: Path) -> tuple[bool, list[list[float]]]:
-    """Whether a loop of this configuration has ONNX Runtime, and what its estimators, all with a network, say."""
+    """Whether a loop of this configuration has ONNX Runtime, and the estimates of its estimators, all with a network."""
     run = subprocess.run(
         [sys.executable, "-c", PROGRAM, str(path)], capture_output=True, text=True, check=True
     )
@@ -54,13 +53,13 @@ def foreign(data: bytes) -> bytes:
 
 
 def refusal(config: Config, joint: int) -> tuple[str, str]:
-    """What is said of a joint's network, judged apart and judged here."""
-    verdicts, said = judged(config), []
-    for verdict in (verdicts[joint], None):
+    """The refusal of a joint's network, checked apart and checked here."""
+    checks, texts = check_networks(config), []
+    for check in (checks[joint], None):
         with pytest.raises((NetworkError, ConfigError)) as caught:
-            build_estimator(config, config.joints[joint], verdict)
-        said.append(str(caught.value))
-    return said[0], said[1]
+            build_estimator(config, config.joints[joint], check)
+        texts.append(str(caught.value))
+    return texts[0], texts[1]
 
 
 def test_the_loop_has_no_runtime_unless_a_graph_is_foreign(tmp_path: Path) -> None:
@@ -75,7 +74,9 @@ def test_the_loop_has_no_runtime_unless_a_graph_is_foreign(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("method", ["fused", "network"])
-def test_an_estimator_is_the_same_wherever_its_network_was_judged(tmp_path: Path, method: str) -> None:
+def test_an_estimator_is_the_same_wherever_its_network_was_check_networks(
+    tmp_path: Path, method: str
+) -> None:
     files = (
         networks()
         if method == "fused"
@@ -110,30 +111,30 @@ def test_refusals_have_the_same_words(tmp_path: Path) -> None:
         assert apart == here
 
 
-def test_other_bytes_than_the_judged_ones_are_refused(tmp_path: Path) -> None:
+def test_other_bytes_than_the_checked_ones_are_refused(tmp_path: Path) -> None:
     config = load_config(configured(tmp_path, "fused", networks()))
-    verdict = judged(config)[0]
-    assert isinstance(verdict, RuntimeCheck)
+    check = check_networks(config)[0]
+    assert isinstance(check, RuntimeCheck)
     with pytest.raises(NetworkError, match="was changed while it was checked"):
-        build_estimator(config, config.joints[0], verdict._replace(sha256="0" * 64))
+        build_estimator(config, config.joints[0], check._replace(sha256="0" * 64))
 
 
 def test_a_native_evaluation_that_differs_is_refused(tmp_path: Path) -> None:
     config = load_config(configured(tmp_path, "fused", networks()))
-    verdict = judged(config)[0]
-    assert isinstance(verdict, RuntimeCheck)
+    check = check_networks(config)[0]
+    assert isinstance(check, RuntimeCheck)
     with pytest.raises(NetworkError, match=r"native evaluation and ONNX Runtime 0\.001 Nm apart"):
-        build_estimator(config, config.joints[0], verdict._replace(native_error_nm=1e-3))
+        build_estimator(config, config.joints[0], check._replace(native_error_nm=1e-3))
 
 
 def test_a_check_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = load_config(configured(tmp_path, "fused", networks()))
     (tmp_path / "dies.py").write_text("import os, signal; os.kill(os.getpid(), signal.SIGKILL)")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(referee, "PROGRAM", "dies")
-    for joint, verdict in zip(config.joints, judged(config), strict=True):
+    monkeypatch.setattr(process, "CHECK_PROGRAM", "dies")
+    for joint, check in zip(config.joints, check_networks(config), strict=True):
         with pytest.raises(NetworkError) as caught:
-            build_estimator(config, joint, verdict)
+            build_estimator(config, joint, check)
         assert str(caught.value) == (
             f"{tmp_path}/n{joint.number}.onnx: the check by ONNX Runtime ended with exit status -9 "
             f"({tmp_path}/c.yaml: 'joint_{joint.number}', estimator.method is fused)"
