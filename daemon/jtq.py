@@ -60,7 +60,7 @@ GROUPS = {
         ),
         "score": ("jtqd.sysid.score", "print the error of a joint file on runs, before and after"),
         "export-model": (
-            "jtqd.sysid.simulators.command",
+            "jtqd.sysid.simulators",
             "write a joint file for other simulators: MJCF, URDF",
         ),
     },

@@ -154,6 +154,19 @@ def make_directory(path: Path) -> None:
         )
 
 
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file that is there whole or, also after a crash, as it was before. Raises OSError."""
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
 def check_installed(extra: str, *packages: str) -> None:
     """Raise ConfigError unless the packages are installed, import names of what an extra of pyproject.toml brings."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]

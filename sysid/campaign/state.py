@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.checked import ConfigError, write_whole
 from jtqd.estimator.decoder import Text, below, choice, in_file, read, split
 from jtqd.sysid.planner.plan import Plan, load_plan
 
@@ -143,7 +143,7 @@ class CampaignDirectory:
             if state.status != DONE:
                 for path in _files_of(self.path, name):
                     path.unlink()
-        _write_whole(self.path / PLAN_FILE, plan.to_yaml())
+        write_whole(self.path / PLAN_FILE, plan.to_yaml().encode())
         self._save()
 
     def put(self, name: str, state: RunState) -> None:
@@ -182,7 +182,7 @@ class CampaignDirectory:
             "recipe": self.recipe,
             "runs": [{"name": name, **asdict(state)} for name, state in self.runs.items()],
         }
-        _write_whole(self.path / STATE_FILE, json.dumps(content, indent=1) + "\n")
+        write_whole(self.path / STATE_FILE, f"{json.dumps(content, indent=1)}\n".encode())
 
 
 @dataclass(frozen=True)
@@ -205,13 +205,3 @@ def _files_of(directory: Path, run: str) -> list[Path]:
     endings = "|".join(map(re.escape, (*ENDINGS, *EVIDENCE)))
     of_run = re.compile(rf"{re.escape(run)}(~\d+)?(@\d+)?({endings})")
     return sorted(path for path in directory.iterdir() if of_run.fullmatch(path.name))
-
-
-def _write_whole(path: Path, text: str) -> None:
-    """Replace a file so that whoever reads it, also after a crash, finds the old or the new one, never a part."""
-    temporary = path.with_name(f".{path.name}.new")
-    with temporary.open("w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)

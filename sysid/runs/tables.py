@@ -12,7 +12,6 @@ import hashlib
 import importlib.util
 import io
 import math
-import os
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
+from jtqd.estimator.checked import counted, write_whole
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
 from jtqd.sysid.runs.column_map import TIME, Column, ColumnMap, Expression, ExpressionError, targets
 from jtqd.sysid.runs.run_file import Content, RunError, file_bytes, header_place
@@ -282,15 +281,7 @@ def write_run(path: Path | str, table: RunTable) -> str:
     data = ("\n".join(lines) + "\n").encode()
     if path.suffix == ".gz":
         data = gzip.compress(data, _COMPRESSION, mtime=0)
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    write_whole(path, data)
     return hashlib.sha256(data).hexdigest()
 
 

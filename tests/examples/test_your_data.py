@@ -16,7 +16,7 @@ from jtqd.daemon.jtq import main as jtq
 from jtqd.models.files import load_joint
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
-from jtqd.sysid.simulators.model import mjcf, model_of
+from jtqd.sysid.simulators import mjcf, model_of
 from tests.daemon.logs.campaign_log import Cycle, write_log
 from tests.daemon.logs.campaign_log import Joint as LogJoint
 from tests.paths import ROOT

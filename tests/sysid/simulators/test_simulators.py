@@ -17,7 +17,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.score import FREE, errors_on
-from jtqd.sysid.simulators.model import mjcf, model_of, urdf
+from jtqd.sysid.simulators import mjcf, model_of, urdf
 from tests.sysid.simulators.mujoco_rig import free_run_error
 from tests.sysid.test_score import TRUE, WRONG, swing
 
