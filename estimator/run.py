@@ -7,7 +7,7 @@ Column names in messages are those of the files: `time_s`, `j1.current_a`, `j1.m
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
 from typing import Final
@@ -48,6 +48,11 @@ class JointColumns:
             column = getattr(self, item.name)
             if column is not None:
                 object.__setattr__(self, item.name, _read_only(column, item.name))
+
+    def map(self, change: Callable[[str, FloatArray], FloatArray]) -> JointColumns:
+        """Return a copy with `change(name, column)` in place of each column that is there."""
+        columns = {item.name: getattr(self, item.name) for item in fields(self)}
+        return JointColumns(**{name: None if x is None else change(name, x) for name, x in columns.items()})
 
     def two_encoders(self, gear_ratio: float) -> bool:
         """Return whether both sides of the gear were measured: positions that are each other through the ratio are one."""

@@ -1,4 +1,4 @@
-"""`jtq campaign`: options, the plan that they ask for, dry run, and the campaign itself (docs/fit.md)."""
+"""`jtq campaign`: options, the plan, the dry run, and the campaign itself (docs/fit.md)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ import hashlib
 import json
 import logging
 import math
-import shutil
-import signal
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from types import FrameType
 from typing import Any, Final
 
 import numpy as np
@@ -23,14 +20,17 @@ import numpy as np
 from jtqd.drivers.bus_load import LIMIT, BusLoad
 from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.text import table_lines
 from jtqd.models.files import shipped
-from jtqd.sysid.campaign import exact
+from jtqd.sysid.campaign import processes
 from jtqd.sysid.campaign.bench import Bench, BenchConfig
-from jtqd.sysid.campaign.processes import EmulatedBench, ProcessError, StopAsked, unix_bus
-from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Designing, Reporter, clock_text
-from jtqd.sysid.campaign.runner import LONGEST_FILLED_S, Outcome, attempt, go_through
+from jtqd.sysid.campaign.processes import EXACT_TIME, EXACT_TIME_BUS, ExactTimeError, ProcessError
+from jtqd.sysid.campaign.recorded import LONGEST_INTERPOLATED_S
+from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Reporter, clock_text
+from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
+from jtqd.sysid.motion.shell import stop_signals
 from jtqd.sysid.planner.campaigns import (
     KINDS,
     OnTried,
@@ -45,13 +45,24 @@ from jtqd.sysid.planner.campaigns import (
 )
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
 from jtqd.sysid.planner.single_joint import parsed_limits, range_of, tightest, with_limits
+from jtqd.sysid.progress import bar
 
 EMULATED: Final = "sim"
 PLANT: Final = "campaign_plant.yaml"
-EMULATED_TIMING: Final = Timing(sync_lost_s=LONGEST_FILLED_S, late_s=LONGEST_FILLED_S, stale_cycles=50)
-"""Nothing can break on the emulated bench: the motion goes on over what can be interpolated."""
+EMULATED_TIMING: Final = Timing(
+    sync_lost_s=LONGEST_INTERPOLATED_S, late_s=LONGEST_INTERPOLATED_S, stale_cycles=50
+)
+"""Nothing can break on the emulated bench: the motion goes on over gaps that can be interpolated."""
 LIMIT_NAMES: Final = tuple(item.name for item in fields(Limits) if item.name != "position_rad")
 _SCALING: Final = ("runs", "seconds", "hold_s", "seed", "evaluations", "quick")
+_LONG_SEARCH: Final = 20_000
+"""Motions evaluated in about 4 s."""
+_LATE: Final = (
+    "runs were lost because this machine was late: give it SCHED_FIFO (root, or ulimit -r 80); see jtq doctor"
+)
+_TOO_BUSY: Final = f"{_LATE}; or in exact time, however busy the machine is: --bus {EXACT_TIME}"
+_MASTER_GONE: Final = "fault 8130h"
+"""Drives watch jtqd's heartbeat (1016h:1): after jtqd's end with the run before they stand in this fault, powered off."""
 _EXAMPLES: Final = """examples:
   jtq campaign efficiency --dry-run
   jtq campaign efficiency --bus sim --out campaigns/efficiency
@@ -61,7 +72,7 @@ _EXAMPLES: Final = """examples:
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return all options; `usage_error` and `missing_option` check their combination."""
+    """Return the options; `_usage_error` checks their combination."""
     made = argparse.ArgumentParser(
         prog="jtq campaign",
         description="Drive the joints of a bus through a campaign of runs, record and check each; continue an interrupted\n"
@@ -125,8 +136,8 @@ def parser() -> argparse.ArgumentParser:
     return made
 
 
-def usage_error(options: argparse.Namespace) -> str:
-    """Return what is wrong with the combination of options; empty when nothing is."""
+def _usage_error(options: argparse.Namespace) -> str:
+    """Return the error in the combination of options, or "". Raises ConfigError for a plan file that cannot be read."""
     if options.plan not in KINDS:
         if not options.plan.endswith((".yaml", ".yml")):
             return f"found plan {options.plan!r}, expected {', '.join(KINDS)} or a .yaml file"
@@ -135,11 +146,8 @@ def usage_error(options: argparse.Namespace) -> str:
             return f"--{given[0].removesuffix('_s')} belongs to {', '.join(KINDS)}, not for a plan file"
     if options.plant is not None and not emulated(options.bus):
         return "--plant requires --bus sim"
-    return ""
-
-
-def missing_option(options: argparse.Namespace) -> str:
-    """Return which option is missing, or an empty text. An unreadable plan file is reported before."""
+    if options.plan not in KINDS:
+        load_plan(Path(options.plan))
     if not options.dry_run and (options.bus is None or options.out is None):
         missing = "--bus" if options.bus is None else "--out"
         return f"{missing} is missing, for example --bus sim --out campaigns/{Path(options.plan).stem}"
@@ -147,18 +155,18 @@ def missing_option(options: argparse.Namespace) -> str:
 
 
 def emulated(bus: str | None) -> bool:
-    """Return whether the campaign brings its own bench."""
-    return bus is not None and (bus in (EMULATED, exact.BUS) or bus.startswith(f"{EMULATED}:"))
+    """Return whether the campaign runs on the emulated bench."""
+    return bus is not None and (bus in (EMULATED, EXACT_TIME) or bus.startswith(f"{EMULATED}:"))
 
 
 def recipe(options: argparse.Namespace, joints: Sequence[Joint]) -> dict[str, Any]:
-    """Return what the plan is made from, as plain values; the same recipe is the same plan. Raises ConfigError."""
+    """Return the inputs of the plan as plain values: the same recipe is the same plan. Raises ConfigError."""
     limits = {name: None if math.isinf(value) else value for name, value in options.limit}
     towing = {"towing": [list(pair) for pair in options.towing]} if options.towing else {}
     files = {"joints_sha256": hashlib.sha256(repr(tuple(joints)).encode()).hexdigest()}
     if options.plan not in KINDS:
         plan = load_plan(Path(options.plan))
-        alone = any(run.current_joint is None for run in plan.runs)  # their limits come from the joint files
+        alone = any(run.current_joint is None for run in plan.runs)  # limits from the joint files
         return {"plan_sha256": plan.sha256, "limits": limits, **towing, **(files if alone else {})}
     return {
         "kind": options.plan,
@@ -170,7 +178,7 @@ def recipe(options: argparse.Namespace, joints: Sequence[Joint]) -> dict[str, An
 
 
 def scale_of(options: argparse.Namespace) -> Scale:
-    """Size of a campaign that is not a file."""
+    """Return the size of a named campaign."""
     scale = {name: getattr(options, name) for name in _SCALING}
     return Scale(**scale, limits=replace(DEFAULT_LIMITS, **dict(options.limit)))
 
@@ -198,7 +206,7 @@ def wanted_plan(
 
 
 def _bench_of(options: argparse.Namespace) -> tuple[BenchConfig, tuple[Unit, ...]]:
-    """Return the bench of the configuration, with --limits in its joints, and what is moved together. Raises ConfigError."""
+    """Return the bench with --limits in its joints, and the units of joints that move together. Raises ConfigError."""
     config = BenchConfig.load(options.config)
     joints = list(config.joints)
     for number, given in options.limits:
@@ -246,38 +254,8 @@ def _limit(text: str) -> tuple[str, float]:
     return name, number
 
 
-def rows(plan: Plan, setpoints: Mapping[str, Setpoints]) -> list[dict[str, Any]]:
-    """Return one row per run: name, velocity joint, segments, seconds, peaks of velocity and current, travel."""
-    result = []
-    for run in plan.runs:
-        points = setpoints[run.name]
-        result.append(
-            {
-                "run": run.name,
-                "velocity_joint": run.velocity_joint,
-                "current_joint": run.current_joint,
-                "segments": len(run.segments),
-                "seconds": round(points.duration_s, 3),
-                "peak_velocity_rad_s": round(float(np.abs(points.velocity_rad_s).max()), 4),
-                "peak_current_a": round(float(np.abs(points.current_a).max()), 4),
-                "travel_rad": round(travel_rad(points), 4),
-            }
-        )
-    return result
-
-
-def total_s(setpoints: Mapping[str, Setpoints]) -> float:
-    """Expected length of the whole campaign, with what lies between the runs."""
-    return sum(points.duration_s + BETWEEN_RUNS_S for points in setpoints.values())
-
-
-def _moved(row: Mapping[str, Any]) -> str:
-    """Return the velocity joint of a row, and whether nothing tows it."""
-    return f"{row['velocity_joint']}{' alone' if row['current_joint'] is None else ''}"
-
-
 def plan_notes(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -> list[str]:
-    """Return what the runs of each unit can identify, and why one has none; nothing for the one towing bench of old."""
+    """Return lines on the runs of each unit, or why it has none; nothing for the measured towing bench of joints 1 and 2."""
     if [unit.joints for unit in units] == [(1, 2)] and units[0].measured:
         return []
     kind = options.plan if options.plan in KINDS else ""
@@ -300,94 +278,92 @@ def plan_notes(options: argparse.Namespace, units: Sequence[Unit], plan: Plan) -
     return lines
 
 
-def dry_run_mapping(
-    plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad, notes: Sequence[str] = ()
+def dry_run_content(
+    plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad, notes: Sequence[str]
 ) -> dict[str, Any]:
-    """Return what a campaign would do, for a program: its runs, how long they take, the bus load."""
+    """Return runs, times and bus load of a campaign (jtq.campaign_plan/1)."""
+    motion_s = sum(points.duration_s for points in setpoints.values())
     return {
         "schema": "jtq.campaign_plan/1",
         "name": plan.name,
         "plan_sha256": plan.sha256,
-        "runs": rows(plan, setpoints),
-        "motion_s": round(sum(points.duration_s for points in setpoints.values()), 3),
-        "expected_s": round(total_s(setpoints), 1),
+        "runs": [
+            {
+                "run": run.name,
+                "velocity_joint": run.velocity_joint,
+                "current_joint": run.current_joint,
+                "segments": len(run.segments),
+                "seconds": round(points.duration_s, 3),
+                "peak_velocity_rad_s": round(float(np.abs(points.velocity_rad_s).max()), 4),
+                "peak_current_a": round(float(np.abs(points.current_a).max()), 4),
+                "travel_rad": round(travel_rad(points), 4),
+            }
+            for run in plan.runs
+            for points in [setpoints[run.name]]
+        ],
+        "motion_s": round(motion_s, 3),
+        "expected_s": round(motion_s + BETWEEN_RUNS_S * len(setpoints), 1),
         "bus_load_worst": load.worst,
         "bus_load_limit": LIMIT,
         "units": list(notes),
     }
 
 
-def dry_run_text(
-    plan: Plan, setpoints: Mapping[str, Setpoints], load: BusLoad, notes: Sequence[str] = ()
-) -> str:
-    """Return the same for people."""
-    table = rows(plan, setpoints)
-    width = max(len("run"), *(len(row["run"]) for row in table))
+def dry_run_text(content: Mapping[str, Any], limits: Limits, load: BusLoad) -> str:
+    """Return `dry_run_content` for people."""
+    table = [["run", "velocity joint", "segments", "seconds", "peak rad/s", "peak A", "travel rad"]]
+    table += [
+        [
+            row["run"],
+            f"{row['velocity_joint']}{' alone' if row['current_joint'] is None else ''}",
+            str(row["segments"]),
+            f"{row['seconds']:.1f}",
+            f"{row['peak_velocity_rad_s']:.2f}",
+            f"{row['peak_current_a']:.2f}",
+            f"{row['travel_rad']:.1f}",
+        ]
+        for row in content["runs"]
+    ]
+    warmest = f"{limits.temperature_c:g} °C" if math.isfinite(limits.temperature_c) else "not supervised"
     lines = [
-        f"{'run':<{width}}  {'velocity joint':>14}  {'segments':>8}  {'seconds':>7}  {'peak rad/s':>10}  "
-        f"{'peak A':>6}  {'travel rad':>10}"
-    ]
-    lines += [
-        f"{row['run']:<{width}}  {_moved(row):>14}  {row['segments']:>8}  {row['seconds']:>7.1f}  "
-        f"{row['peak_velocity_rad_s']:>10.2f}  {row['peak_current_a']:>6.2f}  {row['travel_rad']:>10.1f}"
-        for row in table
-    ]
-    motion_s = sum(points.duration_s for points in setpoints.values())
-    limits = plan.limits
-    lines += [
-        f"{counted(len(table), 'run')}, {clock_text(motion_s)} of motion, about {clock_text(total_s(setpoints))} in all",
+        *table_lines(table),
+        f"{counted(len(content['runs']), 'run')}, {clock_text(content['motion_s'])} of motion, about "
+        f"{clock_text(content['expected_s'])} in all",
         f"limits: {limits.current_a:g} A, {limits.velocity_rad_s:g} rad/s, {limits.torque_nm:g} Nm, "
-        f"{limits.travel_rad:g} rad, "
-        + (
-            f"{limits.temperature_c:g} °C"
-            if math.isfinite(limits.temperature_c)
-            else "temperature not supervised"
-        ),
+        f"{limits.travel_rad:g} rad, temperature {warmest}",
         f"bus load {load.worst:.1%} in the worst case, {load.worst * load.capacity_bits:.0f} of {load.capacity_bits:.0f} "
         f"bits in a cycle, limit {LIMIT:.0%}",
-        *notes,
+        *content["units"],
     ]
     return "\n".join(lines)
-
-
-_LATE: Final = (
-    "runs were lost because this machine was late: give it SCHED_FIFO (root, or ulimit -r 80); see jtq doctor"
-)
-_TOO_BUSY: Final = f"{_LATE}; or in exact time, however busy the machine is: --bus {exact.BUS}"
-_MASTER_GONE: Final = "fault 8130h"
-"""Drives watch jtqd's heartbeat (1016h:1): when jtqd ended with the run before, they went to this fault, powered off."""
 
 
 def main(argv: list[str]) -> int:
     """Plan and run; exit status 0 done, 1 failure or ended early, 2 usage, 3 done with findings."""
     options = parser().parse_args(argv)
-    problem = usage_error(options)
     try:
-        if not problem and options.plan not in KINDS:
-            load_plan(Path(options.plan))
-        problem = problem or missing_option(options)
+        problem = _usage_error(options)
         if problem:
             print(f"jtq campaign: {problem}", file=sys.stderr)
             return 2
         return _dry_run(options) if options.dry_run else _campaign(options, argv)
     except (ConfigError, StateError, ProcessError) as error:
         print(f"jtq campaign: {error}", file=sys.stderr)
-        return 1
     except OSError as error:
-        print(
-            f"jtq campaign: {error.filename or options.out or 'output'}: {error.strerror or error}",
-            file=sys.stderr,
-        )
-        return 1
+        where = error.filename or options.out or "output"
+        print(f"jtq campaign: {where}: {error.strerror or error}", file=sys.stderr)
+    return 1
 
 
 def _make_plan(options: argparse.Namespace, config: BenchConfig, units: Sequence[Unit]) -> Plan:
-    """Return the plan, with a bar or a line where making it takes its time."""
+    """Return the plan; a search of trajectories shows its progress."""
     if options.plan != "excitation":
         return wanted_plan(options, config.joints, units)
-    pairs = sum(len(unit.joints) == 2 for unit in units)
-    with Designing(pairs * scale_of(options).motions_tried) as designing:
-        return wanted_plan(options, config.joints, units, designing.advance)
+    total = sum(len(unit.joints) == 2 for unit in units) * scale_of(options).motions_tried
+    if total > _LONG_SEARCH and not sys.stderr.isatty():
+        print("jtq campaign: designing trajectories", file=sys.stderr, flush=True)
+    with bar("designing trajectories", total) as advance:
+        return wanted_plan(options, config.joints, units, advance)
 
 
 def _check_plan(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
@@ -404,22 +380,20 @@ def _dry_run(options: argparse.Namespace) -> int:
     setpoints = _check_plan(plan, options)
     config.check_temperature(plan.limits.temperature_c)
     notes = plan_notes(options, units, plan)
-    if options.json:
-        print(json.dumps(dry_run_mapping(plan, setpoints, load, notes)))
-    else:
-        print(dry_run_text(plan, setpoints, load, notes))
+    content = dry_run_content(plan, setpoints, load, notes)
+    print(json.dumps(content) if options.json else dry_run_text(content, plan.limits, load))
     return 0
 
 
 def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bool = True) -> int:
-    """Run the campaign; exact_too: what real time loses on the emulated bench may go on in exact time."""
+    """Run the campaign; exact_too: runs that real time loses on the emulated bench may go on in exact time."""
     config, units = _bench_of(options)
-    config.load_with_commander()  # refuses what does not fit the bus
-    if options.bus == exact.BUS:
-        if not exact.inside():
-            return exact.campaign(argv, options.out)
-        options.bus = exact.BUS_INSIDE
-    exact_next = exact_too and options.bus == EMULATED and exact.ready()
+    config.load_with_commander()  # refuses a configuration that does not fit the bus
+    if options.bus == EXACT_TIME:
+        if not processes.in_exact_time():
+            return processes.run_in_exact_time(argv, options.out)
+        options.bus = EXACT_TIME_BUS
+    exact_next = exact_too and options.bus == EMULATED and processes.exact_time_ready()
     made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
@@ -434,14 +408,14 @@ def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bo
         directory.close()
     if outcome.late:
         print(
-            f"jtq campaign: {outcome.ended}: this machine is too busy for real time; what is left takes place in exact "
-            "time, in the bench kernel",
+            f"jtq campaign: {outcome.ended}: this machine is too busy for real time; the remaining runs take place in "
+            "exact time, in the bench kernel",
             file=sys.stderr,
             flush=True,
         )
         try:
-            return exact.campaign(argv, options.out)
-        except exact.NoExactTimeError as error:
+            return processes.run_in_exact_time(argv, options.out)
+        except ExactTimeError as error:
             print(f"jtq campaign: {error}; in real time again", file=sys.stderr)
             return _campaign(options, argv, exact_too=False)
     print(json.dumps(outcome.content()) if options.json else outcome.text())
@@ -462,59 +436,49 @@ def _run(
     to_do = [setpoints[run.name].duration_s for run in plan.runs if directory.runs[run.name].status != DONE]
     if not to_do:
         return Outcome(directory.runs)
-    with _stop_flag() as stop_asked, _folder() as folder:
-        bus, done = options.bus, len(plan.runs) - len(to_do)
-        process: Any = nullcontext()
+    done, bus, timing = len(plan.runs) - len(to_do), options.bus, None
+    with ExitStack() as stack:
+        taken = stack.enter_context(stop_signals())
         if emulated(bus):
-            bus = bus.removeprefix(EMULATED).removeprefix(":") or unix_bus(folder)
-            process = EmulatedBench(
-                bus,
-                folder,
-                options.plant or shipped(PLANT),
-                _bench_seed(plan, options, done),
-                len(config.drives),
-                config.sensor is not None,
-            )
-        with process, Reporter(to_do, len(plan.runs), done) as reporter, _commander_log(reporter):
-            bench = Bench(bus, options.config, config, EMULATED_TIMING if emulated(options.bus) else None)
-            motion = bench.play(plan.limits_of, reporter.on_progress)
-            return go_through(
-                plan,
-                setpoints,
-                directory,
-                reporter,
-                lambda run, points: attempt(
-                    run, points, bench, directory.path, motion=motion, stop_asked=stop_asked
-                ),
-                keep_going=options.keep_going,
-                exact_next=exact_next,
-            )
-
-
-def _bench_seed(plan: Plan, options: argparse.Namespace, done: int) -> int:
-    """Other days of the emulated bench, and other noise, for every campaign, and for what is left of one.
-
-    Runs that are to judge must not take place on the days that were trained on.
-    """
-    return seed_of(f"bench/{plan.name}", float(done), options.seed)
-
-
-class _ReporterHandler(logging.Handler):
-    """What the commander logs, to the reporter; but not what jtqd's own end leaves behind in every run."""
-
-    def __init__(self, reporter: Reporter) -> None:
-        super().__init__()
-        self._reporter = reporter
-
-    def emit(self, record: logging.LogRecord) -> None:
-        text = record.getMessage()
-        if _MASTER_GONE not in text:
-            self._reporter.write_line(text)
+            # a short path: the address of a unix socket holds 107 bytes
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="jtq-campaign-")))
+            bus = bus.removeprefix(EMULATED).removeprefix(":") or processes.unix_bus(folder)
+            plant = options.plant or shipped(PLANT)
+            # days of its own for every campaign, and for the remaining runs of one: validation runs on other days
+            # than those of the training
+            seed = seed_of(f"bench/{plan.name}", float(done), options.seed)
+            sensor = config.sensor is not None
+            bench = processes.emulated_bench(bus, folder, plant, seed, len(config.drives), sensor=sensor)
+            stack.enter_context(bench)
+            timing = EMULATED_TIMING
+        reporter = stack.enter_context(Reporter(to_do, len(plan.runs), done))
+        stack.enter_context(_commander_log(reporter))
+        place = Bench(bus, options.config, config, timing)
+        motion = place.play(plan.limits_of, reporter.on_progress)
+        return go_through(
+            plan,
+            setpoints,
+            directory,
+            reporter,
+            lambda run, points: attempt(
+                run, points, place, directory.path, motion=motion, stop_asked=lambda: bool(taken)
+            ),
+            keep_going=options.keep_going,
+            exact_next=exact_next,
+        )
 
 
 @contextmanager
 def _commander_log(reporter: Reporter) -> Iterator[None]:
-    logger, handler = logging.getLogger("jtqd.sysid.motion"), _ReporterHandler(reporter)
+    """Write the commander's log to the reporter, without the fault that jtqd's own end causes in every run."""
+
+    class Lines(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            text = record.getMessage()
+            if _MASTER_GONE not in text:
+                reporter.write_line(text)
+
+    logger, handler = logging.getLogger("jtqd.sysid.motion"), Lines()
     logger.addHandler(handler)
     propagate, logger.propagate = logger.propagate, False
     try:
@@ -522,29 +486,3 @@ def _commander_log(reporter: Reporter) -> Iterator[None]:
     finally:
         logger.removeHandler(handler)
         logger.propagate = propagate
-
-
-@contextmanager
-def _folder() -> Iterator[Path]:
-    """Yield a short path: the address of a unix socket holds 107 bytes."""
-    folder = Path(tempfile.mkdtemp(prefix="jtq-campaign-"))
-    try:
-        yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _stop_flag() -> Iterator[StopAsked]:
-    """SIGINT and SIGTERM set a flag between motions; during one the commander takes them itself."""
-    taken: list[int] = []
-
-    def take(number: int, frame: FrameType | None) -> None:
-        taken.append(number)
-
-    before = {number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield lambda: bool(taken)
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

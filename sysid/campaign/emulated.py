@@ -1,8 +1,7 @@
 """`python -m jtqd.sysid.campaign.emulated`: runs of a campaign on the emulated bench without a bus, faster than real time.
 
-Run tables and marks as a campaign leaves them, each run on a day of its own, and the true torques beside each
-(NAME.truth.npz). No bus, no loop, no missing cycles: for questions that need hundreds of days, such as how often an interval
-covers. What jtqd itself would have recorded comes from `jtq campaign --bus sim`.
+It writes the run tables and marks of a campaign, each run on a day of its own, and the true torques (NAME.truth.npz). There
+is no jtqd and no missing cycle: for questions that need hundreds of days, such as the coverage of an interval.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ def emulated_with_truth(bench: AnyPlant, seed: int, day: int, run: Run) -> Emula
     """Return one run on this day of the seed, with the true torques.
 
     A joint that is moved alone is joint 1 of the bench and turns joint 2, which has no current, as in `jtq sim --drives 1`;
-    its table has its own columns only. Any other pair than joints 1 and 2 has a bench like theirs.
+    its table has its own columns only. Any other pair than joints 1 and 2 takes their places.
     """
     points = expand(run)
     commands = (
@@ -130,16 +129,16 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _emulate(out: Path, plan: Plan, plant: Path, seed: int) -> None:
-    """Write what is not there yet, on all processors."""
-    left = [(day, run) for day, run in enumerate(plan.runs) if not (out / f"{run.name}.json").exists()]
+    """Write the runs that are not there yet, on all processors."""
+    missing = [(day, run) for day, run in enumerate(plan.runs) if not (out / f"{run.name}.json").exists()]
     with ProcessPoolExecutor() as pool:
-        made: Iterable[str] = pool.map(partial(_write_run_files, out, plant, seed), left)
-        for _ in zip(progress(left, "runs"), made, strict=True):
+        made: Iterable[str] = pool.map(partial(_write_run_files, out, plant, seed), missing)
+        for _ in zip(progress(missing, "runs"), made, strict=True):
             pass
 
 
 def _claim(out: Path, plan: Plan, plant: Path, seed: int) -> None:
-    """Make the directory, or see that it holds runs of the same recipe. Raises ConfigError, OSError."""
+    """Make the directory, or check that it holds runs of the same recipe. Raises ConfigError, OSError."""
     recipe = {"plan": plan.sha256, "plant": hashlib.sha256(plant.read_bytes()).hexdigest(), "seed": seed}
     file = out / _RECIPE
     if file.is_file():

@@ -1,4 +1,8 @@
-"""The processes that a campaign starts: jtqd for every run, and the emulated bench for all of them."""
+"""Processes of a campaign: jtqd for every run, the emulated bench, and the campaign itself in the bench kernel (exact time).
+
+In exact time the clock waits for the processes (docs/testing.md): the same jtqd, commander and emulated drives on SocketCAN
+miss no cycle, however busy the machine is.
+"""
 
 from __future__ import annotations
 
@@ -12,26 +16,35 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any, Final
+from types import FrameType
+from typing import Any, Final, NoReturn
 
 from jtqd.drivers.bus_socket import PREFIX
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
+from jtqd.sim_can.bench_kernel import build, guest, packages
 
+EXACT_TIME: Final = "exact"
+"""As `--bus`: the emulated bench in exact time."""
+EXACT_TIME_BUS: Final = "sim:vcan0"
+"""The same inside the bench kernel."""
 READY_S: Final = 60.0
-"""Longest time until a process is at work; a small controller loads its libraries from a slow card."""
-END_S: Final = 30.0
+"""Longest start of a process; a small controller loads its libraries from a slow card."""
+_END_S: Final = 30.0
 _MARGIN_S: Final = 60.0
-"""jtqd ends by itself so long after a run at the latest: nobody may be left to end it."""
+"""jtqd ends by itself this long after a run, if the campaign cannot end it."""
 _POLL_S: Final = 0.1
 _BENCH_PRIORITY: Final = 40
-_COMMANDER_PRIORITY: Final = 30
 _PR_SET_PDEATHSIG: Final = 1
 _LIBC: Final = ctypes.CDLL(None)
 
 
 class ProcessError(Exception):
     """A process did not start, or ended by a failure; one line with its last message."""
+
+
+class ExactTimeError(ProcessError):
+    """The bench kernel cannot be built or booted; one line."""
 
 
 class Interrupted(Exception):  # noqa: N818 - an order, not an error
@@ -41,40 +54,59 @@ class Interrupted(Exception):  # noqa: N818 - an order, not an error
 StopAsked = Callable[[], bool]
 
 
+def unix_bus(folder: Path) -> str:
+    """Return the address of a unix bus in a folder."""
+    return f"{PREFIX}{folder / 'bus'}"
+
+
 def _die_with_parent() -> None:
     _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
-def _start(module: str, arguments: Sequence[str], messages: Path, **streams: Any) -> subprocess.Popen[bytes]:
-    """Return a Python module as a process; its standard error goes to the file `messages`.
+def _start(module: str, arguments: Sequence[str], messages: Path, stdout: Any) -> subprocess.Popen[bytes]:
+    """Start a Python module as a process, its standard error in the file `messages`.
 
-    It has a session of its own: Ctrl-C on a terminal must reach the commander alone, which needs the SYNC of jtqd to
-    bring both joints to rest. It gets SIGTERM when we die, however we die.
+    It has a session of its own: Ctrl-C on a terminal must reach the commander alone, which needs the SYNC of jtqd to bring
+    the joints to rest. It gets SIGTERM when this process dies.
     """
     with messages.open("wb") as log:
         return subprocess.Popen(
             [sys.executable, "-P", "-m", module, *arguments],
             stdin=subprocess.DEVNULL,
+            stdout=stdout,
             stderr=log,
             start_new_session=True,
             preexec_fn=_die_with_parent,  # noqa: PLW1509 - there are no threads here
-            **streams,
         )
 
 
 def _end(process: subprocess.Popen[bytes]) -> int:
-    """SIGTERM, wait, SIGKILL if it must be; its exit status."""
-    if process.poll() is None:
-        process.terminate()
+    """Send SIGTERM, and SIGKILL to a process that does not end; return its exit status."""
+    process.terminate()
     try:
-        return process.wait(END_S)
+        return process.wait(_END_S)
     except subprocess.TimeoutExpired:
         process.kill()
         return process.wait()
 
 
+def _wait_for(
+    process: subprocess.Popen[bytes], seen: Callable[[], bool], messages: Path, name: str, late: str
+) -> None:
+    """Wait until `seen()`, which blocks for a moment itself.
+
+    Raises ProcessError where the process ends, or is `late` after READY_S.
+    """
+    deadline = time.monotonic() + READY_S
+    while not seen():
+        if process.poll() is not None:
+            raise ProcessError(f"{name} ended with exit status {process.returncode}: {last_line(messages)}")
+        if time.monotonic() > deadline:
+            raise ProcessError(f"{name}{late} within {READY_S:g} s")
+
+
 def last_line(path: Path) -> str:
-    """Last line of what a process wrote, for a message of one line."""
+    """Return the last line that a process wrote to a file."""
     try:
         lines = path.read_text(errors="replace").strip().splitlines()
     except OSError:
@@ -82,73 +114,43 @@ def last_line(path: Path) -> str:
     return lines[-1] if lines else "no message"
 
 
-class EmulatedBench:
-    """The emulated bench as one process for the whole campaign, at rest until it is commanded; a context manager.
+@contextmanager
+def emulated_bench(
+    bus: str, folder: Path, plant: Path, seed: int, drives: int, *, sensor: bool
+) -> Iterator[None]:
+    """Run the emulated bench as a process, at rest until it is commanded.
 
     Args:
-        bus: where it is put; a unix bus is made if there is none.
-        folder: for its messages. plant: plant file, None for the one of campaigns. seed: of its noise and its days.
+        bus: where it is put; a unix bus is made if there is none. folder: for its messages. seed: of its noise and days.
         drives, sensor: what is on it; drives 1 and 2, and 3 and 4, are coupled.
+
+    Raises ProcessError when it does not start.
     """
+    arguments = ["--bus", bus, "--profile", "rest", "--seed", str(seed), "--plant", str(plant)]
+    arguments += ["--drives", str(drives), *([] if sensor else ["--no-sensor"])]
+    messages = folder / "bench.log"
+    process = _start("jtqd.sim_can", arguments, messages, subprocess.DEVNULL)
 
-    def __init__(  # noqa: PLR0917
-        self, bus: str, folder: Path, plant: Path | None, seed: int, drives: int = 2, sensor: bool = True
-    ) -> None:
-        arguments = ["--bus", bus, "--profile", "rest", "--seed", str(seed)]
-        arguments += [] if plant is None else ["--plant", str(plant)]
-        arguments += ["--drives", str(drives), *([] if sensor else ["--no-sensor"])]
-        self._messages = folder / "bench.log"
-        self._process = _start("jtqd.sim_can", arguments, self._messages, stdout=subprocess.DEVNULL)
+    def ready() -> bool:
+        time.sleep(_POLL_S / 10)
+        return b"bench ready" in messages.read_bytes()
 
-    def __enter__(self) -> EmulatedBench:
-        """Wait until it is ready. Raises ProcessError."""
-        deadline = time.monotonic() + READY_S
-        while b"bench ready" not in self._messages.read_bytes():
-            self.check()
-            if time.monotonic() > deadline:
-                self.__exit__()
-                raise ProcessError(f"the emulated bench: not ready within {READY_S:g} s")
-            time.sleep(_POLL_S / 10)
-        _prefer(self._process.pid)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        _end(self._process)
-
-    def check(self) -> None:
-        """Raises ProcessError when it is no longer there."""
-        if self._process.poll() is not None:
-            raise ProcessError(
-                f"the emulated bench ended with exit status {self._process.returncode}: {last_line(self._messages)}"
-            )
-
-
-def _prefer(pid: int) -> None:
-    """The emulated nodes stand for hardware: they come before everything but jtqd's loop, where that is permitted."""
-    with suppress(PermissionError):
-        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
-
-
-@contextmanager
-def on_time() -> Iterator[None]:
-    """This process at a real-time priority while it commands, where permitted; below jtqd's loop and the drives."""
-    before, priority = os.sched_getscheduler(0), os.sched_getparam(0)
-    with suppress(PermissionError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(_COMMANDER_PRIORITY))
     try:
+        _wait_for(process, ready, messages, "the emulated bench", ": not ready")
+        with suppress(PermissionError):  # it stands for hardware: before everything but jtqd's loop
+            os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(_BENCH_PRIORITY))
         yield
     finally:
-        with suppress(PermissionError):
-            os.sched_setscheduler(0, before, priority)
+        _end(process)
 
 
 class Jtqd:
-    """jtqd during one run; a context manager that is entered when it publishes, and ends it in order.
+    """jtqd during one run: a context manager that waits for its first estimate, and ends it in order.
 
     Args:
         bus, config: as for jtqd. folder: of the run; its log goes to folder/log, its messages to folder/jtqd.log.
         duration_s: of the motion.
-        estimate_cob_id: seen on the bus, jtqd is publishing.
+        estimate_cob_id: of the PDO that jtqd publishes.
         stop_asked: asked while waiting.
     """
 
@@ -168,7 +170,7 @@ class Jtqd:
         self._arguments += ["--duration", f"{duration_s + _MARGIN_S:.1f}"]
         self._arguments += [] if config is None else ["--config", str(config)]
         self._output = folder / "jtqd.json"
-        self._status: int | None = None
+        self._status = 0
 
     def __enter__(self) -> Jtqd:
         """Start and wait for the first estimate. Raises ProcessError, Interrupted."""
@@ -177,23 +179,26 @@ class Jtqd:
         except BusError as error:
             raise ProcessError(str(error)) from None
         with self._output.open("wb") as output:
-            self._process = _start("jtqd.daemon.jtqd", self._arguments, self.messages, stdout=output)
+            self._process = _start("jtqd.daemon.jtqd", self._arguments, self.messages, output)
+
+        def published() -> bool:
+            if socket.wait(_POLL_S):
+                return True
+            if self._stop_asked():
+                raise Interrupted
+            return False
+
         try:
-            self._wait(socket.wait)
+            _wait_for(self._process, published, self.messages, "jtqd", " published nothing")
         except BaseException:
-            self.end()
+            _end(self._process)
             raise
         finally:
             socket.close()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.end()
-
-    def end(self) -> None:
-        """SIGTERM and wait for its summary; once."""
-        if self._status is None:
-            self._status = _end(self._process)
+        self._status = _end(self._process)
 
     def log(self) -> tuple[tuple[Path, ...], dict[str, Any]]:
         """Return parts of the log in their order, and the summary, after the end.
@@ -212,19 +217,42 @@ class Jtqd:
             raise ProcessError(f"jtqd recorded nothing: {recording.get('error') or 'no reason given'}")
         return tuple(map(Path, recording.get("paths") or [recording["path"]])), summary
 
-    def _wait(self, seen: Callable[[float], bool]) -> None:
-        deadline = time.monotonic() + READY_S
-        while not seen(_POLL_S):
-            if self._stop_asked():
-                raise Interrupted
-            if self._process.poll() is not None:
-                raise ProcessError(
-                    f"jtqd ended with exit status {self._process.returncode}: {last_line(self.messages)}"
-                )
-            if time.monotonic() > deadline:
-                raise ProcessError(f"jtqd published nothing within {READY_S:g} s")
+
+def in_exact_time() -> bool:
+    """Return whether this process runs in the bench kernel."""
+    return os.environ.get(guest.TIME_TRAVEL_MARK) == "1"
 
 
-def unix_bus(folder: Path) -> str:
-    """Address of a unix bus in a folder."""
-    return f"{PREFIX}{folder / 'bus'}"
+def exact_time_ready() -> bool:
+    """Return whether the bench kernel is there, and this process is not in it."""
+    try:
+        return not in_exact_time() and build.find() is not None and not packages.missing(packages.GUEST)
+    except RuntimeError:
+        return False
+
+
+def run_in_exact_time(argv: Sequence[str], out: Path) -> int:
+    """Run `jtq campaign` with these arguments in the bench kernel; return its exit status.
+
+    Raises:
+        ExactTimeError: the kernel cannot be built or booted.
+        ProcessError: a signal ended it.
+    """
+    command = [sys.executable, "-P", "-m", "jtqd.daemon.jtq", "campaign", *argv, "--bus", EXACT_TIME_BUS]
+    sys.stdout.flush()
+    before = signal.signal(signal.SIGTERM, _terminated)
+    try:
+        result = guest.run(
+            command, time_travel=True, out_dir=out, sinks=(sys.stdout.buffer, sys.stderr.buffer)
+        )
+    except RuntimeError as error:  # every error of the bench kernel is one
+        raise ExactTimeError(f"exact time: {error}") from None
+    except KeyboardInterrupt:
+        raise ProcessError("ended by a signal; the same command continues with the remaining runs") from None
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    return result.returncode
+
+
+def _terminated(number: int, frame: FrameType | None) -> NoReturn:
+    raise KeyboardInterrupt

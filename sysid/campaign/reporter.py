@@ -14,11 +14,9 @@ from jtqd.estimator.checked import counted
 from jtqd.sysid.campaign.state import DONE, RunState
 
 BETWEEN_RUNS_S: Final = 4.0
-"""What a run takes beside its motion, until one has been measured: start of jtqd, set-up of the drives, table."""
+"""Assumed before the first run is measured: start of jtqd, set-up of the drives, run table."""
 _REFRESH_S: Final = 1.0
-"""Drawing takes 0.5 ms and happens between two set-points: not more often than necessary."""
-_WORTH_A_LINE: Final = 20_000
-"""Motions tried in about 4 s."""
+"""Drawing takes 0.5 ms between two set-points."""
 
 
 def clock_text(seconds: float) -> str:
@@ -29,82 +27,46 @@ def clock_text(seconds: float) -> str:
 
 
 class Remaining:
-    """How long a campaign still takes: motions to be played, and what has been measured between them.
+    """Remaining time of a campaign: motions to be played, and the measured time between them.
 
     Args:
-        motions_s: lengths of all runs that are to be played, in order.
+        motions_s: lengths of all runs that are to be played.
         now: clock in seconds.
     """
 
     def __init__(self, motions_s: list[float], now: Callable[[], float] = time.monotonic) -> None:
         self.total_s: Final = sum(motions_s)
+        self.played_s = 0.0
+        """Motions of the runs that are over."""
         self._left = len(motions_s)
-        self._motions_s = self.total_s  # not begun yet, or under way
-        self._current_s = 0.0
-        self._now = now
-        self._began = now()
-        self._played_s = 0.0
-        self._finished = 0
+        self._over = 0
+        self._now, self._began = now, now()
 
-    def begin(self, motion_s: float) -> None:
-        """A run begins."""
-        self._current_s = motion_s
-
-    def end(self) -> None:
-        """The run that was begun is over, whatever became of it."""
+    def end(self, motion_s: float) -> None:
+        """Count a run that is over."""
+        self.played_s += motion_s
         self._left -= 1
-        self._finished += 1
-        self._motions_s -= self._current_s
-        self._played_s += self._current_s
-        self._current_s = 0.0
+        self._over += 1
 
     def seconds(self, played_s: float = 0.0) -> float:
-        """Return the time that is left when played_s of the run under way have been played."""
+        """Return the remaining time after played_s of the current run."""
+        motion_s = self.played_s + played_s
         between_s = BETWEEN_RUNS_S
-        if self._finished:
-            elapsed_s = self._now() - self._began
-            between_s = max(
-                (elapsed_s - self._played_s - played_s) / (self._finished + (played_s > 0.0)), 0.0
-            )
-        return self._motions_s - played_s + between_s * self._left
-
-
-class Designing:
-    """A bar, or a line, while trajectories are designed; a context manager.
-
-    Args:
-        total: motions that will be tried.
-    """
-
-    def __init__(self, total: int, console: Console | None = None) -> None:
-        self._console = console or Console(stderr=True)
-        self._bar = Progress(console=self._console, transient=True, disable=not self._console.is_terminal)
-        self._task = self._bar.add_task("designing trajectories", total=total)
-        self._total = total
-
-    def __enter__(self) -> Designing:
-        if not self._console.is_terminal and self._total > _WORTH_A_LINE:
-            print("jtq campaign: designing trajectories", file=sys.stderr, flush=True)
-        self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._bar.stop()
-
-    def advance(self, tried: int) -> None:
-        """So many more motions have been tried."""
-        self._bar.advance(self._task, tried)
+        if self._over:
+            begun = self._over + (played_s > 0.0)
+            between_s = max((self._now() - self._began - motion_s) / begun, 0.0)
+        return self.total_s - motion_s + between_s * self._left
 
 
 class Reporter:
-    """A context manager around the runs: which one is under way, and what became of it."""
+    """A context manager around the runs: the current one, and the outcome of each."""
 
     def __init__(self, motions_s: list[float], total: int, done: int, console: Console | None = None) -> None:
         self._console = console or Console(stderr=True)
         self._remaining = Remaining(motions_s)
         self._total, self._number = total, done
         self._name = ""
-        self._shown = 0.0
+        self._shown_s = 0.0
         self._bar = Progress(
             TextColumn("{task.description}"),
             BarColumn(None),
@@ -116,7 +78,6 @@ class Reporter:
             disable=not self._console.is_terminal,
         )
         self._task = self._bar.add_task("", total=max(self._remaining.total_s, 1e-9), left="")
-        self._finished_s = 0.0
 
     def __enter__(self) -> Reporter:
         self._bar.start()
@@ -125,55 +86,49 @@ class Reporter:
     def __exit__(self, *_: object) -> None:
         self._bar.stop()
 
-    def begin(self, name: str, motion_s: float) -> None:
-        """A run begins."""
+    def begin(self, name: str) -> None:
+        """Show the next run."""
         self._name = name
         self._number += 1
-        self._remaining.begin(motion_s)
-        self._draw(0.0)
+        self._shown_s = -_REFRESH_S
+        self.on_progress(0.0, 0.0)
 
     def on_progress(self, played_s: float, _total_s: float) -> None:
-        """Called by the commander between two set-points."""
-        if self._console.is_terminal and time.monotonic() - self._shown >= _REFRESH_S:
-            self._draw(played_s)
-
-    def attempt_failed(self, name: str, reason: str, attempt: int) -> None:
-        """An attempt came to nothing and the run is tried again."""
-        self.write_line(f"{name}: attempt {attempt}: {reason}; repeated")
-
-    def end(self, name: str, motion_s: float, state: RunState) -> None:
-        """A run is over."""
-        self._remaining.end()
-        self._finished_s += motion_s
-        if self._console.is_terminal and state.status == DONE and not state.findings:
+        """Draw the bar; called by the commander between two set-points."""
+        if not self._console.is_terminal or time.monotonic() - self._shown_s < _REFRESH_S:
             return
-        text = f"run {self._number} of {self._total}: {name}: {state.status}"
-        if state.status == DONE:
-            text += (
-                f", {counted(state.rows, 'row')}, {counted(state.missed + state.incomplete, 'cycle')} missing"
-            )
-        else:
-            text += f": {state.reason}"
-        left = self._remaining.seconds()
-        self.write_line(text + (f"; {clock_text(left)} left" if left > 0.0 else ""))
-        for finding in state.findings:
-            self.write_line(f"{name}: {finding}")
-
-    def write_line(self, text: str) -> None:
-        """One line on stderr, above the bar where there is one."""
-        if self._console.is_terminal:
-            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
-        else:
-            print(f"jtq campaign: {text}", file=sys.stderr, flush=True)
-
-    def _draw(self, played_s: float) -> None:
-        if not self._console.is_terminal:
-            return
-        self._shown = time.monotonic()
+        self._shown_s = time.monotonic()
         self._bar.update(
             self._task,
-            completed=self._finished_s + played_s,
+            completed=self._remaining.played_s + played_s,
             description=f"{self._number}/{self._total} {self._name}",
             left=clock_text(self._remaining.seconds(played_s)),
             refresh=True,
         )
+
+    def attempt_failed(self, name: str, reason: str, attempt: int) -> None:
+        """Report an attempt that is repeated."""
+        self.write_line(f"{name}: attempt {attempt}: {reason}; repeated")
+
+    def end(self, name: str, motion_s: float, state: RunState) -> None:
+        """Report a run that is over."""
+        self._remaining.end(motion_s)
+        if self._console.is_terminal and state.status == DONE and not state.findings:
+            return
+        text = f"run {self._number} of {self._total}: {name}: {state.status}"
+        if state.status == DONE:
+            missing = counted(state.missed + state.incomplete, "cycle")
+            text += f", {counted(state.rows, 'row')}, {missing} missing"
+        else:
+            text += f": {state.reason}"
+        left_s = self._remaining.seconds()
+        self.write_line(text + (f"; {clock_text(left_s)} left" if left_s > 0.0 else ""))
+        for finding in state.findings:
+            self.write_line(f"{name}: {finding}")
+
+    def write_line(self, text: str) -> None:
+        """Write a line on stderr, above the bar where there is one."""
+        if self._console.is_terminal:
+            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(f"jtq campaign: {text}", file=sys.stderr, flush=True)

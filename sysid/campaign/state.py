@@ -1,4 +1,4 @@
-"""campaign.json: what has become of every run, written so that a campaign that was killed can go on (jtq.campaign/1).
+"""campaign.json: the state of every run, written after each, so that an interrupted campaign can go on (jtq.campaign/1).
 
 The directory belongs to one campaign at a time (a lock that ends with its process), and to one plan.
 """
@@ -26,9 +26,9 @@ LOCK_FILE: Final = ".lock"
 PARTS: Final = ".part"
 """Suffix of a run's directory while the run is under way."""
 ENDINGS: Final = (".csv.gz", ".json", ".mcap")
-"""Files of a run that is done; further parts of its log are NAME@2.mcap, NAME@3.mcap ...."""
+"""Files of a run that is done; further parts of its log are NAME@2.mcap, NAME@3.mcap, ..."""
 EVIDENCE: Final = (".stopped.mcap", ".failed.mcap", ".jtqd.log")
-"""What is left of an attempt that came to nothing, until the next attempt."""
+"""Files of a failed attempt, until the next attempt."""
 DONE, STOPPED, FAILED, PENDING = STATUSES = ("done", "stopped", "failed", "pending")
 
 
@@ -38,15 +38,15 @@ class StateError(Exception):
 
 @dataclass(frozen=True)
 class RunState:
-    """What has become of one run.
+    """State of one run.
 
     Attributes:
         status: done; stopped (a limit, or the bus); failed (nothing usable was recorded); pending.
-        reason: one line for stopped and failed. attempts: how often it was begun.
+        reason: one line for stopped and failed. attempts: number of attempts.
         played_s: length of the set-points that were sent in the last attempt.
         rows: of the run table. missed, incomplete: cycles that are no rows (see log_to_run).
-        interpolated: rows among `rows` that were made by interpolation. pieces: tables that the run has become.
-        findings: what is wrong with the table, a line each. sha256: of NAME.csv.gz.
+        interpolated: rows among `rows` that were interpolated. pieces: number of run tables, one for each partial run.
+        findings: faults of the table, a line each. sha256: of NAME.csv.gz.
     """
 
     status: Annotated[str, choice(STATUSES)] = PENDING
@@ -63,18 +63,15 @@ class RunState:
     pieces: int = 1
 
     def tables(self, name: str) -> list[str]:
-        """Return the names of its tables: its own, or NAME~1, NAME~2, ... of its pieces."""
+        """Return the names of its tables: its own, or NAME~1, NAME~2, ... of its partial runs."""
         return [name] if self.pieces == 1 else [f"{name}~{number}" for number in range(1, self.pieces + 1)]
 
 
 class CampaignDirectory:
-    """A campaign's directory, locked for this process until `close`; the state in it is that of the last `put`.
-
-    Args:
-        path: made if missing.
+    """A campaign's directory, made if missing, locked for this process until `close`; its state is that of the last `put`.
 
     Raises:
-        StateError: another campaign is at work there, or what is there is no campaign's.
+        StateError: another campaign is running there, or campaign.json cannot be read.
         OSError: it cannot be made or written.
     """
 
@@ -106,11 +103,11 @@ class CampaignDirectory:
         return bool(self.plan_sha256)
 
     def close(self) -> None:
-        """Give the directory up."""
+        """Unlock the directory."""
         os.close(self._lock)
 
     def same_recipe(self, recipe: Mapping[str, Any]) -> Plan | None:
-        """The plan that was begun here from the same recipe: made once, so that it need not be designed again."""
+        """Return the plan of this directory if it was made from the same recipe; else None."""
         if not self.begun or self.recipe != recipe:
             return None
         try:
@@ -120,10 +117,9 @@ class CampaignDirectory:
         return plan if plan.sha256 == self.plan_sha256 else None
 
     def begin(self, plan: Plan, recipe: Mapping[str, Any]) -> None:
-        """Begin, or go on: runs that are done stay done, everything half-written is removed.
+        """Begin, or go on: runs that are done stay done, files of all others are removed.
 
-        Raises:
-            StateError: another plan was begun here.
+        Raises StateError for a directory of another plan.
         """
         if self.begun and self.plan_sha256 != plan.sha256:
             raise StateError(
@@ -147,12 +143,12 @@ class CampaignDirectory:
         self._save()
 
     def put(self, name: str, state: RunState) -> None:
-        """Write the state of a run, whole or not at all."""
+        """Set the state of a run, and write the file."""
         self.runs[name] = state
         self._save()
 
     def _still_done(self, name: str) -> RunState:
-        """Return the state of a run as recorded; pending again when it is not done, or its files have gone."""
+        """Return the state of a run; pending where it is not done or one of its files is missing."""
         state = self.runs.get(name, RunState())
         files = (self.path / (table + ending) for table in state.tables(name) for ending in ENDINGS)
         if state.status == DONE and all(file.is_file() for file in files):
@@ -201,7 +197,7 @@ def _run_state(n: int, section: Mapping[str, Any]) -> tuple[str, RunState]:
 
 
 def _files_of(directory: Path, run: str) -> list[Path]:
-    """Return files of a run that are there, all parts of its log among them."""
+    """Return the files of a run, all parts of its log included."""
     endings = "|".join(map(re.escape, (*ENDINGS, *EVIDENCE)))
     of_run = re.compile(rf"{re.escape(run)}(~\d+)?(@\d+)?({endings})")
     return sorted(path for path in directory.iterdir() if of_run.fullmatch(path.name))

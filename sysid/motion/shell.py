@@ -64,7 +64,7 @@ def play(
     """
     timing = timing or Timing()
     check_setpoints(setpoints, limits)
-    with _signals() as taken, _on_time():
+    with stop_signals() as taken, _on_time():
         try:
             setup = BenchSetup(bus, drives, sensor, timing)
         except BusError as refused:
@@ -150,8 +150,8 @@ def _take(socket: FrameSocket) -> list[Frame]:
 
 
 @contextmanager
-def _signals() -> Iterator[list[str]]:
-    """Collect SIGINT and SIGTERM by name in a list while this lasts (in the main thread)."""
+def stop_signals() -> Iterator[list[str]]:
+    """Collect SIGINT and SIGTERM by name in a list, where this is the main thread."""
     taken: list[str] = []
 
     def take(number: int, frame: FrameType | None) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.runs.channels import MOVING_RAD_S, RunIssue
 
 SLOWEST_HZ: Final = 50.0
@@ -88,12 +88,7 @@ def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
     """Return the run on steps of step_s, its rows at these times [n]."""
     grid = np.arange(time_s[0], time_s[-1] + 1e-9, step_s)
     joints = {
-        number: JointColumns(
-            **{
-                name: None if (column := getattr(columns, name)) is None else _cubic(grid, time_s, column)
-                for name in COLUMN_NAMES
-            }
-        )
+        number: columns.map(lambda _, column: _cubic(grid, time_s, column))
         for number, columns in table.joints.items()
     }
     return RunTable(grid, joints)

@@ -1,4 +1,4 @@
-"""Campaigns in exact time: when they go there, with which command, and what comes back; one is driven."""
+"""Campaigns in exact time: when they run there, with which command, and how they end; one is driven."""
 
 import json
 import os
@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from jtqd.sim_can.bench_kernel import build, guest, packages
-from jtqd.sysid.campaign import command, exact
+from jtqd.sysid.campaign import command, processes
 from jtqd.sysid.campaign.processes import ProcessError
 from jtqd.sysid.campaign.runner import Outcome
 from jtqd.sysid.campaign.state import DONE, STATE_FILE, RunState
@@ -42,9 +42,11 @@ def argv(tmp_path: Path) -> list[str]:
 
 @pytest.fixture
 def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], Path]]:
-    """What is handed to exact time; it ends with status 3."""
+    """Calls of exact time, which ends with status 3."""
     found: list[tuple[list[str], Path]] = []
-    monkeypatch.setattr(exact, "campaign", lambda argv, out: found.append((list(argv), out)) or 3)
+    monkeypatch.setattr(
+        processes, "run_in_exact_time", lambda argv, out: found.append((list(argv), out)) or 3
+    )
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
     return found
 
@@ -53,7 +55,7 @@ def test_bus_exact_goes_there_at_once(argv: list[str], sent: list[Any], tmp_path
     argv += ["--bus", "exact"]
     assert command.main(argv) == 3
     assert sent == [(argv, tmp_path / "out")]
-    assert not (tmp_path / "out").exists(), "the directory belongs to the campaign in there"
+    assert not (tmp_path / "out").exists(), "the directory belongs to the campaign inside"
 
 
 def test_inside_of_exact_time_the_bench_is_on_its_bus(
@@ -65,7 +67,7 @@ def test_inside_of_exact_time_the_bench_is_on_its_bus(
         command, "_run", lambda options, *_, **__: buses.append(options.bus) or Outcome({}, "ended")
     )
     assert command.main([*argv, "--bus", "exact"]) == 1
-    assert buses == [exact.BUS_INSIDE]
+    assert buses == [processes.EXACT_TIME_BUS]
     assert sent == []
 
 
@@ -73,14 +75,14 @@ def test_inside_of_exact_time_the_bench_is_on_its_bus(
     "case",  # bus, whether the bench kernel is there, whether it is used
     [("sim", True, True), ("sim", False, False), ("sim:unix:/tmp/bus", True, False), ("can0", True, False)],
 )
-def test_what_real_time_lost_goes_on_in_exact_time_if_it_is_the_emulated_bench_alone(
+def test_runs_that_real_time_loses_go_on_in_exact_time_on_the_emulated_bench_alone(
     argv: list[str],
     sent: list[Any],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
     case: tuple[str, bool, bool],
 ) -> None:
-    """A real bench is never left for an emulated one, and a bus that was named is the one that is used."""
+    """Never from a real bench to an emulated one, and never from a given bus to another."""
     bus, ready, goes = case
     asked = []
 
@@ -89,7 +91,7 @@ def test_what_real_time_lost_goes_on_in_exact_time_if_it_is_the_emulated_bench_a
         lost = {"a": RunState("stopped", "SYNC missing for 51 ms, limit 50 ms")}
         return Outcome(lost, "a: SYNC missing for 51 ms, limit 50 ms", late=exact_next)
 
-    monkeypatch.setattr(exact, "ready", lambda: ready)
+    monkeypatch.setattr(processes, "exact_time_ready", lambda: ready)
     monkeypatch.setattr(command, "_run", run)
     argv += ["--bus", bus]
     assert command.main(argv) == (3 if goes else 1)
@@ -114,7 +116,7 @@ def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(
         raise guest.GuestError("the guest ended without a result")
 
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
-    monkeypatch.setattr(exact, "ready", lambda: True)
+    monkeypatch.setattr(processes, "exact_time_ready", lambda: True)
     monkeypatch.setattr(guest, "run", boot)
     monkeypatch.setattr(command, "_run", run)
     assert command.main([*argv, "--bus", "sim"]) == 0
@@ -122,7 +124,7 @@ def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(
     assert "the guest ended without a result; in real time again" in capsys.readouterr().err
 
 
-def test_the_command_in_there_is_the_same_on_another_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_inside_is_the_same_on_another_bus(monkeypatch: pytest.MonkeyPatch) -> None:
     ran: list[tuple[list[str], dict[str, Any]]] = []
 
     def run(words: list[str], **options: Any) -> SimpleNamespace:
@@ -130,7 +132,7 @@ def test_the_command_in_there_is_the_same_on_another_bus(monkeypatch: pytest.Mon
         return SimpleNamespace(returncode=3)
 
     monkeypatch.setattr(guest, "run", run)
-    assert exact.campaign(["validate", "--bus", "sim", "--quick"], Path("there")) == 3
+    assert processes.run_in_exact_time(["validate", "--bus", "sim", "--quick"], Path("there")) == 3
     [(words, options)] = ran
     assert words[-7:] == ["campaign", "validate", "--bus", "sim", "--quick", "--bus", "sim:vcan0"]
     assert command.parser().parse_args(words[-6:]).bus == "sim:vcan0"
@@ -147,7 +149,7 @@ def test_the_command_in_there_is_the_same_on_another_bus(monkeypatch: pytest.Mon
         (KeyboardInterrupt(), "the same command continues"),
     ],
 )
-def test_without_the_bench_kernel_it_is_one_line(
+def test_a_missing_bench_kernel_is_one_line(
     monkeypatch: pytest.MonkeyPatch, raised: BaseException, words: str
 ) -> None:
     def run(*_: object, **__: object) -> None:
@@ -156,20 +158,20 @@ def test_without_the_bench_kernel_it_is_one_line(
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(guest, "run", run)
     with pytest.raises(ProcessError, match=words):
-        exact.campaign(["validate"], Path("there"))
+        processes.run_in_exact_time(["validate"], Path("there"))
     assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_sigterm_ends_the_guest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guest, "run", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
     with pytest.raises(ProcessError, match="ended by a signal"):
-        exact.campaign(["validate"], Path("there"))
+        processes.run_in_exact_time(["validate"], Path("there"))
 
 
 def test_a_broken_override_of_the_kernel_is_no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JTQD_BENCH_KERNEL", "/nowhere")
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
-    assert not exact.ready()
+    assert not processes.exact_time_ready()
 
 
 @pytest.mark.boots

@@ -1,55 +1,36 @@
-"""Runs of a campaign: what is wrong with one, which are tried again, what ends a campaign, exit status."""
+"""Runs of a campaign: which are repeated, what ends a campaign, exit status, progress."""
 
 import io
-from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import lru_cache
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
-from jtqd.estimator.joint import Joint
-from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.emulated_run import JointCommand, emulate_run
-from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.campaign.processes import Interrupted
 from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
 from jtqd.sysid.campaign.runner import (
     ATTEMPTS,
-    LONGEST_GAP,
     Attempt,
     Outcome,
-    _stopped,
-    ends_early,
-    fill,
-    findings,
-    gap_too_long,
     go_through,
-    partial_runs,
+    stopped,
 )
 from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.commander import Pace
 from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
-from jtqd.sysid.planner.campaigns import plateau_run
 from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Fourier,
     Plan,
-    Plateau,
     Rest,
     Run,
     Segment,
     check_plan,
-    expand,
-    marks_of,
 )
-from jtqd.sysid.runs.logs import LoggedRun
 
-GAP_S = 1e-3 * LONGEST_GAP
 PLAN = Plan("p", DEFAULT_LIMITS, tuple(Run(name, 1, (Rest(1.0),)) for name in ("a", "b", "c")))
 GOOD = Attempt(RunState(DONE, played_s=1.0, rows=1000))
 LIMIT = Attempt(RunState(STOPPED, "joint 1: current 9.1 A, limit 9 A"))
@@ -61,7 +42,7 @@ SIGNAL = Attempt(RunState(STOPPED, "SIGINT"), signalled=True)
 
 
 class Script:
-    """Attempts that a test prescribes, run by run; what was asked for is written down."""
+    """Attempts that a test prescribes, run by run; the runs that were asked for."""
 
     def __init__(self, **attempts: list[Attempt | BaseException]) -> None:
         self._attempts: dict[str, Iterator[Attempt | BaseException]] = {
@@ -109,7 +90,7 @@ def gone(directory: CampaignDirectory, script: Script, **options: bool) -> Outco
         ({"b": [Interrupted()]}, {"keep_going": True}, "ab", ([DONE, "pending", "pending"], 1)),
     ],
 )
-def test_what_is_tried_and_what_becomes_of_it(
+def test_attempts_and_outcome(
     directory: CampaignDirectory,
     attempts: dict[str, list[Attempt | BaseException]],
     options: dict[str, bool],
@@ -145,7 +126,7 @@ OTHER_FINDING = Attempt(RunState(DONE, rows=1000, findings=("j1.torque_nm: found
         ({"b": [SIGNAL]}, "ab", False, [DONE, STOPPED, "pending"]),
     ],
 )
-def test_where_exact_time_can_be_had_nothing_is_tried_again_in_real_time(
+def test_nothing_is_repeated_in_real_time_where_exact_time_can_be_had(
     directory: CampaignDirectory,
     attempts: dict[str, list[Attempt | BaseException]],
     asked: str,
@@ -172,28 +153,6 @@ def fourier_run(name: str = "b", trajectories: int = 2) -> Run:
     return Run(name, 1, tuple(segments))
 
 
-def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
-    run = fourier_run()
-    one, two = partial_runs(run)
-    assert (one.name, two.name) == ("b~1", "b~2")
-    assert one.duration_s + two.duration_s == run.duration_s
-    whole = expand(run)
-    parts = [expand(piece) for piece in (one, two)]
-    for name in ("velocity_rad_s", "current_a"):
-        joined = np.concatenate([getattr(part, name) for part in parts])
-        assert np.array_equal(joined, getattr(whole, name))
-    assert all(part.velocity_rad_s[0] == part.velocity_rad_s[-1] == 0.0 for part in parts)
-
-
-def test_a_ladder_and_a_single_trajectory_are_not_cut() -> None:
-    for run in (
-        plateau_run("r", 2, [(1.2, 1.0), (-1.2, 3.0)], 0.8),
-        fourier_run(trajectories=1),
-        PLAN.runs[0],
-    ):
-        assert partial_runs(run) == (run,)
-
-
 @pytest.mark.parametrize(
     ("attempts", "asked", "status", "pieces"),
     [
@@ -205,7 +164,7 @@ def test_a_ladder_and_a_single_trajectory_are_not_cut() -> None:
         ({"b": [LIMIT]}, ["b"], STOPPED, 1),
     ],
 )
-def test_what_is_lost_is_driven_again_in_pieces(
+def test_a_lost_run_is_repeated_in_partial_runs(
     tmp_path: Path,
     attempts: dict[str, list[Attempt | BaseException]],
     asked: list[str],
@@ -229,13 +188,13 @@ def test_what_is_lost_is_driven_again_in_pieces(
                 (tmp_path / f"{table}{ending}").write_text("x")
         again = CampaignDirectory(tmp_path)
         again.begin(plan, {})
-        assert again.runs["b"].status == DONE, "the pieces are its files"
+        assert again.runs["b"].status == DONE, "the partial runs are its files"
         again.close()
     if "b~1" in attempts:
         assert state.reason.startswith("b~1: ")
 
 
-def test_a_campaign_that_was_short_of_time_is_told_apart() -> None:
+def test_a_campaign_that_was_short_of_time() -> None:
     assert Outcome({"a": LATE.state}).short_of_time
     assert Outcome({"a": RunState(FAILED, "b~1: found a gap of 30.0 ms in the log")}).short_of_time
     assert not Outcome({"a": LIMIT.state, "b": GOOD.state}).short_of_time
@@ -251,7 +210,7 @@ def test_only_what_is_not_done_is_played_when_the_command_is_repeated(directory:
     assert script.asked == ["b", "c"]
 
 
-def test_findings_are_told_and_make_the_exit_status_3(directory: CampaignDirectory) -> None:
+def test_findings_make_the_exit_status_3(directory: CampaignDirectory) -> None:
     dead = Attempt(RunState(DONE, rows=9, missed=4, incomplete=2, findings=("j1.torque_nm: dead channel",)))
     outcome = gone(directory, Script(b=[dead]))
     assert outcome.exit_status == 3
@@ -265,7 +224,7 @@ def test_findings_are_told_and_make_the_exit_status_3(directory: CampaignDirecto
 
 
 def late_reasons() -> list[str]:
-    """What the commander itself says when nothing but time was against it."""
+    """Reasons of the commander where SYNC or the machine was late."""
     pace = Pace(Timing(), 0)
     pace.on_sync(1_000_000, 1_000_000)
     lost = pace.watch(40_000_000)
@@ -278,7 +237,7 @@ def late_reasons() -> list[str]:
 
 
 def limit_reasons() -> list[str]:
-    """What the monitor says of every limit."""
+    """Reasons of the monitor, of every limit."""
     fine = JointSample(0.0, 0.0, 0.0, 20.0)
     monitor = Monitor(Limits(1.0, 1.0, 1.0, 1.0, 30.0))
     samples = [
@@ -295,30 +254,22 @@ def limit_reasons() -> list[str]:
 
 def test_a_late_bus_is_tried_again_and_a_limit_never() -> None:
     for reason in late_reasons():
-        assert _stopped(MotionResult("stopped", reason, 1.0)).again, reason
+        assert stopped(MotionResult("stopped", reason, 1.0)).again, reason
     for reason in [*limit_reasons(), "joint 1: fault (statusword 0218h)", "SIGINT", "SIGTERM"]:
-        assert not _stopped(MotionResult("stopped", reason, 1.0)).again, reason
-    assert _stopped(MotionResult("stopped", "SIGTERM", 1.0)).signalled
-    assert not _stopped(MotionResult("stopped", limit_reasons()[0], 1.0)).signalled
+        assert not stopped(MotionResult("stopped", reason, 1.0)).again, reason
+    assert stopped(MotionResult("stopped", "SIGTERM", 1.0)).signalled
+    assert not stopped(MotionResult("stopped", limit_reasons()[0], 1.0)).signalled
 
 
-def test_remaining_time_is_motion_plus_what_was_measured_between() -> None:
+def test_remaining_time_is_motion_plus_the_measured_time_between() -> None:
     now = [100.0]
     remaining = Remaining([10.0, 20.0, 30.0], lambda: now[0])
     assert remaining.seconds() == pytest.approx(60.0 + 3 * BETWEEN_RUNS_S)
-    remaining.begin(10.0)
     assert remaining.seconds(4.0) == pytest.approx(56.0 + 3 * BETWEEN_RUNS_S)
-    now[0] += 16.0  # 10 s of motion and 6 s beside it
-    remaining.end()
-    assert remaining.seconds() == pytest.approx(50.0 + 2 * 6.0)
-    remaining.begin(20.0)
-    now[0] += 26.0
-    remaining.end()
-    assert remaining.seconds() == pytest.approx(30.0 + 6.0)
-    remaining.begin(30.0)
-    now[0] += 36.0
-    remaining.end()
-    assert remaining.seconds() == 0.0
+    for motion_s, expected in ((10.0, 50.0 + 2 * 6.0), (20.0, 30.0 + 6.0), (30.0, 0.0)):
+        now[0] += motion_s + 6.0
+        remaining.end(motion_s)
+        assert remaining.seconds() == pytest.approx(expected)
 
 
 def test_clock_text() -> None:
@@ -328,7 +279,7 @@ def test_clock_text() -> None:
 def reported(terminal: bool, state: RunState) -> str:
     console = Console(file=io.StringIO(), force_terminal=terminal, width=120)
     with Reporter([2.0], 1, 0, console) as reporter:
-        reporter.begin("one", 2.0)
+        reporter.begin("one")
         reporter.on_progress(1.0, 2.0)
         reporter.end("one", 2.0, state)
     assert isinstance(console.file, io.StringIO)
@@ -347,219 +298,3 @@ def test_a_bar_on_a_terminal_and_lines_elsewhere(capsys: pytest.CaptureFixture[s
         "jtq campaign: run 1 of 1: one: done, 7 rows, 0 cycles missing",
         "jtq campaign: one: [dead] channel",
     ]
-
-
-def test_marks_say_which_segment_was_when() -> None:
-    run = Run("r", 2, (Plateau(1.0, 2.0, 0.5, 0.25), Rest(0.5)))
-    plan = Plan("p", DEFAULT_LIMITS, (run,))
-    marks = marks_of(run, check_plan(plan)["r"])
-    assert (marks["run"], marks["velocity_joint"]) == ("r", 2)
-    assert [segment["kind"] for segment in marks["segments"]] == ["ramp", "plateau", "ramp", "rest"]
-    assert marks["segments"][1] == {
-        "kind": "plateau",
-        "start_s": 0.25,
-        "end_s": 0.75,
-        "velocity_joint": 2,
-        "velocity_rad_s": 1.0,
-        "current_a": 2.0,
-    }
-    assert np.isclose(marks["segments"][-1]["end_s"], run.duration_s)
-
-
-Change = Callable[[dict[int, JointColumns]], None]
-
-
-@lru_cache
-def good_run() -> tuple[RunTable, Setpoints, tuple[Joint, Joint]]:
-    """Joint 2 drives over three points, both directions; as measured on the emulated bench."""
-    points = expand(plateau_run("r", 2, [(1.2, 1.0), (1.2, 3.0), (-1.2, -3.0)], 0.8))
-    last = len(points) - 1
-    current = JointCommand.current(lambda t: float(points.current_a[min(round(t * 1e3), last)]))
-    velocity = JointCommand.velocity(lambda t: float(points.velocity_rad_s[min(round(t * 1e3), last)]))
-    table = emulate_run(load_plant(shipped("plant.yaml")), (current, velocity), points.duration_s, seed=2)
-    return table, points, (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
-
-
-def logged(table: RunTable) -> LoggedRun:
-    gap = float(np.diff(table.time_s).max())
-    return LoggedRun(table, missed=0, incomplete=0, incomplete_by={}, longest_gap_s=gap)
-
-
-def found(change: Change | None = None) -> tuple[str, ...]:
-    table, points, joints = good_run()
-    columns = dict(table.joints)
-    if change is not None:
-        change(columns)
-    return findings(logged(RunTable(table.time_s, columns)), points, joints, measured=(1, 2))
-
-
-def torque(change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    """The same change of the sensor as both joints have it."""
-
-    def both(columns: dict[int, JointColumns]) -> None:
-        for number in (1, 2):
-            values = columns[number].torque_nm
-            assert values is not None
-            columns[number] = replace(columns[number], torque_nm=change(np.array(values)))
-
-    return both
-
-
-def one(number: int, name: str, change: Callable[[np.ndarray], np.ndarray]) -> Change:
-    def joint(columns: dict[int, JointColumns]) -> None:
-        values = np.array(getattr(columns[number], name))
-        columns[number] = replace(columns[number], **{name: change(values)})
-
-    return joint
-
-
-def held(values: np.ndarray) -> np.ndarray:
-    values[1200:2600] = values[1200]
-    return values
-
-
-def without_sensor(columns: dict[int, JointColumns]) -> None:
-    for number in (1, 2):
-        columns[number] = replace(columns[number], torque_nm=None)
-
-
-def test_a_good_run_has_nothing_to_say() -> None:
-    assert found() == ()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (without_sensor, ["j1.torque_nm", "no value in the whole run"]),
-        (torque(lambda x: 0.0 * x), ["torque_nm", "exactly zero", "dead channel"]),
-        (torque(held), ["torque_nm", "stuck"]),
-        (torque(lambda x: np.clip(x, -8.0, 8.0)), ["torque_nm", "saturated"]),
-        (torque(lambda x: -x), ["torque_nm", "swapped sign"]),
-        (one(1, "current_a", lambda x: -x), ["j1.current_a", "opposite sign"]),
-        (one(1, "current_a", lambda x: 0.7 * x), ["j1.current_a", "off the set-point"]),
-        (one(2, "motor_velocity_rad_s", lambda x: 0.8 * x), ["j2.motor_velocity_rad_s", "off the set-point"]),
-        (one(2, "motor_velocity_rad_s", lambda x: -x), ["j2.motor_velocity_rad_s", "opposite sign"]),
-        (one(1, "link_position_rad", lambda x: -x), ["j1.link_position_rad", "swapped sign"]),
-        (one(2, "link_position_rad", lambda x: 1.03 * x), ["j2", "gear ratio"]),
-        (one(2, "link_position_rad", lambda x: -x), ["j2.link_position_rad", "expected -1"]),
-    ],
-)
-def test_every_fault_is_named(change: Change, words: list[str]) -> None:
-    lines = found(change)
-    assert all(len(line.splitlines()) == 1 for line in lines)
-    assert any(all(word in line for word in words) for line in lines), lines
-
-
-def one_encoder(columns: dict[int, JointColumns]) -> None:
-    for number, each in columns.items():
-        columns[number] = replace(each, link_position_rad=None)
-
-
-def test_joints_with_one_encoder_are_judged_by_it() -> None:
-    """The motors' positions through the gears say how the links turn."""
-    assert found(one_encoder) == ()
-
-    def turned(columns: dict[int, JointColumns]) -> None:
-        one_encoder(columns)
-        two = columns[2].motor_position_rad
-        assert two is not None
-        columns[2] = replace(columns[2], motor_position_rad=1.05 * two)
-
-    assert any(
-        "j2.motor_position_rad: through the gear found it turning -1.049 times" in each
-        for each in found(turned)
-    )
-
-
-def test_a_bench_without_a_sensor_is_not_reproached_for_it() -> None:
-    table, points, joints = good_run()
-    columns = dict(table.joints)
-    without_sensor(columns)
-    assert findings(logged(RunTable(table.time_s, columns)), points, joints, measured=()) == ()
-
-
-def test_missing_cycles_are_named_above_one_percent_only() -> None:
-    table, points, joints = good_run()
-    run = logged(table)
-    few = replace(run, missed=20, incomplete=10, incomplete_by={"joint 1": 10, "sensor": 0})
-    assert findings(few, points, joints, measured=(1, 2)) == ()
-    many = replace(run, missed=50, incomplete=10, incomplete_by={"joint 1": 10, "sensor": 0})
-    (line,) = findings(many, points, joints, measured=(1, 2))
-    for word in ("50 without a cycle", "10 incomplete: joint 1 10", "at most 1%"):
-        assert word in line
-
-
-def test_lost_cycles_do_not_make_a_motion_look_wrong() -> None:
-    """Rows are compared with the set-point of their own time, not of their number."""
-    table, points, joints = good_run()
-    keep = np.random.default_rng(1).random(len(table.time_s)) > 0.3
-    columns = {
-        number: JointColumns(
-            **{
-                name: None if getattr(joint, name) is None else getattr(joint, name)[keep]
-                for name in joint.__slots__
-            }
-        )
-        for number, joint in table.joints.items()
-    }
-    assert findings(logged(RunTable(table.time_s[keep], columns)), points, joints, measured=(1, 2)) == ()
-
-
-def with_gaps(*gaps: tuple[int, int]) -> LoggedRun:
-    """A good run without the rows [first, first + count) of each gap."""
-    table, _, _ = good_run()
-    keep = np.ones(len(table.time_s), bool)
-    for first, count in gaps:
-        keep[first : first + count] = False
-    columns = {
-        number: JointColumns(
-            **{
-                name: None if getattr(joint, name) is None else getattr(joint, name)[keep]
-                for name in joint.__slots__
-            }
-        )
-        for number, joint in table.joints.items()
-    }
-    return logged(RunTable(table.time_s[keep], columns))
-
-
-def test_a_gap_is_interpolated_and_counted() -> None:
-    table, _, _ = good_run()
-    whole, made = fill(with_gaps((1000, 15), (2000, 5)), GAP_S)
-    assert made == 15, "a short gap is left to the readers"
-    assert gap_too_long(whole, GAP_S) is None
-    time_s = np.asarray(whole.table.time_s)
-    assert np.abs(np.diff(time_s)[990:1020] - 1e-3).max() < 1e-9
-    place = slice(1000, 1015)
-    for name, worst in (("motor_position_rad", 0.05), ("link_position_rad", 1e-3), ("current_a", 0.5)):
-        found = np.asarray(getattr(whole.table.joints[2], name))[place]
-        assert np.abs(found - np.asarray(getattr(table.joints[2], name))[place]).max() < worst
-
-
-@pytest.mark.parametrize("gaps", [((1000, 60),), ((1000, 45), (3000, 45)), ()], ids=["long", "many", "none"])
-def test_what_is_too_long_or_too_much_is_not_interpolated(gaps: tuple[tuple[int, int], ...]) -> None:
-    run = with_gaps(*gaps)
-    assert fill(run, GAP_S) == (run, 0)
-    assert (gap_too_long(run, GAP_S) is None) == (not gaps)
-
-
-def test_a_log_that_lost_the_end_of_the_motion_is_not_kept() -> None:
-    table, points, _ = good_run()
-    assert ends_early(logged(table), points) is None
-    keep = table.time_s < points.duration_s - 0.2
-    joints = {n: JointColumns(current_a=columns.current_a[keep]) for n, columns in table.joints.items()}  # type: ignore[index]
-    why = ends_early(logged(RunTable(table.time_s[keep], joints)), points)
-    assert why is not None
-    assert "found the last row of the log at" in why
-
-
-def test_a_gap_that_readers_refuse_makes_a_run_gap_too_long() -> None:
-    table, _, _ = good_run()
-    assert gap_too_long(logged(table), GAP_S) is None
-    assert gap_too_long(replace(logged(table), longest_gap_s=0.009), GAP_S) is None
-    shifted = np.array(table.time_s)
-    shifted[1000:] += 0.024
-    why = gap_too_long(logged(RunTable(shifted, table.joints)), GAP_S)
-    assert why is not None
-    assert "25.0 ms" in why
-    assert "at 0.999 s" in why
