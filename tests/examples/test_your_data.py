@@ -111,7 +111,7 @@ def test_the_rig_is_found_as_it_is(place: Path) -> None:
         assert values[key]["file_value"] == before
         assert values[key]["change"] == pytest.approx(values[key]["value"] / before - 1.0)
     assert len(found["causes"]) == 2
-    assert any("2 pieces of one recording" in note for note in found["channel_notes"])
+    assert any("2 segments of one recording" in note for note in found["channel_notes"])
     assert any("taken as true" in note for note in found["channel_notes"])
 
 
