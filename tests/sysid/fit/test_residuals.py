@@ -99,13 +99,8 @@ def test_the_error_of_the_fused_value_is_that_of_fused_paths_less_the_sensor() -
     section = replace(fused(), loss=smooth_loss(), torsion=STIFF)
     parts = path_residuals(run, section.loss, section.torsion)
     one, sensor = fused_errors(parts, section), run.sensor_nm
-    value, spread = Fusion(replace(section.sigma, reference_nm=0.0), True).fuse_many(
-        parts.raw_nm,
-        parts.raw_nm - sensor - parts.current_error_nm,
-        parts.half_nm,
-        parts.velocity_rad_s,
-        parts.torsion_nm,
-        parts.open_nm,
+    _, value, spread, _ = Fusion(replace(section.sigma, reference_nm=0.0), True).fuse(
+        *parts.fusion_inputs, loss_nm=parts.raw_nm - sensor - parts.current_error_nm
     )
     assert one.error_nm == pytest.approx(value - sensor, abs=1e-9)
     assert one.spread_nm == pytest.approx(spread, rel=1e-9)
