@@ -17,7 +17,7 @@ from jtqd.estimator.observer cimport (
 from jtqd.estimator.perceptron cimport PerceptronLaw
 from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
 from jtqd.estimator.uncertainty cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
-from jtqd.estimator.path_difference cimport ZerosLaw, ZerosState
+from jtqd.estimator.path_difference cimport OffsetLaw, OffsetState
 
 cdef struct NetworkLaw:
     bint used
@@ -50,7 +50,7 @@ cdef struct FusedLaw:
     FusedTrustLaw trust
     bint with_envelope  # trust is set, of the network or of the joint file
     NetworkLaw network
-    ZerosLaw zeros
+    OffsetLaw offsets
     AgreementLaw agreement
     LinkLaw link
     bint tracked  # the link: variances of what is quicker than the motor path
@@ -64,19 +64,19 @@ cdef struct FusedState:
     FusedObserverState observer
     double temperature, thermal
     double half
-    double lowered_s  # for how long the status still is, after the paths disagreed
-    ZerosState zeros
+    double degraded_s  # for how long the status still is, after the paths disagreed
+    OffsetState offsets
     AgreementState agreement
     LinkState link
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law
     cdef FusedState state
-    cdef void learn(
+    cdef void update_path_difference(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil
-    cdef bint left_behind(self) noexcept nogil
-    cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil
+    cdef bint offset_pending(self) noexcept nogil
+    cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil
     cdef double half_interval(
         self, const FusedObserved *seen, const Fused *physics, double half, double more, double sigma
     ) noexcept nogil

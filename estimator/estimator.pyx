@@ -15,15 +15,15 @@ from libc.string cimport memcmp
 
 from jtqd.estimator.path_difference cimport (
     TURN_WAVES,
-    doubt_of,
+    mismatch_variance,
     fill_agreement,
-    follow_agreement,
-    follow_turn,
-    lowers,
+    update_agreement,
+    update_turn,
+    degrades,
     pause_turn,
     restart_agreement,
-    turns_otherwise,
-    unsettle_turn,
+    turn_differs,
+    restart_turn,
 )
 from jtqd.estimator.block cimport copied, put_back
 from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
@@ -71,18 +71,18 @@ from jtqd.estimator.uncertainty cimport (
     trust,
 )
 from jtqd.estimator.path_difference cimport (
-    beyond,
-    completes,
+    implausible,
+    gather,
     drop_block,
     early_factor,
-    fill_zeros,
+    fill_offsets,
     known_nm2,
-    left_behind_nm,
+    uncorrected_torque,
     local_stiffness,
-    restart_zeros,
-    tell_zeros,
-    update_zeros,
-    zeros_of,
+    restart_offsets,
+    report_offsets,
+    update_offsets,
+    offsets_of,
 )
 
 from math import nan
@@ -107,7 +107,7 @@ Of a joint file with section `fused.standstill` only of what the disagreement of
 """
 
 LOWERED_S: Final = 0.1
-"""So long the status stays lowered after the two paths have disagreed: it must not flicker."""
+"""So long the status stays degraded after the two paths have disagreed: it must not flicker."""
 
 SLOPE_NM: Final = 0.5
 """Step of the motor torque over which the slope of the loss is taken."""
@@ -283,16 +283,16 @@ cdef class FusedEstimator(Estimator):
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
         per_ampere = joint.gear_ratio * joint.torque_constant_nm_per_a
-        watched = fused.agreement is not None
+        estimated = fused.agreement is not None
         self.law.tracked = self.law.observer.tracking > 0.0
         if self.law.tracked:
             self.law.tracking_noise = fused.tracking.sigma_nm**2
             self.law.tracking_viscous = fused.tracking.viscous_nms_per_rad**2
             self.law.tracking_bend = fused.tracking.bend
-        fill_zeros(&self.law.zeros, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, watched)
+        fill_offsets(&self.law.offsets, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, estimated)
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
-        physics_scale = fused.zeros.scale if self.law.zeros.spread > 0.0 else fused.sigma.scale
+        physics_scale = fused.zeros.scale if self.law.offsets.spread > 0.0 else fused.sigma.scale
         network_scale = physics_scale if network is None else network.sigma_scale
         for k in range(4):
             self.law.physics_scale[k], self.law.network_scale[k] = physics_scale[k], network_scale[k]
@@ -319,22 +319,22 @@ cdef class FusedEstimator(Estimator):
     def reset(self):
         """Forget the past: the next step starts."""
         restart_guard(&self.state.guard)
-        self.state.half = self.state.lowered_s = 0.0
-        restart_zeros(&self.law.zeros, &self.state.zeros)
+        self.state.half = self.state.degraded_s = 0.0
+        restart_offsets(&self.law.offsets, &self.state.offsets)
         restart_agreement(&self.state.agreement)
         restart_link(&self.state.link)
 
     @property
     def zeros(self):
         """What is known of the joint's zeros (`Zeros`); None where they are not tracked."""
-        return zeros_of(&self.law.zeros, &self.state.zeros) if self.law.zeros.used else None
+        return offsets_of(&self.law.offsets, &self.state.offsets) if self.law.offsets.corrected else None
 
     cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
-        """As `Estimator.learned`; whether the two views disagree is told in any case."""
-        tell_zeros(&self.law.zeros, &self.state.zeros, out)
-        if self.state.lowered_s > 0.0:
+        """As `Estimator.learned`; whether the two views disagree is report in any case."""
+        report_offsets(&self.law.offsets, &self.state.offsets, out)
+        if self.state.degraded_s > 0.0:
             out.flags |= IS_APART
-        if self.left_behind():
+        if self.offset_pending():
             out.flags |= IS_LEFT
         size[0] = sizeof(FusedState)
         return &self.state
@@ -357,8 +357,8 @@ cdef class FusedEstimator(Estimator):
         That is the observer with its torsion, the losses, and the torque per ampere. Limits, sigmas and networks may differ.
         """
         return (
-            self.law.zeros.used == other.law.zeros.used
-            and self.law.zeros.torque_per_ampere == other.law.zeros.torque_per_ampere
+            self.law.offsets.corrected == other.law.offsets.corrected
+            and self.law.offsets.torque_per_ampere == other.law.offsets.torque_per_ampere
             and memcmp(&self.law.observer, &other.law.observer, sizeof(FusedObserverLaw)) == 0
             and memcmp(&self.law.loss, &other.law.loss, sizeof(AdditiveLaw)) == 0
         )
@@ -368,10 +368,10 @@ cdef class FusedEstimator(Estimator):
         cdef FusedObserved seen
         cdef LinkSeen link
         cdef Sample corrected
-        if self.law.zeros.used:
+        if self.law.offsets.corrected:
             corrected = x[0]
-            corrected.link_position_rad -= self.state.zeros.link_rad
-            corrected.current_a -= self.state.zeros.current_a
+            corrected.link_position_rad -= self.state.offsets.link_rad
+            corrected.current_a -= self.state.offsets.current_a
             x = &corrected
         self.observed = observe_fused(
             &self.law.guard, &self.state.guard, &self.law.observer, &self.state.observer, x, &seen
@@ -391,68 +391,68 @@ cdef class FusedEstimator(Estimator):
             self.estimate(&seen, x, network_wanted, out)
         else:
             self.state.half = 0.0
-            drop_block(&self.state.zeros)
-            unsettle_turn(&self.state.agreement)
+            drop_block(&self.state.offsets)
+            restart_turn(&self.state.agreement)
             restart_link(&self.state.link)
 
-    cdef void learn(
+    cdef void update_path_difference(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil:
         """Take a sample into what the difference of the two views tells: the zeros, and whether the joint is that of its file."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm, dt, innovation
-        cdef double noise = physics.variance - law.zeros.spread_nm  # the day's zero is a state, no noise
+        cdef double noise = physics.variance - law.offsets.spread_nm  # the day's zero is a state, no noise
         cdef Loss next
         cdef double wave[TURN_WAVES]
-        if law.agreement.turned:
+        if law.agreement.with_turn:
             if status == VALID:
                 wave[0], wave[1], wave[2] = seen.cos1, seen.sin1, seen.cos2
                 wave[3], wave[4], wave[5] = seen.sin2, seen.cos4, seen.sin4
-                follow_turn(&law.agreement, &s.agreement, x.dt_s, physics.apart, seen.direction, v, loss, wave)
+                update_turn(&law.agreement, &s.agreement, x.dt_s, physics.difference, seen.direction, v, loss, wave)
             else:
                 pause_turn(&s.agreement)
         if status != VALID:
-            drop_block(&s.zeros)
-        elif completes(&s.zeros, x.dt_s, physics.apart, seen.direction, v, seen.torsion_nm, noise):
-            dt = s.zeros.block.dt
+            drop_block(&s.offsets)
+        elif gather(&s.offsets, x.dt_s, physics.difference, seen.direction, v, seen.torsion_nm, noise):
+            dt = s.offsets.block.dt
             next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
-            innovation = update_zeros(
-                &law.zeros, &s.zeros, local_stiffness(&law.observer, s.observer.d), (next.nm - loss) / STEP
+            innovation = update_offsets(
+                &law.offsets, &s.offsets, local_stiffness(&law.observer, s.observer.d), (next.nm - loss) / STEP
             )
             if law.agreement.used:
-                follow_agreement(
+                update_agreement(
                     &law.agreement,
                     &s.agreement,
                     innovation,
                     dt,
-                    s.zeros.x[4],
-                    s.zeros.p[4][4],
-                    left_behind_nm(&law.zeros, &s.zeros),
+                    s.offsets.x[4],
+                    s.offsets.p[4][4],
+                    uncorrected_torque(&law.offsets, &s.offsets),
                 )
 
-    cdef bint foreign(self, const Fused *physics, double dt) noexcept nogil:
+    cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil:
         """Return whether the two paths are not of this joint file: they disagree, or the link's zero is impossible."""
         cdef FusedState *s = &self.state
-        if fabs(physics.apart) > FOREIGN * sqrt(physics.variance) or turns_otherwise(&self.law.agreement, &s.agreement):
-            s.lowered_s = LOWERED
-        elif s.lowered_s > 0.0:
-            s.lowered_s -= dt
-        if s.lowered_s > 0.0:
+        if fabs(physics.difference) > FOREIGN * sqrt(physics.variance) or turn_differs(&self.law.agreement, &s.agreement):
+            s.degraded_s = LOWERED
+        elif s.degraded_s > 0.0:
+            s.degraded_s -= dt
+        if s.degraded_s > 0.0:
             return True
-        return self.left_behind() or (self.law.zeros.used and beyond(&self.law.zeros, &s.zeros))
+        return self.offset_pending() or (self.law.offsets.corrected and implausible(&self.law.offsets, &s.offsets))
 
-    cdef bint left_behind(self) noexcept nogil:
+    cdef bint offset_pending(self) noexcept nogil:
         """Return whether more of a known zero is not yet taken off than the torsion's own sigma can hide."""
-        cdef double left = self.state.zeros.left_nm
-        return self.law.zeros.used and left * left > FOREIGN * FOREIGN * self.law.fusion.torsion
+        cdef double left = self.state.offsets.uncorrected_nm
+        return self.law.offsets.corrected and left * left > FOREIGN * FOREIGN * self.law.fusion.torsion
 
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, weight = 0.0, correction, size, apart, doubt = 0.0, known = 0.0
+        cdef double scale, weight = 0.0, correction, size, difference, mismatch = 0.0, known = 0.0
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics
@@ -462,20 +462,20 @@ cdef class FusedEstimator(Estimator):
         loss = additive_loss(&law.loss, raw, v, s.thermal, seen.direction)
         s.half = fading(loss.half, s.half, x.dt_s)
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
-        lowered = self.foreign(&physics, x.dt_s)
-        if law.zeros.watched:
-            self.learn(seen, x, &physics, loss.nm, out.status)
-        if law.zeros.spread > 0.0:
-            known = known_nm2(&law.zeros, &s.zeros)
+        degraded = self.inconsistent(&physics, x.dt_s)
+        if law.offsets.estimated:
+            self.update_path_difference(seen, x, &physics, loss.nm, out.status)
+        if law.offsets.spread > 0.0:
+            known = known_nm2(&law.offsets, &s.offsets)
             reweigh(&physics, known)
-            physics.sigma *= early_factor(&law.zeros, known)
+            physics.sigma *= early_factor(&law.offsets, known)
         out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
         self.features[3], self.features[4] = seen.cos2, seen.sin2
         self.features[5], self.features[6] = seen.cos4, seen.sin4
         # at rest the current path says little of the torque, and its distance to the torsion nothing of the file
-        apart = 0.0 if out.status == STANDSTILL else self.features[2]
+        difference = 0.0 if out.status == STANDSTILL else self.features[2]
         if law.network.used:
             if network_wanted:
                 correction = (
@@ -484,42 +484,42 @@ cdef class FusedEstimator(Estimator):
                 out.network_nm = out.physics_nm + correction
                 size = fabs(correction)
                 if size <= law.network_limit:  # not so for NaN
-                    weight = fused_trust(&law.trust, v, raw, apart, x.temperature_c)
+                    weight = fused_trust(&law.trust, v, raw, difference, x.temperature_c)
                     if size > law.fade:
                         weight = fmin(weight, (law.network_limit - size) * law.inverse_fade)
                     out.torque_nm += weight * network_share(v) * correction
                     scale += weight * (law.network_scale[quadrant] - scale)
             if weight < 1.0:
-                lowered = True
+                degraded = True
         elif law.with_envelope:
             # at half the weight ends what the fit knows; the same motor torque holds more load when it is back-driven
-            if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, apart, x.temperature_c) < 0.5:
-                lowered = True
+            if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, difference, x.temperature_c) < 0.5:
+                degraded = True
         out.sigma_nm = scale * physics.sigma
-        # a zero that is not taken off counts once: as doubt, where the file has what is usual
-        wider = disagreement(&physics, 0.0 if law.agreement.used else s.zeros.left_nm)
+        # a zero that is not taken off counts once: as mismatch, where the file has what is usual
+        wider = disagreement(&physics, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
         if wider > 0.0:
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
         if law.agreement.used:
-            doubt = doubt_of(&s.agreement, physics.alpha, seen.torsion_nm)
-            if lowers(
+            mismatch = mismatch_variance(&s.agreement, physics.alpha, seen.torsion_nm)
+            if degrades(
                 &law.agreement,
                 &s.agreement,
-                doubt,
+                mismatch,
                 out.sigma_nm,
-                s.zeros.x[4],
-                s.zeros.p[4][4],
+                s.offsets.x[4],
+                s.offsets.p[4][4],
                 physics.alpha,
                 seen.torsion_nm,
             ):
-                s.lowered_s, lowered = LOWERED, True
+                s.degraded_s, degraded = LOWERED, True
             # a zero that was learned from views that disagree is as doubtful as they are
-            doubt += physics.alpha * physics.alpha * fmin(known, s.agreement.doubt)
-            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + doubt)
-        if lowered:
+            mismatch += physics.alpha * physics.alpha * fmin(known, s.agreement.mismatch)
+            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + mismatch)
+        if degraded:
             out.status = DEGRADED
         elif out.status == STANDSTILL:
-            out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider * wider + doubt, out.sigma_nm)
+            out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider * wider + mismatch, out.sigma_nm)
         if law.tracked and out.status != STANDSTILL:  # measured in motion
             out.sigma_nm = sqrt(
                 out.sigma_nm * out.sigma_nm
@@ -553,7 +553,7 @@ cdef class FusedEstimator(Estimator):
         if more > 0.0:
             width = sqrt(width * width + STANDSTILL_WIDTH * STANDSTILL_WIDTH * more)
         # the friction interval is about the current path, not about the value
-        return fmin(friction + fabs(physics.alpha * physics.apart), width)
+        return fmin(friction + fabs(physics.alpha * physics.difference), width)
 
     def run_observed(self, seen):
         """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`.
@@ -561,10 +561,10 @@ cdef class FusedEstimator(Estimator):
         Raises ValueError where zeros are tracked: they act on what is observed, use `run`; and for a run without `turn` where
         the joint file has what the views differ by over the motor's turn.
         """
-        if self.law.zeros.used:
+        if self.law.offsets.corrected:
             raise ValueError("found an estimator that tracks zeros, expected one without, or a run of samples")
         n = len(seen.raw_nm)
-        if self.law.agreement.turned and len(seen.turn) != n:
+        if self.law.agreement.with_turn and len(seen.turn) != n:
             raise ValueError("found a run without waves of the motor's turn, expected one of `observe_run`")
         values, features, status = np.full((5, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
         turn = seen.turn if len(seen.turn) == n else np.zeros((n, 2))
@@ -583,15 +583,15 @@ cdef class FusedEstimator(Estimator):
         cdef Py_ssize_t k
         cdef int m
         sample = Sample(NAN, NAN, NAN, NAN, NAN, NAN)
-        self.state.half = self.state.lowered_s = 0.0
-        restart_zeros(&self.law.zeros, &self.state.zeros)
+        self.state.half = self.state.degraded_s = 0.0
+        restart_offsets(&self.law.offsets, &self.state.offsets)
         restart_agreement(&self.state.agreement)
         with nogil:
             for k in range(row.shape[0]):
                 if asked[k] != VALID and asked[k] != STANDSTILL:
                     self.state.half = 0.0
-                    drop_block(&self.state.zeros)
-                    unsettle_turn(&self.state.agreement)
+                    drop_block(&self.state.offsets)
+                    restart_turn(&self.state.agreement)
                     continue
                 one.raw_nm, one.joint_velocity_rad_s, one.torsion_nm = row[k, 0], row[k, 1], row[k, 2]
                 one.cos2, one.sin2, one.cos4, one.sin4 = row[k, 3], row[k, 4], row[k, 5], row[k, 6]
@@ -599,8 +599,8 @@ cdef class FusedEstimator(Estimator):
                 one.cos1, one.sin1 = row[k, 10], row[k, 11]
                 sample.dt_s, sample.temperature_c = dt[k], temperature[k]
                 no_values(&out, asked[k])
-                if self.law.zeros.watched:
-                    self.state.observer.d = one.torsion_nm / self.law.zeros.stiffness
+                if self.law.offsets.estimated:
+                    self.state.observer.d = one.torsion_nm / self.law.offsets.stiffness
                 self.estimate(&one, &sample, True, &out)
                 to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
                 to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm
@@ -694,7 +694,7 @@ cdef class ExtendedEstimator(Estimator):
         return getattr(self.inner, "zeros", None)
 
     cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
-        """As that of the inner estimator: the corrections forget within a second, and are not told."""
+        """As that of the inner estimator: the corrections forget within a second, and are not report."""
         return self.inner.learned(out, size)
 
     def reset(self):

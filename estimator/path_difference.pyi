@@ -7,8 +7,8 @@ MOVING_RAD_S: Final[float]
 ONE_WAY: Final[float]
 BLOCK: Final[int]
 CORRELATION_S: Final[float]
-DOUBT: Final[float]
-SURE: Final[float]
+SHRUNK_BELOW: Final[float]
+KEPT_ABOVE: Final[float]
 COVERED: Final[float]
 SLEW_S: Final[float]
 LARGEST_LINK: Final[float]
@@ -38,18 +38,18 @@ def levels(
     fused: Fused,
     rated_nm: float,
     dt_s: FloatArray,
-    apart_nm: FloatArray,
+    difference_nm: FloatArray,
     direction: FloatArray,
     velocity_rad_s: FloatArray,
     torsion_nm: FloatArray,
     variance_nm2: FloatArray,
     slope: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]: ...
-def followed(
+def track_run(
     fused: Fused,
     rated_nm: float,
     dt_s: FloatArray,
-    apart_nm: FloatArray,
+    difference_nm: FloatArray,
     direction: FloatArray,
     velocity_rad_s: FloatArray,
     torsion_nm: FloatArray,
@@ -61,7 +61,7 @@ def followed(
 def turn_waves(
     turn: Turn,
     dt_s: FloatArray,
-    apart_nm: FloatArray,
+    difference_nm: FloatArray,
     direction: FloatArray,
     velocity_rad_s: FloatArray,
     loss_nm: FloatArray,

@@ -48,7 +48,7 @@ cdef struct FusionLaw:
 
 cdef struct Fused:
     double alpha, value, sigma
-    double apart, variance  # torsion less current, and its variance; 0 and 1 without torsion
+    double difference, variance  # torsion less current, and its variance; 0 and 1 without torsion
 
 cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1
 cdef double network_share(double velocity) noexcept nogil

@@ -167,7 +167,7 @@ cdef void reweigh(Fused *fused, double known) noexcept nogil:
     cdef double c = fused.alpha * fused.variance, t = fused.variance - c, alpha
     t = fmax(t - known, LEAST * t)
     alpha = c / (c + t)
-    fused.value += (alpha - fused.alpha) * fused.apart
+    fused.value += (alpha - fused.alpha) * fused.difference
     fused.alpha, fused.sigma = alpha, sqrt(alpha * t)
 
 
@@ -190,7 +190,7 @@ cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nog
 
     Both are errors of a known size, not of a known variance: the 90 % interval, not sigma, is to hold them.
     """
-    cdef double more = fabs(fused.apart) - DISAGREE * sqrt(fused.variance)
+    cdef double more = fabs(fused.difference) - DISAGREE * sqrt(fused.variance)
     cdef double offset = fused.alpha * uncorrected_nm
     if more > 0.0:
         more *= fmax(fused.alpha, 1.0 - fused.alpha)

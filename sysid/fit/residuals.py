@@ -21,7 +21,7 @@ from jtqd.estimator.estimator import SLOPE_NM, quadrants
 from jtqd.estimator.joint import AdditiveLoss, Fused, Torsion
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.path_difference import followed
+from jtqd.estimator.path_difference import track_run
 from jtqd.estimator.uncertainty import DISAGREE_SIGMAS, GAUSS, Fusion, faded
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import (
@@ -153,7 +153,7 @@ def fused_errors(
     torsion, current, known, doubt, gain = np.zeros((5, len(run.raw_nm)))
     early = np.ones(len(run.raw_nm))
     if rated_nm is not None and fused.torsion is not None and len(run.dt_s):
-        torsion, current, known, doubt, gain, early = followed(
+        torsion, current, known, doubt, gain, early = track_run(
             fused,
             rated_nm,
             run.dt_s,

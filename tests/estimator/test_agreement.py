@@ -15,7 +15,7 @@ from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
 from jtqd.estimator.joint import Agreement, Joint
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.path_difference import DOWN_S, followed, levels
+from jtqd.estimator.path_difference import DOWN_S, levels, track_run
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.uncertainty import Fusion, faded
@@ -198,7 +198,7 @@ def test_of_a_gain_only_what_is_beyond_its_own_standard_deviations_is_doubt() ->
     found = []
     for sigmas in (0.0, 0.5, 1.0, 10.0):
         of_file = replace(fused, agreement=replace(loud, gain_sigmas=sigmas))
-        *_, doubt, _ = followed(of_file, USUAL.rated_torque_nm, *signals, K * one, False)
+        *_, doubt, _ = track_run(of_file, USUAL.rated_torque_nm, *signals, K * one, False)
         gain = levels(of_file, USUAL.rated_torque_nm, *signals)[2][-1]
         assert doubt[-1] == pytest.approx(loud.gain_factor * max(gain - 0.002, 0.0), rel=1e-9)
         found.append(gain)
@@ -216,7 +216,7 @@ def test_a_zero_that_is_not_taken_off_counts_by_its_factor() -> None:
     signals = (1e-3 * one, -2.0 * one, np.sign(v), v, 5.0 * np.sin(v), 0.3 * one, 0.0 * one, K * one)
     loud = replace(AGREEMENT, slow_nm=20.0, fast_nm=20.0, gain=1.0)
     doubts = [
-        followed(
+        track_run(
             replace(fused, agreement=replace(loud, zero_factor=factor)),
             USUAL.rated_torque_nm,
             *signals,

@@ -12,7 +12,7 @@ from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
 from jtqd.estimator.joint import DayZeros, Joint
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.path_difference import followed, levels
+from jtqd.estimator.path_difference import levels, track_run
 from jtqd.estimator.uncertainty import Fusion, faded
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
@@ -79,7 +79,7 @@ def test_an_encoder_that_slips_makes_sigma_as_wide_as_the_file_s_again() -> None
 
 
 def test_fits_see_what_the_loop_does() -> None:
-    """`followed` and `levels` of the signals of a run: zeros, what is known of them, and what doubt adds of both."""
+    """`track_run` and `levels` of the signals of a run: zeros, what is known of them, and what doubt adds of both."""
     columns, _ = driven(8.0, link_zero_rad=4e-5)
     dt, _, motor, _, link, temperature = columns
     wavy = link + 0.5 * (WAVIER(np.cumsum(dt), motor / 100.0, link) - link)
@@ -97,7 +97,7 @@ def test_fits_see_what_the_loop_does() -> None:
     parts = (raw, faded(half, half_dt, np.ones(len(raw), bool)), v, torsion, open_nm)
     fusion = Fusion(both.fused.sigma, True)
     signals = (half_dt, torsion - (raw - loss), s, v, torsion, fusion.fuse(*parts).variance_nm2, slope)
-    taken, _, known, *_ = followed(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
+    taken, _, known, *_ = track_run(both.fused, both.rated_torque_nm, *signals, np.full(len(raw), K))
     slow, fast, gain, left, _ = (each[-1] for each in levels(both.fused, both.rated_torque_nm, *signals))
 
     plain, zeros = tracked(columns, LEARNING)
@@ -121,7 +121,7 @@ def test_what_is_not_yet_taken_off_is_not_known() -> None:
     v = 1.2 * np.sin(2.5e-3 * np.arange(n) + 0.4)
     one, zero_nm = np.ones(n), 12.0
     assert LEARNING.fused is not None
-    taken, _, known, *_ = followed(
+    taken, _, known, *_ = track_run(
         LEARNING.fused,
         40.0,
         1e-3 * one,
@@ -179,7 +179,7 @@ def test_without_the_key_nothing_is_wider() -> None:
     dt, _, motor, *_ = columns
     on = np.full(len(dt), K)
     v = np.gradient(motor / 100.0, 1e-3)
-    *_, early = followed(
+    *_, early = track_run(
         old.fused, 40.0, dt, 0.1 * on / K, np.sign(v), v, 5.0 * on / K, 0.3 * on / K, 0.0 * on, on
     )
     assert np.array_equal(early, np.ones(len(dt)))
