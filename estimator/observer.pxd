@@ -100,10 +100,6 @@ cdef bint observe_fused(
     FusedObserved *out,
 ) noexcept nogil
 
-cdef class Observer:
-    cdef ObserverLaw law
-    cdef ObserverState state
-
 cdef class FusedObserver:
     cdef FusedObserverLaw law
     cdef FusedObserverState state

@@ -24,30 +24,6 @@ def reference_of(
     sensor_nm: FloatArray, dt_s: FloatArray, bandwidth_rad_s: float, max_gap_s: float = 0.05
 ) -> FloatArray: ...
 
-class ObservedSample(NamedTuple):
-    raw_nm: float
-    tob_nm: float
-    joint_velocity_rad_s: float
-    link_velocity_rad_s: float
-
-class Observer:
-    def __init__(self, joint: Joint, bandwidth_rad_s: float, link_bandwidth_rad_s: float) -> None: ...
-    def start(
-        self,
-        current_a: float,
-        motor_position_rad: float,
-        motor_velocity_rad_s: float,
-        link_position_rad: float,
-    ) -> ObservedSample: ...
-    def step(
-        self,
-        dt_s: float,
-        current_a: float,
-        motor_position_rad: float,
-        motor_velocity_rad_s: float,
-        link_position_rad: float,
-    ) -> ObservedSample: ...
-
 class FusedObservedSample(NamedTuple):
     raw_nm: float
     joint_velocity_rad_s: float

@@ -157,15 +157,6 @@ def reference_of(sensor_nm, dt_s, double bandwidth_rad_s, double max_gap_s=0.05)
 # The paper's observer -------------------------------------------------------------------------------------------------
 
 
-class ObservedSample(NamedTuple):
-    """Outputs of one step of `Observer`; torques [Nm, joint side], velocities [rad/s, joint side]."""
-
-    raw_nm: float
-    tob_nm: float
-    joint_velocity_rad_s: float
-    link_velocity_rad_s: float
-
-
 cdef void _start(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
     """Set the states of a joint that has always moved at this speed, without acceleration."""
     cdef double spin = law.inertia_rate * x.motor_velocity_rad_s
@@ -208,41 +199,6 @@ cdef int fill_observer(ObserverLaw *law, joint, double bandwidth, double link_ba
     law.rate, law.link_rate = bandwidth, link_bandwidth
     law.friction = (<FrictionModel>FrictionModel(joint.friction)).law
     return 0
-
-
-cdef class Observer:
-    """The paper's observer of one joint, sample by sample.
-
-        tau_tob = tau_raw - g/(s+g) tau_f                         Eq. (4), tau_f = G f_m [Nm, joint side]
-
-    joint: parameters; bandwidth_rad_s: g; link_bandwidth_rad_s: p of the link velocity.
-    """
-
-    def __init__(self, joint, double bandwidth_rad_s, double link_bandwidth_rad_s):
-        fill_observer(&self.law, joint, bandwidth_rad_s, link_bandwidth_rad_s)
-
-    def start(
-        self, double current_a, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad
-    ):
-        """Set the states of a joint that has always moved at this speed, without acceleration."""
-        cdef Sample x = Sample(0.0, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
-        cdef Observed out
-        _start(&self.law, &self.state, &x, &out)
-        return ObservedSample(out.raw_nm, out.tob_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)
-
-    def step(
-        self,
-        double dt_s,
-        double current_a,
-        double motor_position_rad,
-        double motor_velocity_rad_s,
-        double link_position_rad,
-    ):
-        """Advance by dt_s > 0 to the sample given and return the outputs at that sample."""
-        cdef Sample x = Sample(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
-        cdef Observed out
-        _step(&self.law, &self.state, &x, &out)
-        return ObservedSample(out.raw_nm, out.tob_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)
 
 
 # The observer of method fused -----------------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Iterable
 from dataclasses import replace
 
@@ -12,18 +11,16 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import Torsion
+from jtqd.estimator.estimator import JointEstimator
+from jtqd.estimator.joint import Friction, Torsion
 from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.observer import FusedObservedSample, FusedObserver, Observer, first_order_hold
+from jtqd.estimator.observer import FusedObservedSample, FusedObserver, first_order_hold
+from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.estimator_helpers import joint1
 from tests.estimator.fused_helpers import TORSION, twisted
 
 G, KT, J = 100.0, 0.062, 7e-5
 RATE = 200.0
-
-
-def observer(rate: float = RATE, link_rate: float = 200.0) -> Observer:
-    return Observer(joint1(), rate, link_rate)
 
 
 def test_coefficients() -> None:
@@ -34,57 +31,6 @@ def test_coefficients() -> None:
         if x < 1e-2:  # series: b0 = x/2 - x^2/6, b1 = x/2 - x^2/3
             assert b0 == pytest.approx(x / 2 - x * x / 6, rel=1e-4, abs=3e-16)
             assert b1 == pytest.approx(x / 2 - x * x / 3, rel=1e-4, abs=3e-16)
-
-
-def test_no_start_transient() -> None:
-    """At constant current and speed the first step already gives the final value, whatever the speed."""
-    friction = FrictionModel(joint1().friction)
-    for i, w in ((3.0, 150.0), (-1.0, 300.0), (0.0, 0.0), (2.0, -250.0)):
-        o = observer()
-        first = o.start(i, 0.0, w, 0.4)
-        assert first.raw_nm == pytest.approx(G * KT * i, abs=1e-9)
-        for k in range(1, 200):
-            seen = o.step(0.001, i, 0.0, w, 0.4 + w / G * 0.001 * k)
-            assert seen.raw_nm == pytest.approx(G * KT * i, abs=1e-9)
-            assert seen.tob_nm == pytest.approx(G * KT * i - friction.torque(w / G), abs=1e-9)
-            assert seen.joint_velocity_rad_s == pytest.approx(w / G, abs=1e-12)
-            assert seen.link_velocity_rad_s == pytest.approx(w / G, abs=1e-9)
-
-
-@pytest.mark.parametrize("uneven", [False, True])
-def test_constant_acceleration_is_exact(uneven: bool) -> None:
-    """i = 0, w = alpha t: tau_raw = -G J alpha (1 - exp(-g t)), at every sample, for any steps."""
-    rng = np.random.default_rng(4)
-    alpha = 900.0
-    o = observer()
-    o.start(0.0, 0.0, 0.0, 0.0)
-    t = 0.0
-    for _ in range(300):
-        dt = rng.uniform(1e-5, 8e-3) if uneven else 1e-3
-        t += dt
-        seen = o.step(dt, 0.0, 0.0, alpha * t, 0.0)
-        assert seen.raw_nm == pytest.approx(-G * J * alpha * (1 - math.exp(-RATE * t)), abs=1e-9)
-
-
-@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
-def test_a_ramp_lags_by_exactly_one_over_g(rate: float) -> None:
-    """Group delay at DC is 1/g for torque and velocity alike, uneven steps included."""
-    rng = np.random.default_rng(5)
-    o = observer(rate)
-    o.start(0.0, 0.0, 0.0, 0.0)
-    t, slope = 0.0, 7.0
-    while t < 40.0 / rate:
-        dt = rng.uniform(2e-4, 2e-3)
-        t += dt
-        raw = o.step(dt, slope * t, 0.0, 0.0, 0.0).raw_nm
-    assert t - raw / (G * KT * slope) == pytest.approx(1.0 / rate, rel=1e-9)
-    o.start(0.0, 0.0, 0.0, 0.0)
-    t = 0.0
-    while t < 40.0 / rate:
-        dt = rng.uniform(2e-4, 2e-3)
-        t += dt
-        v = o.step(dt, 0.0, 0.0, slope * t, 0.0).joint_velocity_rad_s
-    assert t - v * G / slope == pytest.approx(1.0 / rate, rel=1e-9)
 
 
 def test_frequency_response_has_the_delay_of_the_analogue_filter() -> None:
@@ -101,58 +47,45 @@ def test_frequency_response_has_the_delay_of_the_analogue_filter() -> None:
         assert delay == pytest.approx(expected, rel=tolerance)
 
 
-def test_uneven_steps_against_an_ode_solver() -> None:
-    """Eq. (4) as written, integrated by an ODE solver between samples of piecewise linear i, w and f_m."""
+def test_equation_4_with_uneven_steps_against_an_ode_solver() -> None:
+    """As written, integrated by an ODE solver between samples of piecewise linear i, w and f_m."""
     rng = np.random.default_rng(6)
-    count = 60
+    count, link_rate = 60, 130.0
     dt = rng.uniform(2e-4, 2e-2, count)
     t = np.cumsum(dt)
     i, w, q = (
         3 * rng.normal(size=count),
-        200 * rng.normal(size=count),
-        np.cumsum(0.01 * rng.normal(size=count)),
+        3 * rng.normal(size=count).cumsum(),
+        0.01 * rng.normal(size=count).cumsum(),
     )
     friction = FrictionModel(joint1().friction)
     f_m = np.array([friction.torque(x / G) for x in w]) / G
-    link_rate = 130.0
-    o = observer(RATE, link_rate)
-    o.start(i[0], 0.0, w[0], q[0])
-    state = np.array([i[0] * KT + J * RATE * w[0] - f_m[0], i[0] * KT + J * RATE * w[0], w[0] / G, w[0] / G])
+    settings = EstimatorSettings(method="tob", bandwidth_rad_s=RATE, link_bandwidth_rad_s=link_rate)
+    run = JointEstimator(joint1(), settings).run(dt, i, np.zeros(count), w, q)
+    state = np.array([i[0] * KT + J * RATE * w[0] - f_m[0], w[0] / G])
     for k in range(1, count):
 
         def rates(s: float, y: FloatArray, k: int = k) -> list[float]:
             share = (s - t[k - 1]) / dt[k]
-            i_s = i[k - 1] + share * (i[k] - i[k - 1])
-            w_s = w[k - 1] + share * (w[k] - w[k - 1])
-            f_s = f_m[k - 1] + share * (f_m[k] - f_m[k - 1])
-            slope = (q[k] - q[k - 1]) / dt[k]
+            now, last = (i[k], w[k], f_m[k]), (i[k - 1], w[k - 1], f_m[k - 1])
+            i_s, w_s, f_s = (a + share * (b - a) for a, b in zip(last, now, strict=True))
             u = i_s * KT + J * RATE * w_s
-            return [
-                RATE * (u - f_s - y[0]),
-                RATE * (u - y[1]),
-                RATE * (w_s / G - y[2]),
-                link_rate * (slope - y[3]),
-            ]
+            return [RATE * (u - f_s - y[0]), link_rate * ((q[k] - q[k - 1]) / dt[k] - y[1])]
 
         state = solve_ivp(rates, (t[k - 1], t[k]), state, rtol=1e-11, atol=1e-12).y[:, -1]
-        seen = o.step(dt[k], i[k], 0.0, w[k], q[k])
-        expected = [
-            (state[1] - J * RATE * w[k]) * G,
-            (state[0] - J * RATE * w[k]) * G,
-            state[2],
-            state[3],
-        ]
-        assert list(seen) == pytest.approx(expected, rel=1e-7, abs=1e-7), k
+        assert run.tob_nm[k] == pytest.approx((state[0] - J * RATE * w[k]) * G, rel=1e-7, abs=1e-7), k
+        assert run.features[k, 4] == pytest.approx(state[1], rel=1e-7, abs=1e-7), k
 
 
-def test_a_long_run_is_fast_enough_for_replay() -> None:
-    """60 000 samples (a minute of bus) in well under a second; generous for a loaded machine."""
-    o = observer()
-    o.start(0.0, 0.0, 0.0, 0.0)
-    began = time.process_time()
-    for _ in range(60_000):
-        o.step(0.001, 1.0, 0.0, 10.0, 0.0)
-    assert time.process_time() - began < 1.0
+@pytest.mark.parametrize("link_rate", [RATE, 37.0])
+def test_both_observers_see_the_same_motor_torque_and_link_velocity(link_rate: float) -> None:
+    m = twisted(5, 1500)
+    found = fused_outputs(fused_observer(TORSION, link_rate), m.rows())
+    free = replace(joint1(), friction=Friction(0.0, 0.0))
+    settings = EstimatorSettings(method="tob", bandwidth_rad_s=RATE, link_bandwidth_rad_s=link_rate)
+    paper = JointEstimator(free, settings).run(*m.arrays())
+    assert np.max(np.abs(column(found, "raw_nm") - paper.tob_nm)[1:]) < 1e-9
+    assert np.max(np.abs(column(found, "link_velocity_rad_s") - paper.features[:, 4])[1:]) < 1e-9
 
 
 PLAIN = Torsion(12000.0, 0.0, 0.0, (2.0, 4.0), (0.0, 0.0), (0.0, 0.0))
@@ -199,6 +132,31 @@ def test_constant_speed_has_no_transient(v: float) -> None:
         assert np.max(np.abs(column(found, name) - expected)) < 1e-9, name
 
 
+@pytest.mark.parametrize("uneven_steps", [False, True])
+def test_constant_acceleration_is_exact(uneven_steps: bool) -> None:
+    """i = 0, w = alpha t: tau_raw = -G J alpha (1 - exp(-g t)), at every sample, for any steps."""
+    dt = np.random.default_rng(4).uniform(1e-5, 8e-3, 300) if uneven_steps else np.full(300, 1e-3)
+    t, alpha = np.cumsum(dt) - dt[0], 900.0
+    rows = zip(dt, 0.0 * t, 0.0 * t, alpha * t, 0.0 * t, strict=True)
+    raw = column(fused_outputs(fused_observer(None), rows), "raw_nm")
+    assert raw == pytest.approx(-G * J * alpha * (1 - np.exp(-RATE * t)), abs=1e-9)
+
+
+@pytest.mark.parametrize("rate", [50.0, 200.0, 1000.0])
+def test_a_ramp_lags_by_exactly_one_over_g(rate: float) -> None:
+    """Group delay at DC is 1/g for torque and velocity alike, uneven steps included."""
+    dt = np.random.default_rng(5).uniform(2e-4, 2e-3, int(40.0 / rate / 1e-3))
+    t, slope, zero = np.cumsum(dt) - dt[0], 7.0, np.zeros(len(dt))
+    for name, unit, inputs in (
+        ("raw_nm", G * KT, (slope * t, zero)),
+        ("joint_velocity_rad_s", 1.0 / G, (zero, slope * t)),
+    ):
+        observer = FusedObserver(joint1(), None, rate, RATE)
+        rows = zip(dt, inputs[0], zero, inputs[1], zero, strict=True)
+        last = column(fused_outputs(observer, rows), name)[-1]
+        assert t[-1] - last / (unit * slope) == pytest.approx(1.0 / rate, rel=1e-6)
+
+
 def test_a_ramp_is_followed_with_a_lag_of_one_over_g() -> None:
     """Current, torsion and speed rise in a straight line; after 0.2 s, e^-40 of the start is left."""
     dt = uneven(400)
@@ -219,17 +177,6 @@ def test_a_ramp_is_followed_with_a_lag_of_one_over_g() -> None:
         ("torsion_nm", 12000.0 * 2e-4 * delayed),
     ):
         assert np.max(np.abs(column(found, name)[old] - expected)) < 1e-9, name
-
-
-def test_torque_and_velocities_are_those_of_the_papers_observer() -> None:
-    for link_rate in (RATE, 37.0):
-        m = twisted(5, 1500)
-        found = fused_outputs(fused_observer(TORSION, link_rate), m.rows())
-        other = Observer(joint1(), RATE, link_rate)
-        first, *rest = m.rows()
-        paper = np.array([other.start(*first[1:]), *(other.step(*row) for row in rest)])
-        for name, k in (("raw_nm", 0), ("joint_velocity_rad_s", 2), ("link_velocity_rad_s", 3)):
-            assert np.max(np.abs(column(found, name) - paper[:, k])) < 1e-9
 
 
 @pytest.mark.parametrize("orders", [(2.0, 4.0), (4.0,), (1.0, 2.0, 2.0, 5.5)])
