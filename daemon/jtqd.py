@@ -16,7 +16,7 @@ from typing import Any
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler installed, also in the first second.
 from jtqd import __version__
 from jtqd.daemon.live.launch import NEEDED, Address, address, installed
-from jtqd.estimator.checked import seconds
+from jtqd.estimator.command_line import command_parser, seconds
 
 _EXAMPLES = """examples:
   jtqd --bus sim --duration 20          emulated bench in its own processes, 20 s, with a live table
@@ -34,11 +34,10 @@ _LONGEST_INTERFACE = 15
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtqd`."""
-    result = argparse.ArgumentParser(
-        prog="jtqd",
-        description="Estimate the torque of one to four harmonic-drive joints, as a CANopen master, without torque sensor.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    result = command_parser(
+        "jtqd",
+        "Estimate the torque of one to four harmonic-drive joints, as a CANopen master, without torque sensor.",
+        _EXAMPLES,
     )
     result.add_argument(
         "--bus", required=True, help="SocketCAN interface, unix:PATH, or sim for the emulated bench"

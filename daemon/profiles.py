@@ -16,8 +16,8 @@ from typing import Annotated, Any, Final
 
 import jtqd.drivers.profiles
 from jtqd.drivers.sdo import Key, label, parse_key
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import read_yaml
 
 STATES: Final = ("by the manual", "by the EDS", "tried on the bus", "not confirmed")

@@ -35,7 +35,7 @@ from typing import Annotated, Any, Final, TypeVar, Union, get_args, get_origin, 
 import msgspec
 from msgspec import inspect
 
-from jtqd.estimator.checked import ConfigError, Verbatim, in_unit, number_as_text, range_text, shown
+from jtqd.estimator.errors import ConfigError, Verbatim, in_unit, number_as_text, range_text, shown
 
 T = TypeVar("T")
 _LARGEST = 1e30

@@ -10,7 +10,8 @@ from pathlib import Path
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.config import load_config
 from jtqd.drivers.bus_load import LIMIT
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.command_line import command_parser
+from jtqd.estimator.errors import ConfigError
 
 _EXAMPLES = """examples:
   jtq bus-load                                  of the shipped bench
@@ -24,11 +25,10 @@ exit status: 0 it fits, 1 it does not or cannot be read, 2 usage"""
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq bus-load`."""
-    result = argparse.ArgumentParser(
-        prog="jtq bus-load",
-        description="Compute the worst-case bus load of a configuration: all PDOs, with the maximum number of stuff bits.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    result = command_parser(
+        "jtq bus-load",
+        "Compute the worst-case bus load of a configuration: all PDOs, with the maximum number of stuff bits.",
+        _EXAMPLES,
     )
     result.add_argument(
         "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"

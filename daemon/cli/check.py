@@ -31,7 +31,8 @@ from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
-from jtqd.estimator.checked import ConfigError, seconds
+from jtqd.estimator.command_line import command_parser, seconds
+from jtqd.estimator.errors import ConfigError
 
 SCHEMA = "jtq.check/1"
 _EXAMPLES = """examples:
@@ -57,11 +58,10 @@ class CheckError(Exception):
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq check`."""
-    result = argparse.ArgumentParser(
-        prog="jtq check",
-        description="Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, with a remedy.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    result = command_parser(
+        "jtq check",
+        "Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, with a remedy.",
+        _EXAMPLES,
     )
     result.add_argument(
         "seconds", type=seconds, nargs="?", default=10.0, metavar="S", help="seconds to measure (default: 10)"

@@ -27,11 +27,10 @@ _BUSES = "grep -lx 280 /sys/class/net/*/type 2>/dev/null | cut -d/ -f5; echo sim
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq completion`."""
-    result = argparse.ArgumentParser(
-        prog="jtq completion",
-        description="Print a completion script for the commands and options of the installed version.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    result = command_parser(
+        "jtq completion",
+        "Print a completion script for the commands and options of the installed version.",
+        _EXAMPLES,
     )
     result.add_argument("shell", choices=SHELLS, help="shell that the script is for")
     result.add_argument(

@@ -12,6 +12,7 @@ from typing import Any
 from jtqd.daemon.cli.running import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
 from jtqd.drivers.bus_socket import reachable
+from jtqd.estimator.command_line import command_parser
 
 _TIMEOUT_S = 10.0
 _EXAMPLES = """examples:
@@ -29,11 +30,8 @@ _DONE = {
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq control`."""
-    result = argparse.ArgumentParser(
-        prog="jtq control",
-        description="Send an order to a running jtqd. Only its own user and root are permitted.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    result = command_parser(
+        "jtq control", "Send an order to a running jtqd. Only its own user and root are permitted.", _EXAMPLES
     )
     result.add_argument("verb", choices=VERBS, help="order")
     result.add_argument("--bus", help="daemon on this bus (default: the only running one)")

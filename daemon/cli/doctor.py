@@ -19,7 +19,8 @@ from jtqd.daemon.cli.machine_checks import (
 )
 from jtqd.daemon.cli.running import find_daemons, places
 from jtqd.daemon.config import load_config
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.command_line import command_parser
+from jtqd.estimator.errors import ConfigError
 
 SCHEMA = "jtq.doctor/1"
 _EXAMPLES = """examples:
@@ -34,12 +35,11 @@ _USUAL_LOGS = Path("/var/log/jtqd")
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq doctor`."""
-    result = argparse.ArgumentParser(
-        prog="jtq doctor",
-        description="Examine whether this machine is suitable for jtqd: GOOD, WARN or FAIL for each item, with a remedy. "
+    result = command_parser(
+        "jtq doctor",
+        "Examine whether this machine is suitable for jtqd: GOOD, WARN or FAIL for each item, with a remedy. "
         "Nothing is changed.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     result.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
     result.add_argument(

@@ -36,7 +36,8 @@ from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.command_line import command_parser
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.text import counted
 
 MAX_JOINTS = 4
@@ -56,11 +57,10 @@ exit status: 0 the files are there and jtqd can use them, 1 failure, 2 usage or 
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq init`."""
-    made = argparse.ArgumentParser(
-        prog="jtq init",
-        description="Write a first configuration and joint files that run at once, and list the guesses in them.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = command_parser(
+        "jtq init",
+        "Write a first configuration and joint files that run at once, and list the guesses in them.",
+        _EXAMPLES,
     )
     made.add_argument("--bus", metavar="BUS", help="look at the devices on this bus: can0, or unix:PATH")
     made.add_argument(

@@ -32,7 +32,7 @@ from jtqd.daemon.shared.runtime_dir import installed
 from jtqd.drivers.bus_load import BusLoadError, check_bus_load
 from jtqd.drivers.bus_socket import AF_CAN, CAN_RAW
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.text import percent, size
 

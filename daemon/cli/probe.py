@@ -39,6 +39,7 @@ from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.sdo import Key, label
 from jtqd.drivers.sensor import SENSOR_SCALING_OBJECTS, sensor_tpdo1
 from jtqd.drivers.survey import DRIVE, IDENTITY, SENSOR, TORQUE, BusSurvey, Survey, SurveyError
+from jtqd.estimator.command_line import command_parser
 
 _EXAMPLES = """examples:
   jtq probe --bus can0                      which nodes are there
@@ -51,11 +52,10 @@ exit status: 0 jtqd can use it, 1 failure or no answer, 2 usage, 3 it lacks what
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq probe`."""
-    made = argparse.ArgumentParser(
-        prog="jtq probe",
-        description="Read a device on the bus, and print its section of the configuration. Nothing is written to it.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    made = command_parser(
+        "jtq probe",
+        "Read a device on the bus, and print its section of the configuration. Nothing is written to it.",
+        _EXAMPLES,
     )
     made.add_argument("--bus", required=True, help="can0, or unix:PATH")
     made.add_argument("--node", type=node_id, metavar="N", help="node-ID (default: list the nodes)")

@@ -45,6 +45,7 @@ from jtqd.daemon.shared.snapshot import (
     View,
 )
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
+from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
 
@@ -511,11 +512,10 @@ def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq status`."""
-    result = argparse.ArgumentParser(
-        prog="jtq status",
-        description="Show the state of a running jtqd: torque, status with its reason, inputs, timing, bus, nodes, log.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    result = command_parser(
+        "jtq status",
+        "Show the state of a running jtqd: torque, status with its reason, inputs, timing, bus, nodes, log.",
+        _EXAMPLES,
     )
     result.add_argument(
         "--bus", help="bus of the daemon: can0, unix:PATH or sim (default: the only running one)"

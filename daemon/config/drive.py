@@ -22,8 +22,8 @@ from jtqd.drivers.drive import (
 )
 from jtqd.drivers.pdo import ACYCLIC, PdoError, PdoMap, Tpdo
 from jtqd.drivers.sdo import Key, label, parse_key
-from jtqd.estimator.checked import Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, below, choice, limits
+from jtqd.estimator.errors import Verbatim, range_text
 
 _PDO_BITS: Final = 64
 _TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}

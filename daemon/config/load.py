@@ -28,8 +28,8 @@ from jtqd.daemon.config.sections import (
 from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.drivers.drive import DriveObjects, Temperature, maps_of_json, select_tpdos
 from jtqd.drivers.pdo import PdoMap
-from jtqd.estimator.checked import ConfigError, Verbatim
 from jtqd.estimator.decoder import FieldError, below, in_file, read
+from jtqd.estimator.errors import ConfigError, Verbatim
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 from jtqd.estimator.sha256 import sha256_hex

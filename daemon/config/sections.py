@@ -11,8 +11,8 @@ from jtqd.daemon.config.drive import ObjectsSection, TpdoSection, check_given
 from jtqd.daemon.shared import faults
 from jtqd.drivers.drive import EVERY_SCALING_OBJECT
 from jtqd.drivers.sensor import SENSOR_SCALING_OBJECTS
-from jtqd.estimator.checked import Verbatim, range_text
 from jtqd.estimator.decoder import FieldError, Text, check, choice, limits, parsed
+from jtqd.estimator.errors import Verbatim, range_text
 from jtqd.estimator.settings import CONTACT_THRESHOLD, METHODS, EstimatorSettings, PlausibilityLimits
 
 LATCHED_BY_DEFAULT: Final = faults.NOT_FINITE | faults.BITS["motor_jump"] | faults.BITS["link_jump"]

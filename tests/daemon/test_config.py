@@ -11,7 +11,7 @@ from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.config import Identity, Realtime, RecordingSettings, SafetySettings, load_config
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.drive import CIA_402, DriveObject
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import shipped
 

@@ -25,7 +25,7 @@ from jtqd.daemon.cli import init, probe
 from jtqd.daemon.config import load_config
 from jtqd.daemon.recording import launch
 from jtqd.daemon.replay.logged import CONFIGURATION, PROVENANCE, read_setup
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import shipped
 from tests.drivers.canopen_nodes import booted
 from tests.library_drives.families import PULSES, RATED_MA

@@ -13,8 +13,8 @@ from typing import Annotated, Any
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, Text, check, choice, decode, limits
+from jtqd.estimator.errors import ConfigError
 
 
 @dataclass(frozen=True)
@@ -149,5 +149,5 @@ def test_an_error_reaches_another_process() -> None:
 
 def test_the_command_line_does_not_wait_for_the_decoder() -> None:
     """`jtqd --help` and the drivers need errors and numbers of a command line only."""
-    code = "import sys, jtqd.daemon.jtqd, jtqd.estimator.checked; print('msgspec' in sys.modules)"
+    code = "import sys, jtqd.daemon.jtqd, jtqd.estimator.errors; print('msgspec' in sys.modules)"
     assert subprocess.check_output([sys.executable, "-c", code], text=True) == "False\n"

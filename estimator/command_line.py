@@ -1,0 +1,98 @@
+"""Command lines: parser with examples, numbers of options, checks before the work, whole outputs."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import math
+import os
+from pathlib import Path
+
+from jtqd.estimator.errors import ConfigError
+
+
+def command_parser(prog: str, description: str, examples: str) -> argparse.ArgumentParser:
+    """Return a parser without arguments; examples: epilog of its help, printed as it is."""
+    return argparse.ArgumentParser(
+        prog=prog,
+        description=description,
+        epilog=examples,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+
+
+def seconds(text: str) -> float:
+    """Return a time in seconds, > 0 and below 1e9 (30 years). Raises argparse.ArgumentTypeError."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < 1e9:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a time in seconds > 0")
+    return value
+
+
+def count(text: str) -> int:
+    """Return a whole number >= 1. Raises argparse.ArgumentTypeError."""
+    return _whole(text, 1)
+
+
+def natural(text: str) -> int:
+    """Return a whole number >= 0. Raises argparse.ArgumentTypeError."""
+    return _whole(text, 0)
+
+
+def _whole(text: str, low: int) -> int:
+    try:
+        value = int(text)
+    except ValueError:
+        value = low - 1
+    if value < low:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number >= {low}")
+    return value
+
+
+def check_output(path: Path) -> None:
+    """Refuse the name of a file that cannot be written. Raises ConfigError."""
+    parent = path.parent
+    if path.is_dir():
+        raise ConfigError(f"{path}: found a directory, expected the name of a file")
+    if not parent.is_dir():
+        what = "a file" if parent.exists() else "no such directory"
+        raise ConfigError(f"{parent}: found {what}, expected a directory for {path.name}")
+    if not os.access(parent if not path.exists() else path, os.W_OK):
+        raise ConfigError(f"{path}: cannot be written: no right to, or a read-only file system")
+
+
+def make_directory(path: Path) -> None:
+    """Make the directory of `--out` and check that files can be created in it. Raises ConfigError."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        reason = "it is a file" if isinstance(error, FileExistsError) else error.strerror
+        raise ConfigError(f"--out {path}: cannot be created: {reason}") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise ConfigError(
+            f"--out {path}: files cannot be created there: no right to, or a read-only file system"
+        )
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file that is there whole or, also after a crash, as it was before. Raises OSError."""
+    temporary = path.with_name(f".{path.name}.part")
+    try:
+        with temporary.open("wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def check_installed(extra: str, *packages: str) -> None:
+    """Raise ConfigError unless the packages (import names) of an extra of pyproject.toml are installed."""
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        verb = "is" if len(missing) == 1 else "are"
+        raise ConfigError(f"{', '.join(missing)} {verb} not installed: pip install 'jtqd[{extra}]'")
