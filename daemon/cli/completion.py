@@ -11,6 +11,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from jtqd.estimator.command_line import command_parser
+
 SHELLS = ("bash", "zsh", "tcsh", "fish")
 _EXAMPLES = """examples:
   source <(jtq completion bash)                                   this shell
@@ -53,13 +55,13 @@ def main(argv: list[str]) -> int:
         return 1
     from jtqd.daemon import jtq, jtqd
 
-    program = command_parser(jtq.COMMANDS) if arguments.program == "jtq" else jtqd.parser()
+    program = jtq_parser(jtq.COMMANDS) if arguments.program == "jtq" else jtqd.parser()
     complete_values(program, file=shtab.FILE, directory=shtab.DIRECTORY, bus=shtab.cmd(_BUSES))
     print(shtab.complete(program, arguments.shell))
     return 0
 
 
-def command_parser(commands: Mapping[str, tuple[str, str]]) -> argparse.ArgumentParser:
+def jtq_parser(commands: Mapping[str, tuple[str, str]]) -> argparse.ArgumentParser:
     """Return one parser of `jtq` whose subcommands are the parsers of the commands' modules.
 
     Args:

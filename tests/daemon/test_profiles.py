@@ -262,7 +262,7 @@ def test_probe_names_the_family_and_prints_its_section(
     assert "profile epos4" not in capsys.readouterr().out
 
 
-def test_a_drive_in_other_units_than_the_profile_takes_it_for_is_told() -> None:
+def test_a_drive_in_other_units_than_the_profile_takes_it_for_is_reported() -> None:
     numbers = {(0x60A8, 0): 0x00B50000, (0x60A9, 0): 0xFDB44700}
     (finding,) = profiles.named("epos4").findings(numbers)
     assert finding.startswith("60A9h:0: expected 0xB44700, found 0xFDB44700")

@@ -33,10 +33,10 @@ def running(root: Path, bus: str = "vcan0", log: Path | None = None, *, cycling:
     content = described(bus, log)
     write_about(directory, content)
     snapshot = Snapshot(directory / "snapshot", 1e-3, 0.848)
-    told = EstimateWriter(snapshot)
+    reported = EstimateWriter(snapshot)
     for index in (0, 8):
         monotonic = time.monotonic_ns() + (60_000_000_000 if cycling else -10_000_000_000)
-        told.write(
+        reported.write(
             7992 + index,
             17,
             time.time_ns(),

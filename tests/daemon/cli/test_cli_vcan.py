@@ -124,16 +124,16 @@ def test_status_of_a_running_daemon_and_of_one_whose_loop_stands_still(tmp_path:
 
 def test_check_beside_a_daemon_listens_and_finds_what_does_not_belong(tmp_path: Path, bench: None) -> None:
     with daemon(tmp_path):
-        code, seen, said = jtq("check", "0.5", "--bus", INTERFACE, "--json", runtime=tmp_path)
-        assert seen, said
+        code, seen, printed = jtq("check", "0.5", "--bus", INTERFACE, "--json", runtime=tmp_path)
+        assert seen, printed
         if EXACT:
             assert (code, seen["result"]) == (0, "GOOD"), seen
             texts = {each["item"]: each["text"] for each in seen["items"]}
             assert texts["SYNC"].startswith("1000.0 per s, expected 1000")
             assert "; 0 of " in texts["jtqd's timing"]
-        code, _, said = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
+        code, _, printed = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
         assert code == 1
-        assert said.startswith(f"jtq check: jtqd runs on {INTERFACE} (process ")
+        assert printed.startswith(f"jtq check: jtqd runs on {INTERFACE} (process ")
 
         with process("-c", SPOILER, INTERFACE):
             code, seen, _ = jtq("check", "0.5", "--bus", INTERFACE, "--json", runtime=tmp_path)
@@ -165,8 +165,8 @@ def test_check_drives_the_bus_where_nobody_else_does(tmp_path: Path, bench: None
     code, seen, _ = jtq("check", "0.2", "--bus", INTERFACE, "--json", runtime=tmp_path)
     assert code == 1, "no SYNC"
     assert levels(seen)["SYNC"] == "FAIL"
-    code, seen, said = jtq("check", "0.5", "--bus", INTERFACE, "--drive-sync", "--json", runtime=tmp_path)
-    assert seen, said
+    code, seen, printed = jtq("check", "0.5", "--bus", INTERFACE, "--drive-sync", "--json", runtime=tmp_path)
+    assert seen, printed
     found = levels(seen)
     assert found["boot"] == "GOOD"
     assert {"SYNC echo", "181h drive 1 TPDO1", "183h sensor 3 channel 1", "success rate"} <= found.keys()
@@ -186,9 +186,9 @@ def test_check_drives_the_bus_where_nobody_else_does(tmp_path: Path, bench: None
     # A foreign SYNC producer: this check does not become the second one.
     with process("-c", FOREIGN_SYNC, INTERFACE):
         time.sleep(0.5)
-        code, _, said = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
+        code, _, printed = jtq("check", "1", "--bus", INTERFACE, "--drive-sync", runtime=tmp_path)
     assert code == 1
-    assert said.startswith(f"jtq check: another node sends SYNC on {INTERFACE}")
+    assert printed.startswith(f"jtq check: another node sends SYNC on {INTERFACE}")
 
 
 FOREIGN_SYNC = """

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from jtqd.daemon import jtq, jtqd
-from jtqd.daemon.cli.completion import SHELLS, command_parser, complete_values, main
+from jtqd.daemon.cli.completion import SHELLS, complete_values, jtq_parser, main
 from tests.paths import ROOT
 
 
@@ -102,7 +102,7 @@ def test_bash_completes(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_command_without_its_extra_is_left_without_options() -> None:
-    parser = command_parser({"gone": ("jtqd.daemon.cli.no_such_module", "what it was")})
+    parser = jtq_parser({"gone": ("jtqd.daemon.cli.no_such_module", "what it was")})
     (below,) = (each for each in parser._actions if isinstance(each, argparse._SubParsersAction))
     assert [action.dest for action in below.choices["gone"]._actions] == ["help"]
 

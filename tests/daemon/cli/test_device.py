@@ -38,7 +38,7 @@ MILLIDEGREE = 0xFD41_0000
 
 def drive(numbers: dict[tuple[int, int], int] | None = None, tpdos: tuple[Tpdo, ...] = ()) -> Survey:
     """A drive of node 5 with a gear of 100:1 and encoders of 65536 and 524288 counts."""
-    told = {
+    reported = {
         (0x608F, 1): 65536,
         (0x608F, 2): 1,
         (0x6090, 1): 65536,
@@ -51,7 +51,9 @@ def drive(numbers: dict[tuple[int, int], int] | None = None, tpdos: tuple[Tpdo, 
         (0x6076, 0): 400,
         **(numbers or {}),
     }
-    return Survey(5, "the bus", 402, {}, {key: value for key, value in told.items() if value}, tpdos=tpdos)
+    return Survey(
+        5, "the bus", 402, {}, {key: value for key, value in reported.items() if value}, tpdos=tpdos
+    )
 
 
 def entries(numbers: dict[tuple[int, int], int], gear: float = 100.0) -> dict[str, Any]:
@@ -72,7 +74,7 @@ def entries(numbers: dict[tuple[int, int], int], gear: float = 100.0) -> dict[st
     ],
     ids=[
         "none",
-        "of a drive that was told nothing",
+        "of a drive that was reported nothing",
         "increments",
         "counts of the motor per turn of the joint",
     ],
@@ -93,11 +95,18 @@ def test_each_unit_is_scaled_by_its_object() -> None:
     assert entries(both)["motor_position"] == {"by": "60A8h"}, "the unit's own word goes before"
 
 
-@pytest.mark.parametrize(("told", "gear"), [(100, 100.0), (1, 100.0), (0, 100.0), (50, 100.0), (1, 1.0)])
+@pytest.mark.parametrize(("reported", "gear"), [(100, 100.0), (1, 100.0), (0, 100.0), (50, 100.0), (1, 1.0)])
 @pytest.mark.parametrize("velocity", [0, 0xFD41_0300])
-def test_the_unit_is_right_whatever_gear_the_drive_counts_with(told: int, gear: float, velocity: int) -> None:
+def test_the_unit_is_right_whatever_gear_the_drive_counts_with(
+    reported: int, gear: float, velocity: int
+) -> None:
     """One millidegree of the shaft behind the drive's own gear; the link's position has nothing to do with a gear."""
-    numbers = {(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): velocity, (0x6091, 1): told, (0x6091, 2): told and 1}
+    numbers = {
+        (0x60A8, 0): MILLIDEGREE,
+        (0x60A9, 0): velocity,
+        (0x6091, 1): reported,
+        (0x6091, 2): reported and 1,
+    }
     survey = drive(numbers)
     wanted = Wanted(gear_ratio=gear, rated_torque_nm=30.0, torque_constant_nm_per_a=0.1)
     section = yaml.safe_load("\n".join(drive_lines(propose_joint(1, 5, survey, wanted))))["joint_1"]
@@ -107,8 +116,8 @@ def test_the_unit_is_right_whatever_gear_the_drive_counts_with(told: int, gear: 
         objects = replace(objects, **{name: replace(getattr(objects, name), **keys)})
     scaling, _ = drive_scaling(DriveProfile(5, objects=objects, given=given), survey.numbers)
     millidegree = 1.7453292519943296e-05
-    assert scaling.motor_rad_per_count == pytest.approx(millidegree * (told or 1))
-    assert scaling.motor_rad_s_per_unit == pytest.approx(millidegree * (told or 1))
+    assert scaling.motor_rad_per_count == pytest.approx(millidegree * (reported or 1))
+    assert scaling.motor_rad_s_per_unit == pytest.approx(millidegree * (reported or 1))
     assert scaling.link_rad_per_count == pytest.approx(millidegree)
 
 
@@ -149,7 +158,7 @@ def test_counts_by_an_option_go_before_what_the_drive_tells() -> None:
         ({(0x60A9, 0): 0x0001_0300}, "60A9h:0, the unit of velocities: expected 0xXX10, 0xXX41 or 0xXXB4"),
     ],
 )
-def test_a_unit_that_is_no_angle_is_told(numbers: dict[tuple[int, int], int], text: str) -> None:
+def test_a_unit_that_is_no_angle_is_reported(numbers: dict[tuple[int, int], int], text: str) -> None:
     survey = drive(numbers)
     (problem,) = unit_problems(5, survey)
     assert problem.startswith(f"node 5 (drive): {text}")

@@ -47,33 +47,36 @@ def drive(values=None, without=()):
     return survey(store, NODE)
 
 
-def test_what_the_drive_tells_is_taken_and_nothing_else_is_given():
+def numbers(values):
+    return {name: value.number for name, value in values.items()}
+
+
+def test_values_of_the_drive_are_used_and_none_is_given():
     joint = propose_joint(1, NODE, drive({(0x6075, 0): 8000, (0x6076, 0): 500}), Wanted())
-    values = {name: value.number for name, value in joint.values.items()}
+    values = numbers(joint.values)
     assert values["gear_ratio"] == 100.0
     assert values["torque_constant_nm_per_a"] == pytest.approx(0.5 / 8.0, rel=0.01)
     assert values["rated_torque_nm"] == pytest.approx(0.7 * 100 * 0.5)
-    assert joint.given == {}
-    assert joint.problems == ()
-    assert not joint.values["gear_ratio"].guess
+    assert (joint.given, joint.problems, joint.values["gear_ratio"].guess) == ({}, (), False)
     assert len(joint.guesses) == 8
 
 
-def test_an_option_goes_before_the_drive_and_says_so():
-    wanted = Wanted(gear_ratio=50.5, rated_torque_nm=28.0, torque_constant_nm_per_a=0.05, rated_current_a=6.0)
+@pytest.mark.parametrize(
+    ("wanted", "given"),
+    [
+        (
+            Wanted(gear_ratio=50.5, rated_torque_nm=28.0, torque_constant_nm_per_a=0.05, rated_current_a=6.0),
+            {(0x6091, 1): 101, (0x6091, 2): 2, (0x6075, 0): 6000},
+        ),
+        (Wanted(gear_ratio=100.0, rated_current_a=8.0, encoder_counts=65536), {}),
+    ],
+    ids=["an option replaces the drive's value", "one that agrees gives nothing"],
+)
+def test_options(wanted, given):
     joint = propose_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted)
-    assert {name: joint.values[name].number for name in ("gear_ratio", "rated_torque_nm")} == {
-        "gear_ratio": 50.5,
-        "rated_torque_nm": 28.0,
-    }
-    given = {key: value.number for key, value in joint.given.items()}
-    assert given == {(0x6091, 1): 101, (0x6091, 2): 2, (0x6075, 0): 6000}
-    assert "the drive has 100" in joint.given[0x6091, 1].origin
-
-
-def test_an_option_that_agrees_with_the_drive_gives_nothing():
-    wanted = Wanted(gear_ratio=100.0, rated_current_a=8.0, encoder_counts=65536)
-    assert propose_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted).given == {}
+    assert numbers(joint.given) == given
+    assert joint.values["gear_ratio"].number == wanted.gear_ratio
+    assert all("the drive has " in each.origin for each in joint.given.values())
 
 
 @pytest.mark.parametrize(
@@ -86,7 +89,7 @@ def test_an_option_that_agrees_with_the_drive_gives_nothing():
         (((0x60E6, 1),), Wanted(), "--link-encoder-counts"),
     ],
 )
-def test_what_cannot_be_guessed_is_asked_for_by_its_option(without, wanted, option):
+def test_a_value_that_cannot_be_guessed_is_asked_for_by_its_option(without, wanted, option):
     with pytest.raises(MissingValueError, match=f"give {option}"):
         propose_joint(1, NODE, drive(without=without), wanted)
 
@@ -98,16 +101,8 @@ def test_a_gear_of_one_to_one_is_not_believed():
 
 def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
     """What is given makes the same factors as a drive that has the objects: one turn is one turn."""
-    missing = [
-        (0x608F, 1),
-        (0x608F, 2),
-        (0x6090, 1),
-        (0x6090, 2),
-        (0x60E6, 1),
-        (0x60EB, 1),
-        (0x6091, 1),
-        (0x6091, 2),
-    ]
+    turns = [(index, sub) for index in (0x608F, 0x6090, 0x6091) for sub in (1, 2)]
+    missing = [*turns, (0x60E6, 1), (0x60EB, 1)]
     found = drive({(0x6075, 0): 8000}, without=missing)
     joint = propose_joint(1, NODE, found, GIVEN)
     given = {key: round(value.number) for key, value in joint.given.items()}
@@ -120,15 +115,18 @@ def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
     assert any("606Ch" in each for each in joint.guesses)
 
 
-def test_a_drive_that_jtqd_cannot_use_is_told():
-    (problem,) = propose_joint(1, NODE, drive(without=[(0x6041, 0)]), Wanted()).problems
-    assert problem == "node 5 (emulated joint drive): has no 6041h:0, which jtqd maps"
-
-
-def test_a_value_that_the_boot_would_refuse_is_told():
-    (problem,) = propose_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted()).problems
-    assert problem.endswith("6075h:0 motor rated current in mA: expected 1..1000000, found 2000000")
-    assert propose_joint(1, NODE, drive({(0x6075, 0): 2_000_000}), Wanted(rated_current_a=8.0)).problems == ()
+@pytest.mark.parametrize(
+    ("values", "without", "wanted", "problem"),
+    [
+        ({}, [(0x6041, 0)], Wanted(), "node 5 (emulated joint drive): has no 6041h:0, which jtqd maps"),
+        ({(0x6075, 0): 2_000_000}, [], Wanted(), "rated current in mA: expected 1..1000000, found 2000000"),
+        ({(0x6075, 0): 2_000_000}, [], Wanted(rated_current_a=8.0), None),
+    ],
+)
+def test_problems_of_a_drive(values, without, wanted, problem):
+    found = propose_joint(1, NODE, drive(values, without), wanted).problems
+    assert len(found) == (problem is not None)
+    assert all(each.endswith(problem) for each in found)
 
 
 def test_every_number_is_one_in_yaml():
@@ -174,95 +172,77 @@ def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objec
     assert scaling.ampere_per_unit > 0.0
 
 
-def run(capsys, *arguments):
-    status = init.main([*map(str, arguments)])
+def run(capsys, arguments, *more):
+    status = init.main([*arguments.split(), *map(str, more)])
     out, err = capsys.readouterr()
     return status, out, err
 
 
+BY_EDS = f"--from-eds {EDS} --gear-ratio 101"
+BY_HAND = "--node 9 --gear-ratio 101 --rated-torque 30 --torque-constant 0.1"
+
+
 def test_from_an_eds_alone(tmp_path, capsys):
-    status, out, err = run(
-        capsys, "--from-eds", EDS, "--node", 5, "--node", 6, "--gear-ratio", 101, "--out", tmp_path / "arm"
-    )
+    status, out, err = run(capsys, f"{BY_EDS} --node 5 --node 6 --out", tmp_path / "arm")
     assert (status, err) == (0, "")
     assert "still a guess:" in out
     config = load_config(tmp_path / "arm" / "jtqd.yaml")
     assert [joint.node_id for joint in config.joints] == [5, 6]
-    assert config.estimator.method == "tob"
-    assert config.sensor is None
-    assert config.joints[0].joint.gear_ratio == 101.0
-    assert config.joints[0].identity.vendor == 0x7A1
+    assert (config.estimator.method, config.sensor) == ("tob", None)
+    assert (config.joints[0].joint.gear_ratio, config.joints[0].identity.vendor) == (101.0, 0x7A1)
 
 
 def test_an_eds_without_a_node_id_is_one_joint_at_a_guessed_node(tmp_path, capsys):
-    status, out, err = run(capsys, "--from-eds", EDS, "--gear-ratio", 101, "--out", tmp_path / "arm")
+    status, out, err = run(capsys, f"{BY_EDS} --out", tmp_path)
     assert (status, err) == (0, "")
-    assert (
-        "joint_1: node = 1 (an EDS knows no node-ID: --node, or --bus)" in out.partition("still a guess:")[2]
-    )
-    assert "  node: 1                 # GUESS, an EDS" in (tmp_path / "arm" / "jtqd.yaml").read_text()
-    assert [joint.node_id for joint in load_config(tmp_path / "arm" / "jtqd.yaml").joints] == [1]
-    given = run(capsys, "--from-eds", EDS, "--node", 1, "--gear-ratio", 101, "--out", tmp_path / "given")[1]
-    assert "node = " not in given
+    assert "joint_1: node = 1 (an EDS knows no node-ID: --node, or --bus)" in out.partition("a guess:")[2]
+    assert "  node: 1                 # GUESS, an EDS" in (tmp_path / "jtqd.yaml").read_text()
+    assert [joint.node_id for joint in load_config(tmp_path / "jtqd.yaml").joints] == [1]
+    assert "node = " not in run(capsys, f"{BY_EDS} --node 1 --force --out", tmp_path)[1]
 
 
-def test_one_joint_alone(tmp_path, capsys):
-    arguments = ["--node", 9, "--gear-ratio", 50, "--rated-torque", 20, "--torque-constant", 0.05]
-    status, _, err = run(capsys, *arguments, "--out", tmp_path)
+@pytest.mark.parametrize(
+    ("arguments", "nodes", "period_us"),
+    [
+        (BY_HAND, [9], 1000),
+        (f"{BY_EDS} --node 5 --node 6 --node 7 --node 8", [5, 6, 7, 8], 2000),
+        (f"{BY_EDS} --node 1 --node 2 --bitrate 500000", [1, 2], 2000),
+    ],
+)
+def test_joints_and_the_shortest_period_that_fits(arguments, nodes, period_us, tmp_path, capsys):
+    status, out, err = run(capsys, f"{arguments} --json --out", tmp_path)
     assert (status, err) == (0, "")
     config = load_config(tmp_path / "jtqd.yaml")
-    assert [(each.number, each.node_id) for each in config.joints] == [(1, 9)]
+    assert [joint.node_id for joint in config.joints] == nodes
+    assert json.loads(out)["period_us"] == config.period_ns // 1000 == period_us
 
 
-def test_a_slower_bus_gets_a_longer_period(tmp_path, capsys):
-    arguments = [
-        "--from-eds",
-        EDS,
-        "--node",
-        1,
-        "--node",
-        2,
-        "--gear-ratio",
-        100,
-        "--bitrate",
-        500_000,
-        "--json",
-    ]
-    status, out, _ = run(capsys, *arguments, "--out", tmp_path)
-    assert status == 0
-    assert json.loads(out)["period_us"] == load_config(tmp_path / "jtqd.yaml").period_ns // 1000 == 2000
-
-
-def test_every_guess_is_marked_in_the_files_and_told(tmp_path, capsys):
-    _, out, _ = run(
-        capsys, "--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path, "--json", "--force"
-    )
-    told = json.loads(out)["guesses"]
+def test_every_guess_is_marked_in_the_files_and_listed(tmp_path, capsys):
+    _, out, _ = run(capsys, f"{BY_EDS} --node 5 --json --out", tmp_path)
     text = (tmp_path / "joint_1.yaml").read_text()
     marked = [line.split(":")[0].strip() for line in text.splitlines() if "# GUESS" in line]
-    assert marked == [each.split(": ")[1].split(" = ")[0] for each in told]
+    assert marked == [each.split(": ")[1].split(" = ")[0] for each in json.loads(out)["guesses"]]
     assert len(marked) == 8
 
 
 def test_a_name_for_the_unit_of_an_interface(tmp_path, capsys):
-    arguments = ["--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path]
-    assert run(capsys, *arguments, "--name", "can0")[0] == 0
+    assert run(capsys, f"{BY_EDS} --node 5 --name can0 --out", tmp_path)[0] == 0
     assert load_config(tmp_path / "can0.yaml").joints[0].node_id == 5
     for wrong in ("joint_1", "../x", ""):
         with pytest.raises(SystemExit):
-            init.main([*map(str, arguments), "--name", wrong])
+            run(capsys, f"{BY_EDS} --node 5", "--out", tmp_path, "--name", wrong)
 
 
-def test_what_is_there_is_not_overwritten(tmp_path, capsys):
+def test_existing_files_are_not_overwritten(tmp_path, capsys):
     (tmp_path / "joint_2.yaml").write_text("mine")
-    status, _, err = run(capsys, "--from-eds", EDS, "--node", 5, "--gear-ratio", 101, "--out", tmp_path)
+    status, _, err = run(capsys, f"{BY_EDS} --node 5 --out", tmp_path)
     assert status == 2
     assert "joint_2.yaml: exists" in err
     assert (tmp_path / "joint_2.yaml").read_text() == "mine"
 
 
 @pytest.mark.parametrize(
-    ("arguments", "status", "told"),
+    ("arguments", "status", "problem"),
     [
         (["--node", "5", "--node", "5"], 2, "names a node twice"),
         ([f"--node={node}" for node in range(5, 10)], 2, "at most 4 joints"),
@@ -278,10 +258,10 @@ def test_what_is_there_is_not_overwritten(tmp_path, capsys):
         (["--node", "5", "--from-eds", "a\0.eds"], 1, "cannot be read: "),
     ],
 )
-def test_wrong_input_is_one_line(arguments, status, told, tmp_path, capsys):
-    found, out, err = run(capsys, *arguments, "--out", tmp_path / "arm")
+def test_wrong_input_is_one_line(arguments, status, problem, tmp_path, capsys):
+    found, out, err = run(capsys, "", *arguments, "--out", tmp_path / "arm")
     assert (found, out) == (status, "")
-    assert told in err
+    assert problem in err
     assert err.count("\n") == 1
 
 
@@ -293,15 +273,7 @@ def test_a_broken_eds_is_one_line(data, tmp_path):
     (tmp_path / "bad.eds").write_bytes(data)
     command = [
         sys.executable,
-        "-m",
-        "jtqd.daemon.jtq",
-        "init",
-        "--from-eds",
-        "bad.eds",
-        "--node",
-        "5",
-        "--out",
-        "d",
+        *["-m", "jtqd.daemon.jtq", "init", "--from-eds", "bad.eds", "--node", "5", "--out", "d"],
     ]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == (1 if data else 2)
@@ -311,44 +283,24 @@ def test_a_broken_eds_is_one_line(data, tmp_path):
 
 def test_a_pipe_is_not_waited_for(tmp_path, capsys):
     os.mkfifo(tmp_path / "pipe.eds")
-    status, _, err = run(capsys, "--from-eds", tmp_path / "pipe.eds", "--node", 5, "--out", tmp_path)
+    status, _, err = run(capsys, "--node 5 --out", tmp_path, "--from-eds", tmp_path / "pipe.eds")
     assert (status, err.endswith("found no regular file, expected an EDS\n")) == (1, True)
 
 
 def test_an_eds_in_the_maker_s_code_page_is_read(tmp_path, capsys):
     (tmp_path / "maker.eds").write_bytes(b"; 0.1 \xb0\n" + EDS.read_bytes())
-    arguments = ["--from-eds", tmp_path / "maker.eds", "--node", 5, "--gear-ratio", 101, "--out", tmp_path]
-    assert run(capsys, *arguments)[0] == 0
+    maker = ("--from-eds", tmp_path / "maker.eds")
+    assert run(capsys, "--node 5 --gear-ratio 101 --out", tmp_path, *maker)[0] == 0
 
 
 def test_files_that_jtqd_refuses_do_not_stay(tmp_path, capsys):
-    arguments = [
-        "--node",
-        5,
-        "--gear-ratio",
-        101,
-        "--rated-torque",
-        30,
-        "--torque-constant",
-        0.1,
-        "--out",
-        tmp_path,
-    ]
-    status, _, err = run(capsys, *arguments, "--bitrate", 1)
+    status, _, err = run(capsys, f"{BY_HAND} --bitrate 1 --out", tmp_path)
     assert (status, err.count("\n")) == (1, 1)
     assert f"{tmp_path / 'jtqd.yaml'}: key 'bitrate'" in err
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "jtqd.yaml").write_text("mine")
-    assert run(capsys, *arguments, "--bitrate", 1, "--force")[0] == 1
+    assert run(capsys, f"{BY_HAND} --bitrate 1 --force --out", tmp_path)[0] == 1
     assert [each.read_text() for each in tmp_path.iterdir()] == ["mine"], "nothing is lost"
-
-
-def test_four_joints(tmp_path, capsys):
-    arguments = ["--from-eds", EDS, "--gear-ratio", 101, "--out", tmp_path]
-    status, _, err = run(capsys, *arguments, *(f"--node={node}" for node in (5, 6, 7, 8)))
-    assert (status, err) == (0, "")
-    config = load_config(tmp_path / "jtqd.yaml")
-    assert [joint.node_id for joint in config.joints] == [5, 6, 7, 8]
 
 
 @pytest.fixture
@@ -365,7 +317,7 @@ def bench(tmp_path):
 
 
 def test_the_devices_of_a_bus(bench, tmp_path, capsys):
-    status, out, err = run(capsys, "--bus", bench, "--out", tmp_path / "arm")
+    status, out, err = run(capsys, f"--bus {bench} --out", tmp_path / "arm")
     assert (status, err) == (0, "")
     assert "node 3: emulated torque sensor" in out
     content = yaml.safe_load((tmp_path / "arm" / "jtqd.yaml").read_text())
@@ -374,7 +326,7 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     config = load_config(tmp_path / "arm" / "jtqd.yaml")
     assert config.joints[0].sensor_channel == 1
 
-    status, out, err = run(capsys, "--bus", bench, "--from-eds", EDS, "--out", tmp_path / "with_eds")
+    status, out, err = run(capsys, f"--bus {bench} --from-eds {EDS} --out", tmp_path / "with_eds")
     assert (status, err) == (0, "")
     assert [line.rsplit("by ")[-1] for line in out.splitlines() if line.startswith("node 1:")] == [
         "the bus)",
@@ -382,17 +334,16 @@ def test_the_devices_of_a_bus(bench, tmp_path, capsys):
     ]
     other = tmp_path / "other.eds"
     other.write_text(EDS.read_text().replace("DefaultValue=1953", "DefaultValue=154"))
-    status, _, err = run(capsys, "--bus", bench, "--from-eds", other, "--out", tmp_path / "other")
+    status, _, err = run(capsys, f"--bus {bench} --from-eds {other} --out", tmp_path / "other")
     assert (status, err.count("\n")) == (2, 1)
     assert "is of vendor 0000009Ah, but node 1 has 000007A1h" in err
 
-    for sensor, told in ((2, "node 2 is no CiA 404 sensor"), (9, "node 9 does not answer")):
-        arguments = ["--bus", bench, "--node", 1, "--sensor", sensor, "--out", tmp_path / "other"]
-        status, _, err = run(capsys, *arguments)
+    for sensor, reported in ((2, "node 2 is no CiA 404 sensor"), (9, "node 9 does not answer")):
+        status, _, err = run(capsys, f"--bus {bench} --node 1 --sensor {sensor} --out", tmp_path / "other")
         assert (status, err.count("\n")) == (2, 1)
-        assert f"--sensor: {told}" in err
+        assert f"--sensor: {reported}" in err
 
-    status, _, err = run(capsys, "--bus", bench, "--node", 8, "--out", tmp_path / "other")
+    status, _, err = run(capsys, f"--bus {bench} --node 8 --out", tmp_path / "other")
     assert status == 2
     assert "node 8 does not answer" in err
     assert "1 (emulated joint drive)" in err
@@ -406,9 +357,9 @@ def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
         "node 3",
     ]
     assert probe.main(["--bus", bench, "--node", "1"]) == 0
-    told = capsys.readouterr().out
+    reported = capsys.readouterr().out
     for words in ("608Fh:1", "60E4h:1", "TPDOs", "181h", "identity: {vendor: 0x000007A1"):
-        assert words in told
+        assert words in reported
     assert probe.main(["--bus", bench, "--node", "1", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["device"]["vendor"] == 0x7A1
@@ -426,7 +377,7 @@ def test_probe_of_a_bus_and_of_its_devices(bench, capsys):
 
 def test_the_section_alone_goes_into_a_configuration_that_jtqd_reads(bench, tmp_path, capsys):
     arm = tmp_path / "arm"
-    assert run(capsys, "--bus", bench, "--node", 1, "--sensor", "none", "--out", arm)[0] == 0
+    assert run(capsys, f"--bus {bench} --node 1 --sensor none --out", arm)[0] == 0
     arguments = ["--bus", bench, "--node", "2", "--joint", "2", "--gear-ratio", "101"]
     assert probe.main([*arguments, "--section"]) == 0
     section = capsys.readouterr().out
@@ -442,9 +393,9 @@ def test_the_section_alone_goes_into_a_configuration_that_jtqd_reads(bench, tmp_
 
 def test_a_drive_that_does_not_know_its_gear_has_a_section_with_the_option():
     found = drive({(0x6091, 1): 1})
-    told = probe.text(found, [])
-    assert "no section of the configuration yet: " in told
-    assert "give --gear-ratio" in told
+    reported = probe.text(found, [])
+    assert "no section of the configuration yet: " in reported
+    assert "give --gear-ratio" in reported
     with pytest.raises(MissingValueError, match="give --gear-ratio"):
         probe.section(found)
     lines = probe.section(found, None, Wanted(gear_ratio=101.0), 3)
@@ -454,12 +405,12 @@ def test_a_drive_that_does_not_know_its_gear_has_a_section_with_the_option():
 
 def test_probe_says_what_each_object_is():
     lines = [line.split(maxsplit=2) for line in probe.text(drive(), []).splitlines()]
-    told = {line[0]: line[1:] for line in lines if len(line) == 3}
-    assert told["1018h:1"] == ["000007A1h", "vendor"]
-    assert told["608Fh:1"] == ["65536", "position encoder increments"]
-    assert told["6064h:0"][1] == "motor position"
-    assert (len(told["6041h:0"][0]), told["6041h:0"][1]) == (5, "statusword")
-    assert told["6075h:0"][1] == "motor rated current in mA"
+    reported = {line[0]: line[1:] for line in lines if len(line) == 3}
+    assert reported["1018h:1"] == ["000007A1h", "vendor"]
+    assert reported["608Fh:1"] == ["65536", "position encoder increments"]
+    assert reported["6064h:0"][1] == "motor position"
+    assert (len(reported["6041h:0"][0]), reported["6041h:0"][1]) == (5, "statusword")
+    assert reported["6075h:0"][1] == "motor rated current in mA"
     named = [
         each for each in probe.text(drive(), []).splitlines() if each.startswith("  ") and "h:" in each[:8]
     ]

@@ -75,9 +75,11 @@ def test_the_picture_shows_everything_and_fits(tmp_path: Path, width: int) -> No
     ):
         assert wanted in " ".join(text.split()) or wanted in text, wanted
     assert ("100.0 %" in text) == ("-155.2 rad/s" in text) == (width >= 100), "where there is room"
-    told = [line.strip() for line in text.splitlines() if line.startswith("no room for: ")]
-    assert any(line.endswith("motor, with a torque") for line in told) == (width < 100), "and told where not"
-    assert (told == []) == (width >= 140)
+    reported = [line.strip() for line in text.splitlines() if line.startswith("no room for: ")]
+    assert any(line.endswith("motor, with a torque") for line in reported) == (width < 100), (
+        "and reported where not"
+    )
+    assert (reported == []) == (width >= 140)
 
 
 @pytest.mark.parametrize("width", [54, 66, 78])
@@ -126,10 +128,10 @@ def test_none_one_and_several(tmp_path: Path, status: Status) -> None:
     assert status("--once")[0] == 0
     assert "vcan1" in status("--once", "--bus", "vcan1")[2]
     running(tmp_path, "vcan1")
-    code, _, said = status("--once")
+    code, _, printed = status("--once")
     assert code == 2
-    assert said.splitlines()[0] == "jtq status: several daemons run; select one with --bus:"
-    assert [line.split()[:2] for line in said.splitlines()[1:]] == [["--bus", "vcan0"], ["--bus", "vcan1"]]
+    assert printed.splitlines()[0] == "jtq status: several daemons run; select one with --bus:"
+    assert [line.split()[:2] for line in printed.splitlines()[1:]] == [["--bus", "vcan0"], ["--bus", "vcan1"]]
     assert status("--once", "--bus", "vcan1")[0] == 0
 
 
@@ -191,7 +193,7 @@ def test_the_live_view_on_a_terminal_outlives_its_daemon_and_ends_by_ctrl_c(tmp_
 
 
 def test_no_line_is_dropped_on_a_small_terminal(tmp_path: Path) -> None:
-    """All pages together hold every line of the picture, each fits, and the line below says how many there are."""
+    """All pages together hold every line of the picture, each fits, and the line below states how many there are."""
     console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True)
     reading = Watch(running(tmp_path)).read()
     recent = Recent()
