@@ -118,7 +118,7 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
     from jtqd.daemon.ros2 import launch as ros2
     from jtqd.daemon.supervisor.process import ConfigurationRefused, Supervisor, SupervisorError
     from jtqd.drivers.frame_socket import BusError
-    from jtqd.estimator.checked import ConfigError
+    from jtqd.estimator.errors import ConfigError
 
     try:
         config = load_config(arguments.config)

@@ -31,7 +31,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jtqd.estimator.checked import ConfigError
+    from jtqd.estimator.errors import ConfigError
     from jtqd.estimator.joint import Effect, Joint
     from jtqd.estimator.methods import estimate_columns, make_estimator
     from jtqd.estimator.network import load_network

@@ -14,7 +14,6 @@ from itertools import pairwise
 from types import MappingProxyType
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import Verbatim
 from jtqd.estimator.decoder import (
     FieldError,
     Text,
@@ -27,6 +26,7 @@ from jtqd.estimator.decoder import (
     parsed,
 )
 from jtqd.estimator.effects import EFFECTS, checked_parameters
+from jtqd.estimator.errors import Verbatim
 
 CONVENTIONS: Final = ("joint_over_motor", "motor_over_joint")
 """eta = tau_j/(G Kt i), as in the paper's Table I; or eta = G Kt i/tau_j, its Eq. (6)."""

@@ -17,8 +17,8 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, read
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Envelope, Joint
 from jtqd.estimator.onnx_graph import (
     GraphFile,

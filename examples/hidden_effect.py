@@ -33,7 +33,8 @@ import yaml
 from jtqd.daemon.logs import LogError, read_topics
 from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass

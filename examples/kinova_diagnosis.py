@@ -24,7 +24,7 @@ from matplotlib import pyplot as plt
 from scipy.optimize import lsq_linear
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.models.files import load_joint, shipped

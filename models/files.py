@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 
 _LARGEST_YAML: Final = 1_000_000

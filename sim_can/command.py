@@ -8,7 +8,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.errors import ConfigError
 from jtqd.sim_can.eds_entries import EdsChild
 
 if TYPE_CHECKING:

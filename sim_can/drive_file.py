@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-from jtqd.estimator.checked import range_text
 from jtqd.estimator.decoder import FieldError, limits
+from jtqd.estimator.errors import range_text
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.sim_can.joint_effects import EffectFriction, JointEffects, total
 from jtqd.sim_can.plant import JointConstants, Plant, relaxed_angle
 from jtqd.sim_can.plant_file import STEEPEST_KINEMATIC_ERROR, PlantParameters, substep_limit

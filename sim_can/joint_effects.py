@@ -13,9 +13,9 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import Effect, Functions, ScalarFunctions, State, Values
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.losses import JointFriction
 

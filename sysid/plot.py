@@ -12,7 +12,7 @@ import numpy as np
 
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.checked import check_installed
+from jtqd.estimator.command_line import check_installed
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (

@@ -24,9 +24,9 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import MOTOR as BALANCE_MOTOR
 from jtqd.estimator.effects.effect import TORSION as BALANCE_TORSION
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass

@@ -22,8 +22,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, check_output, write_whole
+from jtqd.estimator.command_line import check_output, write_whole
 from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss

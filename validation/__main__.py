@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.checked import check_output
+from jtqd.estimator.command_line import check_output
 from validation.study import UsageError, json_of, text_of
 
 STUDIES: Final = {

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.estimator.checked import make_directory
+from jtqd.estimator.command_line import make_directory
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.observer import low_pass

@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 
 import yaml
 
-from jtqd.estimator.checked import check_installed, make_directory, natural
+from jtqd.estimator.command_line import check_installed, make_directory, natural
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.state import DONE, STATE_FILE
 from jtqd.sysid.planner.campaigns import outside_runs

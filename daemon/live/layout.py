@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
-from jtqd.estimator.checked import seconds
+from jtqd.estimator.command_line import seconds
 
 _LAYOUTS = Path(__file__).with_name("layouts")
 _EXAMPLES = """examples:

@@ -27,7 +27,7 @@ import msgspec
 from jtqd.daemon.logs.log_file import Contents, LogError, Source, scan, sealed_chunk
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
 from jtqd.daemon.recording.run_files import ACTIVE, PartFile, free_bytes, part_files
-from jtqd.estimator.checked import counted
+from jtqd.estimator.text import counted
 
 _PARTIAL = ".recovering"
 """Ending of the copy while it is written."""

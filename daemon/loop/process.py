@@ -37,7 +37,7 @@ from jtqd.drivers.filters import CanFilter, any_format
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import SYNC_COB_ID
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
 from jtqd.estimator.network import FusedNetwork, load_network
 from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck

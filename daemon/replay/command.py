@@ -22,7 +22,8 @@ from jtqd.daemon.replay.compare import Comparison, Contacts, Difference, Identit
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.session import ReplayOptions, Result, replay_each
 from jtqd.estimator.arrays import RecordArray
-from jtqd.estimator.checked import ConfigError, check_output
+from jtqd.estimator.command_line import check_output
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.settings import METHODS
 

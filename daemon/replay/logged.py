@@ -25,7 +25,7 @@ from jtqd.daemon.recording.schemas import ZEROS
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.daemon.shared.snapshot import PAST_WORDS
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.status import PAST_LAYOUT
 from jtqd.models.files import load_yaml
 

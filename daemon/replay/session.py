@@ -31,7 +31,7 @@ from jtqd.daemon.replay.runs import (
     stretches,
 )
 from jtqd.estimator.arrays import RecordArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
 from jtqd.estimator.network import NATIVE_LIMIT, load_network

@@ -10,7 +10,7 @@ from pathlib import Path
 from jtqd.daemon.config import HIGHEST_DOMAIN, LOOPBACK, Config, Ros2Settings
 from jtqd.daemon.recording.launch import loop_request
 from jtqd.daemon.shared.side_process import SideProcess, StartChild
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 
 _WHEELS_FOR = "x86_64"
 _VARIABLE = "ROS_DOMAIN_ID"

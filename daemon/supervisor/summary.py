@@ -11,8 +11,8 @@ from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.notices import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.estimator.checked import finite
 from jtqd.estimator.status import Zeros
+from jtqd.estimator.text import finite
 
 _LOST = 0.05
 """Part of the slots that a machine on which something else runs may miss at most before it is said."""

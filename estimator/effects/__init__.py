@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Final
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import Field, FieldError, below, field_of, limits, read_values
 from jtqd.estimator.effects.effect import REGISTERED, Effect
+from jtqd.estimator.errors import ConfigError
 
 _NO_EFFECTS: Final = ("array_functions",)
 """Not loaded here: it brings numpy, which supervisor and bench do without."""

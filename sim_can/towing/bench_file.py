@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Annotated, Any, Final, NamedTuple
 
-from jtqd.estimator.checked import Verbatim
 from jtqd.estimator.decoder import FieldError, Text, below, in_file, limits, parsed, read
+from jtqd.estimator.errors import Verbatim
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.drive_file import USUAL_DRIVE, DriveParameters, SensorParameters
 

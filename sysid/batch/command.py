@@ -13,8 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.checked import ConfigError, check_installed, count, counted, make_directory, seconds
+from jtqd.estimator.command_line import check_installed, count, make_directory, seconds
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.settings import METHODS
+from jtqd.estimator.text import counted
 from jtqd.sysid.batch.run import (
     BY_DIRECTORY,
     BY_RUN,

@@ -17,8 +17,8 @@ from jtqd.drivers.object_dictionary import Identity
 from jtqd.drivers.own_objects import COMMANDER_NODE
 from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.drivers.sensor import SensorProfile
-from jtqd.estimator.checked import ConfigError, Verbatim
 from jtqd.estimator.decoder import FieldError, below, in_file
+from jtqd.estimator.errors import ConfigError, Verbatim
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.motion.setpoints import (
     Limits,

@@ -18,9 +18,10 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.drivers.bus_load import LIMIT, BusLoad
-from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
+from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.text import table_lines
+from jtqd.estimator.text import counted, table_lines
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign import processes
 from jtqd.sysid.campaign.bench import Bench, BenchConfig

@@ -18,8 +18,10 @@ from pathlib import Path
 from typing import Final
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, count, counted, natural, seconds
+from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import RunTable
+from jtqd.estimator.text import counted
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, TimeFunction, emulate
 from jtqd.sim_can.plants import AnyPlant, load_any_plant

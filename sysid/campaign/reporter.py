@@ -10,7 +10,7 @@ from typing import Final
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from jtqd.estimator.checked import counted
+from jtqd.estimator.text import counted
 from jtqd.sysid.campaign.state import DONE, RunState
 
 BETWEEN_RUNS_S: Final = 4.0

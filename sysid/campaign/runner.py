@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from jtqd.daemon.logs import LogError
-from jtqd.estimator.checked import counted
+from jtqd.estimator.text import counted
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
 from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
 from jtqd.sysid.campaign.recorded import (

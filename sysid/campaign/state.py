@@ -15,8 +15,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.checked import ConfigError, write_whole
+from jtqd.estimator.command_line import write_whole
 from jtqd.estimator.decoder import Text, below, choice, in_file, read, split
+from jtqd.estimator.errors import ConfigError
 from jtqd.sysid.planner.plan import Plan, load_plan
 
 SCHEMA: Final = "jtq.campaign/1"

@@ -14,11 +14,11 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
+from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.current_zero import Readings, readings

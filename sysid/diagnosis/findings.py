@@ -10,8 +10,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.file_values import FileValue, file_values
 
 SCHEMA: Final = "jtq.findings/1"

@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.array_functions import ArrayFunctions
 from jtqd.estimator.effects.effect import Effect, State, Values
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss

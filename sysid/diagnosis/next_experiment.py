@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.experiment_choice import kinds_for
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import smooth

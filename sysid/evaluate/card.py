@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.text import counted
 from jtqd.sysid.evaluate.methods import TITLES, JointModels, Samples
 from jtqd.sysid.evaluate.report import plain_values, table
 from jtqd.sysid.evaluate.scores import (

@@ -12,7 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.checked import ConfigError, check_installed, make_directory
+from jtqd.estimator.command_line import check_installed, make_directory
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.evaluate.card import BASELINE, Card, make_card, method_of
 from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate, loop_time

@@ -18,11 +18,11 @@ from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Envelope
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import recommended
+from jtqd.estimator.text import counted
 from jtqd.sysid.evaluate.inputs import JudgedRun
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples, take_samples
 from jtqd.sysid.evaluate.scores import (

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, observe_run, quadrants
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import AnyNetwork, estimate_columns

@@ -9,8 +9,8 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import QUADRANTS
+from jtqd.estimator.text import counted
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.evaluation import Evaluation, RunRecord, Target, mse, worse_runs
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples

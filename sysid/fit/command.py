@@ -14,8 +14,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, check_installed, check_output, counted
+from jtqd.estimator.command_line import check_installed, check_output
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
+from jtqd.estimator.text import counted
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.efficiency import (
     EfficiencyFit,

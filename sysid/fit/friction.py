@@ -17,9 +17,9 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
+from jtqd.estimator.text import counted
 from jtqd.sysid.fit.efficiency import SAME_VELOCITY_RAD_S
 from jtqd.sysid.fit.plateaus import Plateau
 

@@ -22,8 +22,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Friction, Fused, Joint
+from jtqd.estimator.text import counted
 from jtqd.sysid.fit.calibration import (
     calibrated,
     fit_sigma,

@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
 

@@ -12,7 +12,8 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, count, natural, seconds
+from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.planner.design import FINAL_RATE_HZ, STARTS, Bench, ExcitationLimits, design, starts_of

@@ -24,7 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, check_installed
+from jtqd.estimator.command_line import check_installed
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S, LossModel
 from jtqd.models.files import load_joint, shipped

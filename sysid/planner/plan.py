@@ -20,8 +20,9 @@ import numpy as np
 import yaml
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, Verbatim, finite
 from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, parsed, read, split
+from jtqd.estimator.errors import ConfigError, Verbatim
+from jtqd.estimator.text import finite
 from jtqd.models.files import load_yaml
 from jtqd.sysid.motion.setpoints import (
     MOST_JOINTS,

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, MotionError, Setpoints
 from jtqd.sysid.planner.design import (

@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, check_output
+from jtqd.estimator.command_line import check_output
+from jtqd.estimator.errors import ConfigError
 from jtqd.sysid.report.page import LIGHT
 
 SENSOR, BEFORE, AFTER = LIGHT["ink"], LIGHT["before"], LIGHT["after"]

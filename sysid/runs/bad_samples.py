@@ -26,9 +26,9 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
+from jtqd.estimator.text import counted
 from jtqd.sysid.runs.channels import STUCK_S, Channels, RunIssue
 
 _FURTHER: Final = 10.0

@@ -32,10 +32,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import FrictionModel, static_friction
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.estimator.text import counted
 
 MOVING_RAD_S: Final = 0.02
 """Joint side; slower joints are not judged."""

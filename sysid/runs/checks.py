@@ -17,9 +17,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.estimator.text import counted
 from jtqd.sysid.runs.bad_samples import Limits, check_held, saturation_limits, without_outliers
 from jtqd.sysid.runs.channels import (
     MOTION,

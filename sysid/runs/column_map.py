@@ -36,7 +36,6 @@ from typing import Annotated, Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import Verbatim, shown
 from jtqd.estimator.decoder import (
     Field,
     FieldError,
@@ -48,6 +47,7 @@ from jtqd.estimator.decoder import (
     read,
     read_values,
 )
+from jtqd.estimator.errors import Verbatim, shown
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.models.files import load_yaml
 from jtqd.sysid.runs.bad_samples import outlier_rows

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from jtqd.daemon.logs import LogError, LogFile, Records, iter_topics, log_parts, topics_of
 from jtqd.drivers.drive import NOT_MEASURED, STATE_MASK, STATES, TEMPERATURE_C_PER_UNIT, State, drive_tpdo3
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError, counted
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.estimator.text import counted
 from jtqd.models.files import parse_yaml
 from jtqd.sysid.runs.column_map import TIME
 from jtqd.sysid.runs.run_file import Content, RunError, file_bytes

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
+from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import JOINTS, TIME
 from jtqd.sysid.runs.run_file import Content, RunError, RunFile, header_place
 

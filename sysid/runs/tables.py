@@ -23,8 +23,9 @@ from zipfile import BadZipFile
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted, write_whole
+from jtqd.estimator.command_line import write_whole
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
+from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import TIME, Column, ColumnMap, Expression, ExpressionError, targets
 from jtqd.sysid.runs.run_file import Content, RunError, file_bytes, header_place
 

@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.estimator.text import counted
 from jtqd.sysid.runs.channels import MOVING_RAD_S, RunIssue
 
 SLOWEST_HZ: Final = 50.0

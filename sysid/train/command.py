@@ -12,7 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.estimator.checked import ConfigError, check_installed, count, make_directory, natural
+from jtqd.estimator.command_line import check_installed, count, make_directory, natural
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint

@@ -18,12 +18,12 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.estimator import FusedEstimator, quadrants
 from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.onnx_graph import perceptron_content
 from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.text import counted
 from jtqd.estimator.uncertainty import Fusion, network_shares
 from jtqd.sysid.fit.calibration import conformal_scale
 from jtqd.sysid.fit.envelope import envelope_of

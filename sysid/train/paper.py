@@ -9,7 +9,6 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import counted
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.network import FEATURES
@@ -17,6 +16,7 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
+from jtqd.estimator.text import counted
 from jtqd.sysid.train.network import Trained, export_network, forward, train
 
 SAMPLES: Final = 200_000

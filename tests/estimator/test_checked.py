@@ -10,7 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.estimator.checked import ConfigError, check_installed, check_output, counted, make_directory
+from jtqd.estimator.command_line import check_installed, check_output, make_directory
+from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.text import counted
 
 ROOT = Path(__file__).parents[2]
 

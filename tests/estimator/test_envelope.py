@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import FieldError, read
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Envelope, Joint
 from tests.estimator.fused_helpers import everywhere, fused_joint
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import MAX_NODES, Joint
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.joint_writer import write_joint

@@ -11,7 +11,7 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import FrictionModel, LossModel

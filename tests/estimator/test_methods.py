@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Effect
 from jtqd.estimator.methods import estimate_columns, make_estimator

@@ -11,8 +11,8 @@ import pytest
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.joint_safety import safety_of
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.plausibility import FROZEN_RAD
 from jtqd.estimator.settings import PlausibilityLimits
 from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH

@@ -10,8 +10,8 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.contact import link_loads
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Joint, Tracking
 from jtqd.estimator.observer import TRACKED_FADE_S, low_pass, reference_of, tracked

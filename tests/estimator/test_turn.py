@@ -10,7 +10,7 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, observe_run
 from jtqd.estimator.joint import TURN_WAVES, Agreement, Joint, Turn
 from jtqd.estimator.losses import AdditiveLossModel

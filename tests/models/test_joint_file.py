@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.config import load_config
-from jtqd.estimator.checked import ConfigError, range_text
 from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.errors import ConfigError, range_text
 from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.models.files import load_joint, load_yaml, read_yaml, shipped
 from jtqd.sim_can.plant_file import load_plant

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.demo import demo_current, demo_velocity

@@ -5,7 +5,7 @@ import json
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant_file import RunToRun, Thermal, load_plant, plant_from_mapping
 

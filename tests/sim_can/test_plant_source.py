@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.cost import measure

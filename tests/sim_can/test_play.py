@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import shipped
 from jtqd.sim_can.play import PlaySource, columns_beside, open_play
 

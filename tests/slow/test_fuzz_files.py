@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import load_yaml
 from tests.slow.fuzz.damage import bombs
 from tests.slow.fuzz.files import fuzz_files

@@ -18,7 +18,7 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.checked import count
+from jtqd.estimator.command_line import count
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause, Findings, joint_text

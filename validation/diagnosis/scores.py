@@ -19,7 +19,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Place

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray
-from jtqd.estimator.checked import natural
+from jtqd.estimator.command_line import natural
 from jtqd.estimator.uncertainty import GAUSS
 from validation.goals.identify import (
     FIT_SEED,

@@ -23,7 +23,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import count
+from jtqd.estimator.command_line import count
 from jtqd.estimator.joint import Fused, Torsion
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import EstimatorSettings, bandwidth_of

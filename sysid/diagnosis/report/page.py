@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import yaml
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects.effect import Effect
+from jtqd.estimator.errors import ConfigError
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
 from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, campaign_command, joint_motion_file
 from jtqd.sysid.diagnosis.report import views

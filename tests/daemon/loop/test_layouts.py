@@ -19,7 +19,7 @@ from jtqd.daemon.core.input_pdos import (
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.drivers.drive import tpdos_as_json
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from tests.daemon.loop.cycle_helpers import SCALE
 from tests.daemon.loop.one_drive import MS, NUMBER_OF, OneDrive, config_with
 

@@ -14,7 +14,7 @@ from onnx import helper
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop import process
 from jtqd.daemon.loop.process import build_estimator, build_estimators, check_networks
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
 from tests.estimator.estimator_helpers import small_network
 from tests.estimator.fused_configuration import configured, networks

@@ -14,7 +14,7 @@ import yaml
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped

@@ -13,8 +13,8 @@ from hypothesis import strategies as some
 from jtqd.daemon.config import LATCHED_BY_DEFAULT, SafetySettings
 from jtqd.daemon.core.status import NEEDED, JointStatus
 from jtqd.daemon.shared import faults
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.status import (
     DEGRADED,
     DRIVE_FAULT,

@@ -12,7 +12,7 @@ import pytest
 from jtqd.daemon.core.input_pdos import InputPdo, input_pdos
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.replay.replayer import _held
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from tests.daemon.loop.one_drive import config_with
 from tests.daemon.snapshots import counted
 

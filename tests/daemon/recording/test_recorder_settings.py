@@ -11,8 +11,8 @@ import pytest
 from jtqd.daemon.config import RecordingSettings, load_config
 from jtqd.daemon.recording.launch import recording_request
 from jtqd.daemon.recording.recorder import RecorderRequest
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import shipped
 from tests.daemon.recording.test_dbc import SCALING
 

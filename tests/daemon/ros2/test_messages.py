@@ -13,7 +13,7 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import JointView, View
 from jtqd.estimator import status as st
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from tests.daemon.recording.recorder_bench import START_NS, joint_values, record_of
 
 RATIOS = (100.0, 160.0)

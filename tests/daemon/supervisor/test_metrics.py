@@ -10,7 +10,7 @@ from jtqd.daemon.shared.conditions import WARNING, Condition
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.daemon.supervisor.service import metrics_text, write_metrics
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import shipped
 from tests.daemon.loop.cycle_helpers import inputs, make, turn
 

@@ -15,12 +15,12 @@ import pytest
 
 from jtqd.estimator import effects
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.effects import EFFECTS, checked_parameters, discover
 from jtqd.estimator.effects import effect as effect_module
 from jtqd.estimator.effects.array_functions import ArrayFunctions
 from jtqd.estimator.effects.effect import GROUPS, HOOKS, Effect, ScalarFunctions, State
 from jtqd.estimator.effects.terms import Term
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect as Entry
 from jtqd.estimator.joint import Friction, Joint
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN, at, balances, state

@@ -7,7 +7,7 @@ import jtqd.sim_can.towing
 
 ROOM = Path(jtqd.sim_can.towing.__file__).parent
 ALLOWED = {
-    "jtqd.estimator.checked",  # reading of files
+    "jtqd.estimator.errors",  # reading of files
     "jtqd.estimator.decoder",
     "jtqd.estimator.joint",  # names and nominal values: what a drive believes
     "jtqd.sim_can.drive_control",  # the drives' own loops

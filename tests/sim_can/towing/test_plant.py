@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import load_joint, load_yaml
 from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run
 from jtqd.sim_can.source import CURRENT, VELOCITY

@@ -102,7 +102,7 @@ def targets(directory: Path) -> list[Target]:
     from jtqd.daemon.replay import command as replay_command
     from jtqd.drivers.boot import RequestError
     from jtqd.drivers.object_dictionary import EdsError, read_eds
-    from jtqd.estimator.checked import ConfigError
+    from jtqd.estimator.errors import ConfigError
     from jtqd.estimator.onnx_graph import NetworkError
     from jtqd.models.files import load_joint
     from jtqd.sim_can.plant_file import load_plant

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant_file import load_plant

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint
 from jtqd.sysid.diagnosis.extended_joint import extended, files, title, write_extended

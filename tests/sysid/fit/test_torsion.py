@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import observe_run
 from jtqd.estimator.joint import Joint, Torsion, Tracking
 from jtqd.estimator.observer import slipped

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.errors import ConfigError
 from jtqd.sysid.planner.fourier import RAMP_SHARE, FourierSeries, FourierTrajectory
 
 

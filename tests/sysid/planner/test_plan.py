@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import yaml
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.planner.plan import (

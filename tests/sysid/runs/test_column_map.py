@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator.errors import ConfigError
 from jtqd.sysid.runs.column_map import ColumnMap, KnownLoad, motion_of
 from jtqd.sysid.runs.files import read_run, read_runs
 from jtqd.sysid.runs.run_file import RunError

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jtqd.estimator import checked
-from jtqd.estimator.checked import ConfigError
+from jtqd.estimator import text
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sysid import runs
@@ -480,7 +480,7 @@ def test_a_column_map_may_be_given_as_its_file(tmp_path: Path) -> None:
 
 
 def test_the_examples_in_the_docstrings_hold() -> None:
-    for module in (runs, checked):
+    for module in (runs, text):
         result = doctest.testmod(module)
         assert result.attempted
         assert not result.failed
