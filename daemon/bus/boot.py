@@ -13,8 +13,9 @@ from typing import Any
 
 from jtqd.daemon.config import Config, as_booted
 from jtqd.daemon.shared.child_process import Child
-from jtqd.daemon.shared.log_lines import RateLimit
-from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader, View
+from jtqd.daemon.shared.events import RateLimit
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.drivers import nmt
 from jtqd.drivers.boot import BootRequest, DriveNode, SensorNode, Sync
 from jtqd.drivers.bus_load import BusLoad, configured_load
 from jtqd.drivers.emcy import COMMUNICATION
@@ -159,7 +160,9 @@ class ReturningNodes:
 
     def waiting(self, view: View, now_s: float) -> list[int]:
         """Return the nodes that need a boot and may be tried now, the longest waiting first."""
-        idle = [int(node) for node in self._report["nodes"] if view.node_states[int(node)] in NOT_OPERATIONAL]
+        idle = [
+            int(node) for node in self._report["nodes"] if view.node_states[int(node)] in nmt.NOT_OPERATIONAL
+        ]
         wanted = dict.fromkeys((*view.unconfigured, *idle, *self._requested, *self.absent))
         due = [node for node in wanted if now_s >= self._not_before.get(node, 0.0)]
         return sorted(due, key=lambda node: self._not_before.get(node, 0.0))

@@ -13,7 +13,7 @@ from math import inf
 from typing import NamedTuple
 
 from jtqd.daemon.shared.conditions import Change
-from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.events import RateLimit
 from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, Emergency, ErrorHistory, describe, parse
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.own_objects import BUS_FIELDS

@@ -13,7 +13,7 @@ from math import inf
 from typing import Any, NamedTuple
 
 from jtqd.daemon.bus.boot import ReturningNodes
-from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.boot_node import VERIFY_CONFIGURATION, signature
 from jtqd.drivers.nmt import STATES

@@ -29,7 +29,7 @@ from jtqd.daemon.bus.nodes import NodeCare, NodeEvent, NodeWatch
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
-from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy, nmt
 from jtqd.drivers.emcy import describe, name_of

@@ -9,7 +9,7 @@ from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, judge
 from jtqd.daemon.cli.traffic import NodeCount, PdoCount, TimeHistogram, Timing, Traffic, identifier_text
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import Condition
-from jtqd.daemon.shared.notices import ERROR
+from jtqd.daemon.shared.events import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import LIMIT

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 from jtqd.daemon.recording.run_files import Account, read_account
 from jtqd.daemon.shared.conditions import Condition, read_conditions
-from jtqd.daemon.shared.notices import FILE as NOTICES
-from jtqd.daemon.shared.notices import Notice, NoticesError, NoticesReader
+from jtqd.daemon.shared.events import FILE as NOTICES
+from jtqd.daemon.shared.events import Notice, NoticesError, NoticesReader
 from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, read_about
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
 

@@ -31,21 +31,14 @@ from jtqd.daemon.cli.running import (
 )
 from jtqd.daemon.cli.terminal import HEAD, HEADING, Columns, Keys, histogram, line, paged, sparkline
 from jtqd.daemon.shared.conditions import SEVERITIES, Condition
-from jtqd.daemon.shared.contacts import contact_line, contact_of
 from jtqd.daemon.shared.counters import Shown, shown_in
-from jtqd.daemon.shared.notices import ERROR, WARNING, Notice
-from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
+from jtqd.daemon.shared.events import ERROR, WARNING, Notice
+from jtqd.daemon.shared.reasons import contact_line, contact_of, drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
-from jtqd.daemon.shared.snapshot import (
-    LATE_BIN_NS,
-    NMT_STATES,
-    OPERATIONAL,
-    WORK_BIN_NS,
-    SnapshotReader,
-    View,
-)
+from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
 from jtqd.estimator.command_line import command_parser
+from jtqd.drivers import nmt
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
 
@@ -323,12 +316,12 @@ def _nodes(about: About, view: View) -> Columns:
     table = Columns({"node": "left", "what": "left", "state": "left", "heartbeat": "right"}, ("what",))
     for node, what in sorted(about.nodes.items()):
         heard = view.node_heard_ns[node]
-        state = Text(NMT_STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
+        state = Text(nmt.STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
         if silent_s(view, node, about.heartbeat_ms) is not None:
             state = Text(f"silent, last {state.plain}", style="bold red")
         elif node in view.unconfigured:
             state = Text("restarted, not configured yet", style="bold red")
-        elif heard and view.node_states[node] != OPERATIONAL:
+        elif heard and view.node_states[node] != nmt.OPERATIONAL:
             state.stylize("yellow")
         age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
         table.add(f"{node:02X}h", what, state, age)
@@ -483,7 +476,7 @@ def _nodes_content(about: About, view: View) -> list[dict[str, Any]]:
         {
             "node": node,
             "what": what,
-            "state": NMT_STATES.get(view.node_states[node]) if heard[node] else None,
+            "state": nmt.STATES.get(view.node_states[node]) if heard[node] else None,
             "heartbeat_age_s": (view.sync_realtime_ns - heard[node]) * 1e-9 if heard[node] else None,
             "configured": node not in view.unconfigured,
         }

@@ -30,7 +30,7 @@ from jtqd.daemon.recording.diagnostics import LoopReader
 from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros_of
 from jtqd.daemon.recording.recording import SCANNED, EventLog
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.notices import NoticesError, NoticesReader
+from jtqd.daemon.shared.events import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError
 from jtqd.daemon.shared.side_process import CannotBegin, Stop, run_side_process
 from jtqd.daemon.shared.snapshot import SnapshotError

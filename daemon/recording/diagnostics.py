@@ -14,17 +14,18 @@ from typing import Any, NamedTuple
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import Status
 from jtqd.daemon.recording.run_files import MEGABYTE, Account
-from jtqd.daemon.shared import notices
+from jtqd.daemon.shared import events
 from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, read_conditions, worst
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.daemon.shared.ring import RingReader
-from jtqd.daemon.shared.snapshot import NMT_STATES, OPERATIONAL, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.drivers import nmt
 
 OK, WARN, ERROR, STALE = range(4)
 _OF_THE_BUS = shown_in(Shown.BUS)
 _JOINT_LEVELS = {"VALID": OK, "STANDSTILL": OK, "STALE": STALE, "DRIVE_FAULT": ERROR, "INVALID": ERROR}
-_LEVELS = {notices.INFO: OK, notices.WARNING: WARN, notices.ERROR: ERROR}
+_LEVELS = {events.INFO: OK, events.WARNING: WARN, events.ERROR: ERROR}
 """Of severities."""
 _QUANTILES = (0.5, 0.99, 1.0)
 _PERIOD_NS = 1_000_000_000
@@ -169,11 +170,11 @@ class Diagnostics:
 
     def _node(self, view: View, node: Node, now_ns: int, found: Sequence[Condition]) -> Status:
         state = view.node_states[node.node_id]
-        name = NMT_STATES.get(state, f"state {state}")
+        name = nmt.STATES.get(state, f"state {state}")
         heard = view.node_heard_ns[node.node_id]
         age_s = (now_ns - heard) * 1e-9 if heard else float("nan")
         level, text = _level(found, f"node {node.node_id}", name)
-        level = max(level, OK if state == OPERATIONAL else WARN)
+        level = max(level, OK if state == nmt.OPERATIONAL else WARN)
         if not age_s <= _SILENT_S:
             level, text = STALE, "no heartbeat"
         values: dict[str, float | str] = {"nmt_state": name, "heartbeat_age_s": age_s}

@@ -40,7 +40,7 @@ from jtqd.daemon.recording.run_files import (
 )
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS, layout_of
-from jtqd.daemon.shared.notices import NoticesError, NoticesReader
+from jtqd.daemon.shared.events import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotError
 
@@ -74,7 +74,7 @@ class RecorderRequest:
         attachments: each {"name", "media_type", and one of "path", "text" and "base64"}.
         progress: `ProgressFile`; an older recorder's account in it is carried on. None: none.
         snapshot: the loop's `jtqd.daemon.shared.snapshot`, for /diagnostics. None: without it.
-        notices: the supervisor's `jtqd.daemon.shared.notices`, for /events and /log. None: without them.
+        notices: the supervisor's `jtqd.daemon.shared.events`, for /events and /log. None: without them.
         bus: name of the bus, for /diagnostics.
         nodes: [node-ID, name] of those in /diagnostics.
         joint_names: of the joints, joint 1 first, for /joint_states; there are as many joints as names.

@@ -9,7 +9,7 @@ EMCY code. The supervisor's parts observe and call `Conditions.update`; everybod
     metrics, final summary              `present()`, `history()`
 
 What only happens (a boot-up message, an EMCY of a node, an NMT command of somebody else) is no condition but an event
-(`jtqd.daemon.shared.notices`).
+(`jtqd.daemon.shared.events`).
 
 >>> conditions = Conditions()
 >>> drive = Subject("node 2", 2, joints=0b10)
@@ -32,7 +32,7 @@ from math import inf
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from jtqd.daemon.shared.notices import ERROR, INFO, WARNING
+from jtqd.daemon.shared.events import ERROR, INFO, WARNING
 
 FILE = "conditions.json"
 """Name of the file in the runtime directory of a daemon."""
@@ -69,10 +69,10 @@ class Definition:
     Attributes:
         name: as in files, metrics and docs.
         about: what it is about (`JOINT` .. `MACHINE`).
-        severity: INFO, WARNING or ERROR of `jtqd.daemon.shared.notices`.
+        severity: INFO, WARNING or ERROR of `jtqd.daemon.shared.events`.
         text: one sentence in the present tense; {} takes the details.
         ended: what the line at its end says, before "after 2.3 s"; "" where an event says so.
-        topic: of the event that a line becomes (`jtqd.daemon.shared.notices.Notice`).
+        topic: of the event that a line becomes (`jtqd.daemon.shared.events.Notice`).
         emcy: of the EMCY messages of its begin and end; None: none.
         hold_s: a change that does not last so long is none.
         repeat_s: while it is present, its line comes again so often; such lines have a rate limit of their own.

@@ -1,21 +1,22 @@
-"""Why a joint has the status it has, and why its inputs are missing, in words. Pure: from a snapshot and `about.json`."""
+"""A joint in words: the reason of its status, of a missing input or sensor, and its contact. Pure: from a snapshot."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
-from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION, FLAG_SENSOR
+from jtqd.daemon.shared.cycle_record import (
+    FLAG_CONTACT,
+    FLAG_CONTACT_KNOWN,
+    FLAG_MOTION,
+    FLAG_NETWORK_SKIPPED,
+    FLAG_POSITION,
+    FLAG_SENSOR,
+)
 from jtqd.daemon.shared.faults import MEANINGS, NAMES, STATUS_OF_STATE
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint
-from jtqd.daemon.shared.snapshot import (
-    NMT_STATES,
-    NO_ZEROS,
-    NOT_OPERATIONAL,
-    OPERATIONAL,
-    JointView,
-    View,
-)
+from jtqd.daemon.shared.snapshot import NO_ZEROS, JointView, View
+from jtqd.drivers import nmt
 from jtqd.drivers.drive import State, state_of
 from jtqd.estimator import status as st
 from jtqd.estimator.status import APART, LEFT, Zeros
@@ -157,8 +158,8 @@ def stale_reason(
     unready = unready_reason(node, view)
     if unready:
         return unready
-    if view.node_states[node] in NOT_OPERATIONAL:
-        return f"node {node} is {NMT_STATES[view.node_states[node]]}"
+    if view.node_states[node] in nmt.NOT_OPERATIONAL:
+        return f"node {node} is {nmt.STATES[view.node_states[node]]}"
     for counter, meaning in _ON_THE_BUS:
         if rose(counter):
             return meaning
@@ -178,7 +179,7 @@ def unready_reason(node: int, view: View) -> str:
         return ""
     if not view.node_heard_ns[node] and not view.node_states[node]:
         return f"node {node} is absent"
-    if view.node_states[node] == OPERATIONAL:
+    if view.node_states[node] == nmt.OPERATIONAL:
         return f"node {node} has a changed configuration"
     return f"node {node} has restarted and is not configured yet"
 
@@ -197,3 +198,29 @@ def silent_s(view: View, node: int, heartbeat_ms: int) -> float | None:
     heard = view.node_heard_ns[node]
     age_s = (view.sync_realtime_ns - heard) * 1e-9
     return age_s if heard and age_s > SILENT_AFTER * heartbeat_ms * 1e-3 else None
+
+
+# Contact ---------------------------------------------------------------------------------------------------------------
+
+
+def contact_of(seen: JointView) -> bool | None:
+    """Return whether the joint is pushed from outside; None where that is not known or not watched."""
+    return bool(seen.input_flags & FLAG_CONTACT) if seen.input_flags & FLAG_CONTACT_KNOWN else None
+
+
+def contact_text(seen: JointView) -> str:
+    """Return the contact for a cell of a table: its size, "none" or "unknown"."""
+    contact = contact_of(seen)
+    if contact is None:
+        return "unknown"
+    return f"{seen.contact_nm:+.1f} Nm" if contact else "none"
+
+
+def contact_line(seen: JointView, threshold_nm: float) -> str:
+    """Return the contact with what it is judged by: residual and threshold [Nm], torque rate [Nm/s]."""
+    contact = contact_of(seen)
+    if contact is None:
+        return "unknown"
+    word = "CONTACT" if contact else "none"
+    rate = f", torque rate {seen.torque_rate_nm_s:+.0f} Nm/s" if isfinite(seen.torque_rate_nm_s) else ""
+    return f"{word}: {seen.contact_nm:+.2f} Nm from outside (threshold {threshold_nm:.2f}){rate}"

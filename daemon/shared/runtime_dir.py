@@ -1,4 +1,4 @@
-"""Where a running jtqd keeps its ring and snapshot: one directory per bus, on a tmpfs.
+"""The runtime directory of a running jtqd: ring, snapshot and description of one daemon, on a tmpfs.
 
 The directory is open to the daemon's group (0750): the snapshot, `about.json` and the recorder's account can be read by its
 members (`jtq status`); what only the daemon's own processes need (`ring`, `lock`, `control`) stays with its user.
@@ -20,6 +20,8 @@ from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from jtqd.estimator.sha256 import sha256_hex
 
@@ -62,18 +64,18 @@ def claim(bus: str) -> tuple[Path, int]:
 
 
 def remove(directory: Path) -> None:
-    """Take away a directory that this process has claimed; what cannot be removed stays."""
+    """Remove a directory that this process has claimed; what cannot be removed stays."""
     with suppress(OSError):
         for entry in directory.iterdir():
             if entry.name != _LOCK:
                 entry.unlink(missing_ok=True)
-        # Last: from here on the name is free, and another process may make it anew.
+        # Last: from here on the name is free, and another process may make it again.
         (directory / _LOCK).unlink()
         directory.rmdir()
 
 
 def _sweep(root: Path) -> None:
-    """Take away what daemons of this user left that were killed: directories whose claim nobody holds."""
+    """Remove the directories of killed daemons of this user: those whose lock nobody holds."""
     for directory in root.glob(f"jtqd-{os.getuid()}-*"):
         with suppress(OSError):
             if not (directory / _LOCK).is_file():  # not one of ours, or just being made
@@ -84,7 +86,7 @@ def _sweep(root: Path) -> None:
 
 
 def _swept(error: BlockingIOError) -> bool:
-    """Return whether nobody who runs there holds the claim: somebody is just taking away what a killed daemon left."""
+    """Return whether no running process holds the lock: another one is removing the directory of a killed daemon."""
     holder = str(error).split()[1]
     return not (holder.isdigit() and Path("/proc", holder).exists())
 
@@ -141,12 +143,12 @@ class AboutJoint:
     sensor: str | None
     temperature: bool
     contact_threshold_nm: float | None = None
-    """None: nobody watches for contacts."""
+    """None: contacts are not watched."""
 
 
 @dataclass(frozen=True)
 class About:
-    """What `about.json` says; `started` is UTC (ISO 8601), `started_ticks` the process's start time in /proc/PID/stat."""
+    """Content of `about.json`; `started` is UTC (ISO 8601), `started_ticks` the process's start time in /proc/PID/stat."""
 
     bus: str
     instance: str
@@ -189,7 +191,7 @@ def write_about(directory: Path, content: About) -> None:
     new = directory / (FILE + ".new")
     with open(new, "w", encoding="utf-8") as file:
         os.fchmod(file.fileno(), 0o640)
-        json.dump({"schema": SCHEMA} | _plain(content), file)
+        json.dump({"schema": SCHEMA} | msgspec.to_builtins(content), file)
     os.replace(new, directory / FILE)
 
 
@@ -201,16 +203,13 @@ def read_about(path: Path) -> About:
         PermissionError: it belongs to a daemon of another user and group.
     """
     try:
-        content: Any = json.loads(path.read_text(encoding="utf-8"))
-        if content.pop("schema") != SCHEMA:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["schema"] != SCHEMA:
             raise AboutError(f"{path}: written by another version of jtqd")
-        joints = tuple(
-            AboutJoint(**each | {"inputs": tuple(each["inputs"])}) for each in content.pop("joints")
-        )
-        return About(joints=joints, inputs=tuple(content.pop("inputs")), **content)
+        return msgspec.convert(content, About)
     except PermissionError:
         raise
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise AboutError(f"{path}: {error}") from None
 
 
@@ -239,11 +238,4 @@ def versions() -> dict[str, str]:
     """Versions of Python and of the packages that an estimate and its log depend on, for `about.json` and the log."""
     return {name: installed(name) or "not installed" for name in _PACKAGES} | {
         "python": platform.python_version()
-    }
-
-
-def _plain(content: About) -> dict[str, Any]:
-    return {
-        name: [vars(joint) for joint in value] if name == "joints" else value
-        for name, value in vars(content).items()
     }

@@ -22,11 +22,6 @@ from jtqd.estimator.status import Zeros
 STATUS_CODES = 16
 MAX_NODE = 128
 
-NMT_STATES = {0: "boot-up", 4: "stopped", 5: "operational", 127: "pre-operational"}
-"""Heartbeat states of CiA 301."""
-OPERATIONAL, NOT_OPERATIONAL = 5, (4, 127)
-"""Heartbeat states in which a node sends its PDOs, and in which it sends none."""
-
 
 class JointView(NamedTuple):
     """Last estimate of one joint; NaN where unknown. `sensor_nm` is the sensor in the same cycle."""

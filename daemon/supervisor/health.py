@@ -32,7 +32,8 @@ from jtqd.daemon.shared.reasons import (
     stale_reason,
     unready_reason,
 )
-from jtqd.daemon.shared.snapshot import NMT_STATES, NOT_OPERATIONAL, InputView, JointView, View
+from jtqd.daemon.shared.snapshot import InputView, JointView, View
+from jtqd.drivers import nmt
 from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.estimator import status as st
 from jtqd.estimator.status import Zeros
@@ -353,5 +354,5 @@ class Health:
             "node_unconfigured", subject, bool(unready), now_s, unready.removeprefix(f"node {node} ")
         )
         state = view.node_states[node]
-        idle = not unready and state in NOT_OPERATIONAL
-        conditions.update("node_not_operational", subject, idle, now_s, NMT_STATES.get(state, ""))
+        idle = not unready and state in nmt.NOT_OPERATIONAL
+        conditions.update("node_not_operational", subject, idle, now_s, nmt.STATES.get(state, ""))

@@ -28,9 +28,8 @@ from jtqd.daemon.recording.launch import RecorderProcess, recording_request
 from jtqd.daemon.ros2.launch import Ros2Publisher
 from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
-from jtqd.daemon.shared.log_lines import ERROR, INFO, NOTICE, WARNING, EventLog, OperatorLog
-from jtqd.daemon.shared.notices import FILE as NOTICES
-from jtqd.daemon.shared.notices import Notices
+from jtqd.daemon.shared.events import FILE as NOTICES
+from jtqd.daemon.shared.events import EventLog, Notices, OperatorLog, Priority
 from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.supervisor.description import about
@@ -329,14 +328,14 @@ class Supervisor:
         if ready is None:
             return None
         for line in ready["notes"]:
-            self._log(line, INFO)
+            self._log(line, Priority.INFO)
         loop.send({**report, "worst_load": self._load.worst})
         running = wait_for(loop, self._stopped)
         if running is None:
             return None
         boot.end_of_input()
         for line in running["refused"]:
-            self._log(f"not granted: {line}", WARNING)
+            self._log(f"not granted: {line}", Priority.WARNING)
         if running["refused"]:
             text = "; ".join(running["refused"])
             self._conditions.update("not_granted", THE_MACHINE, True, time.monotonic(), text)
@@ -369,7 +368,7 @@ class Supervisor:
         self._leave()
         failed = result.get("error") or result.get("failed")
         if failed:
-            self._log(f"ended: {failed}", ERROR)
+            self._log(f"ended: {failed}", Priority.ERROR)
         recording = self._recorder.end(failed=bool(failed))
         return summary_of(
             reader,
@@ -450,7 +449,10 @@ class Supervisor:
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
                 if bench is not None and not bench.alive():
-                    self._log(f"the emulated bench ended with exit status {bench.process.returncode}", ERROR)
+                    self._log(
+                        f"the emulated bench ended with exit status {bench.process.returncode}",
+                        Priority.ERROR,
+                    )
                     bench = None
                 if self._stop and not stopping:
                     stopping = time.monotonic()
@@ -462,7 +464,7 @@ class Supervisor:
                     return {"error": f"the loop did not end within {_LOOP_END_S:g} s"}
                 if self._hung_up:
                     self._hung_up = False
-                    self._log(_ON_HANGUP, NOTICE, "SIGHUP")
+                    self._log(_ON_HANGUP, Priority.NOTICE, "SIGHUP")
                 self._recorder.watch()
                 if self._live is not None:
                     self._live.watch()

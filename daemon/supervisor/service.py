@@ -18,7 +18,7 @@ from typing import Any
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
 from jtqd.daemon.shared.counters import RECORDER_LOST, TABLE
-from jtqd.daemon.shared.log_lines import NOTICE, WARNING, OperatorLog
+from jtqd.daemon.shared.events import OperatorLog, Priority
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
@@ -198,7 +198,7 @@ class Service:
     def _ask_save(self, request: Reply) -> Reply:
         if not self._save():
             raise ControlError("recording is off")
-        self._log("flight recording written on request", NOTICE, "save")
+        self._log("flight recording written on request", Priority.NOTICE, "save")
         return {"ok": True}
 
     def _reset(self, request: Reply) -> Answer:
@@ -206,7 +206,7 @@ class Service:
         assert reader is not None
         before = sum(each.latched for each in reader.read().joints)
         number, until = reader.ask_reset(), time.monotonic() + _RESET_S
-        self._log("latched faults reset on request", NOTICE, "reset")
+        self._log("latched faults reset on request", Priority.NOTICE, "reset")
 
         def answer() -> Reply | None:
             if reader.resets_done >= number:
@@ -235,7 +235,7 @@ class Service:
             present = self._conditions.present()
             write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost, present))
         except OSError as error:
-            self._log(f"metrics: {path}: {error.strerror}", WARNING, "metrics")
+            self._log(f"metrics: {path}: {error.strerror}", Priority.WARNING, "metrics")
 
 
 def _status(view: View) -> str:

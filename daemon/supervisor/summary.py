@@ -9,7 +9,7 @@ from typing import Any
 
 from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.counters import Shown, shown_in
-from jtqd.daemon.shared.notices import INFO
+from jtqd.daemon.shared.events import INFO
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.status import Zeros
 from jtqd.estimator.text import finite

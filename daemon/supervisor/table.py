@@ -14,8 +14,8 @@ from rich.measure import Measurement
 from rich.table import Table
 from rich.text import Text
 
-from jtqd.daemon.shared.contacts import contact_of, contact_text
-from jtqd.daemon.shared.log_lines import INFO, OperatorLog
+from jtqd.daemon.shared.events import OperatorLog, Priority
+from jtqd.daemon.shared.reasons import contact_of, contact_text
 from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
 
@@ -212,5 +212,5 @@ class Display:
             self._live.update(table, refresh=True)
         else:
             line = plain_line(self._reader, self._previous, view, self._bitrate, contacts=self._contacts)
-            self._log(line.removeprefix("jtqd: "), INFO)
+            self._log(line.removeprefix("jtqd: "), Priority.INFO)
         self._previous, self._shown = view, now

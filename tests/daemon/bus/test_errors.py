@@ -17,7 +17,7 @@ from jtqd.daemon.bus.errors import (
     EmcyLog,
     OwnErrors,
 )
-from jtqd.daemon.shared.log_lines import RateLimit
+from jtqd.daemon.shared.events import RateLimit
 from jtqd.drivers.emcy import Emergency, describe, name_of, parse
 from jtqd.drivers.object_dictionary import ObjectStore
 from tests.drivers.canopen_nodes import EDS

@@ -8,7 +8,7 @@ from typing import Any
 import canopen
 import pytest
 
-from jtqd.daemon.shared.notices import NoticesReader
+from jtqd.daemon.shared.events import NoticesReader
 from tests.daemon.bus.master_daemon import STALE, Daemon, a_daemon, frame
 from tests.paths import JTQD_EDS
 

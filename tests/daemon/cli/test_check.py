@@ -20,7 +20,7 @@ from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, identifier_t
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import Condition
-from jtqd.daemon.shared.notices import ERROR, WARNING
+from jtqd.daemon.shared.events import ERROR, WARNING
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, stuffed_bits
 from tests.drivers.hub_helpers import until_it_listens
 from tests.shipped_bench import shipped_bench

@@ -14,8 +14,8 @@ import pytest
 
 from jtqd.daemon.cli.running import Watch, find_daemons, on_bus
 from jtqd.daemon.config import load_config
+from jtqd.daemon.shared.events import Notices
 from jtqd.daemon.shared.faults import DRIVE_FAULT
-from jtqd.daemon.shared.notices import Notices
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About, AboutError, read_about, start_ticks, write_about
 from jtqd.daemon.shared.snapshot import JointView

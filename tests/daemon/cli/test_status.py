@@ -21,7 +21,7 @@ from jtqd.daemon.cli.status import Moment, Recent, StatusView, main
 from jtqd.daemon.cli.terminal import paged
 from jtqd.daemon.recording.run_files import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
-from jtqd.daemon.shared.notices import ERROR, WARNING, Notices
+from jtqd.daemon.shared.events import ERROR, WARNING, Notices
 from jtqd.daemon.shared.runtime_dir import start_ticks, write_about
 from tests.daemon.cli.status_daemon import picture, running
 

@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 from jtqd.daemon.recording import schemas
 from jtqd.daemon.shared import cycle_record
-from jtqd.daemon.shared.notices import FILE, Notices
+from jtqd.daemon.shared.events import FILE, Notices
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from tests.daemon.recording.recorder_bench import DEFINITIONS, put, record_of

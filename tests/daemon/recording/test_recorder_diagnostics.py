@@ -9,7 +9,7 @@ from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.notices import ERROR, INFO, WARNING, Notices
+from jtqd.daemon.shared.events import ERROR, INFO, WARNING, Notices
 from jtqd.daemon.shared.snapshot import JointView, Snapshot
 from tests.daemon.recording.recorder_bench import DEFINITIONS, messages_of, session_on, statuses_of
 from tests.daemon.snapshots import EstimateWriter

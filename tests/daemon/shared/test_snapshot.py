@@ -12,27 +12,17 @@ import pytest
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import (
     INPUT,
-    NMT_STATES,
-    NOT_OPERATIONAL,
-    OPERATIONAL,
     SIZE,
     Snapshot,
     SnapshotError,
     SnapshotReader,
 )
-from jtqd.drivers import nmt
 from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import frame, inputs, make, turn
 from tests.daemon.snapshots import EstimateWriter
 
 ONE = (1.0, 0.1, 1.1, 1.2, math.nan, 0.9, 0x27, 2, 0, 7, 0, 0.8, 1.25, 40.0, math.nan)
 TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.nan, 5.0, math.nan, 0.3)
-
-
-def test_states_of_nodes_are_those_of_the_drivers() -> None:
-    """The ground floor imports no drivers, so they stand here twice."""
-    assert nmt.STATES == NMT_STATES
-    assert (OPERATIONAL, NOT_OPERATIONAL) == (nmt.OPERATIONAL, (nmt.STOPPED, nmt.PRE_OPERATIONAL))
 
 
 def test_round_trip(tmp_path: Path) -> None:

@@ -20,10 +20,11 @@ from typing import Any
 
 import yaml
 
-from jtqd.daemon.shared.snapshot import NOT_OPERATIONAL, SnapshotReader
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket
+from jtqd.drivers.nmt import NOT_OPERATIONAL
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench, bench_filters
 from jtqd.sim_can.plant_file import load_plant

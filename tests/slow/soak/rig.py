@@ -13,8 +13,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
-from jtqd.daemon.shared.notices import FILE as NOTICES
-from jtqd.daemon.shared.notices import NoticesReader
+from jtqd.daemon.shared.events import FILE as NOTICES
+from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from tests.paths import ROOT
 from tests.slow.faults.ears import Ears
