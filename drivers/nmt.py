@@ -21,6 +21,8 @@ STATES: Final = {
     PRE_OPERATIONAL: "pre-operational",
 }
 """By the byte of a heartbeat."""
+NOT_OPERATIONAL: Final = (STOPPED, PRE_OPERATIONAL)
+"""States in which a node sends no PDO."""
 
 START, STOP, ENTER_PRE_OPERATIONAL, RESET_NODE, RESET_COMMUNICATION = 0x01, 0x02, 0x80, 0x81, 0x82
 COMMANDS: Final = {

@@ -1,8 +1,7 @@
-"""Live state of the loop in shared memory: counters, histograms and the last estimate.
+"""The snapshot: live state of the loop in shared memory (counters, histograms, last estimate), for all that show it.
 
-For status views and for jtqd's own objects. The loop writes, the daemon's user and group read; nothing a
-reader does can delay the loop. The counters are single 64-bit words; the block of the last estimate is
-guarded by a sequence number that is odd while it is being written, with everything else that is written every 8th cycle.
+The loop writes, the daemon's user and group read, and no reader can delay the loop. The counters are single 64-bit words.
+The last estimate, and all else that is written every 8th cycle, is guarded by a sequence number that is odd during a write.
 """
 
 from __future__ import annotations
@@ -13,9 +12,9 @@ import struct
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from jtqd.daemon.shared.counters import COUNTERS
+from jtqd.daemon.shared.counters import COUNTERS, word_of
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.estimator.status import Zeros
 
@@ -45,7 +44,7 @@ class JointView(NamedTuple):
     """Group delay of the estimate."""
     torque_rate_nm_s: float = float("nan")
     contact_nm: float = float("nan")
-    """As in the cycle record; whether there is a contact say bits of `input_flags`."""
+    """As in the cycle record; bits of `input_flags` tell whether there is a contact."""
 
 
 class Measured(NamedTuple):
@@ -60,7 +59,7 @@ class Measured(NamedTuple):
 
 
 class InputView(NamedTuple):
-    """One input PDO, in the order of `daemon/core/input_pdos.py`; every 8th cycle is looked at."""
+    """One input PDO, in the order of `daemon/core/input_pdos.py`, as of every 8th cycle."""
 
     used_ns: int
     """SYNC of the last cycle seen that used it, CLOCK_MONOTONIC; 0 never."""
@@ -123,7 +122,7 @@ class View(NamedTuple):
     """State of each joint's estimator after this cycle (`FusedEstimator.past`); empty where it learns nothing."""
 
 
-def quantiles(bins: tuple[int, ...], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
+def quantiles(bins: Sequence[int], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
     """Quantiles [us] of a histogram with bins of `bin_ns`, upper edge of their bin; see `SnapshotReader.work_us`."""
     total = sum(bins)
     result = []
@@ -156,31 +155,9 @@ PAST_WORDS = 192
 """Room for the state of an estimator."""
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""
-_ORDERS_OFFSET = _HEAD.size
-_COUNTERS_OFFSET = _ORDERS_OFFSET + 5 * 8
-_SEQUENCE_OFFSET = _COUNTERS_OFFSET + 8 * len(COUNTERS)
-_ESTIMATE_OFFSET = _SEQUENCE_OFFSET + 8
 ESTIMATE_SIZE = ESTIMATE.size + MOST_JOINTS * (JOINT.size + MEASURED.size)
-_MEASURED_OFFSET = _ESTIMATE_OFFSET + ESTIMATE.size + MOST_JOINTS * JOINT.size
-_ERRORS_OFFSET = _MEASURED_OFFSET + MOST_JOINTS * MEASURED.size
-_WORK_OFFSET = _ERRORS_OFFSET + MOST_JOINTS * 3 * 8
-_LATE_OFFSET = _WORK_OFFSET + 8 * WORK_BINS
-_STATUS_OFFSET = _LATE_OFFSET + 8 * LATE_BINS
-_INPUTS_OFFSET = _STATUS_OFFSET + 8 * MOST_JOINTS * STATUS_CODES
-_HEARD_OFFSET = _INPUTS_OFFSET + INPUT.size * MAX_INPUTS
-_NODES_OFFSET = _HEARD_OFFSET + 8 * MAX_NODE
-_CONFIGURED_OFFSET = _NODES_OFFSET + MAX_NODE
-_UNCONFIGURED_OFFSET = _CONFIGURED_OFFSET + MAX_NODE
-_FACTORS_OFFSET = _UNCONFIGURED_OFFSET + MAX_NODE
-_FACTORS = struct.Struct("<4d")
-_RESTARTS_OFFSET = _FACTORS_OFFSET + _FACTORS.size * MAX_NODE
-_CONFIGURED_FOR_OFFSET = _RESTARTS_OFFSET + 8 * MAX_NODE
-_DOUBTS_OFFSET = _CONFIGURED_FOR_OFFSET + 8 * MAX_NODE
-_LEARNED_OFFSET = _DOUBTS_OFFSET + MAX_NODE
-SIZE = _LEARNED_OFFSET + MOST_JOINTS * LEARNED.size
-_WORD = struct.Struct("<Q")
 _PATIENCE_S = 0.05
-"""Of a reader, with a loop in the midst of a write: many times what a preempted loop may take."""
+"""Of a reader, while the loop is in a write: many times what a preempted loop may take."""
 _PAUSE_S = 50e-6
 
 
@@ -188,31 +165,70 @@ class SnapshotError(Exception):
     """No snapshot of this layout at the path."""
 
 
-class Snapshot:
-    """Writer's side, one per loop: the memory that `daemon/core/snapshot.pyx` writes into.
-
-    It has room for four joints; `joints` says how many there are.
+class _Views:
+    """Views of the snapshot's memory, in their order in it.
 
     Attributes:
-        orders: requests of the supervisor and what became of them: [resets asked, done, doubts reported, seen,
-            turns of the supervisor].
-        counters: memory of the counters, one unsigned 64-bit word each, in the order of `COUNTERS`.
-        work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
-        late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
-        errors: of each joint the sums of squared errors against the sensor of the estimate's age and against the sensor
-            now, and the number of samples.
-        status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2, ...
-        inputs: one `INPUT` for each input PDO.
-        node_states: last heartbeat state of each node-ID.
-        node_heard: kernel stamp of that heartbeat [ns].
-        configured: number of times each node-ID has been configured; written by the supervisor.
-        unconfigured: 1 for each node-ID that restarted and has not been configured since.
-        restarts: boot-up messages of each node-ID.
-        configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
-        doubts: number of times each node-ID was found to be configured otherwise; written by the supervisor.
-        learned: of each joint a `LEARNED`; as `estimate`, guarded by the sequence.
+        orders: requests of the supervisor and their execution: [resets requested, executed, changed nodes reported, taken,
+            signs of life of the supervisor].
+        counters: the words of `counters.TABLE`.
         sequence: odd while the snapshot is being written.
         estimate: the last estimate: times, status, `JointView` and `Measured` of all joints.
+        errors: of each joint the sums of squared errors against the sensor of the estimate's age and against the sensor
+            now, and the number of samples.
+        work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
+        late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
+        status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2, ...
+        inputs: one `INPUT` for each input PDO.
+        node_heard: kernel stamp of the last heartbeat of each node-ID [ns].
+        node_states: state in that heartbeat.
+        configured: number of times each node-ID has been configured; written by the supervisor.
+        unconfigured: 1 for each node-ID that restarted and has not been configured since.
+        node_factors: four scaling factors of each node-ID that was absent at the start; written by the supervisor.
+        restarts: boot-up messages of each node-ID.
+        configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
+        doubts: number of times each node-ID was found with a changed configuration; written by the supervisor.
+        learned: of each joint a `LEARNED`; as `estimate`, guarded by the sequence.
+    """
+
+    def __init__(self, memory: memoryview) -> None:
+        self._memory: Any = memory
+        self.size = _HEAD.size
+        self.orders = self._next("Q", 5)
+        self.counters = self._next("Q", len(COUNTERS))
+        self.sequence = self._next("Q", 1)
+        self.estimate = self._next("B", ESTIMATE_SIZE)
+        self.errors = self._next("d", 3 * MOST_JOINTS)
+        self.work = self._next("Q", WORK_BINS)
+        self.late = self._next("Q", LATE_BINS)
+        self.status_cycles = self._next("Q", MOST_JOINTS * STATUS_CODES)
+        self.inputs = self._next("B", MAX_INPUTS * INPUT.size)
+        self.node_heard = self._next("q", MAX_NODE)
+        self.node_states = self._next("B", MAX_NODE)
+        self.configured = self._next("B", MAX_NODE)
+        self.unconfigured = self._next("B", MAX_NODE)
+        self.node_factors = self._next("d", 4 * MAX_NODE)
+        self.restarts = self._next("Q", MAX_NODE)
+        self.configured_for = self._next("Q", MAX_NODE)
+        self.doubts = self._next("B", MAX_NODE)
+        self.learned = self._next("B", MOST_JOINTS * LEARNED.size)
+
+    def _next(self, code: str, count: int) -> Any:
+        """Return the view of the next `count` items of a code of `struct`."""
+        start, self.size = self.size, self.size + struct.calcsize("<" + code) * count
+        return self._memory[start : self.size].cast(code)
+
+
+SIZE = _Views(memoryview(b"")).size
+
+
+class Snapshot(_Views):
+    """Writer's side, one per loop: the memory that `daemon/core/snapshot.pyx` writes into.
+
+    It has room for four joints.
+
+    Attributes:
+        joints: number of joints.
     """
 
     def __init__(self, path: Path, period_s: float, worst_load: float, joints: int = 2) -> None:
@@ -221,31 +237,14 @@ class Snapshot:
         with open(temporary, "w+b") as file:
             os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
             os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
-            self._memory = mmap.mmap(file.fileno(), 0)
-        _HEAD.pack_into(self._memory, 0, _MAGIC, os.getpid(), period_s, worst_load, joints)
+            memory = mmap.mmap(file.fileno(), 0)
+        _HEAD.pack_into(memory, 0, _MAGIC, os.getpid(), period_s, worst_load, joints)
         os.replace(temporary, path)
-        view = memoryview(self._memory)
-        self.orders = view[_ORDERS_OFFSET:_COUNTERS_OFFSET].cast("Q")
-        self.counters = view[_COUNTERS_OFFSET:_SEQUENCE_OFFSET].cast("Q")
-        self.errors = view[_ERRORS_OFFSET:_WORK_OFFSET].cast("d")
-        self.work = view[_WORK_OFFSET:_LATE_OFFSET].cast("Q")
-        self.late = view[_LATE_OFFSET:_STATUS_OFFSET].cast("Q")
-        self.status_cycles = view[_STATUS_OFFSET:_INPUTS_OFFSET].cast("Q")
-        self.inputs = view[_INPUTS_OFFSET:_HEARD_OFFSET]
-        self.node_heard = view[_HEARD_OFFSET:_NODES_OFFSET].cast("q")
-        self.node_states = view[_NODES_OFFSET:_CONFIGURED_OFFSET]
-        self.configured = view[_CONFIGURED_OFFSET:_UNCONFIGURED_OFFSET]
-        self.unconfigured = view[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]
-        self.restarts = view[_RESTARTS_OFFSET:_CONFIGURED_FOR_OFFSET].cast("Q")
-        self.configured_for = view[_CONFIGURED_FOR_OFFSET:_DOUBTS_OFFSET].cast("Q")
-        self.doubts = view[_DOUBTS_OFFSET:_LEARNED_OFFSET]
-        self.learned = view[_LEARNED_OFFSET:SIZE]
-        self.sequence = view[_SEQUENCE_OFFSET:_ESTIMATE_OFFSET].cast("Q")
-        self.estimate = view[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
+        super().__init__(memoryview(memory))
 
     def factors(self, node_id: int) -> tuple[float, ...]:
-        """Four scaling factors that the supervisor has noted for a node (`note_factors`); zeros where none."""
-        return _FACTORS.unpack_from(self._memory, _FACTORS_OFFSET + node_id * _FACTORS.size)
+        """Return the four scaling factors of a node that the supervisor has noted (`note_factors`); zeros where none."""
+        return tuple(self.node_factors[4 * node_id : 4 * node_id + 4])
 
 
 class SnapshotReader:
@@ -262,19 +261,20 @@ class SnapshotReader:
                 self._memory = mmap.mmap(file.fileno(), 0, access=access)
         except (OSError, ValueError) as error:
             raise SnapshotError(f"{path}: no running loop: {error}") from None
-        if len(self._memory) != SIZE or _WORD.unpack_from(self._memory, 0)[0] != _MAGIC:
+        if len(self._memory) != SIZE or _HEAD.unpack_from(self._memory, 0)[0] != _MAGIC:
             raise SnapshotError(f"{path}: not a status snapshot of this version")
+        self._views = _Views(memoryview(self._memory))
 
     def read(self) -> View:
         """Return a consistent view; wait while the loop is writing.
 
-        A loop that was killed in the midst of a write never ends it; after `_PATIENCE_S` the reading is of what it left.
+        A loop that was killed in a write never ends it; after `_PATIENCE_S` the view is of the unfinished write.
         """
-        end = 0.0
+        sequence, end = self._views.sequence, 0.0
         while True:
-            before = _WORD.unpack_from(self._memory, _SEQUENCE_OFFSET)[0]
+            before = sequence[0]
             view = self._view()
-            if before % 2 == 0 and before == _WORD.unpack_from(self._memory, _SEQUENCE_OFFSET)[0]:
+            if before % 2 == 0 and before == sequence[0]:
                 return view
             now = time.monotonic()
             end = end or now + _PATIENCE_S
@@ -283,116 +283,102 @@ class SnapshotReader:
             time.sleep(_PAUSE_S)  # the loop may have been preempted in its write: it needs the processor more
 
     def _view(self) -> View:
-        memory = self._memory
-        _, pid, period_s, worst_load, count = _HEAD.unpack_from(memory, 0)
-        block = memory[_ESTIMATE_OFFSET:_ERRORS_OFFSET]
+        views = self._views
+        _, pid, period_s, worst_load, count = _HEAD.unpack_from(self._memory, 0)
+        block, errors = bytes(views.estimate), views.errors
         index, sync_counter, realtime_ns, monotonic_ns, *since = ESTIMATE.unpack_from(block, 0)
-        numbers = range(count)
-        joints = tuple(
-            JointView._make(JOINT.unpack_from(block, ESTIMATE.size + n * JOINT.size)) for n in numbers
-        )
-        first = _MEASURED_OFFSET - _ESTIMATE_OFFSET
-        measured = tuple(
-            Measured._make(MEASURED.unpack_from(block, first + n * MEASURED.size)) for n in numbers
-        )
-        words = struct.unpack_from(f"<{len(COUNTERS)}Q", memory, _COUNTERS_OFFSET)
-        cycles = struct.unpack_from(f"<{count * STATUS_CODES}Q", memory, _STATUS_OFFSET)
-        inputs = (
-            InputView._make(INPUT.unpack_from(memory, _INPUTS_OFFSET + n * INPUT.size))
-            for n in range(MAX_INPUTS)
-        )
-        sums = struct.unpack_from(f"<{3 * count}d", memory, _ERRORS_OFFSET)
-        learned = [LEARNED.unpack_from(memory, _LEARNED_OFFSET + n * LEARNED.size) for n in numbers]
+        joints, first = range(count), ESTIMATE.size + MOST_JOINTS * JOINT.size
+        inputs = (InputView._make(each) for each in INPUT.iter_unpack(views.inputs))
+        learned = [LEARNED.unpack_from(views.learned, n * LEARNED.size) for n in joints]
         aligned, now = (
             tuple(
-                (sums[3 * n + k] / sums[3 * n + 2]) ** 0.5 if sums[3 * n + 2] else float("nan")
-                for n in numbers
+                (errors[3 * n + k] / errors[3 * n + 2]) ** 0.5 if errors[3 * n + 2] else float("nan")
+                for n in joints
             )
             for k in (0, 1)
         )
+        cycles = views.status_cycles.tolist()
         return View(
-            pid,
-            index,
-            sync_counter,
-            realtime_ns,
-            period_s,
-            worst_load,
-            joints,
-            dict(zip(COUNTERS, words, strict=True)),
-            aligned,
-            bytes(memory[_NODES_OFFSET:_CONFIGURED_OFFSET]),
-            tuple(node for node, flag in enumerate(memory[_UNCONFIGURED_OFFSET:_FACTORS_OFFSET]) if flag),
-            monotonic_ns,
-            tuple(since[:count]),
-            measured,
-            tuple(cycles[n * STATUS_CODES : (n + 1) * STATUS_CODES] for n in numbers),
-            tuple(each for each in inputs if any(each)),
-            struct.unpack_from(f"<{MAX_NODE}q", memory, _HEARD_OFFSET),
-            struct.unpack_from(f"<{MAX_NODE}Q", memory, _RESTARTS_OFFSET),
-            now,
-            tuple(Zeros._make(each[:9]) for each in learned),
-            tuple(each[10][: each[9]] for each in learned),
+            pid=pid,
+            cycle=index,
+            sync_counter=sync_counter,
+            sync_realtime_ns=realtime_ns,
+            sync_monotonic_ns=monotonic_ns,
+            period_s=period_s,
+            worst_load=worst_load,
+            joints=tuple(
+                JointView(*JOINT.unpack_from(block, ESTIMATE.size + n * JOINT.size)) for n in joints
+            ),
+            measured=tuple(Measured(*MEASURED.unpack_from(block, first + n * MEASURED.size)) for n in joints),
+            counters=dict(zip(COUNTERS, views.counters, strict=True)),
+            rmse_nm=aligned,
+            rmse_now_nm=now,
+            node_states=bytes(views.node_states),
+            node_heard_ns=tuple(views.node_heard),
+            restarts=tuple(views.restarts),
+            unconfigured=tuple(node for node, flag in enumerate(views.unconfigured) if flag),
+            status_since=tuple(since[:count]),
+            status_cycles=tuple(tuple(cycles[n * STATUS_CODES : (n + 1) * STATUS_CODES]) for n in joints),
+            inputs=tuple(each for each in inputs if any(each)),
+            zeros=tuple(Zeros(*each[:9]) for each in learned),
+            pasts=tuple(each[10][: each[9]] for each in learned),
         )
 
     def work_us(self, *shares: float) -> list[float]:
         """Return quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
-        largest = self.read().counters["work_max_ns"]
-        return quantiles(self.work_bins(), WORK_BIN_NS, largest, shares)
+        return quantiles(self.work_bins(), WORK_BIN_NS, self._views.counters[word_of("work_max_ns")], shares)
 
     def late_us(self, *shares: float) -> list[float]:
-        """Quantiles of the SYNC's lateness [us], upper edge of their bin (1.0: the true maximum); NaN without data."""
-        largest = self.read().counters["late_max_ns"]
-        return quantiles(self.late_bins(), LATE_BIN_NS, largest, shares)
+        """Return quantiles of the SYNC's lateness [us], as `work_us`."""
+        return quantiles(self.late_bins(), LATE_BIN_NS, self._views.counters[word_of("late_max_ns")], shares)
 
     def work_bins(self) -> tuple[int, ...]:
         """Return the histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
-        return self._histogram(_WORK_OFFSET, WORK_BINS)
+        return tuple(self._views.work)
 
     def late_bins(self) -> tuple[int, ...]:
         """Return the histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
-        return self._histogram(_LATE_OFFSET, LATE_BINS)
-
-    def note_configured(self, node_id: int, restarts: int) -> None:
-        """Tell the loop that a node has been configured (supervisor only).
-
-        `restarts`: its `View.restarts` when that began; the loop believes nothing of a node that has restarted since.
-        """
-        _WORD.pack_into(self._memory, _CONFIGURED_FOR_OFFSET + 8 * node_id, restarts)
-        offset = _CONFIGURED_OFFSET + node_id
-        self._memory[offset] = (self._memory[offset] + 1) % 256
-
-    def note_factors(self, node_id: int, factors: Sequence[float]) -> None:
-        """Scaling of a node that was absent at the start, before `note_configured` (supervisor only).
-
-        A drive: rad per count and rad/s per unit of the motor, rad per count of the link, A per unit. A sensor: Nm per unit
-        of its channels.
-        """
-        values = (*factors, 0.0, 0.0, 0.0, 0.0)[:4]
-        _FACTORS.pack_into(self._memory, _FACTORS_OFFSET + node_id * _FACTORS.size, *values)
-
-    def note_doubt(self, node_id: int) -> None:
-        """Tell the loop that a node has a changed configuration: not to be used until it is again (supervisor only)."""
-        offset = _DOUBTS_OFFSET + node_id
-        self._memory[offset] = (self._memory[offset] + 1) % 256
-        self._ask(2)
-
-    def note_alive(self) -> None:
-        """Tell the loop that the supervisor turns (supervisor only)."""
-        self._ask(4)
-
-    def ask_reset(self) -> int:
-        """Request the release of latched faults (supervisor only); return the number of the request."""
-        return self._ask(0)
-
-    def _ask(self, word: int) -> int:
-        number = int(_WORD.unpack_from(self._memory, _ORDERS_OFFSET + 8 * word)[0]) + 1
-        _WORD.pack_into(self._memory, _ORDERS_OFFSET + 8 * word, number)
-        return number
+        return tuple(self._views.late)
 
     @property
     def resets_done(self) -> int:
         """Return the number of the last reset request that the loop has executed."""
-        return int(_WORD.unpack_from(self._memory, _ORDERS_OFFSET + 8)[0])
+        return int(self._views.orders[1])
 
-    def _histogram(self, offset: int, bins: int) -> tuple[int, ...]:
-        return struct.unpack_from(f"<{bins}Q", self._memory, offset)
+    # Of the supervisor only -------------------------------------------------------------------------------------------
+
+    def note_configured(self, node_id: int, restarts: int) -> None:
+        """Report to the loop that a node has been configured.
+
+        `restarts`: its `View.restarts` when that began; the loop does not use a node that has restarted since.
+        """
+        views = self._views
+        views.configured_for[node_id] = restarts
+        views.configured[node_id] = (views.configured[node_id] + 1) % 256
+
+    def note_factors(self, node_id: int, factors: Sequence[float]) -> None:
+        """Report the scaling of a node that was absent at the start, before `note_configured`.
+
+        A drive: rad per count and rad/s per unit of the motor, rad per count of the link, A per unit. A sensor: Nm per unit
+        of its channels.
+        """
+        for n, factor in enumerate((*factors, 0.0, 0.0, 0.0, 0.0)[:4]):
+            self._views.node_factors[4 * node_id + n] = factor
+
+    def note_doubt(self, node_id: int) -> None:
+        """Report that a node has a changed configuration: the loop does not use it until it is configured again."""
+        doubts = self._views.doubts
+        doubts[node_id] = (doubts[node_id] + 1) % 256
+        self._request(2)
+
+    def note_alive(self) -> None:
+        """Give the loop a sign of life of the supervisor."""
+        self._request(4)
+
+    def ask_reset(self) -> int:
+        """Request the release of latched faults; return the number of the request."""
+        return self._request(0)
+
+    def _request(self, word: int) -> int:
+        self._views.orders[word] += 1
+        return int(self._views.orders[word])

@@ -16,7 +16,7 @@ from jtqd.daemon.cli.status import Moment, Recent, StatusView, content
 from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
-from jtqd.daemon.shared.snapshot import _COUNTERS_OFFSET, Snapshot, SnapshotReader
+from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.daemon.supervisor.description import about
 from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import LiveTable, plain_line
@@ -174,8 +174,7 @@ def test_a_live_view_remembers_the_count(tmp_path: Path, monkeypatch: pytest.Mon
     watch, recent = Watch(made), Recent()
     watch.read()
     status._remember(recent, watch.read())
-    with (made.directory / "snapshot").open("r+b") as file:
-        file.seek(_COUNTERS_OFFSET + 8 * COUNTERS.index("contacts"))
-        file.write((2).to_bytes(8, "little"))
+    writer = SnapshotReader(made.directory / "snapshot", supervisor=True)
+    writer._views.counters[COUNTERS.index("contacts")] = 2
     status._remember(recent, watch.read())
     assert recent.contacts == 2
