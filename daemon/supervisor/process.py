@@ -1,4 +1,4 @@
-"""The supervisor: starts bench, loop, boot and recorder, shows how the loop is doing, ends all in order.
+"""The supervisor: starts bench, loop, boot and recorder, shows the state of the loop, and ends all in order.
 
 It also serves the own node. It has no thread and touches no frame of the cycle; if it is busy, or dies, no
 cycle is late for it.
@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import select
 import signal
 import time
@@ -19,9 +20,9 @@ from types import FrameType
 from typing import Any
 
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error, own_eds
-from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
-from jtqd.daemon.config import Config, Ros2Settings, as_booted
+from jtqd.daemon.config import Config, JointConfig, Ros2Settings, as_booted
+from jtqd.daemon.core.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.live.launch import Address, LiveView
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.recording.launch import RecorderProcess, recording_request
@@ -30,25 +31,34 @@ from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import EventLog, Notices, OperatorLog, Priority
-from jtqd.daemon.shared.runtime_dir import About, claim, instance_name, remove, write_about
+from jtqd.daemon.shared.runtime_dir import (
+    About,
+    AboutJoint,
+    claim,
+    instance_name,
+    remove,
+    start_ticks,
+    versions,
+    write_about,
+)
+from jtqd.daemon.shared.side_process import StartChild
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
-from jtqd.daemon.supervisor.description import about
 from jtqd.daemon.supervisor.health import Health
 from jtqd.daemon.supervisor.service import Service
 from jtqd.daemon.supervisor.summary import Summary, summary_of
 from jtqd.daemon.supervisor.table import Display
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
+from jtqd.drivers.drive import tpdos_as_json
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
 
 _WARM_UP_TIMEOUT_S = 60.0
+"""Generous: a controller may load its libraries from a slow card; nothing is published meanwhile."""
 _BOOT_REQUESTS = 100
 """SDO requests of a node's boot, at most; each may take the time that the configuration allows it."""
-"""Generous: a controller that loads its libraries from a slow card may take its time; nothing is published meanwhile."""
 _BENCH_PRIORITY = 40
 
-StartChild = Callable[[str, list[str], str], Child]
 Stopped = Callable[[], bool]
 
 
@@ -71,10 +81,10 @@ def checked_load(config: Config) -> BusLoad:
 def log_directory(record: str | None) -> Path | None:
     """Return the log directory of the option `--record`, created if missing; None: no recording.
 
-    A disk that is full, read-only or closed to us now may not be so later: the recorder reports it and waits for it.
+    A disk that is full, read-only or not permitted may change later: the recorder reports it and waits.
 
     Raises:
-        SupervisorError: the path can be no directory, whatever becomes of the disk.
+        SupervisorError: the path cannot be a directory.
     """
     if record == "none":
         return None
@@ -89,7 +99,7 @@ def log_directory(record: str | None) -> Path | None:
         raise SupervisorError(
             f"--record {record}: found a file there, expected a directory for logs"
         ) from None
-    except FileNotFoundError:  # the way there exists, and takes none: /proc, a link that leads nowhere
+    except FileNotFoundError:  # an existing parent without room for one: /proc, a broken link
         raise SupervisorError(f"--record {record}: the directory cannot be created") from None
     except OSError:
         pass
@@ -142,7 +152,7 @@ def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict
 
 
 def check_gears(config: Config, report: dict[str, Any]) -> str | None:
-    """Check the gear ratios that the devices report; what is wrong with one, or None."""
+    """Return what is wrong with a gear ratio that a device reports; None: nothing."""
     for number, booted in report["nodes"].items():
         wrong = gear_ratio_error(config, int(number), booted.get("gear_ratio"))
         if wrong is not None:
@@ -179,6 +189,53 @@ def put_back(config: Config, send: Callable[[bytes], bool]) -> None:
             send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
         except BusError:
             return
+
+
+def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:
+    """Describe this process: a daemon on `bus` that logs to `log_directory` (None: nowhere)."""
+    names = tuple(pdo.name for pdo in input_pdos(config))
+    return About(
+        bus=bus,
+        instance=instance,
+        pid=os.getpid(),
+        started=time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        started_ticks=start_ticks(os.getpid()) or 0,
+        configuration=str(config.path.resolve()),
+        configuration_sha256=config.sha256,
+        method=config.estimator.method,
+        node=config.node_id,
+        bitrate=config.bitrate,
+        period_us=config.period_ns // 1000,
+        deadline_us=config.input_deadline_ns / 1000,
+        heartbeat_ms=config.heartbeat_ms,
+        joints=tuple(
+            _about_joint(config, number, joint, names) for number, joint in enumerate(config.joints)
+        ),
+        sensor_node=config.sensor.node_id if config.sensor else None,
+        inputs=names,
+        log_directory=str(log_directory.resolve()) if log_directory else None,
+        log_prefix=f"jtqd-{instance}-",
+        versions=versions() | {"kernel": platform.release()},
+        tpdos={str(joint.node_id): tpdos_as_json(joint.tpdos) for joint in config.joints},
+    )
+
+
+def _about_joint(config: Config, number: int, joint: JointConfig, names: tuple[str, ...]) -> AboutJoint:
+    sensor = sensor_index(config, joint.sensor_channel)
+    rated = joint.joint.rated_torque_nm
+    return AboutJoint(
+        number=joint.number,
+        name=joint.joint.name,
+        node=joint.node_id,
+        rated_torque_nm=rated,
+        torque_limit_nm=config.estimator.torque_limit * rated,
+        network=joint.network.path.name if joint.network else None,
+        network_limit_nm=config.estimator.network_limit * rated,
+        inputs=names_of_inputs(config, number),
+        sensor=None if sensor is None else names[sensor],
+        temperature=joint.temperature is not None,
+        contact_threshold_nm=None if config.contact is None else config.contact.threshold_of(rated),
+    )
 
 
 _LOOP_END_S = 3.0
@@ -247,7 +304,8 @@ class Supervisor:
         """Set as long as nodes that we have started are on the bus."""
         self._load = checked_load(config)
         self._log_directory = log_directory(record)
-        self._ros2 = Ros2Publisher(self._child, config.ros2 or Ros2Settings()) if ros2 else None
+        self._sides: list[LiveView | Ros2Publisher] = [] if live is None else [LiveView(self._child, live)]
+        self._sides += [Ros2Publisher(self._child, config.ros2 or Ros2Settings())] if ros2 else []
         try:
             self._directory, self._lock = claim(bus)
         except BlockingIOError as error:
@@ -261,7 +319,6 @@ class Supervisor:
         self._snapshot = self._directory / "snapshot"
         self._children: list[Child] = []
         self._recorder = RecorderProcess(self._child, self._directory)
-        self._live = None if live is None else LiveView(self._child, live)
         self._log = OperatorLog()
         self._log_event = EventLog(self._log)
         self._conditions = Conditions()
@@ -342,10 +399,8 @@ class Supervisor:
         reader = SnapshotReader(self._snapshot, supervisor=True)
         self._log_event.notices = Notices(self._directory / NOTICES)
         self._record(report)
-        if self._live is not None:
-            self._live.start(self._config, self._directory, self._instance)
-        if self._ros2 is not None:
-            self._ros2.start(self._config, self._directory, self._instance)
+        for side in self._sides:
+            side.start(self._config, self._directory, self._instance)
         store = ObjectStore(entries_from_json(report["own_entries"]), self._config.node_id)
         self._bus_service = BusService(
             socket,
@@ -358,12 +413,11 @@ class Supervisor:
             log=self._log_event,
             directory=self._directory,
         )
-        self._node = node = self._bus_service.own
         self._bus_service.begin(time.monotonic())
         self._report = report
         self._service.open(reader)
         began_s, self._stolen = time.monotonic(), StolenTime(self._conditions)
-        result = self._watch(loop, node, reader, bench)
+        result = self._watch(loop, reader, bench)
         stolen = self._stolen.total_s()
         self._leave()
         failed = result.get("error") or result.get("failed")
@@ -431,12 +485,10 @@ class Supervisor:
 
     # Run -----------------------------------------------------------------------------------------------------------------
 
-    def _watch(
-        self, loop: Child, node: OwnNode, reader: SnapshotReader, bench: Child | None
-    ) -> dict[str, Any]:
+    def _watch(self, loop: Child, reader: SnapshotReader, bench: Child | None) -> dict[str, Any]:
         """Serve table, SDO requests and recorder until the loop ends; return the loop's last answer."""
         title = f"jtqd on {self._instance}, node {self._config.node_id:02X}h, {self._config.estimator.method}"
-        stopping = 0.0
+        stopping, node = 0.0, self._bus_service.own
         watched = self._config.contact is not None
         with Display(reader, self._config.bitrate, title, self._log, contacts=watched) as display:
             while True:
@@ -466,10 +518,8 @@ class Supervisor:
                     self._hung_up = False
                     self._log(_ON_HANGUP, Priority.NOTICE, "SIGHUP")
                 self._recorder.watch()
-                if self._live is not None:
-                    self._live.watch()
-                if self._ros2 is not None:
-                    self._ros2.watch()
+                for side in self._sides:
+                    side.watch()
                 node.recorder_lost = self._recorder.lost
                 reader.note_alive()
                 view, now = reader.read(), time.monotonic()
@@ -498,9 +548,7 @@ class Supervisor:
             self._bus_service.turn(view, now)
         except BusError:
             self._bus_gone = True
-        if (
-            len(self._report["nodes"]) > known
-        ):  # absent at the start: without its scaling the log cannot be understood
+        if len(self._report["nodes"]) > known:  # one was absent at the start: the log needs its scaling
             self._record(self._report, again=True)
 
     def _stopped(self) -> bool:

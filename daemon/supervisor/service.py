@@ -1,6 +1,6 @@
-"""Service to those who look after a daemon: systemd, the control socket, the metrics file.
+"""Services of a running daemon to its operator: systemd, the control socket, the metrics file.
 
-Nothing here touches the loop but through shared memory and signals. The metrics are a Prometheus text file for a node
+They reach the loop through shared memory only. The metrics are a Prometheus text file for a node
 exporter's textfile collector: off unless the configuration has `metrics: {file: PATH}`; a name without a directory lies in
 the runtime directory.
 """
@@ -25,6 +25,19 @@ from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlSe
 from jtqd.estimator import status as st
 
 _SHARES = (0.5, 0.99, 1.0)
+_OF_JOINTS = (
+    ("torque_nm", "Estimated torque, joint side."),
+    ("sigma_nm", "Its standard deviation."),
+    ("status", "Status as in the estimate PDO."),
+)
+"""Fields of a `JointView`."""
+_OF_ZEROS = (
+    ("link_zero_rad", "gauge", "Offset of the link encoder.", "link_rad"),
+    ("link_zero_sigma_rad", "gauge", "Its standard deviation.", "link_sigma_rad"),
+    ("link_zero_used_rad", "gauge", "What of it is taken off the reading.", "link_used_rad"),
+    ("link_zero_jumps_total", "counter", "How often it has jumped.", "jumps"),
+)
+"""Fields of `Zeros`."""
 
 
 def metrics_text(
@@ -46,40 +59,22 @@ def metrics_text(
         value = recorder_lost if each is RECORDER_LOST else view.counters[each.name]
         name, kind = (each.name, "gauge") if each.is_maximum else (f"{each.name}_total", "counter")
         metric(name, kind, f"{each.text[0].upper()}{each.text[1:]} (docs/bus.md).", [("", value)])
-    joints = [(f',joint="{number}"', joint) for number, joint in enumerate(view.joints, start=1)]
-    metric(
-        "torque_nm", "gauge", "Estimated torque, joint side.", [(at, each.torque_nm) for at, each in joints]
-    )
-    metric("sigma_nm", "gauge", "Its standard deviation.", [(at, each.sigma_nm) for at, each in joints])
-    metric("status", "gauge", "Status as in the estimate PDO.", [(at, each.status) for at, each in joints])
-    tracked = [(f',joint="{n}"', each) for n, each in enumerate(view.zeros, start=1) if each.tracked]
-    if tracked:
-        rows = [(at, each.link_rad) for at, each in tracked]
-        metric("link_zero_rad", "gauge", "Zero of the link encoder.", rows)
-        rows = [(at, each.link_sigma_rad) for at, each in tracked]
-        metric("link_zero_sigma_rad", "gauge", "Its standard deviation.", rows)
-        rows = [(at, each.link_used_rad) for at, each in tracked]
-        metric("link_zero_used_rad", "gauge", "What of it is taken off the reading.", rows)
-        rows = [(at, each.jumps) for at, each in tracked]
-        metric("link_zero_jumps_total", "counter", "How often it has jumped.", rows)
+    joints = [(f',joint="{n}"', each) for n, each in enumerate(view.joints, start=1)]
+    for name, text in _OF_JOINTS:
+        metric(name, "gauge", text, [(at, getattr(each, name)) for at, each in joints])
+    if any(each.tracked for each in view.zeros):
+        tracked = [(f',joint="{n}"', each) for n, each in enumerate(view.zeros, start=1) if each.tracked]
+        for name, kind, text, field in _OF_ZEROS:
+            metric(name, kind, text, [(at, getattr(each, field)) for at, each in tracked])
     present = Counter(each.name for each in conditions)
-    metric(
-        "condition",
-        "gauge",
-        "Number of joints, nodes, ... with this condition (docs/testing.md).",
-        [(f',name="{name}"', present[name]) for name in CATALOGUE],
-    )
-    work = zip(_SHARES, reader.work_us(*_SHARES), strict=True)
-    late = zip(_SHARES, reader.late_us(*_SHARES), strict=True)
-    metric(
-        "work_us", "gauge", "Work per cycle by quantile.", [(f',quantile="{q}"', value) for q, value in work]
-    )
-    metric(
-        "late_us",
-        "gauge",
-        "Lateness of SYNC by quantile.",
-        [(f',quantile="{q}"', value) for q, value in late],
-    )
+    text = "Number of joints, nodes, ... with this condition (docs/testing.md)."
+    metric("condition", "gauge", text, [(f',name="{name}"', present[name]) for name in CATALOGUE])
+    for name, text, values in (
+        ("work_us", "Work per cycle by quantile.", reader.work_us(*_SHARES)),
+        ("late_us", "Lateness of SYNC by quantile.", reader.late_us(*_SHARES)),
+    ):
+        rows = [(f',quantile="{share}"', value) for share, value in zip(_SHARES, values, strict=True)]
+        metric(name, "gauge", text, rows)
     return "\n".join(lines) + "\n"
 
 
@@ -172,15 +167,10 @@ class Service:
             self._metrics_due = now + _METRICS_PERIOD_S
             self._write_metrics(view, recorder_lost)
 
-    def stopping(self, why: str = "") -> None:
+    def stopping(self) -> None:
         """Report the begin of the shutdown."""
-        self._notifier.send(
-            "STOPPING=1", f"STATUS={why or 'ending: the nodes go to pre-operational, the log is finished'}"
-        )
-
-    def failed(self, why: str) -> None:
-        """Report the failure that ends the daemon."""
-        self._notifier.send(f"STATUS=failed: {why}")
+        text = "ending: the nodes go to pre-operational, the log is finished"
+        self._notifier.send("STOPPING=1", f"STATUS={text}")
 
     def close(self) -> None:
         """Stop accepting orders."""

@@ -13,7 +13,7 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.runtime_dir import About, write_about
 from jtqd.daemon.shared.snapshot import INPUT, Snapshot
-from jtqd.daemon.supervisor.description import about
+from jtqd.daemon.supervisor.process import about
 from tests.daemon.snapshots import EstimateWriter
 
 NAN = float("nan")

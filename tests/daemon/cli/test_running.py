@@ -19,7 +19,7 @@ from jtqd.daemon.shared.faults import DRIVE_FAULT
 from jtqd.daemon.shared.reasons import drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About, AboutError, read_about, start_ticks, write_about
 from jtqd.daemon.shared.snapshot import JointView
-from jtqd.daemon.supervisor.description import about
+from jtqd.daemon.supervisor.process import about
 from jtqd.estimator import status as st
 from jtqd.estimator.status import LINK_JUMP, MOTOR_JUMP
 from tests.daemon.cli.status_daemon import described, running
