@@ -2,50 +2,47 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from math import isfinite
 from typing import Any
 
 from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.events import INFO
-from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.estimator.status import Zeros
-from jtqd.estimator.text import finite
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.estimator.text import counted, finite
 
 _LOST = 0.05
-"""Part of the slots that a machine on which something else runs may miss at most before it is said."""
+"""Share of missed slots beyond which real time is reported as not kept."""
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Figures of one run; times in us, torque in Nm. `error` is what ended it, if anything did."""
+    """Final figures of one run.
 
-    cycles: int
-    missed: int
-    stale_inputs: int
-    work_us: tuple[float, float, float]
-    late_us: tuple[float, float, float]
-    rmse_nm: tuple[float, ...]
-    """Of each joint in motion, against the sensor as old as the estimate."""
-    counters: dict[str, int]
-    refused: tuple[str, ...]
-    recording: dict[str, Any] | None
-    error: str | None
-    inputs: dict[str, dict[str, int]]
-    """Late, lost, duplicate and rejected frames of each PDO by its name."""
-    conditions: tuple[Occurrences, ...] = ()
-    """What happened (`jtqd.daemon.shared.conditions`); `first_s` counts from the begin of the run."""
+    Attributes:
+        view: last reading of the snapshot.
+        work_us, late_us: p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us].
+        refused: real-time settings that the kernel did not grant.
+        recording: the recorder's account; None where nothing was recorded.
+        error: the failure that ended the run, if any.
+        inputs: late, lost, duplicate and rejected frames of each PDO by its name.
+        conditions: those that were present at any time; `first_s` counts from the begin of the run.
+        stolen_s: processor time that a hypervisor took (`daemon/loop/realtime.py`).
+        contacts: they were watched.
+    """
+
+    view: View
+    work_us: Sequence[float]
+    late_us: Sequence[float]
+    refused: Sequence[str] = ()
+    recording: dict[str, Any] | None = None
+    error: str | None = None
+    inputs: dict[str, dict[str, int]] = field(default_factory=dict)
+    conditions: Sequence[Occurrences] = ()
     stolen_s: float = 0.0
-    """What a hypervisor took from the processors meanwhile (`daemon/loop/realtime.py`)."""
-    rmse_now_nm: tuple[float, ...] = ()
-    """Against the sensor now: with the estimate's age as an error, as a controller meets it."""
-    age_ms: tuple[float, ...] = ()
-    zeros: tuple[Zeros, ...] = ()
-    """Of each joint at the end."""
-    contacts: int | None = None
-    """How many were told; None where nobody watched."""
+    contacts: bool = False
 
     @property
     def exit_status(self) -> int:
@@ -56,23 +53,28 @@ class Summary:
 
     def content(self) -> dict[str, Any]:
         """Return the summary as plain data for JSON."""
+        view, counters = self.view, self.view.counters
+
+        def by_joint(values: Iterable[Any]) -> dict[str, Any]:
+            return {f"joint_{n}": value for n, value in enumerate(values, start=1)}
+
         return {
-            "cycles": self.cycles,
-            "missed": self.missed,
-            "stale_inputs": self.stale_inputs,
+            "cycles": counters["cycles"],
+            "missed": counters["missed"],
+            "stale_inputs": counters["stale_inputs"],
             "work_us": dict(zip(("p50", "p99", "max"), map(finite, self.work_us), strict=True)),
             "late_us": dict(zip(("p50", "p99", "max"), map(finite, self.late_us), strict=True)),
-            "rmse_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_nm, start=1)},
-            "rmse_now_nm": {f"joint_{n}": finite(rmse) for n, rmse in enumerate(self.rmse_now_nm, start=1)},
-            "age_ms": {f"joint_{n}": finite(age) for n, age in enumerate(self.age_ms, start=1)},
-            "zeros": {f"joint_{n}": each.content() for n, each in enumerate(self.zeros, start=1)},
-            "contacts": self.contacts,
-            "deviations": {f"joint_{n}": self._deviations(n) for n in range(1, len(self.rmse_nm) + 1)},
+            "rmse_nm": by_joint(map(finite, view.rmse_nm)),
+            "rmse_now_nm": by_joint(map(finite, view.rmse_now_nm)),
+            "age_ms": by_joint(finite(each.age_ms) for each in view.joints),
+            "zeros": by_joint(each.content() for each in view.zeros),
+            "contacts": counters["contacts"] if self.contacts else None,
+            "deviations": by_joint(self._deviations(n) for n in range(1, len(view.joints) + 1)),
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
                 for each in self.conditions
             ],
-            "counters": self.counters,
+            "counters": counters,
             "stolen_s": round(self.stolen_s, 2),
             "not_granted": list(self.refused),
             "inputs": self.inputs,
@@ -88,17 +90,17 @@ class Summary:
         )
 
     def _timing(self) -> list[str]:
+        counters = self.view.counters
+        cycles, missed = counters["cycles"], counters["missed"]
+        quantiles = "p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us"
         lines = [
-            f"cycles        {self.cycles}, missed {self.missed}, stale inputs {self.stale_inputs}",
-            "cycle work    p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us (from wake-up to hand-over)".format(
-                *self.work_us
-            ),
-            "SYNC lateness p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us".format(*self.late_us),
+            f"cycles        {cycles}, missed {missed}, stale inputs {counters['stale_inputs']}",
+            f"cycle work    {quantiles.format(*self.work_us)} (from wake-up to hand-over)",
+            f"SYNC lateness {quantiles.format(*self.late_us)}",
         ]
-        slots = self.cycles + self.missed
-        if self.missed > _LOST * slots:
+        if missed > _LOST * (cycles + missed):
             why = " (jtqd was not granted all that it asked for)" if self.refused else ""
-            share = 100.0 * self.missed / slots
+            share = 100.0 * missed / (cycles + missed)
             lines.append(
                 f"real time     not kept: {share:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
             )
@@ -106,24 +108,34 @@ class Summary:
             lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
         return lines
 
+    def _recorded(self) -> list[str]:
+        account = self.recording
+        if account is None:
+            return ["log           none"]
+        lost, parts = account.get("lost", 0), len(account.get("paths", ()))
+        nothing = "no trigger" if account.get("flight_recordings") == 0 else "it could not be written"
+        shown = account.get("path") or f"none: {account.get('error') or nothing}"
+        shown += f" (the last of {parts} parts)" if parts > 1 else ""
+        shown += f", {counted(lost, 'cycle')} lost" if lost else ""
+        left = [f"              {each} (left by a killed recorder)" for each in account.get("left", [])]
+        return [f"log           {shown}", *left]
+
     def text(self) -> str:
         """Return the summary as text."""
-        counters, lines = self.counters, self._timing()
-        for joint, (rmse, now, age) in enumerate(
-            zip(self.rmse_nm, self.rmse_now_nm, self.age_ms, strict=False), start=1
+        view, counters, lines = self.view, self.view.counters, self._timing()
+        for n, (rmse, now, joint) in enumerate(
+            zip(view.rmse_nm, view.rmse_now_nm, view.joints, strict=False)
         ):
             shown = "no reference"
             if isfinite(rmse):
+                age = joint.age_ms
                 older = f", both {age:.2f} ms old ({now:.3f} Nm against it now)" if age > 0.0 else " now"
                 shown = f"{rmse:.3f} Nm against the sensor in motion{older}"
-            lines.append(f"RMSE joint {joint}  {shown}")
-        lines += [
-            f"zeros joint {joint} {zeros.text}"
-            for joint, zeros in enumerate(self.zeros, start=1)
-            if zeros.tracked
-        ]
-        if self.contacts is not None:
-            lines.append(f"contacts      {self.contacts or 'none'}")
+            lines.append(f"RMSE joint {n + 1}  {shown}")
+        zeros = enumerate(view.zeros, start=1)
+        lines += [f"zeros joint {joint} {each.text}" for joint, each in zeros if each.tracked]
+        if self.contacts:
+            lines.append(f"contacts      {counters['contacts'] or 'none'}")
         happened = [each for each in self.conditions if CATALOGUE[each.name].severity > INFO]
         for n, each in enumerate(happened):
             times = "once" if each.times == 1 else f"{each.times} times"
@@ -131,34 +143,19 @@ class Summary:
                 f"{'' if n else 'conditions':<13} {each.subject}: {each.name.replace('_', ' ')} {times}, "
                 f"{each.total_s:.1f} s in all, first after {each.first_s:.1f} s"
             )
-        for title, view in (("no torque", Shown.SUMMARY_TORQUE), ("bus", Shown.SUMMARY_BUS)):
-            counted = [
+        for title, selected in (("no torque", Shown.SUMMARY_TORQUE), ("bus", Shown.SUMMARY_BUS)):
+            found = [
                 f"{name.removeprefix('fault_').replace('_', ' ')} {counters[name]}"
-                for name in shown_in(view)
+                for name in shown_in(selected)
                 if counters[name]
             ]
-            if counted:
-                lines.append(f"{title:<13} {', '.join(counted)}")
+            if found:
+                lines.append(f"{title:<13} {', '.join(found)}")
         for name, counts in self.inputs.items():
             shown = ", ".join(f"{kind} {count}" for kind, count in counts.items() if count)
             if shown:
                 lines.append(f"  {name:<24} {shown}")
-        if self.recording is None:
-            lines.append("log           none")
-        else:
-            lost, path = self.recording.get("lost", 0), self.recording.get("path")
-            nothing = (
-                "no trigger" if self.recording.get("flight_recordings") == 0 else "it could not be written"
-            )
-            shown = path or f"none: {self.recording.get('error') or nothing}"
-            parts = len(self.recording.get("paths", ()))
-            shown += f" (the last of {parts} parts)" if parts > 1 else ""
-            lines.append(
-                f"log           {shown}" + (f", {lost} cycle{'s' if lost != 1 else ''} lost" if lost else "")
-            )
-            lines += [
-                f"              {left} (left by a killed recorder)" for left in self.recording.get("left", [])
-            ]
+        lines += self._recorded()
         if self.error:
             lines.append(f"ended by      {self.error}")
         return "\n".join(lines)
@@ -180,32 +177,19 @@ def summary_of(
     Args:
         reader: snapshot of its loop.
         result: last answer of the loop.
-        refused: what the kernel did not grant.
-        recording: the recorder's account, None where nothing was recorded.
-        history: conditions that happened.
+        refused, recording, stolen_s, contacts: as in `Summary`.
+        history: conditions that were present at any time.
         began_s: begin of the run (CLOCK_MONOTONIC).
-        stolen_s: as in `Summary`.
-        contacts: they were watched.
     """
-    view = reader.read()
-    p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
-    late50, late99, late_worst = reader.late_us(0.5, 0.99, 1.0)
     return Summary(
-        cycles=view.counters["cycles"],
-        missed=view.counters["missed"],
-        stale_inputs=view.counters["stale_inputs"],
-        work_us=(p50, p99, worst),
-        late_us=(late50, late99, late_worst),
-        rmse_nm=view.rmse_nm,
-        rmse_now_nm=view.rmse_now_nm,
-        age_ms=tuple(each.age_ms for each in view.joints),
-        zeros=view.zeros,
-        counters=view.counters,
-        refused=tuple(refused),
+        view=reader.read(),
+        work_us=reader.work_us(0.5, 0.99, 1.0),
+        late_us=reader.late_us(0.5, 0.99, 1.0),
+        refused=refused,
         recording=recording,
         error=result.get("error") or result.get("failed"),
         inputs=result.get("counters", {}),
         conditions=tuple(each._replace(first_s=max(0.0, each.first_s - began_s)) for each in history),
         stolen_s=stolen_s,
-        contacts=view.counters["contacts"] if contacts else None,
+        contacts=contacts,
     )

@@ -11,9 +11,7 @@ from jtqd.daemon.bus.errors import OwnErrors
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared import faults
-from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader, View
-from jtqd.daemon.supervisor.summary import Summary
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.status import INVALID
 from tests.daemon.snapshots import EstimateWriter
@@ -114,43 +112,3 @@ def test_faults_and_latches_are_emcy_with_the_drives_node(
     assert told(faulty(JUMP, JUMP), faulty(TORSION)) == []
     assert told(faulty(JUMP), WELL) == ["00 00 81 02 ff 01 00 01", "00 00 81 01 ff 02 00 02"]
     assert told(WELL, WELL) == ["00 00 00 01 ff 01 00 01"]
-
-
-def test_the_summary_says_why_there_was_no_torque() -> None:
-    def lines(**counters: int) -> list[str]:
-        counted = dict.fromkeys(COUNTERS, 0) | counters
-        us = (1.0, 2.0, 3.0)
-        text = Summary(9, 0, 0, us, us, (0.1, 0.1), counted, (), None, None, {}).text()
-        return [line for line in text.splitlines() if line.startswith("no torque")]
-
-    assert lines() == []
-    assert lines(fault_motor_jump=2, latches=1, overruns=3) == [
-        "no torque     overruns 3, motor jump 2, latches 1"
-    ]
-
-
-def test_the_summary_tells_stolen_time_where_there_was_any() -> None:
-    us = (1.0, 2.0, 3.0)
-    for stolen_s, lines in (
-        (0.0, []),
-        (0.318, ["processors    0.32 s stolen by the hypervisor"]),
-    ):
-        told = Summary(
-            9, 0, 0, us, us, (0.1, 0.1), dict.fromkeys(COUNTERS, 0), (), None, None, {}, (), stolen_s
-        )
-        assert [line for line in told.text().splitlines() if line.startswith("processors")] == lines
-        assert told.content()["stolen_s"] == round(stolen_s, 2)
-
-
-def test_the_summary_says_that_real_time_was_not_kept() -> None:
-    def lines(cycles: int, missed: int, *refused: str) -> list[str]:
-        us = (1.0, 2.0, 3.0)
-        told = Summary(cycles, missed, 0, us, us, (), dict.fromkeys(COUNTERS, 0), refused, None, None, {})
-        return [line for line in told.text().splitlines() if line.startswith("real time")]
-
-    assert lines(0, 0) == lines(950, 50) == []
-    assert lines(900, 100) == [
-        "real time     not kept: 10 % of the slots missed; jtq doctor looks at the machine"
-    ]
-    (why,) = lines(4054, 15936, "SCHED_FIFO")
-    assert why.startswith("real time     not kept: 80 % of the slots missed (jtqd was not granted all that")
