@@ -37,8 +37,8 @@ from jtqd.daemon.shared.reasons import contact_line, contact_of, drive_state, jo
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
 from jtqd.daemon.supervisor.table import COLOURS, bus_load, plain_line
-from jtqd.estimator.command_line import command_parser
 from jtqd.drivers import nmt
+from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
 
