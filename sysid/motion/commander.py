@@ -36,14 +36,14 @@ from jtqd.sysid.motion.setpoints import (
     Surroundings,
     Timing,
     Violation,
-    out_of_room,
+    out_of_range,
 )
 from jtqd.sysid.motion.stopping import Phase, PowerOff, Stopping
 
 UNPACED: Final = 2
 """Period of our own clock while there is no SYNC, in periods of SYNC."""
 LARGEST_ADVANCE: Final = 4
-"""Cycles passed over after lost ones, at most: what is lost beyond that makes the motion longer, never a jump."""
+"""Most cycles that are skipped after lost ones: more of them make the motion longer, never a jump."""
 
 
 class Pace:
@@ -69,7 +69,7 @@ class Pace:
 
     @property
     def wake_ns(self) -> int:
-        """When the frames of the present cycle, or else of the next one, should all have come; 0: unknown."""
+        """When all frames of the current cycle, or else of the next one, should have come; 0: unknown."""
         if not self.synced:
             return 0
         return self._newest_ns + self._delay_ns + (0 if self.pending else self._period_ns)
@@ -141,8 +141,8 @@ class Commander:
 
     Attributes:
         phase: see the module's diagram.
-        refusal: why nothing was begun; None otherwise, and `result` holds once `over`.
-        out_of_place: the refusal is that the joint stands at the wrong place, at this position [rad]; else None.
+        refusal: why nothing has moved; None otherwise, and `result` holds once `over`.
+        out_of_place: position [rad] of a joint that was refused because of it; else None.
     """
 
     def __init__(
@@ -220,7 +220,7 @@ class Commander:
         self._stop(Violation(reason, self.phase is Phase.RAMPING))
 
     def frame_refused(self, refused: bool) -> None:
-        """Count frames that the full transmit queue refused; several in a row: nobody hears us, and the motion stops."""
+        """Count frames that the full transmit queue refused; several in a row stop the motion."""
         self._full = self._full + 1 if refused else 0
         if self._full == FULL_QUEUE_FRAMES:
             self._stop(Violation(f"bus: transmit queue full for {FULL_QUEUE_FRAMES} frames in a row", True))
@@ -235,7 +235,7 @@ class Commander:
                 handler(data, t_ns)
             elif can_id == SYNC_COB_ID:
                 if self._pace.pending:
-                    self._examine()  # several cycles have come at once: none goes unseen
+                    self._examine()  # several cycles have come at once: each is checked
                 self._stop_late(self._pace.on_sync(t_ns, now_ns))
                 self.inputs.cycle += 1
         self._stop_late(self._pace.watch(now_ns))
@@ -252,7 +252,7 @@ class Commander:
     # Violations ---------------------------------------------------------------------------------------------
 
     def _stop_late(self, violation: Violation | None) -> None:
-        """Stop because SYNC or we are late; before the start the wait begins anew instead."""
+        """Stop because SYNC or this process is late; before the start the wait begins again instead."""
         if violation is None:
             return
         if self.phase is Phase.WAITING:
@@ -310,7 +310,7 @@ class Commander:
         return (self._now_ns - self._since_ns) * 1e-9
 
     def _step(self, advance: int) -> bytes | None:
-        """Do one cycle of the present phase; return the RPDO for the drive whose turn it is."""
+        """Do one cycle of the current phase; return the RPDO for the next drive."""
         self._cycles += 1
         turn = self._cycles % len(self.inputs.drives)
         if self.phase is Phase.POWERLESS:
@@ -337,11 +337,11 @@ class Commander:
         return frame
 
     def _without_power(self, turn: int) -> bytes | None:
-        """Begin the next stretch without power with its first set-point, also where cycles were lost just before it."""
-        stretch = self._unpowered.pop(0)
-        self._index = stretch[0]
+        """Begin the next window without power with its first set-point, also where cycles were lost just before it."""
+        window = self._unpowered.pop(0)
+        self._index = window[0]
         self._power_off = PowerOff(
-            self.inputs, self._supervision, self._commands, self.timing, stretch, self._now_ns
+            self.inputs, self._supervision, self._commands, self.timing, window, self._now_ns
         )
         self.phase = Phase.POWERLESS
         return self._power_off.step(turn, 0, self._now_ns)
@@ -374,13 +374,13 @@ class Commander:
                 self.phase = Phase.OVER
         elif self._now_ns - self._still_since_ns >= self.timing.still_s * 1e9:
             leader = self.inputs.drives[self._setpoints.velocity_joint - 1]
-            self.refusal = out_of_room(self._setpoints, self._limits, leader.position_rad)
+            self.refusal = out_of_range(self._setpoints, self._limits, leader.position_rad)
             if self.refusal is not None:
                 self.out_of_place = leader.position_rad
             self._enter(Phase.ENABLING if self.refusal is None else Phase.OVER)
 
     def _enabling(self, turn: int) -> bytes | None:
-        """Send 6040h 6, 7, 15, each after the statusword has confirmed the one before."""
+        """Send 6040h 6, 7, 15, each after the statusword has confirmed the last one."""
         states = [state_of(drive.statusword) for drive in self.inputs.drives]
         if all(state is State.OPERATION_ENABLED for state in states):
             self._enter(Phase.PLAYING)
@@ -393,7 +393,7 @@ class Commander:
             text = (
                 f"{describe(drive.statusword)} after {self.timing.enable_s:g} s, expected operation enabled"
             )
-            self._stop(Violation(f"{drive.who}: {text}", True))
+            self._stop(Violation(f"{drive.name}: {text}", True))
             return self._commands.control(turn, QUICK_STOP_WORD)
         word = enabling_word(states[turn])
         return None if word is None else self._commands.control(turn, word)

@@ -1,8 +1,8 @@
 """Drives from the commanding side: CiA 402 controlwords, set-up and release by SDO, and the RPDOs of a motion.
 
-jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are configured. Here come mode of operation,
-interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2). What is written is read back. Every
-failure is a BootError: one line with node, object, expected and found.
+jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) are configured. The set-up adds mode of
+operation, interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2), and reads back each object.
+Every failure is a BootError: one line with node, object, expected and found.
 
     quick_stop, switch_off, reset_fault, set_up, release    one drive, over any `SdoAccess`: no bus, no clock
     sensor_units                                            the sensor
@@ -10,7 +10,7 @@ failure is a BootError: one line with node, object, expected and found.
     Commands, Heartbeat                                     the frames that the commander sends
 
 Controlwords: CiA 402-2, table "command coding". A drive is led one state at a time; each step waits until the statusword
-(`jtqd.drivers.drive`) has confirmed the one before.
+(`jtqd.drivers.drive`) has confirmed the last one.
 """
 
 from __future__ import annotations
@@ -90,11 +90,11 @@ def describe(statusword: int) -> str:
     return f"{state_of(statusword).value} (statusword {statusword:04X}h)"
 
 
-def turns(moved: Sequence[int], drives: int) -> tuple[tuple[int, ...], int]:
+def sending_order(moved: Sequence[int], drives: int) -> tuple[tuple[int, ...], int]:
     """Return the drives (0, 1, ..) in the order of their set-points, and the cycles from one of a moved drive to its next.
 
-    moved: numbers (1, 2, ..) of the joints that are moved, among so many drives; the others are held. Those moved take
-    turns, and after each round comes one of those held:
+    moved: numbers (1, 2, ..) of the joints that are moved; the others are held. After each round of the moved drives comes
+    one of those held:
 
         two of two 0 1          one of one 0          one of three 0 1, 0 2          two of three 0 1 2
     """
@@ -117,7 +117,7 @@ Sleep = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class DriveUnits:
-    """What the commander must know of a drive: identifiers and factors to SI, as read from it.
+    """Identifiers of a drive and its factors to SI units, as read from it.
 
     Attributes:
         node: node number.
@@ -126,7 +126,7 @@ class DriveUnits:
         scaling: factors of 6064h, 606Ch, 60E4h:1 and 6078h.
         heartbeat_ms: 1017h.
         temperature: True when TPDO3 (380h+n) brings the temperature in 0.1 °C.
-        objects: which of its objects hold the quantities. tpdos: those that carry them, as they are mapped in it.
+        objects: objects of its quantities. tpdos: those that carry them, as they are mapped in it.
     """
 
     node: int
@@ -183,7 +183,7 @@ def switch_off(access: SdoAccess, node: int, sleep: Sleep) -> None:
 
 
 def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
-    """Reset a fault by a rising edge of bit 7 (transition 15); return which it was (603Fh), None when there was none.
+    """Reset a fault by a rising edge of bit 7 (transition 15); return its code (603Fh) in words, None without a fault.
 
     Raises BootError when the fault stays.
     """
@@ -310,10 +310,10 @@ def _require_rpdo(drive: NodeObjects, communication: int, pdo: PdoMap) -> None:
 
 
 def _tpdos(drive: NodeObjects, profile: DriveProfile) -> tuple[PdoMap, ...]:
-    """Return the TPDOs that carry the drive's quantities, as they are mapped now, by jtqd or for good. Raises BootError."""
+    """Return the TPDOs that carry the drive's quantities, as they are mapped in it. Raises BootError."""
     maps = []
     for tpdo in read_tpdos(lambda key: drive.optional_number(key, 4)):
-        with suppress(PdoError):  # whatever else it sends
+        with suppress(PdoError):  # other TPDOs
             if tpdo.on:
                 maps.append(map_of(drive.node, tpdo, profile.objects))
     try:
@@ -372,7 +372,7 @@ class BenchSetup:
     ) -> tuple[tuple[DriveUnits, ...], SensorUnits | None]:
         """Bring all drives to: off, free of faults, modes set, targets zero, watching our heartbeat; return all units.
 
-        Raises MotionError; what was set is put back then. A second commander is noticed before anything is touched.
+        Raises MotionError, with the drives released; a second commander is found before anything is written.
         """
         try:
             self._require_jtqd_alone()
@@ -385,7 +385,7 @@ class BenchSetup:
             raise MotionError(str(error)) from None
 
     def _require_jtqd_alone(self) -> None:
-        """Require jtqd's SYNC, and no other commander: for two periods of our own heartbeat nobody else sends it."""
+        """Require jtqd's SYNC, and no other commander: two periods of our own heartbeat without another one."""
         socket, frames = self._socket, self._socket.frames
         heard = set()
         end_s = time.monotonic() + 2.0 * self._timing.own_heartbeat_s
@@ -410,7 +410,7 @@ class BenchSetup:
             fault = reset_fault(access[profile.node_id], profile.node_id, time.sleep)
             if fault is not None:
                 logging.getLogger(__name__).warning("node %d: %s was reset", profile.node_id, fault)
-        round_cycles = turns(setpoints.joints, len(self._drives))[1]
+        round_cycles = sending_order(setpoints.joints, len(self._drives))[1]
         units = tuple(
             set_up(
                 access[profile.node_id],
@@ -428,9 +428,9 @@ class BenchSetup:
         return units, found
 
     def release(self, *, beating: bool) -> str:
-        """Release all drives for certain; return "", or what could not be done, in one line.
+        """Release all drives; return "", or the failures in one line.
 
-        `beating`: our heartbeat has been heard, so it goes on until nobody watches it any more.
+        beating: the drives watch our heartbeat, so it continues until they are released.
         """
         self._beating = beating
         problems = []
@@ -466,21 +466,19 @@ _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
 
 
 class Commands:
-    """RPDOs for drive `turn` (0, 1, ...); set-points are scaled to the drives' units once, beforehand.
+    """RPDOs for drive `turn` (0, 1, ...); set-points are scaled to the drives' units once.
 
     A drive that is not moved is held: velocity zero. Raises MotionError for set-points that 60FFh (32 bits) or 6071h
     (16 bits) cannot hold, and for a joint without a drive.
 
     Attributes:
-        order: drives in the order in which they get set-points, one per cycle: those that are moved in turn, and one of
-            those that are held after each round.
-        round_cycles: cycles from one set-point of a moved drive to its next.
+        order, round_cycles: see `sending_order`.
     """
 
     def __init__(self, setpoints: Setpoints, drives: Sequence[DriveUnits]) -> None:
         if setpoints.joints[-1] > len(drives):
             raise MotionError(f"plan: joint {setpoints.joints[-1]} is moved, the bus has {len(drives)}")
-        self.order, self.round_cycles = turns(setpoints.joints, len(drives))
+        self.order, self.round_cycles = sending_order(setpoints.joints, len(drives))
         self._leader = setpoints.velocity_joint - 1  # the drive in velocity mode
         self._follower = -1 if setpoints.current_joint is None else setpoints.current_joint - 1
         self._lead, self._follow = drives[self._leader], drives[self._follower]

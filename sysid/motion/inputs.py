@@ -1,10 +1,10 @@
 """Measured values of all joints with their age, from frames and stamps, and their supervision. Pure.
 
-    Inputs         decodes TPDOs, heartbeats, EMCY and the answers that matter
-    Supervision    what must hold while the joints move: nodes alive, inputs fresh, drives enabled, sensor valid
+    Inputs         decodes TPDOs, heartbeats, EMCY and SDO confirmations
+    Supervision    conditions of a motion: nodes alive, inputs fresh, drives enabled, sensor valid
 
-All times are CLOCK_MONOTONIC in ns and come as arguments. A frame of another length than its PDO is not taken: the PDO then
-grows stale.
+All times are CLOCK_MONOTONIC in ns and come as arguments. A frame of another length than its PDO is ignored, so that the PDO
+becomes stale.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ Handler = Callable[[bytes, int], None]
 
 
 class NodeInput:
-    """Heartbeat and EMCY of one node. `who` is "joint 1", "joint 2", ... or "sensor"; `emergency` is the EMCY in force."""
+    """Heartbeat and EMCY of one node. `name` is "joint 1", "joint 2", ... or "sensor"; `emergency` is the EMCY in force."""
 
-    def __init__(self, who: str, node: int, heartbeat_ms: int) -> None:
-        self.who, self.node = who, node
+    def __init__(self, name: str, node: int, heartbeat_ms: int) -> None:
+        self.name, self.node = name, node
         self.heartbeat_ns = heartbeat_ms * 1_000_000
         self.beat_ns = _NEVER_NS
         self.nmt_state = -1
@@ -60,7 +60,7 @@ class DriveInput(NodeInput):
 
     Attributes:
         cycles: SYNCs seen when each of `units.tpdos` came last.
-        sdo_confirmed: it has confirmed an SDO that wrote its controlword.
+        sdo_confirmed: it has confirmed a download of its controlword.
     """
 
     def __init__(self, number: int, units: DriveUnits, inputs: Inputs) -> None:
@@ -164,7 +164,7 @@ class DriveInput(NodeInput):
             self.sdo_confirmed = True
 
     def sample(self) -> JointSample:
-        """Return what was measured last."""
+        """Return the newest values."""
         return JointSample(
             self.current_a, self.velocity_rad_s, self.travel_rad, self.temperature_c, self.position_rad
         )
@@ -189,7 +189,7 @@ class ChannelInput:
 
 
 class Inputs:
-    """All frames that the commander listens to but SYNC.
+    """All frames that the commander receives but SYNC.
 
     Attributes:
         cycle: number of SYNCs so far, kept by the commander.
@@ -230,7 +230,7 @@ class Inputs:
         return (SYNC_COB_ID, *self.handlers)
 
     def sample(self) -> Sample:
-        """Return what was measured last, of everything."""
+        """Return the newest values of all joints and channels."""
         return Sample(
             tuple([drive.sample() for drive in self.drives]),
             tuple([channel.torque_nm for channel in self.channels]),
@@ -252,7 +252,7 @@ _MS: Final = 1e-6
 
 
 class Supervision:
-    """Checks of `inputs`, once per cycle, without a state of their own. A hard violation: each drive brakes by itself."""
+    """Checks of `inputs`, once per cycle, without a state. A hard violation: each drive brakes by itself."""
 
     def __init__(self, inputs: Inputs, timing: Timing) -> None:
         self._inputs = inputs
@@ -292,19 +292,17 @@ class Supervision:
         return None
 
     def missing(self, now_ns: int) -> str | None:
-        """Return what is missing or wrong before the start; None when all is there and in order."""
+        """Return the first fault before the start; None when all inputs are there and in order."""
         inputs = self._inputs
         for node in inputs.nodes:
             if node.nmt_state < 0:
-                return f"{node.who}: no heartbeat {HEARTBEAT_BASE + node.node:03X}h"
+                return f"{node.name}: no heartbeat {HEARTBEAT_BASE + node.node:03X}h"
         for drive in inputs.drives:
             if not all(drive.cycles):
                 names = " or ".join(f"TPDO{pdo.number}" for pdo in drive.units.tpdos)
-                return f"{drive.who}: no {names}; start jtqd, which configures them"
+                return f"{drive.name}: no {names}; start jtqd, which configures them"
             if drive.units.temperature and drive.temperature_c != drive.temperature_c:
-                return (
-                    f"{drive.who}: no temperature ({0x380 + drive.node:03X}h), which is required by its limit"
-                )
+                return f"{drive.name}: no temperature ({0x380 + drive.node:03X}h), which is required by its limit"
         for channel in inputs.channels:
             if not channel.cycle:
                 return f"sensor: no torque of channel {channel.channel}"
@@ -312,12 +310,12 @@ class Supervision:
         return None if found is None else found.reason
 
     def moving(self) -> str | None:
-        """Return which joint does not stand, or cannot be seen to; None when all do."""
+        """Return the first joint that does not stand, or whose velocity is stale; None when all stand."""
         oldest = self._inputs.cycle - self._stale
         for drive in self._inputs.drives:
             if not -STILL_RAD_S <= drive.velocity_rad_s <= STILL_RAD_S or drive.moved_cycle < oldest:
                 velocity = f"velocity {drive.velocity_rad_s:.3f} rad/s before the start"
-                return f"{drive.who}: {velocity}, limit {STILL_RAD_S:g} rad/s"
+                return f"{drive.name}: {velocity}, limit {STILL_RAD_S:g} rad/s"
         return None
 
     def obeyed(self, turn: int) -> bool:
@@ -337,15 +335,15 @@ class Supervision:
     def _node(self, node: NodeInput, now_ns: int, *, hard: bool) -> Violation | None:
         if node.emergency is not None:
             code, register = node.emergency.code, node.emergency.register
-            return Violation(f"{node.who}: EMCY {code:04X}h (error register {register:02X}h)", hard)
+            return Violation(f"{node.name}: EMCY {code:04X}h (error register {register:02X}h)", hard)
         if node.nmt_state != OPERATIONAL:
             name = _NMT_NAMES.get(node.nmt_state, f"state {node.nmt_state}")
-            return Violation(f"{node.who}: NMT {name}, expected operational", hard)
+            return Violation(f"{node.name}: NMT {name}, expected operational", hard)
         age_ns = now_ns - node.beat_ns
         if age_ns > node.heartbeat_ns * self._beats:
             limit = node.heartbeat_ns * self._beats * _MS
             return Violation(
-                f"{node.who}: no heartbeat for {age_ns * _MS:.0f} ms, limit {limit:.0f} ms", hard
+                f"{node.name}: no heartbeat for {age_ns * _MS:.0f} ms, limit {limit:.0f} ms", hard
             )
         return None
 
@@ -355,7 +353,7 @@ class Supervision:
         late = [at for at, cycle in enumerate(drive.cycles) if cycle < oldest]
         pdo, missing = drive.units.tpdos[late[-1]], self._inputs.cycle - drive.cycles[late[-1]]
         text = f"TPDO{pdo.number} ({pdo.cob_id:03X}h) missing for {missing} cycles, limit {self._stale}"
-        return Violation(f"{drive.who}: {text}", max(drive.cycles) < oldest)
+        return Violation(f"{drive.name}: {text}", max(drive.cycles) < oldest)
 
     def _stale_channel(self, channel: ChannelInput) -> Violation:
         missing = self._inputs.cycle - channel.cycle
@@ -369,13 +367,13 @@ class Supervision:
         if not drive.units.temperature or age_ns <= self._temperature_ns:
             return None
         limit = self._temperature_ns * 1e-9
-        return Violation(f"{drive.who}: no temperature for {age_ns * 1e-9:.1f} s, limit {limit:g} s", False)
+        return Violation(f"{drive.name}: no temperature for {age_ns * 1e-9:.1f} s, limit {limit:g} s", False)
 
 
 def _state(drive: DriveInput, enabled: bool) -> Violation | None:
     state = state_of(drive.statusword)
     if enabled and state is not State.OPERATION_ENABLED:
-        return Violation(f"{drive.who}: {describe(drive.statusword)}, expected operation enabled", True)
+        return Violation(f"{drive.name}: {describe(drive.statusword)}, expected operation enabled", True)
     if state in FAULTED:
-        return Violation(f"{drive.who}: {describe(drive.statusword)}", True)
+        return Violation(f"{drive.name}: {describe(drive.statusword)}", True)
     return None

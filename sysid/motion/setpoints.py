@@ -1,8 +1,8 @@
-"""Set-points of a motion, millisecond by millisecond, its limits, and how it ends. Pure.
+"""Set-points of a motion, one per millisecond, its limits, and its result. Pure.
 
-On a towing bench one joint follows a velocity, the other a current. A joint that is on none follows a velocity alone. All
-other joints of the bus are held: velocity zero. `Limits` hold for what is measured (`Monitor`) and for what is planned
-(`check_setpoints`); every refusal is one line that names joint, quantity, what was found, and the limit.
+On a towing bench one joint follows a velocity, the other a current. Any other joint follows a velocity alone. All
+other joints of the bus are held: velocity zero. `Limits` hold for the measurement (`Monitor`) and for the plan
+(`check_setpoints`); every refusal is one line that names joint, quantity, found value and limit.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class MotionError(Exception):
 
 
 class OutOfPlaceError(MotionError):
-    """The motion was refused because a joint that is moved alone stands where it would leave its travel.
+    """The motion was refused because a joint that is moved alone would leave its travel from where it stands.
 
     position_rad: where it stands, by its own encoder.
     """
@@ -33,7 +33,7 @@ class OutOfPlaceError(MotionError):
 
 
 class MotionResult(NamedTuple):
-    """How a motion ended. Both joints are disabled in either case, or `reason` says what could not be confirmed.
+    """Result of a motion. All joints are disabled in either case, or `reason` reports what could not be confirmed.
 
     Attributes:
         status: "done", or "stopped" before its end.
@@ -139,7 +139,7 @@ MOST_JOINTS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """A named stretch of a run.
+    """An interval of a run by its kind.
 
     Attributes:
         kind: "plateau", "rest", "power_off" or "fourier".
@@ -162,7 +162,7 @@ class Setpoints:
         velocity_joint: number of the joint in velocity mode (csv).
         velocity_rad_s: [n] joint side, in the own frame of the velocity joint.
         current_a: [n] motor current of the current joint, in its own frame.
-        marks: what is when, in order of time; for people and files, not for the motion.
+        marks: intervals of the run in order of time; for people and files, not for the motion.
         off: (first, end) of set-points during which both drives have no power, in order, end not included.
         current_joint: the joint in torque mode (cst) that tows the other one; None: there is none, the velocity joint is
             moved alone and current_a is zero. Left out: the other one of joints 1 and 2.
@@ -280,7 +280,7 @@ class Limits:
 
 
 class JointSample(NamedTuple):
-    """What was measured of one joint in one cycle: motor current, joint side velocity and travel, temperature, position.
+    """Measurement of one joint in one cycle: motor current, joint side velocity and travel, temperature, position.
 
     `temperature_c` is nan as long as none has come; `position_rad` counts from the zero of the joint's own encoder.
     """
@@ -293,26 +293,26 @@ class JointSample(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """What was measured in one cycle: joints 1, 2, ..., and the torque [Nm] of each sensor channel in use."""
+    """Measurement of one cycle: joints 1, 2, ..., and the torque [Nm] of each sensor channel in use."""
 
     joints: tuple[JointSample, ...]
     torque_nm: tuple[float, ...]
 
 
 HELD_RAD: Final = 0.05
-"""Joint side: a joint that is held and has turned so far gives way."""
+"""Joint side: largest travel of a joint that is held."""
 HELD_RAD_S: Final = 0.3
 """Joint side: largest velocity of a joint that is held."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """What is on the bus beside the joints that are moved.
+    """Joints and sensor channels of the bus that are not moved.
 
     Attributes:
-        held_current_a: largest current of each joint that is held, by number; one that is not named: as those moved.
-        channels: joints that a channel of the sensor measures, of the channels that the torque's limit holds for; None: all,
-            and the joints of a single one are 1 and 2.
+        held_current_a: largest current of each joint that is held, by number; missing: as the joints that are moved.
+        channels: joints of each sensor channel for which the torque limit holds; None: all channels, and the joints of a
+            single one are 1 and 2.
     """
 
     held_current_a: Mapping[int, float] = field(default_factory=dict)
@@ -320,7 +320,7 @@ class Surroundings:
 
 
 class Monitor:
-    """Comparison of samples with the limits, without a state: the same sample gives the same answer.
+    """Compares samples with the limits; it has no state.
 
     Args:
         limits: of the joints that are moved. moved: their numbers; all others are held.
@@ -362,10 +362,10 @@ class Monitor:
         for channel, torque in enumerate(sample.torque_nm, 1):
             if -limit <= torque <= limit or (self._channels is not None and channel not in self._channels):
                 continue
-            return f"{self._whose(channel, len(sample.torque_nm))}: torque at the sensor {torque:.2f} Nm, limit {limit:g} Nm"
+            return f"{self._owner(channel, len(sample.torque_nm))}: torque at the sensor {torque:.2f} Nm, limit {limit:g} Nm"
         return None
 
-    def _whose(self, channel: int, channels: int) -> str:
+    def _owner(self, channel: int, channels: int) -> str:
         if self._channels is None:
             return "joints 1 and 2" if channels == 1 else f"joint {channel}"
         joints = self._channels[channel]
@@ -386,20 +386,20 @@ class Monitor:
 
 
 def check_setpoints(setpoints: Setpoints, limits: Limits) -> None:
-    """Refuse a plan that cannot be kept within the limits, or that jumps; before anything moves.
+    """Refuse a plan that exceeds the limits, or that jumps, before anything moves.
 
-    Travel is that of the velocity joint; the other one turns with it. The first set-point is compared with
-    standstill. Where a joint that is moved alone stands is not known before (`out_of_room`). Raises MotionError naming
-    joint, quantity, time, found and limit.
+    Travel is that of the velocity joint; the other one turns with it. The first set-point is compared with standstill.
+    The position of a joint that is moved alone is checked at the start (`out_of_range`). Raises MotionError naming joint,
+    quantity, time, found and limit.
     """
     one, other = setpoints.velocity_joint, setpoints.current_joint
     _below(setpoints.velocity_rad_s, limits.velocity_rad_s, f"velocity of joint {one}", "rad/s")
     _below(setpoints.current_a, limits.current_a, f"current of joint {other}", "A")
     _below(path(setpoints), limits.travel_rad, f"travel of joint {one}", "rad")
-    low, high = way(setpoints)
-    room = limits.position_rad[1] - limits.position_rad[0]
-    if high - low > room:
-        raise MotionError(f"plan: joint {one} moves over {high - low:.3f} rad, limit {room:g} rad")
+    low, high = path_range(setpoints)
+    travel = limits.position_rad[1] - limits.position_rad[0]
+    if high - low > travel:
+        raise MotionError(f"plan: joint {one} moves over {high - low:.3f} rad, limit {travel:g} rad")
     _smooth(
         setpoints.velocity_rad_s, STEEPEST_VELOCITY_RAD_S2 * PERIOD_S, f"velocity of joint {one}", "rad/s"
     )
@@ -412,15 +412,15 @@ def path(setpoints: Setpoints) -> FloatArray:
     return found
 
 
-def way(setpoints: Setpoints) -> tuple[float, float]:
-    """Return the lowest and highest of `path`, the start included."""
+def path_range(setpoints: Setpoints) -> tuple[float, float]:
+    """Return the least and the largest of `path`, the start included."""
     found = path(setpoints)
     return min(float(found.min()), 0.0), max(float(found.max()), 0.0)
 
 
-def out_of_room(setpoints: Setpoints, limits: Limits, start_rad: float) -> str | None:
+def out_of_range(setpoints: Setpoints, limits: Limits, start_rad: float) -> str | None:
     """Return why the velocity joint cannot begin at start_rad [rad], or None."""
-    (low, high), (down, up) = limits.position_rad, way(setpoints)
+    (low, high), (down, up) = limits.position_rad, path_range(setpoints)
     if low <= start_rad + down and start_rad + up <= high:
         return None
     return (

@@ -55,10 +55,10 @@ def play(
     timing: Timing | None = None,
     around: Surroundings | None = None,
 ) -> MotionResult:
-    """Move joints as `setpoints` say, within `limits`, on a bus on which jtqd runs; all are disabled afterwards.
+    """Move joints along `setpoints`, within `limits`, on a bus on which jtqd runs; all are disabled afterwards.
 
-    SIGINT and SIGTERM stop the joints, a second one makes them brake at once; the handlers that were there before are
-    back when this returns. `drives` are joints 1, 2, ..; those that the set-points do not name are held. Without `sensor`
+    SIGINT and SIGTERM stop the joints, a second one makes them brake at once; the previous handlers are
+    restored when this returns. drives: joints 1, 2, ..; those that the set-points do not name are held. Without `sensor`
     the torque is not supervised.
     Raises MotionError (OutOfPlaceError), one line, when the motion was refused and nothing has moved.
     """

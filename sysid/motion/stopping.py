@@ -149,7 +149,7 @@ class Stopping:
 
 
 ON_S: Final = 0.25
-"""Before the end of the stretch the power comes back, so that the motion after it is not late."""
+"""Before the end of the window the power comes back, so that the next motion is not late."""
 FREE_RAD_S: Final = 0.2
 """Joint side: a gear that springs back as the torque goes is slower, and stands again at once."""
 STAND_S: Final = 2.0
@@ -163,10 +163,10 @@ class _Step(Enum):
 
 
 class PowerOff:
-    """One stretch of a motion without power, set-points `stretch` = (first, end): out of operation enabled and back.
+    """One window of a motion without power, set-points `window` = (first, end): out of operation enabled and back.
 
         standing     set-points of zero, until both joints have stood for Timing.still_s
-        off          6040h 0 to both, until both statuswords confirm it; then nothing but time, at least half of the stretch
+        off          6040h 0 to both, until both statuswords confirm it; then nothing but time, at least half of the window
         on           6040h 6, 7, 15 to both as at the start, targets zero, until both are in operation enabled
 
     Limits and supervision go on meanwhile, but that both drives must be in operation enabled. A joint that turns although
@@ -174,7 +174,7 @@ class PowerOff:
 
     Attributes:
         index: set-point in force; all of them are zero.
-        over: both drives are in operation enabled again, and the stretch has ended.
+        over: both drives are in operation enabled again, and the window has ended.
         violation: why it cannot go on.
     """
 
@@ -184,10 +184,10 @@ class PowerOff:
         supervision: Supervision,
         commands: Commands,
         timing: Timing,
-        stretch: tuple[int, int],
+        window: tuple[int, int],
         now_ns: int,
     ) -> None:
-        self.index, self._end = stretch
+        self.index, self._end = window
         self._least_s = 0.5 * (self._end - self.index) * PERIOD_S
         self.violation: Violation | None = None
         self.over = False
@@ -239,7 +239,7 @@ class PowerOff:
                 drives = self._inputs.drives
                 drive = next((d for d in drives if state_of(d.statusword) in POWERED), drives[-1])
                 self.violation = Violation(
-                    f"{drive.who}: {describe(drive.statusword)} after {self._timing.disable_s:g} s, expected no power",
+                    f"{drive.name}: {describe(drive.statusword)} after {self._timing.disable_s:g} s, expected no power",
                     True,
                 )
         elif (self._end - self.index) * PERIOD_S <= ON_S and (
@@ -258,7 +258,7 @@ class PowerOff:
         if self._elapsed_s(now_ns) > self._timing.enable_s:
             drive = self._inputs.drives[states[0] is State.OPERATION_ENABLED]
             self.violation = Violation(
-                f"{drive.who}: {describe(drive.statusword)} after {self._timing.enable_s:g} s, expected operation enabled",
+                f"{drive.name}: {describe(drive.statusword)} after {self._timing.enable_s:g} s, expected operation enabled",
                 True,
             )
         word = enabling_word(states[turn])
@@ -269,5 +269,5 @@ class PowerOff:
         for drive in self._inputs.drives:
             if not -FREE_RAD_S <= drive.velocity_rad_s <= FREE_RAD_S:
                 text = f"velocity {drive.velocity_rad_s:.3f} rad/s without power, limit {FREE_RAD_S:g} rad/s"
-                return Violation(f"{drive.who}: {text}", True)
+                return Violation(f"{drive.name}: {text}", True)
         return None

@@ -28,7 +28,7 @@ from jtqd.sysid.motion.setpoints import (
     Setpoints,
     Timing,
     path,
-    way,
+    path_range,
 )
 from jtqd.sysid.planner.campaigns import Scale, check_joints, efficiency_runs, make_plan_of, units_of
 from jtqd.sysid.planner.plan import (
@@ -184,7 +184,7 @@ def test_a_joint_alone_stays_where_it_may_be_and_comes_back(kind: str) -> None:
     for run, points in zip(plan.runs, check_plan(plan).values(), strict=True):
         assert (run.joints, run.current_joint) == ((1,), None)
         assert not points.current_a.any()
-        low, high = way(points)
+        low, high = path_range(points)
         assert -1.5 * SHARE - 1e-3 <= low < high <= 1.5 * SHARE + 1e-3, run.name
         assert float(np.abs(points.velocity_rad_s).max()) <= SHARE * LIMITS.velocity_rad_s + 1e-9
         steepest = float(np.abs(np.diff(points.velocity_rad_s, prepend=0.0)).max()) * 1e3

@@ -20,7 +20,7 @@ from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import sources_of
 from jtqd.sysid.motion.commander import Commander
-from jtqd.sysid.motion.drives import CST, CSV, sensor_units, set_up, switch_off, turns
+from jtqd.sysid.motion.drives import CST, CSV, sending_order, sensor_units, set_up, switch_off
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Surroundings, Timing
 from jtqd.sysid.motion.stopping import Phase
 
@@ -134,7 +134,7 @@ class LockStep:
         period_s = 1e-3 * self.period_ms
         timing = replace(timing or Timing(), period_s=period_s, setpoint_delay_s=0.7 * period_s)
         temperature = math.isfinite(limits.temperature_c)
-        round_cycles = turns(setpoints.joints, len(self.nodes))[1]
+        round_cycles = sending_order(setpoints.joints, len(self.nodes))[1]
         for node in self.nodes:
             switch_off(self.access(node), node, self.sleep)
         units = [

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.sim_can import drive_node as cia402
-from jtqd.sysid.motion.drives import turns
+from jtqd.sysid.motion.drives import sending_order
 from jtqd.sysid.motion.setpoints import (
     HELD_RAD,
     Limits,
@@ -17,7 +17,7 @@ from jtqd.sysid.motion.setpoints import (
     Setpoints,
     Surroundings,
     check_setpoints,
-    way,
+    path_range,
 )
 from jtqd.sysid.motion.stopping import Phase
 from jtqd.sysid.planner.single_joint import approach
@@ -49,7 +49,7 @@ def travels(lock: LockStep) -> list[float]:
 def test_one_drive_has_its_turn_in_each_cycle(
     moved: tuple[int, ...], drives: int, order: tuple[int, ...], cycles: int
 ) -> None:
-    assert turns(moved, drives) == (order, cycles)
+    assert sending_order(moved, drives) == (order, cycles)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_joints_are_moved_and_all_others_held(drives: int, period_ms: int, setpo
     lock = LockStep(drives=drives, period_ms=period_ms)
     lock.commander(setpoints, replace(ALONE, torque_nm=100.0))
     lock.run(lambda: lock.motion.phase is Phase.RAMPING)
-    wanted = way(setpoints)[1] + way(setpoints)[0]
+    wanted = path_range(setpoints)[1] + path_range(setpoints)[0]
     for number, travel in enumerate(travels(lock), 1):
         if number == setpoints.velocity_joint:
             assert travel == pytest.approx(wanted, abs=0.02)

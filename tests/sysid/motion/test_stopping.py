@@ -256,12 +256,12 @@ def test_an_emcy(lock: LockStep, joint: int) -> None:
     stopped_with(lock, rf"joint {joint}: EMCY 4210h \(error register 08h\)", BRAKE_MS)
 
 
-@pytest.mark.parametrize(("node", "who"), [(1, "joint 1"), (2, "joint 2"), (3, "sensor")])
-def test_a_node_whose_heartbeat_stops(lock: LockStep, node: int, who: str) -> None:
+@pytest.mark.parametrize(("node", "name"), [(1, "joint 1"), (2, "joint 2"), (3, "sensor")])
+def test_a_node_whose_heartbeat_stops(lock: LockStep, node: int, name: str) -> None:
     started(lock)
     lock.filter = lambda frames: [frame for frame in frames if frame[0] != 0x700 + node]
     assert 200 <= until_stop(lock, 1000) <= 302
-    stopped_with(lock, rf"{who}: no heartbeat for 30\d ms, limit 300 ms")
+    stopped_with(lock, rf"{name}: no heartbeat for 30\d ms, limit 300 ms")
 
 
 def test_the_sensor_says_that_it_is_not_valid(lock: LockStep) -> None:
