@@ -46,6 +46,23 @@ def plateau(
 
 Frames = list[tuple[int, bytes, int]]
 """COB-ID, data and time of each."""
+Filter = Callable[[Frames], Frames]
+
+
+def changed(can_id: int, change: Callable[[bytes], bytes]) -> Filter:
+    """A filter that changes the data of one COB-ID."""
+    return lambda frames: [(i, change(d) if i == can_id else d, t) for i, d, t in frames]
+
+
+def without(*identifiers: int) -> Filter:
+    """A filter that loses the frames of some COB-IDs."""
+    return lambda frames: [frame for frame in frames if frame[0] not in identifiers]
+
+
+def turning(node: int, velocity_rad_s: float) -> Filter:
+    """A filter: the drive measures this velocity, joint side."""
+    units = round(velocity_rad_s * 100 / (2 * math.pi) * 65536)
+    return changed(0x280 + node, lambda data: units.to_bytes(4, "little") + data[4:])
 
 
 class BenchAccess:
@@ -95,7 +112,7 @@ class LockStep:
         self.now = 1_000 * MS
         self.counter = 0
         self.sent: list[tuple[int, int, bytes]] = []
-        self.filter: Callable[[Frames], Frames] = lambda frames: frames
+        self.filter: Filter = lambda frames: frames
         self.sync_runs = True
         self.deaf = False
         self.waiting: Frames = []
@@ -186,6 +203,21 @@ class LockStep:
     def run_for(self, ms: int) -> None:
         for _ in range(ms):
             self.cycle()
+
+    def held_up(self, cycles: int) -> None:
+        """The commander sees nothing for some cycles, and all their frames in the next one."""
+        held: Frames = []
+        self.deaf = True
+        for _ in range(cycles):
+            self.cycle()
+            held += self.waiting
+            self.waiting = []
+        self.deaf = False
+        self.waiting = held
+
+    def with_extra(self, can_id: int, data: bytes) -> None:
+        """Add a frame to every cycle from here on."""
+        self.filter = lambda frames: [*frames, (can_id, data, self.now)]
 
     def play_until(self, ms: int) -> None:
         """Until set-point number `ms` has been in force."""

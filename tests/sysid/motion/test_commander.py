@@ -1,4 +1,4 @@
-"""The commander leads the emulated bench through a motion, in lock-step: what it sends, and that the joints follow."""
+"""The commander leads the emulated bench through a motion, in lock-step: its frames, and the motion of the joints."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from jtqd.drivers.pdo import Tpdo
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
 from jtqd.sysid.motion.stopping import Phase
-from tests.sysid.motion.lock_step import MS, WARM, WIDE, LockStep, plateau
+from tests.sysid.motion.lock_step import MS, WARM, WIDE, LockStep, changed, plateau, turning, without
 
 OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 RPDOS = {0x201, 0x202, 0x301, 0x302}
@@ -62,7 +62,7 @@ def one_encoder_and_torque(node: int) -> DriveProfile:
 
 
 def three_tpdos(node: int) -> DriveProfile:
-    """Every quantity where nobody would look for it."""
+    """Every quantity in another place than usual."""
     words = (
         (0x60410010, 0x60640020),
         (0x606C0020,),
@@ -100,7 +100,7 @@ def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
     again = LockStep(profiles=(made(1), made(2)))
     motion = again.commander(plateau(1.2, 2.5))
     again.play_until(400)
-    again.filter = lambda frames: [frame for frame in frames if frame[0] != last.cob_id]
+    again.filter = without(last.cob_id)
     again.run()
     text = f"joint 1: TPDO{last.number} ({last.cob_id:03X}h) missing for 6 cycles, limit 5"
     assert motion.result.reason.startswith(text)
@@ -138,7 +138,7 @@ def test_each_drive_gets_every_second_setpoint_and_no_cycle_carries_two(lock: Lo
 
 
 def test_the_start_word_by_word(lock: LockStep) -> None:
-    """After boot-up and standstill: 6, 7, 15 to each drive, each when its statusword has confirmed the one before."""
+    """After boot-up and standstill: 6, 7, 15 to each drive, each when its statusword has confirmed the last one."""
     motion = lock.commander(plateau(1.0, 2.0))
     lock.run(lambda: motion.phase is Phase.PLAYING)
     assert lock.sent[0][1:] == (0x721, b"\x00"), "boot-up message"
@@ -166,15 +166,7 @@ def test_the_end_word_by_word(lock: LockStep) -> None:
 def test_joints_that_turn_are_not_enabled(lock: LockStep) -> None:
     """Joint 2 turns by hand: refused after 3 s, nothing was enabled."""
     motion = lock.commander(plateau(1.0, 2.0))
-
-    def turning(frames: list[tuple[int, bytes, int]]) -> list[tuple[int, bytes, int]]:
-        units = round(0.05 * 100 / (2 * math.pi) * 65536)
-        return [
-            (can_id, units.to_bytes(4, "little") + data[4:], t) if can_id == 0x282 else (can_id, data, t)
-            for can_id, data, t in frames
-        ]
-
-    lock.filter = turning
+    lock.filter = turning(2, 0.05)
     lock.run()
     assert motion.refusal == "joint 2: velocity 0.050 rad/s before the start, limit 0.02 rad/s"
     assert not [each for each in lock.sent if each[1] in RPDOS]
@@ -194,7 +186,7 @@ def test_joints_that_turn_are_not_enabled(lock: LockStep) -> None:
 )
 def test_nothing_is_begun_without_every_input(lock: LockStep, gone: int, line: str) -> None:
     motion = lock.commander(plateau(1.0, 2.0))
-    lock.filter = lambda frames: [frame for frame in frames if frame[0] != gone]
+    lock.filter = without(gone)
     assert lock.run() == pytest.approx(3000, abs=5)
     assert motion.refusal == line
     assert not [each for each in lock.sent if each[1] in RPDOS]
@@ -202,7 +194,7 @@ def test_nothing_is_begun_without_every_input(lock: LockStep, gone: int, line: s
 
 def test_an_emcy_or_a_fault_that_is_there_already_refuses_the_start(lock: LockStep) -> None:
     motion = lock.commander(plateau(1.0, 2.0))
-    lock.filter = lambda frames: [*frames, (0x081, bytes.fromhex("1023020000000000"), lock.now)]
+    lock.with_extra(0x081, bytes.fromhex("1023020000000000"))
     lock.run()
     assert motion.refusal == "joint 1: EMCY 2310h (error register 02h)"
     lock = LockStep()
@@ -213,15 +205,10 @@ def test_an_emcy_or_a_fault_that_is_there_already_refuses_the_start(lock: LockSt
 
 
 @pytest.mark.parametrize("content", [None, (-0x8000).to_bytes(2, "little", signed=True)])
-def test_temperature_must_be_heard_when_it_is_limited(lock: LockStep, content: bytes | None) -> None:
-    """TPDO3 of drive 2 does not come, or says "not measured" (8000h)."""
+def test_a_temperature_limit_needs_a_temperature(lock: LockStep, content: bytes | None) -> None:
+    """TPDO3 of drive 2 does not come, or is "not measured" (8000h)."""
     motion = lock.commander(plateau(1.0, 2.0), WARM)
-
-    def filter_(frames: list[tuple[int, bytes, int]]) -> list[tuple[int, bytes, int]]:
-        replaced = [(0x382, content, t) for can_id, _, t in frames if can_id == 0x382 and content]
-        return [frame for frame in frames if frame[0] != 0x382] + replaced
-
-    lock.filter = filter_
+    lock.filter = without(0x382) if content is None else changed(0x382, lambda _: content)
     lock.run()
     assert motion.refusal == "joint 2: no temperature (382h), which is required by its limit"
 
@@ -249,7 +236,7 @@ def test_a_drive_that_does_not_come_on_stops_the_other(lock: LockStep) -> None:
 
 
 def test_lost_cycles_make_the_motion_longer_and_never_jump(lock: LockStep) -> None:
-    """jtqd leaves out up to 12 SYNCs now and then: it goes on, at most four set-points further."""
+    """Up to 12 SYNCs are missing now and then: the motion continues at most four set-points further."""
     ramp = plateau(1.5, 3.0, hold_ms=300)
     motion = lock.commander(ramp)
     lock.play_until(100)
@@ -270,14 +257,7 @@ def test_lost_cycles_make_the_motion_longer_and_never_jump(lock: LockStep) -> No
 def test_a_commander_that_is_held_up_briefly_sends_no_burst(lock: LockStep) -> None:
     motion = lock.commander(plateau(1.0, 2.0))
     lock.play_until(300)
-    lock.deaf = True
-    held: list[tuple[int, bytes, int]] = []
-    for _ in range(15):
-        lock.cycle()
-        held += lock.waiting
-        lock.waiting = []
-    lock.deaf = False
-    lock.waiting = held
+    lock.held_up(15)
     before = len(lock.sent)
     lock.cycle()
     assert len([each for each in lock.sent[before:] if each[1] in RPDOS]) == 1
@@ -306,7 +286,7 @@ def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock: 
     assert motion.result.status == "done"
 
 
-def test_setpoints_beyond_what_an_rpdo_holds_are_refused(lock: LockStep) -> None:
+def test_setpoints_beyond_the_range_of_an_rpdo_are_refused(lock: LockStep) -> None:
     """300 A of an 8 A drive are 37500 in 1/1000 of rated torque; 16 bits end at 32767."""
     with pytest.raises(
         MotionError, match="plan: current of joint 2 is -37500 in units of the drive, limit 32767"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -21,7 +20,16 @@ from jtqd.sysid.motion.setpoints import (
 )
 from jtqd.sysid.motion.stopping import Phase
 from jtqd.sysid.planner.single_joint import approach
-from tests.sysid.motion.lock_step import MS, Frames, LockStep, plateau, raised_cosine
+from tests.sysid.motion.lock_step import (
+    MS,
+    Filter,
+    LockStep,
+    changed,
+    plateau,
+    raised_cosine,
+    turning,
+    without,
+)
 
 ALONE = Limits(current_a=9.0, velocity_rad_s=2.0, torque_nm=40.0, travel_rad=4.0, position_rad=(-2.0, 2.0))
 
@@ -46,7 +54,7 @@ def travels(lock: LockStep) -> list[float]:
         ((3, 4), 4, (2, 3, 0, 2, 3, 1), 3),
     ],
 )
-def test_one_drive_has_its_turn_in_each_cycle(
+def test_one_drive_gets_a_setpoint_in_each_cycle(
     moved: tuple[int, ...], drives: int, order: tuple[int, ...], cycles: int
 ) -> None:
     assert sending_order(moved, drives) == (order, cycles)
@@ -88,44 +96,24 @@ def test_joints_are_moved_and_all_others_held(drives: int, period_ms: int, setpo
     assert set(held) <= {0}
 
 
-def emergency_of(node: int) -> Callable[[Frames, int], Frames]:
-    return lambda frames, now: [*frames, (0x080 + node, b"\x10\x23\x03\0\0\0\0\0", now)]
-
-
-def turning(node: int) -> Callable[[Frames, int], Frames]:
-    """A joint that is held turns away, as its velocity says."""
-
-    def changed(frames: Frames, now: int) -> Frames:
-        fast = (400_000).to_bytes(4, "little")
-        return [
-            (can_id, fast + data[4:], stamp) if can_id == 0x280 + node else (can_id, data, stamp)
-            for can_id, data, stamp in frames
-        ]
-
-    return changed
-
-
-def silent(node: int) -> Callable[[Frames, int], Frames]:
-    return lambda frames, now: [each for each in frames if each[0] not in (0x180 + node, 0x280 + node)]
-
-
 @pytest.mark.parametrize(
-    ("happens", "reason"),
+    ("faulty", "reason"),
     [
-        (emergency_of(1), "joint 1: EMCY 2310h"),
-        (turning(2), "joint 2: velocity 0.383 rad/s, limit 0.3 rad/s"),
-        (silent(1), "joint 1: TPDO2 (281h) missing"),
-        (emergency_of(3), "joint 3: EMCY 2310h"),
+        (1, "joint 1: EMCY 2310h"),
+        (turning(2, 0.383), "joint 2: velocity 0.383 rad/s, limit 0.3 rad/s"),
+        (without(0x181, 0x281), "joint 1: TPDO2 (281h) missing"),
+        (3, "joint 3: EMCY 2310h"),
     ],
     ids=["fault of a held joint", "held joint turns", "held joint is silent", "fault of the moved one"],
 )
-def test_whatever_happens_to_any_drive_stops_all(
-    happens: Callable[[Frames, int], Frames], reason: str
-) -> None:
+def test_a_fault_of_any_drive_stops_all(faulty: int | Filter, reason: str) -> None:
     lock = LockStep(drives=3, period_ms=2)
     lock.commander(alone(3, 1.0, hold_ms=1000), ALONE)
     lock.play_until(300)
-    lock.filter = lambda frames: happens(frames, lock.now)
+    if isinstance(faulty, int):
+        lock.with_extra(0x080 + faulty, b"\x10\x23\x03\0\0\0\0\0")
+    else:
+        lock.filter = faulty
     began = lock.now
     lock.run(lambda: lock.motion.over)
     result = lock.motion.result
@@ -146,7 +134,7 @@ def test_a_joint_that_would_leave_its_travel_is_not_begun() -> None:
     assert lock.states == (cia402.SWITCH_ON_DISABLED,)
 
 
-def test_an_approach_ends_where_it_shall_and_within_its_limits() -> None:
+def test_an_approach_ends_at_its_target_and_within_its_limits() -> None:
     for start, target in ((1.5, 0.0), (-1.9, 1.0), (0.3, 0.31)):
         there = approach(1, start, target, ALONE)
         check_setpoints(there, ALONE)
@@ -159,50 +147,33 @@ def test_an_approach_ends_where_it_shall_and_within_its_limits() -> None:
 
 
 def test_the_travel_of_a_joint_that_is_moved_alone_is_supervised() -> None:
-    """The encoder says that it is beyond, whatever the plan was."""
+    """The encoder is beyond the limit, although the plan is not."""
     lock = LockStep(drives=1)
     lock.commander(alone(1, 1.0, hold_ms=600), replace(ALONE, position_rad=(-1.0, 1.0)))
     lock.play_until(500)
     node = lock.motion.inputs.drives[0]
     beyond = round(1.2 / node.units.scaling.link_rad_per_count)
-
-    def moved(frames: Frames) -> Frames:
-        return [
-            (can_id, data[:4] + beyond.to_bytes(4, "little", signed=True), stamp)
-            if can_id == 0x181
-            else (can_id, data, stamp)
-            for can_id, data, stamp in frames
-        ]
-
-    lock.filter = moved
+    lock.filter = changed(0x181, lambda data: data[:4] + beyond.to_bytes(4, "little", signed=True))
     lock.run()
     assert lock.motion.result.reason.startswith("joint 1: position 1.2")
     assert "limits -1 to 1 rad" in lock.motion.result.reason
 
 
 def test_the_torque_of_another_joint_is_no_reason_to_stop() -> None:
-    """Joint 3 is measured by channel 2; what joints 1 and 2 carry on channel 1 is theirs."""
+    """Joint 3 is measured by channel 2; channel 1 belongs to joints 1 and 2."""
     around = Surroundings({1: 9.0, 2: 9.0}, {2: (3,)})
     lock = LockStep(drives=3, period_ms=2)
     lock.commander(alone(3, 1.0), ALONE, around=around)
     lock.play_until(200)
-
-    def loaded(channel: int, torque: bytes) -> Callable[[Frames], Frames]:
-        cob_id = 0x080 + 0x100 * channel + 5
-        return lambda frames: [
-            (can_id, torque + data[-1:], stamp) if can_id == cob_id else (can_id, data, stamp)
-            for can_id, data, stamp in frames
-        ]
-
-    lock.filter = loaded(1, b"\xff\xff\xff\x7f")
+    lock.filter = changed(0x185, lambda data: b"\xff\xff\xff\x7f" + data[-1:])
     lock.run_for(50)
     assert lock.motion.phase is Phase.PLAYING
-    lock.filter = loaded(2, b"\xff\x7f")
+    lock.filter = changed(0x285, lambda data: b"\xff\x7f" + data[-1:])
     lock.run()
     assert lock.motion.result.reason.startswith("joint 3: torque at the sensor")
 
 
-def test_the_drives_get_what_the_bus_has_room_for() -> None:
+def test_a_moved_drive_interpolates_over_its_sending_period() -> None:
     """60C2h of the moved drive is the time between two of its set-points."""
     lock = LockStep(drives=3, period_ms=2)
     lock.commander(alone(3, 1.0), ALONE)

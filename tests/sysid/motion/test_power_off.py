@@ -13,7 +13,7 @@ from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.motion.setpoints import Mark, Setpoints
 from jtqd.sysid.motion.stopping import Phase
 from jtqd.sysid.planner.plan import Off, Plateau, Rest, Run, check_run, expand
-from tests.sysid.motion.lock_step import MS, PLANT, WIDE, Frames, LockStep, plateau
+from tests.sysid.motion.lock_step import MS, PLANT, WIDE, LockStep, changed, plateau, turning
 
 BOTH_OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 BOTH_ON = (cia402.OPERATION_ENABLED, cia402.OPERATION_ENABLED)
@@ -55,7 +55,7 @@ def stopped(lock: LockStep, pattern: str) -> None:
     assert lock.states == BOTH_OFF
 
 
-def test_the_motion_goes_on_after_a_stretch_without_power_in_which_only_the_offset_is_read() -> None:
+def test_the_motion_continues_after_a_window_without_power_in_which_only_the_offset_is_read() -> None:
     lock = with_offset()
     motion = lock.commander(check_run(RUN, WIDE))
     rows = []
@@ -64,9 +64,7 @@ def test_the_motion_goes_on_after_a_stretch_without_power_in_which_only_the_offs
         true = [drive.current_a for drive in lock.source.plant.drives]
         read = [drive.current_a for drive in lock.source.drives]
         rows.append((motion.played_s, lock.states == BOTH_OFF, *lock.velocities, *true, *read))
-    assert motion.result == ("done", "", pytest.approx(RUN.duration_s)), (
-        "what was off took no longer than planned"
-    )
+    assert motion.result == ("done", "", pytest.approx(RUN.duration_s)), "off for as long as planned"
     played, off, v1, v2, i1, i2, r1, r2 = np.array(rows).T
     inside = (off > 0) & (played > 0.0) & (played < RUN.duration_s)
     assert inside.sum() * 1e-3 == pytest.approx(OFF_S - 0.4, abs=0.02), "standing before, 0.25 s to come back"
@@ -84,7 +82,7 @@ def test_the_motion_goes_on_after_a_stretch_without_power_in_which_only_the_offs
     assert np.abs([v1[back], v2[back]]).max() < 0.02, "enabled again without a jump"
 
 
-def test_the_words_on_the_way_there_and_back_and_that_no_target_is_sent_meanwhile() -> None:
+def test_the_controlwords_of_switching_off_and_on_and_no_target_meanwhile() -> None:
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.phase is Phase.POWERLESS)
@@ -101,7 +99,7 @@ def test_the_words_on_the_way_there_and_back_and_that_no_target_is_sent_meanwhil
     assert lock.states == BOTH_ON
 
 
-def test_a_stretch_without_power_is_no_new_day_of_the_emulated_bench() -> None:
+def test_a_window_without_power_is_no_new_day_of_the_emulated_bench() -> None:
     lock = LockStep(load_plant(shipped("campaign_plant.yaml")))
     zeros = set()
     lock.commander(check_run(RUN, WIDE))
@@ -112,7 +110,7 @@ def test_a_stretch_without_power_is_no_new_day_of_the_emulated_bench() -> None:
     assert len(zeros) == 1
     lock.commander(plateau(0.2, 0.0))
     lock.run()
-    assert lock.source.day_number == 1, "the next run, which is set up anew, is"
+    assert lock.source.day_number == 1, "the next run is"
 
 
 def test_a_signal_while_the_power_is_off_ends_the_motion_without_enabling_again() -> None:
@@ -126,41 +124,27 @@ def test_a_signal_while_the_power_is_off_ends_the_motion_without_enabling_again(
     assert words <= {b"\x02\x00", b"\x00\x00"}, "quick stop and disable voltage, never enable operation"
 
 
-def test_limits_and_supervision_go_on_without_power() -> None:
-    for can_id, data, pattern in (
-        (0x081, bytes.fromhex("1023020000000000"), r"joint 1: EMCY 2310h .*"),
-        (0x702, b"\x7f", r"joint 2: NMT pre-operational, expected operational"),
-        (
-            0x183,
-            (200_000).to_bytes(4, "little") + b"\x00",
-            r"joints 1 and 2: torque at the sensor 200.00 Nm, .*",
-        ),
-    ):
-        lock = LockStep()
-        until_off(lock)
-        lock.run_for(300)
-
-        def more(frames: Frames, can_id: int = can_id, data: bytes = data, lock: LockStep = lock) -> Frames:
-            return [*frames, (can_id, data, lock.now)]
-
-        lock.filter = more
-        stopped(lock, pattern)
+@pytest.mark.parametrize(
+    ("can_id", "data", "pattern"),
+    [
+        (0x081, "1023020000000000", r"joint 1: EMCY 2310h .*"),
+        (0x702, "7f", r"joint 2: NMT pre-operational, expected operational"),
+        (0x183, "400d030000", r"joints 1 and 2: torque at the sensor 200.00 Nm, .*"),
+    ],
+)
+def test_limits_and_supervision_continue_without_power(can_id: int, data: str, pattern: str) -> None:
+    lock = LockStep()
+    until_off(lock)
+    lock.run_for(300)
+    lock.with_extra(can_id, bytes.fromhex(data))
+    stopped(lock, pattern)
 
 
 def test_a_joint_that_turns_without_power_ends_the_motion() -> None:
     lock = LockStep()
     until_off(lock)
     lock.run_for(300)
-    gear = PLANT.joints[1].joint.gear_ratio
-
-    def turning(frames: Frames) -> Frames:
-        units = round(0.3 * gear / (2 * math.pi) * 65536)
-        return [
-            (can_id, units.to_bytes(4, "little") + data[4:], t) if can_id == 0x282 else (can_id, data, t)
-            for can_id, data, t in frames
-        ]
-
-    lock.filter = turning
+    lock.filter = turning(2, 0.3)
     stopped(lock, r"joint 2: velocity 0\.300 rad/s without power, limit 0\.2 rad/s")
 
 
@@ -177,16 +161,10 @@ def test_a_drive_that_does_not_obey_ends_the_motion(word: int, pattern: str) -> 
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.phase is Phase.POWERLESS)
 
-    def same_word(frames: Frames) -> Frames:
-        if lock.motion.phase is not Phase.POWERLESS:
-            return frames
-        return [
-            (i, data[:6] + word.to_bytes(2, "little") if i == 0x282 else data, t) for i, data, t in frames
-        ]
-
+    same_word = changed(0x282, lambda data: data[:6] + word.to_bytes(2, "little"))
     if word == 0x0231:
         lock.run(lambda: lock.states == BOTH_OFF)
-    lock.filter = same_word
+    lock.filter = lambda frames: same_word(frames) if lock.motion.phase is Phase.POWERLESS else frames
     lock.run(lambda: lock.motion.phase is not Phase.POWERLESS, limit_ms=4000)
     lock.run()
     assert lock.motion.result.status == "stopped"
@@ -195,19 +173,11 @@ def test_a_drive_that_does_not_obey_ends_the_motion(word: int, pattern: str) -> 
 
 
 def test_the_power_does_not_go_while_a_joint_moves() -> None:
-    """Both drives stay enabled until both joints have stood for 150 ms, and are off for half of the stretch then."""
+    """Both drives stay enabled until both joints have stood for 150 ms, and are then off for half of the window."""
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.phase is Phase.POWERLESS)
-    gear = PLANT.joints[0].joint.gear_ratio
-
-    def turning(frames: Frames) -> Frames:
-        units = round(0.1 * gear / (2 * math.pi) * 65536)
-        return [
-            (i, units.to_bytes(4, "little") + data[4:] if i == 0x281 else data, t) for i, data, t in frames
-        ]
-
-    lock.filter = turning
+    lock.filter = turning(1, 0.1)
     lock.run_for(1500)
     assert lock.states == BOTH_ON
     lock.filter = lambda frames: frames
@@ -219,7 +189,7 @@ def test_the_power_does_not_go_while_a_joint_moves() -> None:
     assert off == pytest.approx(700, abs=60)
 
 
-def test_lost_cycles_do_not_skip_a_stretch_without_power() -> None:
+def test_lost_cycles_do_not_skip_a_window_without_power() -> None:
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.played_s >= 0.899)
@@ -227,7 +197,7 @@ def test_lost_cycles_do_not_skip_a_stretch_without_power() -> None:
     lock.run(lambda: lock.states == BOTH_OFF, limit_ms=400)
 
 
-def test_segments_say_when_the_power_is_off() -> None:
+def test_segments_without_power() -> None:
     points = expand(RUN)
     assert points.off == ((900, 2400),)
     assert Mark("power_off", 0.9, 2.4) in points.marks

@@ -1,7 +1,7 @@
-"""Each way a motion is stopped, once: who is named, how fast both joints stand, that no set-point follows.
+"""Each way a motion is stopped: its reason, how fast both joints stand, that no set-point follows.
 
-By limits, by what is missing or faulty, by SYNC or a commander that is late, by a signal. Lock-step with the emulated bench,
-so the truth is known: the plant's velocities, and what the bench has sent on the bus.
+By limits, by missing or faulty inputs, by SYNC or a commander that is late, by a signal. Lock-step with the emulated bench,
+so the true velocities are known.
 """
 
 import re
@@ -14,7 +14,7 @@ import pytest
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.motion.stopping import Phase
-from tests.sysid.motion.lock_step import MS, WARM, WIDE, Frames, LockStep, plateau
+from tests.sysid.motion.lock_step import MS, WARM, WIDE, Frames, LockStep, changed, plateau, without
 
 SPEED = 1.5
 CURRENT = 3.0
@@ -66,11 +66,6 @@ def until_stop(lock: LockStep, limit_ms: int) -> int:
     return lock.run(lambda: lock.motion.phase in (Phase.RAMPING, Phase.BRAKING), limit_ms)
 
 
-def changed(can_id: int, change: Callable[[bytes], bytes]) -> Callable[[Frames], Frames]:
-    """A filter that changes the data of one COB-ID."""
-    return lambda frames: [(i, change(d) if i == can_id else d, t) for i, d, t in frames]
-
-
 @pytest.fixture
 def lock() -> LockStep:
     return LockStep()
@@ -79,38 +74,44 @@ def lock() -> LockStep:
 # Limits, reached by the true plant --------------------------------------------------------------------------
 
 
-def test_current_of_the_driving_joint(lock: LockStep) -> None:
-    """Planned 3 A, limit 2.5 A: joint 2 is named when its true current has come there, not before.
+DRIVEN, DRIVING = (lambda lock, k=k: lock.source.plant.drives[k].current_a for k in (0, 1))
 
-    At negative speed it drives joint 1, which needs less.
-    """
-    lock.commander(plateau(-0.5, CURRENT, ramp_ms=1000), replace(WIDE, current_a=2.5))
+
+@pytest.mark.parametrize(
+    ("speed", "limit", "measured", "tolerance", "reason"),
+    [
+        (-0.5, {"current_a": 2.5}, DRIVING, 0.06, r"joint 2: current 2\.5\d\d A, limit 2\.5 A"),
+        (0.5, {"current_a": 3.4}, DRIVEN, 0.1, r"joint 1: current 3\.4\d\d A, limit 3\.4 A"),
+        (
+            SPEED,
+            {"velocity_rad_s": 1.0},
+            lambda lock: lock.velocities[0],
+            0.05,
+            r"joint [12]: velocity -?1\.0\d+ rad/s, limit 1 rad/s",
+        ),
+        (
+            SPEED,
+            {"torque_nm": 10.0},
+            lambda lock: lock.source.channels[0].torque_nm,
+            1.0,
+            r"joints 1 and 2: torque at the sensor -?1\d\.\d\d Nm, limit 10 Nm",
+        ),
+    ],
+    ids=["current of the driving joint", "current of the velocity joint, driving both", "velocity", "torque"],
+)
+def test_a_limit_stops_the_motion_when_the_true_value_reaches_it(  # noqa: PLR0917
+    lock: LockStep,
+    speed: float,
+    limit: dict[str, float],
+    measured: Callable[[LockStep], float],
+    tolerance: float,
+    reason: str,
+) -> None:
+    lock.commander(plateau(speed, CURRENT, ramp_ms=300 if speed == SPEED else 1000), replace(WIDE, **limit))
     until_stop(lock, 2000)
-    assert lock.source.plant.drives[1].current_a == pytest.approx(2.5, abs=0.06)
-    stopped_with(lock, r"joint 2: current 2\.5\d\d A, limit 2\.5 A")
-
-
-def test_current_of_the_velocity_joint(lock: LockStep) -> None:
-    """At positive speed joint 1 drives joint 2 as well, and needs more than its 3 A."""
-    lock.commander(plateau(0.5, CURRENT, ramp_ms=1000), replace(WIDE, current_a=3.4))
-    until_stop(lock, 2000)
-    assert lock.source.plant.drives[0].current_a == pytest.approx(3.4, abs=0.1)
-    assert lock.source.plant.drives[1].current_a < 3.1
-    stopped_with(lock, r"joint 1: current 3\.4\d\d A, limit 3\.4 A")
-
-
-def test_velocity(lock: LockStep) -> None:
-    lock.commander(plateau(SPEED, CURRENT), replace(WIDE, velocity_rad_s=1.0))
-    until_stop(lock, 1000)
-    assert abs(lock.velocities[0]) == pytest.approx(1.0, abs=0.05)
-    stopped_with(lock, r"joint [12]: velocity -?1\.0\d+ rad/s, limit 1 rad/s")
-
-
-def test_torque(lock: LockStep) -> None:
-    lock.commander(plateau(SPEED, CURRENT), replace(WIDE, torque_nm=10.0))
-    until_stop(lock, 1000)
-    assert abs(lock.source.channels[0].torque_nm) == pytest.approx(10.0, abs=1.0)
-    stopped_with(lock, r"joints 1 and 2: torque at the sensor -?1\d\.\d\d Nm, limit 10 Nm")
+    (value,) = limit.values()
+    assert abs(measured(lock)) == pytest.approx(value, abs=tolerance)
+    stopped_with(lock, reason)
 
 
 @pytest.mark.parametrize("direction", [1, -1])
@@ -125,7 +126,7 @@ def test_travel(lock: LockStep, direction: int) -> None:
     assert abs(plant.motor_position[0] / 100) < 1.2 + SPEED**2 / 20 + 0.05, "stopping distance v^2 / 2a"
 
 
-# Limits and signals of each joint, told on the bus ----------------------------------------------------------
+# Limits of each joint, by frames on the bus ------------------------------------------------------------------
 
 
 # COB-ID, layout, place
@@ -167,7 +168,7 @@ def test_one_sample_beyond_a_limit_names_its_joint(
 
 @pytest.mark.parametrize("encoder", ["motor", "link"])
 def test_a_dead_encoder_does_not_hide_the_travel(lock: LockStep, encoder: str) -> None:
-    """One encoder of each joint stays where it is; the others still know."""
+    """One encoder of each joint stays at its value; the other one still counts."""
     started(lock, replace(WIDE, travel_rad=2.0))
     frozen: dict[int, bytes] = {}
 
@@ -199,24 +200,17 @@ def test_a_dead_encoder_does_not_hide_the_travel(lock: LockStep, encoder: str) -
         (0x183, "sensor: torque of channel 1 missing for 6 cycles, limit 5"),
     ],
 )
-def test_a_pdo_that_stays_away(lock: LockStep, gone: int, line: str) -> None:
+def test_a_pdo_that_is_missing_or_has_another_length(lock: LockStep, gone: int, line: str) -> None:
     started(lock)
-    lock.filter = lambda frames: [frame for frame in frames if frame[0] != gone]
+    lock.filter = changed(gone, lambda data: data[:7]) if gone == 0x281 else without(gone)
     assert until_stop(lock, 100) == 6
     stopped_with(lock, re.escape(line))
     assert lock.states == (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 
 
-def test_a_pdo_of_another_length_is_none(lock: LockStep) -> None:
-    started(lock)
-    lock.filter = changed(0x281, lambda data: data[:7])
-    assert until_stop(lock, 100) == 6
-    stopped_with(lock, re.escape("joint 1: TPDO2 (281h) missing for 6 cycles, limit 5"))
-
-
 def test_five_missing_pdos_are_no_reason(lock: LockStep) -> None:
     started(lock)
-    lock.filter = lambda frames: [frame for frame in frames if frame[0] != 0x282]
+    lock.filter = without(0x282)
     lock.run_for(5)
     lock.filter = lambda frames: frames
     lock.run_for(50)
@@ -225,7 +219,7 @@ def test_five_missing_pdos_are_no_reason(lock: LockStep) -> None:
 
 @pytest.mark.parametrize("joint", [1, 2])
 def test_a_fault_of_one_drive_brakes_both(lock: LockStep, joint: int) -> None:
-    """Also that of the velocity joint: the other's current must not run away with the pair."""
+    """Also that of the velocity joint: the other one's current must not accelerate the pair."""
     started(lock)
     lock.bench.drives[joint - 1].machine.fault()
     assert until_stop(lock, 10) <= 2
@@ -249,8 +243,7 @@ def test_a_drive_that_trips_on_current_names_its_fault(lock: LockStep) -> None:
 @pytest.mark.parametrize("joint", [1, 2])
 def test_an_emcy(lock: LockStep, joint: int) -> None:
     started(lock)
-    told = iter([[(0x080 + joint, bytes.fromhex("1042 08 0000000000"), lock.now)]])
-    lock.filter = lambda frames: [*frames, *next(told, [])]
+    lock.with_extra(0x080 + joint, bytes.fromhex("1042 08 0000000000"))
     assert until_stop(lock, 10) == 1
     assert lock.motion.phase is Phase.BRAKING
     stopped_with(lock, rf"joint {joint}: EMCY 4210h \(error register 08h\)", BRAKE_MS)
@@ -259,12 +252,12 @@ def test_an_emcy(lock: LockStep, joint: int) -> None:
 @pytest.mark.parametrize(("node", "name"), [(1, "joint 1"), (2, "joint 2"), (3, "sensor")])
 def test_a_node_whose_heartbeat_stops(lock: LockStep, node: int, name: str) -> None:
     started(lock)
-    lock.filter = lambda frames: [frame for frame in frames if frame[0] != 0x700 + node]
+    lock.filter = without(0x700 + node)
     assert 200 <= until_stop(lock, 1000) <= 302
     stopped_with(lock, rf"{name}: no heartbeat for 30\d ms, limit 300 ms")
 
 
-def test_the_sensor_says_that_it_is_not_valid(lock: LockStep) -> None:
+def test_a_sensor_that_is_not_valid(lock: LockStep) -> None:
     started(lock)
     lock.source.channels[0].valid = False
     until_stop(lock, 10)
@@ -272,8 +265,8 @@ def test_the_sensor_says_that_it_is_not_valid(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("node", [1, 2])
-def test_a_node_that_hears_no_rpdo_any_more_is_stopped_by_sdo(lock: LockStep, node: int) -> None:
-    """Pre-operational: its heartbeat says so, its power stage does not know. 10 ms later an SDO brakes it."""
+def test_a_node_that_receives_no_rpdo_is_stopped_by_sdo(lock: LockStep, node: int) -> None:
+    """Pre-operational with its power on: an SDO brakes it 10 ms later."""
     started(lock)
     lock.to_bench(0, bytes([0x80, node]))
     assert until_stop(lock, 10) <= 7
@@ -284,7 +277,7 @@ def test_a_node_that_hears_no_rpdo_any_more_is_stopped_by_sdo(lock: LockStep, no
     assert [data.hex() for _, _, data in by_sdo] == ["2b40600002000000"]
 
 
-def test_a_drive_that_obeys_nothing_hears_no_heartbeat_and_stops_by_itself(lock: LockStep) -> None:
+def test_a_drive_that_obeys_nothing_gets_no_heartbeat_and_stops_by_itself(lock: LockStep) -> None:
     """Neither RPDO nor SDO reach drive 1: after 0.2 s our heartbeat ends, 0.3 s later it brakes with 8130h."""
     started(lock)
     reach = lock.bench.drives[0].on_frame
@@ -307,7 +300,7 @@ def test_a_drive_that_obeys_nothing_hears_no_heartbeat_and_stops_by_itself(lock:
 
 
 def test_sync_that_stops(lock: LockStep) -> None:
-    """After 20 ms both drives brake by themselves; what is sent then is quick stop and power off, nothing else."""
+    """After 20 ms both drives brake by themselves; only quick stop and power off are sent then."""
     started(lock)
     lock.sync_runs = False
     assert 19 <= until_stop(lock, 100) <= 21
@@ -334,14 +327,7 @@ def test_sync_that_was_away_for_longer_than_allowed(lock: LockStep) -> None:
 @pytest.mark.parametrize("ms", [25, 200])
 def test_a_commander_that_was_held_up(lock: LockStep, ms: int) -> None:
     started(lock)
-    held: Frames = []
-    lock.deaf = True
-    for _ in range(ms):
-        lock.cycle()
-        held += lock.waiting
-        lock.waiting = []
-    lock.deaf = False
-    lock.waiting = held
+    lock.held_up(ms)
     lock.cycle()
     stopped_with(lock, f"commander: late by {ms + 0.7:.0f} ms, limit 20 ms")
 
@@ -349,22 +335,16 @@ def test_a_commander_that_was_held_up(lock: LockStep, ms: int) -> None:
 def test_a_limit_that_was_exceeded_while_the_commander_did_not_look_is_not_missed(lock: LockStep) -> None:
     """Three cycles come at once, the middle one with 9.6 A."""
     started(lock)
-    held: Frames = []
-    lock.deaf = True
-    for n in range(3):
-        lock.filter = changed(0x282, lambda d, n=n: struct.pack("<ihH", 0, 1200, 0x1237) if n == 1 else d)  # type: ignore[misc]
-        lock.cycle()
-        held += lock.waiting
-        lock.waiting = []
-    lock.deaf = False
+    cycle = iter(range(3))
+    lock.filter = changed(0x282, lambda d: struct.pack("<ihH", 0, 1200, 0x1237) if next(cycle) == 1 else d)
+    lock.held_up(3)
     lock.filter = lambda frames: frames
-    lock.waiting = held
     lock.cycle()
     stopped_with(lock, r"joint 2: current 9\.600 A, limit 9 A")
 
 
 def test_a_commander_that_dies_is_noticed_by_both_drives(lock: LockStep) -> None:
-    """1016h:2: 300 ms after its last heartbeat both drives brake, say EMCY 8130h and keep the fault."""
+    """1016h:2: 300 ms after its last heartbeat both drives brake with EMCY 8130h and keep the fault."""
     started(lock)
     last = max(ms for ms, can_id, _ in lock.sent if can_id == 0x721)
     emergencies = []
@@ -401,7 +381,7 @@ def test_single_refused_frames_are_no_reason(lock: LockStep) -> None:
 
 def test_a_second_commander(lock: LockStep) -> None:
     started(lock)
-    lock.filter = lambda frames: [*frames, (0x721, b"\x05", lock.now)]
+    lock.with_extra(0x721, b"\x05")
     lock.cycle()
     stopped_with(lock, r"another commander is on the bus .*", BRAKE_MS)
 
@@ -433,7 +413,7 @@ def test_asked_twice_they_brake_at_once_and_the_first_reason_stays(lock: LockSte
     stopped_with(lock, "SIGINT", BRAKE_MS)
 
 
-def test_a_stop_while_stopping_for_a_limit_does_not_begin_the_ramp_anew(lock: LockStep) -> None:
+def test_a_stop_while_stopping_for_a_limit_does_not_begin_the_ramp_again(lock: LockStep) -> None:
     """The temperature stays beyond its limit all along the ramp: one ramp, one reason."""
     started(lock, WARM)
     lock.filter = changed(0x381, lambda _: struct.pack("<h", 800))

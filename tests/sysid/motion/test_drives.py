@@ -1,15 +1,19 @@
-"""Drives made ready by SDO: against the emulated drives, and with devices that are not as they should be."""
+"""Drives from the commanding side: controlwords, set-up and release by SDO, with emulated and with wrong devices."""
 
 import pytest
 
 from jtqd.drivers.boot_node import BootError
-from jtqd.drivers.drive import DriveProfile
+from jtqd.drivers.drive import DriveProfile, State, state_of
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoAbort
 from jtqd.drivers.sensor import SensorProfile
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sysid.motion.drives import (
     CST,
     CSV,
+    DISABLE_VOLTAGE,
+    POWERED,
+    QUICK_STOP_WORD,
+    enabling_word,
     quick_stop,
     release,
     reset_fault,
@@ -23,6 +27,40 @@ from tests.sysid.motion.lock_step import BenchAccess, LockStep
 @pytest.fixture
 def lock() -> LockStep:
     return LockStep()
+
+
+def test_states_of_all_statuswords() -> None:
+    assert [state_of(word).value for word in cia402.STATUSWORDS] == list(cia402.NAMES)
+    for word in range(0x10000):
+        state = state_of(word)
+        assert state is state_of(word & 0x6F), "other bits do not change the state"
+        if word & 0x6F == 0x27:
+            assert state is State.OPERATION_ENABLED
+
+
+@pytest.mark.parametrize("number", [cia402.SWITCH_ON_DISABLED, cia402.READY, cia402.SWITCHED_ON])
+def test_controlwords_lead_a_drive_to_operation_enabled(number: int) -> None:
+    machine = cia402.StateMachine()
+    machine.state = number
+    words = []
+    while state_of(machine.statusword) is not State.OPERATION_ENABLED:
+        word = enabling_word(state_of(machine.statusword))
+        assert word is not None
+        words.append(word)
+        machine.controlword(word)
+    assert words == [0x06, 0x07, 0x0F][number - cia402.SWITCH_ON_DISABLED :]
+    machine.controlword(QUICK_STOP_WORD)
+    assert state_of(machine.statusword) is State.QUICK_STOP
+    machine.controlword(DISABLE_VOLTAGE)
+    assert state_of(machine.statusword) is State.SWITCH_ON_DISABLED
+
+
+def test_no_controlword_leads_out_of_a_fault_and_an_unknown_state_counts_as_powered() -> None:
+    stuck = (State.FAULT, State.FAULT_REACTION, State.QUICK_STOP, State.NOT_READY, State.UNKNOWN)
+    assert [enabling_word(state) for state in stuck] == [None] * 5
+    assert state_of(0x7FFF) is State.UNKNOWN
+    assert State.UNKNOWN in POWERED
+    assert not {State.FAULT, State.SWITCH_ON_DISABLED, State.READY} & POWERED
 
 
 class Bent:
@@ -50,7 +88,7 @@ def configure(
     set_up(Bent(lock.access(1), answers), DriveProfile(1), CSV, 300, lock.sleep, temperature=temperature)
 
 
-def test_a_drive_is_configured_and_says_how_it_counts(lock: LockStep) -> None:
+def test_a_drive_is_configured_and_its_units_read(lock: LockStep) -> None:
     access = lock.access(2)
     access.write(0x6071, 0, b"\x10\x00")
     access.write(0x60FF, 0, b"\x10\x00\x00\x00")
@@ -67,7 +105,7 @@ def test_a_drive_is_configured_and_says_how_it_counts(lock: LockStep) -> None:
     assert units.velocity_units(1.0) == 1043038, "100 turns of 65536 counts in 2 pi seconds"
 
 
-def test_the_sensor_says_how_it_counts(lock: LockStep) -> None:
+def test_the_units_of_the_sensor(lock: LockStep) -> None:
     units = sensor_units(lock.access(3), SensorProfile(3))
     assert (units.node, units.heartbeat_ms) == (3, 100)
     assert units.nm_per_unit == pytest.approx((0.001,))
@@ -106,7 +144,7 @@ def test_a_drive_without_temperature_may_be_used_when_none_is_limited(lock: Lock
     configure(lock, {(0x1802, 1): SdoAbort(NO_OBJECT)}, temperature=False)
 
 
-def test_a_fault_is_reset_and_said(lock: LockStep) -> None:
+def test_a_fault_is_reset_and_returned(lock: LockStep) -> None:
     machine = lock.bench.drives[0].machine
     assert reset_fault(lock.access(1), 1, lock.sleep) is None
     machine.fault()
@@ -122,7 +160,7 @@ def test_a_fault_that_stays_is_refused(lock: LockStep) -> None:
 
 
 def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> None:
-    """Enabled at 1 rad/s by somebody: quick stop first, and it stands when the power is off."""
+    """Enabled at 1 rad/s: quick stop first, and it stands when the power is off."""
     set_up(lock.access(1), DriveProfile(1), CSV, 300, lock.sleep, temperature=False)
     access = lock.access(1)
     access.write(0x60FF, 0, (1043038).to_bytes(4, "little"))
@@ -143,14 +181,14 @@ def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> No
     assert len(words) == 2, "a drive that is off is not commanded"
 
 
-def test_a_drive_that_stays_powered_is_said(lock: LockStep) -> None:
+def test_a_drive_that_stays_powered_is_refused(lock: LockStep) -> None:
     with pytest.raises(
         BootError, match=r"node 1: 6041h:0: expected disabled, found operation enabled \(statusword 1237h\)"
     ):
         switch_off(Bent(lock.access(1), {(0x6041, 0): 0x1237}), 1, lock.sleep)
 
 
-def test_after_the_motion_nobody_watches_and_the_targets_are_zero(lock: LockStep) -> None:
+def test_after_the_motion_the_watch_ends_and_the_targets_are_zero(lock: LockStep) -> None:
     access = lock.access(2)
     set_up(access, DriveProfile(2), CST, 300, lock.sleep, temperature=False)
     lock.to_bench(0x721, b"\x05")
