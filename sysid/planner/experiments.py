@@ -332,11 +332,11 @@ Move = tuple[float, float, float, float]
 """Target [rad], speed [rad/s], acceleration [rad/s2], rest after it [s]."""
 
 
-def _played(name: str, what: str, room: JointRange, moves: Iterable[Move]) -> Motion:
+def _played(name: str, what: str, joint: JointRange, moves: Iterable[Move]) -> Motion:
     """From rest at the middle over all moves to rest."""
     step = 1.0 / RATE_HZ
     velocity = [np.zeros(round(_REST_S * RATE_HZ))]
-    at = room.middle_rad
+    at = joint.middle_rad
     for target, speed, acceleration, rest_s in moves:
         way = target - at
         top = min(speed, math.sqrt(2.0 * acceleration * abs(way) / math.pi))
@@ -351,52 +351,52 @@ def _played(name: str, what: str, room: JointRange, moves: Iterable[Move]) -> Mo
         at = target
     velocity.append(np.zeros(round(_REST_S * RATE_HZ)))
     whole = np.concatenate(velocity)
-    position = room.middle_rad + np.concatenate(([0.0], np.cumsum(0.5 * (whole[1:] + whole[:-1])))) * step
+    position = joint.middle_rad + np.concatenate(([0.0], np.cumsum(0.5 * (whole[1:] + whole[:-1])))) * step
     return Motion(name, what, step * np.arange(len(whole), dtype=np.float64), position, whole)
 
 
-def _ladder(room: JointRange, shares: Iterable[float]) -> list[Move]:
+def _ladder(joint: JointRange, shares: Iterable[float]) -> list[Move]:
     """Both ways at each speed, a part of the fastest: over as much of the travel as half a minute takes, or not at all."""
     moves: list[Move] = []
-    a = room.acceleration_rad_s2
+    a = joint.acceleration_rad_s2
     for share in shares:
-        speed = share * room.velocity_rad_s
-        half = min(0.5 * room.span_rad, 0.5 * speed * 12.0)
+        speed = share * joint.velocity_rad_s
+        half = min(0.5 * joint.span_rad, 0.5 * speed * 12.0)
         if half < 0.5 * speed * _SHORTEST_PASS_S:
             continue
-        moves += [(room.middle_rad + s * half, speed, a, 0.3) for s in (-1.0, 1.0, -1.0, 1.0)]
-    moves.append((room.middle_rad, 0.5 * room.velocity_rad_s, a, 0.0))
+        moves += [(joint.middle_rad + s * half, speed, a, 0.3) for s in (-1.0, 1.0, -1.0, 1.0)]
+    moves.append((joint.middle_rad, 0.5 * joint.velocity_rad_s, a, 0.0))
     return moves
 
 
-def _joint_excitation(room: JointRange, name: str) -> list[Motion]:
+def _joint_excitation(joint: JointRange, name: str) -> list[Motion]:
     """Random targets, speeds and rests from a fixed seed: every position in both directions at several speeds."""
     made = []
     for k in (1, 2, 3, 4):
         rng = np.random.default_rng(k)
         moves = [
             (
-                float(rng.uniform(room.low_rad, room.high_rad)),
-                float(rng.uniform(0.2, 1.0)) * room.velocity_rad_s,
-                float(rng.uniform(0.3, 1.0)) * room.acceleration_rad_s2,
+                float(rng.uniform(joint.low_rad, joint.high_rad)),
+                float(rng.uniform(0.2, 1.0)) * joint.velocity_rad_s,
+                float(rng.uniform(0.3, 1.0)) * joint.acceleration_rad_s2,
                 float(rng.choice([0.0, 0.3])),
             )
             for _ in range(24)
         ]
-        made.append(_played(f"{name}_{k}", _EMPTY if k < 3 else _LOADED, room, moves))
+        made.append(_played(f"{name}_{k}", _EMPTY if k < 3 else _LOADED, joint, moves))
     return made
 
 
-def _joint_repeat(room: JointRange, name: str) -> list[Motion]:
-    moves = _ladder(room, (0.2, 0.5, 1.0))
-    return [_played(f"{name}_{k}", "the same motion again", room, moves) for k in (1, 2, 3, 4)]
+def _joint_repeat(joint: JointRange, name: str) -> list[Motion]:
+    moves = _ladder(joint, (0.2, 0.5, 1.0))
+    return [_played(f"{name}_{k}", "the same motion again", joint, moves) for k in (1, 2, 3, 4)]
 
 
 def _both_payloads(shares: Sequence[float]) -> Callable[[JointRange, str], list[Motion]]:
-    def made(room: JointRange, name: str) -> list[Motion]:
-        moves = _ladder(room, shares)
+    def made(joint: JointRange, name: str) -> list[Motion]:
+        moves = _ladder(joint, shares)
         return [
-            _played(f"{name}_{k}_{label}", what, room, moves)
+            _played(f"{name}_{k}_{label}", what, joint, moves)
             for k in (1, 2)
             for label, what in (("empty", _EMPTY), ("loaded", _LOADED))
         ]
@@ -404,46 +404,46 @@ def _both_payloads(shares: Sequence[float]) -> Callable[[JointRange, str], list[
     return made
 
 
-def _joint_load_ramp(room: JointRange, name: str) -> list[Motion]:
+def _joint_load_ramp(joint: JointRange, name: str) -> list[Motion]:
     """Standing at five positions, each reached from both sides: gravity is the load that goes up and down."""
-    at = np.linspace(room.low_rad, room.high_rad, 5)
-    speed, a = 0.3 * room.velocity_rad_s, 0.5 * room.acceleration_rad_s2
+    at = np.linspace(joint.low_rad, joint.high_rad, 5)
+    speed, a = 0.3 * joint.velocity_rad_s, 0.5 * joint.acceleration_rad_s2
     moves = [(float(q), speed, a, 2.0) for q in (*at, *at[::-1])]
     return [
-        _played(f"{name}_{label}", what, room, moves)
+        _played(f"{name}_{label}", what, joint, moves)
         for label, what in (("empty", _EMPTY), ("loaded", _LOADED))
     ]
 
 
-def _joint_quick_changes(room: JointRange, name: str) -> list[Motion]:
+def _joint_quick_changes(joint: JointRange, name: str) -> list[Motion]:
     made = []
     for k, share in enumerate((0.3, 0.6, 1.0), 1):
-        a = share * room.acceleration_rad_s2
-        half = min(0.25 * room.span_rad, 0.5 * room.velocity_rad_s**2 / a)
+        a = share * joint.acceleration_rad_s2
+        half = min(0.25 * joint.span_rad, 0.5 * joint.velocity_rad_s**2 / a)
         moves: list[Move] = [
-            (room.middle_rad + s * half, room.velocity_rad_s, a, 0.0) for s in (-1.0, 1.0) * 10
+            (joint.middle_rad + s * half, joint.velocity_rad_s, a, 0.0) for s in (-1.0, 1.0) * 10
         ]
-        made.append(_played(f"{name}_{k}", _EMPTY, room, moves))
+        made.append(_played(f"{name}_{k}", _EMPTY, joint, moves))
     return made
 
 
-def _joint_warm_up(room: JointRange, name: str) -> list[Motion]:
-    check = _ladder(room, (0.1, 0.3, 1.0))
-    a = room.acceleration_rad_s2
-    work: list[Move] = [(q, room.velocity_rad_s, a, 0.0) for q in (room.low_rad, room.high_rad)] * 30
+def _joint_warm_up(joint: JointRange, name: str) -> list[Motion]:
+    check = _ladder(joint, (0.1, 0.3, 1.0))
+    a = joint.acceleration_rad_s2
+    work: list[Move] = [(q, joint.velocity_rad_s, a, 0.0) for q in (joint.low_rad, joint.high_rad)] * 30
     moves = (check + work) * 4 + check
-    return [_played(f"{name}_{k}", "from cold, without a break", room, moves) for k in (1, 2)]
+    return [_played(f"{name}_{k}", "from cold, without a break", joint, moves) for k in (1, 2)]
 
 
-def _joint_zero_reading(room: JointRange, name: str) -> list[Motion]:
+def _joint_zero_reading(joint: JointRange, name: str) -> list[Motion]:
     """Two stops of 5 s, each reached from both sides; the brake holds."""
-    a, speed = 0.5 * room.acceleration_rad_s2, 0.3 * room.velocity_rad_s
+    a, speed = 0.5 * joint.acceleration_rad_s2, 0.3 * joint.velocity_rad_s
     moves: list[Move] = [
-        (room.middle_rad + s * 0.25 * room.span_rad, speed, a, 0.3 if k % 2 else 5.0)
+        (joint.middle_rad + s * 0.25 * joint.span_rad, speed, a, 0.3 if k % 2 else 5.0)
         for k, s in enumerate((1.0, 0.5, -1.0, -0.5) * 2)
     ]
     what = "in each stop of 5 s: brake on, power stage off, recorded as jN.enabled 0"
-    return [_played(f"{name}_{k}", what, room, moves) for k in (1, 2)]
+    return [_played(f"{name}_{k}", what, joint, moves) for k in (1, 2)]
 
 
 # Kinds of experiment --------------------------------------------------------------------------------------------
@@ -453,7 +453,7 @@ def _joint_zero_reading(room: JointRange, name: str) -> list[Motion]:
 class Experiment:
     """A kind of experiment. pair_text, joint_text: what is done and what that shows, of two joints on a bench and of one.
 
-    pair: runs of one velocity joint, named after the prefix given; joint: motions, named after it. Signs as in `campaigns`.
+    pair: runs of one velocity joint, named after a prefix; joint: motions, named after a prefix. Signs as in `campaigns`.
     Every kind is done with either joint as the velocity joint, so that both joints drive and are driven, and there are
     always runs to hold out.
     """
@@ -545,6 +545,6 @@ def pair_runs(kinds: Iterable[str], reach: PairRange) -> tuple[Run, ...]:
     )
 
 
-def joint_motions(kinds: Iterable[str], room: JointRange) -> list[Motion]:
+def joint_motions(kinds: Iterable[str], joint: JointRange) -> list[Motion]:
     """Return the motions of one joint for these kinds of experiment."""
-    return [motion for kind in kinds for motion in EXPERIMENTS[kind].joint(room, kind)]
+    return [motion for kind in kinds for motion in EXPERIMENTS[kind].joint(joint, kind)]
