@@ -1,4 +1,4 @@
-"""Emulated bench runs and ways to spoil them, for the tests of a diagnosis' channel checks."""
+"""Emulated bench runs and ways to spoil them, for the tests of channel checks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
+from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
@@ -16,6 +16,7 @@ from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 
 JOINTS = {number: load_joint(shipped(f"joint{number}.yaml")) for number in (1, 2)}
 DEGREES = 180.0 / math.pi
+ANGLES = "motor_position_rad motor_velocity_rad_s link_position_rad"
 Change = Callable[[JointColumns], JointColumns]
 
 
@@ -32,23 +33,29 @@ def bench() -> RunTable:
     return emulate_run(load_plant(shipped("campaign_plant.yaml")), motion(), 20.0, 5, day=3)
 
 
+def column(table: RunTable, name: str, number: int = 1) -> FloatArray:
+    """A copy of a column that is there."""
+    values: FloatArray | None = getattr(table.joints[number], name)
+    assert values is not None
+    return values.copy()
+
+
 def changed(table: RunTable, change: Change, number: int = 1) -> RunTable:
     return RunTable(table.time_s, {**table.joints, number: change(table.joints[number])})
 
 
-def times(names: str, factor: float) -> Change:
-    def change(columns: JointColumns) -> JointColumns:
-        return replace(columns, **{name: getattr(columns, name) * factor for name in names.split()})
+def having(table: RunTable, **columns: FloatArray | None) -> RunTable:
+    """The run with other columns of joint 1."""
+    return changed(table, lambda joint: replace(joint, **columns))
 
-    return change
+
+def times(names: str, factor: float) -> Change:
+    return lambda joint: joint.map(lambda name, values: values * factor if name in names.split() else values)
 
 
 def each_column(table: RunTable, change: Callable[[FloatArray], FloatArray]) -> RunTable:
-    def of(columns: JointColumns) -> JointColumns:
-        parts = {name: getattr(columns, name) for name in COLUMN_NAMES}
-        return JointColumns(**{name: None if c is None else change(c) for name, c in parts.items()})
-
-    return RunTable(change(table.time_s), {number: of(columns) for number, columns in table.joints.items()})
+    joints = {number: joint.map(lambda _, values: change(values)) for number, joint in table.joints.items()}
+    return RunTable(change(table.time_s), joints)
 
 
 def checked(table: RunTable, joints: dict[int, Joint] | None = None) -> CheckedRuns:
@@ -57,6 +64,3 @@ def checked(table: RunTable, joints: dict[int, Joint] | None = None) -> CheckedR
         assert line.startswith("r.csv: ")
         assert "\n" not in line
     return result
-
-
-ANGLES = "motor_position_rad motor_velocity_rad_s link_position_rad"

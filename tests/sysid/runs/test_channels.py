@@ -1,8 +1,10 @@
-"""Channels that cannot be right are named, each by what is wrong with it; runs that are right raise no finding."""
+"""Channels of one joint that cannot be right, by their fault; units by size; columns that two joints have exchanged."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,11 +16,25 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
 from jtqd.sysid.runs.channels import Channels, check_channels
+from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import read_run
+from jtqd.sysid.runs.files import read_run, read_runs
 from tests.estimator.estimator_helpers import joint1
+from tests.paths import ROOT
 from tests.sysid.campaign_helpers import plateau_run
+from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 from tests.sysid.runs.random_motion import Excitation, random_current, random_velocity
+from tests.sysid.runs.spoiled_runs import (
+    ANGLES,
+    DEGREES,
+    Change,
+    bench,
+    changed,
+    checked,
+    column,
+    motion,
+    times,
+)
 
 JOINT = joint1()
 POINTS = [(v, i) for v in (0.4, 2.0, -1.0) for i in (0.0, 3.0, 5.0, -4.0)]
@@ -43,11 +59,6 @@ def kinds(table: RunTable, joint: Joint = JOINT, number: int = 1, **changes: Flo
     return [item.kind for item in found]
 
 
-def column(table: RunTable, name: str) -> FloatArray:
-    values: FloatArray = getattr(table.joints[1], name)
-    return values.copy()
-
-
 @pytest.mark.parametrize("number", [1, 2])
 def test_good_runs_have_no_finding(noisy: RunTable, ideal: RunTable, number: int) -> None:
     assert kinds(noisy, number=number) == []
@@ -56,7 +67,6 @@ def test_good_runs_have_no_finding(noisy: RunTable, ideal: RunTable, number: int
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_random_motion_through_all_quadrants_has_no_finding(seed: int) -> None:
-    print("seed", seed)
     rng = np.random.default_rng(seed)
     commands = (
         JointCommand.velocity(random_velocity(Excitation(), 12.0, rng)),
@@ -85,18 +95,15 @@ def test_dead_channels(noisy: RunTable) -> None:
     assert kinds(noisy, motor_velocity_rad_s=zero, motor_position_rad=None) == ["motor_velocity_rad_s_dead"]
 
 
-def test_a_sensor_that_stays_where_it_was(noisy: RunTable) -> None:
+@pytest.mark.parametrize("span", [slice(1200, None), slice(1300, 2300)])
+def test_a_stuck_sensor(noisy: RunTable, span: slice) -> None:
+    """To the end of the run, or for a while in which the current changes."""
     torque = column(noisy, "torque_nm")
-    torque[1200:] = torque[1200]
-    assert kinds(noisy, torque_nm=torque) == ["torque_nm_stuck"]
-    text = check_channels(Channels(noisy.time_s, replace(noisy.joints[1], torque_nm=torque), JOINT, "r: j1"))[
-        0
-    ].text
-    assert f"found exactly {torque[1200]:g} Nm for" in text
-    # a stretch in the middle is enough, when the current moved in it
-    torque = column(noisy, "torque_nm")
-    torque[1300:2300] = torque[1300]
-    assert kinds(noisy, torque_nm=torque) == ["torque_nm_stuck"]
+    torque[span] = torque[span.start]
+    run = replace(noisy.joints[1], torque_nm=torque)
+    [issue] = check_channels(Channels(noisy.time_s, run, JOINT, "r: j1"))
+    assert issue.kind == "torque_nm_stuck"
+    assert f"found exactly {torque[span.start]:g} Nm for" in issue.text
 
 
 def test_a_saturated_sensor(noisy: RunTable, ideal: RunTable) -> None:
@@ -105,7 +112,7 @@ def test_a_saturated_sensor(noisy: RunTable, ideal: RunTable) -> None:
         assert kinds(table, torque_nm=torque) == ["torque_nm_saturated"]
 
 
-def test_a_current_that_stays_where_it_was(noisy: RunTable) -> None:
+def test_a_stuck_current(noisy: RunTable) -> None:
     current = column(noisy, "current_a")
     current[1100:] = current[1100]
     assert "current_a_stuck" in kinds(noisy, current_a=current)
@@ -117,13 +124,13 @@ def test_stuck_positions(noisy: RunTable) -> None:
     assert kinds(noisy, motor_position_rad=np.full_like(motor, 7.0))[0] == "motor_position_rad_stuck"
 
 
-def test_swapped_signs_are_told_apart(noisy: RunTable, ideal: RunTable) -> None:
+def test_swapped_signs_are_distinguished(noisy: RunTable, ideal: RunTable) -> None:
     for table in (noisy, ideal):
         for name in ("torque_nm", "current_a", "motor_velocity_rad_s", "link_position_rad"):
             assert kinds(table, **{name: -column(table, name)}) == [f"{name}_sign"], name
 
 
-def test_swapped_torque_and_current_are_told_apart_without_positions(noisy: RunTable) -> None:
+def test_swapped_torque_and_current_are_distinguished_without_positions(noisy: RunTable) -> None:
     none = {"motor_position_rad": None, "link_position_rad": None}
     for name in ("torque_nm", "current_a"):
         assert kinds(noisy, **none, **{name: -column(noisy, name)}) == [f"{name}_sign"]
@@ -164,14 +171,14 @@ def test_positions_that_roll_over_are_no_finding(noisy: RunTable) -> None:
     assert kinds(noisy, motor_position_rad=wrapped, link_position_rad=link) == []
 
 
-def test_channels_that_are_not_there_are_not_asked(noisy: RunTable) -> None:
+def test_missing_channels_have_no_finding(noisy: RunTable) -> None:
     assert check_channels(Channels(noisy.time_s, JointColumns(), JOINT, "r")) == []
     only = JointColumns(current_a=noisy.joints[1].current_a, torque_nm=noisy.joints[1].torque_nm)
     assert check_channels(Channels(noisy.time_s, only, JOINT, "r")) == []
 
 
 def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal: RunTable) -> None:
-    """In a standing joint a constant torque beside a moving current is what stiction does."""
+    """Stiction: a constant torque in a standing joint while the current changes."""
     n = 2000
     time_s = 0.001 * np.arange(n)
     run = JointColumns(
@@ -180,3 +187,151 @@ def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal: RunTable) -
     assert check_channels(Channels(time_s, run, JOINT, "r")) == []
     moving = replace(run, motor_velocity_rad_s=np.full(n, 50.0))
     assert [f.kind for f in check_channels(Channels(time_s, moving, JOINT, "r"))] == ["torque_nm_stuck"]
+
+
+# Units ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def day() -> RunTable:
+    return bench()
+
+
+@pytest.mark.parametrize(
+    ("change", "channel", "unit"),
+    [
+        (times("motor_velocity_rad_s", 30.0 / math.pi), "motor_velocity_rad_s", "rpm"),
+        (times("motor_velocity_rad_s", DEGREES), "motor_velocity_rad_s", "degrees per second"),
+        (times("motor_velocity_rad_s", 0.01), "motor_velocity_rad_s", "joint side's velocity"),
+        (times("motor_velocity_rad_s", 65536 / (2 * math.pi)), "motor_velocity_rad_s", "counts per second"),
+        (times("motor_position_rad", DEGREES), "motor_position_rad", "degrees suspected"),
+        (times("motor_position_rad", 65536 / (2 * math.pi)), "motor_position_rad", "counts (65536"),
+        (
+            times("motor_position_rad motor_velocity_rad_s", DEGREES),
+            "motor_position_rad",
+            "degrees suspected",
+        ),
+        (times("motor_position_rad motor_velocity_rad_s", 0.01), "motor_position_rad", "joint side"),
+        (times("link_position_rad", DEGREES), "link_position_rad", "degrees suspected"),
+        (times("link_position_rad", 524288 / (2 * math.pi)), "link_position_rad", "counts (524288"),
+        (times(ANGLES, DEGREES), "j1", "degrees suspected"),
+        (times("torque_nm", 1000.0), "torque_nm", "mNm suspected"),
+        (times("torque_nm", 0.01), "torque_nm", "motor side"),
+        (times("current_a", 1000.0), "current_a", "mA"),
+        (times("current_a torque_nm", 1000.0), "j1", "mNm and mA"),
+    ],
+)
+def test_other_units_by_size_and_the_other_joint_stays(
+    day: RunTable, change: Change, channel: str, unit: str
+) -> None:
+    result = checked(changed(day, change))
+    assert len(result.refused) == 1
+    assert f"r.csv: j1.{channel}: " in result.refused[0] or channel == "j1"
+    assert unit in result.refused[0]
+    assert "expected" in result.refused[0]
+    assert list(result.runs[0][1].joints) == [2]
+    assert result.lost == (1,)
+
+
+def test_slow_motion_in_degrees_is_seen_by_the_spring() -> None:
+    """57 times 0.1 rad/s is a speed that joints have; the torsion against the sensor shows the unit."""
+    table = emulate_run(load_plant(shipped("plant.yaml")), motion(0.12), 20.0, 6)
+    assert checked(table).refused == ()
+    found = checked(changed(table, times(ANGLES, DEGREES))).refused
+    assert len(found) == 1
+    assert "stiffness" in found[0]
+    assert "degrees suspected" in found[0]
+
+
+def test_one_encoder_in_degrees_is_seen_by_its_speed(day: RunTable) -> None:
+    table = changed(day, lambda c: replace(c, motor_position_rad=None, motor_velocity_rad_s=None))
+    assert checked(table).refused == ()
+    found = checked(changed(table, times("link_position_rad", DEGREES))).refused
+    assert len(found) == 1
+    assert "motor speed" in found[0]
+    assert "degrees suspected" in found[0]
+
+
+# Exchanged columns ----------------------------------------------------------------------------------------------
+
+NOMINAL = load_joint(shipped("joint1.yaml"))
+ONE = replace(NOMINAL, efficiency=None, friction=replace(NOMINAL.friction, stribeck_nm=0.0))
+TWO = replace(
+    ONE,
+    name="two",
+    gear_ratio=50.0,
+    torque_constant_nm_per_a=0.03,
+    friction=replace(ONE.friction, coulomb_nm=0.6, viscous_nms_per_rad=0.4),
+)
+PAIR = {3: ONE, 4: TWO}
+MOTION = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
+KINOVA = ROOT / "models" / "kinova_gen3"
+
+
+def rich(seed: int) -> RunTable:
+    one, two = (rich_run(j, seed + k, noise=2e-3) for k, j in enumerate((ONE, TWO)))
+    return RunTable(one.time_s, {3: one.joints[1], 4: two.joints[1]})
+
+
+def exchanged(table: RunTable, names: tuple[str, ...], a: int = 3, b: int = 4) -> RunTable:
+    one, two = table.joints[a], table.joints[b]
+    joints = {
+        a: replace(one, **{n: getattr(two, n) for n in names}),
+        b: replace(two, **{n: getattr(one, n) for n in names}),
+    }
+    return RunTable(table.time_s, {**table.joints, **joints})
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("torque_nm",), "good: j3.torque_nm and j4.torque_nm: found the other joint's"),
+        (("current_a",), "good: j3.current_a and j4.current_a: found the other joint's"),
+        (("current_a", *MOTION, "torque_nm"), "good: j3 and j4: found that each fits the other's joint file"),
+    ],
+    ids=["torque", "current", "all"],
+)
+def test_exchanged_columns(names: tuple[str, ...], expected: str) -> None:
+    checked = check_runs([("good", exchanged(rich(5), names))], PAIR)
+    assert checked.runs == ()
+    (line,) = checked.refused
+    assert line.startswith(expected)
+    assert "swapped columns" in line
+    assert checked.lost == (3, 4)
+
+
+def test_a_run_with_exchanged_columns_is_left_out_and_the_others_are_used() -> None:
+    bad = exchanged(rich(5), ("torque_nm",))
+    checked = check_runs([("a", rich(7)), ("b", bad), ("c", rich(9))], PAIR)
+    assert [name for name, _ in checked.runs] == ["a", "c"]
+    assert [line.split(":")[0] for line in checked.refused] == ["b"]
+
+
+def test_a_wrong_joint_file_is_no_exchange() -> None:
+    wrong = replace(ONE, torque_constant_nm_per_a=0.7 * ONE.torque_constant_nm_per_a, rotor_inertia_kgm2=1e-6)
+    assert not [
+        line for line in check_runs([("a", rich(5))], {3: wrong, 4: TWO}).refused if "swapped" in line
+    ]
+
+
+@cache
+def kinova() -> tuple[list[tuple[str, RunTable]], dict[int, Joint]]:
+    columns = ColumnMap.load(KINOVA / "columns.yaml")
+    read = read_runs(sorted(KINOVA.glob("*.csv.gz")), columns)
+    joints = {n: load_joint(KINOVA / f"joint{n}.yaml") for n in range(2, 8)}
+    return [(run.name, run.table) for run in read], joints
+
+
+def test_columns_of_a_real_arm_are_where_they_belong() -> None:
+    runs, joints = kinova()
+    assert not [line for line in check_runs(runs, joints).refused if "swapped" in line]
+
+
+@pytest.mark.parametrize("names", [("torque_nm",), ("current_a",)])
+def test_exchanged_columns_of_a_real_arm(names: tuple[str, ...]) -> None:
+    runs, joints = kinova()
+    bad = [(name, exchanged(table, names)) for name, table in runs]
+    refused = check_runs(bad, {3: joints[3], 4: joints[4]}).refused
+    swapped = [line for line in refused if "swapped columns" in line]
+    assert len(swapped) == len(runs)
+    assert all(f"j3.{names[0]} and j4.{names[0]}" in line for line in swapped)
