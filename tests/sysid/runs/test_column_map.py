@@ -1,14 +1,18 @@
-"""Column maps: known loads, voltage drives and expressions, on a pendulum whose torque and current are known."""
+"""Column maps: expressions of columns; known loads and voltage drives, on a pendulum whose torque and current are known."""
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from jtqd.estimator.errors import ConfigError
-from jtqd.sysid.runs.column_map import ColumnMap, KnownLoad, motion_of
+from jtqd.sysid.runs.column_map import ColumnMap, ExpressionError, KnownLoad, motion_of, parse
 from jtqd.sysid.runs.files import read_run, read_runs
 from jtqd.sysid.runs.run_file import RunError
+from tests.sysid.runs.spoiled_runs import column
 
 T = np.arange(0.0, 6.0, 0.004)
 Q = 0.8 * np.sin(2.0 * T) + 0.2 * np.sin(5.0 * T)
@@ -59,8 +63,7 @@ def rig(path: Path) -> Path:
 
 def test_a_known_load_is_the_torque_of_its_motion(tmp_path: Path) -> None:
     run = read_run(rig(tmp_path / "a.csv"), made(j1__current_a="i", j1__load=LOAD))
-    found = run.table.joints[1].torque_nm
-    assert found is not None
+    found = column(run.table, "torque_nm")
     inner = slice(10, -10)
     assert np.max(np.abs(found - TORQUE)[inner]) < 0.01 * np.max(np.abs(TORQUE))
     assert run.table.time_s == pytest.approx(T)
@@ -91,8 +94,7 @@ def test_a_drive_that_gives_duty(tmp_path: Path, with_speed: bool) -> None:
         more["j1__motor_velocity_rad_s"] = "w"
     drive = {"voltage_v": "12 * duty", "resistance_ohm": OHM, "back_emf_vs_per_rad": EMF}
     run = read_run(path, made(j1__drive=drive, **more))
-    found = run.table.joints[1].current_a
-    assert found is not None
+    found = column(run.table, "current_a")
     true = TORQUE / RATIO / 0.05
     assert np.max(np.abs(found - true)[10:-10]) < 0.01 * np.max(np.abs(true))
     assert "a wrong resistance shows as torque_constant" in run.notes[0]
@@ -112,7 +114,7 @@ DRIVE = {"voltage_v": "v", "resistance_ohm": 1.0, "back_emf_vs_per_rad": 0.1}
 
 
 @pytest.mark.parametrize(
-    ("more", "said"),
+    ("more", "expected"),
     [
         ({"j1.load": {"mass_kg": 1.0}}, "key 'j1.load.lever_m': missing"),
         ({"j1.load": {"mass_kg": -1.0, "lever_m": 1.0}}, "found -1.0, expected a number in kg >= 0"),
@@ -132,10 +134,10 @@ DRIVE = {"voltage_v": "v", "resistance_ohm": 1.0, "back_emf_vs_per_rad": 0.1}
         ),
     ],
 )
-def test_wrong_loads_and_drives_are_named(more: dict[str, object], said: str) -> None:
+def test_wrong_loads_and_drives_are_named(more: dict[str, object], expected: str) -> None:
     with pytest.raises(ConfigError) as caught:
         ColumnMap.from_mapping(mapping() | more, "m.yaml", Path())
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
     assert "m.yaml" in str(caught.value)
 
 
@@ -148,71 +150,108 @@ def test_a_wrong_expression_names_file_key_and_map(tmp_path: Path) -> None:
     )
 
 
-def test_gaps_make_segments_that_keep_their_time(tmp_path: Path) -> None:
-    """Gaps of 0.5 and 0.1 s; one of three rows is bridged; a segment of half a second is left out."""
-    keep = ~(
-        ((T > 2.0) & (T < 2.5))
-        | ((T > 4.0) & (T < 4.1))
-        | ((T > 4.6) & (T < 4.7))
-        | ((T > 1.0) & (T < 1.014))
-    )
-    path = table(tmp_path / "a.csv", {"time_s": T[keep], "j1.current_a": Q[keep], "j1.torque_nm": V[keep]})
-    with pytest.raises(RunError, match="found a gap of 0"):
-        read_run(path)
-    segments = read_runs([path], segments=True)
-    assert [run.name for run in segments] == ["a.csv (1 of 3)", "a.csv (2 of 3)", "a.csv (3 of 3)"]
-    assert [float(run.table.time_s[0]) for run in segments] == pytest.approx([0.0, 2.5, 4.7])
-    assert len({run.sha256 for run in segments}) == 1
-    assert "3 gaps of more than 0.025 s: used as 3 segments of one recording" in " ".join(segments[0].notes)
-    assert segments[1].notes == ()
-
-
-def test_an_outlier_of_a_position_is_not_in_the_torque_of_the_load_beside_it(tmp_path: Path) -> None:
+def test_an_outlier_of_a_position_is_not_in_the_torque_of_the_load(tmp_path: Path) -> None:
     outlier = np.sin(T)
     outlier[1000] = 1e6
     torques = []
     for angle in (np.sin(T), outlier):
         path = table(tmp_path / "a.csv", {"t": T, "q": angle, "i": T})
-        columns = ColumnMap.from_mapping(
-            {
-                "time_s": "t",
-                "j1.current_a": "i",
-                "j1.link_position_rad": "q",
-                "j1.load": {"inertia_kgm2": 2.0},
-            },
-            "m",
-            Path(),
+        columns = made(
+            time_s="t", j1__current_a="i", j1__link_position_rad="q", j1__load={"inertia_kgm2": 2.0}
         )
-        torque = read_run(path, columns).table.joints[1].torque_nm
-        assert torque is not None
-        torques.append(torque)
+        torques.append(column(read_run(path, columns).table, "torque_nm"))
     assert torques[1] == pytest.approx(torques[0], abs=0.1)
 
 
 def test_turns_in_a_gap_are_not_known(tmp_path: Path) -> None:
     keep = ~((T > 2.0) & (T < 2.5))
     path = table(tmp_path / "a.csv", {"t": T[keep], "q": np.mod(9.0 * T[keep], 2.0 * np.pi), "i": Q[keep]})
-    columns = ColumnMap.from_mapping(
-        {"time_s": "t", "j1.current_a": "i", "j1.motor_position_rad": "unwrap(q, 2 * pi)"}, "m", Path()
-    )
+    mapping = {"time_s": "t", "j1.current_a": "i", "j1.motor_position_rad": "unwrap(q, 2 * pi)"}
+    columns = ColumnMap.from_mapping(mapping, "m", Path())
     first, second = read_runs([path], columns, segments=True)
     assert any("j1.motor_position_rad is unwrapped, its turns in the gaps" in note for note in first.notes)
     for segment in (first, second):
-        position = segment.table.joints[1].motor_position_rad
-        assert position is not None
+        position = column(segment.table, "motor_position_rad")
         assert np.diff(position) == pytest.approx(9.0 * np.diff(segment.table.time_s), abs=1e-6)
 
 
-def test_segments_that_are_all_too_short_are_refused(tmp_path: Path) -> None:
-    keep = (T % 0.5) < 0.4
-    path = table(tmp_path / "a.csv", {"time_s": T[keep], "j1.current_a": Q[keep]})
-    with pytest.raises(
-        RunError,
-        match=r"found 12 segments between gaps, the longest of 0\.\d+ s, expected one of at least 1 s",
-    ):
-        read_runs([path], segments=True)
+# Expressions ----------------------------------------------------------------------------------------------------
+
+CELLS = {
+    "a": np.array([1.0, 2.0, 4.0]),
+    "b": np.array([-1.0, 0.5, 3.0]),
+    "motor angle [deg]": np.array([0.0, 90.0, 180.0]),
+    "effort.j1": np.array([7.0, 8.0, 9.0]),
+    "counts": np.array([4090.0, 4094.0, 2.0]),
+    "a+b": np.array([100.0, 200.0, 300.0]),
+    "stamp_ns": np.array([0.0, 1e6, 2e6]),
+}
+HEADER = tuple(CELLS)
 
 
-def test_a_short_whole_recording_is_one_segment(tmp_path: Path) -> None:
-    [run] = read_runs([table(tmp_path / "a.csv", {"time_s": T[:50], "j1.current_a": Q[:50]})], segments=True)
-    assert run.name == "a.csv"
+@pytest.mark.parametrize(
+    ("text", "expected", "names"),
+    [
+        ("a", [1.0, 2.0, 4.0], ("a",)),
+        ("a + 0.87*b", [0.13, 2.435, 6.61], ("a", "b")),
+        ("-(a - b) / 2", [-1.0, -0.75, -0.5], ("a", "b")),
+        ("a+b", [100.0, 200.0, 300.0], ("a+b",)),  # the name of a column is that column
+        ("deg2rad(`motor angle [deg]`)", [0.0, math.pi / 2, math.pi], ("motor angle [deg]",)),
+        ("effort.j1 - 7", [0.0, 1.0, 2.0], ("effort.j1",)),
+        ("unwrap(counts, 4096) - 4090", [0.0, 4.0, 8.0], ("counts",)),
+        ("unwrap(a, 2*pi)", [1.0, 2.0, 4.0], ("a",)),
+        ("rpm2rad_s(a) * 30/pi", [1.0, 2.0, 4.0], ("a",)),
+        ("rev2rad(a)/2/pi", [1.0, 2.0, 4.0], ("a",)),
+        ("1.5 * 9.81 * 0.2 * sin(b)", list(1.5 * 9.81 * 0.2 * np.sin(CELLS["b"])), ("b",)),
+        ("sign(b) * abs(b) + cos(a) - cos(a)", [-1.0, 0.5, 3.0], ("b", "a")),
+        ("12", [12.0, 12.0, 12.0], ()),
+    ],
+)
+def test_values_of_expressions(text: str, expected: list[float], names: tuple[str, ...]) -> None:
+    found = parse(text, HEADER)
+    assert found.names == names
+    assert found.value(CELLS).tolist() == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("a + d", "no column 'd', expected it for j1.torque_nm"),
+        ("motor angle [deg]x", "expected a column of the file or an expression of columns"),
+        ("`no such` * 2", "no column 'no such'"),
+        ("a ** 2", "found the operator **"),
+        ("a if b else a", "found IfExp"),
+        ("a < b", "found Compare"),
+        ("a[0]", "found brackets (a name with signs stands in backquotes)"),
+        ("a + 0,87 * b", "found a comma"),
+        ("[a]", "found List"),
+        ("'a' + b", "found 'a' in"),
+        ("True * a", "found True"),
+        ("1j * a", "found 1j"),
+        ("exp(a)", "found the call of 'exp'"),
+        ("__import__('os').system('true')", "found the call of"),
+        ("sin(a).__class__", "found Attribute"),
+        ("sin(a, b)", "found 2 arguments of sin"),
+        ("sin(x=a)", "found the call of 'sin'"),
+        ("unwrap(a, b)", "a period of unwrap that is no number"),
+        ("(lambda: a)()", "found the call of"),
+        ("1" + "0" * 400 + "*a", "out of range"),
+        ("+".join(["a"] * 60), "more than 40 levels"),
+        ("a" * 1001, "1001 characters"),
+        ("(" * 300 + "a" + ")" * 300, "expected"),
+    ],
+)
+def test_other_expressions_are_refused_in_one_line(text: str, expected: str) -> None:
+    with pytest.raises(ExpressionError) as caught:
+        parse(text, HEADER, "j1.torque_nm")
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@given(st.text(alphabet="ab`()+-*/. 019,sincospi_[]'\"=<>!lambdexr", max_size=60))
+def test_any_text_is_an_expression_or_an_expression_error(text: str) -> None:
+    try:
+        found = parse(text, HEADER)
+    except ExpressionError:
+        return
+    assert found.value(CELLS).shape == (3,)

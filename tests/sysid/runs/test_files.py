@@ -1,4 +1,4 @@
-"""Run files: what is read is what was written, and everything wrong is one clear line."""
+"""Run files: reading, writing, segments, duplicates; every error is one line."""
 
 import doctest
 import gzip
@@ -10,15 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jtqd.daemon.logs import export
 from jtqd.estimator import text
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sysid import runs
+from jtqd.sysid.diagnosis import command as diagnose
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import read_run, read_runs
+from jtqd.sysid.runs.files import read_run, read_runs, same_run, windows
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import write_run
+from tests.paths import ROOT
+from tests.sysid.runs.spoiled_runs import column
 
 KINOVA = shipped("kinova_gen3/columns.yaml").parent
 GOOD = "time_s,j1.current_a,j1.torque_nm\n0.000,1.5,-2\n0.001,2.5,-3\n0.002,3.5,-4\n"
@@ -38,13 +42,10 @@ def _map(**targets: object) -> ColumnMap:
 
 def test_own_names_are_read_without_a_map_and_absent_columns_are_none(tmp_path: Path) -> None:
     run = read_run(_file(tmp_path, GOOD))
-    joint = run.table.joints[1]
     assert run.table.time_s.tolist() == [0.0, 0.001, 0.002]
-    assert joint.current_a is not None
-    assert joint.current_a.tolist() == [1.5, 2.5, 3.5]
-    assert joint.torque_nm is not None
-    assert joint.torque_nm.tolist() == [-2.0, -3.0, -4.0]
-    assert joint.motor_position_rad is None
+    assert column(run.table, "current_a").tolist() == [1.5, 2.5, 3.5]
+    assert column(run.table, "torque_nm").tolist() == [-2.0, -3.0, -4.0]
+    assert run.table.joints[1].motor_position_rad is None
     assert list(run.table.joints) == [1]
     assert run.notes == ()
 
@@ -65,18 +66,14 @@ def test_map_renames_scales_shifts_and_flips(tmp_path: Path) -> None:
         j7__link_position_rad="pos",
     )
     table = read_run(path, columns).table
-    joint = table.joints[7]
     assert table.time_s.tolist() == [5.0, 5.001]
-    assert joint.current_a is not None
-    assert joint.current_a.tolist() == [-1.0, -2.0]
-    assert joint.motor_position_rad is not None
-    assert joint.motor_position_rad.tolist() == [50.0, 25.0]
-    assert joint.link_position_rad is not None
-    assert joint.link_position_rad.tolist() == [0.5, 0.25]
+    assert column(table, "current_a", 7).tolist() == [-1.0, -2.0]
+    assert column(table, "motor_position_rad", 7).tolist() == [50.0, 25.0]
+    assert column(table, "link_position_rad", 7).tolist() == [0.5, 0.25]
 
 
 @pytest.mark.parametrize(
-    ("mapping", "said"),
+    ("mapping", "expected"),
     [
         ({"j1.current_a": "A"}, "key 'time_s': missing"),
         ({"time_s": "t", "j1.curent_a": "A"}, "did you mean 'j1.current_a'"),
@@ -100,16 +97,16 @@ def test_map_renames_scales_shifts_and_flips(tmp_path: Path) -> None:
         ({"time_s": {"column": 3}}, "found 3, expected a column of the file, or an expression of columns"),
     ],
 )
-def test_wrong_maps_are_named(mapping: dict[str, object], said: str) -> None:
+def test_wrong_maps_are_named(mapping: dict[str, object], expected: str) -> None:
     with pytest.raises(ConfigError) as caught:
         ColumnMap.from_mapping(mapping, "m.yaml", Path())
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
     assert "m.yaml" in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
-    ("content", "said"),
+    ("content", "expected"),
     [
         ("", "empty file"),
         (" \n\n", "empty file"),
@@ -131,11 +128,11 @@ def test_wrong_maps_are_named(mapping: dict[str, object], said: str) -> None:
         ('time_s,j1.current_a\n0,"1\n1,2\n', "found"),
     ],
 )
-def test_bad_files_are_refused_in_one_line(tmp_path: Path, content: str | bytes, said: str) -> None:
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, content: str | bytes, expected: str) -> None:
     path = _file(tmp_path, content)
     with pytest.raises(RunError) as caught:
         read_run(path)
-    assert said in str(caught.value)
+    assert expected in str(caught.value)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
 
@@ -178,7 +175,7 @@ def test_one_wrong_stamp_is_no_other_run(tmp_path: Path) -> None:
             read_runs([path], segments=True)
 
 
-def test_rows_written_twice_are_left_out_and_said(tmp_path: Path) -> None:
+def test_rows_written_twice_are_left_out_with_a_note(tmp_path: Path) -> None:
     t = 0.002 * np.arange(2000.0)
     rows = np.sort(np.concatenate((np.arange(2000), [700, 900, 900])))
     cells = {"time_s": t[rows], "j1.current_a": np.sin(t)[rows]}
@@ -207,7 +204,7 @@ def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path: Path) 
     assert f"{count} stamps like the one before: rounded, spread between those around" in run.notes
 
 
-def test_a_row_that_a_recorder_did_not_finish_is_left_out_and_said(tmp_path: Path) -> None:
+def test_an_unfinished_last_row_is_left_out_with_a_note(tmp_path: Path) -> None:
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0, "j1.motor_position_rad": T})
     whole = path.read_text()
     path.write_text(whole + "5.0,6.")
@@ -231,6 +228,41 @@ def test_one_run_twice_in_a_file_is_refused(tmp_path: Path) -> None:
         read_runs([path], segments=True)
 
 
+def test_gaps_make_segments_that_keep_their_time(tmp_path: Path) -> None:
+    """Gaps of 0.5 and 0.1 s; one of three rows is bridged; a segment of half a second is left out."""
+    t = np.arange(0.0, 6.0, 0.004)
+    keep = np.ones(len(t), bool)
+    for start, end in ((1.0, 1.014), (2.0, 2.5), (4.0, 4.1), (4.6, 4.7)):
+        keep &= ~((t > start) & (t < end))
+    t = t[keep]
+    path = _table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t), "j1.torque_nm": np.cos(t)})
+    with pytest.raises(RunError, match="found a gap of 0"):
+        read_run(path)
+    segments = read_runs([path], segments=True)
+    assert [run.name for run in segments] == ["a.csv (1 of 3)", "a.csv (2 of 3)", "a.csv (3 of 3)"]
+    assert [float(run.table.time_s[0]) for run in segments] == pytest.approx([0.0, 2.5, 4.7])
+    assert len({run.sha256 for run in segments}) == 1
+    assert "3 gaps of more than 0.025 s: used as 3 segments of one recording" in " ".join(segments[0].notes)
+    assert segments[1].notes == ()
+
+
+def test_segments_that_are_all_too_short_are_refused(tmp_path: Path) -> None:
+    t = np.arange(0.0, 6.0, 0.004)
+    t = t[(t % 0.5) < 0.4]
+    path = _table(tmp_path / "a.csv", {"time_s": t, "j1.current_a": np.sin(t)})
+    with pytest.raises(
+        RunError,
+        match=r"found 12 segments between gaps, the longest of 0\.\d+ s, expected one of at least 1 s",
+    ):
+        read_runs([path], segments=True)
+
+
+def test_a_short_whole_recording_is_one_segment(tmp_path: Path) -> None:
+    path = _table(tmp_path / "a.csv", {"time_s": T[:50], "j1.current_a": np.sin(T[:50])})
+    [run] = read_runs([path], segments=True)
+    assert run.name == "a.csv"
+
+
 def test_rows_with_a_blank_cell_are_gaps(tmp_path: Path) -> None:
     current, warm = np.round(np.sin(T), 3).astype(object), np.full(len(T), "", object)
     current[[50, 51]], current[200:220] = "", "NaN"
@@ -247,7 +279,7 @@ def test_rows_with_a_blank_cell_are_gaps(tmp_path: Path) -> None:
         read_runs([_table(path, {"time_s": T, "j1.current_a": current})], segments=True)
 
 
-def test_what_a_load_is_computed_from_cannot_be_blank(tmp_path: Path) -> None:
+def test_a_column_of_a_known_load_cannot_be_blank(tmp_path: Path) -> None:
     path = _table(tmp_path / "a.csv", {"t": T, "q": np.full(len(T), "", object), "i": T})
     load = {"inertia_kgm2": 0.1}
     columns = _map(time_s="t", j1__link_position_rad="q", j1__current_a="i", j1__load=load)
@@ -275,9 +307,7 @@ def test_a_comma_in_a_name_separates_nothing_where_the_rows_have_none(tmp_path: 
 @pytest.mark.parametrize("separator", [";", "\t"])
 def test_other_separators_are_read(tmp_path: Path, separator: str) -> None:
     path = _table(tmp_path / "a.csv", {"time_s": T, "j1.current_a": T + 1.0}, separator)
-    current = read_run(path).table.joints[1].current_a
-    assert current is not None
-    assert current.tolist() == (T + 1.0).tolist()
+    assert column(read_run(path).table, "current_a").tolist() == (T + 1.0).tolist()
     path.write_text(path.read_text().replace("3.0", "3,0"))
     with pytest.raises(RunError, match="expected a finite number with a decimal point"):
         read_run(path)
@@ -336,19 +366,11 @@ def test_shipped_runs_have_the_digits_of_the_source() -> None:
     assert len(opti.table.time_s) == 4741
     assert len(run1.table.time_s) == 1942
     assert np.allclose(np.diff(opti.table.time_s), 0.001, atol=1e-12)
-    joint2 = opti.table.joints[2]
-    assert joint2.link_position_rad is not None
-    assert joint2.motor_position_rad is not None
-    assert joint2.current_a is not None
-    assert joint2.torque_nm is not None
-    # First row of the source: Position2 1.19094, Cur2 -2.85206, TorqueSm2 -25.8335.
-    assert (joint2.link_position_rad[0], joint2.current_a[0], joint2.torque_nm[0]) == (
-        1.19094,
-        -2.85206,
-        -25.8335,
-    )
-    assert joint2.motor_position_rad[0] == pytest.approx(119.094)
-    # The one known dead channel, and no other.
+    names = ("link_position_rad", "current_a", "torque_nm", "motor_position_rad")
+    # first row of the source: Position2 1.19094, Cur2 -2.85206, TorqueSm2 -25.8335
+    first = [column(opti.table, name, 2)[0] for name in names]
+    assert first == [1.19094, -2.85206, -25.8335, pytest.approx(119.094)]
+    # the one known dead channel
     assert opti.notes == ()
     assert [note.split()[0] for note in run1.notes] == ["j1.torque_nm"]
     assert run1.table.joints[1].torque_nm is None
@@ -356,23 +378,20 @@ def test_shipped_runs_have_the_digits_of_the_source() -> None:
 
 
 def test_damaged_files_never_raise_anything_else(tmp_path: Path) -> None:
-    seed = 20
-    print("seed", seed)
-    random_ = random.Random(seed)
+    random_ = random.Random(20)
     for _ in range(400):
         data = bytearray(GOOD.encode())
         for _ in range(random_.randint(1, 4)):
             where = random_.randrange(len(data))
             data[where : where + random_.randint(0, 3)] = random_.randbytes(random_.randint(0, 3))
         packed = random_.random() < 0.3
-        said = ""
+        content = gzip.compress(data) if packed else bytes(data)
+        message = ""
         try:
-            read_run(
-                _file(tmp_path, gzip.compress(data) if packed else bytes(data), "x.csv" + ".gz" * packed)
-            )
+            read_run(_file(tmp_path, content, "x.csv" + ".gz" * packed))
         except RunError as error:
-            said = str(error)
-        assert "\n" not in said
+            message = str(error)
+        assert "\n" not in message
 
 
 def random_table(rng: np.random.Generator, rows: int) -> RunTable:
@@ -398,11 +417,11 @@ def test_any_table_comes_back_to_1e_9(tmp_path: Path, name: str) -> None:
         assert set(read.table.joints) == set(table.joints), f"seed {seed}"
         assert np.abs(read.table.time_s - table.time_s).max() < 1e-10
         for number, columns in table.joints.items():
-            for column in COLUMN_NAMES:
-                wanted, found = getattr(columns, column), getattr(read.table.joints[number], column)
-                assert (wanted is None) == (found is None), f"seed {seed}, {column}"
+            for each in COLUMN_NAMES:
+                wanted, found = getattr(columns, each), getattr(read.table.joints[number], each)
+                assert (wanted is None) == (found is None), f"seed {seed}, {each}"
                 if wanted is not None:
-                    assert np.abs(found - wanted).max() < 1e-9, f"seed {seed}, {column}"
+                    assert np.abs(found - wanted).max() < 1e-9, f"seed {seed}, {each}"
 
 
 def test_the_same_table_is_the_same_file(tmp_path: Path) -> None:
@@ -442,8 +461,7 @@ def test_numbers_a_text_could_get_wrong_survive(tmp_path: Path) -> None:
     values = np.array([*hard, *(rng.uniform(-1, 1) * 10 ** rng.randint(-9, 6) for _ in range(200))])
     table = RunTable(np.arange(len(values)) * 1e-3, {1: JointColumns(current_a=values)})
     write_run(tmp_path / "run.csv", table)
-    found = read_run(tmp_path / "run.csv").table.joints[1].current_a
-    assert found is not None
+    found = column(read_run(tmp_path / "run.csv").table, "current_a")
     assert np.all(np.abs(found - values) <= 1e-9 + 1e-15 * np.abs(values))
 
 
@@ -474,9 +492,97 @@ def test_a_column_map_may_be_given_as_its_file(tmp_path: Path) -> None:
     path = _file(tmp_path, GOOD.replace("j1.current_a", "I"))
     columns = _file(tmp_path, "time_s: time_s\nj1.current_a: {column: I, scale: 2.0}\n", "columns.yaml")
     [run] = read_runs([path], columns)
-    current = run.table.joints[1].current_a
-    assert current is not None
-    assert current.tolist() == [3.0, 5.0, 7.0]
+    assert column(run.table, "current_a").tolist() == [3.0, 5.0, 7.0]
+
+
+# One run in two files -------------------------------------------------------------------------------------------
+
+LOG = ROOT / "tests" / "golden" / "network.mcap"
+COUNT_RAD, LEVEL_A = 2.0 * np.pi / 65536, 0.005
+
+
+def swung(seed: int, rows: int = 20_000, moves: float = 1.0, levels: float = 3.0) -> RunTable:
+    """One motion as counts, and current in steps; moves: part of the time; levels: noise in steps of current."""
+    rng = np.random.default_rng(seed)
+    time_s = 1e-3 * np.arange(rows)
+    swing = np.sin(np.minimum(2.0 * np.pi * 0.5 * time_s, 2.0 * np.pi * 0.5 * moves * time_s[-1]))
+    position = np.round(40.0 * swing / COUNT_RAD) * COUNT_RAD
+    current = np.round(swing / LEVEL_A + levels * rng.normal(size=rows) / 3.0) * LEVEL_A
+    return RunTable(time_s, {1: JointColumns(current_a=current, motor_position_rad=position)})
+
+
+def part(table: RunTable, rows: slice, digits: int = 17) -> RunTable:
+    """These rows, with so many digits."""
+
+    def rounded(_: str, numbers: np.ndarray) -> np.ndarray:
+        return np.array([float(f"{number:.{digits}g}") for number in numbers[rows]])
+
+    time_s = table.time_s[rows] - table.time_s[rows][0]
+    return RunTable(time_s, {number: each.map(rounded) for number, each in table.joints.items()})
+
+
+@pytest.mark.parametrize(
+    ("rows", "digits"), [(slice(None), 17), (slice(None), 7), (slice(3000, 9000), 9), (slice(5, None), 8)]
+)
+def test_the_same_samples_are_the_same_run(rows: slice, digits: int) -> None:
+    whole = swung(1)
+    assert same_run(windows(whole), windows(part(whole, rows, digits)))
+    assert same_run(windows(part(whole, rows, digits)), windows(whole))
+
+
+@pytest.mark.parametrize("moves", [1.0, 0.1])
+@pytest.mark.parametrize("levels", [3.0, 1.0, 0.0])
+def test_runs_of_one_motion_are_not(moves: float, levels: float) -> None:
+    """Also with little noise, and mostly at rest; without any noise they are not judged."""
+    one, two = (windows(swung(seed, moves=moves, levels=levels)) for seed in (1, 2))
+    if levels:
+        assert not same_run(one, two)
+    elif moves < 1.0:
+        assert not one, "not judged"
+
+
+def test_other_joints_and_missing_columns_are_not_compared() -> None:
+    table = swung(1)
+    other = RunTable(table.time_s, {2: table.joints[1]})
+    assert not same_run(windows(table), windows(other))
+    assert windows(RunTable(table.time_s, {1: JointColumns(current_a=table.joints[1].current_a)})) == {}
+    assert windows(swung(1, rows=100)) == {}
+
+
+def test_one_joint_that_differs_makes_another_run() -> None:
+    one, two = swung(1), swung(2)
+    both = [RunTable(one.time_s, {1: one.joints[1], 2: each.joints[1]}) for each in (one, two)]
+    assert not same_run(*map(windows, both))
+
+
+def test_a_log_and_its_table_are_refused_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = tmp_path / "exported.csv"
+    export.main(["csv", str(LOG), "--out", str(table)])
+    capsys.readouterr()
+    with pytest.raises(RunError, match=r"exported\.csv: found the same run as in network\.mcap"):
+        read_runs([LOG, table], segments=True)
+    joint = str(ROOT / "models" / "joint1.yaml")
+    assert diagnose.main([str(LOG), str(table), "--joint", joint, "--out", str(tmp_path / "d")]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert "expected every run once" in error
+
+
+def test_a_table_of_all_cycles_is_the_same_run_without_its_blank_cells(tmp_path: Path) -> None:
+    table = tmp_path / "all.csv"
+    export.main(["csv", str(LOG), "--out", str(table), "--all-cycles"])
+    [found] = read_runs([table], segments=True)
+    assert "193 of 1050 rows left out for a blank cell ('j1.temperature_c' in 193" in found.notes[0]
+    with pytest.raises(RunError, match=r"found the same run as in network\.mcap"):
+        read_runs([LOG, table], segments=True)
+
+
+def test_two_runs_are_read(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        write_run(tmp_path / f"{seed}.csv", swung(seed, rows=3000))
+    assert len(read_runs([tmp_path])) == 2
 
 
 def test_the_examples_in_the_docstrings_hold() -> None:

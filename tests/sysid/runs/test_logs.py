@@ -1,4 +1,4 @@
-"""From jtqd's log to the run table: what is in it, what is left out, and that every slot is accounted for."""
+"""From jtqd's log to the run table: its columns, the rows that are left out, and an account of every slot."""
 
 import hashlib
 import math
@@ -13,6 +13,7 @@ from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.logs import log_to_run
 from tests.daemon.logs.campaign_log import OFF, Cycle, Joint, regular, temperature, write_log
+from tests.sysid.runs.spoiled_runs import column
 
 NAN = math.nan
 
@@ -69,8 +70,7 @@ def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path: Path
 
     logged = log_to_run(write_log(tmp_path / "a.mcap", regular(100, wanted)))
     assert len(logged.table.time_s) == 60
-    assert logged.table.joints[1].current_a is not None
-    assert logged.table.joints[1].current_a[0] == pytest.approx(2.0)
+    assert column(logged.table, "current_a")[0] == pytest.approx(2.0)
 
 
 def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_path: Path) -> None:
@@ -82,8 +82,7 @@ def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_
         return one._replace(statusword=words.get(n, one.statusword)), two
 
     logged = log_to_run(write_log(tmp_path / "a.mcap", regular(30, wanted)))
-    enabled = logged.table.joints[1].enabled
-    assert enabled is not None
+    enabled = column(logged.table, "enabled")
     assert np.flatnonzero(enabled == 0.0).tolist() == [10, 11, 12]
     assert set(enabled) == {0.0, 1.0}
     assert logged.table.joints[2].enabled is None, "its power was on all the time"
@@ -115,7 +114,7 @@ def test_missing_inputs_and_cycles_are_left_out_and_counted_by_input(tmp_path: P
             assert column is None or np.isfinite(column).all()
 
 
-def test_a_sensor_that_never_says_anything_leaves_the_rest(tmp_path: Path) -> None:
+def test_a_sensor_without_a_value_leaves_the_rest(tmp_path: Path) -> None:
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
         return one._replace(sensor_nm=NAN, input_flags=3), two._replace(sensor_nm=NAN, input_flags=3)
@@ -149,49 +148,35 @@ def test_temperature_holds_between_its_frames_and_before_the_first_one(tmp_path:
     with_frames(20, temperature(4, 33.0), (0x385, b"\x00\x80"))  # 8000h: not measured
     with_frames(30, (0x384, b"\x01"))  # too short: not a temperature
     logged = log_to_run(write_log(tmp_path / "a.mcap", cycles), nodes=(4, 5))
-    one, two = (logged.table.joints[number].temperature_c for number in (1, 2))
-    assert one is not None
-    assert two is not None
+    one, two = (column(logged.table, "temperature_c", number) for number in (1, 2))
     assert one.tolist() == pytest.approx([31.5] * 20 + [33.0] * 20)
     assert two.tolist() == pytest.approx([-3.2] * 40)
     assert log_to_run(tmp_path / "a.mcap", nodes=(1, 2)).table.joints[1].temperature_c is None
 
 
-def test_a_temperature_belongs_to_its_cycle_in_any_chunk(tmp_path: Path) -> None:
-    """A chunk holds 0.5 s; the second temperature comes in the third one."""
-    cycles = regular(1300, joints)
-    for at, value in ((100, 25.0), (1200, 29.0)):
-        cycles[at] = cycles[at]._replace(frames=[temperature(1, value)])
-    table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
-    assert table.joints[1].temperature_c is not None
-    assert table.joints[1].temperature_c.tolist() == [25.0] * 1200 + [29.0] * 100
-
-
-def test_a_temperature_from_before_the_motion_counts(tmp_path: Path) -> None:
-    def wanted(n: int) -> tuple[Joint, Joint]:
-        one, two = joints(n)
-        return (one, two) if n >= 20 else (one._replace(statusword=OFF), two)
-
-    cycles = regular(40, wanted)
-    cycles[3] = cycles[3]._replace(frames=[temperature(1, 25.0)])
-    table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
-    assert table.joints[1].temperature_c is not None
-    assert table.joints[1].temperature_c.tolist() == [25.0] * 20
-
-
-def test_a_temperature_told_with_the_drive_off_does_not_hold_in_the_motion(tmp_path: Path) -> None:
-    """An emulated day begins when the drives are enabled: what was told before is of the day before."""
+@pytest.mark.parametrize(
+    ("rows", "first", "frames", "expected"),
+    [
+        (1300, 0, {100: 25.0, 1200: 29.0}, [25.0] * 1200 + [29.0] * 100),
+        (40, 20, {3: 25.0}, [25.0] * 20),
+        (40, 20, {3: 25.0, 27: 29.0, 35: 29.5}, [29.0] * 15 + [29.5] * 5),
+    ],
+    ids=["in several chunks of 0.5 s", "before the motion only", "before and in the motion"],
+)
+def test_a_temperature_belongs_to_its_cycle(
+    tmp_path: Path, rows: int, first: int, frames: dict[int, float], expected: list[float]
+) -> None:
+    """One from before the motion counts only where the motion has none: an emulated day begins with the motion."""
 
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
-        return (one, two) if n >= 20 else (one._replace(statusword=OFF), two)
+        return (one, two) if n >= first else (one._replace(statusword=OFF), two)
 
-    cycles = regular(40, wanted)
-    for at, value in ((3, 25.0), (27, 29.0), (35, 29.5)):
+    cycles = regular(rows, wanted)
+    for at, value in frames.items():
         cycles[at] = cycles[at]._replace(frames=[temperature(1, value)])
     table = log_to_run(write_log(tmp_path / "a.mcap", cycles)).table
-    assert table.joints[1].temperature_c is not None
-    assert table.joints[1].temperature_c.tolist() == pytest.approx([29.0] * 15 + [29.5] * 5)
+    assert column(table, "temperature_c").tolist() == pytest.approx(expected)
 
 
 def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
@@ -215,7 +200,7 @@ def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
             assert word in str(caught.value)
 
 
-def test_a_joint_with_one_encoder_has_no_link_position_and_the_reader_says_so(tmp_path: Path) -> None:
+def test_a_joint_with_one_encoder_has_no_link_position_and_a_note(tmp_path: Path) -> None:
     """The cycles of the other joint, which has one, are complete only with it."""
 
     def wanted(n: int) -> tuple[Joint, Joint]:
@@ -227,8 +212,7 @@ def test_a_joint_with_one_encoder_has_no_link_position_and_the_reader_says_so(tm
     one, two = logged.table.joints[1], logged.table.joints[2]
     assert (one.two_encoders(100.0), two.two_encoders(100.0)) == (False, True)
     assert one.link_position_rad is None
-    assert one.current_a is not None
-    assert len(one.current_a) == 29
+    assert len(column(logged.table, "current_a")) == 29
     assert logged.incomplete_by == {"joint 1": 0, "joint 2": 1, "sensor": 0}
     [run] = read_runs([path])
     assert "joint 1: one encoder, no link position: nothing is known of the torsion of the gear" in run.notes
@@ -255,12 +239,10 @@ def test_one_to_four_joints_and_the_reference_of_those_that_have_one(tmp_path: P
         logged = log_to_run(write_log(tmp_path / f"{count}.mcap", cycles, count))
         assert list(logged.table.joints) == list(range(1, count + 1))
         for number, columns in logged.table.joints.items():
-            assert columns.current_a is not None
-            assert columns.current_a.tolist() == [0.1 * n * number for n in range(50)]
+            assert column(logged.table, "current_a", number).tolist() == [0.1 * n * number for n in range(50)]
             assert (columns.torque_nm is not None) == (number == 3)
         assert (logged.missed, logged.incomplete, dict(logged.left_out)) == (0, 0, {})
-    assert logged.table.joints[3].torque_nm is not None
-    assert logged.table.joints[3].torque_nm.tolist() == [3.0 + n for n in range(50)]
+    assert column(logged.table, "torque_nm", 3).tolist() == [3.0 + n for n in range(50)]
 
 
 def test_one_joint_alone_has_its_own_cycles(tmp_path: Path) -> None:
@@ -277,8 +259,7 @@ def test_one_joint_alone_has_its_own_cycles(tmp_path: Path) -> None:
     assert (len(together.table.time_s), together.incomplete_by["joint 4"]) == (19, 1)
     assert list(alone.table.joints) == [4]
     assert len(alone.table.time_s) == 59
-    assert alone.table.joints[4].current_a is not None
-    assert alone.table.joints[4].current_a[0] == 0.0
+    assert column(alone.table, "current_a", 4)[0] == 0.0
     assert len(log_to_run(path, joints=[2, 3]).table.time_s) == 20
 
 
@@ -298,12 +279,11 @@ def test_the_last_motion_of_a_joint_begins_when_all_drives_are_enabled(tmp_path:
     assert len(whole.table.time_s) == 45, "from 5 to 49, without power in between"
     last = log_to_run(path, joints=[3], enabled=[1, 2, 3], last_motion=True)
     assert list(last.table.joints) == [3]
-    assert last.table.joints[3].motor_position_rad is not None
-    assert last.table.joints[3].motor_position_rad.tolist() == [3.0 + n for n in range(25, 50)]
-    assert (last.missed, last.incomplete) == (0, 0), "what joint 4 lost does not matter"
+    assert column(last.table, "motor_position_rad", 3).tolist() == [3.0 + n for n in range(25, 50)]
+    assert (last.missed, last.incomplete) == (0, 0), "losses of joint 4 do not count"
 
 
-def test_a_joint_that_was_never_enabled_is_left_out_and_named(tmp_path: Path) -> None:
+def test_a_joint_that_was_never_enabled_is_left_out_with_a_note(tmp_path: Path) -> None:
     def wanted(n: int) -> tuple[Joint, ...]:
         one, two, three, last = four(n)
         return one._replace(statusword=OFF), two._replace(current_a=NAN), three, last
@@ -333,12 +313,9 @@ def test_the_temperature_of_a_joint_is_that_of_the_node_in_the_attached_configur
         f"joint_1: {{node: 11}}\njoint_2: {{node: 12, {own}}}\njoint_3: {{node: 1}}\njoint_4: {{}}\n"
     )
     table = log_to_run(write_log(tmp_path / "a.mcap", cycles, 4, configuration)).table
-    found = {number: columns.temperature_c for number, columns in table.joints.items()}
-    assert found[2] is not None
-    assert found[3] is not None
-    assert (found[2][0], found[3][0]) == (pytest.approx(3.55), 31.0), "in the unit of its object"
-    assert found[1] is None
-    assert found[4] is None
+    first = [column(table, "temperature_c", number)[0] for number in (2, 3)]
+    assert first == [pytest.approx(3.55), 31.0], "in the unit of its object"
+    assert table.joints[1].temperature_c is table.joints[4].temperature_c is None
 
 
 def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
@@ -363,14 +340,13 @@ def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
         assert logged.missed == int(lost[:, 3].sum()), f"seed {seed}"
         assert len(logged.table.time_s) == int(good.sum()), f"seed {seed}"
         assert len(logged.table.time_s) + logged.missed + logged.incomplete == 200, f"seed {seed}"
-        found = logged.table.joints[1].current_a
-        assert found is not None
+        found = column(logged.table, "current_a")
         assert found.tolist() == pytest.approx((0.1 * np.flatnonzero(good)).tolist()), f"seed {seed}"
         assert replace(logged, incomplete=0).lost_share <= logged.lost_share
 
 
 def test_the_parts_of_a_run_are_one_recording(tmp_path: Path) -> None:
-    """Read in pieces: two parts of one run and a log of another; the second part's beginning is lost for 60 ms."""
+    """In segments: two parts of one run and a log of another; the second part lacks its first 60 ms."""
     cycles = regular(4000, joints)
     parts = [tmp_path / f"b-20260101T000000Z-000{k}.mcap" for k in (1, 2)]
     write_log(parts[0], cycles[:2000])
