@@ -182,10 +182,10 @@ def test_a_fleet_with_one_broken_log(tmp_path, capsys):
     logs, out = fleet(tmp_path / "logs", ["r1/left", "r1/right"]), tmp_path / "out"
     touch(logs, "r2/bad.csv")
     assert jtq(["batch", *arguments(logs, out)]) == 3
-    said = capsys.readouterr()
+    printed = capsys.readouterr()
     assert states(out) == {"r1/left": "done", "r1/right": "done", "r2": "failed"}
-    assert "3 groups: 2 done, 0 finished before, 1 failed" in said.out
-    assert "jtq batch: r2: bad.csv: line 1: found no column" in said.err
+    assert "3 groups: 2 done, 0 finished before, 1 failed" in printed.out
+    assert "jtq batch: r2: bad.csv: line 1: found no column" in printed.err
     broken = next(group for group in summary(out)["groups"] if group["name"] == "r2")
     assert broken["key"] not in results(out), "what failed is tried again"
     assert broken["figures"] is None

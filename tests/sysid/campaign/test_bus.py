@@ -156,7 +156,7 @@ def test_a_campaign_that_was_killed_goes_on(arguments: list[str], tmp_path: Path
 
 
 def check_tables(out: Path) -> None:
-    """What was measured is what the plan said, in the quadrants it is named for, with no cycle missing."""
+    """The measurement follows the plan, in the quadrants of its name, with no cycle missing."""
     plan = load_plan(out / "plan.yaml")
     for run in plan.runs:
         read = read_run(out / f"{run.name}.csv.gz")
@@ -186,7 +186,7 @@ def check_tables(out: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_a_limit_stops_the_joints_and_the_campaign_unless_told_to_go_on(
+def test_a_limit_stops_the_joints_and_the_campaign_unless_keep_going(
     arguments: list[str], tmp_path: Path
 ) -> None:
     out = tmp_path / "out"

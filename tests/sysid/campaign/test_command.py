@@ -42,7 +42,7 @@ def plan(tmp_path: Path) -> str:
 
 
 @pytest.mark.parametrize("more", [[], ["--dry-run"], ["--bus", "sim", "--out", "x"]])
-def test_a_plan_that_is_not_there_is_said_before_a_missing_option(
+def test_a_missing_plan_comes_before_a_missing_option(
     more: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["nothere.yaml", *more]) == 1
@@ -83,15 +83,15 @@ def test_misuse_is_status_2_and_one_line(
         (["--limit", "current_a=none"], ["current_a=none"]),
     ],
 )
-def test_options_say_what_they_expect(
+def test_wrong_values_of_options(
     option: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as caught:
         main(["efficiency", "--dry-run", *option])
     assert caught.value.code == 2
-    said = capsys.readouterr().err
+    error = capsys.readouterr().err
     for word in words:
-        assert word in said
+        assert word in error
 
 
 def test_a_dry_run_prints_every_run_and_moves_nothing(capsys: pytest.CaptureFixture[str]) -> None:
@@ -119,7 +119,7 @@ def test_a_dry_run_as_json_adds_up(plan: str, capsys: pytest.CaptureFixture[str]
 
 
 def bench_config(folder: Path, **changes: object) -> Path:
-    """The shipped configuration beside copies of its models, with changes of top-level keys."""
+    """The shipped configuration with copies of its models, and changes of top-level keys."""
     content = yaml.safe_load(shipped("bench.yaml").read_text()) | changes
     shutil.copytree(shipped("trained/joint1.yaml").parent, folder / "trained")
     path = folder / "bench.yaml"
@@ -183,9 +183,9 @@ def test_a_drive_that_would_be_moved_otherwise_than_planned_is_refused(
     section: dict[str, object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["efficiency", "--dry-run", "--config", str(drives_with(tmp_path, **section))]) == 1
-    said = capsys.readouterr().err
-    assert words in said
-    assert len(said.splitlines()) == 1
+    error = capsys.readouterr().err
+    assert words in error
+    assert len(error.splitlines()) == 1
 
 
 def test_the_bus_load_of_a_campaign_is_that_of_the_layout(tmp_path: Path) -> None:
@@ -200,10 +200,10 @@ def test_the_bus_load_of_a_campaign_is_that_of_the_layout(tmp_path: Path) -> Non
 
 def test_a_plan_beyond_its_limits_is_refused(plan: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([plan, "--dry-run", "--limit", "velocity_rad_s=0.4"]) == 1
-    said = capsys.readouterr().err
-    assert len(said.splitlines()) == 1
+    error = capsys.readouterr().err
+    assert len(error.splitlines()) == 1
     for word in ("small.yaml", "run 'a'", "velocity", "limit 0.4 rad/s"):
-        assert word in said
+        assert word in error
     assert main([plan, "--dry-run", "--limit", "temperature_c=none"]) == 0
     assert "temperature not supervised" in capsys.readouterr().out
 
@@ -243,9 +243,9 @@ def test_the_same_directory_takes_no_other_plan(
         ["validate", "--quick", "--seed", "3", "--limit", "torque_nm=9"],
     ):
         assert main([*other, "--bus", "unix:/nonexistent/bus", "--out", str(out)]) == 1
-        said = capsys.readouterr().err
-        assert "of another plan" in said
-        assert len(said.splitlines()) == 1
+        error = capsys.readouterr().err
+        assert "of another plan" in error
+        assert len(error.splitlines()) == 1
     same = ["validate", "--quick", "--seed", "3", "--bus", "unix:/nonexistent/bus", "--out", str(out)]
     assert main(same) == 0
 
@@ -276,7 +276,7 @@ def test_a_bus_that_is_not_there_ends_the_campaign_in_one_line(
     assert left == [".lock", "campaign.json", "plan.yaml"]
 
 
-def test_what_jtqd_says_when_it_does_not_start_is_told(
+def test_the_error_of_a_jtqd_that_does_not_start_is_passed_on(
     plan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A bench with nothing on it: jtqd's boot names the node that is missing, and the campaign passes it on."""

@@ -38,9 +38,9 @@ def test_tables_and_marks_are_those_of_the_plan(directory: Path) -> None:
     assert marks["velocity_joint"] == run.velocity_joint
     one = table.joints[run.velocity_joint]
     assert one.motor_velocity_rad_s is not None
-    told = expand(run).velocity_rad_s[: len(table.time_s)]
+    planned = expand(run).velocity_rad_s[: len(table.time_s)]
     driven = one.motor_velocity_rad_s / joints[run.velocity_joint - 1].gear_ratio
-    assert np.corrcoef(told, driven)[0, 1] > 0.99
+    assert np.corrcoef(planned, driven)[0, 1] > 0.99
 
 
 def test_each_run_has_a_day_of_its_own() -> None:

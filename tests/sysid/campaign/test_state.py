@@ -39,7 +39,7 @@ def test_a_new_directory_has_every_run_pending(tmp_path: Path) -> None:
     directory.close()
 
 
-def test_what_is_done_is_found_again_and_the_rest_begins_anew(tmp_path: Path) -> None:
+def test_done_runs_are_found_again_and_the_others_begin_again(tmp_path: Path) -> None:
     directory = begun(tmp_path)
     files(tmp_path, "a", ".csv.gz", ".json", ".mcap")
     directory.put("a", DONE_STATE)
@@ -48,7 +48,7 @@ def test_what_is_done_is_found_again_and_the_rest_begins_anew(tmp_path: Path) ->
     files(tmp_path, "b@2", ".stopped.mcap", ".mcap")
     files(tmp_path, "b@x", ".mcap")  # somebody else's
     directory.put("b", RunState(STOPPED, "too hot", attempts=1))
-    files(tmp_path, "c", ".csv.gz", ".json")  # killed while it was being kept: no state says done
+    files(tmp_path, "c", ".csv.gz", ".json")  # killed while it was being kept: no state is "done"
     (tmp_path / "c.part").mkdir()
     files(tmp_path / "c.part", "log", ".mcap")
     directory.close()
@@ -99,7 +99,7 @@ def test_two_campaigns_at_once_in_one_directory_are_refused(tmp_path: Path) -> N
     begun(tmp_path).close()
 
 
-def test_somebody_s_own_files_are_not_taken_for_ours(tmp_path: Path) -> None:
+def test_foreign_files_are_refused(tmp_path: Path) -> None:
     files(tmp_path, "b", ".csv.gz")
     with pytest.raises(StateError, match=r"found b\.csv\.gz and no campaign\.json"):
         begun(tmp_path)
@@ -119,7 +119,7 @@ def test_somebody_s_own_files_are_not_taken_for_ours(tmp_path: Path) -> None:
         ('{"schema": "jtq.campaign/1", "name": "p"}', "plan_sha256"),
     ],
 )
-def test_a_state_that_is_none_is_named(tmp_path: Path, text: str, word: str) -> None:
+def test_a_state_that_cannot_be_read_is_refused(tmp_path: Path, text: str, word: str) -> None:
     (tmp_path / "campaign.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(StateError) as caught:
         CampaignDirectory(tmp_path)

@@ -82,7 +82,7 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 class Listener:
-    """Collects what is said under some COB-IDs; a thread reads, for a full queue loses what comes last."""
+    """Collects the frames of some COB-IDs; a thread reads, because a full queue loses the last frames."""
 
     def __init__(self, bus: str, *identifiers: int) -> None:
         self.socket = open_frame_socket(bus, [exact(can_id) for can_id in identifiers])
@@ -98,7 +98,7 @@ class Listener:
                     self._found.put((can_id, data[:length]))
 
     def frames(self) -> list[tuple[int, bytes]]:
-        """What was said since the last call."""
+        """Frames since the last call."""
         time.sleep(0.3)
         return [self._found.get() for _ in range(self._found.qsize())]
 
@@ -106,14 +106,18 @@ class Listener:
 def test_a_motion_is_played_and_leaves_both_drives_off_and_unwatched(bus: str) -> None:
     """The drives may turn by themselves before (demo motion). What they measured follows the plan; then all is quiet."""
     listener = Listener(bus, 0x281, 0x301, 0x202, 0x081, 0x082)
-    told: list[tuple[float, float]] = []
+    progress: list[tuple[float, float]] = []
     result = play(
-        bus, plateau(1.0, 2.0, hold_ms=1400), LIMITS, on_progress=lambda *s: told.append(s), timing=PATIENT
+        bus,
+        plateau(1.0, 2.0, hold_ms=1400),
+        LIMITS,
+        on_progress=lambda *s: progress.append(s),
+        timing=PATIENT,
     )
     assert result.reason == ""
     assert result == ("done", "", 2.0)
-    assert told[0] == (0.0, 2.0)
-    assert [played for played, _ in told] == sorted(played for played, _ in told)
+    assert progress[0] == (0.0, 2.0)
+    assert [played for played, _ in progress] == sorted(played for played, _ in progress)
     frames = listener.frames()
     speeds = [int.from_bytes(data[:4], "little", signed=True) for can_id, data in frames if can_id == 0x281]
     assert max(speeds) == pytest.approx(1043038, rel=0.15), "1 rad/s of the joint"
@@ -178,7 +182,7 @@ def test_what_cannot_be_begun_is_refused_in_one_line(bus: str) -> None:
 
 
 def test_a_second_commander_is_refused_before_it_touches_anything(bus: str) -> None:
-    """Both in this process: the second one is told off while the first one plays on to its end."""
+    """Both in this process: the second one is refused while the first one plays on to its end."""
     results: list[object] = []
     first = threading.Thread(
         target=lambda: results.append(play(bus, plateau(0.8, 1.0, hold_ms=1500), LIMITS, timing=PATIENT))

@@ -113,7 +113,7 @@ play({interface!r}, plateau(1.0, 2.0, hold_ms=60_000), Limits(9.0, 3.3, 100.0, 1
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("jtqd")
 def test_a_commander_that_is_killed_is_noticed_by_both_drives(tmp_path: Path) -> None:
-    """1016h:2: each drive says EMCY 8130h and stands, 300 ms after the last heartbeat of node 21h."""
+    """1016h:2: each drive sends EMCY 8130h and stands, 300 ms after the last heartbeat of node 21h."""
     root = ROOT
     commander = subprocess.Popen([sys.executable, "-c", PLAY.format(interface=INTERFACE)], cwd=root)
     subprocess.run(

@@ -70,8 +70,7 @@ def test_command_refuses_in_one_line(arguments, status, message, capsys, tmp_pat
 def test_command_without_scipy_refuses_in_one_line(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "scipy", None)
     assert excitation_command.main(["--count", "1", "--evaluations", "100"]) == 1
-    said = capsys.readouterr().err
-    assert said == "jtq excitation: scipy is not installed: pip install 'jtqd[analysis]'\n"
+    assert capsys.readouterr().err == "jtq excitation: scipy is not installed: pip install 'jtqd[analysis]'\n"
 
 
 @pytest.mark.parametrize("value", ["nan", "0", "-1", "many", "1e23"])

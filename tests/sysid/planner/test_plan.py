@@ -1,8 +1,9 @@
-"""Plans and their set-points: what is written is what is read, what is told is smooth, and what goes too far is refused."""
+"""Plans: files, smooth set-points, limits, marks, and the partial runs of a run."""
 
 import copy
 import random
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,10 @@ import pytest
 import yaml
 
 from jtqd.estimator.errors import ConfigError
-from jtqd.sysid.motion.setpoints import Limits
+from jtqd.estimator.joint import MotionLimits
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.motion.setpoints import Limits, path
+from jtqd.sysid.planner.campaigns import efficiency_runs, plateau_run
 from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
@@ -24,9 +28,13 @@ from jtqd.sysid.planner.plan import (
     check_run,
     expand,
     load_plan,
+    marks_of,
+    partial_runs,
     smooth_step,
     travel_rad,
 )
+from jtqd.sysid.planner.single_joint import plateau_run as alone_run
+from jtqd.sysid.planner.single_joint import range_of
 
 PLAN: dict[str, Any] = {
     "schema": "jtq.plan/1",
@@ -134,9 +142,7 @@ def test_every_number_of_a_plan_counts_for_its_hash() -> None:
         (lambda p: p["runs"][0]["segments"][2].pop("duration_s"), ["duration_s", "missing"]),
     ],
 )
-def test_what_is_wrong_in_a_plan_is_named_in_one_line(
-    change: Callable[[dict[str, Any]], Any], words: list[str]
-) -> None:
+def test_errors_in_a_plan_are_one_line(change: Callable[[dict[str, Any]], Any], words: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
         Plan.from_mapping(changed(change), "my.plan.yaml")
     message = str(caught.value)
@@ -167,7 +173,7 @@ def test_smooth_step_has_no_slope_and_no_curvature_at_its_ends() -> None:
     assert np.diff(fine).max() * 10000 == pytest.approx(1.875, rel=1e-6)
 
 
-def test_set_points_hold_what_the_segments_say_at_the_times_of_the_marks() -> None:
+def test_set_points_are_those_of_the_segments_at_the_times_of_the_marks() -> None:
     points = expand(Plan.from_mapping(PLAN, "p").runs[0])
     assert len(points) == 6900
     assert (points.velocity_joint, points.current_joint) == (2, 1)
@@ -259,3 +265,87 @@ def test_fourier_segments_carry_their_series_unchanged() -> None:
     assert isinstance(segment, Fourier)
     assert segment.duration_s == 4.0
     assert segment.current.offset_a == 0.5
+
+
+# Partial runs ---------------------------------------------------------------------------------------------------
+
+_SERIES = FourierSeries(1.0, (1.0,), (0.5,), 4.0)
+TWO_TRAJECTORIES = run_of(
+    Rest(1.0, 0.0),
+    *(
+        segment
+        for b in (0.1, 0.2)
+        for segment in (
+            Fourier(FourierTrajectory(2.0 * np.pi / 4.0, (0.2,), (b,), 4.0), _SERIES),
+            Rest(1.0, 0.0),
+            Rest(1.0, 0.0),
+        )
+    ),
+)
+JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=MotionLimits((-1.0, 2.0), 1.5, 6.0, 25.0))
+RANGE = range_of(1, JOINT, DEFAULT_LIMITS)
+
+
+def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
+    run = TWO_TRAJECTORIES
+    one, two = partial_runs(run)
+    assert (one.name, two.name) == ("r~1", "r~2")
+    assert one.duration_s + two.duration_s == run.duration_s
+    whole = expand(run)
+    parts = [expand(piece) for piece in (one, two)]
+    for name in ("velocity_rad_s", "current_a"):
+        joined = np.concatenate([getattr(part, name) for part in parts])
+        assert np.array_equal(joined, getattr(whole, name))
+    assert all(part.velocity_rad_s[0] == part.velocity_rad_s[-1] == 0.0 for part in parts)
+
+
+def test_plateaus_of_both_directions_and_a_single_trajectory_are_not_cut() -> None:
+    for run in (
+        plateau_run("r", 2, [(1.2, 1.0), (-1.2, 3.0)], 0.8),
+        replace(TWO_TRAJECTORIES, segments=TWO_TRAJECTORIES.segments[:3]),
+        run_of(Rest(1.0)),
+    ):
+        assert partial_runs(run) == (run,)
+
+
+def test_marks_of_a_run() -> None:
+    run = Run("r", 2, (Plateau(1.0, 2.0, 0.5, 0.25), Rest(0.5)))
+    plan = Plan("p", DEFAULT_LIMITS, (run,))
+    marks = marks_of(run, check_plan(plan)["r"])
+    assert (marks["run"], marks["velocity_joint"]) == ("r", 2)
+    assert [segment["kind"] for segment in marks["segments"]] == ["ramp", "plateau", "ramp", "rest"]
+    assert marks["segments"][1] == {
+        "kind": "plateau",
+        "start_s": 0.25,
+        "end_s": 0.75,
+        "velocity_joint": 2,
+        "velocity_rad_s": 1.0,
+        "current_a": 2.0,
+    }
+    assert np.isclose(marks["segments"][-1]["end_s"], run.duration_s)
+
+
+def test_plateaus_of_a_joint_alone_are_cut_by_velocity() -> None:
+    run = alone_run(1, RANGE, "r", (0.1, 0.2, 0.5))
+    parts = partial_runs(run)
+    assert [part.name for part in parts] == ["r~1", "r~2", "r~3"]
+    assert sum(part.duration_s for part in parts) == pytest.approx(run.duration_s, abs=0.01)
+    for part in parts:
+        points = check_run(part, RANGE.limits)
+        assert path(points)[-1] == pytest.approx(0.0, abs=2e-3)
+
+
+def test_a_run_of_one_direction_is_cut_by_plateau() -> None:
+    (run, *_) = efficiency_runs((1.4,), 2.1, (1.0, 2.5, 4.0))
+    parts = partial_runs(run)
+    assert len(parts) == 3
+    wanted = [each for each in run.segments if isinstance(each, Plateau)]
+    for part, plateau in zip(parts, wanted, strict=True):
+        (own,) = [each for each in part.segments if isinstance(each, Plateau)]
+        assert (own.velocity_rad_s, own.current_a, own.hold_s) == (
+            plateau.velocity_rad_s,
+            plateau.current_a,
+            plateau.hold_s,
+        )
+        assert own.ramp_s == wanted[0].ramp_s, "from rest, as the run's own first one"
+        assert travel_rad(check_run(part, DEFAULT_LIMITS)) < travel_rad(expand(run))

@@ -97,15 +97,17 @@ def test_round_trip_the_gain_is_there_in_mujoco_too(flexible: bool) -> None:
     assert before == pytest.approx(ours, rel=0.15)  # two simulators, one model
 
 
-def test_what_a_format_cannot_say_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_values_that_a_format_cannot_express_are_listed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     write_joint(tmp_path / "plain.yaml", TRUE, "plain")
     assert jtq(["export-model", str(tmp_path / "plain.yaml"), "--out", str(tmp_path / "joint.xml")]) == 0
     assert capsys.readouterr() == ("", "")
     assert mujoco.MjModel.from_xml_path(str(tmp_path / "joint.xml")).njnt == 1
     assert jtq(["export-model", str(shipped("joint1.yaml"))]) == 3
-    said = capsys.readouterr()
-    assert "not in the model: efficiency: losses that depend on the load" in said.err
-    assert mujoco.MjModel.from_xml_string(said.out).njnt == 1
+    printed = capsys.readouterr()
+    assert "not in the model: efficiency: losses that depend on the load" in printed.err
+    assert mujoco.MjModel.from_xml_string(printed.out).njnt == 1
     stribeck = replace(TRUE, friction=Friction(1.2, 0.8, 0.6, 0.1))
     assert model_of(stribeck).left_out == ("friction.stribeck_nm 0.6 below 0.1 rad/s",)
     assert jtq(["export-model", str(tmp_path / "plain.yaml"), "--format", "urdf", "--flexible"]) == 2

@@ -1,4 +1,4 @@
-"""The campaigns that ship: the paper's points are in them, and on the plant they are the quadrants they are named for."""
+"""Shipped campaigns: the paper's points and quadrants, limits, and the units of joints that move together."""
 
 from dataclasses import replace
 
@@ -12,12 +12,14 @@ from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.planner.campaigns import (
     KINDS,
     Scale,
+    check_joints,
     currents_of,
     efficiency_runs,
     excitation_runs,
     make_plan,
     seed_of,
     slow_and_fast,
+    units_of,
     validation_runs,
     variable_runs,
 )
@@ -26,6 +28,7 @@ from jtqd.sysid.planner.plan import (
     Fourier,
     Plan,
     Plateau,
+    Rest,
     Run,
     check_plan,
     expand,
@@ -196,3 +199,54 @@ def test_a_run_of_one_direction_turns_back_before_it_goes_too_far() -> None:
         check_plan(
             Plan("p", replace(DEFAULT_LIMITS, travel_rad=4.0), efficiency_runs((2.2,), travel_rad=4.0))
         )
+
+
+@pytest.mark.parametrize(
+    ("channels", "sensor", "towing", "expected"),
+    [
+        ([1, 1], True, [], [((1, 2), True)]),
+        ([1, 1], False, [], [((1,), False), ((2,), False)]),
+        ([None, None], False, [(2, 1)], [((1, 2), False)]),
+        ([1, 2], True, [(1, 2)], [((1, 2), True)]),
+        ([1, 2], True, [], [((1,), True), ((2,), True)]),
+        ([1], True, [], [((1,), True)]),
+        ([1, 1, 2], True, [], [((1, 2), True), ((3,), True)]),
+        ([1, 1, None], True, [], [((1, 2), True), ((3,), False)]),
+        ([1, 2, 2, 1], True, [], [((1, 4), True), ((2, 3), True)]),
+        ([None] * 4, False, [(3, 4)], [((1,), False), ((2,), False), ((3, 4), False)]),
+    ],
+)
+def test_joints_at_one_channel_or_given_by_towing_are_coupled(
+    channels: list[int | None],
+    sensor: bool,
+    towing: list[tuple[int, int]],
+    expected: list[tuple[tuple[int, ...], bool]],
+) -> None:
+    assert [(unit.joints, unit.measured) for unit in units_of(channels, sensor, towing)] == expected
+
+
+@pytest.mark.parametrize(
+    ("channels", "towing", "words"),
+    [
+        ([1, 1, 1], [], "one sensor_channel for joints 1, 2, 3"),
+        ([1, 1, None], [(2, 3)], "joint 2 coupled with joints"),
+        ([None, None], [(1, 3)], "found joint 3, expected joints of the bus, 1 to 2"),
+    ],
+)
+def test_wrong_couplings_are_refused(
+    channels: list[int | None], towing: list[tuple[int, int]], words: str
+) -> None:
+    with pytest.raises(ConfigError, match=words):
+        units_of(channels, True, towing)
+
+
+def test_runs_must_fit_the_coupling_of_the_joints() -> None:
+    bench, arm = units_of([1, 1], True), units_of([None, None], False)
+    pair = Plan("p", DEFAULT_LIMITS, (Run("r", 1, (Rest(1.0),)),))
+    single = Plan("p", DEFAULT_LIMITS, (Run("r", 1, (Rest(1.0),), None),))
+    check_joints(pair, bench)
+    check_joints(single, arm)
+    with pytest.raises(ConfigError, match="--towing 1,2 says that they are coupled"):
+        check_joints(pair, arm)
+    with pytest.raises(ConfigError, match="moved alone, expected a run of joints 1 and 2"):
+        check_joints(single, bench)
