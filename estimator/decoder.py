@@ -392,3 +392,12 @@ def _expected(node: Any, unit: str) -> str:
         count = f"{lengths[0]} " if len(lengths) == 1 else f"{lengths[0]} to {lengths[-1]} "
         return f"a list of {count if len(lengths) < sys.maxsize else ''}finite numbers{in_unit(unit)}"
     return "true or false" if isinstance(node, inspect.BoolType) else "a text"
+
+
+def plain_values(value: Any) -> Any:
+    """Return a value as JSON has it: dataclasses and mappings as dicts, keys as text, NaN and infinity as None."""
+    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=_json_value))
+
+
+def _json_value(value: Any) -> Any:
+    return dict(value) if isinstance(value, Mapping) else value.item()  # a numpy scalar

@@ -62,17 +62,22 @@ def duration(seconds: float) -> str:
     return f"{whole // 86400} d {whole % 86400 // 3600:02d} h"
 
 
-def table_lines(rows: Sequence[Sequence[str]], left: Container[int] = (0,)) -> list[str]:
-    """Return the lines of a table with columns as wide as they must be: those in `left` to the left, the others right.
+def table_lines(
+    rows: Sequence[Sequence[str]], left: Container[int] = (0,), *, rule: bool = False
+) -> list[str]:
+    """Return the lines of a table with columns as wide as they must be.
+
+    rows: the first has the headings. left: columns that are aligned to the left. rule: a line below the headings.
 
     >>> table_lines([["joint", "Nm"], ["1", "2.5"]])
     ['joint   Nm', '1      2.5']
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    head, *body = rows
     return [
         "  ".join(
             cell.ljust(width) if n in left else cell.rjust(width)
             for n, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
-        for row in rows
+        for row in (head, *([["-" * width for width in widths]] if rule else []), *body)
     ]

@@ -32,6 +32,8 @@ from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.estimator.settings import METHODS, bandwidth_of, recommended
+from jtqd.estimator.text import finite
+from jtqd.estimator.text import table_lines as aligned
 from jtqd.models.files import load_joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import without_known_effects
@@ -180,8 +182,8 @@ def to_mapping(
                 "what": row.what,
                 "run": row.run,
                 "unit": row.unit,
-                "rmse": [_finite(error) for error in row.errors],
-                "change": _finite(row.change),
+                "rmse": [finite(error) for error in row.errors],
+                "change": finite(row.change),
             }
             for row in rows
         ],
@@ -207,15 +209,7 @@ def table_lines(rows: Sequence[Row], files: Sequence[str]) -> list[str]:
         ]
         for row in rows
     ]
-    widths = [max(len(line[k]) for line in [head, *body]) for k in range(len(head))]
-    left = {0, 1, len(names) + 2}
-    return [
-        "  ".join(
-            cell.ljust(width) if k in left else cell.rjust(width)
-            for k, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in [head, ["-" * width for width in widths], *body]
-    ]
+    return aligned([head, *body], (0, 1, len(names) + 2), rule=True)
 
 
 def _rms(values: FloatArray) -> float:
@@ -232,10 +226,6 @@ def _together(errors: FloatArray, weights: FloatArray) -> float:
 
 def _number(value: float) -> str:
     return f"{value:.4g}" if math.isfinite(value) else "-"
-
-
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
 
 
 BY: Final = "jtq score"

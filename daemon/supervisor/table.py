@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from math import isfinite
 from types import TracebackType
 
 from rich.box import HEAVY_HEAD, Box
@@ -18,6 +17,7 @@ from jtqd.daemon.shared.events import OperatorLog, Priority
 from jtqd.daemon.shared.reasons import contact_of, contact_text
 from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
+from jtqd.estimator.text import number, percent
 
 COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
 """Style of a status; what is not here is bad news."""
@@ -112,17 +112,17 @@ class LiveTable:
         return table
 
 
-def _cells(number: int, joint: JointView) -> dict[str, str | Text]:
+def _cells(joint_number: int, joint: JointView) -> dict[str, str | Text]:
     """Return the cells of one joint."""
     name = NAMES.get(joint.status, str(joint.status))
     known = joint.status in PUBLISHED
     touched = contact_text(joint)
     return {
-        "joint": str(number),
-        "torque [Nm]": _number(joint.torque_nm) if known else "-",
-        "sigma [Nm]": _number(joint.sigma_nm) if known else "-",
-        "sensor [Nm]": _number(joint.reference_nm),
-        "error [Nm]": _number(joint.torque_nm - joint.reference_nm) if known else "-",
+        "joint": str(joint_number),
+        "torque [Nm]": number(joint.torque_nm) if known else "-",
+        "sigma [Nm]": number(joint.sigma_nm) if known else "-",
+        "sensor [Nm]": number(joint.reference_nm),
+        "error [Nm]": number(joint.torque_nm - joint.reference_nm) if known else "-",
         _CONTACT: Text(touched, style="bold red") if contact_of(joint) else touched,
         "status": Text(name, style=COLOURS.get(name, "bold red")),
     }
@@ -133,10 +133,9 @@ def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int, 
     p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
     counters = view.counters
     load = bus_load(previous, view, bitrate)
-    load_text = f"{100 * load:.1f} %" if isfinite(load) else "-"
     return (
         f"cycle {counters['cycles']}  work p50 {p50:.0f} us, p99 {p99:.0f} us, max {worst:.0f} us  "
-        f"missed {counters['missed']}  stale inputs {counters['stale_inputs']}  bus load {load_text}"
+        f"missed {counters['missed']}  stale inputs {counters['stale_inputs']}  bus load {percent(load)}"
         + (f"  contacts {counters['contacts']}" if contacts else "")
     )
 
@@ -154,15 +153,11 @@ def _plain(joint: JointView) -> str:
     touched = f", contact {contact_text(joint)}" if contact_of(joint) else ""
     if joint.status not in PUBLISHED:
         return name + touched
-    return f"{name} {_number(joint.torque_nm)} +- {_number(joint.sigma_nm)} Nm{touched}"
+    return f"{name} {number(joint.torque_nm)} +- {number(joint.sigma_nm)} Nm{touched}"
 
 
 def _with_unit(torque: str | Text) -> str:
     return "" if str(torque) == "-" else f"{torque} Nm "
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}" if isfinite(value) else "-"
 
 
 _TABLE_PERIOD_S = 0.2

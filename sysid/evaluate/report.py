@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.joint import QUADRANTS
-from jtqd.estimator.text import counted
+from jtqd.estimator.text import counted, table_lines
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.evaluation import Evaluation, RunRecord, Target, mse, worse_runs
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples
@@ -518,14 +518,8 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return lines with columns as wide as they must be; the first column to the left, the others to the right."""
-    every = [list(header), *map(list, rows)]
-    widths = [max(len(row[k]) for row in every) for k in range(len(header))]
-    lines = []
-    for row in every:
-        cells = [row[0].ljust(widths[0]), *(c.rjust(w) for c, w in zip(row[1:], widths[1:], strict=True))]
-        lines.append(("  " + "  ".join(cells)).rstrip())
-    return lines
+    """Return an indented table as lines."""
+    return [f"  {line}" for line in table_lines([header, *rows])]
 
 
 def _runs(result: Evaluation) -> list[str]:

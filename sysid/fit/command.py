@@ -15,6 +15,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.command_line import check_installed, check_output
+from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
 from jtqd.estimator.text import counted
@@ -39,7 +40,6 @@ from jtqd.sysid.fit.losses import PER_K_PRIOR
 from jtqd.sysid.fit.plateaus import PlateauRules, mean_temperature, plateaus_of
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
 from jtqd.sysid.report.figures import check_picture
-from jtqd.sysid.report.numbers import plain_values
 from jtqd.sysid.runs.channels import RunIssue
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, runs_of_joint

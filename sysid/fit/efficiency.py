@@ -27,6 +27,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Efficiency, Joint, QuadrantPolynomial
 from jtqd.estimator.losses import (
     BACKDRIVING_CURRENT_MAX_A,
@@ -39,7 +40,6 @@ from jtqd.estimator.losses import (
 from jtqd.estimator.text import table_lines
 from jtqd.sysid.fit.plateaus import Plateau, mean_temperature
 from jtqd.sysid.report.figures import plain
-from jtqd.sysid.report.numbers import plain_values
 from jtqd.sysid.runs.channels import RunIssue
 
 COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")

@@ -1,12 +1,9 @@
-"""Numbers as text, with as many digits as the interval supports; values for JSON."""
+"""Numbers of a report page: as many digits as the interval supports, units, a true minus and narrow spaces."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Any, Final
-
-import msgspec
+from typing import Final
 
 DASH: Final = "–"
 SPACE: Final = "\u00a0"
@@ -104,12 +101,3 @@ def _text(value: float, decimals: int) -> str:
 
 def _raised(power: int) -> str:
     return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-def plain_values(value: Any) -> Any:
-    """Return a value for JSON: dataclasses and mappings as dicts, keys as text, NaN and infinity as None."""
-    return msgspec.json.decode(msgspec.json.encode(value, enc_hook=_plain))
-
-
-def _plain(value: Any) -> Any:
-    return dict(value) if isinstance(value, Mapping) else value.item()
