@@ -34,7 +34,7 @@ SEEDS: Final = (3301, 3302, 3303)
 MUJOCO_SEED: Final = 3304
 NAMES: Final = frozenset({"schema", "verdict", "name", "joint", "axis", "unit", "class", "effect", "balance"})
 """Keys of findings.json whose texts are results; any other text is a sentence."""
-PLAIN: Final = frozenset({"unexplained", "outlier_runs", "one_sided"})
+PLAIN: Final = frozenset({"unexplained", "outlier_runs", "stability"})
 """Keys that repeat another one under the standard term."""
 
 
@@ -133,8 +133,9 @@ def findings(out: Path) -> Iterator[str]:
 
 
 def _undated(path: Path) -> str:
-    """Return a joint file without dates and paths."""
+    """Return a joint file without dates, paths and the sentence about the split."""
     text = re.sub(r"\d{4}-\d\d-\d\d(T[\d:.]+(Z|\+00:00)?)?", "DATE", path.read_text(encoding="utf-8"))
+    text = re.sub(r"(?m)^ *split: .*$", "", text)
     return text.replace(str(path.parent.parent), "").replace(str(path.parent), "")
 
 
