@@ -1,5 +1,5 @@
-"""The CANopen master in service, beside the loop: nodes that come and go, their configuration, errors, jtqd as a node.
+"""CANopen master in service, beside the loop: boots of nodes, their configuration, errors on the bus, jtqd as a node.
 
-In: frames of a socket of its own and the loop's snapshot. Out: boots, SDO requests, EMCY, conditions (`service` is the
-shell, the others are pure). May import `drivers`, `daemon.shared`, `daemon.config` and `daemon.core.estimate_pdo`.
+In: frames of a socket of its own and the loop's snapshot. Out: boots, SDO requests, EMCY, conditions. `service` has the
+socket and the clock; the other modules are pure.
 """

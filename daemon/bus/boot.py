@@ -1,7 +1,7 @@
-"""Boot of the nodes: the request, and nodes that restart, stop, appear or lose their configuration in service.
+"""Boot of the nodes: the request, and boots in service of nodes that restart, stop, appear or lose their configuration.
 
-They are configured before their data is used: one after the other, each by a boot process of its own beside the running
-loop; a node that fails is tried again later and keeps no other one waiting.
+A node is configured before its data is used: one after the other, each by a boot process of its own beside the running loop.
+A node that fails is tried again later and keeps no other one waiting.
 """
 
 from __future__ import annotations
@@ -96,10 +96,10 @@ def bus_load_of(config: Config) -> BusLoad:
 
 
 _RETRY_S, _LONGEST_RETRY_S = 0.5, 8.0
-_SAY_AGAIN_S = 60.0
-"""Between two lines that say the same about a boot that fails."""
+_REPEAT_LINE_S = 60.0
+"""Between two equal lines about a boot that fails."""
 _SETTLED_S = 0.3
-"""After its boot a node's last heartbeat may still say pre-operational."""
+"""After its boot a node's last heartbeat may still be that of pre-operational."""
 
 LogEvent = Callable[[str, int, str], None]
 """Takes topic, node and a line of an event."""
@@ -140,13 +140,13 @@ class ReturningNodes:
         self._requested: dict[int, str] = {}
         self._not_before: dict[int, float] = {}
         self._retry_s: dict[int, float] = {}
-        self._limit = RateLimit(_SAY_AGAIN_S)
+        self._limit = RateLimit(_REPEAT_LINE_S)
         self._in_error: set[int] = set()
 
-    def told(self, node: int, register: int) -> None:
+    def note_error(self, node: int, register: int) -> None:
         """Take the error register (1001h) of a node's EMCY.
 
-        A drive with an error of communication (a SYNC of somebody else, a master that it missed) may refuse to be started
+        A drive with an error of communication (a foreign SYNC, a master's heartbeat that it missed) may refuse to be started
         until it has been reset.
         """
         if register & COMMUNICATION:
@@ -174,18 +174,18 @@ class ReturningNodes:
 
         Args:
             view: last reading of the snapshot.
-            present: whether a node was heard of lately; nothing is started for one that is not there.
-            reader: tells the loop that a node may be believed (again).
+            present: whether a node was heard recently; no boot is started for one that is not there.
+            reader: reports to the loop that a node is configured.
             now_s: CLOCK_MONOTONIC.
         """
         if self._child is not None:
-            running = self._child.alive()  # asked first: its last answer is then there to be read
+            running = self._child.alive()  # before its answer is read: the last one is then complete
             answer = self._child.poll_answer()
             if answer is None and running:
                 return None
             node, self._child, self.busy = self.busy, None, 0
-            # One that has restarted meanwhile, but for the boot's own reset, may have lost what was written to it.
-            # Where the loop has heard fewer (a boot-up message was lost to it), its own count is what it compares with.
+            # A node that has restarted meanwhile, but for the boot's own reset, may have lost its configuration.
+            # Where the loop has counted fewer restarts (it missed a boot-up message), it compares with its own count.
             most, self._restarts = self._restarts + _boot_ups(answer, node), view.restarts[node]
             if view.restarts[node] > most:
                 self._refuse(
@@ -199,7 +199,7 @@ class ReturningNodes:
             if booted is None:
                 self._put_off(node, now_s)
                 return None
-            self._take_in(node, booted, reader, now_s)
+            self._adopt(node, booted, reader, now_s)
             return {"node": node, **booted}
         for node in self.waiting(view, now_s):
             if present(node):
@@ -210,7 +210,7 @@ class ReturningNodes:
     def _start(self, node: int, restarts: int) -> None:
         self.busy, self._restarts = node, restarts
         self._child = self._start_child("jtqd.drivers.boot", [], f"the boot of node {node}")
-        # A node that has just restarted needs no reset; one that could not be booted, or tells an error of it, may.
+        # A node that has just restarted needs no reset; one that could not be booted, or reports an error, may.
         reset = self._config.reset_communication and (node in self._retry_s or node in self._in_error)
         self._in_error.discard(node)
         self._child.send(boot_request(self._config, self._bus, only=node, reset=reset).as_json())
@@ -221,7 +221,7 @@ class ReturningNodes:
         self._retry_s[node] = min(2.0 * retry_s, _LONGEST_RETRY_S)
         self._not_before[node] = now_s + retry_s
 
-    def _take_in(self, node: int, booted: dict[str, Any], reader: SnapshotReader, now_s: float) -> None:
+    def _adopt(self, node: int, booted: dict[str, Any], reader: SnapshotReader, now_s: float) -> None:
         key = str(node)
         if key not in self._report["nodes"]:
             reader.note_factors(node, _factors(booted["scaling"]))

@@ -1,13 +1,12 @@
 """Errors on the bus: state of the CAN controller, EMCY of the nodes, and jtqd's own EMCY with 1001h and 1003h. Pure.
 
-`BusState` follows the error messages of the controller's driver. `EmcyLog` keeps what the nodes report. `OwnErrors` is the
-view of jtqd's conditions (`jtqd.daemon.shared.conditions`) as a CANopen node shows it.
+`BusState` follows the error messages of the controller's driver. `EmcyLog` keeps what the nodes report. `OwnErrors` shows
+jtqd's conditions (`jtqd.daemon.shared.conditions`) as those of a CANopen node.
 """
 
 from __future__ import annotations
 
 import struct
-from collections import deque
 from collections.abc import Iterable
 from math import inf
 from typing import NamedTuple
@@ -38,9 +37,9 @@ class BusChange(NamedTuple):
 class BusState:
     """State of the CAN controller and counts of one interface, from the error messages of its driver (linux/can/error.h).
 
-    The kernel's driver sends them as frames with CAN_ERR_FLAG to those who ask for them: error warning, error passive,
+    The kernel's driver sends them as frames with CAN_ERR_FLAG to sockets that ask for them: error warning, error passive,
     bus-off and restart, lost arbitration, missing acknowledge, protocol errors, overruns, and where it can the two error
-    counters. vcan and the unix hub make none by themselves, but carry those that somebody sends.
+    counters. vcan and the unix hub make none, but carry those that a node sends.
 
     Attributes:
         counts: by the names of `BUS_FIELDS`.
@@ -112,45 +111,30 @@ class BusState:
         return BusChange(before, state)
 
 
-DEPTH = 32
-"""Messages kept of each node."""
-
-
-class Kept(NamedTuple):
-    """One message in the history; `time_s` is CLOCK_MONOTONIC."""
-
-    time_s: float
-    emergency: Emergency
-
-
 class _Node:
     def __init__(self) -> None:
-        self.history: deque[Kept] = deque(maxlen=DEPTH)
+        self.last: Emergency | None = None
         self.count = 0
         self.limit = RateLimit()
 
 
 class EmcyLog:
-    """EMCY messages of these nodes: a bounded history of each, and few lines. A message of any other is passed over.
+    """EMCY messages of these nodes: the last one of each, how many, and few lines. Those of other nodes are ignored.
 
-    Every message is kept in the ring of its node and counted. There is a line at once for the first message of a code;
-    what repeats is counted and named in the next line, so that a storm is a few lines in five seconds.
+    There is a line at once for the first message of a code; repetitions are counted and mentioned in the next line, so that
+    a storm is a few lines in five seconds.
     """
 
     def __init__(self, nodes: Iterable[int]) -> None:
         self._nodes = {node: _Node() for node in nodes}
-        self.count = 0
-        """Messages of all nodes."""
 
     def receive(self, node: int, data: bytes, now_s: float) -> str | None:
         """Take a message and return the line to be logged, if any."""
         seen = self._nodes.get(node)
         if seen is None:
             return None
-        emergency = parse(data)
-        self.count += 1
+        seen.last = emergency = parse(data)
         seen.count += 1
-        seen.history.append(Kept(now_s, emergency))
         refused = seen.limit.admit((emergency.code, emergency.register), now_s)
         if refused is None:
             return None
@@ -158,18 +142,13 @@ class EmcyLog:
         what = "EMCY 0000h: error reset" if over else describe(emergency)
         return f"node {node}: {what}" + (f" ({refused} more before)" if refused else "")
 
-    def history(self, node: int) -> list[Kept]:
-        """Return the messages of a node, the oldest first, at most `DEPTH`."""
-        return list(self._nodes[node].history)
-
     def count_of(self, node: int) -> int:
         """Return the number of messages of a node."""
         return self._nodes[node].count
 
     def last(self, node: int) -> Emergency | None:
-        """Return its last message, or None."""
-        history = self._nodes[node].history
-        return history[-1].emergency if history else None
+        """Return the last message of a node, or None."""
+        return self._nodes[node].last
 
 
 _FIELD = struct.Struct("<HHB")
@@ -183,10 +162,10 @@ Error = tuple[int, int]
 
 
 class OwnErrors:
-    """Errors of jtqd's own node: what is present, 1001h, 1003h, and the EMCY messages, with inhibit time.
+    """Errors of jtqd's own node: those present, 1001h, 1003h, and the EMCY messages, with inhibit time.
 
-    An error is a code with a detail (which PDO, which node). There is one message when it comes and one when it has gone:
-    EMCY 0000h with the register of what is left; the manufacturer's field names code and detail:
+    An error is a code with a detail (which PDO, which node). There is one message when it occurs and one when it ends:
+    EMCY 0000h with the register of the errors that are still present. The manufacturer's field holds code and detail:
 
         bytes 0..1  error code, 0000h for an end
         byte  2     error register 1001h
@@ -194,8 +173,8 @@ class OwnErrors:
         bytes 5..6  detail: COB-ID or node-ID
         byte  7     joints concerned: bit 0 joint 1, bit 1 joint 2
 
-    Between two messages passes the inhibit time 1015h. What comes meanwhile waits, in order; an error that has come and
-    gone before its message could be sent has none, but it is in the history.
+    Between two messages passes the inhibit time 1015h. Errors that occur meanwhile wait, in order; one that has ended before
+    its message could be sent has none, but it is in the history.
 
     Args:
         store: its object dictionary; 1001h, 1003h and 1015h are kept and read there.
@@ -217,16 +196,17 @@ class OwnErrors:
         detail = emcy.detail + subject.number
         if change.present:
             joints = subject.joints if emcy.names_joints else 0
-            self.come(emcy.code, detail, joints=joints, register=emcy.register)
+            self.report(emcy.code, detail, joints=joints, register=emcy.register)
         else:
-            self.gone(emcy.code, detail)
+            self.reset(emcy.code, detail)
 
-    def present(self, code: int, detail: int = 0) -> bool:
-        """Return whether the error is present."""
-        return (code, detail) in self._present
+    @property
+    def present(self) -> list[Error]:
+        """The errors that are present, in order."""
+        return list(self._present)
 
-    def come(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> bool:
-        """Raise an error; return False if it is already present."""
+    def report(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> bool:
+        """Report an error as present; return False if it is already."""
         error = code, detail
         if error in self._present:
             return False
@@ -234,15 +214,13 @@ class OwnErrors:
         self._store.set_number(0x1001, 0, self.register)
         self._history.push(code | detail << 16)
         if error in self._sent:
-            self._queue.pop(
-                error, None
-            )  # its end had not been sent: nothing has changed for those who listen
+            self._queue.pop(error, None)  # its end had not been sent: nothing has changed for a receiver
         elif len(self._queue) < _WAITING:
             self._queue[error] = joints
         return True
 
-    def gone(self, code: int, detail: int = 0) -> bool:
-        """Clear an error; return False if it was not present."""
+    def reset(self, code: int, detail: int = 0) -> bool:
+        """Report the end of an error; return False if it was not present."""
         error = code, detail
         if error not in self._present:
             return False
@@ -254,9 +232,11 @@ class OwnErrors:
             self._queue.pop(error, None)
         return True
 
-    def happened(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> None:
+    def report_once(
+        self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION
+    ) -> None:
         """Report a single occurrence, such as a recovery from bus-off: an EMCY message and a history entry."""
-        if self.come(code, detail, joints=joints, register=register):
+        if self.report(code, detail, joints=joints, register=register):
             del self._present[code, detail]
             self._store.set_number(0x1001, 0, self.register)
 
@@ -274,10 +254,6 @@ class OwnErrors:
         if error in self._present:
             self._sent.add(error)
         return EMCY.pack(code, self.register | GENERIC, _FIELD.pack(0, detail & 0xFFFF, joints))
-
-    def all_present(self) -> list[Error]:
-        """Return every present error, in order."""
-        return list(self._present)
 
     @property
     def register(self) -> int:

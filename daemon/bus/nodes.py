@@ -1,4 +1,4 @@
-"""The nodes in service: heartbeats, who needs a boot and is there, and whether each is configured as at its boot.
+"""The nodes in service: their heartbeats, their configuration, and boots of those that need one.
 
 `NodeWatch` follows the heartbeats, `ConfigurationWatch` the objects of one node, and `NodeCare` joins them with the boots in
 service; it owns the SDO queues of the nodes. Pure but for the boot processes: replies and times in, requests out.
@@ -26,7 +26,7 @@ _WINDOW = 20
 _TWICE = 0.65
 """Share of the regular time in which a window may pass before there are two producers: with two it is a half."""
 _LATE = 5.0
-"""Heartbeats after which a reader was away for too long: what has queued up meanwhile says nothing about the rate."""
+"""Heartbeats after which a reader was away for too long: those that have queued up do not show the rate."""
 _OTHERS = 16
 """Foreign nodes that are logged."""
 
@@ -35,7 +35,7 @@ class NodeEvent(NamedTuple):
     """One event of a node.
 
     `kind`: lost, never, back, doubled and single begin and end conditions, with details in `text`; restarted, state,
-    malformed and foreign are events with a whole line, or "" where there were too many of late. `since_s`: when.
+    malformed and foreign are events with a whole line, or "" where there were too many. `since_s`: when.
     """
 
     kind: str
@@ -59,19 +59,18 @@ class _Watch:
 class NodeWatch:
     """Heartbeat consumers of all nodes (CiA 301, 7.2.8.3.2.2), with the boot timeout that the standard lacks.
 
-    A node is watched from the moment it is configured. One that is not heard within the timeout from then on is reported
-    as well as one that was heard and is not any more: a consumer that waits for the first heartbeat would never miss it.
-    What is not one byte, or has a state that does not exist, is counted and does not count as a heartbeat. Two producers
-    with one node-ID show by a rate of nearly twice what was configured.
+    A node is watched from the moment it is configured. One without a first heartbeat within the timeout is reported as one
+    that stops sending it: a consumer that waits for the first heartbeat would never miss it. A frame that is not one byte,
+    or has an unknown state, is counted as malformed. Two producers with one node-ID show by nearly twice the configured
+    rate.
 
     Args:
         nodes: their node-IDs.
-        known: other node-IDs that may be heard without a word (jtqd's own, the commander's).
+        known: other node-IDs that are not reported as foreign (jtqd's own, the commander's).
         heartbeat_s: what was written to 1017h.
         timeout_s: silence after which a node is lost; also how long it may take for its first heartbeat.
 
     Attributes:
-        lost_count: how often nodes were lost.
         malformed: heartbeats with a wrong length or an impossible state.
     """
 
@@ -82,7 +81,7 @@ class NodeWatch:
         self._known = set(known)
         self._heartbeat_s, self._timeout_s = heartbeat_s, timeout_s
         self._ticked_s = inf
-        self.lost_count = self.malformed = 0
+        self.malformed = 0
 
     def watch(self, node: int, now_s: float) -> None:
         """Start monitoring a node that has been configured and started."""
@@ -145,7 +144,6 @@ class NodeWatch:
             never = watch.state == WAITING
             watch.state, watch.lost_s = LOST, max(watch.heard_s, watch.since_s)
             watch.window.clear()
-            self.lost_count += 1
             kind, text = ("never", " since its boot") if never else ("lost", "")
             events.append(NodeEvent(kind, node, f"{self._timeout_s:g} s{text}", watch.lost_s))
         return events
@@ -192,7 +190,7 @@ _MODE_DISPLAY = 0x6061
 
 @dataclass(frozen=True)
 class Check:
-    """One object, the bits of it that count, and what they must be (None: whatever they are at first)."""
+    """One object, the bits of it that count, and their expected value (None: the first one that is read)."""
 
     index: int
     subindex: int
@@ -208,7 +206,7 @@ CHANGED = "its configuration was changed "
 
 
 class ConfigurationMismatch(NamedTuple):
-    """What a reading has shown: with `changed`, the node is not to be used before a new boot; else it is only logged."""
+    """Result of a reading: with `changed`, the node is not used until its next boot; else it is only logged."""
 
     changed: bool
     text: str
@@ -232,14 +230,14 @@ def checks_of(node: Mapping[str, Any]) -> list[Check]:
 class ConfigurationWatch:
     """Whether one node is still configured as at its boot: `next` is the object to be read, `result` takes its value.
 
-    A node with 1020h shows whether anybody has written to its configuration: the object holds the signature that the boot
-    wrote, until somebody does (CiA 301). It need not cover the scaling, and a value may change by other ways than an SDO. So
-    all objects are read, one after the other and again from the beginning, that the meaning of its PDOs depends on
-    (`jtqd.drivers.boot_node`): COB-ID, transmission type and mapping of the TPDOs, rated current, encoder resolutions,
-    gear ratio, the sensor's unit and decimals. The signature is read between them, in every `SIGNATURE_EVERY`th reading.
+    1020h, where a node has it, shows a write to its configuration: it holds the signature of the boot until then (CiA 301).
+    It need not cover the scaling, and a value may change by other ways than an SDO. So all objects on which the meaning of
+    its PDOs depends are read cyclically (`jtqd.drivers.boot_node`): COB-ID, transmission type and mapping of the TPDOs,
+    rated current, encoder resolutions, gear ratio, the sensor's unit and decimals. Every `SIGNATURE_EVERY`th reading is
+    that of the signature.
 
-    A signature that is gone while these are unchanged is somebody else's business (the commander maps RPDOs) and is logged
-    once. The mode of operation that a drive displays (6061h) means nothing for the estimate; a change of it is logged.
+    A signature that is gone while these are unchanged (the commander maps RPDOs) is logged once. The mode of operation that
+    a drive displays (6061h) does not affect the estimate; a change of it is logged.
 
     Args:
         report: the node's part of the boot report.
@@ -304,25 +302,25 @@ class ConfigurationWatch:
 _CHECK_S = 0.1
 """Between two objects read to check a node's configuration: two frames, 0.27 % of 1 Mbit/s at most."""
 _PROBE_S = 0.25
-"""Between two questions whether a node that needs a boot is there."""
+"""Between two requests to a node that needs a boot, whether it answers."""
 _PRESENT_S = 1.0
 _OTHERS_S = 1.0
-"""A node whose SDO server somebody else uses (it serves one client) is not asked for so long."""
+"""A node whose SDO server another client uses (it serves one) is not read for so long."""
 _SDO_TIMEOUT_S = 0.3
 
 
 class NodeCare:
-    """Call `turn` often, and the others for what arrives.
+    """Call `turn` often, and the other methods for what arrives.
 
     Args:
         nodes: silence of each node-ID after which an SDO request is repeated [s].
-        reader: tells the loop which nodes may be believed.
+        reader: reports to the loop which nodes are configured.
         returning: boots nodes.
-        heartbeats: who is heard; nodes are watched from their boot on.
+        heartbeats: of the nodes, watched from their boot on.
         log: takes topic, node and line of an event.
 
     Attributes:
-        changed: nodes that are configured otherwise than at their boot, and what has shown it.
+        changed: nodes that are configured otherwise than at their boot, and how that shows.
     """
 
     def __init__(
@@ -343,16 +341,6 @@ class NodeCare:
         self._check_due = self._probe_due = self._boot_ended = 0.0
         self._check_turn = 0
         self.changed: dict[int, str] = {}
-
-    @property
-    def busy(self) -> int:
-        """Return the node that is being booted, or 0."""
-        return self._returning.busy
-
-    @property
-    def absent(self) -> set[int]:
-        """Return the optional nodes that have not been configured yet."""
-        return self._returning.absent
 
     def is_booting(self, now_s: float) -> bool:
         """Return whether a boot is running or has just ended, so that NMT commands may belong to it."""
@@ -375,13 +363,9 @@ class NodeCare:
         self._checks[node] = ConfigurationWatch(report)
 
     def restarted(self, node: int) -> None:
-        """Take a boot-up message: there is no configuration to check, and no error of before it."""
+        """Take a boot-up message: the node has neither a configuration to be checked nor an error."""
         self._checks.pop(node, None)
-        self._returning.told(node, 0)
-
-    def told(self, node: int, register: int) -> None:
-        """Take the error register of a node's EMCY."""
-        self._returning.told(node, register)
+        self._returning.note_error(node, 0)
 
     def turn(self, view: View, now_s: float) -> list[tuple[int, bytes]]:
         """Return the SDO request that is due, as (node, request)."""

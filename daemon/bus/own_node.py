@@ -1,7 +1,7 @@
 """jtqd as a CANopen node (20h): its object dictionary, readable by any master.
 
-The loop sends the node's PDO and heartbeat; this part answers SDO requests from the snapshot, from what the supervisor sees
-of the bus, and from the configuration. It runs in the supervisor, so that no SDO client can delay a cycle.
+The loop sends the node's PDO and heartbeat. This module answers SDO requests from the snapshot, the state of the bus and the
+configuration. It runs in the supervisor, so that no SDO client can delay a cycle.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class OwnNode:
         if config.sensor is not None:
             self._watched[self._room + 1] = config.sensor.node_id
         self._connect_objects()
-        self.set_parameters(config)
+        self._set_parameters(config)
 
     def answer(self, request: bytes) -> bytes | None:
         """Return the SDO answer to a frame 600h + node-ID, or None."""
@@ -141,8 +141,8 @@ class OwnNode:
             return contact_pdo.field(nan, nan, _UNKNOWN)[part]
         last = view.joints[joint]
         there = last.input_flags & FLAG_CONTACT
-        told = _CONTACT if there else _NONE if last.input_flags & FLAG_CONTACT_KNOWN else _UNKNOWN
-        return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, told)[part]
+        known = _CONTACT if there else _NONE if last.input_flags & FLAG_CONTACT_KNOWN else _UNKNOWN
+        return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, known)[part]
 
     def _contacts(self, pair: int) -> int:
         """Return the contact byte of the PDO that begins with joint `pair`."""
@@ -176,7 +176,7 @@ class OwnNode:
         code, register, count = self.emergencies(node)
         return min(count, 0xFF) << 24 | register << 16 | code
 
-    def set_parameters(self, config: Config) -> None:
+    def _set_parameters(self, config: Config) -> None:
         """Write the configuration to the objects that show it."""
         store = self._store
         store.set_text(0x100A, 0, VERSION)

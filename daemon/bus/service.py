@@ -1,7 +1,7 @@
-"""Duties on the bus beside the loop: own node, EMCY, heartbeats, bus state, nodes that return, checks in service.
+"""Bus service beside the loop: jtqd's own node, EMCY, heartbeats, bus state, nodes that return, checks in service.
 
-Runs in the supervisor, on a frame socket of its own. No frame of a cycle passes here, and nothing here can delay one. The
-parts are pure and tested by themselves; this one only moves frames, times and lines between them.
+It runs in the supervisor, on a frame socket of its own: no frame of a cycle passes here, and nothing here can delay one. It
+moves frames, times and lines between the other modules of this package.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ _HEARTBEATS = ("not watched", "awaited", "heard", "lost")
 
 
 class BusReport:
-    """Keeps `bus.json` in `directory`: what the supervisor sees of the bus, replaced as a whole when something has changed.
+    """Keeps `bus.json` in `directory`: the bus as the supervisor sees it, replaced as a whole when it has changed.
 
         {"state": "error active", "counts": {2205h by name}, "foreign_nmt": 0,
          "nodes": {"1": {"heartbeat": "heard", "emcy": 2, "last_emcy": "EMCY 2310h (...)", "absent": false, "sdo": {...}}},
          "errors": [{"code": "8250h", "name": "RPDO timeout", "detail": "181h"}], "error_register": 17}
 
-    What cannot be written is left out, as nothing depends on it.
+    A write that fails is ignored, as nothing depends on the file.
     """
 
     def __init__(self, directory: Path) -> None:
@@ -80,12 +80,12 @@ def content(service: BusService) -> dict[str, Any]:
             "heartbeat": _HEARTBEATS[state],
             "emcy": service.emergencies.count_of(node),
             "last_emcy": None if last is None else describe(last),
-            "absent": node in service.care.absent,
+            "absent": node in service.returning.absent,
             "sdo": service.care.sdo_counts(node),
         }
     errors = [
         {"code": f"{code:04X}h", "name": name_of(code), "detail": f"{detail:03X}h"}
-        for code, detail in service.errors.all_present()
+        for code, detail in service.errors.present
     ]
     return {
         "state": STATE_NAMES[service.bus.state],
@@ -99,7 +99,7 @@ def content(service: BusService) -> dict[str, Any]:
 
 
 _BATCHES = 8
-"""Calls of `receive` in one turn: a storm of frames waits in the kernel's queue, and what overflows there is counted."""
+"""Calls of `receive` in one turn: a storm of frames waits in the kernel's queue, whose overflow is counted."""
 _REPORT_S = 0.5
 
 _BUS_CONDITIONS = {WARNING: "bus_warning", PASSIVE: "bus_passive", BUS_OFF: "bus_off", DOWN: "bus_down"}
@@ -155,7 +155,7 @@ class BusService:
         reader: snapshot of the loop.
         store: object dictionary of the own node.
         returning: boots nodes in service.
-        conditions: take what is observed here; each change of one that has a code is an EMCY.
+        conditions: updated from here; each change of one that has a code is an EMCY.
         log: takes topic, node and line of an event.
         directory: where `bus.json` is kept up to date; None: nowhere.
     """
@@ -193,6 +193,7 @@ class BusService:
             lambda node: self.care.state(node, self._view),
             self._emergency,
         )
+        self.returning = returning
         self.care = NodeCare(sdo_timeouts_s(config), reader, returning, self.heartbeats, log)
         self._limit = RateLimit()
         self._report_due = 0.0
@@ -299,7 +300,7 @@ class BusService:
             self._log("emcy", node, line)
         last, subject = self.emergencies.last(node), self._subjects.get(node)
         if last is not None:
-            self.care.told(node, last.register)
+            self.returning.note_error(node, last.register)
         if last is not None and subject is not None:
             error = last.code != emcy.NO_ERROR or last.register != 0
             self._conditions.update("node_error", subject, error, now_s, describe(last))
@@ -326,7 +327,7 @@ class BusService:
             superseded = after != ACTIVE
             self._conditions.update(name, THE_BUS, state == after, now_s, text, superseded=superseded)
         if before == BUS_OFF and after == ACTIVE:
-            self.errors.happened(emcy.BUS_OFF_RECOVERED)
+            self.errors.report_once(emcy.BUS_OFF_RECOVERED)
 
     # Nodes ----------------------------------------------------------------------------------------------------------------
 
@@ -341,11 +342,11 @@ class BusService:
             if (
                 kind in _NODE_LINES
                 and text
-                and not (kind in ("restarted", "state") and node == self.care.busy)
+                and not (kind in ("restarted", "state") and node == self.returning.busy)
             ):
                 self._log("heartbeat", node, text)
 
-    # What the own node shows ----------------------------------------------------------------------------------------------
+    # Own node ----------------------------------------------------------------------------------------------
 
     def _emergency(self, node: int) -> tuple[int, int, int]:
         last = self.emergencies.last(node)

@@ -524,7 +524,7 @@ class Supervisor:
                 reader.note_alive()
                 view, now = reader.read(), time.monotonic()
                 self._health.observe(
-                    view, now, absent=self._bus_service.care.absent, cycles_lost=node.recorder_lost
+                    view, now, absent=self._bus_service.returning.absent, cycles_lost=node.recorder_lost
                 )
                 self._stolen.observe(now)
                 self._serve(view, now)

@@ -155,7 +155,7 @@ def test_an_absent_optional_sensor_is_said_and_configured_when_it_appears(tmp_pa
     with MasterBench(tmp_path, with_sensor=False) as bench:
         assert bench.said("node 3: no answer to SDO 1000h:0")
         assert bench.said("it is optional")
-        assert 3 in bench.service.care.absent
+        assert 3 in bench.service.returning.absent
         bench.pause(1.0)
         assert not bench.children, "nobody is booted that is absent"
         probes = [data for can_id, data in bench.heard if can_id == 0x603]
@@ -166,7 +166,7 @@ def test_an_absent_optional_sensor_is_said_and_configured_when_it_appears(tmp_pa
         assert bench.sensor.parameters.tpdos() == [sensor_tpdo1(3)]
         assert bench.sensor.state == 5
         assert bench.snapshot.factors(3) == (0.001, 0.0, 0.0, 0.0)
-        assert 3 not in bench.service.care.absent
+        assert 3 not in bench.service.returning.absent
         bench.pause(0.4)
         assert bench.sdo(0x2206, 3) >> 8 & 0xFF == 2, "and watched from now on"
 

@@ -105,7 +105,7 @@ def test_a_node_that_tells_an_error_of_communication_is_reset_at_once(
 ) -> None:
     """And not once more at the boot after it."""
     for register in registers:
-        case.nodes.told(1, register)
+        case.nodes.note_error(1, register)
     case.nodes.request(1, "changed")
     case.run(0.1)
     assert case.boot.request["reset"] is reset
@@ -189,7 +189,7 @@ def test_where_resets_are_switched_off_a_boot_that_failed_resets_nothing(
     tmp_path: Path, config: Config
 ) -> None:
     case = Case(tmp_path, replace(config, reset_communication=False))
-    case.nodes.told(1, 0x11)
+    case.nodes.note_error(1, 0x11)
     case.nodes.request(1, "changed")
     case.now[1] = None
     for _ in range(2):
