@@ -78,7 +78,7 @@ JOINT_PARAMETERS = (
 def estimate_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
     """180h+20h: the estimate of joints 1 and 2; with more than two joints also 280h+20h: of joints 3 and 4.
 
-    2100h..2103h and 2105h of jtqd.eds and jtqd4.eds. The second half of an odd joint's PDO says that there is none.
+    2100h..2103h and 2105h of jtqd.eds and jtqd4.eds. The second half of an odd joint's PDO is that of no joint.
     """
     return tuple(
         _estimate_tpdo(pair, base + node)

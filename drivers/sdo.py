@@ -221,7 +221,7 @@ class Transfer:
 
     def _uploaded_segment(self, specifier: int, reply: bytes) -> bool:
         if specifier != _SEGMENT_UPLOADED:
-            return False  # the initiate answer once more, or one to somebody else's download
+            return False  # the initiate answer once more, or one to another client's download
         if reply[0] & TOGGLE != self._toggle:
             raise TransferError(TOGGLE_NOT_ALTERNATED)
         self.value += reply[1 : 8 - (reply[0] >> 1 & 7)]

@@ -105,7 +105,7 @@ class _Running:
 
 
 class _Answering(_Running):
-    """Test nodes that answer what arrives; `extra` gives frames that somebody else sends."""
+    """Test nodes that answer what arrives; `extra` gives frames of other nodes."""
 
     def __init__(self, nodes: list[TestNode]) -> None:
         super().__init__()

@@ -1,16 +1,16 @@
-"""Boot against emulated nodes: the way it goes, and each thing that goes wrong with the message it gets."""
+"""Boot against emulated nodes (CiA 302-2): the way it goes, and each thing that goes wrong with the message it gets."""
 
 import dataclasses
 import json
 import subprocess
 import sys
-import time
 
 import pytest
 
 from jtqd.drivers.boot import RequestError, parse_request
-from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot
+from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot, signature
 from jtqd.drivers.drive import DriveProfile, Temperature, drive_tpdo1, drive_tpdo2, drive_tpdo3
+from jtqd.drivers.frame import FRAME
 from jtqd.drivers.object_dictionary import Identity
 from jtqd.drivers.pdo import PdoParameters
 from jtqd.drivers.sensor import SensorProfile, sensor_tpdo1, sensor_tpdo2
@@ -22,6 +22,7 @@ NODES = [
     {"node": 2, "kind": "drive", "identity": {"serial": 22}},
     {"node": 3, "kind": "sensor", "channels": [1]},
 ]
+OPTIONAL_SENSOR = [*NODES[:2], {**NODES[2], "mandatory": False}]
 REQUEST = {
     "bus": "virtual",
     "answer_timeout_s": 0.2,
@@ -32,7 +33,7 @@ REQUEST = {
 
 
 class Bench:
-    """Three nodes in a hub."""
+    """Three nodes in a hub; `extra` gives frames of others, `heard` has all frames."""
 
     def __init__(self, directory):
         self._path = str(directory / "hub")
@@ -40,13 +41,18 @@ class Bench:
         self.sensor = TestNode(sensor_store(3))
         self.nodes = [self.drive1, self.drive2, self.sensor]
         self.drive2.store.set_number(0x1018, 4, 22)
-        self.extra = list
+        self.extra, self.heard = list, []
 
     def boot(self, **changes):
         responder = HubResponder(self._path, self.nodes)
         responder.extra = self.extra
+        responder.hub.attach(self._hear)
         with responder:
             return boot_all({**REQUEST, "bus": f"unix:{self._path}", **changes})
+
+    def _hear(self, frame16, _stamp_ns):
+        can_id, length, data = FRAME.unpack(frame16)
+        self.heard.append((can_id, data[:length]))
 
     def fails(self, **changes):
         with pytest.raises(BootError) as caught:
@@ -57,6 +63,32 @@ class Bench:
 @pytest.fixture
 def bench(tmp_path):
     return Bench(tmp_path)
+
+
+def remove(node, *keys):
+    """Take objects out of a node's dictionary."""
+    store = node.store
+    for key in keys:
+        del store.entries[key]
+    store._indices.clear()
+    store._indices.update(index for index, _ in store.entries)
+
+
+def change_access(node, key, access):
+    node.store.entries[key] = dataclasses.replace(node.store.entries[key], access=access)
+
+
+def once(frame, condition=lambda: True):
+    """Frames of another node: this one, when `condition()` is true for the first time."""
+    sent = []
+
+    def extra():
+        if sent or not condition():
+            return []
+        sent.append(1)
+        return [frame]
+
+    return extra
 
 
 def test_three_nodes_end_operational_and_mapped(bench):
@@ -75,39 +107,27 @@ def test_three_nodes_end_operational_and_mapped(bench):
     assert report.nodes[3].scaling.nm_per_unit == {1: pytest.approx(1e-3)}
 
 
-class Ear:
-    """Hears what the boot sends, and says nothing."""
-
-    def __init__(self):
-        self.heard = []
-
-    def frames(self, can_id, data):
-        self.heard.append((can_id, data))
-        return []
-
-    def beat(self, _now):
-        return []
-
-
-def test_the_master_s_heartbeat_runs_and_all_are_reset_before_anything_is_asked(bench):
+def test_the_masters_boot_up_message_and_heartbeat_come_first_then_resets_then_requests(bench):
     """A drive that watches its master would miss it, and one whose master has ended refuses to be started."""
-    ear = Ear()
-    bench.nodes.append(ear)
-    bench.boot(reset=True)
-    boot_up, asked = (
-        ear.heard.index((0x720, b"\0")),
-        [n for n, each in enumerate(ear.heard) if each[0] > 0x600],
-    )
-    resets = [ear.heard.index((0x000, bytes([130, node]))) for node in (1, 2, 3)]
-    start = ear.heard.index((0x000, bytes([1, 1])))
-    beats = [n for n, each in enumerate(ear.heard) if each == (0x720, b"\x7f")]
-    requests = [n for n in asked if ear.heard[n][0] < 0x680]
-    assert boot_up < beats[0] < requests[0] < start
-    assert boot_up < min(resets) <= max(resets) < requests[0]
+    bench.boot()
+    heard = bench.heard
+    boot_up, start = heard.index((0x720, b"\0")), heard.index((0x000, bytes([1, 1])))
+    resets = [heard.index((0x000, bytes([0x82, node]))) for node in (1, 2, 3)]
+    beats = [n for n, each in enumerate(heard) if each == (0x720, b"\x7f")]
+    requests = [n for n, (can_id, _) in enumerate(heard) if 0x600 < can_id < 0x680]
+    first_write = next(n for n, (can_id, data) in enumerate(heard) if can_id == 0x601 and data[0] != 0x40)
+    assert boot_up < min(resets) <= max(resets) < requests[0] < first_write < start
+    assert boot_up < beats[0] < requests[0]
     assert len([n for n in beats if n < start]) >= 3
-    ear.heard.clear()
+    orders = [data for can_id, data in heard if can_id == 0x000]
+    assert orders[:4] == [b"\x82\x01", b"\x82\x02", b"\x82\x03", b"\x80\x01"]
+
+
+def test_without_the_reset_the_nodes_are_only_stopped(bench):
     bench.boot(reset=False)
-    assert not [data for can_id, data in ear.heard if can_id == 0 and data[0] in (129, 130)]
+    orders = [data for can_id, data in bench.heard if can_id == 0x000]
+    assert orders[0] == b"\x80\x01"
+    assert not any(data[0] in (0x81, 0x82) for data in orders)
 
 
 def test_second_channel_is_mapped_when_used(bench):
@@ -116,11 +136,16 @@ def test_second_channel_is_mapped_when_used(bench):
     assert bench.drive1.requests == []  # one node alone can be booted again
 
 
-def test_hash_says_whether_the_configuration_is_the_same(bench):
-    first = bench.boot().nodes[1].configuration_sha256
-    assert bench.boot().nodes[1].configuration_sha256 == first
+def test_the_hash_and_its_signature_change_with_the_configuration(bench):
+    first = bench.boot()
+    sha256 = first.nodes[1].configuration_sha256
+    written = [each[1:4] for each in bench.drive1.requests if each[0] >> 5 == 1]
+    assert written[-2:] == [b"\x20\x10\x01", b"\x20\x10\x02"], "last, when all is in place"
+    assert tuple(bench.drive1.store.number(0x1020, sub) for sub in (1, 2)) == signature(sha256)
+    assert (first.nodes[1].signed, first.nodes[3].signed) == (True, False)
+    assert bench.boot().nodes[1].configuration_sha256 == sha256
     bench.drive1.store.set_number(0x6075, 0, 4000)
-    assert bench.boot().nodes[1].configuration_sha256 != first
+    assert bench.boot().nodes[1].configuration_sha256 != sha256
 
 
 def test_mapping_is_written_in_the_order_of_cia_301():
@@ -159,14 +184,33 @@ def test_mapping_is_written_in_the_order_of_cia_301():
     ]
 
 
-def test_temperature_is_mapped_where_it_is_asked_for(bench):
-    bench.drive1.store.set_number(0x1802, 5, 0)  # left without its timer, and off, by somebody else
+@pytest.mark.parametrize("behaviour", [0, 1, 2, None])
+def test_error_behaviour_is_written_and_read_back_or_left_alone(bench, behaviour):
+    for node in bench.nodes:
+        node.store.set_number(0x1029, 1, ((behaviour or 0) + 1) % 3)
+    bench.boot(error_behaviour=behaviour)
+    assert [node.store.number(0x1029, 1) for node in bench.nodes] == [
+        1 if behaviour is None else behaviour
+    ] * 3
+
+
+def test_1019h_is_written_only_where_it_differs(bench):
+    for overflow, writes in ((0, 0), (240, 1)):
+        bench.boot(sync={"counter_overflow": overflow})
+        written = [request for request in bench.drive1.requests if request[:3] == bytes.fromhex("2f 19 10")]
+        assert len(written) == writes
+
+
+# Temperature ------------------------------------------------------------------------------------------------
+
+
+def test_temperature_is_mapped_where_it_is_configured(bench):
+    bench.drive1.store.set_number(0x1802, 5, 0)  # left without its timer, and off, by another master
     bench.drive1.store.set_number(0x1802, 1, 0xC0000381)
     nodes = [{"node": 1, "kind": "drive", "temperature": {}}, {"node": 2, "kind": "drive"}]
     report = bench.boot(nodes=nodes)
-    one, two = bench.drive1.parameters, bench.drive2.parameters
-    assert one.tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
-    assert two.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
+    assert bench.drive1.parameters.tpdos() == [drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1)]
+    assert bench.drive2.parameters.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
     assert bench.drive1.store.number(0x1802, 5) == 500
     assert report.nodes[1].tpdos == (drive_tpdo1(1), drive_tpdo2(1), drive_tpdo3(1))
     cold = report.nodes[1].configuration_sha256
@@ -185,12 +229,12 @@ def test_a_temperature_in_another_object_is_mapped_as_3001h_would_be(bench):
     assert bench.drive1.parameters.tpdos()[2].words == (0x2040_0110,)
     assert (store.number(0x1802, 3), store.number(0x1802, 5)) == (5000, 500)
     own["index"] = 0x2041
-    with pytest.raises(BootError, match="2041h:1 joint temperature: expected a value"):
-        bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": own}])
+    error = bench.fails(nodes=[{"node": 1, "kind": "drive", "temperature": own}])
+    assert "2041h:1 joint temperature: expected a value" in str(error)
 
 
 def test_a_node_without_an_inhibit_time_is_mapped_all_the_same(bench):
-    del bench.drive1.store.entries[0x1802, 3]
+    remove(bench.drive1, (0x1802, 3))
     bench.boot(nodes=[{"node": 1, "kind": "drive", "temperature": {}}])
     assert bench.drive1.parameters.tpdos()[2] == drive_tpdo3(1)
 
@@ -229,16 +273,29 @@ def test_a_late_answer_to_another_request_is_not_taken(bench):
         return reply
 
     bench.drive1.answer = wrong_index
-    bench.boot()
+    bench.boot(nodes=[{**NODES[0], "sdo_timeout_ms": 50}, *NODES[1:]])
     assert bench.drive1.requests.count(bytes.fromhex("23 00 1A 01 20 00 64 60")) == 2  # asked again
     assert bench.drive1.parameters.tpdos()[0] == drive_tpdo1(1)
 
 
-def test_wrong_device_type(bench):
-    bench.drive1.store.set_number(0x1000, 0, 0x00020194)
-    error = bench.fails()
-    assert "node 1: 1000h:0 device type: expected profile 402 (0x....0192), found 0x00020194" in str(error)
-    assert error.letter == "C"
+@pytest.mark.parametrize(
+    ("node", "key", "value", "text"),
+    [
+        (
+            1,
+            (0x1000, 0),
+            0x20194,
+            "device type: expected profile 402 (0x....0192), found 0x00020194 (status C)",
+        ),
+        (1, (0x1005, 0), 0x90, "COB-ID SYNC: expected 080h, found 0x00000090"),
+        (2, (0x6091, 2), 0, "gear ratio driving shaft revolutions: expected 1..2147483648, found 0"),
+        (2, (0x6075, 0), 0, "motor rated current in mA: expected 1..1000000, found 0"),
+        (3, (0x6112, 1), 0, "channel operating mode: expected 1 (normal operation), found 0"),
+    ],
+)
+def test_a_wrong_value_is_named(bench, node, key, value, text):
+    bench.nodes[node - 1].store.set_number(*key, value)
+    assert str(bench.fails()) == f"node {node}: {key[0]:04X}h:{key[1]} {text}"
 
 
 @pytest.mark.parametrize(
@@ -257,139 +314,139 @@ def test_wrong_identity(bench, subindex, key, name, letter):
     assert str(error) == f"node 2: {expected}"
 
 
-def test_refused_mapping(bench):
-    def refuse(request, reply):
-        if request[:4] == bytes.fromhex("23 00 1A 01"):
-            return bytes.fromhex("80 00 1A 01 41 00 04 06")
-        return reply
-
-    bench.drive1.answer = refuse
-    error = bench.fails()
-    said = str(error)
-    assert said.startswith(
-        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h); "
-    )
-    assert (
-        "no TPDO carries 60E4h:1 (link position), 6078h:0 (current), 6041h:0 (statusword); TPDO1 carries"
-        in said
-    )
-    assert error.letter == "J"
-
-
-def test_what_was_written_before_a_refusal_is_put_back(bench):
-    """TPDO1 was mapped, and the second entry of TPDO2 is refused: entries, numbers, types and COB-IDs are as before."""
-
-    def objects():
-        store = bench.drive1.store
-        keys = [(0x1A00 + n, sub) for n in range(3) for sub in range(3)]
-        keys += [(0x1800 + n, sub) for n in range(3) for sub in (1, 2)]
-        return {key: store.number(*key) for key in keys}
-
-    store = bench.drive1.store
-    store.set_number(0x1A00, 0, 1)
-    store.set_number(0x1A00, 1, 0x6041_0010)
-    store.set_number(0x1A01, 0, 2)
-    store.set_number(0x1A01, 1, 0x6061_0008)
-    store.set_number(0x1A01, 2, 0x6077_0010)
-    store.set_number(0x1800, 2, 255)
-    before = objects()
-
-    store.entries[0x1A01, 2] = dataclasses.replace(store.entries[0x1A01, 2], access="ro")
-    assert "no TPDO carries 6064h:0" in str(bench.fails())
-    assert objects() == before
-
-
-def test_mapping_that_reads_back_different(bench):
-    bench.drive1.store.on_read(0x1A01, 2, lambda: 0x60770010)
-    error = bench.fails()
-    expected = "mapping entry read back: expected 0x60780010, found 0x60770010"
-    assert str(error) == f"node 1: 1A01h:2 {expected} (status J)"
-
-
-def test_transmission_type_that_does_not_stick(bench):
-    bench.drive1.store.on_read(0x1800, 2, lambda: 255)
-    assert "1800h:2 transmission type read back: expected 0x01, found 0xFF" in str(bench.fails())
-
-
-def test_a_drive_without_the_temperature_that_is_asked_for(bench):
-    del bench.drive2.store.entries[0x3001, 0]
-    bench.drive2.store._indices.discard(0x3001)
-    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "temperature": {}}])
-    assert str(error) == (
-        "node 2: 3001h:0 joint temperature: expected a value (required by the configuration), "
-        "found no such object (status J)"
-    )
-    assert bench.drive2.store.number(0x1A00, 1) != drive_tpdo1(2).words[0], "found before anything is written"
-    bench.boot(nodes=[{"node": 2, "kind": "drive"}])
+@pytest.mark.parametrize(("present", "letter"), [(True, "H"), (False, "G")])
+def test_another_software_version(bench, present, letter):
+    if not present:
+        remove(bench.drive1, (0x100A, 0))
+    node = {"node": 1, "kind": "drive", "identity": {"software": "2.7"}}
+    found = "1.0" if present else "no such object"
+    expected = f"node 1: 100Ah:0 software version: expected 2.7, found {found} (status {letter})"
+    assert str(bench.fails(nodes=[node])) == expected
+    if present:
+        bench.boot(nodes=[{**node, "identity": {"software": "1.0"}}])
 
 
 @pytest.mark.parametrize(
     ("key", "value", "text"),
     [
-        ((0x1A02, 1), 0x30010020, "1A02h:1 mapping entry read back: expected 0x30010010, found 0x30010020"),
-        ((0x1802, 2), 1, "1802h:2 transmission type read back: expected 0xFF, found 0x01"),
-        ((0x1802, 3), 0, "1802h:3 inhibit time in 100 us read back: expected 0x1388, found 0x0000"),
-        ((0x1802, 5), 0, "1802h:5 event timer in ms read back: expected 0x01F4, found 0x0000"),
+        ((0x1A01, 2), 0x60770010, "mapping entry read back: expected 0x60780010, found 0x60770010"),
+        ((0x1800, 2), 255, "transmission type read back: expected 0x01, found 0xFF"),
+        ((0x1A02, 1), 0x30010020, "mapping entry read back: expected 0x30010010, found 0x30010020"),
+        ((0x1802, 2), 1, "transmission type read back: expected 0xFF, found 0x01"),
+        ((0x1802, 3), 0, "inhibit time in 100 us read back: expected 0x1388, found 0x0000"),
+        ((0x1802, 5), 0, "event timer in ms read back: expected 0x01F4, found 0x0000"),
+        ((0x1020, 1), 0, "configuration signature read back: expected 0x"),
     ],
 )
-def test_a_temperature_that_is_not_taken_as_written(bench, key, value, text):
+def test_a_value_that_is_not_kept(bench, key, value, text):
     bench.drive1.store.on_read(*key, lambda: value)
     error = bench.fails(nodes=[{"node": 1, "kind": "drive", "temperature": {}}])
-    assert str(error) == f"node 1: {text} (status J)"
+    assert str(error).startswith(f"node 1: {key[0]:04X}h:{key[1]} {text}")
+    assert error.letter == "J"
 
 
-def test_zero_gear_ratio_and_rated_current(bench):
-    bench.drive2.store.set_number(0x6091, 2, 0)
-    assert str(bench.fails()).startswith("node 2: 6091h:2 gear ratio driving shaft revolutions: expected 1..")
-    bench.drive2.store.restore()
-    bench.drive2.store.set_number(0x1018, 4, 22)
-    bench.drive2.store.set_number(0x6075, 0, 0)
-    error = bench.fails()
-    assert str(error) == "node 2: 6075h:0 motor rated current in mA: expected 1..1000000, found 0"
+@pytest.mark.parametrize(
+    ("node", "missing", "text"),
+    [
+        (
+            {"node": 2, "kind": "drive", "temperature": {}},
+            [(0x3001, 0)],
+            "3001h:0 joint temperature: expected a value (required by the configuration), "
+            "found no such object (status J)",
+        ),
+        (
+            {"node": 2, "kind": "drive"},
+            [(0x60E6, 0), (0x60E6, 1)],
+            "60E6h:1: read refused: object does not exist (06020000h)",
+        ),
+        (
+            {"node": 2, "kind": "drive"},
+            [(0x1019, 0)],
+            "1019h:0 SYNC counter overflow: expected 240 (sync.counter_overflow; 0 for SYNC without a counter), "
+            "found no such object (status J)",
+        ),
+    ],
+)
+def test_a_missing_object_is_named(bench, node, missing, text):
+    remove(bench.drive2, *missing)
+    assert str(bench.fails(nodes=[node])) == f"node 2: {text}"
 
 
-def test_missing_scaling_object_is_named_and_can_be_given(bench):
-    for subindex in (0, 1):
-        del bench.drive1.store.entries[0x60E6, subindex]
-    bench.drive1.store._indices.discard(0x60E6)
-    error = bench.fails()
-    assert str(error) == "node 1: 60E6h:1: read refused: object does not exist (06020000h)"
-    nodes = [{"node": 1, "kind": "drive", "given": {"60E6h:1": 1024}}]
-    scaling = bench.boot(nodes=nodes).nodes[1].scaling
-    assert scaling.link_rad_per_count == pytest.approx(2 * 3.141592653589793 / 1024)
-
-
-def test_sensor_channel_that_is_off(bench):
-    bench.sensor.store.set_number(0x6112, 1, 0)
-    error = bench.fails()
-    assert str(error) == "node 3: 6112h:1 channel operating mode: expected 1 (normal operation), found 0"
-
-
-def test_a_sensor_without_operating_mode_and_a_drive_without_serial_number(bench):
-    for subindex in (0, 1, 2):
-        del bench.sensor.store.entries[0x6112, subindex]
-    del bench.drive1.store.entries[0x1018, 4]
-    report = bench.boot(nodes=[{"node": 1, "kind": "drive", "identity": {"revision": 0x10000}}, *NODES[2:]])
+def test_what_a_node_may_lack(bench):
+    """Serial number, operating mode; a temperature that is not configured, a scaling object that is given, a counter."""
+    remove(bench.sensor, (0x6112, 0), (0x6112, 1), (0x6112, 2))
+    remove(bench.drive1, (0x1018, 4), (0x3001, 0), (0x60E6, 0), (0x60E6, 1), (0x1019, 0))
+    given = {"node": 1, "kind": "drive", "identity": {"revision": 0x10000}, "given": {"60E6h:1": 1024}}
+    report = bench.boot(nodes=[given, NODES[2]], sync={"counter_overflow": 0})
     assert report.nodes[1].serial == 0
+    assert report.nodes[1].notes == ()
+    assert report.nodes[1].scaling.link_rad_per_count == pytest.approx(2 * 3.141592653589793 / 1024)
     assert sorted(report.nodes) == [1, 3]
 
 
-def test_another_sync_identifier(bench):
-    bench.drive1.store.set_number(0x1005, 0, 0x90)
-    assert "node 1: 1005h:0 COB-ID SYNC: expected 080h, found 0x00000090" in str(bench.fails())
+def test_what_is_cosmetic_or_optional_fails_nothing(bench):
+    """1008h is refused with another code, 1016h and 1029h do not keep what is written, 1014h is another COB-ID."""
+    store = bench.drive1.store
+    answered = bench.drive1.answer
+
+    def refuse_name(request, reply):
+        if request[1:3] == bytes.fromhex("08 10"):
+            return bytes.fromhex("80 08 10 00 20 00 00 08")
+        return answered(request, reply)
+
+    bench.drive1.answer = refuse_name
+    store.on_read(0x1016, 1, lambda: 0)
+    store.on_read(0x1014, 0, lambda: 0x8000_0081)
+    store.on_read(0x1029, 1, lambda: 1)
+    remove(bench.drive2, (0x1029, 0), (0x1029, 1))
+    report = bench.boot(error_behaviour=0)
+    assert report.nodes[2].notes == ()
+    node = report.nodes[1]
+    assert node.name == ""
+    assert node.notes == (
+        "1016h:1 consumer heartbeat time read back: expected 0x002001F4, found 0x00000000: "
+        "the drive does not notice when jtqd's heartbeat ends",
+        "1014h COB-ID EMCY: expected 081h, found 0x80000081: its EMCY messages are not read",
+        "1029h:1 error behaviour read back: expected 0x00, found 0x01",
+    )
+
+
+def test_a_name_that_steers_a_terminal_is_replaced(bench):
+    bench.drive1.store.set_text(0x1008, 0, "\x1b[2Jdrive")
+    assert bench.boot().nodes[1].name == "?[2Jdrive"
+
+
+def test_a_sync_producer_is_switched_off(bench):
+    store = bench.drive1.store
+    change_access(bench.drive1, (0x1005, 0), "rw")
+    store.set_number(0x1005, 0, 0x4000_0080)
+    report = bench.boot(sync={"counter_overflow": 0})
+    assert store.number(0x1005, 0) == 0x80
+    assert report.nodes[1].notes == ("1005h: it was a SYNC producer, which jtqd is",)
+
+
+# NMT and heartbeat ------------------------------------------------------------------------------------------
 
 
 def test_no_heartbeat(bench):
     bench.sensor.beats = False
-    error = bench.fails()
-    assert str(error) == "node 3: no heartbeat 703h within 0.1 s (status K)"
+    assert str(bench.fails()) == "node 3: no heartbeat 703h within 0.1 s (status K)"
     assert bench.drive1.state == 0x7F
 
 
-def test_never_operational(bench):
-    bench.drive2.obeys_start = False
-    error = bench.fails()
-    assert str(error) == "node 2: NMT start: expected operational within 0.1 s, found pre-operational"
+def test_a_node_that_is_never_operational_explains_itself(bench):
+    """1001h, 1003h and the last EMCY of the boot are in the line."""
+    node = bench.drive1
+    node.obeys_start = False
+    node.store.set_number(0x1001, 0, 0x11)
+    node.store.on_read(0x1003, 0, lambda: 1)
+    node.store.on_read(0x1003, 1, lambda: 0x8130)
+    bench.extra = once((0x081, bytes.fromhex("10 23 03 00 00 00 00 00")), lambda: node.requests)
+    assert str(bench.fails()) == (
+        "node 1: NMT start: expected operational within 0.1 s, found pre-operational"
+        "; 1001h is 11h (generic, communication), 1003h:1 is 8130h (life guard or heartbeat)"
+        ", its last EMCY is 2310h (continuous overcurrent)"
+    )
 
 
 def restarting(node, times):
@@ -421,43 +478,279 @@ def test_a_node_that_restarts_at_every_configuration_is_refused(bench):
     assert str(bench.fails()).startswith("node 2: the node restarted during boot")
 
 
-def test_foreign_sync(bench):
-    bench.extra = lambda: [(0x080, b"\x01")]
-    error = bench.fails()
-    assert "another SYNC producer is on the bus (COB-ID 080h" in str(error)
-    assert [node.state for node in bench.nodes] == [0x7F] * 3
-    bench.boot(sync={"check_foreign": False})  # jtqd's own SYNC runs when one node is booted again
+def test_a_drive_that_leaves_operational_once_is_started_again(bench):
+    """Its watch (1016h) runs out right after NMT start: it leaves operational (1029h), once."""
 
+    class WatchingDrive(TestNode):
+        starts = 0
 
-def test_garbage_on_the_answer_identifiers_is_passed_over(bench):
-    """Short and 29-bit frames on 581h and 701h, all the time."""
-    bench.extra = lambda: [(0x581, b""), (0x581, b"\x80"), (0x701, b""), (0x701, b"\x00\x00")]
-    bench.boot()
+        def frames(self, can_id, data):
+            out = super().frames(can_id, data)
+            if can_id == 0 and data[0] == 1:
+                self.starts += 1
+                self.state = 0x7F if self.starts == 1 else self.state
+            return out
 
-
-class WatchingDrive(TestNode):
-    """The watch (1016h) runs out right after NMT start: the drive leaves operational (1029h), once."""
-
-    def __init__(self) -> None:
-        super().__init__(drive_store(1))
-        self.starts = 0
-
-    def frames(self, can_id: int, data: bytes) -> list[tuple[int, bytes]]:
-        out = super().frames(can_id, data)
-        if can_id == 0 and data[0] == 1:
-            self.starts += 1
-            if self.starts == 1:
-                self.state = 0x7F
-        return out
-
-
-def test_a_drive_that_leaves_operational_once_is_started_again(bench) -> None:
-    drive = WatchingDrive()
+    drive = WatchingDrive(drive_store(1))
     bench.nodes[:] = [drive]
     bench.boot(nodes=[{"node": 1, "kind": "drive"}])
     assert (drive.state, drive.starts) == (5, 2)
     # It watches its master all the same: one that dies stops it.
     assert drive.store.number(0x1016, 1) == 0x20 << 16 | 500
+
+
+def test_a_node_that_was_operational_is_named_and_configured(bench):
+    bench.drive1.state = 5
+    bench.drive1.store.set_number(0x1017, 0, 20)  # its heartbeat is heard before anything is sent
+    report = bench.boot()
+    assert report.nodes[1].notes == ("it was already operational (status L): stopped and configured again",)
+    assert bench.drive1.parameters.tpdos()[0] == drive_tpdo1(1)
+    assert report.nodes[2].notes == ()
+
+
+def test_garbage_on_the_answer_identifiers_is_ignored(bench):
+    bench.extra = lambda: [(0x581, b""), (0x581, b"\x80"), (0x701, b""), (0x701, b"\x00\x00")]
+    bench.boot()
+
+
+# Another master ---------------------------------------------------------------------------------------------
+
+
+def test_foreign_sync(bench):
+    bench.extra = lambda: [(0x080, b"\x01")]
+    assert "another SYNC producer is on the bus (COB-ID 080h" in str(bench.fails())
+    assert [node.state for node in bench.nodes] == [0x7F] * 3
+    bench.boot(sync={"check_foreign": False})  # jtqd's own SYNC runs when one node is booted again
+
+
+def test_a_running_jtqd_is_not_disturbed(bench):
+    bench.extra = lambda: [(0x720, b"\x05")]
+    bench.fails()
+    assert not [each for each in bench.heard if each[0] in (0x000, 0x601, 0x602, 0x603)]
+
+
+def test_another_jtqd_that_boots_at_the_same_time_is_noticed_by_its_boot_up_message(bench):
+    """It comes late, when the first check has passed."""
+    bench.extra = once((0x720, b"\x00"), lambda: bench.drive1.requests)
+    assert str(bench.fails()) == (
+        "another node 20h, jtqd's own node-ID, is on the bus (heartbeat or boot-up COB-ID 720h)"
+    )
+    assert 5 not in [node.state for node in bench.nodes], "nothing is started"
+
+
+# Optional nodes ---------------------------------------------------------------------------------------------
+
+
+def test_an_absent_optional_node_is_named_and_the_others_run(bench):
+    bench.nodes.remove(bench.sensor)
+    report = bench.boot(nodes=OPTIONAL_SENSOR)
+    assert sorted(report.nodes) == [1, 2]
+    assert str(report.absent[3]) == "node 3: no answer to SDO 1000h:0 within 0.2 s (status B)"
+    assert [node.state for node in bench.nodes] == [5, 5]
+    assert report.as_json()["absent"]["3"]["letter"] == "B"
+
+
+@pytest.mark.parametrize(
+    ("fault", "letter"),
+    [("identity", "C"), ("mapping", "J"), ("heartbeat", "K"), ("start", ""), ("restart", "")],
+)
+def test_a_failure_of_an_optional_node_does_not_stop_the_others(bench, fault, letter):
+    sensor = bench.sensor
+    if fault == "identity":
+        sensor.store.set_number(0x1000, 0, 0x00020192)
+    elif fault == "mapping":
+        sensor.store.on_read(0x1A00, 1, lambda: 0)
+    elif fault == "heartbeat":
+        sensor.beats = False
+    elif fault == "start":
+        sensor.obeys_start = False
+    else:
+        bench.extra = restarting(sensor, 100)
+    report = bench.boot(nodes=OPTIONAL_SENSOR)
+    assert sorted(report.nodes) == [1, 2]
+    assert report.absent[3].letter == letter
+
+
+def test_an_optional_node_is_waited_for_half_a_second_at_most():
+    for answer_s, expected in ((2.0, (2.0, 0.5)), (0.2, (0.2, 0.2))):
+        request = parse_request({"bus": "can0", "answer_timeout_s": answer_s, "nodes": OPTIONAL_SENSOR})
+        assert (request.timeout_s(1), request.timeout_s(3)) == expected
+
+
+# Mapping that is fixed in the drive -------------------------------------------------------------------------
+
+
+def test_refused_mapping(bench):
+    def refuse(request, reply):
+        if request[:4] == bytes.fromhex("23 00 1A 01"):
+            return bytes.fromhex("80 00 1A 01 41 00 04 06")
+        return reply
+
+    bench.drive1.answer = refuse
+    error = bench.fails()
+    assert str(error).startswith(
+        "node 1: 1A00h:1: write of 0x60640020 refused: object cannot be mapped (06040041h); "
+        "no TPDO carries 60E4h:1 (link position), 6078h:0 (current), 6041h:0 (statusword); TPDO1 carries"
+    )
+    assert error.letter == "J"
+
+
+def test_what_was_written_before_a_refusal_is_put_back(bench):
+    """TPDO1 was mapped, and the second entry of TPDO2 is refused: entries, numbers, types and COB-IDs are as before."""
+    store = bench.drive1.store
+
+    def objects():
+        keys = [(0x1A00 + n, sub) for n in range(3) for sub in range(3)]
+        keys += [(0x1800 + n, sub) for n in range(3) for sub in (1, 2)]
+        return {key: store.number(*key) for key in keys}
+
+    for index, subindex, value in (
+        (0x1A00, 0, 1),
+        (0x1A00, 1, 0x6041_0010),
+        (0x1A01, 0, 2),
+        (0x1A01, 1, 0x6061_0008),
+        (0x1A01, 2, 0x6077_0010),
+        (0x1800, 2, 255),
+    ):
+        store.set_number(index, subindex, value)
+    before = objects()
+    change_access(bench.drive1, (0x1A01, 2), "ro")
+    assert "no TPDO carries 6064h:0" in str(bench.fails())
+    assert objects() == before
+
+
+def fixed(node, *tpdos, valid=True, kind=1, writable=()):
+    """Make the mapping of its TPDOs 1, 2, ... read-only, with these words; entries `writable` stay so."""
+    store = node.store
+    for number in range(4):
+        if not store.has(0x1A00 + number, 1):
+            continue
+        words = tpdos[number] if number < len(tpdos) else ()
+        store.set_number(0x1A00 + number, 0, len(words))
+        for entry, word in enumerate(words, 1):
+            store.set_number(0x1A00 + number, entry, word)
+        cob_id = 0x4000_0180 + 0x100 * number + 1
+        store.set_number(0x1800 + number, 1, cob_id if valid and words else cob_id | 0x8000_0000)
+        store.set_number(0x1800 + number, 2, kind)
+    for key in [key for key in store.entries if 0x1800 <= key[0] < 0x1C00 and key not in writable]:
+        change_access(node, key, "ro")
+
+
+COB_IDS = tuple((index, 1) for index in range(0x1800, 0x1804))
+RIGHT = tuple(pdo.words for pdo in (drive_tpdo1(1), drive_tpdo2(1)))
+ELSEWHERE = (0x6041_0010, 0x6064_0020), (0x606C_0020, 0x6078_0010, 0x6061_0008), (0x60E4_0120,)
+"""Layout of a drive whose maker has thought of other readers."""
+
+
+def test_what_is_as_wanted_is_not_written(bench):
+    """The second boot finds what the first has written: it maps nothing."""
+    bench.boot()
+    bench.drive1.requests.clear()
+    node = bench.boot(reset=False).nodes[1]
+    written = [each for each in bench.drive1.requests if each[0] & 0xE0 == 0x20 and 0x18 <= each[2] < 0x1C]
+    assert written == []
+    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
+
+
+@pytest.mark.parametrize("writable", [(), COB_IDS])
+def test_a_fixed_mapping_that_is_the_right_one_is_used(bench, writable):
+    fixed(bench.drive1, *RIGHT, valid=not writable, writable=writable)
+    node = bench.boot().nodes[1]
+    assert bench.drive1.state == 5
+    assert bench.drive1.store.number(0x1800, 1) == 0x4000_0181, "it is on"
+    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
+
+
+@pytest.mark.parametrize("writable", [(), COB_IDS])
+def test_another_fixed_mapping_is_used_as_it_is(bench, writable):
+    fixed(bench.drive1, *ELSEWHERE, writable=writable)
+    node = bench.boot().nodes[1]
+    assert bench.drive1.state == 5
+    assert [(pdo.number, pdo.cob_id, pdo.words) for pdo in node.tpdos] == [
+        (1, 0x181, ELSEWHERE[0]),
+        (2, 0x281, ELSEWHERE[1]),
+        (3, 0x381, ELSEWHERE[2]),
+    ]
+    assert node.notes[0].startswith(
+        "its mapping is used as it is: TPDO1 (181h), TPDO2 (281h), TPDO3 (381h) (1"
+    )
+    cob_ids = [bench.drive1.store.number(0x1800 + n, 1) for n in range(3)]
+    assert cob_ids == [0x4000_0181, 0x4000_0281, 0x4000_0381]
+    watched = {(index, sub): value for index, sub, value in node.watched}
+    assert watched[0x1A01, 2] == 0x6078_0010, "and watched in service"
+    again = bench.boot().nodes[1].configuration_sha256
+    assert again == node.configuration_sha256, "what the attempt has read is not in it"
+
+
+def test_a_temperature_in_a_fixed_mapping_is_used_where_it_is_alone_in_tpdo3(bench):
+    fixed(bench.drive1, *ELSEWHERE[:2], (0x3001_0010,))
+    bench.drive1.store.set_number(0x1802, 2, 255)
+    node = {"node": 1, "kind": "drive", "temperature": {}, "objects": {"link_position": None}}
+    used = bench.boot(nodes=[node]).nodes[1].tpdos
+    assert [pdo.words for pdo in used][2:] == [(0x3001_0010,)]
+    assert used[2].transmission_type == 255
+    node["temperature"] = {"index": 0x6077, "c_per_unit": 0.1}
+    error = bench.fails(nodes=[node])
+    assert "no TPDO with COB-ID 381h carries 6077h:0 alone (temperature)" in str(error)
+
+
+def test_a_tpdo_that_is_not_needed_and_cannot_be_switched_off_is_noted(bench):
+    fixed(bench.drive1, *RIGHT, (0x6061_0008,))
+    node = bench.boot().nodes[1]
+    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
+    assert any("TPDO3 is not needed and stays on" in note for note in node.notes)
+
+
+def test_another_cob_id_of_the_predefined_set(bench):
+    fixed(bench.drive1, *ELSEWHERE)
+    bench.drive1.store.set_number(0x1802, 1, 0x4000_0481)
+    assert [pdo.cob_id for pdo in bench.boot().nodes[1].tpdos] == [0x181, 0x281, 0x481]
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ((0x1802, 1, 0x4000_0391), "TPDO3: TPDO3 has COB-ID 391h, expected one of 181h, 281h, 381h, 481h"),
+        ((0x1802, 1, 0x6000_0381), "TPDO3: TPDO3 has a 29-bit COB-ID"),
+        ((0x1A02, 1, 0x60E4_0110), "TPDO3: 60E4h:1 is mapped with 16 bits, expected 32"),
+        (
+            (0x1A02, 1, 0x6064_0020),
+            "no TPDO carries 60E4h:1 (link position); TPDO1 carries 0x60410010, 0x60640020",
+        ),
+    ],
+)
+def test_a_fixed_mapping_that_is_not_enough_is_named(bench, change, text):
+    fixed(bench.drive1, *ELSEWHERE)
+    bench.drive1.store.set_number(*change)
+    found = str(bench.fails())
+    assert "node 1: 1800h:1: write of 0xC0000181 refused: object is read only (06010002h); no TPDO" in found
+    assert text in found
+
+
+def test_a_transmission_type_that_cannot_be_written_is_named(bench):
+    fixed(bench.drive1, *ELSEWHERE, kind=10)
+    assert "1800h:2: write of 0x01 refused" in str(bench.fails())
+
+
+@pytest.mark.parametrize("kind", [0, 254, 255])
+def test_an_acyclic_type_that_cannot_be_written_is_accepted_where_an_age_is_configured(bench, kind):
+    fixed(bench.drive1, *ELSEWHERE, kind=kind)
+    assert f"TPDO1 has transmission type {kind}: joint_N.max_age_ms allows it" in str(bench.fails())
+    node = bench.boot(nodes=[{**NODES[0], "acyclic": True}, *NODES[1:]]).nodes[1]
+    assert [pdo.transmission_type for pdo in node.tpdos] == [kind] * 3
+    assert f"TPDO1 keeps transmission type {kind}" in node.notes
+
+
+def test_a_configured_layout_is_written(bench):
+    """TPDOs of the request: one PDO has two quantities, another one the rest."""
+    words = [0x6041_0010, 0x6064_0020], [0x606C_0020, 0x6078_0010], [0x60E4_0120]
+    tpdos = [
+        {"number": number, "cob_id": cob_id, "transmission_type": 1, "words": entries}
+        for number, cob_id, entries in zip((1, 2, 3), (0x381, 0x281, 0x181), words, strict=True)
+    ]
+    node = bench.boot(nodes=[{**NODES[0], "tpdos": tpdos}, *NODES[1:]]).nodes[1]
+    assert [(pdo.number, pdo.cob_id) for pdo in node.tpdos] == [(1, 0x381), (2, 0x281), (3, 0x181)]
+    assert bench.drive1.parameters.tpdos() == list(node.tpdos)
 
 
 # The request and the process --------------------------------------------------------------------------------
@@ -524,17 +817,9 @@ def test_request_becomes_profiles():
     assert parse_request(json.loads(json.dumps(request.as_json()))) == request
 
 
-def test_an_optional_node_is_waited_for_half_a_second_at_most():
-    nodes = [{"node": 1, "kind": "drive"}, {"node": 3, "kind": "sensor", "mandatory": False}]
-    patient = parse_request({"bus": "can0", "answer_timeout_s": 2.0, "nodes": nodes})
-    assert (patient.timeout_s(1), patient.timeout_s(3)) == (2.0, 0.5)
-    hasty = parse_request({"bus": "can0", "answer_timeout_s": 0.2, "nodes": nodes})
-    assert (hasty.timeout_s(1), hasty.timeout_s(3)) == (0.2, 0.2)
-
-
-def run_boot(request):
+def run_boot(request, *arguments):
     text = request if isinstance(request, str) else json.dumps(request)
-    command = [sys.executable, "-m", "jtqd.drivers.boot"]
+    command = [sys.executable, "-m", "jtqd.drivers.boot", *arguments]
     done = subprocess.run(
         command, input=text, capture_output=True, text=True, timeout=20, check=False, cwd=ROOT
     )
@@ -544,16 +829,15 @@ def run_boot(request):
 
 def test_process_over_the_unix_bus(tmp_path, bench):
     path = str(tmp_path / "bus")
-    started = time.monotonic()
     with HubResponder(path, bench.nodes):
-        status, report = run_boot({**REQUEST, "bus": f"unix:{path}"})
+        status, report = run_boot({**REQUEST, "bus": f"unix:{path}"}, "drivers/eds/jtqd.eds", "32")
     assert (status, report["ok"]) == (0, True)
-    print(f"boot {report['duration_s']} s, process {time.monotonic() - started:.2f} s")
     assert report["duration_s"] < 0.5
     assert sorted(report["nodes"]) == ["1", "2", "3"]
     assert report["nodes"]["1"]["scaling"]["ampere_per_unit"] == pytest.approx(0.005)
     assert report["nodes"]["3"]["scaling"] == {"nm_per_unit": {"1": pytest.approx(0.001)}}
     assert bench.drive2.parameters.tpdos() == [drive_tpdo1(2), drive_tpdo2(2)]
+    assert report["own_entries"][0]["index"] == 0x1000
 
 
 def test_process_names_the_fault_without_a_traceback(tmp_path, bench):
@@ -595,232 +879,3 @@ def test_boot_over_socketcan(bench):
         report = boot_all({**REQUEST, "bus": "vcan0"})
     assert sorted(report.nodes) == [1, 2, 3]
     assert [node.state for node in bench.nodes] == [5, 5, 5]
-
-
-def test_a_sync_producer_is_told_to_leave_it(bench):
-    store = bench.drive1.store
-    store.entries[0x1005, 0] = dataclasses.replace(store.entries[0x1005, 0], access="rw")
-    store.set_number(0x1005, 0, 0x4000_0080)
-    report = bench.boot(sync={"counter_overflow": 0})
-    assert bench.drive1.store.number(0x1005, 0) == 0x80
-    assert report.nodes[1].notes == ("1005h: it was a SYNC producer, which jtqd is",)
-
-
-def test_a_node_that_cannot_count_syncs_is_refused_only_where_they_have_a_counter(bench):
-    del bench.drive1.store.entries[0x1019, 0]
-    bench.drive1.store._indices.discard(0x1019)
-    assert bench.boot(sync={"counter_overflow": 0}).nodes[1].notes == ()
-    assert str(bench.fails()) == (
-        "node 1: 1019h:0 SYNC counter overflow: expected 240 (sync.counter_overflow; 0 for SYNC without a counter), "
-        "found no such object (status J)"
-    )
-
-
-def test_1019h_is_written_only_where_it_differs(bench):
-    bench.boot(sync={"counter_overflow": 0})
-    assert not [request for request in bench.drive1.requests if request[:3] == bytes.fromhex("2f 19 10")]
-    bench.boot(sync={"counter_overflow": 240})
-    assert [request for request in bench.drive1.requests if request[:3] == bytes.fromhex("2f 19 10")]
-
-
-def test_a_node_that_fails_says_why(bench):
-    """It does not start: 1001h, 1003h and the last EMCY of the boot are in the line."""
-    node, sent = bench.drive1, []
-    node.obeys_start = False
-    node.store.set_number(0x1001, 0, 0x11)
-    node.store.on_read(0x1003, 0, lambda: 1)
-    node.store.on_read(0x1003, 1, lambda: 0x8130)
-
-    def emergency():
-        if sent or not node.requests:
-            return []
-        sent.append(1)
-        return [(0x081, bytes.fromhex("10 23 03 00 00 00 00 00"))]
-
-    bench.extra = emergency
-    said = str(bench.fails())
-    assert said.startswith("node 1: NMT start: expected operational")
-    assert "; 1001h is 11h (generic, communication), 1003h:1 is 8130h (life guard or heartbeat)" in said
-    assert said.endswith(", its last EMCY is 2310h (continuous overcurrent)")
-
-
-def test_what_is_cosmetic_or_optional_fails_nothing(bench):
-    """1008h is refused with a code of its own, 1016h does not keep what is written, 1014h is another COB-ID."""
-    store = bench.drive1.store
-    answered = bench.drive1.answer
-
-    def refuse_name(request, reply):
-        if request[1:3] == bytes.fromhex("08 10"):
-            return bytes.fromhex("80 08 10 00 20 00 00 08")
-        return answered(request, reply)
-
-    bench.drive1.answer = refuse_name
-    store.on_read(0x1016, 1, lambda: 0)
-    store.on_read(0x1014, 0, lambda: 0x8000_0081)
-    node = bench.boot().nodes[1]
-    assert node.name == ""
-    assert node.notes == (
-        "1016h:1 consumer heartbeat time read back: expected 0x002001F4, found 0x00000000: "
-        "the drive does not notice when jtqd's heartbeat ends",
-        "1014h COB-ID EMCY: expected 081h, found 0x80000081: its EMCY messages are not read",
-    )
-
-
-def test_a_name_that_steers_a_terminal_is_replaced(bench):
-    bench.drive1.store.set_text(0x1008, 0, "\x1b[2Jdrive")
-    assert bench.boot().nodes[1].name == "?[2Jdrive"
-
-
-def fixed(node, *tpdos, valid=True, kind=1, writable=()):
-    """Make the mapping of its TPDOs 1, 2, ... read-only, with these words; entries `writable` stay so."""
-    store = node.store
-    for number in range(4):
-        if not store.has(0x1A00 + number, 1):
-            continue
-        words = tpdos[number] if number < len(tpdos) else ()
-        store.set_number(0x1A00 + number, 0, len(words))
-        for entry, word in enumerate(words, 1):
-            store.set_number(0x1A00 + number, entry, word)
-        cob_id = 0x4000_0180 + 0x100 * number + 1
-        store.set_number(0x1800 + number, 1, cob_id if valid and words else cob_id | 0x8000_0000)
-        store.set_number(0x1800 + number, 2, kind)
-    for key, entry in store.entries.items():
-        if 0x1800 <= key[0] < 0x1C00 and key not in writable:
-            store.entries[key] = dataclasses.replace(entry, access="ro")
-
-
-COB_IDS = tuple((index, 1) for index in range(0x1800, 0x1804))
-RIGHT = tuple(pdo.words for pdo in (drive_tpdo1(1), drive_tpdo2(1)))
-ELSEWHERE = (0x6041_0010, 0x6064_0020), (0x606C_0020, 0x6078_0010, 0x6061_0008), (0x60E4_0120,)
-"""Layout of a drive whose maker has thought of other readers."""
-
-
-def test_what_is_as_wanted_is_not_written(bench):
-    """The second boot finds what the first has written: it maps nothing."""
-    bench.boot()
-    written = []
-    answered = bench.drive1.answer
-
-    def watch(request, reply):
-        if request[0] & 0xE0 == 0x20 and 0x18 <= request[2] < 0x1C:
-            written.append(request.hex(" "))
-        return answered(request, reply)
-
-    bench.drive1.answer = watch
-    node = bench.boot(reset=False).nodes[1]
-    assert written == []
-    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
-
-
-@pytest.mark.parametrize("writable", [(), COB_IDS])
-def test_a_mapping_that_is_fixed_in_the_drive_is_used_where_it_is_the_right_one(bench, writable):
-    fixed(bench.drive1, *RIGHT, valid=not writable, writable=writable)
-    node = bench.boot().nodes[1]
-    assert bench.drive1.state == 5
-    assert bench.drive1.store.number(0x1800, 1) == 0x4000_0181, "it is on"
-    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
-
-
-def test_a_temperature_in_a_fixed_mapping_is_used_where_it_is_alone_in_tpdo3(bench):
-    fixed(bench.drive1, *ELSEWHERE[:2], (0x3001_0010,))
-    bench.drive1.store.set_number(0x1802, 2, 255)
-    objects = {"link_position": None}
-    nodes = [{"node": 1, "kind": "drive", "temperature": {}, "objects": objects}]
-    used = bench.boot(nodes=nodes).nodes[1].tpdos
-    assert [pdo.words for pdo in used][2:] == [(0x3001_0010,)]
-    assert used[2].transmission_type == 255
-    nodes[0]["temperature"] = {"index": 0x6077, "c_per_unit": 0.1}
-    with pytest.raises(BootError, match=r"no TPDO with COB-ID 381h carries 6077h:0 alone \(temperature\)"):
-        bench.boot(nodes=nodes)
-
-
-@pytest.mark.parametrize("writable", [(), COB_IDS])
-def test_a_mapping_that_is_fixed_otherwise_is_used_as_it_is(bench, writable):
-    fixed(bench.drive1, *ELSEWHERE, writable=writable)
-    node = bench.boot().nodes[1]
-    assert bench.drive1.state == 5
-    assert [(pdo.number, pdo.cob_id, pdo.words) for pdo in node.tpdos] == [
-        (1, 0x181, ELSEWHERE[0]),
-        (2, 0x281, ELSEWHERE[1]),
-        (3, 0x381, ELSEWHERE[2]),
-    ]
-    assert node.notes[0].startswith(
-        "its mapping is used as it is: TPDO1 (181h), TPDO2 (281h), TPDO3 (381h) (1"
-    )
-    assert [bench.drive1.store.number(0x1800 + n, 1) for n in range(3)] == [
-        0x4000_0181,
-        0x4000_0281,
-        0x4000_0381,
-    ]
-    watched = {(index, sub): value for index, sub, value in node.watched}
-    assert watched[0x1A01, 2] == 0x6078_0010, "and watched in service"
-
-
-def test_a_fixed_mapping_with_the_same_numbers_has_one_hash(bench):
-    """What the attempt has read of what is not in force is not in it."""
-    fixed(bench.drive1, *ELSEWHERE)
-    first = bench.boot().nodes[1].configuration_sha256
-    assert bench.boot().nodes[1].configuration_sha256 == first
-
-
-def test_a_tpdo_that_is_not_needed_and_cannot_be_switched_off_is_told(bench):
-    fixed(bench.drive1, *RIGHT, (0x6061_0008,))
-    node = bench.boot().nodes[1]
-    assert node.tpdos == (drive_tpdo1(1), drive_tpdo2(1))
-    assert any("TPDO3 is not needed and stays on" in note for note in node.notes)
-
-
-def test_another_cob_id_of_the_predefined_set(bench):
-    fixed(bench.drive1, *ELSEWHERE)
-    bench.drive1.store.set_number(0x1802, 1, 0x4000_0481)
-    assert [pdo.cob_id for pdo in bench.boot().nodes[1].tpdos] == [0x181, 0x281, 0x481]
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ((0x1802, 1, 0x4000_0391), "TPDO3: TPDO3 has COB-ID 391h, expected one of 181h, 281h, 381h, 481h"),
-        ((0x1802, 1, 0x6000_0381), "TPDO3: TPDO3 has a 29-bit COB-ID"),
-        ((0x1A02, 1, 0x60E4_0110), "TPDO3: 60E4h:1 is mapped with 16 bits, expected 32"),
-        (
-            (0x1A02, 1, 0x6064_0020),
-            "no TPDO carries 60E4h:1 (link position); TPDO1 carries 0x60410010, 0x60640020",
-        ),
-    ],
-)
-def test_a_mapping_that_is_fixed_and_not_enough_is_named(bench, change, said):
-    fixed(bench.drive1, *ELSEWHERE)
-    bench.drive1.store.set_number(*change)
-    found = str(bench.fails())
-    assert (
-        "node 1: 1800h:1: write of 0xC0000181 refused: object is read only (06010002h); no TPDO carries"
-        in found
-    )
-    assert said in found
-
-
-def test_a_transmission_type_that_cannot_be_written_is_named(bench):
-    fixed(bench.drive1, *ELSEWHERE, kind=10)
-    found = str(bench.fails())
-    assert "1800h:2: write of 0x01 refused" in found
-
-
-@pytest.mark.parametrize("kind", [0, 254, 255])
-def test_a_type_that_cannot_be_written_is_accepted_where_an_age_is_configured(bench, kind):
-    fixed(bench.drive1, *ELSEWHERE, kind=kind)
-    assert f"TPDO1 has transmission type {kind}: joint_N.max_age_ms allows it" in str(bench.fails())
-    node = bench.boot(nodes=[{**NODES[0], "acyclic": True}, *NODES[1:]]).nodes[1]
-    assert [pdo.transmission_type for pdo in node.tpdos] == [kind] * 3
-    assert f"TPDO1 keeps transmission type {kind}" in node.notes
-
-
-def test_a_layout_that_is_asked_for_is_written(bench):
-    """TPDOs of the request: one PDO has two quantities, another one the rest."""
-    words = [0x6041_0010, 0x6064_0020], [0x606C_0020, 0x6078_0010], [0x60E4_0120]
-    tpdos = [
-        {"number": number, "cob_id": cob_id, "transmission_type": 1, "words": entries}
-        for number, cob_id, entries in zip((1, 2, 3), (0x381, 0x281, 0x181), words, strict=True)
-    ]
-    node = bench.boot(nodes=[{**NODES[0], "tpdos": tpdos}, *NODES[1:]]).nodes[1]
-    assert [(pdo.number, pdo.cob_id) for pdo in node.tpdos] == [(1, 0x381), (2, 0x281), (3, 0x181)]
-    assert bench.drive1.parameters.tpdos() == list(node.tpdos)

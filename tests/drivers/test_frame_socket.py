@@ -230,7 +230,7 @@ def test_nothing_to_receive_is_no_error_and_wait_returns_in_time(bench):
 
 
 def test_receive_overflow_is_counted(bench):
-    """A socket that is not read loses frames; what follows afterwards says how many."""
+    """A socket that is not read loses frames; the next frame has their number."""
     a, b = bench.open(), bench.open()
     bench.open()  # a third one keeps the hub's other paths busy
     if bench.hub is None:
@@ -265,7 +265,7 @@ def test_filters_that_no_transport_knows_are_refused(bench):
 
 
 @pytest.mark.parametrize("number", [errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT])
-def test_kernel_without_can_says_so(monkeypatch, number):
+def test_kernel_without_can_is_one_line(monkeypatch, number):
     def refuse(*_arguments):
         raise OSError(number, os.strerror(number))
 
@@ -332,7 +332,7 @@ ERRORS = [
 @pytest.mark.parametrize("call", ["send", "recvmmsg"])
 @pytest.mark.parametrize(("number", "kind"), ERRORS)
 def test_errors_by_number(bench, failing_calls, call, number, kind):
-    """What has gone is said again at each call, also when the kernel says it once."""
+    """A bus that has gone is reported at each call, also when the kernel reports it once."""
     failed, later, _ = outcomes(bench, failing_calls, call, number)
     for found, text in failed:
         assert found == kind

@@ -15,7 +15,7 @@ TPDO = pack(0x181, bytes(range(8)))
 
 
 @pytest.mark.parametrize("stamps", [True, False])
-def test_receiver_reports_wrong_lengths_and_tells_empty_messages_from_the_end(stamps):
+def test_receiver_reports_wrong_lengths_and_empty_messages_are_not_the_end(stamps):
     a, b = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     if stamps:
         b.setsockopt(socket.SOL_SOCKET, 35, 1)

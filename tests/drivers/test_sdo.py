@@ -34,14 +34,14 @@ def frame(text: str) -> bytes:
 
 def talk(transfer: Transfer, server: SdoServer) -> list[str]:
     """Both sides until the end; the frames as text."""
-    said = []
+    transcript = []
     for _ in range(2000):
         reply = server.handle(transfer.request)
         assert reply is not None
-        said += [transfer.request.hex(" "), reply.hex(" ")]
+        transcript += [transfer.request.hex(" "), reply.hex(" ")]
         assert transfer.answer(reply)
         if transfer.done:
-            return said
+            return transcript
     raise AssertionError("endless")
 
 
@@ -151,11 +151,11 @@ def test_a_refusal_is_the_servers():
         "43 00 10 01 00 00 00 00",  # another sub-index
         "60 00 10 00 00 00 00 00",  # the answer to a download of the same object
         "80 18 10 01 00 00 04 05",  # an abort of the earlier request
-        "00 01 02 03 04 05 06 07",  # a segment of nobody's
+        "00 01 02 03 04 05 06 07",  # a segment without a transfer
         "43 00 10 00",  # too short to be one
     ],
 )
-def test_answers_to_something_else_are_passed_over(reply):
+def test_answers_to_something_else_are_ignored(reply):
     exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.5)
     exchange.begin()
     assert exchange.on_reply(frame(reply), 0.01) == []
@@ -165,14 +165,14 @@ def test_answers_to_something_else_are_passed_over(reply):
     assert exchange.ignored == 1
 
 
-def test_a_toggle_error_ends_the_transfer_and_it_is_begun_again():
+def test_a_toggle_error_ends_the_transfer_and_it_is_repeated():
     exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=0.5)
     exchange.begin()
     assert exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.01) == [frame("60 00 00 00 00 00 00 00")]
     out = exchange.on_reply(frame("10 6a 6f 69 6e 74 20 64"), 0.02)  # toggle 1 where 0 is due
     assert out == [
         frame("80 08 10 00 00 00 03 05"),  # abort 05030000h
-        frame("40 08 10 00 00 00 00 00"),  # and the request anew
+        frame("40 08 10 00 00 00 00 00"),  # and the request again
     ]
     assert int.from_bytes(out[0][4:], "little") == TOGGLE_NOT_ALTERNATED
     assert exchange.repeats == 1
@@ -183,7 +183,7 @@ def test_nothing_is_repeated_inside_a_segmented_transfer():
     exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=2.0, answer_s=0.1)
     assert (
         exchange.tick(0.11) == exchange.begin()
-    )  # the first request may be repeated: it begins the transfer anew
+    )  # the first request may be repeated: it restarts the transfer
     segment = [frame("60 00 00 00 00 00 00 00")]
     assert exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.5) == segment
     assert exchange.tick(2.4) == [], "nor is the transfer given up: each answer may take the timeout"
@@ -379,7 +379,7 @@ def test_a_late_answer_to_an_earlier_request_is_not_taken() -> None:
     assert client(socket).read(0x1000, 0) == (0x0002_0192).to_bytes(4, "little")
 
 
-def test_a_silent_node_is_given_up_in_time_and_told() -> None:
+def test_a_silent_node_is_given_up_in_time_and_aborted() -> None:
     socket = FakeSocket(lambda n, reply: [])
     began = time.monotonic()
     with pytest.raises(SdoTimeout, match=r"no answer within 0\.25 s"):

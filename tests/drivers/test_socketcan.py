@@ -67,7 +67,7 @@ def test_link_down_is_bus_down_and_the_same_socket_works_after_up(link):
         assert sock.wait(0.0)  # the error makes it readable
         with pytest.raises(BusDown, match=f"{link}: the interface is down"):
             sock.receive()
-        assert sock.receive() == 0  # said once
+        assert sock.receive() == 0  # reported once
         with pytest.raises(BusDown):
             sock.send(SYNC)
     ip("set", link, "up")
@@ -97,7 +97,7 @@ def test_frames_before_link_down_are_not_lost(link):
     b.close()
 
 
-def test_opening_a_link_that_is_down_says_so_at_the_first_receive(link):
+def test_a_link_that_is_down_is_reported_at_the_first_receive(link):
     ip("set", link, "down")
     sock = open_frame_socket(link, None)
     with pytest.raises(BusDown):

@@ -36,7 +36,7 @@ def test_a_drive_that_has_all():
     assert not found.missing
 
 
-def test_what_is_missing_or_zero_is_told_apart_from_a_value():
+def test_what_is_missing_or_zero_is_no_value():
     store = without((0x60E4, 1), (0x6090, 1), (0x6090, 2), (0x1008, 0))
     store.set_number(0x6091, 1, 0)
     found = survey(store, 5)
@@ -103,13 +103,13 @@ def test_a_device_that_refuses_its_type_has_no_profile():
     assert (found.profile, found.title) == (0, "emulated joint drive")
 
 
-def test_a_29_bit_identifier_is_told_as_it_is():
+def test_a_29_bit_identifier_is_read_as_it_is():
     store = without()
     store.set_number(0x1800, 1, 0x2123_4185)
     assert tpdos(store)[0].cob_id == 0x0123_4185
 
 
-def test_an_eds_tells_defaults_and_what_can_be_mapped(tmp_path):
+def test_an_eds_has_defaults_and_what_can_be_mapped(tmp_path):
     text = DRIVE_EDS.read_text()
     start = text.index("[60E4sub1]")
     end = text.index("[", start + 1)
@@ -134,7 +134,7 @@ def test_no_eds(tmp_path):
 
 @pytest.fixture
 def bus(tmp_path):
-    """A unix bus with nodes 5 and 127 as SDO servers; whoever asks for `syncs` gets a SYNC every 10 ms."""
+    """A unix bus with nodes 5 and 127 as SDO servers; with `syncs` there is a SYNC every 10 ms."""
     path = f"unix:{tmp_path}/bus"
     hub, stop, syncs = Hub(str(tmp_path / "bus")), threading.Event(), threading.Event()
     servers = {node: SdoServer(ObjectStore(DRIVE_EDS, node)) for node in (5, 8, 127)}

@@ -17,7 +17,7 @@ SYNC = pack(0x080, b"\x01")
 TPDO = pack(0x181, bytes(range(8)))
 
 
-def test_missing_bus_is_one_line_that_says_what_to_do(tmp_path):
+def test_missing_bus_is_one_line_with_what_to_do(tmp_path):
     bus = f"unix:{tmp_path}/none"
     with pytest.raises(BusError) as caught:
         open_frame_socket(bus, None)

@@ -30,7 +30,7 @@ class LibraryBench:
     """Hub (or a SocketCAN interface), drives 1 and 2, sensor 3. Context manager; `start` starts a jtqd.
 
     Attributes:
-        statuses, torques_nm: of both joints, of the estimate PDOs since the last `listen_anew`.
+        statuses, torques_nm: of both joints, of the estimate PDOs since the last `forget_frames`.
         heard: every other frame but SYNC and inputs.
     """
 
@@ -87,7 +87,7 @@ class LibraryBench:
 
     def start(self, config: Path | None = None, **changes: Any) -> subprocess.Popen[str]:
         """Start a jtqd, with these sections of its configuration changed, or with a configuration of one's own."""
-        self.listen_anew()
+        self.forget_frames()
         log = self.directory / f"stderr{len(self.logs)}"
         self.logs.append(log)
         run = self.directory / f"run{len(self.logs)}"
@@ -99,8 +99,8 @@ class LibraryBench:
             environment = {**os.environ, "RUNTIME_DIRECTORY": str(run)}
             return self._run("jtqd.daemon.jtqd", *arguments, stderr=stream, env=environment)
 
-    def said(self) -> str:
-        """What the last jtqd has said."""
+    def log_text(self) -> str:
+        """Standard error of the last jtqd."""
         return self.logs[-1].read_text()
 
     def configuration(self, **changes: Any) -> str:
@@ -134,7 +134,7 @@ class LibraryBench:
                 elif not 0x180 <= can_id < 0x580:
                     self.heard.append((can_id, bytes(data[:length])))
 
-    def listen_anew(self) -> None:
+    def forget_frames(self) -> None:
         """Forget what was heard."""
         self.listen()
         self.statuses.clear()

@@ -153,8 +153,8 @@ class Millidegrees(StrictDrive):
 
     def value(self, index: int, subindex: int, now: float) -> int:
         turns, per_s, _ = _motion(now)
-        told = {0x6064: 360_000 * turns, 0x606C: 360_000 * per_s, 0x60E4: 360_000 * turns}
-        return round(told[index] / GEAR) if index in told else super().value(index, subindex, now)
+        reported = {0x6064: 360_000 * turns, 0x606C: 360_000 * per_s, 0x60E4: 360_000 * turns}
+        return round(reported[index] / GEAR) if index in reported else super().value(index, subindex, now)
 
 
 class Feed(StrictDrive):
@@ -171,8 +171,8 @@ class Feed(StrictDrive):
 
     def value(self, index: int, subindex: int, now: float) -> int:
         turns, per_s, _ = _motion(now)
-        told = {0x6064: 36_000 * turns, 0x606C: 36_000 * per_s, 0x60E4: 36_000 * turns / GEAR}
-        return round(told[index]) if index in told else super().value(index, subindex, now)
+        reported = {0x6064: 36_000 * turns, 0x606C: 36_000 * per_s, 0x60E4: 36_000 * turns / GEAR}
+        return round(reported[index]) if index in reported else super().value(index, subindex, now)
 
 
 FAMILIES: dict[str, type[StrictDrive]] = {

@@ -92,11 +92,11 @@ class Node:
     def machine(self) -> Any:
         """Its power stage as statusword 6041h tells it."""
 
-        def says(word: int) -> None:
+        def report(word: int) -> None:
             self.device.statusword = word  # type: ignore[attr-defined]
 
         return SimpleNamespace(
-            fault=lambda: says(_FAULT), stopped=lambda: None, release=lambda: says(_ENABLED)
+            fault=lambda: report(_FAULT), stopped=lambda: None, release=lambda: report(_ENABLED)
         )
 
     def raise_error(self, code: int, register: int) -> list[bytes]:

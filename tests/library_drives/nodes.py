@@ -317,7 +317,7 @@ class StrictNode:
         )
         if not period_ms or len(data) != 1:
             return
-        if data[0] == 0:  # it has restarted: what it told us before holds no more
+        if data[0] == 0:  # it has restarted
             if self._master_due < math.inf:
                 self.raise_error(0x8130, 0x10)
             self._master_due = math.inf

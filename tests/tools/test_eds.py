@@ -272,7 +272,7 @@ def test_device_types_and_modes():
     assert (period["60C2sub1"]["DefaultValue"], period["60C2sub2"]["DefaultValue"]) == ("1", "-3")  # 1 ms
 
 
-def test_drive_tells_its_temperature_twice_a_second():
+def test_drive_sends_its_temperature_twice_a_second():
     """TPDO3: 380h+n, event-driven, event timer 500 ms, 3001h alone (I16, 0.1 degC)."""
     eds = parse((EDS / "drive.eds").read_text())
     sub = {n: number(eds[f"1802sub{n}"]["DefaultValue"], node=2) for n in (1, 2, 3, 5, 6)}

@@ -28,7 +28,7 @@ class MasterBench:
     """jtqd's bus service and three nodes on a hub. Context manager.
 
     Attributes:
-        lines: what the operator was told.
+        lines: of the log.
         heard: frames of jtqd's own node: (identifier, data).
         drives, sensor: the nodes; the sensor is on the bus only after `appear()` where `with_sensor` is False.
     """
@@ -119,7 +119,7 @@ class MasterBench:
         """Data of the frames that jtqd has sent as base + 20h."""
         return [data for can_id, data in self.heard if can_id == base + OWN]
 
-    def said(self, words: str) -> bool:
+    def logged(self, words: str) -> bool:
         return any(words in line for line in self.lines)
 
     def sdo(self, index: int, subindex: int) -> int:

@@ -1,4 +1,4 @@
-"""The whole daemon with the emulated bench on a SocketCAN interface, and what its own node says there."""
+"""The whole daemon with the emulated bench on a SocketCAN interface, and the frames of its own node there."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def frame(text: str) -> bytes:
 
 
 class Daemon:
-    """jtqd with a bench; what its own node says on the bus is collected. Its log goes to DIRECTORY/RECORD, if asked for."""
+    """jtqd with a bench; the frames of its own node are collected. Its log goes to DIRECTORY/RECORD, if asked for."""
 
     def __init__(self, directory: Path, record: str = "", **changes: Any) -> None:
         self.directory, self.bus, self.log = directory, INTERFACE, directory / "stderr"
@@ -62,7 +62,7 @@ class Daemon:
 
     def begun(self) -> None:
         """Wait until it estimates."""
-        assert self.until(self.well, 60.0), self.said()
+        assert self.until(self.well, 60.0), self.log_text()
         (snapshot,) = (self.directory / "run").glob("*/snapshot")
         self.reader = SnapshotReader(snapshot)
 
@@ -111,14 +111,16 @@ class Daemon:
         return len(recent) == 100 and not any(STALE in each for each in recent)
 
     def begin(self) -> None:
-        """Between two tests all is well and told."""
-        assert self.until(lambda: self.well() and self.reader.read().unconfigured == (), 20.0), self.said()
+        """Between two tests all is well and reported."""
+        assert self.until(lambda: self.well() and self.reader.read().unconfigured == (), 20.0), (
+            self.log_text()
+        )
         time.sleep(0.2)
         self.listen()
         self.emcys.clear()
         self.statuses.clear()
 
-    def said(self) -> str:
+    def log_text(self) -> str:
         return self.log.read_text()
 
     def report(self) -> Any:
@@ -126,7 +128,7 @@ class Daemon:
         return json.loads(next((self.directory / "run").glob("*/bus.json")).read_text())
 
     def reopen(self) -> None:
-        """Our own socket anew: what was queued in the old one is gone."""
+        """A new socket of our own: what was queued in the old one is gone."""
         self.socket.close()
         self.socket = open_frame_socket(self.bus, [exact(0x0A0), exact(0x1A0)])
         self.statuses.clear()
@@ -148,7 +150,7 @@ def a_daemon(**changes: Any) -> Iterator[Daemon]:
             yield daemon
         finally:
             daemon.end()
-        assert "Traceback" not in daemon.said()
+        assert "Traceback" not in daemon.log_text()
 
 
 class LateSensor(threading.Thread):

@@ -1,6 +1,6 @@
 """Drives by a C stack for CANopen (CANopenNode, Lely, CanFestival), beside those of the `canopen` library, if there is one.
 
-Debian 12 packages none, so there are no drives made of one; this says so in every run of the tests, and looks again.
+Debian 12 packages none, so there are no drives made of one; this reports it in every run of the tests, and looks again.
 """
 
 from __future__ import annotations

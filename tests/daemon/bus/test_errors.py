@@ -105,7 +105,7 @@ def test_codes_have_names_and_groups() -> None:
 
 
 @pytest.mark.parametrize("length", range(9))
-def test_a_short_message_is_told_as_far_as_it_goes(length: int) -> None:
+def test_a_short_message_is_read_as_far_as_it_goes(length: int) -> None:
     whole = frame("1023 03 0102030405")
     seen = EmcyLog([1])
     line = seen.receive(1, whole[:length], 0.0)
@@ -168,8 +168,8 @@ def test_each_pdo_has_its_own_error_and_the_register_stays_until_the_last_has_go
     store = errors._store
     for cob_id in (0x181, 0x282):
         errors.report(0x8250, cob_id)
-    told = [errors.tick(0.0), errors.tick(0.005), errors.tick(0.02)]
-    assert told == [frame("5082 11 0000 8101 00"), None, frame("5082 11 0000 8202 00")], (
+    reported = [errors.tick(0.0), errors.tick(0.005), errors.tick(0.02)]
+    assert reported == [frame("5082 11 0000 8101 00"), None, frame("5082 11 0000 8202 00")], (
         "10 ms between two (1015h)"
     )
     errors.reset(0x8250, 0x181)
@@ -190,10 +190,10 @@ def test_history_1003h_newest_first_bounded_and_clearable(errors: OwnErrors) -> 
     store.write(0x1003, 0, b"\0")
     assert store.number(0x1003) == 0
     assert store.number(0x1003, 1) == 0
-    assert errors.tick(0.0) is None, "what had gone before it could be told is not told"
+    assert errors.tick(0.0) is None, "an error that had ended before its message is not reported"
 
 
-def test_what_flaps_within_the_inhibit_time_is_not_told_twice(errors: OwnErrors) -> None:
+def test_what_flaps_within_the_inhibit_time_is_reported_once(errors: OwnErrors) -> None:
     errors.report(0x8130, 1)
     assert errors.tick(0.0) is not None
     for _ in range(50):
@@ -203,7 +203,7 @@ def test_what_flaps_within_the_inhibit_time_is_not_told_twice(errors: OwnErrors)
     assert errors.present == [(0x8130, 1)]
 
 
-def test_a_recovery_is_told_once_and_is_no_lasting_error(errors: OwnErrors) -> None:
+def test_a_recovery_is_reported_once_and_is_no_lasting_error(errors: OwnErrors) -> None:
     errors.report_once(0x8140)
     assert errors._store.number(0x1001) == 0
     assert errors.tick(0.0) == frame("4081 01 0000 0000 00")
@@ -216,3 +216,43 @@ def test_many_errors_wait_in_bounded_memory(errors: OwnErrors) -> None:
         errors.report(0x8210, detail)
         errors.reset(0x8210, detail - 30)
     assert len(errors._queue) <= 64
+
+
+def test_waiting_messages_are_bounded_although_all_errors_are_present(errors: OwnErrors) -> None:
+    for detail in range(5000):
+        errors.report(0x8210, detail)
+    assert len(errors._queue) == 64
+    assert len(errors.present) == 5000
+
+
+def test_an_error_that_occurs_again_is_reported_when_the_inhibit_time_is_over(errors: OwnErrors) -> None:
+    reported = []
+    for n in range(2):
+        errors.report(0x8130, 1)
+        reported.append(errors.tick(0.5 * n))
+        errors.reset(0x8130, 1)
+        reported.append(errors.tick(0.5 * n + 0.25))
+    assert [message is not None and message[:2].hex() for message in reported] == [
+        "3081",
+        "0000",
+        "3081",
+        "0000",
+    ]
+    errors.report(0x8130, 1)
+    errors.report(0x8130, 2)
+    assert errors.tick(2.0) is not None
+    assert errors.tick(2.0 + 100 * 1e-4) is not None, "1015h is over"
+
+
+def test_error_counters_stay_until_a_message_brings_others() -> None:
+    bus = BusState()
+    bus.error_frame(ERR | 0x204, bytes.fromhex("0020000000008003"))
+    bus.error_frame(ERR | 0x080, bytes(8))  # a bus error alone: no counters, one protocol error
+    assert (bus.counts["tx_errors"], bus.counts["rx_errors"], bus.counts["protocol_errors"]) == (128, 3, 1)
+
+
+def test_another_register_is_another_message() -> None:
+    seen = EmcyLog([1])
+    assert seen.receive(1, bytes.fromhex("1023030000000000"), 0.0) is not None
+    assert seen.receive(1, bytes.fromhex("1023010000000000"), 0.1) is not None
+    assert seen.receive(1, bytes.fromhex("1023010000000000"), 0.2) is None

@@ -49,30 +49,30 @@ def no_errors(bench: LibraryBench) -> bool:
 def test_first_start_and_restart_after_a_clean_stop_and_after_a_kill(bench: LibraryBench) -> None:
     """The drives watch jtqd's heartbeat: 8130h, once it has ended, and no start before that is over."""
     first = bench.start()
-    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(bench.both_used), bench.log_text()
     assert no_errors(bench), bench.order("state")
     assert bench.stop(first) == 0
     assert bench.until(lambda: not no_errors(bench), 3.0), "a drive that misses its master"
     assert bench.until(lambda: set(bench.emergencies(1)) == {0x8130})
-    bench.listen_anew()
+    bench.forget_frames()
     second = bench.start()
-    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(bench.both_used), bench.log_text()
     assert no_errors(bench)
     bench.stop(second, signal.SIGKILL)
-    bench.listen_anew()
+    bench.forget_frames()
     third = bench.start()  # within the 0.5 s in which the drives still wait for the second one
-    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(bench.both_used), bench.log_text()
     assert no_errors(bench)
     assert bench.stop(third) == 0
 
 
 def test_a_second_jtqd_is_refused_and_the_first_goes_on(bench: LibraryBench) -> None:
     first = bench.start()
-    assert bench.until(bench.both_used), bench.said()
-    bench.listen_anew()
+    assert bench.until(bench.both_used), bench.log_text()
+    bench.forget_frames()
     second = bench.start()
     assert second.wait(20) == 1
-    assert "another SYNC producer is on the bus" in bench.said()
+    assert "another SYNC producer is on the bus" in bench.log_text()
     assert not [data for can_id, data in bench.heard if can_id == 0x000], "it touches no node"
     assert bench.until(bench.both_used)
     assert bench.stop(first) == 0
@@ -83,15 +83,15 @@ def test_power_cycle_of_a_node_in_service(node: int) -> None:
     """It comes back with 1019h = 0, nothing mapped and no heartbeat, and is used again."""
     with a_bench() as bench:
         jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         bench.order(f"off {node}")
         if node < 3:
             assert bench.until(lambda: bench.joint_stale(node - 1))
         time.sleep(0.5)
-        bench.listen_anew()
+        bench.forget_frames()
         bench.order(f"on {node}")
-        assert bench.until(lambda: "returned and is configured again" in bench.said()), bench.said()
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(lambda: "returned and is configured again" in bench.log_text()), bench.log_text()
+        assert bench.until(bench.both_used), bench.log_text()
         assert bench.until(lambda: bench.order("state")[str(node)]["state"] == 5)
         assert bench.emergencies(node) == []
         assert bench.stop(jtqd) == 0
@@ -99,16 +99,18 @@ def test_power_cycle_of_a_node_in_service(node: int) -> None:
 
 def test_emcy_with_and_without_heartbeat(bench: LibraryBench) -> None:
     jtqd = bench.start()
-    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(bench.both_used), bench.log_text()
     bench.order("emcy 1 2310")
-    assert bench.until(lambda: "node 1: EMCY 2310h (continuous overcurrent)" in bench.said()), bench.said()
+    assert bench.until(lambda: "node 1: EMCY 2310h (continuous overcurrent)" in bench.log_text()), (
+        bench.log_text()
+    )
     bench.order("well 1 2310")
-    assert bench.until(lambda: "node 1: EMCY 0000h: error reset" in bench.said())
+    assert bench.until(lambda: "node 1: EMCY 0000h: error reset" in bench.log_text())
     bench.order("mute 2")
-    assert bench.until(lambda: "node 2: no heartbeat for 0.3 s" in bench.said()), bench.said()
+    assert bench.until(lambda: "node 2: no heartbeat for 0.3 s" in bench.log_text()), bench.log_text()
     bench.order("emcy 2 4310")
-    assert bench.until(lambda: "node 2: EMCY 4310h (excess temperature of the drive)" in bench.said())
-    bench.listen_anew()
+    assert bench.until(lambda: "node 2: EMCY 4310h (excess temperature of the drive)" in bench.log_text())
+    bench.forget_frames()
     assert bench.until(bench.both_used), "its PDOs come in time and are used"
     assert bench.stop(jtqd) == 0
 
@@ -117,13 +119,13 @@ def test_bus_off_of_one_node() -> None:
     """It neither hears nor is heard for a second: its master's heartbeat is missing, and it waits in pre-operational."""
     with a_bench() as bench:
         jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         bench.order("cut 1")
-        assert bench.until(lambda: bench.joint_stale(0)), bench.said()
+        assert bench.until(lambda: bench.joint_stale(0)), bench.log_text()
         assert bench.until(lambda: 0x8130 in bench.order("state")["1"]["errors"])
-        bench.listen_anew()
+        bench.forget_frames()
         bench.order("join 1")
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         assert bench.until(lambda: no_errors(bench))
         assert bench.stop(jtqd) == 0
 
@@ -141,9 +143,9 @@ def test_bus_off_of_one_node() -> None:
 def test_devices_differ(manners: tuple[str, ...]) -> None:
     with a_bench(*manners) as bench:
         jtqd = bench.start()
-        assert bench.until(bench.both_used, 40.0), bench.said()
+        assert bench.until(bench.both_used, 40.0), bench.log_text()
         if "1016" in manners[-1]:
-            assert "1016h:1 consumer heartbeat time: no such object" in bench.said()
+            assert "1016h:1 consumer heartbeat time: no such object" in bench.log_text()
         assert bench.stop(jtqd) == 0
 
 
@@ -152,16 +154,16 @@ def test_a_fixed_mapping_is_used_as_it_is(fixed: str) -> None:
     """Quantities in three of four TPDOs, one of them on another COB-ID: read from the drive, also after its power cycle."""
     with a_bench("--fixed", fixed) as bench:
         jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.said()
-        assert "its mapping is used as it is: TPDO1 (181h), TPDO2 (381h), TPDO4 (481h)" in bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
+        assert "its mapping is used as it is: TPDO1 (181h), TPDO2 (381h), TPDO4 (481h)" in bench.log_text()
         assert bench.until(
             lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
         )
         bench.order("off 1")
         assert bench.until(lambda: bench.joint_stale(0))
-        bench.listen_anew()
+        bench.forget_frames()
         bench.order("on 1")
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         assert bench.stop(jtqd) == 0
 
 
@@ -171,9 +173,9 @@ def test_what_init_writes_for_drives_that_tell_less_runs(
     """No 60E4h, 606Ch, 6078h: `jtq probe` and `jtq init` say so, and jtqd runs with the files as they are."""
     with a_bench("--without", "60E4,60E6,60EB,606C,6090,6078,6075") as bench:
         assert probe.main(["--bus", bench.bus, "--node", "1"]) == 0
-        told = capsys.readouterr().out
+        reported = capsys.readouterr().out
         for line in ("link_position: false", "motor_velocity: false", "current: {index: 0x6077}"):
-            assert line in told
+            assert line in reported
         known = ["--rated-torque", "30", "--torque-constant", str(TORQUE_CONSTANT)]
         assert init.main(["--bus", bench.bus, "--out", str(tmp_path), *known]) == 0
         assert "joint 2: objects.link_position: false (no 60E4h:1, by the bus)" in capsys.readouterr().out
@@ -181,7 +183,7 @@ def test_what_init_writes_for_drives_that_tell_less_runs(
         content = yaml.safe_load(path.read_text()) | {"sync": {"period_us": 10_000}}
         path.write_text(yaml.safe_dump(content))
         jtqd = bench.start(path)
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         assert bench.until(lambda: any(torque and abs(torque) > 2.0 for torque, _ in bench.torques_nm))
         assert bench.stop(jtqd) == 0
 
@@ -210,7 +212,7 @@ def test_check_knows_the_mapping_of_the_drives() -> None:
         booted = items("0.5", "--drive-sync")
         assert "node 1: its mapping is used as it is: TPDO1 (181h)" in booted["boot"]
         jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         beside = items("0.5", RUNTIME_DIRECTORY=str(bench.runs[-1]))
         for found in (booted, beside):
             assert "481h drive 1 TPDO4" in found
@@ -224,11 +226,11 @@ def test_a_drive_that_sends_by_itself_needs_an_age_and_is_used_by_its_stamps() -
     with a_bench("--fixed", "event") as bench:
         refused = bench.start()
         assert refused.wait(20) == 1
-        assert "TPDO1 has transmission type 255: joint_N.max_age_ms allows it" in bench.said()
+        assert "TPDO1 has transmission type 255: joint_N.max_age_ms allows it" in bench.log_text()
         ages = {f"joint_{n}": {"max_age_ms": 100} for n in (1, 2)}
         jtqd = bench.start(**ages)
-        assert bench.until(bench.both_used), bench.said()
-        assert "TPDO1 keeps transmission type 255" in bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
+        assert "TPDO1 keeps transmission type 255" in bench.log_text()
         assert bench.until(
             lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
         )
@@ -255,7 +257,7 @@ def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
         "motor_velocity": {"index": 0x2031, "type": "I16", "factor": 2.0 * math.pi / 60.0},
     }
     jtqd = bench.start(joint_1={"objects": objects}, joint_2={"file": str(shipped("joint1.yaml"))})
-    assert bench.until(bench.both_used), bench.said()
+    assert bench.until(bench.both_used), bench.log_text()
     assert bench.until(lambda: len(bench.torques_nm) > 600)
     pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
     assert len(pairs) > 300
@@ -279,8 +281,8 @@ def test_one_encoder_no_velocity_and_torque_instead_of_current() -> None:
         jtqd = bench.start(
             joint_1={"objects": torque}, joint_2={"objects": less, "file": str(shipped("joint1.yaml"))}
         )
-        assert bench.until(bench.both_used), bench.said()
-        assert bench.until(lambda: len(pairs()) > 300), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
+        assert bench.until(lambda: len(pairs()) > 300), bench.log_text()
         assert bench.stop(jtqd) == 0
     assert max(abs(one) for one, _ in pairs()) > 2.0
     apart = sorted(abs(one - two) for one, two in pairs())
@@ -323,7 +325,7 @@ def test_a_drive_of_a_family_beside_one_of_cia_402(family: str, section: dict[st
     with a_bench("--family", family) as bench:
         joint_2 = {"file": str(shipped("joint1.yaml"))}
         jtqd = bench.start(joint_1={"profile": family, **section}, joint_2=joint_2)
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         assert bench.until(lambda: len(bench.torques_nm) > 500)
         pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
         assert len(pairs) > 250
@@ -337,7 +339,7 @@ def test_a_drive_of_a_family_beside_one_of_cia_402(family: str, section: dict[st
 def test_answers_of_half_a_second() -> None:
     with a_bench("--sdo", "0.5") as bench:
         jtqd = bench.start(sensor={"sdo_timeout_ms": 800}, nodes={"sdo_timeout_ms": 800})
-        assert bench.until(bench.both_used, 150.0), bench.said()
+        assert bench.until(bench.both_used, 150.0), bench.log_text()
         assert bench.stop(jtqd) == 0
 
 
@@ -345,13 +347,13 @@ def test_answers_of_half_a_second() -> None:
 def test_first_start_restart_and_power_cycle_on_socketcan() -> None:
     with a_bench(bus=os.environ.get("JTQD_CAN_INTERFACE", "vcan0")) as bench:
         first = bench.start()
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         bench.stop(first, signal.SIGKILL)
-        bench.listen_anew()
+        bench.forget_frames()
         second = bench.start()
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         bench.order("off 1")
         assert bench.until(lambda: bench.joint_stale(0))
         bench.order("on 1")
-        assert bench.until(bench.both_used), bench.said()
+        assert bench.until(bench.both_used), bench.log_text()
         assert bench.stop(second) == 0

@@ -20,7 +20,7 @@ ELSEWHERE = (
         "interface removed and created again",
         "exit status 1 with one line; systemd restarts jtqd when the interface is back",
         (
-            "tests/daemon/bus/test_master_vcan.py::test_an_interface_that_is_removed_ends_the_daemon_with_one_line",
+            "tests/daemon/bus/test_daemon_on_vcan.py::test_an_interface_that_is_removed_ends_the_daemon_with_one_line",
             "tests/systemd/test_systemd_boot.py::test_whatever_happens_to_a_service",
         ),
     ),
@@ -30,7 +30,7 @@ ELSEWHERE = (
         "one line, exit status 1; a link that is down is reported at the first receive",
         (
             "tests/daemon/test_jtqd.py::test_unknown_bus",
-            "tests/drivers/test_socketcan.py::test_opening_a_link_that_is_down_says_so_at_the_first_receive",
+            "tests/drivers/test_socketcan.py::test_a_link_that_is_down_is_reported_at_the_first_receive",
         ),
     ),
     Shown(
@@ -61,16 +61,13 @@ ELSEWHERE = (
         28,
         "mapping or transmission type that reads back different",
         "refused at the boot",
-        (
-            "tests/drivers/test_boot.py::test_mapping_that_reads_back_different",
-            "tests/drivers/test_boot.py::test_transmission_type_that_does_not_stick",
-        ),
+        ("tests/drivers/test_boot.py::test_a_value_that_is_not_kept",),
     ),
     Shown(
         31,
         "mode of operation display (6061h) changes",
         "a line for the operator; the estimate uses current and positions in any mode",
-        ("tests/daemon/bus/test_master_changes.py::test_another_mode_is_told_and_the_node_is_used",),
+        ("tests/daemon/bus/test_service.py::test_another_mode_is_reported_and_the_node_is_used",),
     ),
     Shown(
         32,
@@ -78,8 +75,8 @@ ELSEWHERE = (
         "each transfer ends with a result or an error, never with a wrong value",
         (
             "tests/drivers/test_sdo.py::test_a_refusal_is_the_servers",
-            "tests/drivers/test_sdo.py::test_answers_to_something_else_are_passed_over",
-            "tests/drivers/test_sdo.py::test_a_toggle_error_ends_the_transfer_and_it_is_begun_again",
+            "tests/drivers/test_sdo.py::test_answers_to_something_else_are_ignored",
+            "tests/drivers/test_sdo.py::test_a_toggle_error_ends_the_transfer_and_it_is_repeated",
             "tests/drivers/test_sdo.py::test_a_size_that_is_not_kept_and_one_that_is_too_large",
             "tests/drivers/test_sdo.py::test_silence_is_asked_again_and_then_given_up",
             "tests/slow/test_fuzz_frames.py::test_the_supervisors_path",
@@ -95,7 +92,7 @@ ELSEWHERE = (
         36,
         "rated current 0",
         "refused at the boot",
-        ("tests/drivers/test_boot.py::test_zero_gear_ratio_and_rated_current",),
+        ("tests/drivers/test_boot.py::test_a_wrong_value_is_named",),
     ),
     Shown(
         38,

@@ -1,15 +1,21 @@
-"""The whole daemon on vcan: what a master has to notice in a run, by frames on its bus."""
+"""The whole daemon on vcan: nodes and masters in a run, error messages of the controller, an interface that goes down."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
+import subprocess
+import time
 from collections.abc import Iterator
 from typing import Any
 
 import canopen
 import pytest
 
+from jtqd.daemon.logs import read_attachments
 from jtqd.daemon.shared.events import NoticesReader
-from tests.daemon.bus.master_daemon import STALE, Daemon, a_daemon, frame
+from tests.daemon.bus.master_daemon import INTERFACE, STALE, Daemon, LateSensor, a_daemon, frame
 from tests.paths import JTQD_EDS
 
 pytestmark = pytest.mark.socketcan
@@ -69,7 +75,7 @@ def test_any_master_reads_every_object_of_the_data_sheet(node: Any) -> None:
             entry.raw = 0
 
 
-def test_lengths_are_told_per_pdo_and_never_applied(daemon: Daemon, node: Any) -> None:
+def test_lengths_are_reported_per_pdo_and_never_applied(daemon: Daemon, node: Any) -> None:
     """5 bytes under 282h, and 8 under 183h, which has 5."""
     node.sdo[0x1003][0].raw = 0
     daemon.send(0x282, bytes(5))
@@ -85,7 +91,7 @@ def test_lengths_are_told_per_pdo_and_never_applied(daemon: Daemon, node: Any) -
     assert daemon.well() or daemon.until(daemon.well)
     inputs = daemon.reader.read().inputs
     assert (inputs[3].short, inputs[4].long) == (1, 1)
-    assert "281h" not in daemon.said()
+    assert "281h" not in daemon.log_text()
     node.sdo[0x1003][0].raw = 0
     assert node.sdo[0x1003][0].raw == 0
 
@@ -99,7 +105,7 @@ def test_a_second_sync_producer_makes_all_inputs_stale_and_is_8150h(daemon: Daem
         or daemon.reader.read().counters["foreign_sync"] > 0
     )
     assert daemon.until(lambda: frame("5081 11 0000 8000 03") in daemon.emcys)
-    assert "another SYNC producer" in daemon.said()
+    assert "another SYNC producer" in daemon.log_text()
     assert daemon.until(
         lambda: any(each[:2] == b"\0\0" and each[3:7] == frame("5081 8000") for each in daemon.emcys)
     )
@@ -107,14 +113,14 @@ def test_a_second_sync_producer_makes_all_inputs_stale_and_is_8150h(daemon: Daem
 
 
 def test_a_node_that_stops_is_8250h_for_each_of_its_pdos(daemon: Daemon) -> None:
-    """NMT stop by somebody else: told, its PDOs time out, and it is configured and started again."""
+    """NMT stop by another master: reported, its PDOs time out, and it is configured and started again."""
     daemon.send(0x000, b"\x02\x02")
     assert daemon.until(lambda: len(daemon.emcys) >= 4)
     come = [each for each in daemon.emcys if each[:2] == frame("5082")]
     assert {each[5:] for each in come} == {frame("8201 02"), frame("8202 02")}
     gone = [each for each in daemon.emcys if each[:2] == b"\0\0"]
     assert {each[3:] for each in gone} == {frame("5082 8201 02"), frame("5082 8202 02")}
-    assert "NMT command 'stop' to node 2 from another master" in daemon.said()
+    assert "NMT command 'stop' to node 2 from another master" in daemon.log_text()
     assert daemon.until(daemon.well)
     assert (STALE, STALE) not in daemon.statuses[-50:]
 
@@ -124,12 +130,109 @@ def test_a_node_reset_in_the_middle_of_a_run_is_configured_before_it_is_believed
     before = daemon.reader.read().counters["published"]
     daemon.send(0x000, b"\x82\x01")
     assert daemon.until(lambda: any(each[0] == STALE for each in daemon.statuses))
-    assert daemon.until(daemon.well, 20.0), daemon.said()
+    assert daemon.until(daemon.well, 20.0), daemon.log_text()
     first = next(n for n, each in enumerate(daemon.statuses) if each[0] == STALE)
     assert daemon.statuses[first : first + 50].count((STALE, STALE)) < 25, "joint 2 goes on"
     assert daemon.process.poll() is None
     assert daemon.reader.read().counters["published"] > before
-    assert "node 1 returned and is configured again" in daemon.said()
+    assert "node 1 returned and is configured again" in daemon.log_text()
     (notices,) = (daemon.directory / "run").glob("*/notices")
     texts = [each.text for each in NoticesReader(notices).read()[0]]
     assert "node 1 returned and is configured again" in texts, "for the log"
+
+
+# The interface
+
+
+def ip(*arguments: str) -> None:
+    subprocess.run(["ip", "link", *arguments], check=True)
+
+
+def inject(text: str) -> None:
+    """An error message of a driver, as candump prints it."""
+    subprocess.run(["cansend", INTERFACE, text], check=True)
+
+
+def test_error_messages_of_the_controller(daemon: Daemon) -> None:
+    """CRTL with CNT: TX passive, 136 and 0 errors; then active again; then bus-off."""
+    inject("20000204#0020000000008800")
+    assert daemon.until(lambda: frame("2081 11 0000 0000 00") in daemon.emcys)
+    assert "bus: error passive, previously error active (TEC 136, REC 0)" in daemon.log_text()
+    inject("20000004#0040000000000000")
+    assert daemon.until(lambda: frame("0000 00 2081 0000 00") in daemon.emcys)
+    began = time.monotonic()
+    inject("20000040#0000000000000000")
+    assert daemon.until(lambda: frame("4081 01 0000 0000 00") in daemon.emcys)
+    print(f"bus-off: EMCY 8140h after {time.monotonic() - began:.3f} s")
+    assert "bus: bus-off" in daemon.log_text()
+    assert daemon.until(lambda: daemon.report()["counts"]["bus_offs"] == 1)
+    assert daemon.well() or daemon.until(daemon.well)
+
+
+def test_an_interface_that_is_down_for_a_second(daemon: Daemon) -> None:
+    """ENETDOWN comes once; the same sockets work again after `up`. The drives have left operational: booted again."""
+    ip("set", INTERFACE, "down")
+    assert daemon.until(lambda: "bus: interface down" in daemon.log_text())
+    time.sleep(1.0)
+    daemon.reopen()
+    ip("set", INTERFACE, "up")
+    began = time.monotonic()
+    assert daemon.until(daemon.well, 20.0), daemon.log_text()
+    print(f"back {time.monotonic() - began:.2f} s after the interface was up")
+    assert daemon.until(lambda: "bus: error active after" in daemon.log_text()), daemon.log_text()
+    assert daemon.process.poll() is None
+    assert daemon.until(lambda: daemon.report()["state"] == "error active")
+    assert daemon.report()["counts"]["downs"] == 1
+
+
+@pytest.mark.skipif(not os.environ.get("JTQD_IN_BENCH_KERNEL"), reason="removes the interface")
+def test_an_interface_that_is_removed_ends_the_daemon_with_one_line(daemon: Daemon) -> None:
+    """ENODEV: the socket is useless for good. systemd starts jtqd again when the interface is back (BindsTo)."""
+    before = len(daemon.log_text().splitlines())
+    try:
+        ip("del", INTERFACE)
+        assert daemon.process.wait(20) == 1
+        daemon.bench.wait(20)
+    finally:
+        ip("add", "dev", INTERFACE, "type", "vcan")
+        ip("set", INTERFACE, "txqueuelen", "1000", "up")
+    lines = daemon.log_text().splitlines()[before:]
+    assert "Traceback" not in daemon.log_text()
+    assert not [line for line in lines if "jtqd" not in line]
+    summary = daemon.out.read_text()
+    assert f"{INTERFACE}: bus lost" in summary + daemon.log_text(), summary
+    with a_daemon() as again:
+        assert again.process.poll() is None, "made again, it works again"
+
+
+def test_a_sensor_that_appears_in_service_is_configured_and_used() -> None:
+    """Absent at the start: jtqd reports it and estimates without a reference; then its torque is there, scaled.
+
+    The log then goes on in a part with its scaling.
+    """
+    with a_daemon(record="logs", sensor={"node": 5, "channels": 1}) as daemon:
+        sensor = LateSensor(daemon.bus)
+        try:
+            assert "node 5: no answer to SDO 1000h:0" in daemon.log_text()
+            view = daemon.reader.read()
+            assert all(math.isnan(joint.sensor_nm) for joint in view.joints)
+            assert view.counters["complete"] == view.counters["cycles"], "the loop does not wait for it"
+            assert view.counters["stale_inputs"] == 0, "nor misses it"
+            sensor.start()
+            torque = pytest.approx(4.321)
+            assert daemon.until(lambda: daemon.reader.read().joints[0].sensor_nm == torque, 20.0), (
+                daemon.log_text()
+            )
+            assert "node 5 appeared and is configured" in daemon.log_text()
+            assert daemon.until(daemon.well)
+            logs = daemon.directory / "logs"
+            assert daemon.until(lambda: len(list(logs.iterdir())) == 2)
+            before, after = (
+                json.loads(read_attachments(path)["provenance.json"])["nodes"]
+                for path in sorted(logs.iterdir())
+            )
+            assert "5" not in before
+            assert after["5"]["scaling"] == {"nm_per_unit": {"1": pytest.approx(0.001)}}
+        finally:
+            sensor.ended = True
+            sensor.join(5)

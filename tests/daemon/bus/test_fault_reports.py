@@ -1,4 +1,4 @@
-"""Faults are named: to the operator, in objects and EMCY of jtqd's own node, and released from there."""
+"""Faults of joints and inputs: lines, objects and EMCY of jtqd's own node, their release."""
 
 from __future__ import annotations
 
@@ -11,13 +11,17 @@ from jtqd.daemon.bus.errors import OwnErrors
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared import faults
-from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader, View
+from jtqd.daemon.shared.conditions import Subject
+from jtqd.daemon.shared.snapshot import InputView, JointView, Snapshot, SnapshotReader, View
+from jtqd.daemon.supervisor.health import TIMEOUT_CYCLES, PdoChange, PdoWatch
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.status import INVALID
 from tests.daemon.snapshots import EstimateWriter
 from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import JTQD_EDS
 
+PDO = Subject("181h drive 1 TPDO1", 0x181, 1, node=1)
+SEEN = InputView(*(0,) * 12)
 JUMP, TORSION = faults.BITS["motor_jump"], faults.BITS["torsion"]
 
 
@@ -29,17 +33,17 @@ def reading(n: int, one: JointView = WELL, two: JointView = WELL) -> View:
     return view(n, one, two)
 
 
-def test_a_fault_is_told_when_it_begins_and_when_all_are_over() -> None:
+def test_a_fault_is_reported_when_it_begins_and_when_all_are_over() -> None:
     watch = Observer()
     assert watch.lines(reading(1), 0.0) == []
     assert watch.lines(reading(2, faulty(TORSION)), 1.0) == [
         "joint 1: no torque: the torsion exceeds the limit of the gear (torsion)"
     ]
-    assert watch.lines(reading(3, faulty(TORSION)), 20.0) == [], "told once"
+    assert watch.lines(reading(3, faulty(TORSION)), 20.0) == [], "reported once"
     assert watch.lines(reading(4), 22.5) == ["joint 1: fault cleared after 21.5 s"]
 
 
-def test_a_latched_fault_says_how_it_is_released() -> None:
+def test_a_latched_fault_is_reported_with_its_release() -> None:
     watch = Observer()
     assert watch.lines(reading(1, WELL, faulty(JUMP, JUMP)), 0.0) == [
         "joint 2: no torque: the motor position jumped (motor_jump)",
@@ -102,13 +106,64 @@ def test_faults_and_latches_are_emcy_with_the_drives_node(
     watch.conditions.subscribe(errors.follow)
     store.set_number(0x1015, 0, 0)
 
-    def told(one: JointView, two: JointView) -> list[str]:
+    def reported(one: JointView, two: JointView) -> list[str]:
         watch.lines(reading(1, one, two), 0.0)
         return [message.hex(" ") for message in iter(lambda: errors.tick(0.0), None)]
 
-    assert told(WELL, WELL) == []
-    assert told(WELL, faulty(TORSION)) == ["01 ff 81 00 00 02 00 02"]
-    assert told(faulty(JUMP, JUMP), faulty(TORSION)) == ["01 ff 81 00 00 01 00 01", "02 ff 81 00 00 01 00 01"]
-    assert told(faulty(JUMP, JUMP), faulty(TORSION)) == []
-    assert told(faulty(JUMP), WELL) == ["00 00 81 02 ff 01 00 01", "00 00 81 01 ff 02 00 02"]
-    assert told(WELL, WELL) == ["00 00 00 01 ff 01 00 01"]
+    assert reported(WELL, WELL) == []
+    assert reported(WELL, faulty(TORSION)) == ["01 ff 81 00 00 02 00 02"]
+    assert reported(faulty(JUMP, JUMP), faulty(TORSION)) == [
+        "01 ff 81 00 00 01 00 01",
+        "02 ff 81 00 00 01 00 01",
+    ]
+    assert reported(faulty(JUMP, JUMP), faulty(TORSION)) == []
+    assert reported(faulty(JUMP), WELL) == ["00 00 81 02 ff 01 00 01", "00 00 81 01 ff 02 00 02"]
+    assert reported(WELL, WELL) == ["00 00 00 01 ff 01 00 01"]
+
+
+@pytest.fixture
+def errors(node: tuple[ObjectStore, Snapshot, SnapshotReader]) -> OwnErrors:
+    return OwnErrors(node[0])
+
+
+def test_the_twentieth_cycle_is_the_deadline_and_absent_nodes_have_none() -> None:
+    watch = PdoWatch([PDO])
+    watch.changes([SEEN], (), 0.0)
+    row = SEEN._replace(missed=TIMEOUT_CYCLES, in_a_row=TIMEOUT_CYCLES)
+    assert watch.changes([row], (), 0.1) == [PdoChange(0x8250, PDO, True)]
+    watch = PdoWatch([PDO])
+    watch.changes([SEEN], {1}, 0.0)
+    assert watch.changes([row._replace(in_a_row=0)], {1}, 0.1) == []
+
+
+def test_a_counters_error_lasts_a_second_and_a_latch_alone_is_a_fault_too(errors: OwnErrors) -> None:
+    watch = Observer()
+    watch.conditions.subscribe(errors.follow)
+    watch.lines(view(1), 10.0)
+    watch.lines(view(2, rx_dropped=3), 10.1)
+    for now in (10.2, 11.0):
+        watch.lines(view(3, rx_dropped=3), now)
+        assert (0x8110, 1) in errors.present, now
+    watch.lines(view(4, rx_dropped=3), 11.2)
+    assert (0x8110, 1) not in errors.present
+    watch.lines(view(5, WELL._replace(latched=0x100)), 11.3)
+    assert (0xFF01, 1) in errors.present
+    assert (0xFF02, 1) in errors.present
+    assert (0xFF01, 2) not in errors.present
+
+
+def test_a_fault_that_is_joined_by_another_has_lasted_from_the_first_on() -> None:
+    watch, lines = Observer(), []
+    flags = {0.0: 0x04, 2.0: 0x0C, 4.0: 0x0C, 9.0: 0}
+    for now, bits in flags.items():
+        lines += watch.lines(view(int(now), WELL._replace(input_flags=bits << 8)), now)
+    assert [line.split(" (")[-1] for line in lines[:2]] == ["motor_jump)", "link_jump)"]
+    assert lines[2:] == ["joint 1: fault cleared after 9.0 s"]
+
+
+def test_a_fault_that_is_latched_later_is_reported_again() -> None:
+    watch = Observer()
+    fault = WELL._replace(input_flags=0x0400)
+    assert len(watch.lines(view(1, fault), 0.0)) == 1
+    (line,) = watch.lines(view(2, fault._replace(latched=0x04)), 10.0)
+    assert line == "joint 1: latched: the motor position jumped (motor_jump); `jtq control reset` releases it"
