@@ -1,4 +1,4 @@
-"""What is wrong now with a joint, a node, a PDO, the bus, the loop, the recorder or the machine. Pure but for the file.
+"""Conditions: what is wrong at present with a joint, a node, a PDO, the bus, the loop, the recorder or the machine.
 
 `CATALOGUE` is the one list of everything that jtqd reports as present for some time, with its severity, its text and its
 EMCY code. The supervisor's parts observe and call `Conditions.update`; everybody else sees a view of the same set:
@@ -71,12 +71,12 @@ class Definition:
         about: what it is about (`JOINT` .. `MACHINE`).
         severity: INFO, WARNING or ERROR of `jtqd.daemon.shared.events`.
         text: one sentence in the present tense; {} takes the details.
-        ended: what the line at its end says, before "after 2.3 s"; "" where an event says so.
+        ended: text of the line at its end, before "after 2.3 s"; "" where an event reports it.
         topic: of the event that a line becomes (`jtqd.daemon.shared.events.Notice`).
         emcy: of the EMCY messages of its begin and end; None: none.
         hold_s: a change that does not last so long is none.
         repeat_s: while it is present, its line comes again so often; such lines have a rate limit of their own.
-        logged: a line when it begins and when it ends; not where lines of another condition or of events say the same.
+        logged: a line when it begins and when it ends; not where another condition or an event has the same line.
     """
 
     name: str
@@ -93,183 +93,67 @@ class Definition:
 
 _HOLD_S = 0.1
 _REPEAT_S = 60.0
+# fmt: off
 _ROWS = (
     # Joints
     Definition("stale_input", JOINT, WARNING, "inputs lost: {}", "inputs back", hold_s=_HOLD_S),
     Definition("sensor_lost", JOINT, WARNING, "torque sensor lost: {}", "torque sensor back", hold_s=_HOLD_S),
-    Definition(
-        "temperature_lost", JOINT, WARNING, "temperature lost: {}", "temperature back", hold_s=_HOLD_S
-    ),
-    Definition(
-        "joint_fault",
-        JOINT,
-        ERROR,
-        "no torque: {}",
-        "fault cleared",
-        topic="fault",
-        emcy=Emcy(0xFF01, _MANUFACTURER),
-    ),
-    Definition(
-        "fault_latched",
-        JOINT,
-        ERROR,
-        "latched: {}; `jtq control reset` releases it",
-        "latched faults released",
-        topic="fault",
-        emcy=Emcy(0xFF02, _MANUFACTURER),
-        repeat_s=_REPEAT_S,
-    ),
-    Definition(
-        "drive_fault",
-        JOINT,
-        ERROR,
-        "the drive reports {}",
-        "drive fault cleared",
-        topic="fault",
-        hold_s=_HOLD_S,
-    ),
+    Definition("temperature_lost", JOINT, WARNING, "temperature lost: {}", "temperature back", hold_s=_HOLD_S),
+    Definition("joint_fault", JOINT, ERROR, "no torque: {}", "fault cleared", topic="fault",
+               emcy=Emcy(0xFF01, _MANUFACTURER)),
+    Definition("fault_latched", JOINT, ERROR, "latched: {}; `jtq control reset` releases it",
+               "latched faults released", topic="fault", emcy=Emcy(0xFF02, _MANUFACTURER), repeat_s=_REPEAT_S),
+    Definition("drive_fault", JOINT, ERROR, "the drive reports {}", "drive fault cleared", topic="fault",
+               hold_s=_HOLD_S),
     Definition("drive_off", JOINT, INFO, "the drive carries no current: {}", hold_s=_HOLD_S, logged=False),
     Definition("degraded", JOINT, INFO, "the estimate is degraded: {}", hold_s=_HOLD_S, logged=False),
-    Definition(
-        "zero_implausible",
-        JOINT,
-        WARNING,
-        "the link encoder's zero is {}",
-        "the link encoder's zero is plausible again",
-    ),
-    Definition(
-        "zero_jumped",
-        JOINT,
-        WARNING,
-        "the link encoder's zero has jumped, {}, and is not known again yet",
-        "the link encoder's zero is learned anew",
-    ),
-    Definition(
-        "deviation",
-        JOINT,
-        WARNING,
-        f"the estimate has been more than {DEVIATION_SIGMAS:g} sigma away from the torque sensor "
-        f"for {DEVIATION_S:g} s: {{}}",
-        "the estimate agrees with the torque sensor again",
-    ),
+    Definition("zero_implausible", JOINT, WARNING, "the link encoder's zero is {}",
+               "the link encoder's zero is plausible again"),
+    Definition("zero_jumped", JOINT, WARNING, "the link encoder's zero has jumped, {}, and is not known again yet",
+               "the link encoder's zero is learned again"),
+    Definition("deviation", JOINT, WARNING,
+               f"the estimate has been more than {DEVIATION_SIGMAS:g} sigma away from the torque sensor "
+               f"for {DEVIATION_S:g} s: {{}}",
+               "the estimate agrees with the torque sensor again"),
     # Nodes and their PDOs
-    Definition(
-        "node_lost",
-        NODE,
-        WARNING,
-        "no heartbeat for {}",
-        "heartbeat is back",
-        topic="heartbeat",
-        emcy=Emcy(0x8130),
-    ),
-    Definition(
-        "node_doubled",
-        NODE,
-        WARNING,
-        "{}: possibly two nodes with this node-ID",
-        "one heartbeat producer again",
-        topic="heartbeat",
-        emcy=Emcy(0x8150, detail=0x700, names_joints=False),
-    ),
-    Definition(
-        "node_changed",
-        NODE,
-        WARNING,
-        "its configuration was changed {}",
-        topic="boot",
-        emcy=Emcy(0xFF03, _MANUFACTURER),
-    ),
+    Definition("node_lost", NODE, WARNING, "no heartbeat for {}", "heartbeat is back", topic="heartbeat",
+               emcy=Emcy(0x8130)),
+    Definition("node_doubled", NODE, WARNING, "{}: possibly two nodes with this node-ID",
+               "one heartbeat producer again", topic="heartbeat", emcy=Emcy(0x8150, detail=0x700, names_joints=False)),
+    Definition("node_changed", NODE, WARNING, "its configuration was changed {}", topic="boot",
+               emcy=Emcy(0xFF03, _MANUFACTURER)),
     Definition("node_absent", NODE, WARNING, "optional node absent", topic="boot", logged=False),
     Definition("node_unconfigured", NODE, WARNING, "not used: {}", topic="boot", logged=False),
     Definition("node_not_operational", NODE, WARNING, "NMT state {}", topic="heartbeat", logged=False),
     Definition("node_error", NODE, WARNING, "reports {}", topic="emcy", logged=False),
-    Definition(
-        "pdo_timeout",
-        PDO,
-        WARNING,
-        "no valid frame for {} cycles in a row",
-        topic="pdo",
-        emcy=Emcy(0x8250),
-        logged=False,
-    ),
-    Definition(
-        "pdo_short",
-        PDO,
-        WARNING,
-        "PDO not processed due to length error (8210h): too short",
-        "length correct again",
-        topic="pdo",
-        emcy=Emcy(0x8210),
-    ),
-    Definition(
-        "pdo_long",
-        PDO,
-        WARNING,
-        "PDO length exceeded (8220h): not used",
-        "length correct again",
-        topic="pdo",
-        emcy=Emcy(0x8220),
-    ),
+    Definition("pdo_timeout", PDO, WARNING, "no valid frame for {} cycles in a row", topic="pdo", emcy=Emcy(0x8250),
+               logged=False),
+    Definition("pdo_short", PDO, WARNING, "PDO not processed due to length error (8210h): too short",
+               "length correct again", topic="pdo", emcy=Emcy(0x8210)),
+    Definition("pdo_long", PDO, WARNING, "PDO length exceeded (8220h): not used", "length correct again",
+               topic="pdo", emcy=Emcy(0x8220)),
     # Bus
     Definition("bus_warning", BUS, WARNING, "error warning, previously {}", "error active", topic="bus"),
-    Definition(
-        "bus_passive",
-        BUS,
-        WARNING,
-        "error passive, previously {}",
-        "error active",
-        topic="bus",
-        emcy=Emcy(0x8120, names_joints=False),
-    ),
+    Definition("bus_passive", BUS, WARNING, "error passive, previously {}", "error active", topic="bus",
+               emcy=Emcy(0x8120, names_joints=False)),
     Definition("bus_off", BUS, ERROR, "bus-off, previously {}", "error active", topic="bus"),
     Definition("bus_down", BUS, ERROR, "interface down, previously {}", "error active", topic="bus"),
-    Definition(
-        "foreign_sync",
-        BUS,
-        ERROR,
-        "another SYNC producer: inputs of these cycles are not used",
-        "no other SYNC producer",
-        topic="sync",
-        emcy=Emcy(0x8150, detail=0x080),
-    ),
-    Definition(
-        "sync_late", BUS, WARNING, "the own SYNC waits in the transmit queue", topic="sync", logged=False
-    ),
-    Definition(
-        "receive_overrun",
-        BUS,
-        WARNING,
-        "received frames were lost: the loop's socket was read too late",
-        "no further received frames lost",
-        topic="bus",
-        emcy=Emcy(0x8110, detail=1),
-    ),
-    Definition(
-        "transmit_overrun",
-        BUS,
-        WARNING,
-        "frames could not be sent: the transmit queue is full",
-        "frames are sent again",
-        topic="bus",
-        emcy=Emcy(0x8110, detail=2),
-    ),
+    Definition("foreign_sync", BUS, ERROR, "another SYNC producer: inputs of these cycles are not used",
+               "no other SYNC producer", topic="sync", emcy=Emcy(0x8150, detail=0x080)),
+    Definition("sync_late", BUS, WARNING, "the own SYNC waits in the transmit queue", topic="sync", logged=False),
+    Definition("receive_overrun", BUS, WARNING, "received frames were lost: the loop's socket was read too late",
+               "no further received frames lost", topic="bus", emcy=Emcy(0x8110, detail=1)),
+    Definition("transmit_overrun", BUS, WARNING, "frames could not be sent: the transmit queue is full",
+               "frames are sent again", topic="bus", emcy=Emcy(0x8110, detail=2)),
     # Loop, recorder, machine
     Definition("loop_stopped", LOOP, ERROR, "no cycle for {}", "cycles again", topic="loop"),
     Definition("late_loop", LOOP, WARNING, "cycles are missed: the loop is late", topic="loop", logged=False),
-    Definition(
-        "cycles_lost",
-        RECORDER,
-        ERROR,
-        "cycles are lost: {} are not in the log",
-        "no further cycles lost",
-        topic="recorder",
-        repeat_s=_REPEAT_S,
-    ),
-    Definition(
-        "stolen_time", MACHINE, INFO, "the hypervisor takes processor time", topic="machine", logged=False
-    ),
+    Definition("cycles_lost", RECORDER, ERROR, "cycles are lost: {} are not in the log", "no further cycles lost",
+               topic="recorder", repeat_s=_REPEAT_S),
+    Definition("stolen_time", MACHINE, INFO, "the hypervisor takes processor time", topic="machine", logged=False),
     Definition("not_granted", MACHINE, WARNING, "not granted: {}", topic="machine", logged=False),
 )
+# fmt: on
 CATALOGUE: Final = {row.name: row for row in _ROWS}
 
 
@@ -337,8 +221,8 @@ class Line(NamedTuple):
     def rate_class(self) -> str:
         """Lines of one class share a rate limit; "": none.
 
-        What concerns a joint may come and go with its cable: few lines of each joint reach the operator. What waits for the
-        operator is not held back by them.
+        A fault of a joint may come and go with its cable: few lines of each joint reach the operator. What waits for the
+        operator is not limited with them.
         """
         if self.definition.about not in (JOINT, PDO):
             return ""

@@ -58,11 +58,7 @@ def layout_of(joints: int) -> Layout:
 
 
 PAIR: Final = layout_of(2)
-"""Of two joints: the layout of most buses, and of the constants below."""
-HEAD, FRAME_CAPACITY = PAIR.head, PAIR.frame_capacity
-FRAMES_OFFSET, STAMPS_OFFSET, TAIL_OFFSET = PAIR.frames_offset, PAIR.stamps_offset, PAIR.tail_offset
-RECORD_SIZE = PAIR.size
-_BY_SIZE: Final = {layout_of(joints).size: layout_of(joints) for joints in range(1, MOST_JOINTS + 1)}
+"""The layout of two joints."""
 
 FLAG_COMPLETE = 0x01
 """Every expected input of this cycle arrived before its deadline."""
@@ -148,8 +144,8 @@ class JointRecord(NamedTuple):
     latched."""
 
 
-def selection(header: Collection[str], joint: Collection[str], joints: int = 2) -> struct.Struct:
-    """Layout that unpacks only these fields, from the start of a record: those of the header, then of joint 1 to `joints`.
+def selection(header: Collection[str], joint: Collection[str], joints: int) -> struct.Struct:
+    """Return a layout that unpacks only these fields of a record: those of the header, then of joint 1 to `joints`.
 
     The values come in the order of the record. Raises ValueError for a field that the record does not have.
     """
@@ -170,18 +166,10 @@ def _selected(layout: str, names: tuple[str, ...], wanted: Collection[str]) -> s
 
 
 def header_of(record: bytes | memoryview) -> Header:
-    """Header of one record of `RECORD_SIZE` bytes."""
+    """Return the header of one record."""
     return Header._make(HEADER.unpack_from(record, 0))
 
 
 def joint_of(record: bytes | memoryview, joint: int) -> JointRecord:
-    """Block of joint `joint`, from 1 on, of one record."""
+    """Return the block of joint `joint`, from 1 on, of one record."""
     return JointRecord._make(JOINT.unpack_from(record, HEADER.size + (joint - 1) * JOINT.size))
-
-
-def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
-    """Frames of one record as (16 bytes of `struct can_frame`, CLOCK_REALTIME stamp in ns), in order of arrival."""
-    count, layout = header_of(record).frame_count, _BY_SIZE[len(record)]
-    stamps = struct.unpack_from(f"<{count}q", record, layout.stamps_offset)
-    view, start = memoryview(record), layout.frames_offset
-    return [(bytes(view[start + 16 * n : start + 16 * n + 16]), stamp) for n, stamp in enumerate(stamps)]

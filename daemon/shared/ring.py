@@ -30,12 +30,10 @@ class RingError(Exception):
 
 
 class Ring:
-    """Writer's side. `slot()` gives the next record's memory, `commit()` publishes it.
-
-    The loop writes by the same rules without going through Python (`daemon/core/record.pyx`).
+    """Writer's side: memory that the loop fills (`daemon/core/record.pyx`).
 
     Args:
-        path: file on a tmpfs, created anew (an older one is replaced: its reader keeps the old memory).
+        path: new file on a tmpfs; an older one is replaced, and its reader keeps the old memory.
         slots: number of records kept.
         record_size: bytes of one record.
 
@@ -51,21 +49,7 @@ class Ring:
         # One 8-byte store. `struct.pack_into` writes zeros first: the reader would at times see a count of 0.
         self.words = view[:_HEADER_SIZE].cast("Q")
         self.records = view[_HEADER_SIZE:]
-        self.size, self._record_size = slots, record_size
-
-    @property
-    def count(self) -> int:
-        """Records written so far."""
-        return self.words[COUNT_WORD]
-
-    def slot(self) -> memoryview:
-        """Return the memory of the record that the next `commit` publishes."""
-        start = self.count % self.size * self._record_size
-        return self.records[start : start + self._record_size]
-
-    def commit(self) -> None:
-        """Publish the record written into `slot()`."""
-        self.words[COUNT_WORD] += 1
+        self.size = slots
 
 
 def _created(path: Path, slots: int, record_size: int) -> mmap.mmap:

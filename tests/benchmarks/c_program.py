@@ -12,7 +12,6 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.core import joint as joint_cycle
 from jtqd.daemon.core import schedule
 from jtqd.daemon.core.status import NEEDED
-from jtqd.daemon.shared import cycle_record
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
 from jtqd.estimator.observer import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
@@ -28,6 +27,7 @@ from tests.benchmarks.fixture import (
     small_network,
 )
 from tests.benchmarks.traffic import SCALING, SENSOR_NM_PER_UNIT
+from tests.daemon import ring_records as rr
 
 _SOURCE = Path(__file__).resolve().parent
 _COMPILE = ("gcc", "-std=gnu11", "-O2", "-Wall", "-Wextra")
@@ -44,8 +44,8 @@ def build(fixture: Fixture) -> Path:
 
 def _header(config: Config) -> str:
     names = {
-        "RECORD_SIZE": cycle_record.RECORD_SIZE,
-        "FRAME_CAPACITY": cycle_record.FRAME_CAPACITY,
+        "RECORD_SIZE": rr.RECORD_SIZE,
+        "FRAME_CAPACITY": rr.FRAME_CAPACITY,
         "RING_SLOTS": config.ring_cycles,
         "STAMP_ACCURACY_NS": joint_cycle.STAMP_ACCURACY_NS,
         "DEGRADED_CYCLES": NEEDED[DEGRADED],

@@ -25,10 +25,11 @@ from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import CycleMessages
 from jtqd.daemon.recording.recorder import RecorderRequest, Session
 from jtqd.daemon.recording.run_files import Account
-from jtqd.daemon.shared import cycle_record
+from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import RingReader
 from tests.benchmarks.contender import ROOT
 from tests.benchmarks.table import mark, table
+from tests.daemon import ring_records as rr
 
 SIZE_LIMIT_GB, CORE_LIMIT_PERCENT = 1.2, 3.0
 _PARTS_PER_HOUR = 6
@@ -71,7 +72,7 @@ def _daemon(directory: Path, disk: Path, seconds: float) -> tuple[dict[str, Any]
         time.sleep(seconds)
         share = (_cpu_s(pid) - cpu) / (time.monotonic() - begin)
         (ring,) = directory.glob("*/ring")
-        records = RingReader(ring, cycle_record.RECORD_SIZE).read(4000).records
+        records = RingReader(ring, rr.RECORD_SIZE).read(4000).records
         output, _ = daemon.communicate(timeout=60.0)
     finally:
         daemon.kill()
@@ -157,7 +158,7 @@ def _library(records: list[bytes], path: Path) -> float:
             channels[topic.number] = writer.register_channel(topic.name, "cdr", schema)
         begin = time.process_time()
         for record in laps:
-            header = cycle_record.header_of(record)
+            header = cr.header_of(record)
             block, stamp = _block(messages, record), header.sync_realtime_ns
             for number, payload in messages.payloads(block):
                 writer.add_message(channels[number], stamp, payload, stamp, header.cycle)
@@ -166,7 +167,7 @@ def _library(records: list[bytes], path: Path) -> float:
 
 
 def _block(messages: CycleMessages, record: bytes) -> bytes:
-    header = cycle_record.header_of(record)
+    header = cr.header_of(record)
     return messages.block(
         record,
         header.cycle,

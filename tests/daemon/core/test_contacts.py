@@ -32,6 +32,7 @@ from jtqd.estimator.status import INVALID
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, Push, emulate
 from jtqd.sim_can.plants import load_any_plant
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, ExactTime, ScriptedSocket, frame
 from tests.paths import JTQD_EDS
 
@@ -98,7 +99,7 @@ class Loop:
                 )
                 for n in (0, 1)
             ],
-            Ring(directory / "ring", 512, cr.RECORD_SIZE),
+            Ring(directory / "ring", 512, rr.RECORD_SIZE),
             Snapshot(self.path, 1e-3, 0.8, 2),
             node_id=0x20,
             counter_overflow=240,
@@ -108,7 +109,7 @@ class Loop:
             grid=Grid(0, 1_000_000),
             contacts=contacts,
         )
-        self.ring = RingReader(directory / "ring", cr.RECORD_SIZE)
+        self.ring = RingReader(directory / "ring", rr.RECORD_SIZE)
         self.sync = 0
 
     def answers(self, sync: int) -> list[bytes]:
@@ -164,7 +165,7 @@ def test_a_push_goes_out_is_recorded_and_counted(tmp_path: Path, exact: ExactTim
             rate = pdo.torque_rate_nm_s[0]
             assert rate == pytest.approx(max(min(one.torque_rate_nm_s, 4064.0), -4064.0), abs=16.01)
         assert pdo.sequence == cr.header_of(record).sync_counter
-        assert 0x3A0 in [int.from_bytes(data[:4], "little") for data, _ in cr.frames_of(record)]
+        assert 0x3A0 in [int.from_bytes(data[:4], "little") for data, _ in rr.frames_of(record)]
     settled = [cr.joint_of(record, 1).contact_nm for record in records[PUSHED + 8 : PUSHED + 60]]
     assert np.mean(settled) == pytest.approx(3.0, abs=0.5)
     loop.cycle.leave()

@@ -17,6 +17,7 @@ from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import (
     ENABLED,
     I32,
@@ -124,7 +125,7 @@ def test_every_joint_is_sent_recorded_and_told(
                 assert torque == pytest.approx(logged.torque_nm, abs=0.0051)
             assert logged.current_a == pytest.approx(joint)
             assert logged.sensor_torque_nm == 9.0 if sensor else math.isnan(logged.sensor_torque_nm)
-        frames = [int.from_bytes(data[:4], "little") for data, _ in cr.frames_of(record)]
+        frames = [int.from_bytes(data[:4], "little") for data, _ in rr.frames_of(record)]
         assert frames.count(0x080) == 1
         assert set(ids) <= set(frames)
         assert cr.header_of(record).frames_left_out == 0

@@ -23,6 +23,7 @@ from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import INVALID
 from jtqd.models.files import load_joint, shipped
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import I32, SENSOR, frame, inputs, make, turn
 
 PDO = InputPdo(0x181, 8, I32, 1, "181h")
@@ -91,7 +92,7 @@ def test_counters_of_another_length_are_refused() -> None:
 
 
 def test_a_ring_of_other_records_is_refused(tmp_path: Path) -> None:
-    RecordRing(Ring(tmp_path / "ring", 8, cr.RECORD_SIZE))
+    RecordRing(Ring(tmp_path / "ring", 8, rr.RECORD_SIZE))
     with pytest.raises(ValueError, match="found a ring of 512 bytes for 8 cycles"):
         RecordRing(Ring(tmp_path / "other", 8, 64))
 

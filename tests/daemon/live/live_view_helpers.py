@@ -14,10 +14,10 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from jtqd.daemon.recording import schemas
-from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.events import FILE, Notices
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
+from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import DEFINITIONS, put, record_of
 from tests.paths import ROOT
 
@@ -31,7 +31,7 @@ class Memory:
 
     def __init__(self, directory):
         self.directory = directory
-        self.ring = Ring(directory / "ring", 4096, cycle_record.RECORD_SIZE)
+        self.ring = Ring(directory / "ring", 4096, rr.RECORD_SIZE)
         self.snapshot = Snapshot(directory / "snapshot", 0.001, 0.5)
         self.notices = Notices(directory / FILE)
         self.count = 0

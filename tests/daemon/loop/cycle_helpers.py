@@ -17,13 +17,13 @@ from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, d
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import Grid, PythonClock
-from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import BusDown
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
+from tests.daemon import ring_records as rr
 
 I32 = struct.Struct("<ii")
 MOTION = struct.Struct("<ihH")
@@ -174,7 +174,7 @@ def make(
         socket,  # type: ignore[arg-type]
         Intake(PDOS, temperatures),
         joints,
-        Ring(tmp_path / "ring", slots, cr.RECORD_SIZE),
+        Ring(tmp_path / "ring", slots, rr.RECORD_SIZE),
         Snapshot(tmp_path / "snapshot", 1e-3, 0.8),
         safety=safety,
         node_id=0x20,
@@ -184,7 +184,7 @@ def make(
         heartbeat_cycles=100,
         grid=Grid(time.monotonic_ns(), 10_000_000),
     )
-    return cycle, socket, RingReader(tmp_path / "ring", cr.RECORD_SIZE)
+    return cycle, socket, RingReader(tmp_path / "ring", rr.RECORD_SIZE)
 
 
 def turn(cycle: Cycle, count: int = 1, **before: Callable[[], None]) -> None:

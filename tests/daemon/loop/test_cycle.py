@@ -12,6 +12,7 @@ from jtqd.daemon.core.schedule import WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.status import VALID, Estimate
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import (
     I32,
     SCALE,
@@ -72,7 +73,7 @@ def test_inputs_are_scaled_and_recorded(tmp_path: Path) -> None:
     assert joint.input_flags == 7
     header = cr.header_of(record)
     assert header.flags & (cr.FLAG_COMPLETE | cr.FLAG_PUBLISHED | cr.FLAG_SYNC_CONFIRMED) == 0x0B
-    ids = [struct.unpack_from("<I", data)[0] for data, _ in cr.frames_of(record)]
+    ids = [struct.unpack_from("<I", data)[0] for data, _ in rr.frames_of(record)]
     assert ids == [0x080, 0x181, 0x281, 0x182, 0x282, 0x183, 0x1A0]
 
 
@@ -150,8 +151,8 @@ def test_more_frames_than_a_record_holds_are_counted(tmp_path: Path) -> None:
     cycle, _, reader = make(tmp_path, lambda n: inputs() + flood)
     turn(cycle, 2)
     header = cr.header_of(reader.read().records[1])
-    assert header.frame_count == cr.FRAME_CAPACITY
-    assert header.frames_left_out == 1 + 5 + 20 + 1 - cr.FRAME_CAPACITY
+    assert header.frame_count == rr.FRAME_CAPACITY
+    assert header.frames_left_out == 1 + 5 + 20 + 1 - rr.FRAME_CAPACITY
 
 
 def test_leaving_says_off(tmp_path: Path) -> None:

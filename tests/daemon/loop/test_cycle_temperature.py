@@ -20,6 +20,7 @@ from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.methods import AnyEstimator, make_estimator
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import I32, ExactTime, estimates, frame, inputs, make, turn
 from tests.estimator.fused_configuration import joint_of, network_of
 
@@ -176,7 +177,7 @@ def replayed(records: list[bytes], node: int) -> list[float]:
     value, heard, result = math.nan, 0, []
     for record in records:
         cycle = cr.header_of(record).cycle
-        for data, _ in cr.frames_of(record):
+        for data, _ in rr.frames_of(record):
             can_id, length = struct.unpack_from("<IB", data)
             if can_id == 0x380 + node and length == 2:
                 (raw,) = struct.unpack_from("<h", data, 8)

@@ -30,6 +30,7 @@ from jtqd.estimator.network import FusedNetwork, load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STALE, VALID
 from jtqd.models.files import load_joint, shipped
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import (
     I32,
     MOTION,
@@ -160,7 +161,7 @@ def test_too_late_for_either_network_is_physics_for_both(tmp_path: Path, clock: 
     assert statuses(socket)[-1] == (DEGRADED, DEGRADED)
     pdo = decode(estimates(socket)[-1])
     assert None not in pdo.torque_nm
-    (*_, record) = RingReader(tmp_path / "ring", cr.RECORD_SIZE).read().records
+    (*_, record) = RingReader(tmp_path / "ring", rr.RECORD_SIZE).read().records
     joint = [cr.joint_of(record, n) for n in (1, 2)]
     assert [math.isnan(each.network_nm) for each in joint] == [True, True]
     assert [each.torque_nm for each in joint] == [each.physics_nm for each in joint]
@@ -293,7 +294,7 @@ def replay(records: list[bytes], clock: ExactTime) -> Iterator[tuple[float, ...]
         header, logged = cr.header_of(record), cr.joint_of(record, 1)
         if header.flags & cr.FLAG_RESET:
             joint.reset_latch()
-        data = {int.from_bytes(each[:4], "little"): each[8:16] for each, _ in cr.frames_of(record)}
+        data = {int.from_bytes(each[:4], "little"): each[8:16] for each, _ in rr.frames_of(record)}
         for index, bit in ((0, 1), (1, 2), (4, 4)):
             fresh, pdo = bool(logged.input_flags & bit), PDOS[index]
             intake.place(index, pdo.layout.unpack_from(data[pdo.cob_id]) if fresh else None)

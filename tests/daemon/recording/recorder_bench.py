@@ -20,6 +20,7 @@ from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
+from tests.daemon import ring_records as rr
 from tests.daemon.recording.cdr_decoder import Definition
 from tests.paths import ROOT
 
@@ -36,7 +37,7 @@ def joint_values(index, number, status=2):
 
 def record_of(index, *, statuses=(2, 2), missed=0, start_ns=START_NS):
     """The record of one cycle at 1 kHz, with two frames."""
-    record = bytearray(cr.RECORD_SIZE)
+    record = bytearray(rr.RECORD_SIZE)
     header = (
         index,
         index * 1_000_000,
@@ -49,17 +50,14 @@ def record_of(index, *, statuses=(2, 2), missed=0, start_ns=START_NS):
         2,
     )
     joints = [joint_values(index, number, statuses[number - 1]) for number in (1, 2)]
-    cr.HEAD.pack_into(record, 0, *header, 0, 0, 0, 0, 0, 0, *joints[0], *joints[1])
-    record[cr.FRAMES_OFFSET : cr.FRAMES_OFFSET + 32] = SYNC + TPDO
-    struct.pack_into("<2q", record, cr.STAMPS_OFFSET, header[2] + 1, header[2] + 2)
-    cr.TAIL.pack_into(record, cr.TAIL_OFFSET, index)
+    cr.PAIR.head.pack_into(record, 0, *header, 0, 0, 0, 0, 0, 0, *joints[0], *joints[1])
+    record[cr.PAIR.frames_offset : cr.PAIR.frames_offset + 32] = SYNC + TPDO
+    struct.pack_into("<2q", record, cr.PAIR.stamps_offset, header[2] + 1, header[2] + 2)
+    cr.TAIL.pack_into(record, cr.PAIR.tail_offset, index)
     return bytes(record)
 
 
-def put(ring, record):
-    """What the loop does with a record."""
-    ring.slot()[:] = record
-    ring.commit()
+put = rr.append
 
 
 class RecorderProcess:
@@ -67,7 +65,7 @@ class RecorderProcess:
 
     def __init__(self, directory, *, slots=4096, output=None, before=None, prepare=None, **request):
         self.output = directory / "logs" if output is None else output
-        self.ring = Ring(directory / "ring", slots, cr.RECORD_SIZE)
+        self.ring = Ring(directory / "ring", slots, rr.RECORD_SIZE)
         if prepare is not None:
             prepare(self.ring)
         request = {"ring": str(directory / "ring"), "directory": str(self.output), "prefix": "test"} | request
@@ -111,7 +109,7 @@ class RecorderProcess:
         """Put records at a steady pace."""
         start = time.monotonic()
         for n in range(count):
-            put(self.ring, record_of(first + n))
+            rr.append(self.ring, record_of(first + n))
             if n % 10 == 9:
                 time.sleep(max(0.0, start + (n + 1) / rate_hz - time.monotonic()))
 

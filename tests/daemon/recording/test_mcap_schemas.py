@@ -9,6 +9,7 @@ import pytest
 from jtqd.daemon.recording import messages, schemas
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
+from tests.daemon import ring_records as rr
 from tests.daemon.recording.cdr_decoder import Definition
 
 DEFINITIONS = {name: Definition(name, text) for name, text in schemas.SCHEMAS.items()}
@@ -22,7 +23,7 @@ CYCLES = messages.CycleMessages(2)
 def random_record(seed):
     """A record with random content everywhere, and its header and joints as they were put in."""
     rng = random.Random(seed)
-    count = rng.randrange(cr.FRAME_CAPACITY + 1)
+    count = rng.randrange(rr.FRAME_CAPACITY + 1)
     header = (
         rng.getrandbits(64),
         rng.getrandbits(62),
@@ -38,8 +39,8 @@ def random_record(seed):
     joints = [
         (*(rng.gauss(0, 100) for _ in range(16)), *(rng.getrandbits(16) for _ in range(4))) for _ in "12"
     ]
-    record = bytearray(rng.randbytes(cr.RECORD_SIZE))  # what an earlier lap left behind counts as random
-    cr.HEAD.pack_into(record, 0, *header, *joints[0], *joints[1])
+    record = bytearray(rng.randbytes(rr.RECORD_SIZE))  # what an earlier lap left behind counts as random
+    cr.PAIR.head.pack_into(record, 0, *header, *joints[0], *joints[1])
     return bytes(record), cr.Header(*header), [cr.JointRecord(*joint) for joint in joints]
 
 
@@ -88,8 +89,8 @@ def test_cycle_block_decodes_to_the_record(seed):
     for name in header._fields[3:-1]:
         assert message[name] == getattr(header, name), name
     assert (message["cycle"], message["sync_monotonic_ns"]) == header[:2]
-    expected = cr.frames_of(record)
-    for n in range(cr.FRAME_CAPACITY):
+    expected = rr.frames_of(record)
+    for n in range(rr.FRAME_CAPACITY):
         frame = message["frames"][n]
         raw = struct.pack(
             "<IB3s8s", frame["id"], frame["length"], bytes(frame["reserved"]), bytes(frame["data"])

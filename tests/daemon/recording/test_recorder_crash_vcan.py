@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.recording.run_files import part_files
-from jtqd.daemon.shared import cycle_record
 from jtqd.daemon.shared.ring import RingReader
 from jtqd.models.files import shipped
+from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import cycles_of, messages_of
 from tests.daemon.test_vcan import INTERFACE, recorder_of, wait_for_estimates
 
@@ -67,7 +67,7 @@ class Daemon:
     def cycles(self) -> int:
         """Cycles that the loop has run."""
         (ring,) = self.directory.glob("*/ring")
-        reader = RingReader(ring, cycle_record.RECORD_SIZE)
+        reader = RingReader(ring, rr.RECORD_SIZE)
         return reader.position + reader.backlog
 
 

@@ -19,12 +19,12 @@ from jtqd.daemon.recording.recorder import RecorderRequest, main
 from jtqd.daemon.recording.recording import ERROR, WARN, EventLog
 from jtqd.daemon.recording.run_files import parse_part, part_files
 from jtqd.daemon.recording.schemas import definitions
-from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.daemon.supervisor.process import SupervisorError, log_directory
 from jtqd.models.files import shipped
+from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import (
     START_NS,
     cycles_of,
@@ -134,7 +134,7 @@ def test_what_tells_of_loss_is_written_however_much_happens(tmp_path):
 
 
 def test_a_recorder_that_is_told_to_end_before_it_has_begun_records_what_there_is(tmp_path):
-    ring = Ring(tmp_path / "ring", 1024, cr.RECORD_SIZE)
+    ring = Ring(tmp_path / "ring", 1024, rr.RECORD_SIZE)
     for n in range(500):
         put(ring, record_of(n))
     Snapshot(tmp_path / "snapshot", 1e-3, 0.5)
@@ -243,7 +243,7 @@ def test_log_directory_is_made(tmp_path):
 
 
 def test_progress_that_cannot_be_kept_is_one_line(tmp_path, capfd):
-    Ring(tmp_path / "ring", 256, cr.RECORD_SIZE)
+    Ring(tmp_path / "ring", 256, rr.RECORD_SIZE)
     (tmp_path / "recorded").mkdir()
     request = {
         "ring": str(tmp_path / "ring"),

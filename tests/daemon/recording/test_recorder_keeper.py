@@ -9,11 +9,11 @@ import pytest
 
 from jtqd.daemon.recording import launch
 from jtqd.daemon.recording.launch import RecorderProcess
-from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
+from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import put, record_of
 
 _SLOTS = 256
@@ -23,7 +23,7 @@ class Kept:
     """A RecorderProcess with real recorders on a ring without a loop."""
 
     def __init__(self, directory, capfd):
-        self.ring = Ring(directory / "ring", _SLOTS, cr.RECORD_SIZE)
+        self.ring = Ring(directory / "ring", _SLOTS, rr.RECORD_SIZE)
         self.snapshot = Snapshot(directory / "snapshot", 0.001, 0.5)
         self.children, self.capfd, self.said, self.cycles = [], capfd, "", 0
         self.logs = directory / "logs"

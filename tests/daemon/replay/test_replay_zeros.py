@@ -36,6 +36,7 @@ from jtqd.estimator.status import DEGRADED
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate
 from jtqd.sim_can.plants import load_any_plant
+from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, SENSOR, ExactTime, ScriptedSocket, frame
 from tests.paths import ROOT
 
@@ -117,7 +118,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
             ScriptedSocket(lambda sync: answers[sync - 1]),  # type: ignore[arg-type]
             Intake(input_pdos(config), joint_temperatures(config)),
             list(zip(setup.inputs, models.estimators(), strict=True)),
-            Ring(place / "ring", 4096, cr.RECORD_SIZE),
+            Ring(place / "ring", 4096, rr.RECORD_SIZE),
             Snapshot(snapshot, config.period_ns * 1e-9, 0.8),
             safety=models.safety(config),
             node_id=config.node_id,
@@ -127,7 +128,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
             heartbeat_cycles=100,
             grid=Grid(clock.now_ns, config.period_ns),
         )
-        ring, reader = RingReader(place / "ring", cr.RECORD_SIZE), SnapshotReader(snapshot)
+        ring, reader = RingReader(place / "ring", rr.RECORD_SIZE), SnapshotReader(snapshot)
         records: list[bytes] = []
         views: list[View] = []
         while len(records) < CYCLES:

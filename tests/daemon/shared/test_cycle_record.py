@@ -6,6 +6,7 @@ import struct
 import pytest
 
 from jtqd.daemon.shared import cycle_record as cr
+from tests.daemon import ring_records as rr
 
 HEADER = (7, 1_000, 1_700_000_000_123_456_789, 0xF, 50_000, -3, 2, 240, 2, 255, 1, 2, 3, 4, 0)
 JOINT_1 = (*(0.5 + n for n in range(16)), 0x1237, 2, 0x80, 7)
@@ -15,11 +16,11 @@ TPDO = bytes.fromhex("81010000 08 000000 0102030405060708")
 
 
 def sample():
-    record = bytearray(cr.RECORD_SIZE)
-    cr.HEAD.pack_into(record, 0, *HEADER, *JOINT_1, *JOINT_2)
-    record[cr.FRAMES_OFFSET : cr.FRAMES_OFFSET + 32] = SYNC + TPDO
-    struct.pack_into("<2q", record, cr.STAMPS_OFFSET, 11, 22)
-    cr.TAIL.pack_into(record, cr.TAIL_OFFSET, HEADER[0])
+    record = bytearray(rr.RECORD_SIZE)
+    cr.PAIR.head.pack_into(record, 0, *HEADER, *JOINT_1, *JOINT_2)
+    record[cr.PAIR.frames_offset : cr.PAIR.frames_offset + 32] = SYNC + TPDO
+    struct.pack_into("<2q", record, cr.PAIR.stamps_offset, 11, 22)
+    cr.TAIL.pack_into(record, cr.PAIR.tail_offset, HEADER[0])
     return bytes(record)
 
 
@@ -27,10 +28,10 @@ def test_offsets():
     """48 bytes of header, two joints of 136, 16 frames of 16, 16 stamps of 8, the index."""
     assert cr.HEADER.size == 48
     assert cr.JOINT.size == 136
-    assert cr.HEAD.size == 320 == cr.FRAMES_OFFSET
-    assert cr.STAMPS_OFFSET == 576
-    assert cr.TAIL_OFFSET == 704
-    assert cr.RECORD_SIZE == 712
+    assert cr.PAIR.head.size == 320 == cr.PAIR.frames_offset
+    assert cr.PAIR.stamps_offset == 576
+    assert cr.PAIR.tail_offset == 704
+    assert rr.RECORD_SIZE == 712
 
 
 def test_bytes_of_the_header():
@@ -72,20 +73,20 @@ def test_fields_by_name():
 def test_a_selection_of_fields_is_what_the_whole_record_says():
     record = sample()
     wanted = ("frame_count", "cycle", "late_ns")  # in any order: the record's own is kept
-    picked = cr.selection(wanted, ("status", "age_ms")).unpack_from(record)
+    picked = cr.selection(wanted, ("status", "age_ms"), 2).unpack_from(record)
     header, one, two = cr.header_of(record), cr.joint_of(record, 1), cr.joint_of(record, 2)
     assert picked[:5] == (header.cycle, header.late_ns, header.frame_count, one.age_ms, one.status)
     assert math.isnan(picked[5])
     assert picked[6:] == (two.status,)
-    everything = cr.selection(cr.Header._fields, cr.JointRecord._fields)
-    assert everything.size == cr.HEAD.size
-    assert everything.unpack_from(record)[:-7] == cr.HEAD.unpack_from(record)[:-7]
+    everything = cr.selection(cr.Header._fields, cr.JointRecord._fields, 2)
+    assert everything.size == cr.PAIR.head.size
+    assert everything.unpack_from(record)[:-7] == cr.PAIR.head.unpack_from(record)[:-7]
 
 
 def test_a_selection_refuses_fields_that_are_not_there():
     with pytest.raises(ValueError, match="found nonsense, expected fields"):
-        cr.selection(("cycle", "nonsense"), ())
+        cr.selection(("cycle", "nonsense"), (), 2)
 
 
 def test_frames_in_order_with_stamps():
-    assert cr.frames_of(sample()) == [(SYNC, 11), (TPDO, 22)]
+    assert rr.frames_of(sample()) == [(SYNC, 11), (TPDO, 22)]

@@ -55,7 +55,7 @@ def test_a_zero_that_jumps_is_told_until_it_is_known_again() -> None:
     assert line == "joint 1: the link encoder's zero has jumped, from +98 µrad, and is not known again yet"
     assert watch.lines(view(24, zeros=(lost, NO_ZEROS)), 3.0) == []
     (line,) = watch.lines(view(32, zeros=(FOUND._replace(jumps=1), NO_ZEROS)), 9.0)
-    assert "learned anew" in line
+    assert "learned again" in line
     assert watch.present() == []
 
 

@@ -14,12 +14,12 @@ from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, d
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.process import run
-from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
+from tests.daemon import ring_records as rr
 from tests.daemon.snapshots import counted
 from tests.slow.fuzz.bus_in_time import BusInTime, Script
 from tests.slow.fuzz.memory import rss_kb
@@ -151,7 +151,7 @@ def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:
             bus,  # type: ignore[arg-type]
             Intake(_PDOS, temperatures),
             joints,
-            Ring(directory / "ring", 64, cr.RECORD_SIZE),
+            Ring(directory / "ring", 64, rr.RECORD_SIZE),
             Snapshot(directory / "snapshot", 1e-3, 0.8),
             node_id=0x20,
             counter_overflow=240,
