@@ -16,8 +16,7 @@ value nor the unit, and it takes NaN, infinity and keys that no field has: keys,
 A field is a value (float, int, bool, str, a tuple of numbers, or what `parsed` makes), a dataclass (a section), a tuple
 of dataclasses or of mappings (a list of sections) or a Mapping from str to values (a section with free keys). A key may
 be left out where its field has a default or may be None; a section or list that is empty in the file counts as left out.
-`false` for a section that may be None and has another default is None. A dataclass whose section has another shape has
-a class method `from_file(value)`, which raises FieldError.
+`false` for a section that may be None and has another default is None.
 """
 
 from __future__ import annotations
@@ -59,7 +58,7 @@ def limits(
 
 
 def choice(names: Iterable[str], expected: str = "") -> msgspec.Meta:
-    """Return the annotation of a text that is one of `names`; expected: what a message says instead of them."""
+    """Return the annotation of a text that is one of `names`; expected: text of the message in place of them."""
     names = tuple(names)
     expected = expected or "one of " + ", ".join(map(repr, names))
     pattern = "|".join(map(re.escape, names))
@@ -303,12 +302,9 @@ class Field:
 
 
 def _nested(kind: Any, value: object, key: str) -> Any:
-    """Return the dataclass of a section, by its own `from_file` where it has one; kind None: the mapping itself."""
+    """Return the dataclass of a section; kind None: the mapping itself. Raises FieldError with the key."""
     with below(key):
-        if kind is None:
-            return _section(value)
-        own = getattr(kind, "from_file", None)
-        return read(kind, value) if own is None else own(value)
+        return _section(value) if kind is None else read(kind, value)
 
 
 def _plain(value: object) -> object:

@@ -7,7 +7,7 @@ from typing import Final
 
 
 class ConfigError(ValueError):
-    """What an operator wrote cannot be used; the message is one line: where, what, and what instead."""
+    """An operator's input cannot be used; the message is one line: file and key, what was found, what was expected."""
 
 
 _SHORT: Final = reprlib.Repr()
@@ -17,13 +17,13 @@ _SHORT.maxstring = _SHORT.maxlong = _SHORT.maxother = 200
 
 
 class Verbatim(str):
-    """What was found, in words: a message shows it without quotes."""
+    """A description of what was found: a message shows it without quotes."""
 
     __slots__ = ()
 
 
 def shown(value: object) -> str:
-    """Return a value as messages show it: its repr, shortened; what is `Verbatim` as it is."""
+    """Return a value as messages show it: its repr, shortened; a `Verbatim` as it is."""
     if isinstance(value, Verbatim):
         return value
     text = _SHORT.repr(value)

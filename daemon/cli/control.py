@@ -64,7 +64,7 @@ def main(argv: list[str]) -> int:
 
 
 def ask(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]:
-    """Send one request, wait for the reply. Raises OSError (nobody there, not allowed, no answer), ValueError."""
+    """Send one request, wait for the reply. Raises OSError (no daemon, not allowed, no answer), ValueError."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as sock:
         sock.settimeout(timeout_s)
         with reachable(path) as address:
