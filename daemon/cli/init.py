@@ -20,6 +20,7 @@ from typing import Any
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.device import UsageError, description, eds_survey, family_of, merged, surveyed
 from jtqd.daemon.cli.proposal import (
+    OPTIONS,
     ConfigProposal,
     JointProposal,
     MissingValueError,
@@ -113,15 +114,15 @@ def parser() -> argparse.ArgumentParser:
 def add_values(made: argparse.ArgumentParser, *, action: str = "store", of_joint: bool = True) -> None:
     """Add the options for values that a drive does not have (`Wanted`); of_joint: also those of the joint file."""
     for name, kind, unit, text in (
-        ("gear-ratio", _positive, "G", "motor revolutions per joint revolution"),
-        ("rated-torque", _positive, "NM", "rated torque of the joint [Nm]"),
-        ("torque-constant", _positive, "KT", "of the motor [Nm/A]"),
-        ("rated-current", _positive, "A", "of the motor [A], for 6075h"),
-        ("encoder-counts", _count, "N", "counts per revolution of the motor, all edges"),
-        ("link-encoder-counts", _count, "N", "counts per revolution of the joint, at the link"),
+        ("gear_ratio", _positive, "G", "motor revolutions per joint revolution"),
+        ("rated_torque_nm", _positive, "NM", "rated torque of the joint [Nm]"),
+        ("torque_constant_nm_per_a", _positive, "KT", "of the motor [Nm/A]"),
+        ("rated_current_a", _positive, "A", "of the motor [A], for 6075h"),
+        ("encoder_counts", _count, "N", "counts per revolution of the motor, all edges"),
+        ("link_encoder_counts", _count, "N", "counts per revolution of the joint, at the link"),
     ):
-        if of_joint or name not in {"rated-torque", "torque-constant"}:
-            made.add_argument(f"--{name}", type=kind, action=action, metavar=unit, help=text)
+        if of_joint or name not in {"rated_torque_nm", "torque_constant_nm_per_a"}:
+            made.add_argument(OPTIONS[name], dest=name, type=kind, action=action, metavar=unit, help=text)
     made.add_argument(
         "--one-encoder",
         action="store_true",
@@ -272,7 +273,7 @@ def _found(options: argparse.Namespace) -> Found:
         raise UsageError(f"{where}: give --node{_others(surveys)}")
     if len(nodes) > MAX_JOINTS:
         raise UsageError(f"--node: {len(nodes)} drives, this version of jtqd has at most {MAX_JOINTS} joints")
-    for node, path in zip(nodes, _each("from_eds", options.from_eds, len(nodes)), strict=True):
+    for node, path in zip(nodes, _each("--from-eds", options.from_eds, len(nodes)), strict=True):
         if path is not None:
             eds = eds_survey(path, node, options.profile)
             surveys[node] = merged(eds, surveys.get(node), path)
@@ -311,34 +312,20 @@ def _others(surveys: dict[int, Survey]) -> str:
 # ---- joints ----
 
 
-def _each(name: str, values: list[Any] | None, count: int) -> list[Any]:
+def _each(option: str, values: list[Any] | None, count: int) -> list[Any]:
     """Return one value per joint. Raises UsageError."""
     if values is None:
         return [None] * count
-    if len(values) == 1:
-        return values * count
-    if len(values) != count:
-        option = f"--{name.replace('_', '-')}"
+    if len(values) not in (1, count):
         raise UsageError(
             f"{option}: given {len(values)} times, expected once or {count} times (for each joint)"
         )
-    return values
-
-
-VALUES = {
-    "gear_ratio": "gear_ratio",
-    "rated_torque_nm": "rated_torque",
-    "torque_constant_nm_per_a": "torque_constant",
-    "rated_current_a": "rated_current",
-    "encoder_counts": "encoder_counts",
-    "link_encoder_counts": "link_encoder_counts",
-}
-"""Field of Wanted -> option."""
+    return values * count if len(values) == 1 else values
 
 
 def _joints(options: argparse.Namespace, found: Found) -> list[JointProposal]:
     count = len(found.nodes)
-    columns = {field: _each(name, getattr(options, name), count) for field, name in VALUES.items()}
+    columns = {field: _each(option, getattr(options, field), count) for field, option in OPTIONS.items()}
     ask = sys.stdin.isatty() and not options.no_questions and not options.json
     joints = []
     for position, node in enumerate(found.nodes):
@@ -357,23 +344,22 @@ def _joint(
         try:
             return propose_joint(*joint, survey, wanted, family)
         except MissingValueError as error:
-            option = str(error).rpartition("give --")[2].partition(",")[0]
-            field = next((name for name, each in VALUES.items() if each == option.replace("-", "_")), None)
-            if not ask or field is None:
+            if not ask or not error.field:
                 raise
-            answer: Any = _answer(str(error).rpartition(":")[0], option)
-            wanted = replace(wanted, **{field: answer})
+            answer: Any = _answer(error.why, error.field)
+            wanted = replace(wanted, **{error.field: answer})
 
 
-def _answer(why: str, option: str) -> float | int:
+def _answer(why: str, field: str) -> float | int:
     """Ask until a number comes. Raises UsageError at the end of input."""
-    kind = _count if option.endswith("counts") else _positive
+    kind = _count if field.endswith("counts") else _positive
     print(why, file=sys.stderr)
     while True:
-        print(f"{option.replace('-', ' ')}? ", end="", file=sys.stderr, flush=True)
+        question = OPTIONS[field].removeprefix("--").replace("-", " ")
+        print(f"{question}? ", end="", file=sys.stderr, flush=True)
         line = sys.stdin.readline()
         if not line:
-            raise UsageError(f"no answer: give --{option}")
+            raise UsageError(f"no answer: give {OPTIONS[field]}")
         try:
             return kind(line.strip())
         except argparse.ArgumentTypeError as error:

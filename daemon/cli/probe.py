@@ -22,8 +22,9 @@ from jtqd.daemon.cli.device import (
     surveyed,
     unit_problems,
 )
-from jtqd.daemon.cli.init import MAX_JOINTS, VALUES, add_values, node_id
+from jtqd.daemon.cli.init import MAX_JOINTS, add_values, node_id
 from jtqd.daemon.cli.proposal import (
+    OPTIONS,
     MissingValueError,
     Wanted,
     drive_lines,
@@ -126,7 +127,7 @@ def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
     family = family_of(found, options.profile)
     problems = problems_of(found, family)
     wanted = Wanted(
-        **{field: getattr(options, name, None) for field, name in VALUES.items()},
+        **{field: getattr(options, field, None) for field in OPTIONS},
         one_encoder=options.one_encoder,
     )
     if options.json:

@@ -46,8 +46,23 @@ LINK: tuple[Key, Key] = ((0x60E6, 1), (0x60EB, 1))
 NO_NODE: Final = "an EDS knows no node-ID: --node, or --bus"
 
 
+OPTIONS: Final = {
+    "gear_ratio": "--gear-ratio",
+    "rated_torque_nm": "--rated-torque",
+    "torque_constant_nm_per_a": "--torque-constant",
+    "rated_current_a": "--rated-current",
+    "encoder_counts": "--encoder-counts",
+    "link_encoder_counts": "--link-encoder-counts",
+}
+"""Field of `Wanted` -> option of `jtq init`."""
+
+
 class MissingValueError(ValueError):
-    """A value that cannot be guessed; the message names the option."""
+    """A value that cannot be guessed: why, and the field of `Wanted` whose option gives it ("": none does)."""
+
+    def __init__(self, why: str, field: str = "", alternative: str = "") -> None:
+        super().__init__(f"{why}: give {OPTIONS[field]}{alternative}" if field else why)
+        self.why, self.field = why, field
 
 
 @dataclass(frozen=True)
@@ -243,8 +258,8 @@ def _filled(
             where = f"joint {joint[0]} (node {joint[1]}): profile {family.name}"
             if line.option is None:
                 raise MissingValueError(f"{where}: {line.read} has no value ({line.why})")
-            option = "gear-ratio" if line.option.startswith("gear_ratio") else line.option.replace("_", "-")
-            raise MissingValueError(f"{where} needs a value that no object of the drive has: give --{option}")
+            field = "gear_ratio" if line.option.startswith("gear_ratio") else line.option
+            raise MissingValueError(f"{where} needs a value that no object of the drive has", field)
     return found
 
 
@@ -266,11 +281,10 @@ def _gear(number: int, node: int, survey: Survey | None, wanted: Wanted, given: 
     if wanted.gear_ratio is None:
         where = f"joint {number} (node {node})"
         if survey is None or own is None:
-            raise MissingValueError(f"{where}: no 6091h is known: give --gear-ratio")
+            raise MissingValueError(f"{where}: no 6091h is known", "gear_ratio")
         if own == 1.0:
-            raise MissingValueError(
-                f"{where}: 6091h is 1:1, as of drives that do not know their gear: give --gear-ratio"
-            )
+            why = f"{where}: 6091h is 1:1, as of drives that do not know their gear"
+            raise MissingValueError(why, "gear_ratio")
         return Value(own, f"{label(*GEAR[0])}, {survey.source}")
     if survey is not None and own != wanted.gear_ratio:
         origin = "--gear-ratio; " + ("the drive has none" if own is None else f"the drive has {own:g}")
@@ -317,9 +331,8 @@ def _rated_torque(number: int, survey: Survey | None, wanted: Wanted, gear: Valu
         return Value(wanted.rated_torque_nm, "--rated-torque")
     motor_mnm = None if survey is None else survey.number(RATED_TORQUE)
     if survey is None or motor_mnm is None:
-        raise MissingValueError(
-            f"joint {number}: the motor's rated torque (6076h) is not known: give --rated-torque"
-        )
+        why = f"joint {number}: the motor's rated torque (6076h) is not known"
+        raise MissingValueError(why, "rated_torque_nm")
     source = f"{label(*RATED_TORQUE)}, {survey.source}"
     origin = f"{EFFICIENCY:g} x gear ratio x rated torque of the motor ({source})"
     return _guess(EFFICIENCY * gear.number * (1e-3 * motor_mnm), origin, "data sheet of the gear or joint")
@@ -332,10 +345,8 @@ def _torque_constant(
         return Value(wanted.torque_constant_nm_per_a, "--torque-constant")
     if current_a is None:
         if survey is None:
-            raise MissingValueError(f"joint {number}: give --torque-constant, or --rated-current")
-        raise MissingValueError(
-            f"joint {number}: the rated current (6075h) is not known: give --rated-current"
-        )
+            raise MissingValueError(f"joint {number}", "torque_constant_nm_per_a", ", or --rated-current")
+        raise MissingValueError(f"joint {number}: the rated current (6075h) is not known", "rated_current_a")
     verify = "data sheet of the motor (per ampere as 6078h counts it: peak or RMS), or jtq diagnose"
     motor_mnm = None if survey is None else survey.number(RATED_TORQUE)
     if survey is not None and motor_mnm is not None:
@@ -354,23 +365,24 @@ def _encoders(
     if survey is None:
         return
 
-    def give(keys: tuple[Key, Key], counts: int | None, option: str) -> None:
+    def give(keys: tuple[Key, Key], field: str) -> None:
+        counts = getattr(wanted, field)
         if counts is None:
             if not all(survey.scales_by(key) for key in keys):
-                raise MissingValueError(f"node {node}: {label(*keys[0])} is not known: give {option}")
+                raise MissingValueError(f"node {node}: {label(*keys[0])} is not known", field)
         elif [survey.number(key) for key in keys] != [counts, 1]:
-            given[keys[0]] = Value(counts, option)
-            given[keys[1]] = Value(1, option)
+            given[keys[0]] = Value(counts, OPTIONS[field])
+            given[keys[1]] = Value(1, OPTIONS[field])
 
     if "motor_position" in by_standard:
-        give(POSITION, wanted.encoder_counts, "--encoder-counts")
+        give(POSITION, "encoder_counts")
     if "motor_velocity" in by_standard and not all(survey.scales_by(key) for key in VELOCITY):
         for ours, of_position in zip(VELOCITY, POSITION, strict=True):
             number = given[of_position].number if of_position in given else survey.number(of_position)
             verify = "turn the motor at a known speed and compare jtq status; 606Ch may be in rpm"
             given[ours] = Value(number or 1, "606Ch taken for encoder counts per second: no 6090h", verify)
     if "link_position" in by_standard:
-        give(LINK, wanted.link_encoder_counts, "--link-encoder-counts")
+        give(LINK, "link_encoder_counts")
 
 
 def _drive_objects(
