@@ -1,11 +1,13 @@
-"""Accuracy of one method of one joint on held-out runs by speed, load and temperature, and what to measure next.
+"""Accuracy card: one method of one joint on held-out runs by speed, load and temperature, and what to measure next.
 
-No file and no clock. Speed is |v| of the joint; load is the sensor's torque along the motion, tau sign(v), in parts of rated
-torque: positive where the motor drives the load, negative where the load drives the motor. A bin is `known` with at
-least two runs and 0.2 s of data: one run is one zero of the sensor and one temperature.
+Speed is |v| of the joint; load is the sensor's torque along the motion, tau sign(v), in parts of rated torque: positive
+where the motor drives the load, negative where the load drives the motor. A bin is `known` with at least two runs and 0.2 s
+of data: one run is one offset of the sensor and one temperature.
 
-Share of the zeros: mean square of a run's mean error over that of all errors. What is constant within a run is no function
-of speed or load, and no fit removes it.
+Share of the offsets (`zeros`): mean square of a run's mean error over that of all errors. What is constant within a run is
+no function of speed or load, and no fit removes it.
+
+The card is a page, a picture, values for programs (schema jtq.accuracy/1) and lines for a terminal.
 """
 
 from __future__ import annotations
@@ -14,21 +16,20 @@ import itertools
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
 from jtqd.sysid.evaluate.methods import TITLES, JointModels, Samples
-from jtqd.sysid.evaluate.report import plain_values, table
+from jtqd.sysid.evaluate.report import indented_table
 from jtqd.sysid.evaluate.scores import (
     NOMINAL,
-    Block,
     Coverage,
     Score,
     Standstill,
@@ -57,14 +58,18 @@ PLACE: Final = 1.5
 """RMSE of a bin over that of all samples, from which on the bin is named."""
 ZEROS: Final = 0.5
 COVERAGE_OFF: Final = 0.03
-"""Beside two standard errors."""
+"""Besides two standard errors."""
 _UNLIMITED: Final = 1e6
-"""As `MotionLimits` says it."""
+"""Default of `MotionLimits`."""
 _SERIES: Final = tuple(m * 10.0**p for p in range(-4, 4) for m in (1.0, 2.0, 5.0))
 
 
-class Bin(NamedTuple):
-    """From `low` to `high`: seconds and runs of data; score, RMSE of each run [Nm] and coverage of the 90 % interval."""
+@dataclass(frozen=True)
+class Bin:
+    """From `low` to `high`: seconds and runs of data; score, RMSE of each run [Nm] and coverage of the 90 % interval.
+
+    known: whether the figures are of the joint and not of one run.
+    """
 
     low: float
     high: float
@@ -73,27 +78,28 @@ class Bin(NamedTuple):
     error: Score | None
     by_run_nm: tuple[float, ...]
     interval: Coverage | None
+    known: bool = field(init=False)
 
-    @property
-    def known(self) -> bool:
-        """Whether the figures say something of the joint and not of one run."""
-        return self.runs >= ENOUGH_RUNS and self.seconds >= ENOUGH_S
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "known", self.runs >= ENOUGH_RUNS and self.seconds >= ENOUGH_S)
 
 
-class Advice(NamedTuple):
+@dataclass(frozen=True)
+class Advice:
     """What to measure or do next, and why; `key` for programs."""
 
     key: str
     text: str
 
 
-class Card(NamedTuple):
+@dataclass(frozen=True)
+class Card:
     """Everything on the card of one joint.
 
     speed [rad/s], load [parts of rated torque], temperature [degC]: bins; empty where it was not measured. cells: by load
     (rows, as `load`) and speed (columns, as `speed`). baseline: score of the classical TOB on the same samples, None where
     that is the method. mean_nm: standard deviation of the runs' mean errors; zeros: their share of the mean square.
-    limit_rad_s: highest speed that counts; given: whether the joint file's motion_limits say so.
+    limit_rad_s: highest speed that counts; given: whether it is that of the joint file's motion_limits.
     """
 
     number: int
@@ -125,44 +131,46 @@ def method_of(models: JointModels) -> str:
 def make_card(samples: Sequence[Samples], joint: Joint, method: str) -> Card | None:
     """Return the card of one joint from its runs; None where no run has a sample in motion.
 
-    It compares with the sensor, whose zero of the day is in every difference and no part of sigma: intervals have it added.
+    It compares with the sensor, whose offset of the day is in every difference and no part of sigma: intervals have it
+    added.
     """
     samples = [for_intervals(replace(each, true_nm=None)) for each in samples]
     own = [each for each in samples if method in each.estimate_nm and each.scored.any()]
-    overall, interval = _error(own, method), covered(own, method, NOMINAL)
+    overall, interval = score(own, method), covered(own, method)
     if overall is None or interval is None:
         return None
-    means = np.array([float(np.mean(each.error_nm(method)[each.scored])) for each in own])
+    means = np.array([float(np.mean(each.scored_error_nm(method))) for each in own])
     weights = np.array([np.count_nonzero(each.scored) for each in own], np.float64)
     limit, given = _speed_limit(own, joint)
-    speeds, loads, warmth = speed_edges(limit), load_edges(own), temperature_edges(own)
+    speeds, loads, warmth = (
+        list(itertools.pairwise(edges))
+        for edges in (speed_edges(limit), load_edges(own), temperature_edges(own))
+    )
+
+    def bins(of: Sequence[Samples], take: Take, edges: Sequence[tuple[float, float]]) -> tuple[Bin, ...]:
+        return tuple(_bin(_within(of, take, each), method, each) for each in edges)
+
     card = Card(
         number=own[0].number,
         joint=joint.name,
         rated_nm=joint.rated_torque_nm,
         method=method,
         runs=len(own),
-        seconds=sum(_seconds(each, each.scored) for each in own),
+        seconds=_seconds(own),
         error=overall,
-        baseline=None if method == BASELINE else _error(own, BASELINE),
+        baseline=None if method == BASELINE else score(own, BASELINE),
         mean_nm=float(np.std(means, ddof=1)) if len(means) > 1 else math.nan,
         zeros=float(weights @ means**2 / weights.sum()) / overall.mse_nm2 if overall.mse_nm2 else 0.0,
         interval=interval,
         standstill=standstill(samples)[own[0].number],
-        speed=tuple(_bin(own, method, edge, _within(_speed, edge)) for edge in _pairs(speeds)),
-        load=tuple(_bin(own, method, edge, _within(_load, edge)) for edge in _pairs(loads)),
-        temperature=tuple(_bin(own, method, edge, _within(_temperature, edge)) for edge in _pairs(warmth)),
-        cells=tuple(
-            tuple(
-                _bin(own, method, fast, _both(_within(_speed, fast), _within(_load, heavy)))
-                for fast in _pairs(speeds)
-            )
-            for heavy in _pairs(loads)
-        ),
+        speed=bins(own, _speed, speeds),
+        load=bins(own, _load, loads),
+        temperature=bins(own, _temperature, warmth),
+        cells=tuple(bins(_within(own, _load, heavy), _speed, speeds) for heavy in loads),
         limit_rad_s=limit,
         given=given,
     )
-    return card._replace(advice=tuple(_advice(card)))
+    return replace(card, advice=tuple(_advice(card)))
 
 
 def speed_edges(limit_rad_s: float) -> tuple[float, ...]:
@@ -179,7 +187,7 @@ def load_edges(samples: Sequence[Samples]) -> tuple[float, ...]:
 
 
 def temperature_edges(samples: Sequence[Samples]) -> tuple[float, ...]:
-    """Return edges at multiples of 5 K around what was measured; empty where nothing was."""
+    """Return edges at multiples of 5 K around the measured temperatures; empty without any."""
     every = np.concatenate([each.temperature_c[each.scored] for each in samples])
     every = every[np.isfinite(every)]
     if not len(every):
@@ -199,7 +207,6 @@ def _speed_limit(samples: Sequence[Samples], joint: Joint) -> tuple[float, bool]
 
 
 Take = Callable[[Samples], FloatArray]
-Keep = Callable[[Samples], NDArray[np.bool_]]
 
 
 def _speed(each: Samples) -> FloatArray:
@@ -216,47 +223,38 @@ def _temperature(each: Samples) -> FloatArray:
     return each.temperature_c
 
 
-def _within(take: Take, edges: tuple[float, float]) -> Keep:
-    return lambda each: (take(each) >= edges[0]) & (take(each) < edges[1])
+def _within(samples: Sequence[Samples], take: Take, edges: tuple[float, float]) -> list[Samples]:
+    """Return the samples, of which those in a bin are scored."""
+    low, high = edges
+
+    def inside(value: FloatArray) -> BoolArray:
+        return (value >= low) & (value < high)
+
+    return [each.where(inside(take(each))) for each in samples]
 
 
-def _both(one: Keep, other: Keep) -> Keep:
-    return lambda each: one(each) & other(each)
+def _seconds(samples: Sequence[Samples]) -> float:
+    return sum(float(np.diff(each.time_s, prepend=each.time_s[0])[each.scored].sum()) for each in samples)
 
 
-def _pairs(edges: Sequence[float]) -> list[tuple[float, float]]:
-    return list(itertools.pairwise(edges))
-
-
-def _seconds(each: Samples, mask: NDArray[np.bool_]) -> float:
-    steps = np.diff(each.time_s, prepend=each.time_s[0])
-    return float(steps[mask].sum())
-
-
-def _error(samples: Sequence[Samples], method: str, keep: Keep | None = None) -> Score | None:
-    masks = [each.scored if keep is None else each.scored & keep(each) for each in samples]
-    if any(method not in each.estimate_nm for each in samples):
-        return None
-    return score(
-        [Block(each.error_nm(method)[mask], each.rated_nm) for each, mask in zip(samples, masks, strict=True)]
-    )
-
-
-def _bin(samples: Sequence[Samples], method: str, edges: tuple[float, float], keep: Keep) -> Bin:
-    there = [each for each in samples if (each.scored & keep(each)).any()]
-    each_run = [_error([each], method, keep) for each in there]
+def _bin(samples: Sequence[Samples], method: str, edges: tuple[float, float]) -> Bin:
+    there = [each for each in samples if each.scored.any()]
+    each_run = [score([each], method) for each in there]
     return Bin(
         *edges,
-        seconds=sum(_seconds(each, each.scored & keep(each)) for each in there),
+        seconds=_seconds(there),
         runs=len(there),
-        error=_error(there, method, keep),
+        error=score(there, method),
         by_run_nm=tuple(one.rmse_nm for one in each_run if one is not None),
-        interval=covered(there, method, NOMINAL, keep),
+        interval=covered(there, method),
     )
+
+
+# Advice ------------------------------------------------------------------------------------------------------------------
 
 
 def _advice(card: Card) -> list[Advice]:
-    """Return what is worth most first: what is wrong before what is not known."""
+    """Return the most valuable first: what is wrong before what is not known."""
     rules = (_method, _interval, _zeros, _place, _loads, _speeds, _corners, _warmth, _standing, _runs)
     return [Advice(rule.__name__.strip("_"), text) for rule in rules if (text := rule(card))]
 
@@ -287,8 +285,8 @@ def _zeros(card: Card) -> str:
         return ""
     return (
         f"{100.0 * card.zeros:.0f} % of the mean square error is constant within a run and differs from run to run "
-        f"({card.mean_nm:.2g} Nm): zeros of sensor, current or encoders, or friction of the day. Take the sensor's zero "
-        "unloaded before each run; jtq diagnose says which of them it is. More speeds and loads will not lower it."
+        f"({card.mean_nm:.2g} Nm): offsets of sensor, current or encoders, or friction of the day. Take the sensor's offset "
+        "unloaded before each run; jtq diagnose reports which of them it is. More speeds and loads will not lower it."
     )
 
 
@@ -317,12 +315,18 @@ def _loads(card: Card) -> str:
     texts = []
     for title, bins in (
         ("motor drives the load", [each for each in card.load if each.low >= 0.0]),
-        ("load drives the motor", [_mirrored(each) for each in reversed(card.load) if each.high <= 0.0]),
+        (
+            "load drives the motor",
+            [
+                replace(each, low=-each.high, high=-each.low)
+                for each in reversed(card.load)
+                if each.high <= 0.0
+            ],
+        ),
     ):
-        within = [each for each in bins if each.high <= 1.0 + 1e-9]
-        gaps = ranges([each for each in within if not each.known])
+        gaps = ranges([each for each in bins if each.high <= 1.0 + 1e-9 and not each.known])
         if gaps:
-            spans = " and ".join(f"{100.0 * low:.0f} to {100.0 * high:.0f} %" for low, high in gaps)
+            spans = " and ".join(f"{100.0 * abs(low):.0f} to {100.0 * high:.0f} %" for low, high in gaps)
             texts.append(f"{title}: {spans}")
     if not texts:
         return ""
@@ -402,9 +406,103 @@ def ranges(bins: Sequence[Bin]) -> list[tuple[float, float]]:
     return found
 
 
-def _mirrored(each: Bin) -> Bin:
-    return each._replace(low=0.0 - each.high, high=0.0 - each.low)
+# Page, values, text ------------------------------------------------------------------------------------------------------
 
+_TEMPLATE: Final = "card.html.j2"
+
+
+def card_html(
+    cards: Sequence[Card], files: Mapping[int, Mapping[str, str]], findings: Sequence[RunIssue], made: str
+) -> str:
+    """Return the page; files: name to SHA-256, by joint. Needs jinja2 and matplotlib."""
+    content = {
+        "cards": [
+            {
+                "joint": card.joint,
+                "title": f"method {card.method}",
+                "source": source(card),
+                "tiles": tiles(card),
+                "advice": card.advice,
+                "picture": page_svg(lambda card=card: card_figure(card), f"card-{card.number}"),  # type: ignore[misc]
+                "files": sorted(files[card.number].items()),
+            }
+            for card in cards
+        ],
+        "findings": [f"{each.kind}: {each.text}" for each in findings],
+        "made": made,
+    }
+    return page.render("jtqd.sysid.evaluate", _TEMPLATE, content)
+
+
+def card_mapping(cards: Sequence[Card], findings: Sequence[RunIssue]) -> dict[str, Any]:
+    """Return the cards for a program; an axis that was not measured is an empty list."""
+    found = [each._asdict() for each in findings]
+    mapping: dict[str, Any] = plain_values({"schema": SCHEMA, "joints": cards, "findings": found})
+    return mapping
+
+
+def card_lines(card: Card) -> list[str]:
+    """Return the card for a terminal."""
+    lines = [f"{card.joint}: method {card.method}; {source(card)}"]
+    lines += [
+        f"  {title:<15}{value}{f' ({more})' if more else ''}".rstrip() for title, value, more in tiles(card)
+    ]
+    for title, bins, name in (
+        ("speed", card.speed, lambda low, high: f"{low:g} to {high:g} rad/s"),
+        ("load", card.load, load_name),
+        ("temperature", card.temperature, lambda low, high: f"{low:g} to {high:g} degC"),
+    ):
+        rows = [
+            [
+                name(each.low, each.high),
+                f"{each.error.rmse_nm:.3f}" if each.error is not None else "-",
+                f"{100.0 * each.interval.share:.0f} %" if each.interval is not None else "-",
+                str(each.runs),
+                f"{each.seconds:.0f}",
+            ]
+            for each in bins
+        ]
+        if rows:
+            lines += ["", *indented_table([title, "RMSE [Nm]", "90 % interval", "runs", "seconds"], rows)]
+    advice = [each.text for each in card.advice] or [
+        "nothing: every speed, load and temperature was measured"
+    ]
+    return [*lines, "", "  what to measure next", *(f"  - {text}" for text in advice)]
+
+
+def source(card: Card) -> str:
+    """Return what the card was made from."""
+    runs = counted(card.runs, "run")
+    return f"{runs}, {card.seconds:.0f} s in motion, joint {card.number}, rated torque {card.rated_nm:g} Nm"
+
+
+def tiles(card: Card) -> list[tuple[str, str, str]]:
+    """Return title, figure and explanation of the single figures."""
+    interval = card.interval
+    se = f" ± {100.0 * interval.se:.0f}" if math.isfinite(interval.se) else ""
+    beside = "" if card.baseline is None else f"classical TOB {card.baseline.rmse_nm:.2g} Nm"
+    standing = card.standstill.coverage.get(card.method)
+    rest = ("not measured", "")
+    if standing is not None:
+        width = card.standstill.half_width_nm[card.method]
+        rest = (f"holds {100.0 * standing.share:.0f} %", f"half width {width:.2g} Nm on average")
+    return [
+        (
+            "RMSE",
+            f"{card.error.rmse_nm:.2g} Nm",
+            ", ".join(filter(None, (f"{card.error.rmse_rated_percent:.2g} % of rated", beside))),
+        ),
+        ("95 % of errors", f"below {card.error.p95_nm:.2g} Nm", f"largest {card.error.max_nm:.2g} Nm"),
+        (
+            "90 % interval",
+            f"holds {100.0 * interval.share:.0f}{se} %",
+            "of the sensor in motion, its offset added",
+        ),
+        ("Standstill", *rest),
+    ]
+
+
+# Picture -----------------------------------------------------------------------------------------------------------------
 
 WIDTH_IN: Final = 10.0
 _KNOWN, _LITTLE = LIGHT["after"], LIGHT["noise"]
@@ -412,7 +510,7 @@ _LINE_CHARACTERS: Final = 132
 
 
 def card_figure(card: Card) -> Any:
-    """Return the four panels."""
+    """Return the four panels, in the colours of `LIGHT`."""
     from matplotlib import pyplot as plt
 
     figure = plt.figure(figsize=(WIDTH_IN, 6.4), layout="constrained")
@@ -447,49 +545,10 @@ def write_png(card: Card, path: Path) -> None:
             above.text(x, 0.16, more, color=LIGHT["soft"], va="top", fontsize=8.5)
         top = 1.0 - 0.12 / foot
         below.text(0.012, top, "What to measure next", fontsize=11, weight="bold", va="top")
-        below.text(
-            0.012,
-            top - 0.24 / foot,
-            "\n".join(lines) or "Nothing: every speed, load and temperature was measured.",
-            va="top",
-            linespacing=1.35,
-        )
+        text = "\n".join(lines) or "Nothing: every speed, load and temperature was measured."
+        below.text(0.012, top - 0.24 / foot, text, va="top", linespacing=1.35)
         figure.savefig(path, dpi=110)
         plt.close(figure)
-
-
-def source(card: Card) -> str:
-    """Return what the card was made from."""
-    runs = "1 run" if card.runs == 1 else f"{card.runs} runs"
-    return f"{runs}, {card.seconds:.0f} s in motion, joint {card.number}, rated torque {card.rated_nm:g} Nm"
-
-
-def tiles(card: Card) -> list[tuple[str, str, str]]:
-    """Return title, figure and explanation of what is known in one number."""
-    interval = card.interval
-    se = f" ± {100.0 * interval.se:.0f}" if math.isfinite(interval.se) else ""
-    beside = "" if card.baseline is None else f"classical TOB {card.baseline.rmse_nm:.2g} Nm"
-    standing = card.standstill.coverage.get(card.method)
-    return [
-        (
-            "RMSE",
-            f"{card.error.rmse_nm:.2g} Nm",
-            ", ".join(filter(None, (f"{card.error.rmse_rated_percent:.2g} % of rated", beside))),
-        ),
-        ("95 % of errors", f"below {card.error.p95_nm:.2g} Nm", f"largest {card.error.max_nm:.2g} Nm"),
-        (
-            "90 % interval",
-            f"holds {100.0 * interval.share:.0f}{se} %",
-            "of the sensor in motion, its zero added",
-        ),
-        (
-            "Standstill",
-            "not measured" if standing is None else f"holds {100.0 * standing.share:.0f} %",
-            ""
-            if standing is None
-            else f"half width {card.standstill.half_width_nm[card.method]:.2g} Nm on average",
-        ),
-    ]
 
 
 def _panels(figure: Any, card: Card) -> None:
@@ -505,16 +564,23 @@ def _panels(figure: Any, card: Card) -> None:
         ),
         default=1.0,
     )
-    _panel(upper_left, card.speed, top, "speed |v| [rad/s]", lambda edge: f"{edge:g}")
-    _panel(
-        upper_right,
-        card.load,
-        top,
-        "torque along the motion [% of rated], negative: load drives",
-        lambda edge: f"{100.0 * edge:.0f}",
-    )
-    _panel(lower_left, card.temperature, top, "temperature [°C]", lambda edge: f"{edge:g}")
-    _map(lower_right, card)
+    along = "torque along the motion [% of rated]"
+    _panel(upper_left, card.speed, top, "speed |v| [rad/s]", _plain_edge)
+    _panel(upper_right, card.load, top, f"{along}, negative: load drives", _percent_edge)
+    _panel(lower_left, card.temperature, top, "temperature [°C]", _plain_edge)
+    _map(lower_right, card, along)
+
+
+def _plain_edge(edge: float) -> str:
+    return f"{edge:g}"
+
+
+def _percent_edge(edge: float) -> str:
+    return f"{100.0 * edge:.0f}"
+
+
+def _edge_names(bins: Sequence[Bin], name: Callable[[float], str]) -> list[str]:
+    return [name(edge) for edge in (*(each.low for each in bins), bins[-1].high)]
 
 
 def _panel(figure: Any, bins: Sequence[Bin], top: float, label: str, name: Callable[[float], str]) -> None:
@@ -527,37 +593,27 @@ def _panel(figure: Any, bins: Sequence[Bin], top: float, label: str, name: Calla
         upper.text(0.5, 0.5, "not measured", transform=upper.transAxes, ha="center", color=LIGHT["soft"])
         lower.set_xticks([])
     for place, each in enumerate(bins):
+        x = place + 0.5
         if each.error is None:
-            upper.text(
-                place + 0.5, 0.02 * top, "no data", ha="center", va="bottom", color=LIGHT["soft"], fontsize=8
-            )
+            look = {"ha": "center", "va": "bottom", "color": LIGHT["soft"], "fontsize": 8}
+            upper.text(x, 0.02 * top, "no data", **look)
             continue
-        upper.bar(
-            place + 0.5,
-            each.error.rmse_nm,
-            0.8,
-            color=_KNOWN if each.known else _LITTLE,
-            alpha=0.75 if each.known else 1.0,
-        )
+        bar = {"color": _KNOWN, "alpha": 0.75} if each.known else {"color": _LITTLE, "alpha": 1.0}
+        upper.bar(x, each.error.rmse_nm, 0.8, **bar)
         spread = np.linspace(-0.25, 0.25, len(each.by_run_nm)) if len(each.by_run_nm) > 1 else np.zeros(1)
-        upper.plot(
-            place + 0.5 + spread, each.by_run_nm, "o", color=LIGHT["ink"], markersize=2.0, linestyle="none"
-        )
+        upper.plot(x + spread, each.by_run_nm, "o", color=LIGHT["ink"], markersize=2.0, linestyle="none")
         if each.interval is not None:
-            error = 100.0 * each.interval.se if math.isfinite(each.interval.se) else 0.0
             lower.errorbar(
-                place + 0.5,
+                x,
                 100.0 * each.interval.share,
-                yerr=error,
+                yerr=100.0 * each.interval.se if math.isfinite(each.interval.se) else 0.0,
                 fmt="o",
                 color=_KNOWN if each.known else LIGHT["soft"],
                 markersize=4.0,
                 elinewidth=1.2,
             )
     if bins:
-        lower.set_xticks(
-            range(len(bins) + 1), [name(edge) for edge in (*(each.low for each in bins), bins[-1].high)]
-        )
+        lower.set_xticks(range(len(bins) + 1), _edge_names(bins, name))
         lower.set_xlim(0, len(bins))
     lower.axhline(100.0 * NOMINAL, color=LIGHT["soft"], linewidth=0.8, linestyle="--")
     lower.set_ylim(0.0, 105.0)
@@ -568,7 +624,7 @@ def _panel(figure: Any, bins: Sequence[Bin], top: float, label: str, name: Calla
     upper.set_ylabel("RMSE [Nm]")
 
 
-def _map(figure: Any, card: Card) -> None:
+def _map(figure: Any, card: Card, label: str) -> None:
     """RMSE of each combination of speed and load; pale where one run or less than a second is all there is."""
     axis = figure.subplots(1, 1)
     most = max(
@@ -579,20 +635,15 @@ def _map(figure: Any, card: Card) -> None:
         for x, cell in enumerate(row):
             if cell.error is None:
                 continue
-            share = min(1.0, cell.error.rmse_nm / most)
-            axis.bar(
-                x + 0.5,
-                0.94,
-                0.94,
-                bottom=y + 0.03,
-                color=_KNOWN if cell.known else _LITTLE,
-                alpha=0.12 + 0.63 * share if cell.known else 0.6,
-                linewidth=0,
-            )
+            rmse = cell.error.rmse_nm
+            bar = {"color": _LITTLE, "alpha": 0.6}
+            if cell.known:
+                bar = {"color": _KNOWN, "alpha": 0.12 + 0.63 * min(1.0, rmse / most)}
+            axis.bar(x + 0.5, 0.94, 0.94, bottom=y + 0.03, linewidth=0, **bar)
             axis.text(
                 x + 0.5,
                 y + 0.48,
-                f"{cell.error.rmse_nm:.2f}" if cell.error.rmse_nm < 9.995 else f"{cell.error.rmse_nm:.0f}",
+                f"{rmse:.2f}" if rmse < 9.995 else f"{rmse:.0f}",
                 ha="center",
                 va="center",
                 fontsize=7.5,
@@ -600,93 +651,8 @@ def _map(figure: Any, card: Card) -> None:
             )
     axis.set_xlim(0, len(card.speed))
     axis.set_ylim(0, len(card.load))
-    axis.set_xticks(
-        range(len(card.speed) + 1),
-        [f"{edge:g}" for edge in (*(b.low for b in card.speed), card.speed[-1].high)],
-    )
-    axis.set_yticks(
-        range(len(card.load) + 1),
-        [f"{100.0 * edge:.0f}" for edge in (*(b.low for b in card.load), card.load[-1].high)],
-    )
+    axis.set_xticks(range(len(card.speed) + 1), _edge_names(card.speed, _plain_edge))
+    axis.set_yticks(range(len(card.load) + 1), _edge_names(card.load, _percent_edge))
     axis.grid(visible=False)
     axis.set_xlabel("speed |v| [rad/s]; in the cells: RMSE [Nm]")
-    axis.set_ylabel("torque along the motion [% of rated]")
-
-
-_TEMPLATE: Final = "card.html.j2"
-
-
-def card_html(
-    cards: Sequence[Card], files: Mapping[int, Mapping[str, str]], findings: Sequence[RunIssue], made: str
-) -> str:
-    """Return the page; files: name to SHA-256, by joint. Needs jinja2 and matplotlib."""
-    content = {
-        "cards": [
-            {
-                "joint": card.joint,
-                "title": f"method {card.method}",
-                "source": source(card),
-                "tiles": tiles(card),
-                "advice": card.advice,
-                "picture": page_svg(lambda card=card: card_figure(card), f"card-{card.number}"),  # type: ignore[misc]
-                "files": sorted(files[card.number].items()),
-            }
-            for card in cards
-        ],
-        "findings": [f"{each.kind}: {each.text}" for each in findings],
-        "made": made,
-    }
-    return page.render("jtqd.sysid.evaluate", _TEMPLATE, content)
-
-
-def card_mapping(cards: Sequence[Card], findings: Sequence[RunIssue]) -> dict[str, Any]:
-    """Return the cards for a program (schema jtq.accuracy/1); an axis that was not measured is an empty list."""
-    joints = []
-    for card in cards:
-        values = card._asdict() | {
-            "standstill": vars(card.standstill),
-            "speed": [_bin_values(each) for each in card.speed],
-            "load": [_bin_values(each) for each in card.load],
-            "temperature": [_bin_values(each) for each in card.temperature],
-            "cells": [[_bin_values(each) for each in row] for row in card.cells],
-        }
-        joints.append(values)
-    found: dict[str, Any] = plain_values({"schema": SCHEMA, "joints": joints, "findings": list(findings)})
-    return found
-
-
-def _bin_values(each: Bin) -> dict[str, Any]:
-    return each._asdict() | {"known": each.known}
-
-
-def card_lines(card: Card) -> list[str]:
-    """Return the card for a terminal."""
-    lines = [f"{card.joint}: method {card.method}; {source(card)}"]
-    lines += [
-        f"  {title:<15}{value}{f' ({more})' if more else ''}".rstrip() for title, value, more in tiles(card)
-    ]
-    for title, bins, name in (
-        ("speed", card.speed, lambda low, high: f"{low:g} to {high:g} rad/s"),
-        ("load", card.load, load_name),
-        ("temperature", card.temperature, lambda low, high: f"{low:g} to {high:g} degC"),
-    ):
-        rows = [
-            [
-                name(each.low, each.high),
-                f"{each.error.rmse_nm:.3f}" if each.error is not None else "-",
-                f"{100.0 * each.interval.share:.0f} %" if each.interval is not None else "-",
-                str(each.runs),
-                f"{each.seconds:.0f}",
-            ]
-            for each in bins
-        ]
-        if rows:
-            lines += ["", *table([title, "RMSE [Nm]", "90 % interval", "runs", "seconds"], rows)]
-    lines += ["", "  what to measure next", *_next(card.advice)]
-    return lines
-
-
-def _next(advice: Sequence[Advice]) -> list[str]:
-    return [f"  - {each.text}" for each in advice] or [
-        "  - nothing: every speed, load and temperature was measured"
-    ]
+    axis.set_ylabel(label)

@@ -1,4 +1,4 @@
-"""`jtq evaluate`: every method beside the torque sensor on runs never trained on; table, JSON and an HTML report."""
+"""`jtq evaluate`: every method beside the torque sensor on held-out runs; table, JSON and an HTML report, or a card."""
 
 from __future__ import annotations
 
@@ -15,13 +15,23 @@ from typing import Final
 from jtqd.estimator.command_line import check_installed, make_directory
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
-from jtqd.sysid.evaluate.card import BASELINE, Card, make_card, method_of
-from jtqd.sysid.evaluate.evaluation import Evaluation, evaluate, loop_time
+from jtqd.sysid.evaluate.card import (
+    BASELINE,
+    Card,
+    card_html,
+    card_lines,
+    card_mapping,
+    make_card,
+    method_of,
+    write_png,
+)
+from jtqd.sysid.evaluate.evaluation import evaluate, loop_time
 from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
 from jtqd.sysid.evaluate.methods import JointModels, load_models, take_samples
-from jtqd.sysid.evaluate.report import as_mapping, text_lines
+from jtqd.sysid.evaluate.report import as_mapping, report_html, text_lines
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.channels import RunIssue
+from jtqd.sysid.runs.options import add_columns, add_runs
 from jtqd.sysid.runs.run_file import RunError
 
 BY: Final = "jtq evaluate"
@@ -42,24 +52,22 @@ def main(argv: list[str]) -> int:
         inputs = read_inputs(options.runs, models, options.columns)
         if not inputs.runs and inputs.findings:
             raise RunError("\n".join(finding.text for finding in inputs.findings))
-        if options.card:
-            return _card(options, models, inputs)
         outside = Inputs((), (), ())
         if options.outside:
             outside = read_inputs(options.outside, models, options.columns)
-        runs = _distinct(inputs, outside)
-        result = evaluate(runs, outside.runs, models, progress, loop_time(runs, models))
-        result = replace(
-            result, findings=(*_silent(models), *inputs.findings, *outside.findings, *result.findings)
+        findings = (
+            _card(options, models, inputs) if options.card else _report(options, models, inputs, outside)
         )
-        _write(options, result)
     except (ConfigError, NetworkError, RunError, ValueError, OSError) as error:
         for line in str(error).splitlines() or [type(error).__name__]:
             print(f"{BY}: {line}", file=sys.stderr)
         return 1
     for note in (*inputs.notes, *outside.notes):
         print(f"{BY}: {note}", file=sys.stderr)
-    return 3 if result.findings else 0
+    print(
+        f"{BY}: wrote {options.out / ('card.html' if options.card else 'evaluation.html')}", file=sys.stderr
+    )
+    return 3 if findings else 0
 
 
 def parser() -> argparse.ArgumentParser:
@@ -77,13 +85,7 @@ def parser() -> argparse.ArgumentParser:
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "runs",
-        nargs="+",
-        type=Path,
-        metavar="RUNS",
-        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
-    )
+    add_runs(parser)
     parser.add_argument(
         "--models",
         type=Path,
@@ -111,9 +113,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="RUNS",
         help="runs with more load or warmer than the training runs, to score our method outside its envelope",
     )
-    parser.add_argument(
-        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
-    )
+    add_columns(parser)
     parser.add_argument(
         "--card",
         action="store_true",
@@ -124,35 +124,33 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _distinct(inputs: Inputs, outside: Inputs) -> tuple:  # type: ignore[type-arg]
-    """Return the runs to evaluate; one that is also given as outside would count twice. Raises ConfigError."""
+def _report(
+    options: argparse.Namespace, models: tuple[JointModels, ...], inputs: Inputs, outside: Inputs
+) -> tuple[RunIssue, ...]:
+    """Write evaluation.json and evaluation.html; the table or the JSON on standard output. Returns the findings."""
     beyond = {run.sha256: run.name for run in outside.runs}
     for run in inputs.runs:
-        if run.sha256 in beyond:
+        if run.sha256 in beyond:  # it would count twice
             raise ConfigError(
                 f"--outside {beyond[run.sha256]}: found the same data as in {run.name}, expected other runs"
             )
-    return inputs.runs
+    result = evaluate(inputs.runs, outside.runs, models, progress, loop_time(inputs.runs, models))
+    findings = (*_unknown_training(models), *inputs.findings, *outside.findings, *result.findings)
+    result = replace(result, findings=findings)
+    mapping = as_mapping(result)
+    text = json.dumps(mapping, indent=1, allow_nan=False)
+    page = report_html(result, mapping, _made())
+    _write_whole(options.out, {"evaluation.json": f"{text}\n", "evaluation.html": page})
+    print(text if options.json else "\n".join(text_lines(result, mapping)))
+    return findings
 
 
-def _silent(models: tuple[JointModels, ...]) -> list[RunIssue]:
-    return [
-        RunIssue(
-            "training_runs_unknown",
-            f"{name}: found no runs in its metadata, expected names and SHA-256 of what it was trained on: whether it has "
-            "seen these runs cannot be told",
-        )
-        for each in models
-        for name in each.training.silent
-    ]
-
-
-def _card(options: argparse.Namespace, models: tuple[JointModels, ...], inputs: Inputs) -> int:
-    """Write card.json, card.html and a picture per joint; the card on standard output. Returns the exit status."""
-    from jtqd.sysid.evaluate.card import card_html, card_lines, card_mapping, write_png
-
+def _card(
+    options: argparse.Namespace, models: tuple[JointModels, ...], inputs: Inputs
+) -> tuple[RunIssue, ...]:
+    """Write card.json, card.html and a picture per joint; the card on standard output. Returns the findings."""
     cards: list[Card] = []
-    findings = [*_silent(models), *inputs.findings]
+    findings = [*_unknown_training(models), *inputs.findings]
     for each in models:
         method = method_of(each)
         one = replace(each, methods=tuple(dict.fromkeys((BASELINE, method))))
@@ -162,43 +160,34 @@ def _card(options: argparse.Namespace, models: tuple[JointModels, ...], inputs: 
             if each.number in run.columns
         ]
         card = make_card(samples, each.joint, method)
-        if card is None:
-            findings.append(
-                RunIssue(
-                    "nothing_to_score", f"j{each.number}: found no sample in motion with a value: no card"
-                )
-            )
-        else:
+        if card is not None:
             cards.append(card)
+            continue
+        text = f"j{each.number}: found no sample in motion with a value: no card"
+        findings.append(RunIssue("nothing_to_score", text))
     if not cards:
         raise RunError("\n".join(finding.text for finding in findings))
-    mapping = card_mapping(cards, findings)
-    text = json.dumps(mapping, indent=1, allow_nan=False)
-    files = {each.number: each.files for each in models}
-    _write_whole(
-        options.out, {"card.json": f"{text}\n", "card.html": card_html(cards, files, findings, _made())}
-    )
+    text = json.dumps(card_mapping(cards, findings), indent=1, allow_nan=False)
+    page = card_html(cards, {each.number: each.files for each in models}, findings, _made())
+    _write_whole(options.out, {"card.json": f"{text}\n", "card.html": page})
     for card in cards:
         write_png(card, options.out / f"card_joint{card.number}.png")
     lines = [line for card in cards for line in (*card_lines(card), "")]
     lines += [f"{each.kind}: {each.text}" for each in findings]
     print(text if options.json else "\n".join(lines).rstrip())
-    for note in inputs.notes:
-        print(f"{BY}: {note}", file=sys.stderr)
-    print(f"{BY}: wrote {options.out / 'card.html'}", file=sys.stderr)
-    return 3 if findings else 0
+    return tuple(findings)
 
 
-def _write(options: argparse.Namespace, result: Evaluation) -> None:
-    """evaluation.json and evaluation.html; then the table or the JSON on standard output."""
-    from jtqd.sysid.evaluate.report import report_html
-
-    mapping = as_mapping(result)
-    text = json.dumps(mapping, indent=1, allow_nan=False)
-    page = report_html(result, mapping, _made())
-    _write_whole(options.out, {"evaluation.json": f"{text}\n", "evaluation.html": page})
-    print(text if options.json else "\n".join(text_lines(result, mapping)))
-    print(f"{BY}: wrote {options.out / 'evaluation.html'}", file=sys.stderr)
+def _unknown_training(models: tuple[JointModels, ...]) -> list[RunIssue]:
+    return [
+        RunIssue(
+            "training_runs_unknown",
+            f"{name}: found no runs in its metadata, expected names and SHA-256 of its training runs: it is unknown whether "
+            "these runs are among them",
+        )
+        for each in models
+        for name in each.without_runs
+    ]
 
 
 def _made() -> str:

@@ -1,18 +1,15 @@
-"""Evaluate all methods on all runs: samples of every run and joint, every table of the report, and the targets.
+"""Evaluation of all methods on all runs: every table of the report, the targets, and the time of a step. No file.
 
-No file and no clock: a pure function of runs and models.
-
-Measure the time of one step of each method on samples of an evaluated run: its part of jtqd's loop.
-
-Every step is timed alone, as the loop would call it, with the loop's own estimators and networks; the methods take turns
-in short blocks, so that a busy machine affects all alike, and the median leaves out the steps in which the machine did
-something else. One process in a tight loop: caches are warmer than in a loop that sleeps between its cycles.
+Time of a step, each method's part of jtqd's loop: every step is timed alone on samples of an evaluated run, with the loop's
+own estimators and networks. The methods take turns in short blocks, so that a busy machine affects all alike, and the median
+drops the steps in which the machine did something else. One process in a tight loop: caches are warmer than in a loop that
+sleeps between its cycles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from time import perf_counter_ns
 from typing import Final, NamedTuple, TypeVar
 
@@ -23,7 +20,7 @@ from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.text import counted
-from jtqd.sysid.evaluate.inputs import JudgedRun
+from jtqd.sysid.evaluate.inputs import EvaluatedRun
 from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples, take_samples
 from jtqd.sysid.evaluate.scores import (
     ALLOWED,
@@ -57,14 +54,17 @@ from jtqd.sysid.fit.efficiency import QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
 from jtqd.sysid.runs.channels import RunIssue
 
-METHODS: Final = ("tob", PAPERS, OURS)
+# Time of a step ----------------------------------------------------------------------------------------------------------
+
+TIMED: Final = ("tob", PAPERS, OURS)
 SAMPLES: Final = 3000
 """Steps per joint and method, from the middle of the run: it moves there."""
 _BLOCK: Final = 100
 
 
-class LoopTime(NamedTuple):
-    """Median cost of a step [us] by method, summed over the joints that have all of METHODS; run: of the samples."""
+@dataclass(frozen=True)
+class LoopTime:
+    """Median cost of a step [us] by method, summed over the joints that have all of TIMED; run: of the samples."""
 
     step_us: Mapping[str, float]
     joints: int
@@ -72,21 +72,21 @@ class LoopTime(NamedTuple):
     run: str
 
     def extra_us(self, over: str) -> float:
-        """Return what ours costs more than another method [us], all joints together."""
+        """Return the cost of ours beyond that of another method [us], all joints together."""
         return self.step_us[OURS] - self.step_us[over]
 
 
 def loop_time(
-    runs: Sequence[JudgedRun],
+    runs: Sequence[EvaluatedRun],
     models: Sequence[JointModels],
     clock_ns: Callable[[], int] = perf_counter_ns,
 ) -> LoopTime | None:
-    """Return what steps cost on the first run that holds every such joint; None where no joint has all of METHODS."""
-    whole = [each for each in models if set(METHODS) <= set(each.methods)]
+    """Return the cost of steps on the first run that holds every such joint; None where no joint has all of TIMED."""
+    whole = [each for each in models if set(TIMED) <= set(each.methods)]
     run = next((run for run in runs if whole and all(each.number in run.columns for each in whole)), None)
     if run is None:
         return None
-    total = dict.fromkeys(METHODS, 0.0)
+    total = dict.fromkeys(TIMED, 0.0)
     for each in whole:
         rows = _rows(run, each)
         for method, cost in _costs_us(each, rows, clock_ns).items():
@@ -94,51 +94,61 @@ def loop_time(
     return LoopTime(total, len(whole), len(rows), run.name)
 
 
-_Row = tuple[float, float, float, float, float]
+_Step = tuple[float, float, float, float, float, float]
+"""dt, current, motor position, motor velocity, link position, temperature."""
 
 
-def _rows(run: JudgedRun, models: JointModels) -> list[tuple[_Row, float]]:
-    """Return ((dt, current, motor position, motor velocity, link position), temperature) of the middle of the run."""
-    columns = run.columns[models.number]
-    time_s = run.table.time_s
+def _rows(run: EvaluatedRun, models: JointModels) -> list[_Step]:
+    """Return the inputs of the middle of the run."""
+    columns, time_s = run.columns[models.number], run.table.time_s
     begin = max((len(time_s) - SAMPLES) // 2, 1)
     at = slice(begin, begin + SAMPLES)
     names = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
     values = [np.asarray(getattr(columns, name))[at].tolist() for name in names]
     warm = columns.temperature_c
     known = np.full(len(time_s), np.nan) if warm is None else np.asarray(warm)
-    rows = zip(np.diff(time_s)[begin - 1 : begin - 1 + SAMPLES].tolist(), *values, strict=True)
-    return list(zip(rows, known[at].tolist(), strict=True))
+    steps = np.diff(time_s)[begin - 1 : begin - 1 + SAMPLES].tolist()
+    return list(zip(steps, *values, known[at].tolist(), strict=True))
 
 
-def _costs_us(
-    models: JointModels, rows: list[tuple[_Row, float]], clock_ns: Callable[[], int]
-) -> dict[str, float]:
+def _costs_us(models: JointModels, rows: list[_Step], clock_ns: Callable[[], int]) -> dict[str, float]:
     """Return the median cost of a step [us] by method."""
     steps = {
         method: make_estimator(models.joint, recommended(method), models.networks.get(method)).step
-        for method in METHODS
+        for method in TIMED
     }
-    took: dict[str, list[int]] = {method: [] for method in METHODS}
+    took: dict[str, list[int]] = {method: [] for method in TIMED}
     for begin in range(0, len(rows), _BLOCK):
         for method, step in steps.items():
             times = took[method]
-            for row, temperature_c in rows[begin : begin + _BLOCK]:
+            for row in rows[begin : begin + _BLOCK]:
                 began = clock_ns()
-                step(*row, temperature_c)
+                step(*row)
                 times.append(clock_ns() - began)
     return {method: float(np.median(times)) * 1e-3 for method, times in took.items()}
 
 
-SILENT_SHARE: Final = 0.01
-"""Share of the moving samples that a method may leave without a value and not be named for it."""
+# Tables ------------------------------------------------------------------------------------------------------------------
+
+NO_VALUE_SHARE: Final = 0.01
+"""Share of the moving samples without a value of a method from which on that is a finding."""
 
 T = TypeVar("T")
 Progress = Callable[[Sequence[T], str], Iterable[T]]
 
 
-class RunRecord(NamedTuple):
-    """What a run was: kind constant, variable or outside; joints: by number, (share scored, share standing)."""
+@dataclass(frozen=True)
+class RunJoint:
+    """One joint of a run: shares scored and standing, scores by method (None: of a run outside)."""
+
+    scored: float
+    standing: float
+    errors: Row | None
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """One run; kind: constant, variable or outside."""
 
     name: str
     sha256: str
@@ -146,17 +156,29 @@ class RunRecord(NamedTuple):
     duration_s: float
     velocity_joint: int | None
     velocity_joint_by: str
-    joints: Mapping[int, tuple[float, float]]
+    joints: Mapping[int, RunJoint]
+
+
+@dataclass(frozen=True)
+class Target:
+    """One row: figure, the paper's, the goal, ours as text, whether reached (None: not known), and the details."""
+
+    key: str
+    figure: str
+    paper: str
+    goal: str
+    ours: str
+    reached: bool | None
+    details: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class Evaluation:
     """Every table of the report.
 
-    plateaus: of runs at constant velocity; variable, constant_tables: errors over the samples of runs of either kind;
-    intervals: of ours, under "variable", "constant" and "all"; jumps, passages: largest ones by method; picture: the run
-    of the figure like the paper's Fig. 16; loop_time: what steps cost, None where it was not measured;
-    truth: against the true torque, None where no run has it.
+    plateaus: of runs at constant velocity. variable, constant_tables: errors over the samples of runs of either kind.
+    intervals: of ours, under "variable", "constant" and "all". jumps, passages: largest ones by method. picture: the run of
+    the figure like the paper's Fig. 16. loop_time: None where it was not measured. truth: None where no run has it.
     """
 
     models: tuple[JointModels, ...]
@@ -173,26 +195,32 @@ class Evaluation:
     picture: Samples | None
     loop_time: LoopTime | None = None
     truth: TruthTables | None = None
-    targets: tuple[Target, ...] = field(default=())
+    targets: tuple[Target, ...] = ()
 
     @property
     def methods(self) -> tuple[str, ...]:
         """Methods that at least one joint has, in TITLES' order."""
         return tuple(method for method in TITLES if any(method in each.methods for each in self.models))
 
+    @property
+    def run_scores(self) -> dict[tuple[str, int], Row]:
+        """Scores by (run, joint number), of both kinds of runs."""
+        return {**self.variable.runs, **self.constant_tables.runs}
 
-class _Judged(NamedTuple):
-    run: JudgedRun
+
+class _Estimated(NamedTuple):
+    """A run with the samples of its joints, and the plateaus of each of them."""
+
+    run: EvaluatedRun
     samples: tuple[Samples, ...]
     plateaus: tuple[tuple[Plateau, ...], ...]
-    """Of each of `samples`."""
 
 
 def evaluate(
-    runs: Sequence[JudgedRun],
-    outside: Sequence[JudgedRun],
+    runs: Sequence[EvaluatedRun],
+    outside: Sequence[EvaluatedRun],
     models: Sequence[JointModels],
-    progress: Progress[JudgedRun] = lambda items, text: items,
+    progress: Progress[EvaluatedRun] = lambda items, text: items,
     measured: LoopTime | None = None,
 ) -> Evaluation:
     """Score all methods on runs, and ours outside its envelope on the runs `outside`; measured: the cost of their steps.
@@ -200,13 +228,13 @@ def evaluate(
     Raises ConfigError when a joint and its networks do not fit, ValueError when no run has a sample to score.
     """
     findings: list[RunIssue] = []
-    judged = _judge(progress(runs, "estimating"), models, findings)
-    beyond = _judge(progress(outside, "estimating outside"), models, findings)
-    if not judged:
+    estimated = _estimate(progress(runs, "estimating"), models, findings)
+    outer = _estimate(progress(outside, "estimating outside"), models, findings)
+    if not estimated:
         raise ValueError("found no run with a moving sample that every method has a value for, expected one")
-    constant: list[_Judged] = []
-    variable: list[_Judged] = []
-    for each in judged:
+    constant: list[_Estimated] = []
+    variable: list[_Estimated] = []
+    for each in estimated:
         (constant if any(map(is_constant, each.plateaus, each.samples)) else variable).append(each)
     scored: list[PlateauScore] = []
     for each in constant:
@@ -214,45 +242,41 @@ def evaluate(
             found, lost = plateau_scores(plateaus, samples)
             scored += found
             findings += [RunIssue("plateau_lost", text) for text in lost]
-    every = _samples(judged)
+    every = _samples(estimated)
     parts = {"variable": _samples(variable), "constant": _samples(constant), "all": every}
-    modes = {each.run.name: each.run.velocity_joint for each in judged}
+    modes = {each.run.name: each.run.velocity_joint for each in estimated}
+    tables = {kind: error_tables(parts[kind], modes) for kind in ("variable", "constant")}
     methods = [method for method in TITLES if any(method in each.methods for each in models)]
+    jumps = {method: largest_jump(every, method) for method in methods}
+    passages = {method: largest_jump(every, method, passage=True) for method in methods}
+    intervals = {
+        name: interval_tables([for_intervals(each) for each in part]) for name, part in parts.items()
+    }
+    tested = [each for each in parts["variable"] if modes.get(each.run) == each.number]
+    kinds = (("constant", constant), ("variable", variable), ("outside", outer))
     result = Evaluation(
         models=tuple(models),
-        runs=tuple(
-            _record(each, kind)
-            for kind, part in (("constant", constant), ("variable", variable), ("outside", beyond))
-            for each in part
-        ),
+        runs=tuple(_record(each, kind, tables.get(kind)) for kind, part in kinds for each in part),
         findings=tuple(findings),
         plateaus=tuple(scored),
-        variable=error_tables(parts["variable"], modes),
-        constant_tables=error_tables(parts["constant"], modes),
-        intervals={
-            name: table
-            for name, part in parts.items()
-            if (table := interval_tables([for_intervals(each) for each in part])) is not None
-        },
+        variable=tables["variable"],
+        constant_tables=tables["constant"],
+        intervals={name: table for name, table in intervals.items() if table is not None},
         standstill=standstill([for_intervals(each) for each in every]),
-        jumps={method: jump for method in methods if (jump := largest_jump(every, method)) is not None},
-        passages={
-            method: jump
-            for method in methods
-            if (jump := largest_jump(every, method, passage=True)) is not None
-        },
-        outside=tuple(outside_scores(_samples(beyond), _envelopes(models))),
-        picture=_picture(parts["variable"], modes),
+        jumps={method: jump for method, jump in jumps.items() if jump is not None},
+        passages={method: jump for method, jump in passages.items() if jump is not None},
+        outside=tuple(outside_scores(_samples(outer), _envelopes(models))),
+        picture=median_run(tested or parts["variable"]),  # of the joint in velocity mode, as in the paper
         loop_time=measured,
         truth=truth_tables(every),
     )
     return replace(result, targets=targets(result))
 
 
-def _judge(
-    runs: Iterable[JudgedRun], models: Sequence[JointModels], findings: list[RunIssue]
-) -> list[_Judged]:
-    judged = []
+def _estimate(
+    runs: Iterable[EvaluatedRun], models: Sequence[JointModels], findings: list[RunIssue]
+) -> list[_Estimated]:
+    estimated = []
     for run in runs:
         samples, plateaus = [], []
         for each in models:
@@ -265,29 +289,29 @@ def _judge(
                     RunIssue("nothing_to_score", f"{run.name}: j{each.number}: {_why_nothing(one)}")
                 )
                 continue
-            findings += _silent(one)
+            findings += _without_value(one)
             samples.append(one)
             plateaus.append(tuple(plateaus_of(run.name, run.table.time_s, columns, each.joint)))
         if samples:
-            judged.append(_Judged(run, tuple(samples), tuple(plateaus)))
-    return judged
+            estimated.append(_Estimated(run, tuple(samples), tuple(plateaus)))
+    return estimated
 
 
-def _silent(samples: Samples) -> list[RunIssue]:
-    """Name methods that had no value where the joint moved: what they miss is in no score."""
+def _without_value(samples: Samples) -> list[RunIssue]:
+    """Name methods that had no value where the joint moved: these samples are in no score."""
     moving = samples.scored | samples.missing
     share = float(np.count_nonzero(samples.missing)) / float(np.count_nonzero(moving))
-    if share <= SILENT_SHARE:
+    if share <= NO_VALUE_SHARE:
         return []
-    silent = [
+    names = [
         TITLES[method]
         for method, value in samples.estimate_nm.items()
-        if np.isnan(value[samples.missing]).mean() > SILENT_SHARE
+        if np.isnan(value[samples.missing]).mean() > NO_VALUE_SHARE
     ]
     return [
         RunIssue(
             "no_value",
-            f"{samples.run}: j{samples.number}: found no value of {', '.join(silent)} in {100.0 * share:.1f} % of the "
+            f"{samples.run}: j{samples.number}: found no value of {', '.join(names)} in {100.0 * share:.1f} % of the "
             "moving samples: these samples are scored for no method",
         )
     ]
@@ -303,12 +327,12 @@ def _why_nothing(samples: Samples) -> str:
     return "found no sample at which every method has a value, expected most of them: not scored"
 
 
-def _samples(judged: Iterable[_Judged]) -> list[Samples]:
-    return [samples for each in judged for samples in each.samples]
+def _samples(estimated: Iterable[_Estimated]) -> list[Samples]:
+    return [samples for each in estimated for samples in each.samples]
 
 
 def _envelopes(models: Iterable[JointModels]) -> dict[int, Envelope]:
-    """Return where each joint was known to the network of ours, or without one to the fit."""
+    """Return the envelope of each joint: of the network of ours, or without one of the fit."""
     found = {}
     for each in models:
         network = each.networks.get(OURS)
@@ -317,20 +341,21 @@ def _envelopes(models: Iterable[JointModels]) -> dict[int, Envelope]:
     return {number: envelope for number, envelope in found.items() if envelope is not None}
 
 
-def _picture(samples: Sequence[Samples], modes: Mapping[str, int | None]) -> Samples | None:
-    """Return the median run, of the joint in velocity mode where that is known, as in the paper's Fig. 16."""
-    tested = [each for each in samples if modes.get(each.run) == each.number]
-    return median_run(tested or samples)
-
-
-def _record(judged: _Judged, kind: str) -> RunRecord:
-    run = judged.run
+def _record(estimated: _Estimated, kind: str, tables: ErrorTables | None) -> RunRecord:
+    run = estimated.run
     joints = {
-        each.number: (float(each.scored.mean()), float(each.standing.mean())) for each in judged.samples
+        each.number: RunJoint(
+            float(each.scored.mean()),
+            float(each.standing.mean()),
+            None if tables is None else tables.runs[run.name, each.number],
+        )
+        for each in estimated.samples
     }
     duration = float(run.table.time_s[-1] - run.table.time_s[0])
     return RunRecord(run.name, run.sha256, kind, duration, run.velocity_joint, run.by, joints)
 
+
+# Targets -----------------------------------------------------------------------------------------------------------------
 
 TOB_RANGE_NM2: Final = (7.0, 14.0)
 """MSE of the classical TOB from which on, and up to which, the emulated bench is as hard as the paper's."""
@@ -339,30 +364,19 @@ BACK_DRIVE_PERCENT: Final = 2.0
 EXTRA_US: Final = 15.0
 """Of a step, all joints together."""
 _SAME: Final = 1e-9
-"""Relative difference of two mean squares that is rounding: a network that is out of charge leaves the physics as it is."""
+"""Relative difference of two mean squares that is rounding: a network that is faded out leaves the physics as it is."""
 _NO_WORSE: Final = 1.001
-"""Ratio of two RMSE that still counts as no worse: at the rim of the envelope a share of the network is left."""
-
-
-class Target(NamedTuple):
-    """One row: what, the paper's figure, the goal, ours as text, whether reached (None: not known), and the details."""
-
-    key: str
-    figure: str
-    paper: str
-    goal: str
-    ours: str
-    reached: bool | None
-    details: tuple[str, ...] = ()
+"""Ratio of two RMSE that still counts as no worse: at the rim of the envelope a share of the network is active."""
 
 
 def targets(result: Evaluation) -> tuple[Target, ...]:
-    """Return the targets, each beside the paper's figure and ours."""
+    """Return the targets, each with the paper's figure and ours."""
+    variable = result.variable
     return (
-        _tob(result.variable.tested),
-        _tob_to_paper(result),
-        _ours_to_paper(result),
-        _every_run({**result.variable.runs, **result.constant_tables.runs}),
+        _tob(variable.tested),
+        _tob_to_paper(variable),
+        _ours_to_paper(variable),
+        _every_run(result.run_scores),
         _back_drive(result.plateaus),
         _coverage(result.intervals.get("variable"), result.intervals.get("all")),
         *_outside(result.outside),
@@ -374,18 +388,22 @@ def targets(result: Evaluation) -> tuple[Target, ...]:
 
 def worse_runs(runs: Mapping[tuple[str, int], Row]) -> list[tuple[str, int, float, float]]:
     """Return (run, joint, MSE of ours, MSE of the physics) of runs in which ours is worse than its physics [Nm^2]."""
-    worse = []
-    for (run, number), one in runs.items():
-        if OURS in one and "physics" in one:
-            ours, physics = one[OURS].mse_nm2, one["physics"].mse_nm2
-            if ours > physics * (1.0 + _SAME):
-                worse.append((run, number, ours, physics))
-    return worse
+    both = [(*key, mse(one, OURS), mse(one, "physics")) for key, one in runs.items()]
+    return [
+        (run, number, ours, physics)
+        for run, number, ours, physics in both
+        if ours is not None and physics is not None and ours > physics * (1.0 + _SAME)
+    ]
 
 
 def mse(one: Row, method: str) -> float | None:
     """Return the mean square error of a method in a row [Nm^2], None where it is not there."""
     return one[method].mse_nm2 if method in one else None
+
+
+def mse_ratio(one: Row, a: str, b: str) -> float | None:
+    """Return the ratio of the mean square errors of two methods in a row; None where one is missing."""
+    return ratio(mse(one, a), mse(one, b))
 
 
 def _tob(tested: Row) -> Target:
@@ -396,16 +414,14 @@ def _tob(tested: Row) -> Target:
         "MSE of the classical TOB, velocity mode",
         f"{PAPER_MSE_NM2['tob']:g} Nm²",
         f"{low:g} to {high:g} Nm²",
-        "not known" if found is None else f"{found:.2f} Nm²",
+        _number(found, ".2f", " Nm²"),
         None if found is None else low <= found <= high,
         ("property of the bench, not of the estimate",),
     )
 
 
-def _tob_to_paper(result: Evaluation) -> Target:
-    tested, both = (
-        ratio(mse(one, "tob"), mse(one, PAPERS)) for one in (result.variable.tested, result.variable.both)
-    )
+def _tob_to_paper(tables: ErrorTables) -> Target:
+    tested, both = (mse_ratio(one, "tob", PAPERS) for one in (tables.tested, tables.both))
     return Target(
         "tob_to_paper",
         "MSE ratio TOB : paper's chain, velocity mode",
@@ -417,18 +433,16 @@ def _tob_to_paper(result: Evaluation) -> Target:
     )
 
 
-def _ours_to_paper(result: Evaluation) -> Target:
-    tested, both = (
-        ratio(mse(one, OURS), mse(one, PAPERS)) for one in (result.variable.tested, result.variable.both)
-    )
-    known = [value for value in (tested, both) if value is not None]
+def _ours_to_paper(tables: ErrorTables) -> Target:
+    tested, both = (mse_ratio(one, OURS, PAPERS) for one in (tables.tested, tables.both))
+    largest = max((value for value in (tested, both) if value is not None), default=None)
     return Target(
         "ours_to_paper",
         "MSE ratio ours : paper's chain",
         "-",
         f"at most {OURS_TO_PAPER:g}",
-        _number(max(known, default=None), ".3f"),
-        max(known) <= OURS_TO_PAPER if known else None,
+        _number(largest, ".3f"),
+        None if largest is None else largest <= OURS_TO_PAPER,
         (
             f"joint in velocity mode {_number(tested, '.3f')}, all joints {_number(both, '.3f')}; the larger one counts",
         ),
@@ -436,21 +450,22 @@ def _ours_to_paper(result: Evaluation) -> Target:
 
 
 def _every_run(runs: Mapping[tuple[str, int], Row]) -> Target:
-    judged = [key for key, one in runs.items() if OURS in one and "physics" in one]
+    pairs = [
+        (one[OURS].mse_nm2, one["physics"].mse_nm2) for one in runs.values() if {OURS, "physics"} <= set(one)
+    ]
     worse = worse_runs(runs)
-    # a network of share 0 is no network: that ours is not worse then says nothing
-    told = any(runs[key][OURS].mse_nm2 != runs[key]["physics"].mse_nm2 for key in judged)
+    # a network of share 0 is no network: that ours is not worse then means nothing
+    distinct = any(ours != physics for ours, physics in pairs)
+    text = "not known"
+    if pairs:
+        text = f"{len(worse)} of {len(pairs)}" if distinct else "none: they are one number"
     return Target(
         "every_run",
         "runs in which ours is worse than its physics",
         "-",
-        "none" if told else "-",
-        "none: they are one number"
-        if judged and not told
-        else f"{len(worse)} of {len(judged)}"
-        if judged
-        else "not known",
-        not worse if told else None,
+        "none" if distinct else "-",
+        text,
+        not worse if distinct else None,
         tuple(
             f"{run} j{number}: {ours:.4f} against {physics:.4f} Nm²" for run, number, ours, physics in worse
         ),
@@ -459,8 +474,8 @@ def _every_run(runs: Mapping[tuple[str, int], Row]) -> Target:
 
 def _back_drive(plateaus: Sequence[PlateauScore]) -> Target:
     hard = hardest_plateaus(plateaus)
-    ours = worst_plateau(hard, OURS, PlateauScore.rated_percent)
-    tob = worst_plateau(hard, "tob", PlateauScore.percent)
+    ours = worst_plateau(hard, OURS, "rated_percent")
+    tob = worst_plateau(hard, "tob", "percent")
     details = [f"{counted(len(hard), 'plateau')} at 2.4 to 2.6 rad/s and 25 to 35 Nm, back-driven"]
     if tob is not None:
         details.append(f"classical TOB {tob[0]:.1f} % of the torque, {_place(tob[1])}")
@@ -471,7 +486,7 @@ def _back_drive(plateaus: Sequence[PlateauScore]) -> Target:
         "worst error at 2.5 rad/s, 30 Nm, back drive",
         f"{PAPER_WORST_PERCENT:g} % of torque (TOB)",
         f"at most {BACK_DRIVE_PERCENT:g} % of rated",
-        "not known" if ours is None else f"{ours[0]:.2f} % of rated",
+        _number(None if ours is None else ours[0], ".2f", " % of rated"),
         None if ours is None else ours[0] <= BACK_DRIVE_PERCENT,
         tuple(details),
     )
@@ -479,15 +494,10 @@ def _back_drive(plateaus: Sequence[PlateauScore]) -> Target:
 
 def _coverage(variable: IntervalTables | None, every: IntervalTables | None) -> Target:
     low, high = (100.0 * share for share in ALLOWED)
-    cells = (
-        {}
-        if variable is None
-        else {
-            f"j{number} {QUADRANT_TITLES[name]}": one
-            for number, row in variable.quadrants.items()
-            for name, one in row.items()
-        }
-    )
+    rows = {} if variable is None else variable.quadrants
+    cells = {
+        f"j{number} {QUADRANT_TITLES[name]}": one for number, row in rows.items() for name, one in row.items()
+    }
     shares = [100.0 * one.share for one in cells.values()]
     details = [f"{where}: {one}" for where, one in cells.items() if not low <= 100.0 * one.share <= high]
     if every is not None:
@@ -508,24 +518,22 @@ def _coverage(variable: IntervalTables | None, every: IntervalTables | None) -> 
 def _outside(found: Sequence[Outside]) -> tuple[Target, Target]:
     ratios = [each.ours.rmse_nm / each.physics.rmse_nm for each in found if each.physics is not None]
     flagged = min((each.flagged for each in found), default=None)
+    text = "no network: ours is its physics" if found else "not evaluated (--outside)"
+    details = [
+        f"j{each.number}: {each.ours.rmse_nm:.3f} "
+        + ("" if each.physics is None else f"against {each.physics.rmse_nm:.3f} ")
+        + f"Nm, {each.samples} samples outside"
+        for each in found
+    ]
     return (
         Target(
             "outside_rmse",
             "RMSE ours : physics, outside the envelope",
             "-",
             f"at most {_NO_WORSE:g}",
-            f"{max(ratios):.4f}"
-            if ratios
-            else "no network: ours is its physics"
-            if found
-            else "not evaluated (--outside)",
+            f"{max(ratios):.4f}" if ratios else text,
             max(ratios) <= _NO_WORSE if ratios else None,
-            tuple(
-                f"j{each.number}: {each.ours.rmse_nm:.3f} "
-                + ("" if each.physics is None else f"against {each.physics.rmse_nm:.3f} ")
-                + f"Nm, {each.samples} samples outside"
-                for each in found
-            ),
+            tuple(details),
         ),
         Target(
             "outside_flagged",
@@ -558,7 +566,7 @@ def _jump(method: str, name: str, at: Jump | None, passage: Jump | None) -> Targ
         f"jump at a change of quadrant, {name}",
         "-",
         f"at most {LIMIT_NM:g} Nm" if method == OURS else "-",
-        "not known" if at is None else f"{at.nm:.2f} Nm",
+        _number(None if at is None else at.nm, ".2f", " Nm"),
         None if at is None or method != OURS else at.nm <= LIMIT_NM,
         tuple(details),
     )
@@ -589,5 +597,5 @@ def _place(plateau: PlateauScore) -> str:
     return f"{plateau.run} j{plateau.number} at {plateau.velocity_rad_s:.2f} rad/s and {plateau.torque_nm:.1f} Nm"
 
 
-def _number(value: float | None, form: str) -> str:
-    return "not known" if value is None else format(value, form)
+def _number(value: float | None, form: str, unit: str = "") -> str:
+    return "not known" if value is None else format(value, form) + unit

@@ -1,4 +1,4 @@
-"""Read the runs of an evaluation: a run that a model was made from refuses all, a broken one is named and left out.
+"""Runs of an evaluation: one that a model was made from is refused with all others, a broken one is named and left out.
 
 Which joint of a run was in velocity mode (the paper's tested joint) comes from the campaign's marks, else from the data: a
 velocity loop turns its current over by twice the friction within milliseconds wherever the joint reverses, and follows
@@ -12,7 +12,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -33,8 +33,13 @@ _CLEAR: Final = 3.0
 """Ratio of the two joints' roughness from which on the rougher one is called the velocity joint."""
 
 
-def by_marks(marks: Any) -> int | None:
-    """Return the velocity joint that the marks of a campaign name (NAME.json), None where they do not."""
+def by_marks(path: Path) -> int | None:
+    """Return the velocity joint that the campaign's NAME.json beside NAME.csv.gz names, None where it does not."""
+    stem = path.name.removesuffix(".gz").removesuffix(".csv")
+    try:
+        marks = json.loads(path.with_name(f"{stem}.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
     number = marks.get("velocity_joint") if isinstance(marks, dict) else None
     return number if isinstance(number, int) and not isinstance(number, bool) else None
 
@@ -65,7 +70,7 @@ _NEEDED = ("current_a", "motor_position_rad", "link_position_rad", "torque_nm")
 """Columns of a joint that must have been measured; the motor's velocity may be derived."""
 
 
-class JudgedRun(NamedTuple):
+class EvaluatedRun(NamedTuple):
     """One run: columns by joint number, complete and checked; velocity_joint None: not known; `by`: marks or data.
 
     truth: true torque [n] by joint, empty where the run has none.
@@ -81,15 +86,11 @@ class JudgedRun(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """runs: at least one joint of each can be judged; findings: what was left out; notes: what the reader noticed."""
+    """runs: at least one joint of each can be scored; findings: what was left out; notes: of the reader."""
 
-    runs: tuple[JudgedRun, ...]
+    runs: tuple[EvaluatedRun, ...]
     findings: tuple[RunIssue, ...]
     notes: tuple[str, ...]
-
-
-class LeakError(ConfigError):
-    """Runs of the evaluation are runs that the models were made from; one line per run."""
 
 
 def read_inputs(
@@ -98,13 +99,13 @@ def read_inputs(
     """Read and check all runs; a progress bar on a terminal.
 
     Raises:
-        LeakError: models were fitted to, or trained on, one of them.
-        RunError: a path that does not exist, or a directory without a run. ConfigError: the column map.
+        ConfigError: models were fitted to, or trained on, one of them, one line per run; the column map.
+        RunError: a path that does not exist, or a directory without a run.
     """
     paths = run_paths(arguments)
     mapping = None if columns is None else ColumnMap.load(columns)
-    refuse_trained_on(paths, models)
-    runs: list[JudgedRun] = []
+    _refuse_trained_on(paths, models)
+    runs: list[EvaluatedRun] = []
     findings: list[RunIssue] = []
     notes: list[str] = []
     for path in progress(paths, "reading runs"):
@@ -120,35 +121,29 @@ def read_inputs(
                 RunIssue("twice", f"{name}: found the same data as in {twin}: left out, scored once")
             )
             continue
-        judged, found = _judged(name, file, models, path)
+        run, found = _evaluated(name, file, models, path)
         findings += found
         notes += [f"{name}: {note}" for note in file.notes]
-        if judged.columns:
-            runs.append(judged)
+        if run.columns:
+            runs.append(run)
     return Inputs(tuple(runs), tuple(findings), tuple(notes))
 
 
-def refuse_trained_on(paths: Sequence[Path], models: Sequence[JointModels]) -> None:
-    """Raise LeakError when a file holds the data of a run that a model was made from."""
+def _refuse_trained_on(paths: Sequence[Path], models: Sequence[JointModels]) -> None:
+    """Raise ConfigError when a file holds the data of a run that a model was made from."""
     leaks = []
-    for path in paths:
-        if not path.is_file():
-            continue
-        sources = [
-            name
-            for sha256 in run_hashes(path)
-            for each in models
-            for name in each.training.sources.get(sha256, ())
-        ]
-        if sources:
-            leaks.append(f"{path}: found a run that {', '.join(dict.fromkeys(sources))} was trained on")
+    for path in filter(Path.is_file, paths):
+        hashes = set(run_hashes(path))
+        names = [name for each in models for name, runs in each.training.items() if hashes & runs]
+        if names:
+            leaks.append(f"{path}: found a run that {', '.join(dict.fromkeys(names))} was trained on")
     if leaks:
-        raise LeakError("\n".join(leaks) + "\nexpected held-out runs: nothing was scored")
+        raise ConfigError("\n".join(leaks) + "\nexpected held-out runs: nothing was scored")
 
 
-def _judged(
+def _evaluated(
     name: str, file: RunFile, models: Sequence[JointModels], path: Path
-) -> tuple[JudgedRun, list[RunIssue]]:
+) -> tuple[EvaluatedRun, list[RunIssue]]:
     usable: dict[int, JointColumns] = {}
     findings: list[RunIssue] = []
     for each in models:
@@ -156,7 +151,7 @@ def _judged(
         findings += found
         if not found:
             usable[each.number] = file.table.joint(each.number, each.joint.gear_ratio)
-    marked = by_marks(_marks(path))
+    marked = by_marks(path)
     number = marked if marked is not None else by_data(file.table)
     by = "unknown" if number is None else "data" if marked is None else "marks"
     truth: Mapping[int, FloatArray] = {}
@@ -169,7 +164,7 @@ def _judged(
     except ValueError as error:
         findings.append(RunIssue("truth", f"{error}: not scored against the true torque"))
         truth = {}
-    return JudgedRun(name, file.sha256, file.table, usable, number, by, truth), findings
+    return EvaluatedRun(name, file.sha256, file.table, usable, number, by, truth), findings
 
 
 def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue]:
@@ -186,12 +181,3 @@ def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue
         return [RunIssue("missing_columns", f"{where}: found no {', '.join(missing)}: not scored")]
     found = check_channels(Channels(file.table.time_s, columns, joint, where))
     return [RunIssue(item.kind, f"{item.text}: j{number} not scored") for item in found]
-
-
-def _marks(path: Path) -> object:
-    """Return the campaign's NAME.json beside NAME.csv.gz; None where there is none or it is no JSON."""
-    stem = path.name.removesuffix(".gz").removesuffix(".csv")
-    try:
-        return json.loads(path.with_name(f"{stem}.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return None

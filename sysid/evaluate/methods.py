@@ -1,12 +1,12 @@
-"""Load the methods that are compared from a directory of models, and estimate one joint of a run with each.
+"""Methods of an evaluation: models loaded from a directory, and the estimates of every method on one joint of a run.
 
-DIR holds jointN.yaml or joint_N.yaml (joint file; the second as `jtq init` writes it), jointN.onnx (the paper's network)
-and jointN.fused.onnx (ours; without it ours is its physics alone). What is missing leaves its methods out, by name. Joint
-files name the runs that they were made from in `provenance` (every mapping of a section's `sha256`), networks in the
-metadata key `runs` and in a card jointN.json or jointN.fused.json beside them.
+DIR holds jointN.yaml or joint_N.yaml (joint file; the second as `jtq init` writes it), jointN.onnx (the paper's network) and
+jointN.fused.onnx (ours; without it ours is its physics alone). What is missing leaves its methods out, by name. Joint files
+name the runs that they were made from in `provenance` (every mapping of a section's `sha256`), networks in the metadata key
+`runs` and in a card jointN.json or jointN.fused.json beside them.
 
 Only samples at which all methods move and have a value are scored, the same ones for each: a method must not look better
-because it was silent where the others were wrong.
+because it had no value where the others were wrong.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
@@ -25,7 +25,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, observe_run, quadrants
 from jtqd.estimator.joint import Joint
@@ -37,50 +37,31 @@ from jtqd.estimator.settings import METHODS, EstimatorSettings, bandwidth_of, re
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.models.files import load_joint
 
-KEY: Final = "runs"
+OURS: Final = "fused"
+PAPERS: Final = "network"
+TITLES: Final = MappingProxyType(
+    {
+        **{name: METHODS[name].title for name in METHODS if name != OURS},
+        "physics": "our physics",
+        OURS: METHODS[OURS].title,
+    }
+)
+"""Methods in the order of every table. `physics` is `fused` without its network, where it has one."""
+PAPERS_BANDWIDTH: Final = EstimatorSettings().bandwidth_rad_s
+SETTLE_S: Final = 0.1
+"""The filters settle for so long after the first sample."""
+
+
+def settings_of(method: str) -> EstimatorSettings:
+    """Return the settings of a method of TITLES: those of a new configuration."""
+    return recommended(OURS if method == "physics" else method)
+
+
+# Runs that a model was made from -----------------------------------------------------------------------------------------
+
+_RUNS: Final = "runs"
 _COMPRESSION: Final = 6
 """Of run files as this toolbox writes them (jtqd.sysid.runs.tables)."""
-
-
-@dataclass(frozen=True)
-class TrainingRuns:
-    """sources: SHA-256 of a run file -> names of the models made from it; silent: models that name no runs at all."""
-
-    sources: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    silent: tuple[str, ...] = ()
-
-    def and_those_of(self, other: TrainingRuns) -> TrainingRuns:
-        """Return both together."""
-        merged = dict(self.sources)
-        for sha256, names in other.sources.items():
-            merged[sha256] = tuple(dict.fromkeys((*merged.get(sha256, ()), *names)))
-        return TrainingRuns(merged, tuple(dict.fromkeys((*self.silent, *other.silent))))
-
-
-def joint_training_runs(name: str, joint: Joint) -> TrainingRuns:
-    """Return the runs that sections of a joint file were fitted to; a file with nominal values has none, rightly."""
-    sources: dict[str, tuple[str, ...]] = {}
-    for section, record in joint.provenance.items():
-        if isinstance(record, Mapping):
-            for key in ("sha256", KEY):
-                sources |= dict.fromkeys(_hashes(record.get(key)), (f"{name} ({section})",))
-    return TrainingRuns(sources)
-
-
-def network_training_runs(path: Path) -> TrainingRuns:
-    """Return the runs that a network was trained on; one without that information is `silent`."""
-    import onnx
-
-    model = onnx.load_model(str(path), load_external_data=False)
-    found = {entry.key: entry.value for entry in model.metadata_props}
-    hashes = _hashes(_json(found.get(KEY, "")))
-    card = path.with_suffix(".json")
-    if card.is_file():
-        content = _json(card.read_text(encoding="utf-8", errors="replace"))
-        hashes |= _hashes(content.get(KEY) if isinstance(content, dict) else None)
-    if not hashes:
-        return TrainingRuns({}, (path.name,))
-    return TrainingRuns(dict.fromkeys(hashes, (path.name,)))
 
 
 def run_hashes(path: Path) -> tuple[str, ...]:
@@ -91,9 +72,34 @@ def run_hashes(path: Path) -> tuple[str, ...]:
         other = (
             gzip.decompress(data) if path.name.endswith(".gz") else gzip.compress(data, _COMPRESSION, mtime=0)
         )
-    except (OSError, EOFError, zlib.error):  # not a run, as its reader will say
+    except (OSError, EOFError, zlib.error):  # not a run, which its reader reports
         return tuple(hashes)
     return (*hashes, hashlib.sha256(other).hexdigest())
+
+
+def _joint_runs(name: str, joint: Joint) -> dict[str, frozenset[str]]:
+    """Return the hashes of the runs of each fitted section; a file with nominal values has none."""
+    found = {}
+    for section, record in joint.provenance.items():
+        if isinstance(record, Mapping):
+            hashes = _hashes(record.get("sha256")) | _hashes(record.get(_RUNS))
+            if hashes:
+                found[f"{name} ({section})"] = hashes
+    return found
+
+
+def _network_runs(path: Path) -> frozenset[str]:
+    """Return the hashes of the runs that a network was trained on, by its metadata and its card."""
+    import onnx
+
+    model = onnx.load_model(str(path), load_external_data=False)
+    metadata = {entry.key: entry.value for entry in model.metadata_props}
+    hashes = _hashes(_json(metadata.get(_RUNS, "")))
+    card = path.with_suffix(".json")
+    if card.is_file():
+        content = _json(card.read_text(encoding="utf-8", errors="replace"))
+        hashes |= _hashes(content.get(_RUNS) if isinstance(content, dict) else None)
+    return hashes
 
 
 def _json(text: str) -> Any:
@@ -103,35 +109,29 @@ def _json(text: str) -> Any:
         return None
 
 
-def _hashes(value: Any) -> set[str]:
+def _hashes(value: Any) -> frozenset[str]:
     """Hex SHA-256 in a mapping name -> hash or in a list; everything else is none."""
     if isinstance(value, Mapping):
         value = list(value.values())
     if not isinstance(value, list):
-        return set()
-    return {text.lower() for text in value if isinstance(text, str) and len(text) == 64}
+        return frozenset()
+    return frozenset(text.lower() for text in value if isinstance(text, str) and len(text) == 64)
 
 
-OURS: Final = "fused"
-TITLES: Final = MappingProxyType(
-    {
-        **{name: METHODS[name].title for name in METHODS if name != OURS},
-        "physics": "our physics",
-        OURS: METHODS[OURS].title,
-    }
-)
-"""Methods in the order of every table. `physics` is `fused` without its network, where it has one."""
+# Models ------------------------------------------------------------------------------------------------------------------
 
-PAPERS_BANDWIDTH: Final = EstimatorSettings().bandwidth_rad_s
-PAPERS: Final = "network"
+_INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+_ABSENT: Final = {"efficiency": "has no efficiency", "fused": "has no section fused (jtq fit losses)"}
+"""Section of a joint file -> why a method that needs it is missing."""
 
 
 @dataclass(frozen=True)
 class JointModels:
     """Everything that estimates one joint.
 
-    number: of the joint in the runs; networks: by method; methods: those that can be run, in TITLES' order; missing:
-    the others, with the reason; training: runs that anything here was fitted to; files: name to SHA-256.
+    number: of the joint in the runs. networks: by method. methods: those that can be run, in TITLES' order. missing: the
+    others, with the reason. training: SHA-256 of the runs that a network or section was made from, by its name; none for a
+    network that names no runs. files: name to SHA-256.
     """
 
     number: int
@@ -139,13 +139,18 @@ class JointModels:
     networks: Mapping[str, AnyNetwork]
     methods: tuple[str, ...]
     missing: Mapping[str, str]
-    training: TrainingRuns
+    training: Mapping[str, frozenset[str]]
     files: Mapping[str, str]
+
+    @property
+    def without_runs(self) -> tuple[str, ...]:
+        """Networks that name no training runs."""
+        return tuple(name for name, hashes in self.training.items() if not hashes)
 
     def estimate(
         self, time_s: FloatArray, columns: JointColumns
     ) -> tuple[Mapping[str, EstimateRun], ObservedRun]:
-        """Return every method's estimates of a run and what the observer saw; ConfigError, ValueError as the estimators."""
+        """Return every method's estimates of a run, and the outputs of the observer; ConfigError, ValueError."""
         runs = {
             method: estimate_columns(
                 self.joint, settings_of(method), self.networks.get(method), time_s, columns
@@ -159,14 +164,6 @@ class JointModels:
             self.joint, recommended(OURS), torsion, dt, current, motor, velocity, link, columns.temperature_c
         )
         return runs, seen
-
-
-def settings_of(method: str) -> EstimatorSettings:
-    """Return what a method of TITLES is judged with: the settings of a new configuration."""
-    return recommended(OURS if method == "physics" else method)
-
-
-_INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
 
 
 def load_models(directory: Path, numbers: Sequence[int] = ()) -> tuple[JointModels, ...]:
@@ -199,15 +196,11 @@ def load_models(directory: Path, numbers: Sequence[int] = ()) -> tuple[JointMode
     return tuple(_joint_models(there[number], number) for number in sorted(set(numbers) or there))
 
 
-_ABSENT: Final = {"efficiency": "has no efficiency", "fused": "has no section fused (jtq fit losses)"}
-"""Section of a joint file -> why a method that needs it is missing."""
-
-
 def _joint_models(path: Path, number: int) -> JointModels:
     directory = path.parent
     joint = load_joint(path)
     files = {path.name: hashlib.sha256(path.read_bytes()).hexdigest()}
-    training = joint_training_runs(path.name, joint)
+    training = _joint_runs(path.name, joint)
     networks: dict[str, AnyNetwork] = {}
     missing: dict[str, str] = {}
     for method, kind in METHODS.items():
@@ -216,10 +209,10 @@ def _joint_models(path: Path, number: int) -> JointModels:
             missing[method] = f"{path.name} {_ABSENT[absent[0]]}"
             if method == OURS:
                 missing["physics"] = missing[method]
-        name = f"joint{number}{kind.network_ending}"
-        source = directory / name
         if not kind.network:
             continue
+        name = f"joint{number}{kind.network_ending}"
+        source = directory / name
         if not source.exists():
             if kind.network_required:
                 missing.setdefault(method, f"no {name} in {directory}")
@@ -231,32 +224,28 @@ def _joint_models(path: Path, number: int) -> JointModels:
             raise ConfigError(
                 f"{source}: found a network of joint '{network.joint}', expected one of '{joint.name}'"
             )
-        networks[method] = network
-        files[name] = network.sha256
-        training = training.and_those_of(network_training_runs(source))
+        networks[method], files[name] = network, network.sha256
+        training[name] = _network_runs(source)
     methods = tuple(method for method in TITLES if method not in missing)
     ordered = {method: missing[method] for method in TITLES if method in missing}
     return JointModels(number, joint, networks, methods, ordered, training, files)
 
 
-SETTLE_S: Final = 0.1
-"""From the first sample on for so long the filters' starts are still in the data."""
-
-Flags = NDArray[np.bool_]
+# Samples -----------------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Samples:
     """Arrays [n] of one joint (`number`) in one run (`run`).
 
-    sensor_nm: torque sensor, as old as the paper's estimates; sensors_nm: by method, for those that are younger;
-    bandwidth_rad_s: by method, of the filter that makes its age; raw_nm: G Kt i less the rotor's share, whose sign with the
-    velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS); estimate_nm, sigma_nm, status: by method;
-    scored: all methods move and have a value; standing: all have a value and stand still; missing: settled, but some
-    method has no value; temperature_c: NaN where the run has none; bare_nm: the paper's network by itself, without the
-    guard around it, NaN where there is none. true_nm: the gear's torque itself, where the run is emulated and has it;
-    reference_nm: standard deviation of the sensor's zero, standstill_sigmas: half width of the interval at rest in standard
-    deviations, as the joint file has them.
+    sensor_nm: torque sensor with the delay of the paper's estimates. sensors_nm: by method, for those with a shorter delay.
+    bandwidth_rad_s: by method, of the filter that makes its delay. raw_nm: G Kt i less the rotor's share, whose sign with
+    the velocity's [rad/s, joint side] makes the quadrant (index into QUADRANTS). estimate_nm, sigma_nm, status: by method.
+    scored: all methods move and have a value. standing: all have a value and stand still. missing: settled, but some method
+    has no value. temperature_c: NaN where the run has none. bare_nm: the paper's network without the guard around it, NaN
+    where there is none. true_nm: the torque of the gear, where the run is emulated and has it. reference_nm: standard
+    deviation of the sensor's offset, standstill_sigmas: half width of the interval at rest in standard deviations, as the
+    joint file has them.
     """
 
     run: str
@@ -271,9 +260,9 @@ class Samples:
     estimate_nm: Mapping[str, FloatArray]
     sigma_nm: Mapping[str, FloatArray]
     status: Mapping[str, NDArray[np.uint8]]
-    scored: Flags
-    standing: Flags
-    missing: Flags
+    scored: BoolArray
+    standing: BoolArray
+    missing: BoolArray
     bare_nm: FloatArray
     true_nm: FloatArray | None = None
     sensors_nm: Mapping[str, FloatArray] = field(default_factory=dict)
@@ -282,12 +271,20 @@ class Samples:
     standstill_sigmas: float = STANDSTILL_SIGMAS
 
     def sensor_of(self, method: str) -> FloatArray:
-        """Return the sensor [n] as old as a method's estimate [Nm]."""
+        """Return the sensor [n] with the delay of a method's estimate [Nm]."""
         return self.sensors_nm.get(method, self.sensor_nm)
 
     def error_nm(self, method: str) -> FloatArray:
-        """Estimate less sensor of the same age [n] [Nm]."""
+        """Estimate less sensor with the same delay [n] [Nm]."""
         return self.estimate_nm[method] - self.sensor_of(method)
+
+    def scored_error_nm(self, method: str) -> FloatArray:
+        """Error of the scored samples [Nm]."""
+        return self.error_nm(method)[self.scored]
+
+    def where(self, mask: BoolArray) -> Samples:
+        """Return the same with fewer scored samples."""
+        return replace(self, scored=self.scored & mask)
 
 
 def take_samples(
@@ -299,26 +296,27 @@ def take_samples(
 ) -> Samples:
     """Estimate one joint of a run by every method.
 
-    columns: all inputs and the sensor [n]; finite (`RunTable` is). Raises ConfigError and ValueError as the estimators.
+    columns: all inputs and the sensor [n], finite. Raises ConfigError and ValueError as the estimators.
     """
-    runs, seen = models.estimate(time_s, columns)
     if columns.torque_nm is None:
         raise ValueError(f"{run}: j{models.number}.torque_nm: missing")
+    runs, seen = models.estimate(time_s, columns)
+    joint = models.joint
     dt = np.diff(time_s, prepend=time_s[0])
-    rates = {method: bandwidth_of(models.joint, settings_of(method)) for method in runs}
+    rates = {method: bandwidth_of(joint, settings_of(method)) for method in runs}
     sensors = {rate: low_pass(columns.torque_nm, dt, rate) for rate in {PAPERS_BANDWIDTH, *rates.values()}}
-    sensor = sensors[PAPERS_BANDWIDTH]
     settled = time_s - time_s[0] >= SETTLE_S
     published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])
     moving = np.logical_and.reduce([np.isin(each.status, (VALID, DEGRADED)) for each in runs.values()])
     standing = np.logical_and.reduce([each.status == STANDSTILL for each in runs.values()])
-    paper = runs.get("network")
+    section = joint.fused
+    rest = None if section is None else section.standstill
     return Samples(
         run=run,
         number=models.number,
-        rated_nm=models.joint.rated_torque_nm,
+        rated_nm=joint.rated_torque_nm,
         time_s=time_s,
-        sensor_nm=sensor,
+        sensor_nm=sensors[PAPERS_BANDWIDTH],
         raw_nm=seen.raw_nm,
         velocity_rad_s=seen.velocity_rad_s,
         temperature_c=seen.temperature_c,
@@ -329,12 +327,10 @@ def take_samples(
         scored=published & moving,
         standing=published & standing,
         missing=settled & ~published,
-        bare_nm=np.full_like(sensor, np.nan) if paper is None else paper.network_nm,
+        bare_nm=runs[PAPERS].network_nm if PAPERS in runs else np.full_like(time_s, np.nan),
         true_nm=true_nm,
-        reference_nm=0.0 if models.joint.fused is None else models.joint.fused.sigma.reference_nm,
-        standstill_sigmas=STANDSTILL_SIGMAS
-        if models.joint.fused is None or models.joint.fused.standstill is None
-        else models.joint.fused.standstill.sigmas,
         sensors_nm={method: sensors[rate] for method, rate in rates.items() if rate != PAPERS_BANDWIDTH},
         bandwidth_rad_s=rates,
+        reference_nm=0.0 if section is None else section.sigma.reference_nm,
+        standstill_sigmas=STANDSTILL_SIGMAS if rest is None else rest.sigmas,
     )

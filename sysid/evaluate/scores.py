@@ -1,10 +1,15 @@
-"""Score errors and intervals of the estimates, and their jumps where a joint changes its quadrant.
+"""Scores of an evaluation: errors, intervals, jumps at a change of quadrant, plateaus, and ours outside its envelope.
 
-Errors: several blocks of samples (runs, joints) are pooled, every sample counts alike; errors in percent are relative to
-each block's own rated torque. Tables are per method and joint, run, quadrant and velocity.
+Errors: samples of runs and joints are pooled, every sample counts alike; errors in percent are relative to each joint's own
+rated torque. Tables are per method and joint, run, quadrant and velocity.
 
-Intervals: in motion value +- z sigma, z of the normal distribution (sysid.fit.fused: sigma is calibrated for z = 1.645,
-90 %); at standstill value +- sigma, which is an interval and not a standard deviation.
+Intervals: in motion value +- z sigma, z of the normal distribution (`sysid.fit.calibration`: sigma is calibrated for
+z = 1.645, 90 %); at standstill value +- sigma, which is an interval and not a standard deviation.
+
+Truth: emulated runs have the torque of the gear. The sensor has noise, an offset of the day and the links' inertia in it; an
+interval that holds the sensor may be too wide for the torque, so intervals are scored against the torque where a run has it
+(`for_intervals`). `now`: against the torque at the same instant, the delay of the estimate is an error, as for a controller.
+`aligned`: against the torque through the filter of the method's delay, as the tables against the sensor.
 
 Jumps at v = 0 and at tau = 0:
 
@@ -12,42 +17,29 @@ Jumps at v = 0 and at tau = 0:
 
 The torque's own change in that time does not count against the estimate, and a spike that comes and goes is not missed.
 The maximum is over the sensor's windows shifted by up to 10 ms: the torque of a reversing joint swings by 10 Nm in 20 ms,
-and an estimate that follows it 2 ms late is late and does not jump. `unshifted_nm` is without that allowance.
+and an estimate that follows it 2 ms late is late and does not jump. `unshifted_nm` is without that allowance. At the
+crossing: the 20 ms around it. Over the passage: the largest of any 20 ms of the whole passage through |v| <= 0.02 rad/s (or
+|tau| <= 0.3 Nm), entry and exit of the standstill status included, however long the joint rested.
 
-`at` the crossing: the 20 ms around it. Over the `passage`: the largest of any 20 ms of the whole passage through
-|v| <= 0.02 rad/s (or |tau| <= 0.3 Nm), entry and exit of the standstill status included, however long the joint rested.
+Plateaus (section IV.A) are detected in the data (`sysid.fit.plateaus`). Their means run over whole ripple periods, so that
+the error is that of the loss and not the ripple.
 
-Score estimates against the true torque of emulated runs, which no instrument knows.
-
-Runs of `python -m jtqd.sysid.campaign.emulated` have the torque of each gear beside them. The sensor
-has noise, a zero of the day and the links' inertia in it; an interval that holds the sensor may be too wide for the torque.
-
-`now`: the estimate against the torque at the same instant, with the estimate's own age as an error, as a controller sees it.
-Intervals are scored against the torque where a run has it: sigma is that of the torque (`for_intervals`).
-
-`aligned`: against the torque passed through the filter of the method's age, as the tables against the sensor do.
-
-Score every method at constant velocity and load, plateau by plateau (section IV.A), and ours outside its envelope.
-
-Plateaus are detected in the data (sysid.fit.plateaus). Their means run over whole ripple periods, so that the error is
-that of the loss and not the ripple.
-
-Outside is defined by the network's own envelope of load and temperature: |motor torque| beyond the last cell of its map
-that any speed has, or a temperature beyond the range of its training runs, independent of the published status.
+Outside is defined by the envelope of load and temperature: |motor torque| beyond the last cell of its map that any speed
+has, or a temperature beyond the range of its runs, independent of the published status.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import QUADRANTS, Envelope, Joint
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
@@ -57,14 +49,16 @@ from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.methods import OURS, PAPERS_BANDWIDTH, TITLES, Samples, settings_of
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 
+# Errors ------------------------------------------------------------------------------------------------------------------
+
 VELOCITY_EDGES_RAD_S: Final = (0.0, 0.05, 0.2, 0.5, 1.0, 2.0, math.inf)
 """Bins of |v|, joint side: creeping, the paper's slowest, slow, medium, fast, faster."""
+PAPER_MSE_NM2: Final = {"tob": 10.07, "efficiency": 1.97, "network": 0.22}
+"""Section IV.B of the paper, of its tested joint in velocity mode, by method."""
 
-LEVELS: Final = {0.5: 0.6744897501960817, 0.8: 1.2815515655446004, 0.9: GAUSS, 0.95: 1.959963984540054}
-"""Nominal coverage -> half width in standard deviations, of the normal distribution that sigma stands for."""
 
-
-class Score(NamedTuple):
+@dataclass(frozen=True)
+class Score:
     """Of `samples` errors: mean square [Nm^2], its root [Nm] and [% of rated torque], 95th percentile and largest [Nm]."""
 
     samples: int
@@ -75,20 +69,19 @@ class Score(NamedTuple):
     max_nm: float
 
 
-class Block(NamedTuple):
-    """Errors [n] of one run of one joint [Nm], and the rated torque of the joint."""
-
-    error_nm: FloatArray
-    rated_nm: float
+Row = Mapping[str, Score]
+"""Scores by method."""
 
 
-def score(blocks: Sequence[Block]) -> Score | None:
-    """Return the score of all samples of the blocks together; None when there are none."""
-    filled = [block for block in blocks if len(block.error_nm)]
-    if not filled:
+def score(samples: Sequence[Samples], method: str) -> Score | None:
+    """Return the score of a method over the scored samples of joints and runs; None where one lacks it, or without any."""
+    if any(method not in each.estimate_nm for each in samples):
         return None
-    error = np.concatenate([block.error_nm for block in filled])
-    share = np.concatenate([block.error_nm / block.rated_nm for block in filled])
+    errors = [(each.scored_error_nm(method), each.rated_nm) for each in samples if each.scored.any()]
+    if not errors:
+        return None
+    error = np.concatenate([part for part, _ in errors])
+    share = np.concatenate([part / rated for part, rated in errors])
     size = np.abs(error)
     mse = float(np.mean(error * error))
     return Score(
@@ -101,37 +94,29 @@ def score(blocks: Sequence[Block]) -> Score | None:
     )
 
 
-class Coverage(NamedTuple):
-    """Share of `samples` whose interval holds the sensor; se: standard error of it, from run to run, NaN for one run."""
-
-    samples: int
-    runs: int
-    share: float
-    se: float
-
-    def __str__(self) -> str:
-        """E.g. "91.3 % +- 1.2"; without the standard error where there is none."""
-        beside = f" +- {100.0 * self.se:.1f}" if math.isfinite(self.se) else ""
-        return f"{100.0 * self.share:.1f} %{beside}"
+def row(samples: Sequence[Samples]) -> Row:
+    """Return the score of every method that all of the samples have."""
+    scores = {method: score(samples, method) for method in common_methods(samples)}
+    return {method: value for method, value in scores.items() if value is not None}
 
 
-def coverage(inside: Sequence[NDArray[np.bool_]]) -> Coverage | None:
-    """Return the coverage of runs, each an array [n] of whether a sample is inside; None when there is no sample.
+def common_methods(samples: Iterable[Samples]) -> tuple[str, ...]:
+    """Return the methods that all of the samples have, in TITLES' order."""
+    sets = [set(each.estimate_nm) for each in samples]
+    return tuple(method for method in TITLES if sets and all(method in one for one in sets))
 
-    Samples of one run share its zero and its friction and are right or wrong together: the standard error is that of a
-    ratio over whole runs (Cochran 1977, section 6.4), not sqrt(p (1 - p)/n).
-    """
-    runs = [each for each in inside if len(each)]
-    if not runs:
-        return None
-    count = np.array([len(each) for each in runs], np.float64)
-    good = np.array([np.count_nonzero(each) for each in runs], np.float64)
-    share = float(good.sum() / count.sum())
-    se = math.nan
-    if len(runs) > 1:
-        off = good - share * count
-        se = math.sqrt(float(off @ off) * len(runs) / (len(runs) - 1)) / float(count.sum())
-    return Coverage(int(count.sum()), len(runs), share, se)
+
+def by_joint(samples: Iterable[Samples]) -> dict[int, list[Samples]]:
+    """Return the samples by joint number, rising."""
+    found: dict[int, list[Samples]] = {}
+    for each in samples:
+        found.setdefault(each.number, []).append(each)
+    return dict(sorted(found.items()))
+
+
+def in_quadrant(samples: Iterable[Samples], index: int) -> list[Samples]:
+    """Return the samples, of which those of one quadrant (index into QUADRANTS) are scored."""
+    return [each.where(each.quadrant == index) for each in samples]
 
 
 def velocity_bins(velocity_rad_s: FloatArray) -> NDArray[np.intp]:
@@ -151,94 +136,46 @@ def ratio(a: float | None, b: float | None) -> float | None:
     return None if a is None or b is None or b == 0.0 else a / b
 
 
-PAPER_MSE_NM2: Final = {"tob": 10.07, "efficiency": 1.97, "network": 0.22}
-"""Section IV.B of the paper, of its tested joint in velocity mode, by method."""
-
-Row = Mapping[str, Score]
-Keep = Callable[[Samples], NDArray[np.bool_]]
-
-
 @dataclass(frozen=True)
 class ErrorTables:
-    """Scores by method. joints, quadrants, velocities: by joint number (and name); runs: by (run, joint number).
+    """Scores by method. joints, quadrants, velocities: by joint number (and name). runs: by (run, joint number).
 
-    tested: only the joint in velocity mode of each run, as in the paper; both: all joints together. A method is in a
-    row only where every joint of the row has it.
+    tested: only the joint in velocity mode of each run, as in the paper. both: all joints together. A method is in a row
+    only where every joint of the row has it. bare_network_mse_nm2: of the paper's network without the guard around it.
     """
 
+    tested: Row
+    both: Row
     joints: Mapping[int, Row]
     quadrants: Mapping[int, Mapping[str, Row]]
     velocities: Mapping[int, Mapping[str, Row]]
+    bare_network_mse_nm2: Mapping[str, float | None]
     runs: Mapping[tuple[str, int], Row]
-    tested: Row
-    both: Row
-    bare_tested_nm2: float | None
-    bare_both_nm2: float | None
 
 
 def error_tables(samples: Sequence[Samples], velocity_joints: Mapping[str, int | None]) -> ErrorTables:
     """Return the tables of some runs; velocity_joints: by run, None where it is not known."""
     tested = [each for each in samples if velocity_joints.get(each.run) == each.number]
-    numbers = sorted({each.number for each in samples})
-    own = {number: [each for each in samples if each.number == number] for number in numbers}
+    own = by_joint(samples)
+    bins = range(len(VELOCITY_EDGES_RAD_S) - 1)
     return ErrorTables(
-        joints={number: row(own[number]) for number in numbers},
-        quadrants={
-            number: {name: row(own[number], _in_quadrant(k)) for k, name in enumerate(QUADRANTS)}
-            for number in numbers
-        },
-        velocities={
-            number: {bin_name(k): row(own[number], _in_bin(k)) for k in range(len(VELOCITY_EDGES_RAD_S) - 1)}
-            for number in numbers
-        },
-        runs={(each.run, each.number): row([each]) for each in samples},
         tested=row(tested),
         both=row(samples),
-        bare_tested_nm2=_bare(tested),
-        bare_both_nm2=_bare(samples),
+        joints={number: row(part) for number, part in own.items()},
+        quadrants={
+            number: {name: row(in_quadrant(part, k)) for k, name in enumerate(QUADRANTS)}
+            for number, part in own.items()
+        },
+        velocities={
+            number: {
+                bin_name(k): row([each.where(velocity_bins(each.velocity_rad_s) == k) for each in part])
+                for k in bins
+            }
+            for number, part in own.items()
+        },
+        bare_network_mse_nm2={"tested": _bare(tested), "both": _bare(samples)},
+        runs={(each.run, each.number): row([each]) for each in samples},
     )
-
-
-def row(samples: Sequence[Samples], keep: Keep | None = None) -> Row:
-    """Return the score of every method over the scored samples (of which `keep` chooses) of some joints and runs."""
-    masks = [each.scored if keep is None else each.scored & keep(each) for each in samples]
-    found = {}
-    for method in common_methods(samples):
-        blocks = [
-            Block(each.error_nm(method)[mask], each.rated_nm)
-            for each, mask in zip(samples, masks, strict=True)
-        ]
-        value = score(blocks)
-        if value is not None:
-            found[method] = value
-    return found
-
-
-def common_methods(samples: Iterable[Samples]) -> tuple[str, ...]:
-    """Return the methods that all of the samples have, in TITLES' order."""
-    sets = [set(each.estimate_nm) for each in samples]
-    return tuple(method for method in TITLES if sets and all(method in one for one in sets))
-
-
-def median_run(samples: Sequence[Samples]) -> Samples | None:
-    """Return the run in the middle by the MSE of ours (else of the last method there is): the lower one of two."""
-    methods = common_methods(samples)
-    if not methods:
-        return None
-    method = OURS if OURS in methods else methods[-1]
-    scored = [(one[method].mse_nm2, each.run, each) for each in samples if (one := row([each]))]
-    if not scored:
-        return None
-    scored.sort(key=lambda item: item[:2])
-    return scored[(len(scored) - 1) // 2][2]
-
-
-def _in_quadrant(index: int) -> Keep:
-    return lambda each: each.quadrant == index
-
-
-def _in_bin(index: int) -> Keep:
-    return lambda each: velocity_bins(each.velocity_rad_s) == index
 
 
 def _bare(samples: Sequence[Samples]) -> float | None:
@@ -248,53 +185,105 @@ def _bare(samples: Sequence[Samples]) -> float | None:
     return float(np.mean(error * error)) if len(error) and np.isfinite(error).all() else None
 
 
+def median_run(samples: Sequence[Samples]) -> Samples | None:
+    """Return the run in the middle by the MSE of ours (else of the last method there is): the lower one of two."""
+    methods = common_methods(samples)
+    if not methods:
+        return None
+    method = OURS if OURS in methods else methods[-1]
+    scored = [(one.mse_nm2, each.run, each) for each in samples if (one := score([each], method))]
+    scored.sort(key=lambda item: item[:2])
+    return scored[(len(scored) - 1) // 2][2] if scored else None
+
+
+# Intervals ---------------------------------------------------------------------------------------------------------------
+
 NOMINAL: Final = 0.9
 ALLOWED: Final = (0.87, 0.93)
 """Coverage that counts as 90 %."""
+LEVELS: Final = {0.5: 0.6744897501960817, 0.8: 1.2815515655446004, 0.9: GAUSS, 0.95: 1.959963984540054}
+"""Nominal coverage -> half width in standard deviations of the normal distribution."""
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Share of `samples` whose interval holds the sensor; se: standard error of it, from run to run, NaN for one run."""
+
+    samples: int
+    runs: int
+    share: float
+    se: float
+
+    def __str__(self) -> str:
+        """E.g. "91.3 % +- 1.2"; without the standard error where there is none."""
+        beside = f" +- {100.0 * self.se:.1f}" if math.isfinite(self.se) else ""
+        return f"{100.0 * self.share:.1f} %{beside}"
+
+
+def coverage(inside: Sequence[BoolArray]) -> Coverage | None:
+    """Return the coverage of runs, each an array [n] of whether a sample is inside; None when there is no sample.
+
+    Samples of one run share its offset and its friction and are right or wrong together: the standard error is that of a
+    ratio over whole runs (Cochran 1977, section 6.4), not sqrt(p (1 - p)/n).
+    """
+    runs = [each for each in inside if len(each)]
+    if not runs:
+        return None
+    count = np.array([len(each) for each in runs], np.float64)
+    good = np.array([np.count_nonzero(each) for each in runs], np.float64)
+    share = float(good.sum() / count.sum())
+    se = math.nan
+    if len(runs) > 1:
+        off = good - share * count
+        se = math.sqrt(float(off @ off) * len(runs) / (len(runs) - 1)) / float(count.sum())
+    return Coverage(int(count.sum()), len(runs), share, se)
+
+
+def covered(samples: Sequence[Samples], method: str, level: float = NOMINAL) -> Coverage | None:
+    """Return how often value +- z(level) sigma holds the sensor, over scored samples."""
+    return coverage(
+        [
+            np.abs(each.scored_error_nm(method)) <= LEVELS[level] * each.sigma_nm[method][each.scored]
+            for each in samples
+        ]
+    )
 
 
 @dataclass(frozen=True)
 class IntervalTables:
-    """Coverage of the intervals of `method`. overall, joints, quadrants: at 90 %; curve: nominal -> observed, by joint
-    and, under None, of all joints.
+    """Coverage of the intervals of `method`. overall, joints, quadrants: at 90 %. curve: nominal -> observed, by joint and,
+    under "both", of all joints.
     """
 
     method: str
     overall: Coverage
     joints: Mapping[int, Coverage]
     quadrants: Mapping[int, Mapping[str, Coverage]]
-    curve: Mapping[int | None, Mapping[float, Coverage]]
+    curve: Mapping[int | str, Mapping[float, Coverage]]
 
 
 def interval_tables(samples: Sequence[Samples], method: str = OURS) -> IntervalTables | None:
     """Return the coverage of a method over runs; None where it has no scored sample."""
     own = [each for each in samples if method in each.estimate_nm]
-    overall = covered(own, method, NOMINAL)
+    overall = covered(own, method)
     if overall is None:
         return None
     joints: dict[int, Coverage] = {}
     quadrants: dict[int, dict[str, Coverage]] = {}
-    curve: dict[int | None, dict[float, Coverage]] = {None: _curve(own, method)}
-    for number in sorted({each.number for each in own}):
-        part = [each for each in own if each.number == number]
-        one = covered(part, method, NOMINAL)
+    curve: dict[int | str, dict[float, Coverage]] = {"both": _curve(own, method)}
+    for number, part in by_joint(own).items():
+        one = covered(part, method)
         if one is None:
             continue
         joints[number], curve[number] = one, _curve(part, method)
-        by_quadrant = {name: covered(part, method, NOMINAL, _quadrant(k)) for k, name in enumerate(QUADRANTS)}
+        by_quadrant = {name: covered(in_quadrant(part, k), method) for k, name in enumerate(QUADRANTS)}
         quadrants[number] = {name: value for name, value in by_quadrant.items() if value is not None}
     return IntervalTables(method, overall, joints, quadrants, curve)
 
 
-def covered(
-    samples: Sequence[Samples], method: str, level: float, keep: Keep | None = None
-) -> Coverage | None:
-    """Return how often value +- z(level) sigma holds the sensor, over scored samples (of which `keep` chooses)."""
-    inside = []
-    for each in samples:
-        mask = each.scored if keep is None else each.scored & keep(each)
-        inside.append(np.abs(each.error_nm(method)[mask]) <= LEVELS[level] * each.sigma_nm[method][mask])
-    return coverage(inside)
+def _curve(samples: Sequence[Samples], method: str) -> dict[float, Coverage]:
+    points = {level: covered(samples, method, level) for level in LEVELS}
+    return {level: point for level, point in points.items() if point is not None}
 
 
 @dataclass(frozen=True)
@@ -307,45 +296,81 @@ class Standstill:
 
 
 def standstill(samples: Sequence[Samples]) -> dict[int, Standstill]:
-    """Return what the intervals of a standing joint were worth, by joint."""
+    """Return coverage and width of the intervals of a standing joint, by joint."""
     found = {}
-    for number in sorted({each.number for each in samples}):
-        own = [each for each in samples if each.number == number]
-        total = sum(len(each.standing) for each in own)
+    for number, own in by_joint(samples).items():
         inside: dict[str, Coverage] = {}
         width: dict[str, float] = {}
         for method in common_methods(own):
-            one = coverage(
-                [
-                    np.abs(each.error_nm(method)[each.standing]) <= each.sigma_nm[method][each.standing]
-                    for each in own
-                ]
-            )
+            half = [each.sigma_nm[method][each.standing] for each in own]
+            errors = [each.error_nm(method)[each.standing] for each in own]
+            one = coverage([np.abs(e) <= h for e, h in zip(errors, half, strict=True)])
             if one is not None:
-                inside[method] = one
-                width[method] = float(
-                    np.mean(np.concatenate([each.sigma_nm[method][each.standing] for each in own]))
-                )
-        count = sum(int(np.count_nonzero(each.standing)) for each in own)
-        found[number] = Standstill(count / total, inside, width)
+                inside[method], width[method] = one, float(np.mean(np.concatenate(half)))
+        standing = sum(int(np.count_nonzero(each.standing)) for each in own)
+        found[number] = Standstill(standing / sum(len(each.standing) for each in own), inside, width)
     return found
 
 
-def _curve(samples: Sequence[Samples], method: str) -> dict[float, Coverage]:
-    points = {level: covered(samples, method, level) for level in LEVELS}
-    return {level: point for level, point in points.items() if point is not None}
+# Truth -------------------------------------------------------------------------------------------------------------------
 
 
-def _quadrant(index: int) -> Keep:
-    return lambda each: each.quadrant == index
+def for_intervals(samples: Samples) -> Samples:
+    """Return samples whose `sensor_of` an interval is to hold: the true torque, aligned, where the run has it.
 
+    Else the sensor, and sigma of ours grows by the sensor's offset, which the comparison contains: at standstill, where
+    sigma is a half width of so many standard deviations, by as many.
+    """
+    if samples.true_nm is not None:
+        return _aligned(samples, samples.true_nm)
+    wider = samples.reference_nm * np.where(samples.standing, samples.standstill_sigmas, 1.0)
+    sigma = {
+        method: values if METHODS[settings_of(method).method].sigma_has_floor else np.hypot(values, wider)
+        for method, values in samples.sigma_nm.items()
+    }
+    return replace(samples, sigma_nm=sigma)
+
+
+def _aligned(samples: Samples, true_nm: FloatArray) -> Samples:
+    """Return samples with the true torque in place of the sensor, through the filter of each method's delay."""
+    dt = np.diff(samples.time_s, prepend=samples.time_s[0])
+    own = {m: low_pass(true_nm, dt, samples.bandwidth_rad_s[m]) for m in samples.sensors_nm}
+    return replace(samples, sensor_nm=low_pass(true_nm, dt, PAPERS_BANDWIDTH), sensors_nm=own)
+
+
+@dataclass(frozen=True)
+class TruthTables:
+    """Scores of all methods by joint, now and aligned; intervals of ours, standstill by joint: aligned."""
+
+    now: Mapping[int, Row]
+    aligned: Mapping[int, Row]
+    intervals: IntervalTables | None
+    standstill: Mapping[int, Standstill]
+
+
+def truth_tables(samples: Sequence[Samples]) -> TruthTables | None:
+    """Return the scores of the samples that have the truth; None where none has."""
+    known = [(each, each.true_nm) for each in samples if each.true_nm is not None]
+    if not known:
+        return None
+    now = [replace(each, sensor_nm=true, sensors_nm={}) for each, true in known]
+    aligned = [_aligned(each, true) for each, true in known]
+    return TruthTables(
+        {number: row(part) for number, part in by_joint(now).items()},
+        {number: row(part) for number, part in by_joint(aligned).items()},
+        interval_tables(aligned),
+        standstill(aligned),
+    )
+
+
+# Jumps -------------------------------------------------------------------------------------------------------------------
 
 WINDOW_S: Final = 0.02
 LIMIT_NM: Final = 0.2
 VELOCITY_BAND_RAD_S: Final = 0.02
 """Twice the standstill threshold: outside of it the joint moves for every method."""
 TORQUE_BAND_NM: Final = 0.3
-"""Above the sensor's noise: its zero is crossed once, not twenty times."""
+"""Above the sensor's noise: zero is crossed once, not twenty times."""
 
 
 class Crossing(NamedTuple):
@@ -358,7 +383,8 @@ class Crossing(NamedTuple):
     end: int
 
 
-class Jump(NamedTuple):
+@dataclass(frozen=True)
+class Jump:
     """The largest jump [Nm] of one method and where it was; median over all `crossings`; largest one unshifted.
 
     elsewhere_nm: what one in `crossings` windows anywhere in motion exceeds: as much is noise and dynamics, not crossing.
@@ -383,7 +409,7 @@ def crossings(values: FloatArray, band: float) -> list[Crossing]:
     found = []
     for before, after in zip(outside[changed], outside[changed + 1], strict=True):
         inside = values[before : after + 1]
-        last = np.flatnonzero(inside * side[before] >= 0.0)[-1]  # after it the old side is not seen again
+        last = np.flatnonzero(inside * side[before] >= 0.0)[-1]  # the last sample on the old side
         found.append(Crossing(int(before) + 1, int(before + last) + 1, int(after)))
     return found
 
@@ -442,61 +468,13 @@ def _all_crossings(samples: Samples) -> list[tuple[str, Crossing]]:
     ]
 
 
-def for_intervals(samples: Samples) -> Samples:
-    """Return samples whose `sensor_of` an interval is to hold: the true torque, aligned, where the run has it.
-
-    Else the sensor, and sigma of ours grows by the sensor's zero, which the comparison contains: at standstill, where sigma
-    is a half width of so many standard deviations, by as many.
-    """
-    if samples.true_nm is not None:
-        dt = np.diff(samples.time_s, prepend=samples.time_s[0])
-        young = {
-            method: low_pass(samples.true_nm, dt, samples.bandwidth_rad_s[method])
-            for method in samples.sensors_nm
-        }
-        return replace(samples, sensor_nm=low_pass(samples.true_nm, dt, PAPERS_BANDWIDTH), sensors_nm=young)
-    wider = samples.reference_nm * np.where(samples.standing, samples.standstill_sigmas, 1.0)
-    sigma = {
-        method: values if METHODS[settings_of(method).method].sigma_has_floor else np.hypot(values, wider)
-        for method, values in samples.sigma_nm.items()
-    }
-    return replace(samples, sigma_nm=sigma)
-
-
-@dataclass(frozen=True)
-class TruthTables:
-    """Scores of all methods by joint, now and aligned; intervals of ours, standstill by joint: aligned."""
-
-    now: Mapping[int, Row]
-    aligned: Mapping[int, Row]
-    intervals: IntervalTables | None
-    standstill: Mapping[int, Standstill]
-
-
-def truth_tables(samples: Sequence[Samples]) -> TruthTables | None:
-    """Return the scores of the samples that have the truth; None where none has."""
-    now, aligned = [], []
-    for each in samples:
-        if each.true_nm is None:
-            continue
-        now.append(replace(each, sensor_nm=each.true_nm, sensors_nm={}))
-        aligned.append(for_intervals(each))
-    if not now:
-        return None
-    numbers = sorted({each.number for each in now})
-
-    def of(part: list[Samples]) -> dict[int, Row]:
-        return {number: row([each for each in part if each.number == number]) for number in numbers}
-
-    return TruthTables(of(now), of(aligned), interval_tables(aligned), standstill(aligned))
-
+# Constant velocity -------------------------------------------------------------------------------------------------------
 
 PAPER_WORST_PERCENT: Final = 27.6
 """Classical TOB, back drive, 2.5 rad/s, 30 Nm (section IV.A)."""
 WORST_VELOCITY_RAD_S: Final = (2.4, 2.6)
 WORST_TORQUE_NM: Final = (25.0, 35.0)
-"""What counts as "2.5 rad/s and 30 Nm": no plateau has just that torque, because currents are commanded."""
-
+"""Counts as "2.5 rad/s and 30 Nm": no plateau has just that torque, because currents are commanded."""
 NO_LOAD: Final = 0.05
 """Share of rated torque below which an error relative to the torque has no meaning."""
 WHOLE: Final = 0.9
@@ -506,8 +484,12 @@ CONSTANT_SHARE: Final = 0.25
 _MOVING_RAD_S: Final = 0.05
 
 
-class PlateauScore(NamedTuple):
-    """One plateau of one joint; drive: forward or back, as this joint sees it; errors: mean error by method [Nm]."""
+@dataclass(frozen=True)
+class PlateauScore:
+    """One plateau of one joint; drive: forward or back, for this joint; errors: mean error by method [Nm].
+
+    percent: of the plateau's torque, None next to no load. rated_percent: of rated torque.
+    """
 
     run: str
     number: int
@@ -519,19 +501,22 @@ class PlateauScore(NamedTuple):
     torque_nm: float
     rated_nm: float
     errors_nm: Mapping[str, float]
+    percent: Mapping[str, float | None] = field(init=False)
+    rated_percent: Mapping[str, float] = field(init=False)
 
-    def percent(self, method: str) -> float | None:
-        """Error in percent of the plateau's torque; None next to no load."""
-        if abs(self.torque_nm) < NO_LOAD * self.rated_nm:
-            return None
-        return 100.0 * abs(self.errors_nm[method]) / abs(self.torque_nm)
+    def __post_init__(self) -> None:
+        size = {method: 100.0 * abs(error) for method, error in self.errors_nm.items()}
+        torque = abs(self.torque_nm)
+        loaded = torque >= NO_LOAD * self.rated_nm
+        object.__setattr__(
+            self, "percent", {method: each / torque if loaded else None for method, each in size.items()}
+        )
+        object.__setattr__(
+            self, "rated_percent", {method: each / self.rated_nm for method, each in size.items()}
+        )
 
-    def rated_percent(self, method: str) -> float:
-        """Error in percent of rated torque."""
-        return 100.0 * abs(self.errors_nm[method]) / self.rated_nm
 
-
-def plateaus_of(name: str, time_s: np.ndarray, columns: JointColumns, joint: Joint) -> list[Plateau]:
+def plateaus_of(name: str, time_s: FloatArray, columns: JointColumns, joint: Joint) -> list[Plateau]:
     """Return the plateaus of a joint in a run; none where nothing settled."""
     try:
         return find_plateaus(time_s, columns, joint, name)
@@ -571,10 +556,7 @@ def plateau_scores(plateaus: Iterable[Plateau], samples: Samples) -> tuple[list[
                 plateau.current.value,
                 float(np.mean(samples.sensor_nm[inside][kept])),
                 samples.rated_nm,
-                {
-                    method: float(np.mean(samples.error_nm(method)[inside][kept]))
-                    for method in samples.estimate_nm
-                },
+                {m: float(np.mean(samples.error_nm(m)[inside][kept])) for m in samples.estimate_nm},
             )
         )
     return found, lost
@@ -592,14 +574,10 @@ def hardest_plateaus(plateaus: Iterable[PlateauScore]) -> list[PlateauScore]:
 
 
 def worst_plateau(
-    plateaus: Iterable[PlateauScore], method: str, size: Callable[[PlateauScore, str], float | None]
+    plateaus: Iterable[PlateauScore], method: str, key: str
 ) -> tuple[float, PlateauScore] | None:
-    """Return the largest `size(plateau, method)` and its plateau; None where no plateau has one."""
-    sized = [
-        (value, each)
-        for each in plateaus
-        if method in each.errors_nm and (value := size(each, method)) is not None
-    ]
+    """Return the largest `percent` or `rated_percent` (key) of a method and its plateau; None where no plateau has one."""
+    sized = [(value, each) for each in plateaus if (value := getattr(each, key).get(method)) is not None]
     return max(sized, key=lambda item: item[0], default=None)
 
 
@@ -611,18 +589,23 @@ def speed_groups(plateaus: Iterable[PlateauScore]) -> dict[tuple[str, float], li
     return dict(sorted(groups.items(), key=lambda item: (item[0][0] != "forward", item[0][1])))
 
 
-class Range(NamedTuple):
+# Outside of the envelope -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Range:
     """Training range of a joint: motor torque, joint side [Nm], and temperature [degC], None where it had none."""
 
     torque_nm: tuple[float, float]
     temperature_c: tuple[float, float] | None
 
 
-class Outside(NamedTuple):
+@dataclass(frozen=True)
+class Outside:
     """Samples of one joint outside: how many of how many scored; ours and physics-only; share flagged degraded.
 
-    physics: None where no network is there, so that ours is its physics.
-    by_load, by_temperature: samples beyond that limit (some are beyond both).
+    physics: None where no network is there, so that ours is its physics. by_load, by_temperature: samples beyond that limit
+    (some are beyond both).
     """
 
     number: int
@@ -642,13 +625,11 @@ def training_range(envelope: Envelope) -> Range:
     columns = np.flatnonzero(table.any(axis=0)) - table.shape[1] // 2
     if not len(columns):
         return Range((0.0, 0.0), envelope.temperature_c)
-    step = envelope.torque_step_nm
-    return Range(
-        (float((columns[0] - 0.5) * step), float((columns[-1] + 0.5) * step)), envelope.temperature_c
-    )
+    low, high = (columns[0] - 0.5) * envelope.torque_step_nm, (columns[-1] + 0.5) * envelope.torque_step_nm
+    return Range((float(low), float(high)), envelope.temperature_c)
 
 
-def beyond(samples: Samples, limits: Range) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def beyond(samples: Samples, limits: Range) -> tuple[BoolArray, BoolArray]:
     """Return which samples [n] are beyond the range of load, and beyond that of temperature."""
     with np.errstate(invalid="ignore"):
         load = (samples.raw_nm < limits.torque_nm[0]) | (samples.raw_nm > limits.torque_nm[1])
@@ -658,34 +639,26 @@ def beyond(samples: Samples, limits: Range) -> tuple[NDArray[np.bool_], NDArray[
         return load, (samples.temperature_c < low) | (samples.temperature_c > high)
 
 
-def outside_scores(samples: Sequence[Samples], envelopes: dict[int, Envelope]) -> list[Outside]:
+def outside_scores(samples: Sequence[Samples], envelopes: Mapping[int, Envelope]) -> list[Outside]:
     """Return the scores of each joint that has an envelope and samples outside of it."""
     found = []
     for number, envelope in sorted(envelopes.items()):
         own = [each for each in samples if each.number == number and OURS in each.estimate_nm]
         limits = training_range(envelope)
-        beyonds = [beyond(each, limits) for each in own]
-        masks = [each.scored & (load | warm) for each, (load, warm) in zip(own, beyonds, strict=True)]
-        pairs = list(zip(own, masks, strict=True))
-        ours = score([Block(each.error_nm(OURS)[mask], each.rated_nm) for each, mask in pairs])
+        load, warm = zip(*(beyond(each, limits) for each in own), strict=True) if own else ((), ())
+        outside = [each.where(a | b) for each, a, b in zip(own, load, warm, strict=True)]
+        ours = score(outside, OURS)
         if ours is None:
             continue
-        bare = all("physics" in each.estimate_nm for each in own)
-        physics = score(
-            [Block(each.error_nm("physics")[mask], each.rated_nm) for each, mask in pairs if bare]
+        status = np.concatenate([each.status[OURS][each.scored] for each in outside])
+        by_load, by_temperature = (
+            sum(int(np.count_nonzero(each.scored & m)) for each, m in zip(outside, masks, strict=True))
+            for masks in (load, warm)
         )
-        status = np.concatenate([each.status[OURS][mask] for each, mask in pairs])
+        of = sum(int(np.count_nonzero(each.scored)) for each in own)
+        physics = score(outside, "physics")
+        flagged = float(np.mean(status == DEGRADED))
         found.append(
-            Outside(
-                number,
-                limits,
-                ours.samples,
-                sum(int(np.count_nonzero(each.scored)) for each in own),
-                sum(int(np.count_nonzero(m & load)) for m, (load, _) in zip(masks, beyonds, strict=True)),
-                sum(int(np.count_nonzero(m & warm)) for m, (_, warm) in zip(masks, beyonds, strict=True)),
-                ours,
-                physics,
-                float(np.mean(status == DEGRADED)),
-            )
+            Outside(number, limits, ours.samples, of, by_load, by_temperature, ours, physics, flagged)
         )
     return found
