@@ -1,17 +1,19 @@
-"""The figures to reach: each one on both sides of its goal, and unknown where the runs do not tell."""
+"""Targets, each on both sides of its goal and unknown without data; the time of a step, with a simulated clock."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from jtqd.sysid.evaluate.evaluation import Evaluation, LoopTime, Target, targets
-from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.evaluation import TIMED, Evaluation, LoopTime, Target, loop_time, targets
+from jtqd.sysid.evaluate.inputs import EvaluatedRun, read_inputs
+from jtqd.sysid.evaluate.methods import JointModels, Samples, load_models
 from jtqd.sysid.evaluate.scores import (
-    Block,
     Jump,
     Outside,
     PlateauScore,
@@ -98,7 +100,7 @@ def test_every_run_counts_those_at_constant_velocity_included() -> None:
 def test_the_hardest_plateau(error: float, reached: bool) -> None:
     errors = {"tob": 6.0, "fused": error}
     hard = PlateauScore("hard", 1, 0.0, 1.0, "back", 2.5, -4.0, -30.0, 40.0, errors)
-    easy = hard._replace(run="easy", torque_nm=10.0, errors_nm={"tob": 0.0, "fused": 4.0})
+    easy = replace(hard, run="easy", torque_nm=10.0, errors_nm={"tob": 0.0, "fused": 4.0})
     found = target(replace(EMPTY, plateaus=(easy, hard)), "back_drive")
     assert found.reached is reached
     assert found.ours == f"{abs(error) / 0.4:.2f} % of rated"
@@ -126,7 +128,7 @@ def test_every_quadrant_must_be_covered(shares: tuple[float, float], reached: bo
 
 
 def _score(rmse_nm: float) -> Score:
-    found = score([Block(np.full(10, rmse_nm), 40.0)])
+    found = score([samples({"fused": np.full(10, rmse_nm)})], "fused")
     assert found is not None
     return found
 
@@ -134,7 +136,7 @@ def _score(rmse_nm: float) -> Score:
 @pytest.mark.parametrize(("ours", "flagged", "reached"), [(1.0, 0.96, True), (1.01, 0.94, False)])
 def test_outside_every_joint_counts(ours: float, flagged: float, reached: bool) -> None:
     good = Outside(1, Range((-9.0, 9.0), None), 10, 10, 10, 0, _score(0.5), _score(1.0), 1.0)
-    other = good._replace(number=2, ours=_score(ours), flagged=flagged)
+    other = replace(good, number=2, ours=_score(ours), flagged=flagged)
     result = replace(EMPTY, outside=(good, other))
     assert target(result, "outside_rmse").reached is reached
     by_itself = target(result, "outside_flagged")
@@ -147,14 +149,14 @@ def test_outside_ours_without_a_network_is_not_compared_with_itself() -> None:
     found = target(replace(EMPTY, outside=(alone,)), "outside_rmse")
     assert (found.ours, found.reached) == ("no network: ours is its physics", None)
     assert found.details == ("j1: 0.500 Nm, 10 samples outside",)
-    beside = alone._replace(number=2, physics=_score(0.4))
+    beside = replace(alone, number=2, physics=_score(0.4))
     assert target(replace(EMPTY, outside=(alone, beside)), "outside_rmse").ours == "1.2500"
 
 
 @pytest.mark.parametrize(("nm", "reached"), [(0.19, True), (0.21, False)])
 def test_the_largest_jump_of_ours_counts_and_the_papers_is_shown(nm: float, reached: bool) -> None:
     jump = Jump(nm, "run", 1, 0.5, "v = 0", 3, 0.1, 0.4, 0.15)
-    result = replace(EMPTY, jumps={"fused": jump, "network": jump}, passages={"fused": jump._replace(nm=0.9)})
+    result = replace(EMPTY, jumps={"fused": jump, "network": jump}, passages={"fused": replace(jump, nm=0.9)})
     assert target(result, "jump_fused").reached is reached
     assert target(result, "jump_network").reached is None
     assert target(result, "jump_network").ours == f"{nm:.2f} Nm"
@@ -169,3 +171,54 @@ def test_extra_time_is_that_over_the_papers_chain(ours: float, reached: bool) ->
     assert found.reached is reached
     assert found.ours == f"{ours - 15.0:.1f} us"
     assert f"over the classical TOB {ours - 4.0:.1f} us" in found.details[0]
+
+
+# Time of a step -----------------------------------------------------------------------------------------
+
+
+def runs_of(bench: Path, models: tuple[JointModels, ...]) -> tuple[EvaluatedRun, ...]:
+    return read_inputs([bench / "runs" / "variable_1.csv.gz"], models).runs
+
+
+def ticking(step_ns: int, slow_ns: int = 0) -> Callable[[], int]:
+    """A clock that a step takes step_ns by, and every tenth one slow_ns more."""
+    now, calls = 0, 0
+
+    def read() -> int:
+        nonlocal now, calls
+        calls += 1
+        now += step_ns + (slow_ns if calls % 20 == 0 else 0)
+        return now
+
+    return read
+
+
+def test_both_joints_count_and_the_median_leaves_out_what_the_machine_did(bench: Path) -> None:
+    models = load_models(bench / "models")
+    found = loop_time(runs_of(bench, models), models, ticking(1500, 1_000_000))
+    assert found is not None
+    assert found.joints == 2
+    assert found.step_us == dict.fromkeys(TIMED, pytest.approx(3.0))
+    assert found.extra_us("network") == pytest.approx(0.0)
+    assert 2000 < found.samples <= 3000
+    assert found.run == "variable_1.csv.gz"
+
+
+def test_a_real_clock_finds_that_the_network_costs_something(bench: Path) -> None:
+    models = load_models(bench / "models")
+    found = loop_time(runs_of(bench, models), models)
+    assert found is not None
+    assert found.step_us["network"] > found.step_us["tob"] > 0.0
+
+
+def test_extra_is_ours_less_the_other() -> None:
+    assert LoopTime({"tob": 3.0, "network": 14.0, "fused": 19.5}, 2, 10, "r").extra_us("network") == 5.5
+
+
+def test_nothing_is_measured_without_all_methods(bench: Path, tmp_path: Path) -> None:
+    for path in (bench / "models").iterdir():
+        if path.name not in ("joint1.onnx", "joint2.onnx"):
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+    models = load_models(tmp_path)
+    assert loop_time(runs_of(bench, models), models) is None
+    assert loop_time((), load_models(bench / "models")) is None

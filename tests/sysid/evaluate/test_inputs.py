@@ -1,4 +1,4 @@
-"""`jtq evaluate`: what it refuses (trained-on runs), what it leaves out by name (broken runs, missing models)."""
+"""`jtq evaluate`: trained-on runs are refused; broken runs and missing models are left out by name."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import pytest
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint
 from jtqd.sysid.evaluate.command import main
+from jtqd.sysid.evaluate.inputs import by_marks, read_inputs
+from jtqd.sysid.evaluate.methods import load_models
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.tables import write_run
@@ -22,7 +24,6 @@ from tests.sysid.evaluate.evaluate_helpers import (
     NO_PICTURES,
     evaluate,
     fused_network,
-    make_bench,
     paper_network,
     report,
 )
@@ -31,18 +32,12 @@ pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
 
-@pytest.fixture(scope="module")
-def bench(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Nothing in it is changed by a test."""
-    return make_bench(tmp_path_factory.mktemp("evaluate"))
-
-
 @pytest.fixture(autouse=True)
 def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("jtqd.sysid.evaluate.report.pictures", lambda result: NO_PICTURES)
 
 
-# --- leaks ---
+# Leaks ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("copy", ["itself", "renamed", "unpacked", "packed again"])
@@ -94,21 +89,21 @@ def test_a_run_that_a_joint_file_was_fitted_to_is_refused_also_outside(
     assert main([str(runs[1]), "--models", str(models), "--out", str(tmp_path / "out")]) == 0
 
 
-def test_a_network_that_does_not_say_what_it_was_trained_on_is_a_finding(bench: Path, tmp_path: Path) -> None:
+def test_a_network_that_names_no_training_runs_is_a_finding(bench: Path, tmp_path: Path) -> None:
     models = tmp_path / "models"
     shutil.copytree(bench / "models", models)
     (models / "joint1.onnx").write_bytes(paper_network("joint1", runs=None))
     run = bench / "runs" / "variable_1.csv.gz"
     assert evaluate(tmp_path, [run], models=models) == 3
     assert [item["kind"] for item in report(tmp_path / "out")["findings"]] == ["training_runs_unknown"]
-    # its card beside it says so: no finding, and a leak is seen
+    # its card beside it names them: no finding, and a leak is seen
     (models / "joint1.json").write_text(json.dumps({"runs": {"other.csv": "f" * 64}}))
     assert evaluate(tmp_path, [run], models=models) == 0
     (models / "joint1.json").write_text(json.dumps({"runs": {"this.csv": read_run(run).sha256}}))
     assert evaluate(tmp_path, [run], models=models) == 1
 
 
-# --- broken runs, missing models ---
+# Broken runs, missing models -----------------------------------------------------------------------------
 
 
 def _changed(bench: Path, **changes: Any) -> RunTable:
@@ -221,7 +216,7 @@ def test_methods_without_their_files_are_left_out_and_named(
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "words"),
     [
         (shutil.rmtree, "found no directory"),
         (lambda d: (d / "joint1.yaml").unlink(), "expected joint1.yaml"),
@@ -234,7 +229,7 @@ def test_methods_without_their_files_are_left_out_and_named(
     ],
 )
 def test_models_that_cannot_be_used_are_a_failure_in_one_line(
-    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, says: str
+    bench: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Any, words: str
 ) -> None:
     models = tmp_path / "models"
     shutil.copytree(bench / "models", models)
@@ -242,12 +237,12 @@ def test_models_that_cannot_be_used_are_a_failure_in_one_line(
     run = bench / "runs" / "variable_1.csv.gz"
     assert evaluate(tmp_path, [run], "--joint", "1", models=models) == 1
     error = capsys.readouterr().err
-    assert says in error
+    assert words in error
     assert error.count("\n") == 1
 
 
 def test_samples_and_plateaus_without_a_value_are_named(bench: Path, tmp_path: Path) -> None:
-    """A joint rated 10 Nm publishes nothing above 30 Nm: the heavy plateau is in no score, and is said to be in none."""
+    """A joint rated 10 Nm publishes nothing above 30 Nm: the heavy plateau is in no score, which is a finding."""
     models = tmp_path / "models"
     shutil.copytree(bench / "models", models)
     joint = load_joint(models / "joint1.yaml")
@@ -259,3 +254,34 @@ def test_samples_and_plateaus_without_a_value_are_named(bench: Path, tmp_path: P
     assert set(kinds) == {"no_value", "plateau_lost"}
     assert "no value of classical TOB" in kinds["no_value"]
     assert [round(p["velocity_rad_s"], 1) for p in content["constant"]["plateaus"]] == [-1.5]
+
+
+def test_ours_without_a_network_is_the_physics_of_ours_with_one(bench: Path, tmp_path: Path) -> None:
+    models = tmp_path / "models"
+    shutil.copytree(bench / "models", models)
+    with_network = load_models(models)
+    (run,) = read_inputs([bench / "runs" / "variable_1.csv.gz"], with_network).runs
+    for n in (1, 2):
+        (models / f"joint{n}.fused.onnx").unlink()
+    without = load_models(models)
+    for both, alone in zip(with_network, without, strict=True):
+        assert {"physics", "fused"} <= {*both.methods}
+        assert "fused" in alone.methods
+        assert "physics" not in alone.methods
+        assert "physics" in alone.missing
+        time_s, columns = run.table.time_s, run.columns[both.number]
+        expected, found = (each.estimate(time_s, columns)[0] for each in (both, alone))
+        assert np.isfinite(found["fused"].torque_nm).mean() > 0.9
+        np.testing.assert_array_equal(found["fused"].torque_nm, expected["physics"].torque_nm)
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [('{"velocity_joint": 2}', 2), ('{"velocity_joint": true}', None), ("no JSON", None), (None, None)],
+)
+def test_the_marks_of_a_campaign_name_the_velocity_joint(
+    tmp_path: Path, text: str | None, number: int | None
+) -> None:
+    if text is not None:
+        (tmp_path / "run.json").write_text(text)
+    assert by_marks(tmp_path / "run.csv.gz") == number

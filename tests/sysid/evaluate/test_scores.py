@@ -1,8 +1,10 @@
-"""Scores of errors, intervals and jumps, and ranges: against closed forms and samples whose errors are known."""
+"""Scores: errors, intervals, truth, jumps, plateaus and ranges, against closed forms and samples whose errors are known."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,11 +13,10 @@ from jtqd.estimator.joint import QUADRANTS, Envelope
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.sysid.evaluate.evaluation import worse_runs
-from jtqd.sysid.evaluate.inputs import by_data, by_marks
+from jtqd.sysid.evaluate.inputs import by_data
 from jtqd.sysid.evaluate.methods import Samples
 from jtqd.sysid.evaluate.scores import (
     LEVELS,
-    Block,
     PlateauScore,
     coverage,
     covered,
@@ -33,16 +34,22 @@ from jtqd.sysid.evaluate.scores import (
     score,
     standstill,
     training_range,
+    truth_tables,
     velocity_bins,
     worst_plateau,
 )
 from jtqd.sysid.fit.plateaus import Mean, Plateau
 from jtqd.sysid.report.figures import thinned
+from jtqd.sysid.runs.tables import read_truth, truth_path, write_truth
 from tests.sysid.evaluate.evaluate_helpers import samples
 
 
-def test_a_score_is_what_its_names_say() -> None:
-    one = score([Block(np.array([3.0, -4.0]), 40.0), Block(np.array([0.0, 5.0]), 20.0)])
+def test_a_score_has_squares_percentile_and_largest_error() -> None:
+    parts = [
+        samples({"fused": np.array(errors)}, rated_nm=rated)
+        for errors, rated in (([3.0, -4.0], 40.0), ([0.0, 5.0], 20.0))
+    ]
+    one = score(parts, "fused")
     assert one is not None
     assert one.samples == 4
     assert one.mse_nm2 == pytest.approx(50.0 / 4)
@@ -51,7 +58,8 @@ def test_a_score_is_what_its_names_say() -> None:
     assert one.rmse_rated_percent == pytest.approx(100 * math.sqrt((9 + 16) / 1600 / 4 + 25 / 400 / 4))
     assert one.max_nm == 5.0
     assert one.p95_nm == pytest.approx(np.quantile([3, 4, 0, 5], 0.95))
-    assert score([Block(np.zeros(0), 40.0)]) is None
+    assert score([each.where(np.zeros(2, bool)) for each in parts], "fused") is None
+    assert score(parts, "tob") is None
 
 
 def test_velocity_bins_have_their_lower_edge_inside() -> None:
@@ -73,7 +81,7 @@ def test_the_standard_error_of_a_coverage_is_the_one_between_runs() -> None:
     assert coverage([]) is None
 
 
-def test_intervals_of_a_normal_error_cover_what_they_say() -> None:
+def test_intervals_of_a_normal_error_cover_their_level() -> None:
     seed = 5
     rng = np.random.default_rng(seed)
     runs = [samples({"fused": rng.normal(0.0, 2.0, 4000)}, run=str(k), sigma_nm=2.0) for k in range(10)]
@@ -83,12 +91,12 @@ def test_intervals_of_a_normal_error_cover_what_they_say() -> None:
         assert one.share == pytest.approx(level, abs=0.01), (seed, level)
     table = interval_tables(runs)
     assert table is not None
-    assert table.curve[None][0.8].share == pytest.approx(0.8, abs=0.01)
+    assert table.curve["both"][0.8].share == pytest.approx(0.8, abs=0.01)
     assert list(table.quadrants[1]) == ["i_pos_w_pos"]  # the only quadrant with samples
     assert interval_tables([samples({"tob": np.zeros(5)})]) is None
 
 
-def test_standstill_is_judged_by_sigma_itself_and_in_no_other_score() -> None:
+def test_standstill_is_scored_by_sigma_itself_and_in_no_other_score() -> None:
     error = np.concatenate((np.full(60, 0.9), np.full(40, 1.1)))  # of the interval +-1: 60 % inside
     moving = np.zeros(100, bool)
     moving[-10:] = True
@@ -120,7 +128,7 @@ def test_tables_pool_what_belongs_together() -> None:
     assert tables.quadrants[2]["i_pos_w_neg"] == {}
     assert tables.velocities[2]["0.05 to 0.2"]["fused"].mse_nm2 == pytest.approx(0.09)
     assert tables.runs["b", 2]["tob"].rmse_nm == pytest.approx(5.0)
-    assert tables.bare_both_nm2 is None
+    assert tables.bare_network_mse_nm2["both"] is None
     assert tuple(QUADRANTS) == tuple(tables.quadrants[1])
 
 
@@ -155,7 +163,7 @@ def test_runs_in_which_ours_is_worse_than_its_physics_are_found_and_no_others() 
     assert [found[:2] for found in worse_runs(tables.runs)] == [("worse", 1)]
 
 
-# --- constant velocity ---
+# Constant velocity ---------------------------------------------------------------------------------------
 
 
 def _plateau(start_s: float, end_s: float, velocity: float = 2.5, current: float = -4.0) -> Plateau:
@@ -170,9 +178,9 @@ def test_the_error_of_a_plateau_is_that_of_its_means() -> None:
     assert lost == []
     assert found.drive == "back"
     assert found.errors_nm["tob"] == pytest.approx(-3.0)
-    assert found.percent("tob") == pytest.approx(10.0)
-    assert found.rated_percent("tob") == pytest.approx(7.5)
-    assert found.percent("fused") == pytest.approx(2 / 3)
+    assert found.percent["tob"] == pytest.approx(10.0)
+    assert found.rated_percent["tob"] == pytest.approx(7.5)
+    assert found.percent["fused"] == pytest.approx(2 / 3)
     assert plateau_scores([_plateau(1.0, 3.0, -2.5, -4.0)], one)[0][0].drive == "forward"
 
 
@@ -181,8 +189,8 @@ def test_a_plateau_without_load_has_no_relative_error_and_one_without_values_is_
     scored[1000:1500] = False
     one = samples({"tob": np.ones(4000)}, sensor_nm=np.full(4000, 1.9), scored=scored)
     found, lost = plateau_scores([_plateau(2.0, 3.0), _plateau(1.0, 2.0)], one)
-    assert [each.percent("tob") for each in found] == [None]
-    assert found[0].rated_percent("tob") == pytest.approx(2.5)
+    assert [each.percent["tob"] for each in found] == [None]
+    assert found[0].rated_percent["tob"] == pytest.approx(2.5)
     assert len(lost) == 1
     assert "50 %" in lost[0]
     assert "1.00 to 2.00 s" in lost[0]
@@ -195,11 +203,11 @@ def test_the_hardest_plateaus_are_back_driven_fast_and_heavy() -> None:
     right = [one("back", 2.5, -30.0, 0.3), one("back", -2.45, 34.0, -0.6)]
     wrong = [one("forward", 2.5, 30.0, 9.0), one("back", 1.5, 30.0, 9.0), one("back", 2.5, 20.0, 9.0)]
     assert hardest_plateaus(right + wrong) == right
-    found = worst_plateau(right, "fused", PlateauScore.rated_percent)
+    found = worst_plateau(right, "fused", "rated_percent")
     assert found is not None
     assert found[0] == pytest.approx(1.5)
     assert found[1] is right[1]
-    assert worst_plateau(right, "tob", PlateauScore.percent) is None
+    assert worst_plateau(right, "tob", "percent") is None
 
 
 def test_a_run_is_at_constant_velocity_when_plateaus_fill_it() -> None:
@@ -209,10 +217,10 @@ def test_a_run_is_at_constant_velocity_when_plateaus_fill_it() -> None:
     assert not is_constant([], samples({"tob": np.zeros(10)}, velocity_rad_s=np.zeros(10)))
 
 
-# --- outside of the envelope, velocity joint, curves ---
+# Outside of the envelope, velocity joint, curves -----------------------------------------------------------
 
 
-def test_outside_is_what_the_envelope_says_and_not_the_status() -> None:
+def test_outside_is_by_the_envelope_and_not_the_status() -> None:
     known = (
         (0, 0, 1, 1, 0),
         (0, 1, 1, 0, 0),
@@ -254,9 +262,6 @@ def test_the_velocity_joint_is_the_one_whose_current_turns_over() -> None:
     assert by_data(table(smooth, rough)) == 2, seed
     assert by_data(table(smooth, smooth[::-1])) is None, seed
     assert by_data(RunTable(t, {1: JointColumns(current_a=rough)})) is None
-    assert by_marks({"velocity_joint": 2}) == 2
-    assert by_marks({"velocity_joint": True}) is None
-    assert by_marks(None) is None
 
 
 def test_a_thinned_curve_keeps_its_spikes_and_its_gaps() -> None:
@@ -308,7 +313,7 @@ def test_a_step_at_a_reversal_is_a_jump_of_its_size(step: float) -> None:
     assert largest_jump([_reversal(step)], "tob") is None
 
 
-def test_what_the_torque_itself_does_is_no_jump_even_when_it_is_followed_late() -> None:
+def test_a_swing_of_the_torque_is_no_jump_even_when_it_is_followed_late() -> None:
     followed = largest_jump([_reversal(0.0, swing_nm=10.0)], "fused")
     late = largest_jump([_reversal(0.0, swing_nm=10.0, late=5)], "fused", passage=True)
     both = largest_jump([_reversal(3.0, swing_nm=10.0)], "fused")
@@ -333,7 +338,7 @@ def test_a_spike_within_the_window_is_seen_and_one_elsewhere_is_not() -> None:
     assert away.nm == 0.0
 
 
-def test_jumps_are_shown_beside_what_is_usual_in_motion() -> None:
+def test_jumps_are_shown_beside_those_anywhere_in_motion() -> None:
     """A spike every 100 ms is in a fifth of the windows: as usual as at the one crossing in two."""
     n = 10_001
     error = np.where(np.arange(n) % 100 == 50, 0.7, 0.0)
@@ -364,3 +369,47 @@ def test_jumps_are_not_taken_over_gaps() -> None:
     assert np.isnan(jump[40:61]).all()
     assert (jump[10:40] == 0.0).all()
     assert np.isnan(jump[:10]).all()
+
+
+# Truth ---------------------------------------------------------------------------------------------------
+
+TIME = np.arange(4000) * 1e-3
+TORQUE = 20.0 * np.sin(2.0 * np.pi * 0.5 * TIME)
+
+
+def test_an_offset_of_the_sensor_is_no_error_against_the_truth() -> None:
+    """The estimate is 0.5 Nm from the sensor, which is 0.5 Nm off: it is right."""
+    one = samples({"fused": np.full(4000, -0.5)}, sensor_nm=TORQUE + 0.5, sigma_nm=0.2)
+    tables = truth_tables([replace(one, true_nm=TORQUE)])
+    assert tables is not None
+    assert tables.now[1]["fused"].rmse_nm == pytest.approx(0.0, abs=1e-12)
+    assert tables.aligned[1]["fused"].rmse_nm == pytest.approx(
+        0.005 * 20.0 * 2.0 * np.pi * 0.5 / np.sqrt(2.0), rel=0.02
+    )
+    assert tables.intervals is not None
+    shifted = truth_tables([replace(one, true_nm=TORQUE + 2.0)])
+    assert shifted is not None
+    assert shifted.intervals is not None
+    assert shifted.intervals.overall.share < 0.01
+    assert shifted.now[1]["fused"].rmse_rated_percent == pytest.approx(5.0)
+
+
+def test_samples_without_truth_are_in_no_table() -> None:
+    one = samples({"fused": np.zeros(4000)}, sensor_nm=TORQUE)
+    assert truth_tables([one]) is None
+    both = truth_tables([one, replace(one, number=2, true_nm=TORQUE + 1.0)])
+    assert both is not None
+    assert list(both.now) == [2]
+
+
+def test_true_torques_are_written_beside_a_run_and_a_broken_file_is_named(tmp_path: Path) -> None:
+    run = tmp_path / "a.b.csv.gz"
+    assert read_truth(run) == {}
+    write_truth(run, {1: TORQUE, 2: -TORQUE})
+    assert truth_path(run) == tmp_path / "a.b.truth.npz"
+    found = read_truth(run)
+    assert np.array_equal(found[1], TORQUE)
+    assert np.array_equal(found[2], -TORQUE)
+    truth_path(run).write_bytes(b"PK\x03\x04 nothing")
+    with pytest.raises(ValueError, match="expected true torques"):
+        read_truth(run)
