@@ -5,14 +5,12 @@ from __future__ import annotations
 import argparse
 import datetime as dt
 import json
-import os
 import sys
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.command_line import check_installed, make_directory
+from jtqd.estimator.command_line import check_installed, make_directory, write_whole
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.evaluate.card import (
@@ -140,7 +138,8 @@ def _report(
     mapping = as_mapping(result)
     text = json.dumps(mapping, indent=1, allow_nan=False)
     page = report_html(result, mapping, _made())
-    _write_whole(options.out, {"evaluation.json": f"{text}\n", "evaluation.html": page})
+    write_whole(options.out / "evaluation.json", f"{text}\n".encode())
+    write_whole(options.out / "evaluation.html", page.encode())
     print(text if options.json else "\n".join(text_lines(result, mapping)))
     return findings
 
@@ -169,7 +168,8 @@ def _card(
         raise RunError("\n".join(finding.text for finding in findings))
     text = json.dumps(card_mapping(cards, findings), indent=1, allow_nan=False)
     page = card_html(cards, {each.number: each.files for each in models}, findings, _made())
-    _write_whole(options.out, {"card.json": f"{text}\n", "card.html": page})
+    write_whole(options.out / "card.json", f"{text}\n".encode())
+    write_whole(options.out / "card.html", page.encode())
     for card in cards:
         write_png(card, options.out / f"card_joint{card.number}.png")
     lines = [line for card in cards for line in (*card_lines(card), "")]
@@ -192,14 +192,3 @@ def _unknown_training(models: tuple[JointModels, ...]) -> list[RunIssue]:
 
 def _made() -> str:
     return f"{BY}, {dt.datetime.now().astimezone():%Y-%m-%d %H:%M}"
-
-
-def _write_whole(directory: Path, contents: Mapping[str, str]) -> None:
-    """Write files by their names, each whole or not at all."""
-    for name, content in contents.items():
-        temporary = directory / f".{name}.part"
-        try:
-            temporary.write_text(content, encoding="utf-8")
-            os.replace(temporary, directory / name)
-        finally:
-            temporary.unlink(missing_ok=True)
