@@ -6,7 +6,7 @@ import numpy as np
 
 from jtqd.drivers.frame import pack
 from jtqd.estimator import status as st
-from tests.slow.faults.ears import FRAME, SYNC, Heard
+from tests.slow.faults.listener import FRAME, SYNC, Heard
 
 MS = 1_000_000
 BASE_NS = 1_700_000_000_000_000_000

@@ -34,7 +34,7 @@ def copy_of_tree(build: str) -> Path:
     for link in (ROOT / "src" / "jtqd").iterdir():
         if link.is_symlink():
             _mirror(ROOT / link.name, target / link.name, ignored)
-    for folder in ("src", "tests", "examples", "docs", "systemd"):
+    for folder in ("src", "tests", "examples", "docs", "systemd", "tools", "validation"):
         shutil.rmtree(target / folder, ignore_errors=True)
         shutil.copytree(ROOT / folder, target / folder, symlinks=True, ignore=ignored)
     return target

@@ -7,14 +7,11 @@ from dataclasses import replace
 import pytest
 
 from tests.paths import ROOT
-from tests.slow.faults.__main__ import CASES
-from tests.slow.faults.case import Case
-from tests.slow.faults.elsewhere import ELSEWHERE, NOT_COVERED
+from tests.slow.faults.__main__ import line
+from tests.slow.faults.cases import CASES, ELSEWHERE, LEFT_OUT, NOT_COVERED, Case, with_library
 from tests.slow.faults.injections import Fault
-from tests.slow.faults.library import LEFT_OUT, with_library
+from tests.slow.faults.rig import Watcher
 from tests.slow.faults.runner import play
-from tests.slow.faults.table import line
-from tests.slow.faults.watcher import Watcher
 from tests.slow.heard_bus import healthy, heard_of
 
 SHORT = [case for case in CASES if not case.long]

@@ -17,15 +17,12 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
-from tests.slow.faults.ears import SYNC
+from tests.slow.faults.listener import SYNC
 from tests.slow.heard_bus import BASE_NS, healthy, heard_of
-from tests.slow.soak.account import OVERFLOW, Records, SyncTally, account
+from tests.slow.soak.account import ESTIMATE, OVERFLOW, EstimateTally, Records, SyncTally, account
 from tests.slow.soak.bench import OrderedBench
-from tests.slow.soak.estimates import ESTIMATE, EstimateTally
-from tests.slow.soak.faults import COMMON, ON_INTERFACE, Fault
-from tests.slow.soak.memory import MemoryWatch
-from tests.slow.soak.report import SoakReport
-from tests.slow.soak.scene import NotInjectedError, Scene
+from tests.slow.soak.faults import COMMON, ON_INTERFACE, Fault, NotInjectedError, Scene
+from tests.slow.soak.run import MemoryWatch, SoakReport
 
 MS = 1_000_000
 
@@ -157,9 +154,9 @@ def test_a_process_that_goes_on_is_no_fault(fault: Fault, monkeypatch: pytest.Mo
         names = dict.fromkeys(("recorder", "supervisor", "bench"), process.pid)
         scene = Scene(SimpleNamespace(processes=lambda: names), None, random.Random(1))  # type: ignore[arg-type]
         with monkeypatch.context() as patch:
-            patch.setattr("tests.slow.soak.scene.os.kill", lambda *_: None)
-            patch.setattr("tests.slow.soak.scene._KILLED_S", 0.05)
-            patch.setattr("tests.slow.soak.scene.time.sleep", lambda _: None)
+            patch.setattr("tests.slow.soak.faults.os.kill", lambda *_: None)
+            patch.setattr("tests.slow.soak.faults._KILLED_S", 0.05)
+            patch.setattr("tests.slow.soak.faults.time.sleep", lambda _: None)
             with pytest.raises(NotInjectedError):
                 fault.act(scene)
         process.kill()

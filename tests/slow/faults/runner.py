@@ -8,10 +8,9 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tests.slow.faults.case import STARTING, Case
-from tests.slow.faults.ears import Heard, joined
-from tests.slow.faults.rig import Rig
-from tests.slow.faults.watcher import rises
+from tests.slow.faults.cases import STARTING, Case
+from tests.slow.faults.listener import Heard, joined
+from tests.slow.faults.rig import Rig, rises
 
 MS = 1_000_000
 _LONGEST_SETTLE_S = 5.0

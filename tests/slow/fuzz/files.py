@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import json
 import os
 import random
 import resource
 import select
+import shutil
 import signal
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from tests.slow.fuzz.targets import Target, place, targets
+from jtqd.models.files import shipped
+from tests.slow.fuzz.damage import damage_bytes, damage_tree, damage_yaml
 
 LIMIT_S = 20.0
 """A case that takes longer hangs; the slowest good file takes below a second."""
@@ -126,3 +130,175 @@ def _said(errors: Path) -> str:
     if strange:
         return f"strange line: {strange[0][:200]!r}"
     return "refused" if lines else "accepted"
+
+
+# Readers of files: how each is given a file, and the errors it may raise.
+
+Damage = Callable[[random.Random, bytes], tuple[str, bytes]]
+
+
+@dataclass(frozen=True)
+class Target:
+    """One kind of file.
+
+    Attributes:
+        name: in the table.
+        original: a file that is good.
+        suffix: of the damaged copy's name.
+        damage: how it is damaged.
+        read: takes the path of the copy.
+        errors: exceptions that are a clear refusal.
+    """
+
+    name: str
+    original: Path
+    suffix: str
+    damage: Damage
+    read: Callable[[Path], object]
+    errors: tuple[type[Exception], ...]
+
+
+def _json_tree(source: random.Random, data: bytes) -> tuple[str, bytes]:
+    said, tree = damage_tree(source, json.loads(data), aliases=False)
+    return said, json.dumps(tree, default=str).encode()
+
+
+def _command(main: Callable[[list[str]], int], *arguments: str) -> Callable[[Path], None]:
+    """Run a command in this process; its words are judged by the fuzzer, its status here."""
+
+    def run(path: Path) -> None:
+        status = main([*arguments, str(path)])
+        if status not in (0, 1, 3):
+            raise AssertionError(f"exit status {status}, expected 0, 1 or 3")
+
+    return run
+
+
+def _network(method: str) -> Callable[[Path], None]:
+    def read(path: Path) -> None:
+        from jtqd.estimator.methods import make_estimator
+        from jtqd.estimator.network import load_network
+        from jtqd.estimator.settings import EstimatorSettings
+        from jtqd.models.files import load_joint
+
+        network = load_network(method, path.read_bytes())
+        joint = load_joint(shipped("trained/joint1.yaml"))
+        estimator = make_estimator(joint, EstimatorSettings(method=method), network)
+        for n in range(5):
+            estimator.step(1e-3, 1.0, 0.1 * n, 100.0, 0.001 * n, 25.0)
+
+    return read
+
+
+def _read_log(path: Path) -> None:
+    from jtqd.daemon.logs import read_attachments, read_topics, topics_of
+
+    read_attachments(path)
+    seldom = ("/diagnostics", "/events", "/log", "/joint/1/zeros", "/joint/2/zeros")
+    read_topics(path, [each for each in topics_of(path) if each not in seldom])
+
+
+def _read_request(path: Path) -> None:
+    from jtqd.drivers.boot import parse_request
+
+    parse_request(json.loads(path.read_bytes()))
+
+
+def _configuration(directory: Path) -> Path:
+    """The shipped one, with absolute paths of what it names."""
+    models = shipped("bench.yaml").parent
+    text = shipped("bench.yaml").read_text()
+    for name in ("trained", "joint1.yaml", "joint2.yaml"):
+        text = text.replace(f"file: {name}", f"file: {models}/{name}")
+    path = directory / "configuration.yaml"
+    path.write_text(text)
+    return path
+
+
+def targets(directory: Path) -> list[Target]:
+    """All of them; good files are put into `directory`."""
+    from jtqd.daemon.bus.boot import boot_request
+    from jtqd.daemon.config import load_config
+    from jtqd.daemon.logs import LogError, export, recover
+    from jtqd.daemon.replay import command as replay_command
+    from jtqd.drivers.boot import RequestError
+    from jtqd.drivers.object_dictionary import EdsError, read_eds
+    from jtqd.estimator.errors import ConfigError
+    from jtqd.estimator.onnx_graph import NetworkError
+    from jtqd.models.files import load_joint
+    from jtqd.sim_can.plant_file import load_plant
+    from jtqd.sysid.planner.campaigns import Scale, make_plan
+    from jtqd.sysid.planner.plan import load_plan
+    from jtqd.sysid.runs.column_map import ColumnMap
+    from jtqd.sysid.runs.files import read_run
+    from jtqd.sysid.runs.run_file import RunError
+
+    configuration = _configuration(directory)
+    request = directory / "request.json"
+    request.write_text(json.dumps(boot_request(load_config(configuration), "vcan0").as_json()))
+    plan = directory / "plan.yaml"
+    plan.write_text(make_plan("efficiency", Scale()).to_yaml())
+    log = directory / "log.mcap"
+    from tests.daemon.logs import log_files
+    from tests.estimator.fused_configuration import network_of
+
+    log_files.ours(log)
+    run = directory / "run.csv"
+    run.write_text(
+        "time_s,j1.current_a,j1.motor_position_rad,j1.link_position_rad,j1.torque_nm\n"
+        + "".join(f"{n / 1000},{n % 7},{n * 0.1},{n * 0.001},{n % 5}\n" for n in range(200))
+    )
+    eds = Path(sys.modules["jtqd.drivers.object_dictionary"].__file__ or "").parent / "eds" / "jtqd.eds"
+    models = shipped("bench.yaml").parent
+    network = directory / "joint1.fused.onnx"
+    network.write_bytes(network_of(1))
+    logs = (LogError,)
+    return [
+        Target("configuration", configuration, ".yaml", damage_yaml, load_config, (ConfigError,)),
+        Target("joint file", shipped("joint1.yaml"), ".yaml", damage_yaml, load_joint, (ConfigError,)),
+        Target("plant file", shipped("plant.yaml"), ".yaml", damage_yaml, load_plant, (ConfigError,)),
+        Target("plan", plan, ".yaml", damage_yaml, load_plan, (ConfigError,)),
+        Target(
+            "column map",
+            models / "kinova_gen3" / "columns.yaml",
+            ".yaml",
+            damage_yaml,
+            ColumnMap.load,
+            (ConfigError,),
+        ),
+        Target("run table", run, ".csv", damage_bytes, read_run, (RunError,)),
+        Target("boot request", request, ".json", _json_tree, _read_request, (RequestError,)),
+        Target("EDS", eds, ".eds", damage_bytes, lambda path: read_eds(path, 0x20), (EdsError,)),
+        Target(
+            "network, ours",
+            network,
+            ".onnx",
+            damage_bytes,
+            _network("fused"),
+            (NetworkError, ConfigError),
+        ),
+        Target(
+            "network, paper",
+            models / "trained" / "joint1.onnx",
+            ".onnx",
+            damage_bytes,
+            _network("network"),
+            (NetworkError, ConfigError),
+        ),
+        Target("log, read", log, ".mcap", damage_bytes, _read_log, logs),
+        Target("log, recover", log, ".mcap", damage_bytes, _command(recover.main), ()),
+        Target("log, export", log, ".mcap", damage_bytes, _command(export.main, "candump"), ()),
+        Target("log, replay", log, ".mcap", damage_bytes, _command(replay_command.main, "--json"), ()),
+    ]
+
+
+def place(target: Target, directory: Path, data: bytes) -> Path:
+    """The damaged copy, in a directory of its own with the joint files that a plant file names."""
+    case = directory / "case"
+    shutil.rmtree(case, ignore_errors=True)
+    case.mkdir()
+    path = case / f"damaged{target.suffix}"
+    for number in (1, 2):
+        shutil.copy(shipped(f"joint{number}.yaml"), case)
+    path.write_bytes(data)
+    return path

@@ -21,9 +21,8 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
 from tests.daemon import ring_records as rr
 from tests.daemon.snapshots import counted
-from tests.slow.fuzz.bus_in_time import BusInTime, Script
-from tests.slow.fuzz.memory import rss_kb
-from tests.slow.fuzz.traffic import I32, MOTION, SENSOR, STRICT, Traffic, is_of
+from tests.slow.fuzz.traffic import I32, MOTION, SENSOR, BusInTime, Script, Traffic, is_of
+from tests.slow.soak.rig import rss_kb
 
 MS = 1_000_000
 _PDOS = (
@@ -214,6 +213,3 @@ def fuzz_frames(
         "lost_in_queue": bus.rx_dropped,
     }
     return report
-
-
-__all__ = ["STRICT", "FrameReport", "Oracle", "fuzz_frames", "make_cycle"]

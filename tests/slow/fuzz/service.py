@@ -18,7 +18,7 @@ from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, FRAME
 from jtqd.drivers.frame_socket import CAPACITY
 from jtqd.drivers.object_dictionary import ObjectStore
-from tests.slow.fuzz.memory import rss_kb
+from tests.slow.soak.rig import rss_kb
 
 OWN = 0x20
 _TURN = 400

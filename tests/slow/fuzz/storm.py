@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_RTR_FLAG, FRAME
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
-from tests.slow.fuzz.memory import rss_kb
-from tests.slow.soak.rig import Rig
+from tests.slow.soak.rig import Rig, rss_kb
 
 PAIRS = 30
 STRETCH_S = 0.5

@@ -25,7 +25,7 @@ from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.bench_loop import run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
-from tests.slow.faults import acts
+from tests.slow.faults import injections as acts
 from tests.slow.faults.injections import Added, Changed, Cut, Fault, Late, Lost
 
 MS = 1_000_000

@@ -17,7 +17,7 @@ from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from tests.paths import ROOT
-from tests.slow.faults.ears import Ears
+from tests.slow.faults.listener import Ears
 
 _NAMES = {
     "jtqd.daemon.loop.process": "loop",
@@ -154,3 +154,11 @@ class Rig:
         self.bench.wait(20)
         text = (self.directory / "out").read_text().strip()
         self.result = json.loads(text.splitlines()[-1]) if text else {}
+
+
+def rss_kb(pid: int | str = "self") -> int:
+    """Resident memory of its own [kB]: without pages of files and shared memory, which are others' too."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("RssAnon:"):
+            return int(line.split()[1])
+    return 0

@@ -6,20 +6,19 @@ import random
 import sys
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from jtqd.daemon.recording.run_files import read_account
 from jtqd.drivers.frame_socket import BusDown, FrameSocket, open_frame_socket
 from jtqd.estimator import status as st
-from tests.slow.faults.ears import Heard, joined
-from tests.slow.faults.proofs import Proof
-from tests.slow.soak.account import SyncTally, account, read_records
-from tests.slow.soak.estimates import EstimateTally
-from tests.slow.soak.faults import COMMON, ON_INTERFACE, Fault
-from tests.slow.soak.memory import MemoryWatch
-from tests.slow.soak.report import SoakReport
-from tests.slow.soak.rig import Rig
-from tests.slow.soak.scene import NotInjectedError, Scene
+from tests.slow.faults.listener import Heard, Proof, joined
+from tests.slow.soak.account import EstimateTally, SyncTally, account, read_records
+from tests.slow.soak.faults import COMMON, ON_INTERFACE, Fault, NotInjectedError, Scene
+from tests.slow.soak.rig import Rig, rss_kb
 
 _RECOVERY_S = 15.0
 _TOLD_S = 6.0
@@ -27,6 +26,85 @@ _TOLD_S = 6.0
 _LOOK_S = 0.05
 _WELL_LOOKS = 4
 _SAY_EVERY_S = 60.0
+
+
+SLOPE_KB_S = 10.0
+"""A process that grows faster, with the lower end of the interval, leaks: 36 MB in an hour."""
+
+
+@dataclass
+class SoakReport:
+    """Seconds until all was well again by kind of fault; slopes of memory (kB/s, half of its interval, kB at the end)."""
+
+    seed: int
+    seconds: float = 0.0
+    faults: dict[str, list[float]] = field(default_factory=dict)
+    slopes: dict[str, tuple[float, float, int]] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=dict)
+    findings: list[str] = field(default_factory=list)
+
+    def add_slopes(self, slopes: dict[str, tuple[float, float, int]]) -> None:
+        """Memory; a process that grows is a finding. The bench is not jtqd."""
+        self.slopes = slopes
+        for name, (slope, half, _) in slopes.items():
+            if slope - half > SLOPE_KB_S and name != "bench":
+                self.findings.append(f"{name} grows by {slope:.1f} +- {half:.1f} kB/s")
+
+    def as_json(self) -> dict[str, Any]:
+        """All of it."""
+        return dict(vars(self))
+
+    def text(self) -> str:
+        """A table."""
+        lines = [
+            f"seed {self.seed}, {self.seconds:.0f} s, {sum(map(len, self.faults.values()))} faults",
+            f"{'fault':20}{'times':>6}{'recovered after s: median':>27}{'max':>7}",
+        ]
+        for name, times in sorted(self.faults.items()):
+            lines.append(f"{name:20}{len(times):6}{np.median(times):27.2f}{max(times):7.2f}")
+        if self.slopes:
+            lines.append(f"{'process':20}{'kB/s':>8}{'+- (95 %)':>11}{'end kB':>9}")
+        for name, (slope, half, end) in sorted(self.slopes.items()):
+            lines.append(f"{name:20}{slope:8.2f}{half:11.2f}{end:9}")
+        lines += [f"{name:28}{count:10}" for name, count in self.counts.items()]
+        lines += [f"FINDING {each}" for each in self.findings] or ["no finding"]
+        return "\n".join(lines)
+
+
+_SETTLED = 0.3
+"""Share of the run after which memory is looked at: caches and histories are full by then."""
+_YOUNG_S = 30.0
+"""A process fills its buffers for so long after its start; of one that never gets older nothing is said."""
+
+
+class MemoryWatch:
+    """Call `look` now and then; one that was started anew begins again."""
+
+    def __init__(self) -> None:
+        self._samples: dict[tuple[str, int], list[tuple[float, int]]] = {}
+
+    def look(self, rig: Rig, now_s: float) -> None:
+        """One sample of each process."""
+        for name, pid in rig.processes().items():
+            try:
+                self._samples.setdefault((name, pid), []).append((now_s, rss_kb(pid)))
+            except OSError:
+                continue
+
+    def slopes(self, begun_s: float, end_s: float) -> dict[str, tuple[float, float, int]]:
+        """kB/s, half of its 95 % interval and the last value, of the process of each name that lived longest."""
+        found: dict[str, tuple[float, tuple[float, float, int]]] = {}
+        for (name, _), samples in self._samples.items():
+            first_s = max(begun_s + _SETTLED * (end_s - begun_s), samples[0][0] + _YOUNG_S)
+            late = np.array([each for each in samples if each[0] > first_s], float)
+            if len(late) < 10 or late[-1, 0] - late[0, 0] <= found.get(name, (0.0,))[0]:
+                continue
+            t, y = late[:, 0] - late[:, 0].mean(), late[:, 1]
+            slope = float(t @ y / (t @ t))
+            rest = y - y.mean() - slope * t
+            half = 1.96 * float(np.sqrt(rest @ rest / (len(y) - 2) / (t @ t)))
+            found[name] = (late[-1, 0] - late[0, 0], (slope, half, int(y[-1])))
+        return {name: value for name, (_, value) in found.items()}
 
 
 class Soak:
