@@ -18,8 +18,8 @@ from jtqd.daemon.core.estimate_pdo import PUBLISHED_STATUSES
 from jtqd.daemon.logs import iter_messages
 from jtqd.daemon.shared.cycle_record import FLAG_SYNC_CONFIRMED
 from tests.slow.faults.listener import Heard
+from tests.slow.soak.rig import OVERFLOW
 
-OVERFLOW = 240
 PERIOD_NS = 1_000_000
 _APART_NS = 100_000_000
 """Stamps of one SYNC at two receivers differ by less, also behind the hub of a loaded machine. Its counter goes

@@ -230,8 +230,8 @@ def _forget(scene: Scene) -> Proof:
     scene.order("forget", node=node, ms=1)
 
     def silent(heard: Heard) -> Seen:
-        boots = heard.count(0x700 + node, b"\0")
-        return Seen(not boots, f"{boots} boot-ups")
+        boots, resets = heard.count(0x700 + node, b"\0"), heard.count(0x000, bytes((_RESET, node)))
+        return Seen(boots <= resets, f"{boots} boot-ups, {resets} resets by the master")
 
     return proofs.all_of(proofs.withheld(20, 0x180 + node), silent)
 

@@ -13,9 +13,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Self
 
+import yaml
+
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.models.files import shipped
 from tests.paths import ROOT
 from tests.slow.faults.listener import Ears
 
@@ -24,6 +27,8 @@ _NAMES = {
     "jtqd.daemon.recording.recorder": "recorder",
 }
 _MARKS = 200
+OVERFLOW = 240
+"""Of the counter in SYNC."""
 
 
 class Rig:
@@ -66,6 +71,7 @@ class Rig:
         with suppress(PermissionError):  # as jtqd's own bench: its answers must not wait for other programs
             os.sched_setscheduler(self.bench.pid, os.SCHED_FIFO, os.sched_param(40))
         command = ["--bus", self.bus, "--json", "--record", str(self.logs) if record else "none"]
+        command += ["--config", str(_configuration(directory))]
         with open(directory / "out", "w") as out, open(directory / "err", "w") as err:
             self.daemon = subprocess.Popen(
                 [sys.executable, "-m", "jtqd.daemon.jtqd", *command], env=environment, stdout=out, stderr=err
@@ -154,6 +160,18 @@ class Rig:
         self.bench.wait(20)
         text = (self.directory / "out").read_text().strip()
         self.result = json.loads(text.splitlines()[-1]) if text else {}
+
+
+def _configuration(directory: Path) -> Path:
+    """Write the shipped configuration with a counter in SYNC, by which the account knows what was not heard."""
+    content: dict[str, Any] = yaml.safe_load(shipped("bench.yaml").read_text())
+    content["sync"]["counter_overflow"] = OVERFLOW
+    for number in (1, 2):
+        joint = content[f"joint_{number}"]
+        joint["file"] = str(shipped(joint["file"]))
+    path = directory / "configuration.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
 
 
 def rss_kb(pid: int | str = "self") -> int:
