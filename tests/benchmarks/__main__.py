@@ -18,13 +18,12 @@ from tests.benchmarks import (
     recording,
     replay_speed,
     service_cost,
-    stage_table,
+    stages,
     start,
-    status_cost,
 )
 from tests.benchmarks.fixture import make_fixture
 
-NAMES = ("cycle", "stages", "grid", "start", "logs", "recording", "status", "replay", "service")
+NAMES = ("cycle", "stages", "grid", "start", "logs", "recording", "replay", "service")
 _BITRATE = 1_000_000
 _EXAMPLES = """examples:
   python -m tests.benchmarks                   everything, about 13 minutes
@@ -88,7 +87,6 @@ def _measure(name: str, directory: Path, options: argparse.Namespace) -> tuple[A
         "start": (start, {}),
         "recording": (recording, {"seconds": 5.0 if options.quick else 30.0}),
         "logs": (log_reading, {"minutes": 0.25 if options.quick else 5.0}),
-        "status": (status_cost, {}),
         "service": (service_cost, {}),
         "replay": (replay_speed, {}),
     }
@@ -101,8 +99,8 @@ def _measure(name: str, directory: Path, options: argparse.Namespace) -> tuple[A
         result = long_run.run(fixture, minutes=options.minutes)
         return result, long_run.text(result)
     if name == "stages":
-        result = stage_table.run(fixture, seconds=options.rounds * options.seconds / 2.0, quiet=True)
-        return result, stage_table.text(result)
+        result = stages.run(fixture, seconds=options.rounds * options.seconds / 2.0, quiet=True)
+        return result, stages.text(result)
     few = max(1, options.rounds // 2)
     content = {
         "quiet_core": cycle.run(fixture, rounds=options.rounds, seconds=options.seconds, quiet=True),

@@ -68,7 +68,7 @@ class Process:
 
     def __init__(self, command: list[str], name: str) -> None:
         self.name = name
-        environment = os.environ | {"PYTHONPATH": str(ROOT)}
+        environment = os.environ | {"PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,

@@ -11,8 +11,7 @@ from typing import Any
 from tests.benchmarks import c_program, host
 from tests.benchmarks.contender import Process, Task, python
 from tests.benchmarks.fixture import Fixture
-from tests.benchmarks.measure import SETTLE_CYCLES, Samples
-from tests.benchmarks.table import mark, table
+from tests.benchmarks.measure import SETTLE_CYCLES, Samples, mark, table
 
 JTQD, USUAL, C, FOLLOWING = "jtqd", "usual way", "C", "C, following"
 USUAL_RATIO = 4.0

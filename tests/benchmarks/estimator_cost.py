@@ -18,8 +18,7 @@ from jtqd.estimator.losses import LossModel
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork, load_network
 from jtqd.estimator.settings import METHODS, EstimatorSettings, recommended
-from tests.benchmarks.measure import quantile
-from tests.benchmarks.table import mark
+from tests.benchmarks.measure import mark, quantile
 from tests.estimator.estimator_helpers import joint1, motion, small_network
 from tests.estimator.fused_configuration import joint_of, network_of
 

@@ -23,7 +23,7 @@ from mcap.reader import make_reader
 from mcap.records import Chunk
 
 from jtqd.daemon.logs import read_topic
-from tests.benchmarks.table import mark, table
+from tests.benchmarks.measure import mark, table
 from tests.daemon.logs.campaign_log import Cycle, Joint, write_log
 
 RATIO_LIMIT = 10.0

@@ -28,7 +28,7 @@ from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import RingReader
 from tests.benchmarks.contender import ROOT
-from tests.benchmarks.table import mark, table
+from tests.benchmarks.measure import mark, table
 from tests.daemon import ring_records as rr
 
 SIZE_LIMIT_GB, CORE_LIMIT_PERCENT = 1.2, 3.0
@@ -59,7 +59,7 @@ def run(directory: Path, *, seconds: float = 30.0, rounds: int = 3) -> dict[str,
 
 def _daemon(directory: Path, disk: Path, seconds: float) -> tuple[dict[str, Any], list[bytes]]:
     environment = {key: value for key, value in os.environ.items() if key != "RUNTIME_DIRECTORY"}
-    environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
+    environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
     command = [sys.executable, "-P", "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--json"]
     command += ["--duration", f"{seconds + _SETTLE_S + 1.0:g}", "--record", str(disk / "logs")]
     daemon = subprocess.Popen(

@@ -12,7 +12,7 @@ from typing import Any
 from jtqd.daemon.replay.replayer import Replayer, decode
 from jtqd.daemon.replay.runs import read_part, steps_of
 from jtqd.daemon.replay.session import Models, other_models
-from tests.benchmarks.table import table
+from tests.benchmarks.measure import table
 from tests.paths import GOLDEN
 
 METHODS = {"tob": "network", "efficiency": "network", "network": "network", "fused": "faults"}

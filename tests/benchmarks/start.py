@@ -16,7 +16,7 @@ from jtqd.drivers.filters import exact
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.estimator.status import PUBLISHED
 from tests.benchmarks.contender import ROOT
-from tests.benchmarks.table import mark, table
+from tests.benchmarks.measure import mark, table
 
 START_LIMIT_S, MEMORY_LIMIT_MB = 2.0, 120.0
 _ESTIMATE_ID = 0x1A0
@@ -27,7 +27,7 @@ _SETTLE_S = 1.0
 def run(directory: Path, *, duration_s: float = 4.0) -> dict[str, Any]:
     """Start the daemon once, its files in `directory`. Raises RuntimeError when it does not come up."""
     environment = {key: value for key, value in os.environ.items() if key != "RUNTIME_DIRECTORY"}
-    environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": str(ROOT)}
+    environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
     command = [
         sys.executable,
         "-P",

@@ -18,8 +18,7 @@ from jtqd.daemon.loop import process as loop
 from jtqd.drivers.frame import FRAME, pack
 from tests.benchmarks import c_program, long_run, traffic
 from tests.benchmarks.fixture import make_fixture
-from tests.benchmarks.measure import SETTLE_CYCLES, Samples, quantile
-from tests.benchmarks.table import mark, mark_beside_error
+from tests.benchmarks.measure import SETTLE_CYCLES, Samples, mark, mark_beside_error, quantile
 from tests.paths import ROOT
 
 pytestmark = pytest.mark.native
