@@ -78,7 +78,8 @@ def size(names: list[str]) -> Size:
 
 def package_of(name: str) -> str:
     """Return the package that a file lies in: the longest name of the table, else its top folder."""
-    fitting = [each for each in packages() if name.startswith(f"{each}/")]
+    stem = name.rpartition(".")[0]
+    fitting = [each for each in packages() if f"{stem}/".startswith(f"{each}/")]
     return max(fitting, key=len, default=name.partition("/")[0])
 
 
