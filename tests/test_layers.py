@@ -1,7 +1,7 @@
-"""Which room may import which: the rules are the table of docs/architecture.md, the imports are read from the sources.
+"""Which package may import which, and how large it may be: the rules are the table of docs/architecture.md.
 
-Imports inside of functions and under TYPE_CHECKING count like all others, and so does what a compiled module or its .pxd
-imports and cimports.
+Imports are read from the sources. Those inside of functions and under TYPE_CHECKING count like all others, and so does what
+a compiled module or its .pxd imports and cimports. Files and lines are counted as by `python -m tools.count`.
 """
 
 from __future__ import annotations
@@ -17,21 +17,20 @@ from pathlib import Path
 import pytest
 
 from tests.paths import ROOT
+from tools.count import PAGE, Size, packages, sizes
 
 PACKAGES = ("daemon", "drivers", "estimator", "models", "sim_can", "sysid")
-PAGE = ROOT / "docs" / "architecture.md"
-ROW = re.compile(r"^\| `([a-z0-9_./]+)` \|[^|]*\|([^|]*)\|([^|]*)\|$", re.MULTILINE)
 
 
 @cache
 def rules() -> dict[str, tuple[frozenset[str], frozenset[str]]]:
-    """Room -> (rooms that it may import, libraries that it may import), from the table of the page."""
+    """Package -> (packages that it may import, libraries that it may import), from the table of the page."""
     return {
-        room.rstrip("/").replace("/", "."): (
-            frozenset(each.rstrip("/").replace("/", ".") for each in re.findall(r"`([^`]+)`", rooms)),
-            frozenset(re.findall(r"`([^`]+)`", libraries)),
+        name.replace("/", "."): (
+            frozenset(each.replace("/", ".") for each in row.imports),
+            row.libraries,
         )
-        for room, rooms, libraries in ROW.findall(PAGE.read_text())
+        for name, row in packages().items()
     }
 
 
@@ -98,28 +97,39 @@ def of_project(name: str) -> Iterator[str]:
             yield inside
 
 
-def room_of(name: str) -> str:
+def package_of(name: str) -> str:
     """The longest name of the table that the module lies in."""
-    fitting = [room for room in rules() if name == room or name.startswith(room + ".")]
-    assert fitting, f"{name} lies in no room of {PAGE.name}"
+    fitting = [each for each in rules() if name == each or name.startswith(each + ".")]
+    assert fitting, f"{name} lies in no package of {PAGE.name}"
     return max(fitting, key=len)
 
 
-def test_every_room_of_the_table_is_there() -> None:
+def test_every_package_of_the_table_is_there() -> None:
     assert len(rules()) > 15
-    for room, (allowed, _) in rules().items():
-        assert any(name == room or name.startswith(room + ".") for name in modules()), room
-        assert allowed <= set(rules()), f"{room}: {sorted(allowed - set(rules()))} are no rooms"
+    for package, (allowed, _) in rules().items():
+        assert any(name == package or name.startswith(package + ".") for name in modules()), package
+        assert allowed <= set(rules()), f"{package}: {sorted(allowed - set(rules()))} are no packages"
 
 
-@pytest.mark.parametrize("room", sorted(rules()))
-def test_a_room_imports_only_what_the_table_allows(room: str) -> None:
-    allowed, libraries = rules()[room]
+@pytest.mark.parametrize("package", sorted(packages()))
+def test_a_package_is_not_above_its_row(package: str) -> None:
+    """A bound may be raised in a commit of its own, with the reason in the row."""
+    row, found = packages()[package], sizes().get(package, Size(0, 0))
+    assert row.files > 0 < row.lines, f"{package}: its row of {PAGE.name} has no bounds of files and lines"
+    assert found.files <= row.files, f"{package}: found {found.files} files, expected at most {row.files}"
+    assert found.lines <= row.lines, f"{package}: found {found.lines} lines, expected at most {row.lines}"
+
+
+@pytest.mark.parametrize("package", sorted(rules()))
+def test_a_package_imports_only_what_the_table_allows(package: str) -> None:
+    allowed, libraries = rules()[package]
     wrong = []
     for name in modules():
-        if room_of(name) != room:
+        if package_of(name) != package:
             continue
-        wrong += [f"{name} -> {each}" for each in of_project(name) if room_of(each) not in {room, *allowed}]
+        wrong += [
+            f"{name} -> {each}" for each in of_project(name) if package_of(each) not in {package, *allowed}
+        ]
         tops = {each.partition(".")[0] for each in imports(name)} - {"jtqd"} - set(sys.stdlib_module_names)
         wrong += [f"{name} -> {top}" for top in sorted(tops - libraries)]
     assert not wrong, "\n".join(wrong)
@@ -170,7 +180,7 @@ def test_one_import_name() -> None:
     assert links == set(PACKAGES)
 
 
-def test_every_room_says_what_it_is_for() -> None:
+def test_every_package_has_what_it_is_for() -> None:
     for name, path in modules().items():
         if path.name == "__init__.py":
             lines = (ast.get_docstring(ast.parse(path.read_text())) or "").splitlines()
