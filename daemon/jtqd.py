@@ -82,7 +82,7 @@ def main(argv: list[str] | None = None) -> int:
 
 @contextmanager
 def _early_signals() -> Iterator[list[int]]:
-    """Collect orders to end until the supervisor takes the signals; SIGHUP is ignored.
+    """Collect requests to end until the supervisor takes the signals; SIGHUP is ignored.
 
     An exception (KeyboardInterrupt) would surface as errors of the libraries that are being loaded.
     """

@@ -63,7 +63,7 @@ _FIELD = 8  # cpu user nice system idle iowait irq softirq steal
 def stolen_s(stat: Path = Path("/proc/stat")) -> float:
     """Read the time that a hypervisor stole from all processors since the machine's start [s], in steps of 10 ms.
 
-    From proc(5), /proc/stat; 0 where the kernel does not tell. No scheduling priority helps against it.
+    From proc(5), /proc/stat; 0 where the kernel does not report it. No scheduling priority helps against it.
     """
     try:
         return int(stat.read_text().split("\n", 1)[0].split()[_FIELD]) / os.sysconf("SC_CLK_TCK")

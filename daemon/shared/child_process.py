@@ -70,7 +70,7 @@ class Child:
     def outputs(self) -> list[int]:
         """File descriptor of its standard output, for select; none once it is closed.
 
-        A closed one is always readable: whoever waited on it for the process to end would spin.
+        A closed one is always readable: a wait on it for the end of the process would spin.
         """
         assert self.process.stdout is not None
         return [] if self._closed else [self.process.stdout.fileno()]
@@ -85,7 +85,7 @@ class Child:
         return self.process.poll() is None
 
     def send(self, message: Any) -> None:
-        """Send one JSON line; a child that has gone is noticed by whoever waits for its answer."""
+        """Send one JSON line; that a child has gone shows when its answer is waited for."""
         assert self.process.stdin is not None
         try:
             self.process.stdin.write(json.dumps(message).encode() + b"\n")

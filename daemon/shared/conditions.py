@@ -437,7 +437,7 @@ class ConditionsFile:
 def read_conditions(directory: Path) -> list[Condition]:
     """Read the conditions of the daemon with this runtime directory, the worst first; none without a valid file.
 
-    They are as of the supervisor's last look: whether that still runs, `jtqd.daemon.shared.runtime_dir.About.running` tells.
+    They are as of the supervisor's last look: `jtqd.daemon.shared.runtime_dir.About.running` is whether that runs.
     """
     try:
         content = json.loads((directory / FILE).read_text(encoding="utf-8"))

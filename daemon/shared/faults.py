@@ -16,7 +16,7 @@ DEVIATION: Final = 0x80
 """Too far from the torque sensor for too long; looked for only where it is latched."""
 DRIVE_FAULT: Final = 0x100
 STALE: Final = 0x200
-"""So many cycles in a row without a number, for want of inputs or of time, as `safety.stale_latch_cycles` says."""
+"""So many cycles in a row without a number, without inputs or time, as many as `safety.stale_latch_cycles`."""
 
 NAMES: Final = {
     NOT_FINITE: "not_finite",

@@ -99,8 +99,7 @@ def drive_reason(seen: JointView) -> str:
 def degraded_reason(seen: JointView, network_limit_nm: float | None, zeros: Zeros = NO_ZEROS) -> str:
     """Explain status 3 (degraded): what is wrong with physics, or why the network is not fully used.
 
-    network_limit_nm: of the network against physics, None without a network; zeros: of the same cycle, with what the two
-    views say.
+    network_limit_nm: of the network against physics, None without a network; zeros: of the same cycle.
     """
     doubt = _doubt(zeros)
     if doubt:

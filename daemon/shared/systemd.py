@@ -50,7 +50,7 @@ class Notifier:
         return True
 
     def close(self) -> None:
-        """Close the connection: nothing is sent any more."""
+        """Close the connection: nothing is sent after it."""
         if self._socket is not None:
             with suppress(OSError):
                 self._socket.close()
