@@ -47,6 +47,7 @@ from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import joint_number, only, with_joint
+from jtqd.sysid.runs.options import add_columns, add_number, add_runs
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
 SCHEMA: Final = "jtq.score/1"
@@ -312,28 +313,14 @@ def parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("joint", type=Path, metavar="JOINT.yaml", help="joint file")
-    parser.add_argument(
-        "runs",
-        nargs="+",
-        type=Path,
-        metavar="RUN",
-        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
-    )
+    add_runs(parser)
     parser.add_argument(
         "--after",
         type=Path,
         metavar="FILE",
         help="a second file of the same joint, to compare with the first",
     )
-    parser.add_argument(
-        "--number",
-        type=int,
-        choices=range(1, 8),
-        metavar="N",
-        help="number of the joint in the runs (default: the one that its name ends in, or the only one)",
-    )
-    parser.add_argument(
-        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
-    )
+    add_number(parser)
+    add_columns(parser)
     parser.add_argument("--json", action="store_true", help="print the table as JSON (jtq.score/1)")
     return parser

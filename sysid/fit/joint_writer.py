@@ -58,7 +58,7 @@ def with_fit(
     temperature_c: float = math.nan,
     notes: Mapping[str, Any] | None = None,
 ) -> Joint:
-    """Return the joint whose provenance says where `section` (e.g. "efficiency") comes from; the rest of it stays.
+    """Return the joint with the origin of `section` (e.g. "efficiency") in its provenance; the rest of it stays.
 
     by: the command; runs: name of every run and the SHA-256 of its file; date: ISO 8601; temperature_c: mean over what
     was fitted, left out when NaN; notes: further plain values.

@@ -24,6 +24,7 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.joints import joint_number, only
+from jtqd.sysid.runs.options import add_columns, add_number, add_runs
 from jtqd.sysid.runs.run_file import RunError, RunFile
 from jtqd.sysid.train.ours import Gate, judge, train_fused
 from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample, train_paper
@@ -145,7 +146,7 @@ _EXAMPLES = """examples:
   jtq train campaigns/excitation --joint joint1.fused.yaml --network ours --out models
 
 exit status: 0 done, 1 failure, 2 usage, 3 findings in the runs, or (ours) a network that does not take at least 30 % off the
-error of physics on runs left out, or is worse in more than 2 % of them: then it is not written"""
+error of physics on held-out runs, or is worse in more than 2 % of them: then it is not written"""
 
 
 def main(argv: list[str]) -> int:
@@ -189,13 +190,7 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument(
-        "runs",
-        nargs="+",
-        type=Path,
-        metavar="RUNS",
-        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
-    )
+    add_runs(parser)
     parser.add_argument(
         "--joint",
         type=Path,
@@ -204,13 +199,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="FILE",
         help="joint file; may be repeated",
     )
-    parser.add_argument(
-        "--number",
-        type=int,
-        choices=range(1, 8),
-        metavar="N",
-        help="number of the joint in the runs (default: the last digit of its name)",
-    )
+    add_number(parser)
     parser.add_argument(
         "--network",
         choices=sorted(_ITERATIONS),
@@ -233,9 +222,7 @@ def parser() -> argparse.ArgumentParser:
         help="paper's network: also print the MSE of a split by sample",
     )
     parser.add_argument("--seed", type=natural, default=0, help="of weights and batches (default 0)")
-    parser.add_argument(
-        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
-    )
+    add_columns(parser)
     parser.add_argument("--json", action="store_true", help="print paths, hashes and scores as JSON")
     return parser
 

@@ -7,7 +7,8 @@ of a training run can hide in the network. The slow part of a run's residual is 
 mean over half a second), because it is only noise to these gains. sigma_scale comes from runs that neither the physics
 nor the network of their fold had seen.
 
-Whether a network is worth its risk: judged on runs left out, with a share that none of them had a say in. Pure."""
+A network is accepted by its gain on held-out runs, with a share of its correction chosen without the run it is scored on.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +52,7 @@ MOST_WORSE: Final = 0.02
 
 @dataclass(frozen=True)
 class Gate:
-    """What a network has done on runs left out.
+    """Scores of a network on held-out runs, and whether it is accepted.
 
     Attributes:
         network_rmse_nm, physics_rmse_nm: over all runs, each of the same weight.
@@ -83,7 +84,7 @@ class Gate:
     def text(self) -> str:
         """Return the verdict with its numbers, and what is expected."""
         return (
-            f"on {self.runs} runs left out it takes {100 * self.gain:.1f} % off the error of physics "
+            f"on {self.runs} held-out runs it takes {100 * self.gain:.1f} % off the error of physics "
             f"(RMSE {self.physics_rmse_nm:.3f} -> {self.network_rmse_nm:.3f} Nm; "
             f"expected at least {100 * LEAST_GAIN:.0f} %) "
             f"and is worse in {self.worse} (expected at most {100 * MOST_WORSE:.0f} %)"

@@ -83,12 +83,12 @@ def test_with_one_encoder_there_is_no_torsion_to_estimate_from(
     write_joint(path, replace(TRUE, fused=fused_joint().fused), "test")
     write_run(run, swing(0.3))
     assert jtq(["score", str(path), str(run)]) == 0
-    said = capsys.readouterr()
-    assert "estimator tob" in said.out
-    assert "fused" not in said.out
+    output = capsys.readouterr()
+    assert "estimator tob" in output.out
+    assert "fused" not in output.out
     assert (
         "r.csv: j1: found one encoder: method fused, which estimates from the torsion, is not scored"
-        in said.err
+        in output.err
     )
     rigid = replace(TRUE, fused=fused_joint(torsion=None).fused)
     assert "estimator fused, without network" in errors_on("r", swing(0.3), 1, rigid).errors
@@ -147,9 +147,9 @@ def test_a_run_that_cannot_be_used_is_told(files: Path, capsys: pytest.CaptureFi
     columns = replace(table.joints[1], torque_nm=None)
     write_run(files / "blind.csv", RunTable(table.time_s, {1: columns}))
     assert jtq(["score", str(files / "true.yaml"), str(files / "r0.csv"), str(files / "blind.csv")]) == 3
-    said = capsys.readouterr()
-    assert "blind.csv: j1.torque_nm: found no valid torque sensor channel" in said.err
-    assert "r0.csv" in said.out
+    output = capsys.readouterr()
+    assert "blind.csv: j1.torque_nm: found no valid torque sensor channel" in output.err
+    assert "r0.csv" in output.out
     assert jtq(["score", str(files / "true.yaml"), str(files / "blind.csv")]) == 1
     assert "found no run in which joint 1 can be scored" in capsys.readouterr().err
 

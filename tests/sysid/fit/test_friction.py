@@ -1,4 +1,4 @@
-"""Friction at no load: Coulomb and viscous are told from the zeros, and what cannot be friction is refused."""
+"""Friction at no load: Coulomb and viscous are separated from the offsets, and what cannot be friction is refused."""
 
 from __future__ import annotations
 

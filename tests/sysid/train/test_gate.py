@@ -1,4 +1,4 @@
-"""A network is written only where it takes 30 % off the error of physics on runs left out, and is worse in 2 % at most."""
+"""A network is written only where it takes 30 % off the error of physics on held-out runs, and is worse in 2 % at most."""
 
 import json
 from types import SimpleNamespace
@@ -32,7 +32,7 @@ def test_what_changes_nothing_is_refused_with_its_numbers():
     none = judge([(1.0, 1.0)] * 8)
     assert not none.passed
     assert none.text == (
-        "on 8 runs left out it takes 0.0 % off the error of physics (RMSE 1.000 -> 1.000 Nm; expected at least 30 %) "
+        "on 8 held-out runs it takes 0.0 % off the error of physics (RMSE 1.000 -> 1.000 Nm; expected at least 30 %) "
         "and is worse in 0 (expected at most 2 %)"
     )
     with pytest.raises(ValueError, match="no run left out"):
@@ -112,20 +112,20 @@ def train(tmp_path, monkeypatch, capsys):
 
 
 def test_a_network_that_earns_its_share_is_written(train):
-    status, said, files = train("ours", GOOD)
+    status, output, files = train("ours", GOOD)
     assert (status, files) == (0, ["joint1.fused.md", "joint1.fused.onnx", "joint1.fused.png"])
-    assert "10 held-out runs" in said
+    assert "10 held-out runs" in output
 
 
 def test_one_that_does_not_is_not_written_and_the_numbers_are_said(train):
-    status, said, files = train("ours", FAIR)
+    status, output, files = train("ours", FAIR)
     assert (status, files) == (3, [])
-    assert said.startswith(
-        "joint1: no network is written: on 10 runs left out it takes 29.3 % off the error of physics"
+    assert output.startswith(
+        "joint1: no network is written: on 10 held-out runs it takes 29.3 % off the error of physics"
     )
-    assert said.endswith("; jtqd runs on physics alone\n")
-    status, said, _ = train("ours", FAIR, "--json")
-    content = json.loads(said)["joint1"]
+    assert output.endswith("; jtqd runs on physics alone\n")
+    status, output, _ = train("ours", FAIR, "--json")
+    content = json.loads(output)["joint1"]
     assert (status, content["path"], content["gate"]["passed"], content["gate"]["worse"]) == (
         3,
         None,
@@ -136,9 +136,9 @@ def test_one_that_does_not_is_not_written_and_the_numbers_are_said(train):
 
 def test_an_earlier_network_at_that_place_is_named(train, tmp_path):
     train("ours", GOOD)
-    status, said, files = train("ours", FAIR)
+    status, output, files = train("ours", FAIR)
     assert status == 3
-    assert "joint1.fused.onnx is of an earlier training" in said
+    assert "joint1.fused.onnx is of an earlier training" in output
     assert "joint1.fused.onnx" in files
 
 

@@ -179,6 +179,6 @@ def test_gated_network_in_numpy_and_as_a_graph_agree_and_have_no_mean():
     assert abs(gated_output(trained, np.tile(core[0], (360, 1)), around).mean()) < 1e-9
     for share in (1.0, 0.3, 0.0):
         data = export_gated(scaled(trained, share), 4, fused_metadata())
-        said = FusedNetwork(data).run_many(np.column_stack((core, waves)))
-        assert np.abs(said - share * out).max() < 1e-6
-    assert not said.any()  # exactly nothing: the estimate is then the physics to the last bit
+        found = FusedNetwork(data).run_many(np.column_stack((core, waves)))
+        assert np.abs(found - share * out).max() < 1e-6
+    assert not found.any()  # exactly nothing: the estimate is then the physics to the last bit
