@@ -8,8 +8,8 @@ ordinary ladder is taken from the current,
     G Kt i - G^2 Jm dv/dt - Fc s - Fv v - tau  =  c . (1, s, v, dv/dt, tau, |tau| s) + rest
 
 fitted to each recording alone, so that the joint file is right about the terms in it and the rest stays where it was. The
-rest is real and not noise, and a tool that says so about a set with nothing hidden need not be wrong: real joints have a
-ripple. So every set shares its seed with one that hides nothing, and counts by what is said beyond that one. Each run then
+rest is real and not noise, and a tool that reports it of a set with nothing hidden need not be wrong: real joints have a
+ripple. So every set shares its seed with one that hides nothing, and counts by what is found beyond that one. Each run then
 gets its day (zero of the sensor, friction). Effects are functions of the measured channels, put into current or sensor.
 """
 
@@ -70,7 +70,7 @@ JOINTS: Final[dict[str, dict[str, Any]]] = {
         "friction": {"coulomb_nm": 2.0, "viscous_nms_per_rad": 1.5},
     },
 }
-"""Joint files: what models/kinova_gen3 says of gear, motor and rating; the ladder makes the rest true."""
+"""Joint files: gear, motor and rating of models/kinova_gen3; the ladder makes the rest true."""
 _SLOW_RAD_S: Final = 0.02
 _SECOND_S: Final = 1.0
 _SHIFTS_S: Final = tuple(np.arange(-3e-3, 3.01e-3, 0.5e-3).tolist())

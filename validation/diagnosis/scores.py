@@ -190,9 +190,9 @@ def _between(value: float, low: float, high: float, angle: bool) -> bool:
 
 def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bool:
     """Return whether the verdict is "unexplained" and the map of the largest gap points at one of the right places; or
-    whether nothing is explained and a channel check says which channel clips or is stuck, where (`_channel_said`).
+    whether nothing is explained and a channel check reports which channel clips or is stuck, where (`_channel_reported`).
     """
-    if _channel_said(truth, findings):
+    if _channel_reported(truth, findings):
         return True
     if findings.verdict != "unexplained" or not findings.gaps:
         return False
@@ -204,27 +204,27 @@ def place_is_right(truth: Truth, findings: Findings, run_s: float = RUN_S) -> bo
     )
 
 
-def _channel_said(truth: Truth, findings: Findings) -> bool:
-    """Return whether the user is told that a right place of axis "channel" clips, at its value within 1 %; or that it is
+def _channel_reported(truth: Truth, findings: Findings) -> bool:
+    """Return whether the user reads that a right place of axis "channel" clips, at its value within 1 %; or that it is
     stuck, at moments of which most are right.
     """
     if findings.verdict not in ("unexplained", "insufficient_data"):
         return False
     lines = filter(None, map(_HELD.search, dict.fromkeys((*findings.reasons, *findings.channel_notes))))
-    said = [line.groups() for line in lines]
+    checks = [line.groups() for line in lines]
     spans = [(r["run"], r["low"], r["high"]) for r in truth["places"] if r["axis"] == "time"]
     for right in truth["places"]:
         if right["axis"] == "channel" and right.get("stuck"):
             named = [
                 any(run == r and low - _MOMENT_S <= float(t) <= high + _MOMENT_S for r, low, high in spans)
-                for run, joint, channel, _, times, word in said
+                for run, joint, channel, _, times, word in checks
                 if truth["joint"] in ("sensor", int(joint)) and (channel, word) == (right["channel"], "stuck")
                 for t in re.findall(r"\d[\d.]*", times or "")
             ]
             if named and sum(named) > 0.5 * len(named):
                 return True
         elif right["axis"] == "channel":
-            for _, _, channel, value, _, word in said:
+            for _, _, channel, value, _, word in checks:
                 clips = word == "clipped" and channel == right["channel"]
                 if clips and right["low"] <= abs(float(value)) <= right["high"]:
                     return True
@@ -238,7 +238,7 @@ def shown(gap: Gap) -> Sequence[Place]:
 
 def _hit(place: Place, right: Mapping[str, Any]) -> bool:
     """Return whether a bin overlaps a right place; times are the matter of `_moments_hit`."""
-    if right["axis"] == "channel":  # the matter of `_channel_said`
+    if right["axis"] == "channel":  # the matter of `_channel_reported`
         return False
     low, high = right["low"], right["high"]
     if right["axis"] == "frequency":

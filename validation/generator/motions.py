@@ -23,7 +23,7 @@ Array = np.ndarray
 @dataclass(frozen=True)
 class Motion:
     """velocity_rad_s, load_a, on: [n]; leader: index (0, 1) of the joint in velocity mode, the other takes load_a; marked:
-    where the run table says that the drives have no power [n], None: it has no such column.
+    where the run table has the drives without power [n], None: it has no such column.
     """
 
     kind: str

@@ -10,8 +10,8 @@ differentiating: LP(dw/dt) = g (w - LP(w)). Rows at standstill are left out: the
 known to an interval only.
 
 A run does not always support every term. A term whose best value is negative (friction would drive the
-joint), or that cannot be distinguished from the others in this run, keeps the joint file's value and the report says
-so; "at its bound" is not identified. Intervals count independent samples only: n_eff = n / (1 + 2 sum
+joint), or that cannot be distinguished from the others in this run, keeps the joint file's value, and the report
+names it; "at its bound" is not identified. Intervals count independent samples only: n_eff = n / (1 + 2 sum
 rho_k), rho the residual's autocorrelation up to its first value below 0.05. At 1 kHz that is hundreds of
 times fewer than rows.
 """
@@ -228,6 +228,6 @@ def _warnings(speed: FloatArray) -> tuple[str, ...]:
         return ()
     way = "positive" if share > 0.5 else "negative"
     return (
-        f"nearly all motion is in {way} direction: Coulomb friction is not told from an offset "
+        f"nearly all motion is in {way} direction: Coulomb friction is not distinguished from an offset "
         "of current or sensor",
     )

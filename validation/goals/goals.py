@@ -136,7 +136,7 @@ def _texts(values: tuple[float, float, float]) -> tuple[str, str, str]:
 _NOT_HERE: Final = (
     Row("joints in runs worse than physics, %", ("2", "2", "2"), lambda column: "none: no network"),
     Row(
-        "contact of 3 Nm told within, ms; false alarms per hour",
+        "contact of 3 Nm reported within, ms; false alarms per hour",
         ("3; 1", "3; 1", "5; 1"),
         lambda column: "docs/estimator.md",
     ),

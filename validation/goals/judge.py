@@ -170,7 +170,7 @@ def _beyond(columns: JointColumns, true_nm: FloatArray, one: Identified) -> Bool
 
 
 def flagged(result: Result) -> BoolArray:
-    """Return where a method says that it is degraded, or has no value [n]."""
+    """Return where a method reports that it is degraded, or has no value [n]."""
     if result.status is None:
         raise ValueError("found a method without status")
     found: BoolArray = (result.status == DEGRADED) | ~np.isfinite(result.torque_nm)
@@ -179,7 +179,7 @@ def flagged(result: Result) -> BoolArray:
 
 REGRESSION: Final = "regression"
 _FEWEST: Final = 500
-"""Samples of a cell (joint, quadrant) that a share is told of."""
+"""Samples of a cell (joint, quadrant) that a share is given for."""
 
 
 @dataclass(frozen=True)

@@ -157,7 +157,7 @@ class Row(NamedTuple):
 
     @property
     def honest(self) -> bool:
-        """Whether our interval holds neither more nor less than it says."""
+        """Whether our interval holds about as much as its 90 %."""
         return INSIDE[0] <= self.inside[OURS] <= INSIDE[1]
 
 
@@ -331,7 +331,7 @@ def _titles() -> dict[str, str]:
 
 def row_table(rows: Sequence[Row]) -> Table:
     """Return a table of few cases: RMSE [Nm], the best regression in bold; shares inside of the estimators."""
-    told = ", ".join(METHODS.values())
+    names = ", ".join(METHODS.values())
 
     def number(row: Row, name: str) -> str:
         if name not in row.rmse_nm:
@@ -343,7 +343,7 @@ def row_table(rows: Sequence[Row]) -> Table:
         return ", ".join("-" if np.isnan(each.get(n, np.nan)) else f"{each[n]:.0f} %" for n in METHODS)
 
     return Table(
-        ("joint, judged on", *_titles().values(), f"inside 90 %: {told}", f"standstill: {told}"),
+        ("joint, judged on", *_titles().values(), f"inside 90 %: {names}", f"standstill: {names}"),
         [
             (
                 f"{row.name}, {row.judged}",
