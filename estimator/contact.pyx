@@ -1,31 +1,28 @@
-"""Contact: a sudden torque from outside on the link, told by the link's momentum. Why so, figures, limits: docs/estimator.md.
+"""Detection of contacts: a sudden external torque on the link, from the link's momentum. Figures and limits: docs/estimator.md.
 
-Link side of one joint, own frame; neither current nor friction is in it. k: sample, T: step, q: link position:
+Link side of one joint, own frame, without current and friction. k: sample, T: step, q: link position:
 
-    tau     = torsion, unfiltered: young + K (d - d_f) + D (d' - d_f')    d_f: d through the torsion's own filter g_t
+    tau     = torsion, unfiltered: tau_t + K (d - d_f) + D (d' - d_f')    d_f: d through the torsion's own filter g_t
     rate    = g_t K (d - d_f)                                             tau' through g_t/(s + g_t)
               K d_f'                                                      where the torsion is tracked, as is d_f
     p_k     = J (q_k - q_(k-1))/T                                         momentum of the link over a step
-    load    = tau_(k-1) - (p_k - p_(k-1))/T                               what the joint hands on to what is beyond its link
+    load    = tau_(k-1) - (p_k - p_(k-1))/T                               torque on the load beyond the link
 
-A torque from outside on the link makes `load` less than what is beyond the link takes:
+A contact makes `load` less than the torque that the load takes:
 
-    x = -load                       joint alone: what is beyond is not known, and steady or slow
-    x = load_other - load           two joints that turn one link against each other: the other one says what is beyond
-    e = x - w - z                   w: waves of 1 and 2 per motor turn, z: trend; both learned from e, slower than a contact
-    m = (e_k + e_(k-1))/2, or ALONE e_k where that is larger; told as the residual. Encoder noise is in second differences,
-                                    and mostly cancels in the mean; what is large at once need not wait for it
+    x = -load                       one joint: the load is unknown, and constant or slow
+    x = load_other - load           two joints that turn one link against each other: the other one measures the load
+    e = x - w - z                   w: waves of 1 and 2 per motor turn, z: trend; both adapt to e more slowly than a contact acts
+    m = (e_k + e_(k-1))/2           or SINGLE e_k where that is larger; the residual. Encoder noise enters as second differences
+                                    and mostly cancels in the mean; a large residual need not wait for it
     contact where |m| > threshold, until m steps back by as much and by RELEASE of the push, or |m| < RELEASE threshold
-    within 1/TREND_RAD_S, or LONGEST_S have passed; then BLIND samples in which nothing is told, since z begins anew
+    within 1/TREND_RAD_S, or LONGEST_S have passed; then BLANK samples without a result, since z starts again
 
-While there is a contact, neither w nor z learns: m is the size of the push. The load under it goes on meanwhile, with the
-error that it has by the torque, so that m alone does not say when the push ends; a second trend, of e from its beginning,
-says what a step back is.
+During a contact, neither w nor z adapts: m is the size of the push. The load may change meanwhile, so that m alone does not show
+when the push ends; a step back is taken from a second trend, of e since the contact began.
 """
 
 from libc.math cimport NAN, cos, fabs, isnan, sin
-
-from typing import Final
 
 import numpy as np
 
@@ -35,43 +32,26 @@ from jtqd.estimator.sample cimport Sample
 from jtqd.estimator.path_difference cimport local_stiffness
 
 from jtqd.estimator.sample import columns
-from jtqd.estimator.settings import tracking_of
-from jtqd.estimator.status import CONTACT_CODES
 
-OFF, UNKNOWN, NONE, CONTACT = CONTACT_CODES
-
-TREND_RAD_S: Final = 50.0
-"""Of z: loads that change slower are load."""
-NOTCH_RAD_S: Final = 10.0
-"""Rate at which w is learned."""
-RELEASE: Final = 0.5
-"""Part of a push that a step back must have, since the link swings; a contact that has just begun ends below this part of
-the threshold."""
-ALONE: Final = 0.8
-"""What one residual counts beside the mean of two: the largest mean of quiet hours is this part of the largest residual."""
-LONGEST_S: Final = 0.5
-"""What lasts longer is load."""
-BLIND: Final = 6
-"""Samples after a contact: two in which a push may still be ending, and MEANT of which the new trend is the mean."""
-MEANT: Final = 4
-SETTLE_S: Final = 0.1
-"""After a start nothing is told for so long."""
-UNEVEN: Final = 0.05
-"""Two steps in a row that differ by more have no acceleration between them, and neither has the one after: at 1 rad/s a stamp
-that is 50 us off, of samples that are not, looks like 1 Nm on a link of 0.01 kg m2."""
-LONGEST_GAP: Final = 50
-"""Samples without inputs, after which the past is forgotten."""
-
-cdef double RATE = TREND_RAD_S, LEARNED = NOTCH_RAD_S, BACK = RELEASE, ONE = ALONE, MOST_S = LONGEST_S, BELIEVED_S = SETTLE_S
-cdef double UNEVEN_STEPS = UNEVEN
-cdef int MOST_MISSED = LONGEST_GAP, NOT_TOLD = BLIND, MEAN_OF = MEANT
+cdef double TREND_RAD_S = 50.0  # of z: slower changes are load
+cdef double NOTCH_RAD_S = 10.0  # rate at which w adapts
+cdef double RELEASE = 0.5  # of a push, that a step back must have (the link swings); of the threshold, in a contact's beginning
+cdef double SINGLE = 0.8  # weight of one residual beside the mean of two: ratio of their largest values in hours without contact
+cdef double LONGEST_S = 0.5  # what lasts longer is load
+cdef int BLANK = 6  # samples after a contact: two in which the push may still be ending, and RESTART
+cdef int RESTART = 4  # samples of which the new trend is the mean
+cdef double SETTLE_S = 0.1  # after a start, without a result
+# Two steps in a row that differ by more give no acceleration, and neither does the next: at 1 rad/s an error of 50 us of a stamp
+# looks like 1 Nm on a link of 0.01 kg m2.
+cdef double UNEVEN = 0.05
+cdef int LONGEST_GAP = 50  # samples without inputs, after which the state restarts
 
 
 # The link of a joint --------------------------------------------------------------------------------------------------
 
 
 cdef int fill_link(LinkLaw *law, joint, torsion) except -1:
-    """Set the parameters from a joint file; torsion None: there is no load."""
+    """Set the parameters from a joint file; torsion None: no load."""
     law.used = torsion is not None
     law.inertia = joint.link_inertia_kgm2
     law.damping = torsion.damping_nms_per_rad if law.used else 0.0
@@ -79,190 +59,168 @@ cdef int fill_link(LinkLaw *law, joint, torsion) except -1:
 
 
 cdef void restart_link(LinkState *s) noexcept nogil:
-    """Forget the past."""
+    """Restart."""
     s.samples = 0
-    s.torque = s.behind = s.q = s.step = s.dt = 0.0
+    s.torque = s.fast = s.q = s.step = s.dt = 0.0
 
 
-cdef void follow_link(
+cdef void update_link(
     const LinkLaw *law,
     LinkState *s,
     const FusedObserverLaw *observer,
-    const FusedObserverState *now,
-    double young_nm,
+    const FusedObserverState *observed,
+    double torsion_nm,
     double dt,
-    LinkSeen *out,
+    LinkLoad *out,
 ) noexcept nogil:
-    """Take a sample that the observer has taken, dt [s] after the one before; young_nm: torsion through g_t/(s + g_t)."""
-    cdef double behind, stiffness, step, torque
+    """Take a sample of the observer, dt [s] after the last; torsion_nm: tau_t."""
+    cdef double fast, stiffness, step, torque
     out.rate_nm_s = out.load_nm = NAN
     if not law.used:
         return
-    stiffness = local_stiffness(observer, now.z.d)
-    behind = now.last.d - now.z.d
-    torque = young_nm + stiffness * behind
-    step = (now.link - s.q) / dt
+    stiffness = local_stiffness(observer, observed.z.d)
+    fast = observed.last.d - observed.z.d
+    torque = torsion_nm + stiffness * fast
+    step = (observed.link - s.q) / dt
     if observer.tracking > 0.0:
-        out.rate_nm_s = stiffness * now.d_rate
+        out.rate_nm_s = stiffness * observed.d_rate
         if s.samples >= 1:
-            torque += law.damping * (now.d_moved - now.d_rate)
+            torque += law.damping * (observed.d_moved - observed.d_rate)
     else:
-        out.rate_nm_s = observer.torsion_rate * stiffness * behind
+        out.rate_nm_s = observer.torsion_rate * stiffness * fast
         if s.samples >= 1:
-            torque += law.damping * (behind - s.behind) / dt
-    if s.samples >= 1 and fabs(dt - s.dt) > UNEVEN_STEPS * dt:
+            torque += law.damping * (fast - s.fast) / dt
+    if s.samples >= 1 and fabs(dt - s.dt) > UNEVEN * dt:
         s.samples = 1
     if s.samples >= 3:
         out.load_nm = s.torque - law.inertia * (step - s.step) / dt
     if s.samples < 3:
         s.samples += 1
-    s.torque, s.behind, s.q, s.step, s.dt = torque, behind, now.link, step, dt
+    s.torque, s.fast, s.q, s.step, s.dt = torque, fast, observed.link, step, dt
 
 
 # The detector ---------------------------------------------------------------------------------------------------------
 
 
 cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) except -1:
-    """Set the parameters for samples period_s [s] apart. Raises ValueError for a threshold or period that is none."""
+    """Set the parameters for samples period_s [s] apart. Raises ValueError for a threshold or period out of range."""
     if not threshold_nm > 0.0 or not 0.0 < period_s < 0.01:
         raise ValueError(f"found a threshold of {threshold_nm} Nm at {period_s} s, expected both > 0, and less than 10 ms")
-    law.threshold, law.release = threshold_nm, BACK * threshold_nm
-    law.trend, law.notch = RATE * period_s, 2.0 * LEARNED * period_s
-    law.settle, law.longest = <int> (BELIEVED_S / period_s + 0.5), <int> (MOST_S / period_s + 0.5)
+    law.threshold, law.release = threshold_nm, RELEASE * threshold_nm
+    law.trend, law.notch = TREND_RAD_S * period_s, 2.0 * NOTCH_RAD_S * period_s
+    law.settle, law.longest = <int> (SETTLE_S / period_s + 0.5), <int> (LONGEST_S / period_s + 0.5)
     law.brief = <int> (1.0 / law.trend + 0.5)
     return 0
 
 
 cdef void restart_contact(ContactState *s) noexcept nogil:
-    """Forget the past: unknown until it has settled."""
+    """Restart: unknown until it has settled."""
     cdef int k
-    s.samples = s.missed = s.held = s.blind = s.at = 0
+    s.samples = s.missed = s.active = s.blank = s.at = 0
     for k in range(CONTACT_WAVES):
         s.wave[k] = 0.0
-    s.before = 0.0
+    s.last = 0.0
     s.residual_nm = NAN
-    s.told = CONTACT_UNKNOWN
+    s.code = CONTACT_UNKNOWN
 
 
-cdef void watch_contact(const ContactLaw *law, ContactState *s, double outside_nm, double angle) noexcept nogil:
-    """Take x [Nm] at a motor angle [rad], NaN where it is not known; sets `residual_nm` and `told`."""
+cdef void detect_contact(const ContactLaw *law, ContactState *s, double external_nm, double angle) noexcept nogil:
+    """Take x [Nm] at a motor angle [rad], NaN where unknown; sets `residual_nm` and `code`."""
     cdef double c1, s1, c2, s2, x, e, m
     cdef int k
-    if isnan(outside_nm + angle):
-        s.residual_nm, s.told, s.before = NAN, CONTACT_UNKNOWN, 0.0
+    if isnan(external_nm + angle):
+        s.residual_nm, s.code, s.last = NAN, CONTACT_UNKNOWN, 0.0
         s.missed += 1
-        if s.missed > MOST_MISSED:
+        if s.missed > LONGEST_GAP:
             restart_contact(s)
         return
     s.missed = 0
     c1, s1 = cos(angle), sin(angle)
     c2, s2 = c1 * c1 - s1 * s1, 2.0 * s1 * c1
-    x = outside_nm - (s.wave[0] * c1 + s.wave[1] * s1 + s.wave[2] * c2 + s.wave[3] * s2)
+    x = external_nm - (s.wave[0] * c1 + s.wave[1] * s1 + s.wave[2] * c2 + s.wave[3] * s2)
     if s.samples == 0:
         set_trend(s, x)
     if s.samples < law.settle:
         s.samples += 1
-    if s.blind:
-        s.residual_nm, s.told, s.before = NAN, CONTACT_UNKNOWN, 0.0
-        if s.blind <= MEAN_OF:
-            set_trend(s, s.trend + (x - s.trend) / (MEAN_OF - s.blind + 1))
-        s.blind -= 1
+    if s.blank:
+        s.residual_nm, s.code, s.last = NAN, CONTACT_UNKNOWN, 0.0
+        if s.blank <= RESTART:
+            set_trend(s, s.trend + (x - s.trend) / (RESTART - s.blank + 1))
+        s.blank -= 1
         return
     e = x - s.trend
-    m, s.before = 0.5 * (e + s.before), e
-    if ONE * fabs(e) > fabs(m):
-        m = ONE * e
+    m, s.last = 0.5 * (e + s.last), e
+    if SINGLE * fabs(e) > fabs(m):
+        m = SINGLE * e
     if s.samples == law.settle:
-        s.residual_nm, s.told = m, CONTACT_NONE
+        s.residual_nm, s.code = m, CONTACT_NONE
     else:
-        s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
-    if s.held:
-        s.held += 1
-        if s.held <= law.brief:
-            s.size = max(s.size, fabs(m))
+        s.residual_nm, s.code = NAN, CONTACT_UNKNOWN
+    if s.active:
+        s.active += 1
+        if s.active <= law.brief:
+            s.peak = max(s.peak, fabs(m))
         if (
-            (s.under - m) * s.side > max(law.threshold, BACK * s.size)
-            or s.held > law.longest
-            or (s.held <= law.brief and fabs(m) < law.release)
+            (s.baseline - m) * s.sign > max(law.threshold, RELEASE * s.peak)
+            or s.active > law.longest
+            or (s.active <= law.brief and fabs(m) < law.release)
         ):
-            s.residual_nm, s.told = NAN, CONTACT_UNKNOWN
-            s.held, s.blind = 0, NOT_TOLD
+            s.residual_nm, s.code = NAN, CONTACT_UNKNOWN
+            s.active, s.blank = 0, BLANK
             return
-        s.told = CONTACT_THERE
-        s.under += law.trend * (later(s, e) - s.under)
+        s.code = CONTACT_PRESENT
+        s.baseline += law.trend * (delayed(s, e) - s.baseline)
         return
-    if s.told == CONTACT_NONE and fabs(m) > law.threshold:
-        s.told, s.held, s.under = CONTACT_THERE, 1, e
-        s.side, s.size = 1.0 if m > 0.0 else -1.0, fabs(m)
-        for k in range(CONTACT_LATER):
-            s.later[k] = e
+    if s.code == CONTACT_NONE and fabs(m) > law.threshold:
+        s.code, s.active, s.baseline = CONTACT_PRESENT, 1, e
+        s.sign, s.peak = 1.0 if m > 0.0 else -1.0, fabs(m)
+        for k in range(CONTACT_DELAY):
+            s.delayed[k] = e
         return
     s.wave[0] += law.notch * e * c1
     s.wave[1] += law.notch * e * s1
     s.wave[2] += law.notch * e * c2
     s.wave[3] += law.notch * e * s2
-    s.trend += law.trend * (later(s, x) - s.trend)
+    s.trend += law.trend * (delayed(s, x) - s.trend)
 
 
 cdef void set_trend(ContactState *s, double x) noexcept nogil:
-    """Let the trend be x [Nm], as it was for all samples that it is behind."""
+    """Set the trend, and the samples by which it is delayed, to x [Nm]."""
     cdef int k
     s.trend = x
-    for k in range(CONTACT_LATER):
-        s.later[k] = x
+    for k in range(CONTACT_DELAY):
+        s.delayed[k] = x
 
 
-cdef double later(ContactState *s, double x) noexcept nogil:
-    """Return the x [Nm] of CONTACT_LATER samples before, and keep this one."""
-    cdef double before = s.later[s.at]
-    s.later[s.at] = x
-    s.at = (s.at + 1) % CONTACT_LATER
-    return before
+cdef double delayed(ContactState *s, double x) noexcept nogil:
+    """Return the x [Nm] of CONTACT_DELAY samples ago, and store this one."""
+    cdef double oldest = s.delayed[s.at]
+    s.delayed[s.at] = x
+    s.at = (s.at + 1) % CONTACT_DELAY
+    return oldest
 
 
-cdef class ContactDetector:
-    """Detector of contacts for one source of x.
+def detect_contacts(external_nm, motor_position_rad, double threshold_nm, double period_s=0.001):
+    """Return (residual [n] in Nm, NaN where unknown; code [n], see ContactCode) for x [n] in Nm and motor angles [n] in rad.
 
-    Raises ValueError for a threshold or a period that is none.
-
-    Attributes:
-        residual_nm: m of the last sample, NaN where unknown. told: OFF, UNKNOWN, NONE or CONTACT.
+    Raises ValueError for a threshold or a period out of range, or arrays of different length.
     """
-
+    cdef const double[::1] x = np.ascontiguousarray(external_nm, np.float64)
+    cdef const double[::1] angle = np.ascontiguousarray(motor_position_rad, np.float64)
+    residual, code = np.empty(len(x)), np.empty(len(x), np.uint8)
+    cdef double[::1] m = residual
+    cdef unsigned char[::1] c = code
     cdef ContactLaw law
     cdef ContactState state
-
-    def __init__(self, double threshold_nm, double period_s=0.001):
-        fill_contact(&self.law, threshold_nm, period_s)
-        restart_contact(&self.state)
-
-    @property
-    def residual_nm(self):
-        return self.state.residual_nm
-
-    @property
-    def told(self):
-        return self.state.told
-
-    def step(self, double outside_nm, double motor_position_rad):
-        """Take x [Nm] at a motor angle [rad], NaN where it is not known; return what is told."""
-        watch_contact(&self.law, &self.state, outside_nm, motor_position_rad)
-        return self.state.told
-
-    def run(self, outside_nm, motor_position_rad):
-        """Return (residual [n] in Nm, told [n]) for arrays [n]: `step` for every sample."""
-        cdef const double[::1] x = np.ascontiguousarray(outside_nm, np.float64)
-        cdef const double[::1] angle = np.ascontiguousarray(motor_position_rad, np.float64)
-        residual, told = np.empty(len(x)), np.empty(len(x), np.uint8)
-        cdef double[::1] e = residual
-        cdef unsigned char[::1] t = told
-        cdef Py_ssize_t k
-        if angle.shape[0] != x.shape[0]:
-            raise ValueError(f"found {angle.shape[0]} angles, expected {x.shape[0]}")
-        for k in range(x.shape[0]):
-            watch_contact(&self.law, &self.state, x[k], angle[k])
-            e[k], t[k] = self.state.residual_nm, self.state.told
-        return residual, told
+    cdef Py_ssize_t k
+    if angle.shape[0] != x.shape[0]:
+        raise ValueError(f"found {angle.shape[0]} angles, expected {x.shape[0]}")
+    fill_contact(&law, threshold_nm, period_s)
+    restart_contact(&state)
+    for k in range(x.shape[0]):
+        detect_contact(&law, &state, x[k], angle[k])
+        m[k], c[k] = state.residual_nm, state.code
+    return residual, code
 
 
 def link_loads(joint, settings, dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad):
@@ -280,19 +238,11 @@ def link_loads(joint, settings, dt_s, current_a, motor_position_rad, motor_veloc
     cdef FusedObserved seen
     cdef LinkLaw link
     cdef LinkState at
-    cdef LinkSeen out
+    cdef LinkLoad out
     cdef Sample sample
     cdef Py_ssize_t k
     fill_guard(&guard, joint, settings)
-    fill_fused_observer(
-        &law,
-        joint,
-        joint.fused.torsion,
-        settings.bandwidth_rad_s,
-        settings.link_bandwidth_rad_s,
-        settings.own_torsion_bandwidth_rad_s,
-        tracking_of(joint, settings),
-    )
+    fill_fused_observer(&law, joint, joint.fused.torsion, settings)
     fill_link(&link, joint, joint.fused.torsion)
     restart_guard(&guarded)
     restart_link(&at)
@@ -304,7 +254,7 @@ def link_loads(joint, settings, dt_s, current_a, motor_position_rad, motor_veloc
         for k in range(x.shape[1]):
             sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], NAN)
             if observe_fused(&guard, &guarded, &law, &state, &sample, &seen):
-                follow_link(&link, &at, &law, &state, seen.torsion_nm + seen.ahead_nm, sample.dt_s, &out)
+                update_link(&link, &at, &law, &state, seen.torsion_nm + seen.ahead_nm, sample.dt_s, &out)
                 r[k], l[k] = out.rate_nm_s, out.load_nm
             else:
                 restart_link(&at)

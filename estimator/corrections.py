@@ -1,19 +1,19 @@
 """Effects of a joint file as corrections of the estimator's inputs, so that estimators know nothing of effects.
 
-    I       = i - current_a                       what flows
-    i'      = I - loss_nm / (G Kt)                the current that would do without the additional losses
-    theta_l' = theta_l - link_rad - twist_rad     the link at which the plain spring would carry the same torque
+    I       = i - current_a                       true current
+    i'      = I - loss_nm / (G Kt)                current without the additional losses
+    theta_l' = theta_l - link_rad - twist_rad     link position at which the plain spring carries the same torque
 
 An error of the motor's encoder (`Effect.at_motor_of`: one wave per turn, reading off by -G link_rad) is one of the link's
-for the spring, and makes the rotor seem to accelerate by G link_rad omega_m^2 (its part of the true acceleration is left
-out): i' makes up for that inertia, + Jm G link_rad omega_m^2 / Kt.
+for the spring, and makes the rotor seem to accelerate by G link_rad omega_m^2 (its part of the true acceleration is
+neglected): i' compensates that inertia, + Jm G link_rad omega_m^2 / Kt.
 
 Current and link readings are corrected first; loss and twist see the corrected ones. A loss that depends on the torque
-takes the estimate of the sample before. Inertias and the gear's damping replace the joint file's (`plain_joint`). Loads and
-the sensor's effects change nothing of the torque at the drive side.
+takes the last estimate. Inertias and the gear's damping replace the joint file's (`plain_joint`). Loads and the sensor's
+effects do not change the torque at the drive side.
 
 Derivatives of a noisy channel and the deflection that moves a slip pass a first-order filter; it starts at the first
-sample, and again after garbage or a gap.
+sample, and again after a value that is not finite or a gap.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ INVERSE_W0: Final = 1.0 / DIRECTION_VELOCITY_RAD_S
 
 
 class Smoothed(ScalarFunctions):
-    """`ScalarFunctions` functions whose slip follows the filtered deflection: noise would wear the state away.
+    """`ScalarFunctions` whose slip follows the filtered deflection: noise would let the slip creep.
 
-    share: gain of the filter, the part of the way to a new deflection; 1 to start.
+    share: gain of the filter for this step; 1 at a start.
     """
 
     __slots__ = ("_d", "share")
@@ -54,7 +54,7 @@ class Smoothed(ScalarFunctions):
 
 
 def acting_effects(joint: Joint) -> Pairs:
-    """Return the effects that change what an estimator of the drive-side torque must be given, with parameters."""
+    """Return the effects that correct inputs of an estimator of the drive-side torque, with their parameters."""
     pairs = [(EFFECTS[e.name], dict(e.parameters)) for e in joint.effects]
     return tuple(
         (effect, p)
@@ -66,7 +66,7 @@ def acting_effects(joint: Joint) -> Pairs:
 
 
 def plain_joint(joint: Joint) -> Joint:
-    """Return the joint without effects, with the values that they replace."""
+    """Return the joint without effects, with the parameters that they replace."""
     plain = replace(joint, effects=()) if joint.effects else joint
     for entry in joint.effects:
         effect = EFFECTS[entry.name]
@@ -82,7 +82,7 @@ def torsion_zero(joint: Joint) -> float:
 
 
 def seeming_inertia_a(joint: Joint) -> float:
-    """Return Jm G / Kt: times link_rad omega_m^2 the current [A] that an error of the motor's encoder feigns."""
+    """Return Jm G / Kt: times link_rad omega_m^2 the apparent current [A] of an error of the motor's encoder."""
     return plain_joint(joint).rotor_inertia_kgm2 * joint.gear_ratio / joint.torque_constant_nm_per_a
 
 
@@ -151,7 +151,7 @@ class ExtendedInputs:
         self._running = False
 
     def restart(self) -> None:
-        """Let the filters begin again at the next sample."""
+        """Restart the filters at the next sample."""
         self._running = False
 
     def step(  # noqa: PLR0917 - a sample, positional for speed
@@ -164,9 +164,9 @@ class ExtendedInputs:
         temperature_c: float,
         torque_nm: float,
     ) -> tuple[float, float]:
-        """Return (i', theta_l'); torque_nm: the estimate of the sample before, NaN without.
+        """Return (i', theta_l'); torque_nm: the last estimate, NaN without one.
 
-        A sample that is not finite is returned as it is, for the estimator to refuse.
+        A sample that is not finite is returned unchanged: the estimator refuses it.
         """
         if not isfinite(current_a + motor_position_rad + motor_velocity_rad_s + link_position_rad):
             self._running = False

@@ -1,8 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
-from jtqd.estimator.path_difference cimport AgreementLaw, AgreementState
 from jtqd.estimator.contact cimport LinkLaw, LinkState
-from jtqd.estimator.uncertainty cimport Fused, FusionLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
 from jtqd.estimator.observer cimport (
     FusedObserved,
@@ -14,14 +12,14 @@ from jtqd.estimator.observer cimport (
     ObserverLaw,
     ObserverState,
 )
+from jtqd.estimator.path_difference cimport AgreementLaw, AgreementState, OffsetLaw, OffsetState
 from jtqd.estimator.perceptron cimport PerceptronLaw
 from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
-from jtqd.estimator.uncertainty cimport FusedTrustLaw, TrustLaw, UncertaintyLaw
-from jtqd.estimator.path_difference cimport OffsetLaw, OffsetState
+from jtqd.estimator.uncertainty cimport Fused, FusedTrustLaw, FusionLaw, TrustLaw, UncertaintyLaw
 
 cdef struct NetworkLaw:
     bint used
-    bint native  # evaluated here; else by the file's runtime, or a stand-in
+    bint native  # evaluated here; else by ONNX Runtime, or by a stand-in
     PerceptronLaw perceptron
 
 cdef struct JointLaw:
@@ -53,7 +51,7 @@ cdef struct FusedLaw:
     OffsetLaw offsets
     AgreementLaw agreement
     LinkLaw link
-    bint tracked  # the link: variances of what is quicker than the motor path
+    bint tracked  # the torsion is tracked: noise of what is faster than the motor path
     double tracking_noise, tracking_viscous, tracking_bend  # bend: of the viscous part [s^2/rad^2], 0: none
     double physics_scale[4]
     double network_scale[4]
@@ -64,7 +62,7 @@ cdef struct FusedState:
     FusedObserverState observer
     double temperature, thermal
     double half
-    double degraded_s  # for how long the status still is, after the paths disagreed
+    double degraded_s  # time left of the status after the paths disagreed
     OffsetState offsets
     AgreementState agreement
     LinkState link
@@ -84,6 +82,5 @@ cdef class FusedEstimator(Estimator):
 
 cdef class ExtendedEstimator(Estimator):
     cdef readonly Estimator inner
-    cdef readonly object inputs
-    cdef public double torque
-    cdef readonly tuple corrected
+    cdef object corrections
+    cdef double torque_nm  # last estimate

@@ -1,7 +1,6 @@
 from typing import Final
 
 from jtqd.estimator.arrays import FloatArray, QuadrantArray
-from jtqd.estimator.corrections import ExtendedInputs
 from jtqd.estimator.joint import Joint, Torsion
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork
 from jtqd.estimator.run import EstimateRun, ObservedRun
@@ -10,7 +9,6 @@ from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Zeros
 
 STANDSTILL_SIGMAS: Final[float]
-LOWERED_S: Final[float]
 SLOPE_NM: Final[float]
 
 def quadrants(raw_nm: FloatArray, velocity_rad_s: FloatArray) -> QuadrantArray: ...
@@ -31,15 +29,11 @@ class FusedEstimator(Estimator):
     def run_observed(self, seen: ObservedRun) -> EstimateRun: ...
 
 class ExtendedEstimator(Estimator):
-    corrected: tuple[float, float]
-    torque: float
     def __init__(self, joint: Joint, settings: EstimatorSettings, inner: Estimator) -> None: ...
     @property
     def inner(self) -> Estimator: ...
     @property
     def zeros(self) -> Zeros | None: ...
-    @property
-    def inputs(self) -> ExtendedInputs: ...
 
 def observe_run(
     joint: Joint,

@@ -1,43 +1,19 @@
-"""The estimate of one joint, sample by sample: observer, loss, network, uncertainty, in this order.
+"""Estimate of one joint, sample by sample: observer, loss, network, uncertainty, in this order.
 
 | class | methods |
 |---|---|
-| `JointEstimator` | the paper's: `tob`, `efficiency`, `network` |
-| `FusedEstimator` | ours: `fused` |
-| `ExtendedEstimator` | either of them for a joint with effects: inputs corrected first (`corrections`) |
+| `JointEstimator` | `tob`, `efficiency`, `network`, of the paper |
+| `FusedEstimator` | `fused` |
+| `ExtendedEstimator` | any of them for a joint with effects: inputs corrected first (`corrections`) |
 
-`methods.make_estimator` chooses. Parameters and state of an estimator are one flat block each. Everything that enters the
-loss went through the same filter; how old the result is says `age`.
+`methods.make_estimator` chooses. All inputs of the loss pass the same filter; delay of the result: `settings.age_ms`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
 from libc.string cimport memcmp
 
-from jtqd.estimator.path_difference cimport (
-    TURN_WAVES,
-    mismatch_variance,
-    fill_agreement,
-    update_agreement,
-    update_turn,
-    degrades,
-    pause_turn,
-    restart_agreement,
-    turn_differs,
-    restart_turn,
-)
 from jtqd.estimator.block cimport copied, put_back
-from jtqd.estimator.contact cimport LinkSeen, fill_link, follow_link, restart_link
-from jtqd.estimator.uncertainty cimport (
-    Fused,
-    Rest,
-    at_rest,
-    fill_fusion,
-    fuse_paths,
-    fading,
-    network_share,
-    reweigh,
-    disagreement,
-)
+from jtqd.estimator.contact cimport LinkLoad, fill_link, restart_link, update_link
 from jtqd.estimator.losses cimport (
     AdditiveLaw,
     AdditiveLossModel,
@@ -58,68 +34,81 @@ from jtqd.estimator.observer cimport (
     observe_fused,
     restart_guard,
 )
+from jtqd.estimator.path_difference cimport (
+    TURN_WAVES,
+    degrades,
+    drop_block,
+    early_factor,
+    fill_agreement,
+    fill_offsets,
+    gather,
+    implausible,
+    known_nm2,
+    local_stiffness,
+    mismatch_variance,
+    offsets_of,
+    pause_turn,
+    report_offsets,
+    restart_agreement,
+    restart_offsets,
+    restart_turn,
+    turn_differs,
+    uncorrected_torque,
+    update_agreement,
+    update_offsets,
+    update_turn,
+)
 from jtqd.estimator.perceptron cimport Perceptron, evaluate
 from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values, no_values
 from jtqd.estimator.uncertainty cimport (
+    Fused,
+    Rest,
     Spread,
+    at_rest,
+    disagreement,
+    fading,
     fill_fused_trust,
+    fill_fusion,
     fill_trust,
     fill_uncertainty,
+    fuse_paths,
     fused_trust,
+    network_share,
+    reweigh,
     sigma_moving,
     standing,
     trust,
 )
-from jtqd.estimator.path_difference cimport (
-    implausible,
-    gather,
-    drop_block,
-    early_factor,
-    fill_offsets,
-    known_nm2,
-    uncorrected_torque,
-    local_stiffness,
-    restart_offsets,
-    report_offsets,
-    update_offsets,
-    offsets_of,
-)
 
-from math import nan
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator import status as st
 from jtqd.estimator.corrections import ExtendedInputs
-from jtqd.estimator.uncertainty import FOREIGN_SIGMAS
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
 from jtqd.estimator.run import EstimateRun, ObservedRun
 from jtqd.estimator.sample import columns
-from jtqd.estimator.settings import METHODS, tracking_of
-from jtqd.estimator.uncertainty import FADE_START
-from jtqd.estimator.status import APART, LEFT
+from jtqd.estimator.settings import METHODS
+from jtqd.estimator.uncertainty import FADE_START, FOREIGN_SIGMAS
 
 STANDSTILL_SIGMAS: Final = 3.0
-"""Half width of the standstill interval in standard deviations, where torsion narrows what friction leaves open.
+"""Half width of the standstill interval in standard deviations, where torsion narrows the interval of friction.
 
-Of a joint file with section `fused.standstill` only of what the disagreement of the paths adds.
+Of a joint file with section `fused.standstill` only for the disagreement of the paths.
 """
-
-LOWERED_S: Final = 0.1
-"""So long the status stays degraded after the two paths have disagreed: it must not flicker."""
 
 SLOPE_NM: Final = 0.5
 """Step of the motor torque over which the slope of the loss is taken."""
 
-cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, FOREIGN = FOREIGN_SIGMAS, LOWERED = LOWERED_S, STEP = SLOPE_NM
-cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL
-cdef int INVALID = st.INVALID
-cdef int IS_LEFT = LEFT, IS_APART = APART
+cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, STEP = SLOPE_NM, FOREIGN = FOREIGN_SIGMAS
+cdef double LOWERED_S = 0.1  # the status stays degraded for so long after the paths have disagreed: it must not flicker
+cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
+cdef int LEFT = st.LEFT, APART = st.APART
 
 
 cdef fill_network(NetworkLaw *law, network, joint):
-    """Set the block of a network; return what to call for one sample where it is not evaluated natively, or None."""
+    """Set a network's parameters; return the function of one sample of a network that is not evaluated natively, else None."""
     law.used = network is not None
     law.native = False
     if network is None:
@@ -157,7 +146,7 @@ cdef class JointEstimator(Estimator):
         self.joint, self.settings = joint, settings
         self.width = len(FEATURES)
         fill_guard(&self.law.guard, joint, settings)
-        fill_observer(&self.law.observer, joint, settings.bandwidth_rad_s, settings.link_bandwidth_rad_s)
+        fill_observer(&self.law.observer, joint, settings)
         self.law.losses = (<LossModel>losses).law
         fill_uncertainty(&self.law.uncertainty, joint, settings, losses.has_efficiency)
         self.law.with_efficiency = settings.method != "tob"
@@ -178,7 +167,7 @@ cdef class JointEstimator(Estimator):
         return bool(self.law.network.used)
 
     def reset(self):
-        """Forget the past: the next step starts."""
+        """Restart at the next sample."""
         restart_guard(&self.state.guard)
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
@@ -221,13 +210,13 @@ cdef class JointEstimator(Estimator):
 
 
 cdef void publish_within(Values *out, double limit) noexcept nogil:
-    """Withhold a torque that nobody would believe; NaN included."""
+    """Withhold a torque beyond the limit, or NaN."""
     if not -limit <= out.torque_nm <= limit:
         out.torque_nm = out.sigma_nm = NAN
         out.status = INVALID
 
 
-# Our estimator --------------------------------------------------------------------------------------------------------
+# The fused estimator ----------------------------------------------------------------------------------------------------
 
 
 cdef int quadrant_of(double raw, double v) noexcept nogil:
@@ -250,13 +239,13 @@ def quadrants(raw_nm, velocity_rad_s):
 
 
 cdef class FusedEstimator(Estimator):
-    """Our estimator of one joint, method `fused`; without a network its physics alone, degraded outside of the file's envelope.
+    """Estimator of one joint, method `fused`; without a network the physics alone, degraded outside the joint file's envelope.
 
-        tau_raw, v, tau_t, waves, s, open  <-  FusedObserver    s: direction, -1 to 1; open: of the torsion's slip
+        tau_raw, v, tau_t, waves, s, open  <-  fused observer   s: direction, -1 to 1; open: of the torsion's slip
         physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
-        torque  = physics + w turning(v) N(features)            w: trust of the network; turning: 0 at rest, 1 from 0.2 rad/s
+        torque  = physics + w share(v) N(features)              w: trust of the network; share: 0 at rest, 1 from 0.2 rad/s
 
-    w is 1 inside the network's envelope, falls continuously to 0 outside of it, and falls from 1 to 0 while |N| goes
+    w is 1 inside the network's envelope, falls continuously to 0 outside it, and falls from 1 to 0 while |N| goes
     from 75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone),
     6 at standstill.
 
@@ -270,15 +259,7 @@ cdef class FusedEstimator(Estimator):
         self.joint, self.settings = joint, settings
         self.width = len(FUSED_FEATURES)
         fill_guard(&self.law.guard, joint, settings)
-        fill_fused_observer(
-            &self.law.observer,
-            joint,
-            fused.torsion,
-            settings.bandwidth_rad_s,
-            settings.link_bandwidth_rad_s,
-            settings.own_torsion_bandwidth_rad_s,
-            tracking_of(joint, settings),
-        )
+        fill_fused_observer(&self.law.observer, joint, fused.torsion, settings)
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
         fill_fusion(&self.law.fusion, fused.sigma, fused.torsion is not None)
         self.law.fusion.reference = 0.0  # sigma is that of the torque, not of a comparison with a sensor
@@ -317,7 +298,7 @@ cdef class FusedEstimator(Estimator):
         return bool(self.law.network.used)
 
     def reset(self):
-        """Forget the past: the next step starts."""
+        """Restart at the next sample."""
         restart_guard(&self.state.guard)
         self.state.half = self.state.degraded_s = 0.0
         restart_offsets(&self.law.offsets, &self.state.offsets)
@@ -326,22 +307,22 @@ cdef class FusedEstimator(Estimator):
 
     @property
     def zeros(self):
-        """What is known of the joint's zeros (`Zeros`); None where they are not tracked."""
+        """Offsets of link encoder and current (`Zeros`); None where they are not tracked."""
         return offsets_of(&self.law.offsets, &self.state.offsets) if self.law.offsets.corrected else None
 
     cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
-        """As `Estimator.learned`; whether the two views disagree is report in any case."""
+        """As `Estimator.learned`; whether the two paths disagree is reported in any case."""
         report_offsets(&self.law.offsets, &self.state.offsets, out)
         if self.state.degraded_s > 0.0:
-            out.flags |= IS_APART
+            out.flags |= APART
         if self.offset_pending():
-            out.flags |= IS_LEFT
+            out.flags |= LEFT
         size[0] = sizeof(FusedState)
         return &self.state
 
     @property
     def past(self):
-        """All that it knows of the samples so far, bytes of layout `status.PAST_LAYOUT`; `past = other.past` goes on there.
+        """The whole state, bytes of layout `status.PAST_LAYOUT`; `past = other.past` continues from that state.
 
         Raises ValueError for bytes of another length.
         """
@@ -352,9 +333,9 @@ cdef class FusedEstimator(Estimator):
         put_back(&self.state, sizeof(FusedState), content)
 
     def shares_past(self, FusedEstimator other):
-        """Return whether the past of `other` means the same here: nothing differs that the zeros were learned with.
+        """Return whether the state of `other` is valid here: the parameters that offsets are estimated with are the same.
 
-        That is the observer with its torsion, the losses, and the torque per ampere. Limits, sigmas and networks may differ.
+        These are the observer with its torsion, the losses, and the torque per ampere. Limits, sigmas and networks may differ.
         """
         return (
             self.law.offsets.corrected == other.law.offsets.corrected
@@ -366,7 +347,7 @@ cdef class FusedEstimator(Estimator):
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample."""
         cdef FusedObserved seen
-        cdef LinkSeen link
+        cdef LinkLoad link
         cdef Sample corrected
         if self.law.offsets.corrected:
             corrected = x[0]
@@ -378,7 +359,7 @@ cdef class FusedEstimator(Estimator):
         )
         no_values(out, self.state.guard.status)
         if self.observed:
-            follow_link(
+            update_link(
                 &self.law.link,
                 &self.state.link,
                 &self.law.observer,
@@ -398,11 +379,11 @@ cdef class FusedEstimator(Estimator):
     cdef void update_path_difference(
         self, const FusedObserved *seen, const Sample *x, const Fused *physics, double loss, int status
     ) noexcept nogil:
-        """Take a sample into what the difference of the two views tells: the zeros, and whether the joint is that of its file."""
+        """Take a sample of the difference of the paths: into the offsets, and into the check that the joint is that of its file."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm, dt, innovation
-        cdef double noise = physics.variance - law.offsets.spread_nm  # the day's zero is a state, no noise
+        cdef double noise = physics.variance - law.offsets.spread_nm  # the day's offset is a state, no noise
         cdef Loss next
         cdef double wave[TURN_WAVES]
         if law.agreement.with_turn:
@@ -432,10 +413,10 @@ cdef class FusedEstimator(Estimator):
                 )
 
     cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil:
-        """Return whether the two paths are not of this joint file: they disagree, or the link's zero is impossible."""
+        """Return whether the paths contradict the joint file: they disagree, or the link's offset is implausible."""
         cdef FusedState *s = &self.state
         if fabs(physics.difference) > FOREIGN * sqrt(physics.variance) or turn_differs(&self.law.agreement, &s.agreement):
-            s.degraded_s = LOWERED
+            s.degraded_s = LOWERED_S
         elif s.degraded_s > 0.0:
             s.degraded_s -= dt
         if s.degraded_s > 0.0:
@@ -443,9 +424,9 @@ cdef class FusedEstimator(Estimator):
         return self.offset_pending() or (self.law.offsets.corrected and implausible(&self.law.offsets, &s.offsets))
 
     cdef bint offset_pending(self) noexcept nogil:
-        """Return whether more of a known zero is not yet taken off than the torsion's own sigma can hide."""
-        cdef double left = self.state.offsets.uncorrected_nm
-        return self.law.offsets.corrected and left * left > FOREIGN * FOREIGN * self.law.fusion.torsion
+        """Return whether the uncorrected part of a known offset exceeds the torsion's own sigma."""
+        cdef double rest = self.state.offsets.uncorrected_nm
+        return self.law.offsets.corrected and rest * rest > FOREIGN * FOREIGN * self.law.fusion.torsion
 
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
@@ -456,7 +437,7 @@ cdef class FusedEstimator(Estimator):
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
         cdef Fused physics
-        if x.temperature_c != s.temperature:  # a joint reports it twice a second
+        if x.temperature_c != s.temperature:  # reported twice a second
             s.temperature = x.temperature_c
             s.thermal = thermal_friction(&law.loss, x.temperature_c)
         loss = additive_loss(&law.loss, raw, v, s.thermal, seen.direction)
@@ -469,12 +450,12 @@ cdef class FusedEstimator(Estimator):
             known = known_nm2(&law.offsets, &s.offsets)
             reweigh(&physics, known)
             physics.sigma *= early_factor(&law.offsets, known)
-        out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # both paths fused at one age, then made younger
+        out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # paths fused at the same delay, then advanced by the torsion
         scale = law.physics_scale[quadrant]
         self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
         self.features[3], self.features[4] = seen.cos2, seen.sin2
         self.features[5], self.features[6] = seen.cos4, seen.sin4
-        # at rest the current path says little of the torque, and its distance to the torsion nothing of the file
+        # at rest the current path is only an interval, and its distance to the torsion is no evidence against the file
         difference = 0.0 if out.status == STANDSTILL else self.features[2]
         if law.network.used:
             if network_wanted:
@@ -492,11 +473,11 @@ cdef class FusedEstimator(Estimator):
             if weight < 1.0:
                 degraded = True
         elif law.with_envelope:
-            # at half the weight ends what the fit knows; the same motor torque holds more load when it is back-driven
+            # the fit is known up to half the weight; the same motor torque holds more load when back-driven
             if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, difference, x.temperature_c) < 0.5:
                 degraded = True
         out.sigma_nm = scale * physics.sigma
-        # a zero that is not taken off counts once: as mismatch, where the file has what is usual
+        # an uncorrected offset counts once: as mismatch, where the file has section agreement
         wider = disagreement(&physics, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
         if wider > 0.0:
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
@@ -512,8 +493,8 @@ cdef class FusedEstimator(Estimator):
                 physics.alpha,
                 seen.torsion_nm,
             ):
-                s.degraded_s, degraded = LOWERED, True
-            # a zero that was learned from views that disagree is as doubtful as they are
+                s.degraded_s, degraded = LOWERED_S, True
+            # an offset estimated while the paths disagree is as uncertain as they are
             mismatch += physics.alpha * physics.alpha * fmin(known, s.agreement.mismatch)
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + mismatch)
         if degraded:
@@ -531,9 +512,9 @@ cdef class FusedEstimator(Estimator):
     cdef double half_interval(
         self, const FusedObserved *seen, const Fused *physics, double half, double more, double sigma
     ) noexcept nogil:
-        """Return half the interval of a standing joint [Nm], by friction or by the fusion, whichever is less.
+        """Return half the interval of a standing joint [Nm], of friction or of the fusion, whichever is less.
 
-        half: of the friction interval; more: what the paths' disagreement adds to sigma^2; sigma: as in motion.
+        half: of the friction interval; more: variance of the paths' disagreement; sigma: as in motion.
         """
         cdef const FusedLaw *law = &self.law
         cdef double friction = law.stand_share * half + law.stand_floor, width
@@ -552,14 +533,14 @@ cdef class FusedEstimator(Estimator):
         width = law.stand_sigmas * rest.spread + rest.bound
         if more > 0.0:
             width = sqrt(width * width + STANDSTILL_WIDTH * STANDSTILL_WIDTH * more)
-        # the friction interval is about the current path, not about the value
+        # the friction interval is centred on the current path, not on the value
         return fmin(friction + fabs(physics.alpha * physics.difference), width)
 
     def run_observed(self, seen):
         """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`.
 
-        Raises ValueError where zeros are tracked: they act on what is observed, use `run`; and for a run without `turn` where
-        the joint file has what the views differ by over the motor's turn.
+        Raises ValueError where offsets are tracked, since they correct the inputs (use `run`); and for a run without `turn`
+        where the joint file has the difference of the paths over the motor's turn.
         """
         if self.law.offsets.corrected:
             raise ValueError("found an estimator that tracks zeros, expected one without, or a run of samples")
@@ -576,7 +557,7 @@ cdef class FusedEstimator(Estimator):
         cdef const double[::1] temperature = np.ascontiguousarray(seen.temperature_c)
         cdef double[:, ::1] to = values
         cdef double[:, ::1] f = features
-        cdef unsigned char[::1] asked = status
+        cdef unsigned char[::1] code = status
         cdef FusedObserved one
         cdef Sample sample
         cdef Values out
@@ -588,7 +569,7 @@ cdef class FusedEstimator(Estimator):
         restart_agreement(&self.state.agreement)
         with nogil:
             for k in range(row.shape[0]):
-                if asked[k] != VALID and asked[k] != STANDSTILL:
+                if code[k] != VALID and code[k] != STANDSTILL:
                     self.state.half = 0.0
                     drop_block(&self.state.offsets)
                     restart_turn(&self.state.agreement)
@@ -598,13 +579,13 @@ cdef class FusedEstimator(Estimator):
                 one.direction, one.open_nm, one.ahead_nm = row[k, 7], row[k, 8], row[k, 9]
                 one.cos1, one.sin1 = row[k, 10], row[k, 11]
                 sample.dt_s, sample.temperature_c = dt[k], temperature[k]
-                no_values(&out, asked[k])
+                no_values(&out, code[k])
                 if self.law.offsets.estimated:
                     self.state.observer.d = one.torsion_nm / self.law.offsets.stiffness
                 self.estimate(&one, &sample, True, &out)
                 to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
                 to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm
-                asked[k] = out.status
+                code[k] = out.status
                 for m in range(self.width):
                     f[k, m] = self.features[m]
         torque, sigma, tob, physics, network = values
@@ -622,9 +603,9 @@ def observe_run(
     link_position_rad,
     temperature_c=None,
 ):
-    """Return what `FusedObserver` and its guard make of a run, an `ObservedRun`; arrays [n], dt_s[k] since sample k-1.
+    """Return the outputs of the fused observer and its guard over a run, an `ObservedRun`; arrays [n], dt_s[k] since sample k-1.
 
-    torsion: instead of the joint's own, None for none. Raises ValueError for arrays of different length.
+    torsion: in place of the joint's own, None for none. Raises ValueError for arrays of different length.
     """
     inputs = columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c)
     cdef FusedLaw law
@@ -634,15 +615,7 @@ def observe_run(
     cdef Sample sample
     cdef Py_ssize_t k
     fill_guard(&law.guard, joint, settings)
-    fill_fused_observer(
-        &law.observer,
-        joint,
-        torsion,
-        settings.bandwidth_rad_s,
-        settings.link_bandwidth_rad_s,
-        settings.own_torsion_bandwidth_rad_s,
-        tracking_of(joint, settings),
-    )
+    fill_fused_observer(&law.observer, joint, torsion, settings)
     restart_guard(&guard)
     n = inputs.shape[1]
     rows, waves, status = np.full((6, n), NAN), np.full((n, 6), NAN), np.empty(n, np.uint8)
@@ -670,18 +643,16 @@ def observe_run(
 
 
 cdef class ExtendedEstimator(Estimator):
-    """Estimator of a joint with effects: corrected inputs (`ExtendedInputs`) into the estimator of the plain joint.
+    """Estimator of a joint with effects: `ExtendedInputs` corrects the inputs of the estimator of the plain joint.
 
-    joint: with its effects; inner: estimator of `plain_joint(joint)`; `inputs`: the corrections.
-    `corrected`: current [A] and link position [rad] that the inner one was given last; `torque`: its last estimate [Nm].
+    joint: with its effects; inner: estimator of `plain_joint(joint)`.
     """
 
     def __init__(self, joint, settings, Estimator inner):
         self.joint, self.settings, self.inner = joint, settings, inner
         self.width = inner.width
-        self.inputs = ExtendedInputs(joint, settings)
-        self.corrected = (nan, nan)
-        self.torque = NAN
+        self.corrections = ExtendedInputs(joint, settings)
+        self.torque_nm = NAN
 
     @property
     def with_network(self):
@@ -694,32 +665,31 @@ cdef class ExtendedEstimator(Estimator):
         return getattr(self.inner, "zeros", None)
 
     cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
-        """As that of the inner estimator: the corrections forget within a second, and are not report."""
+        """As that of the inner estimator: the corrections forget within a second and are not reported."""
         return self.inner.learned(out, size)
 
     def reset(self):
-        """Forget the past: the next step starts."""
+        """Restart at the next sample."""
         self.inner.reset()
-        self.inputs.restart()
-        self.torque = NAN
+        self.corrections.restart()
+        self.torque_nm = NAN
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out` to the estimate at this sample; the corrections are Python."""
         cdef Sample corrected = x[0]
         cdef int n
         with gil:
-            self.corrected = self.inputs.step(
+            corrected.current_a, corrected.link_position_rad = self.corrections.step(
                 x.dt_s,
                 x.current_a,
                 x.motor_position_rad,
                 x.motor_velocity_rad_s,
                 x.link_position_rad,
                 x.temperature_c,
-                self.torque,
+                self.torque_nm,
             )
-            corrected.current_a, corrected.link_position_rad = self.corrected
         self.inner.advance(&corrected, network_wanted, out)
         self.observed = self.inner.observed
         for n in range(self.width):
             self.features[n] = self.inner.features[n]
-        self.torque = out.torque_nm
+        self.torque_nm = out.torque_nm

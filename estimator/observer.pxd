@@ -1,4 +1,4 @@
-"""Observers and their guard as flat blocks: parameters, state, outputs; the equations stand in observer.pyx."""
+"""Observers and their guard: parameters, states, outputs; the equations stand in observer.pyx."""
 
 from jtqd.estimator.losses cimport MOST_NODES, FrictionLaw
 from jtqd.estimator.sample cimport Sample
@@ -11,18 +11,18 @@ cdef struct ObserverLaw:
     FrictionLaw friction
 
 cdef struct ObserverState:
-    double u, v, friction  # inputs of the sample before
+    double u, v, friction  # inputs of the last sample
     double z, z_v, z_friction  # filtered
     double link, link_velocity
 
 cdef struct Inputs:  # of the filter: u = i Kt + J g w, v, deflection d, waves, direction
     double u, v, d, cos1, sin1, cos2, sin2, cos4, sin4, direction
 
-cdef struct FusedObserved:  # as Observed, and the filtered waves; open: what the torsion's slip leaves open
+cdef struct FusedObserved:  # as Observed, and the filtered waves; open: half width of the slip's bounds, 0 once it is known
     double raw_nm, joint_velocity_rad_s, link_velocity_rad_s, torsion_nm
-    double cos1, sin1, cos2, sin2, cos4, sin4, direction, open_nm, ahead_nm  # ahead: what the torsion's own filter knows earlier
+    double cos1, sin1, cos2, sin2, cos4, sin4, direction, open_nm, ahead_nm  # ahead: torsion through its own filter, less torsion_nm
 
-cdef struct Reference:  # a sensor as old as the estimate
+cdef struct Reference:  # of a sensor, delayed like the estimate
     double last, z, since, settled
 
 cdef struct Wave:
@@ -61,11 +61,11 @@ cdef struct FusedObserverLaw:
 cdef struct FusedObserverState:
     Inputs last, z
     double d
-    double torsion, torsion_z  # of the torsion's own filter, and through the rest of the motor path's
+    double torsion, torsion_z  # through the torsion's own filter, and also through the rest of the motor path's
     Bounds bounds[MOST_SLIPS]
     double link, link_velocity
     TorsionTrack track
-    double d_rate, d_moved  # of the deflection, where it is tracked: the filter's rate, and over the step as read
+    double d_rate, d_moved  # of the tracked deflection: rate of the filter, and of the readings
 
 cdef struct GuardLaw:
     double max_gap, stop, leave, raw_limit
@@ -74,16 +74,8 @@ cdef struct GuardState:
     bint running, standing
     int status
 
-cdef int fill_observer(ObserverLaw *law, joint, double bandwidth, double link_bandwidth) except -1
-cdef int fill_fused_observer(
-    FusedObserverLaw *law,
-    joint,
-    torsion,
-    double bandwidth,
-    double link_bandwidth,
-    double torsion_bandwidth,
-    tracking
-) except -1
+cdef int fill_observer(ObserverLaw *law, joint, settings) except -1
+cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, settings) except -1
 cdef void restart_reference(Reference *r) noexcept nogil
 cdef double follow_reference(Reference *r, double rate, double max_gap, double dt, double now) noexcept nogil
 cdef int fill_guard(GuardLaw *law, joint, settings) except -1
@@ -99,7 +91,3 @@ cdef bint observe_fused(
     const Sample *x,
     FusedObserved *out,
 ) noexcept nogil
-
-cdef class FusedObserver:
-    cdef FusedObserverLaw law
-    cdef FusedObserverState state

@@ -1,10 +1,10 @@
-"""Torque observers in exact discrete form: the paper's (Eqs. 4 and 7), that of method `fused`, and the guard around both.
+"""Torque observers in exact discrete form: the paper's (Eqs. 4 and 7), the one of method `fused`, and the guard of both.
 
 Symbols: i current [A], w motor velocity [rad/s], Kt torque constant, J rotor inertia (motor side), G gear ratio,
 g bandwidth [rad/s], theta_m and theta_l motor and link position [rad].
 
     tau_raw = [ g/(s+g) (i Kt + J g w) - J g w ] G            = G LPF(i Kt - J dw/dt), without any loss
-    v       = g/(s+g) w/G                                     velocity of the same age as tau_raw
+    v       = g/(s+g) w/G                                     velocity, delayed like tau_raw
 
 Discretisation: z' = g (u - z) is integrated exactly for an input that is linear between samples (first-order hold),
 with the measured step dt:
@@ -17,13 +17,13 @@ with a lag of exactly 1/g: the group delay at DC (5 ms at 200 rad/s).
 The link velocity is the derivative of the link position through p/(s+p), exact for a position that is linear between
 samples: r_k = exp(-p dt) r_(k-1) + (1 - exp(-p dt)) (q_k - q_(k-1))/dt.
 
-The guard decides about starts, gaps, garbage and standstill, sample by sample:
+The guard decides on starts, gaps, values that are not finite, and standstill, sample by sample:
 
-| sample | status and what follows |
+| sample | status and effect |
 |---|---|
-| not finite | INVALID, and the next good sample starts again |
-| the first, dt <= 0, dt too long | STARTING: the observer is set to this sample, nothing is published |
-| implausible motor torque or speed | INVALID and start again: one absurd sample must not decay into the next |
+| not finite | INVALID, restart at the next good sample |
+| the first, dt <= 0, dt too long | STARTING: the observer starts at this sample, nothing is published |
+| implausible motor torque or speed | INVALID and restart: one absurd sample must not decay into the next |
 | abs(v) below the threshold | STANDSTILL, until it is above twice the threshold |
 | else | VALID |
 """
@@ -33,23 +33,21 @@ from libc.math cimport INFINITY, NAN, copysign, cos, expm1, fabs, fmax, fmin, is
 from jtqd.estimator.losses cimport FrictionModel, direction_of, friction_torque
 from jtqd.estimator.sample cimport Sample
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
 from jtqd.estimator import status as st
+from jtqd.estimator.settings import tracking_of
 
 RAW_LIMIT: Final = 10.0
-"""Largest |tau_raw| in rated torques: no motor of the joint can give it, friction cannot hide it."""
+"""Largest |tau_raw| in rated torques: more than the motor can give and friction can hide."""
 
 LINK_SPEED_LIMIT_RAD_S: Final = 1e3
-"""Largest link speed of a joint-side encoder that still means anything."""
+"""Largest plausible speed of a joint-side encoder."""
 
 RIPPLE_ORDERS: Final = (2, 4)
 """Per motor revolution: twice the wave generator's turn, and its first harmonic."""
-
-TRACKED_FADE_S: Final = 0.2
-"""Within which the wave of the torsion's tracking filter is forgotten; chosen with its rates, docs/estimator.md."""
 
 cdef double LINK_SPEED_LIMIT = LINK_SPEED_LIMIT_RAD_S
 cdef int STARTING = st.STARTING, VALID = st.VALID, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
@@ -59,30 +57,24 @@ cdef int STARTING = st.STARTING, VALID = st.VALID, STANDSTILL = st.STANDSTILL, I
 
 
 cdef struct Hold:
-    double a, b0, b1, gone  # gone: 1 - a
+    double a, b0, b1, decay  # decay: 1 - a
 
 
 cdef Hold _hold(double rate, double dt) noexcept nogil:
     """Return the coefficients of one step dt > 0; expm1 keeps tiny steps exact."""
     cdef double x = rate * dt
-    cdef double gone = -expm1(-x)
-    cdef double share = gone / x
-    cdef double a = 1.0 - gone
-    return Hold(a, 1.0 - share, share - a, gone)
+    cdef double decay = -expm1(-x)
+    cdef double share = decay / x
+    cdef double a = 1.0 - decay
+    return Hold(a, 1.0 - share, share - a, decay)
 
 
 cdef inline double _filtered(const Hold *h, double z, double now, double last) noexcept nogil:
     return h.a * z + h.b0 * now + h.b1 * last
 
 
-def first_order_hold(double rate_rad_s, double dt_s):
-    """Return (a, b0, b1) of the recursion for one step dt_s > 0."""
-    cdef Hold h = _hold(rate_rad_s, dt_s)
-    return h.a, h.b0, h.b1
-
-
 def low_pass(values, dt_s, double bandwidth_rad_s):
-    """Return values [n] through g/(s+g), exact for values linear between samples: as old as an estimate of bandwidth g.
+    """Return values [n] through g/(s+g), exact for values linear between samples.
 
     dt_s [n], dt_s[k] the step that ends at sample k (dt_s[0] is not used); a step <= 0 passes its sample on unfiltered.
     """
@@ -101,23 +93,23 @@ def low_pass(values, dt_s, double bandwidth_rad_s):
     return out
 
 
-# What an estimate is compared with ----------------------------------------------------------------------------------
+# Reference torque of a sensor ----------------------------------------------------------------------------------------
 
 
-cdef double SETTLED = 5.0  # of 1/g: exp(-5) of the start is left
+cdef double SETTLED = 5.0  # in 1/g: exp(-5) of the start remains
 
 
 cdef void restart_reference(Reference *r) noexcept nogil:
-    """Forget everything: the next value starts."""
+    """Restart at the next value."""
     r.since = INFINITY
     r.last = r.z = r.settled = 0.0
 
 
 cdef double follow_reference(Reference *r, double rate, double max_gap, double dt, double now) noexcept nogil:
-    """Return a sensor's value, dt after the sample before, as old as an estimate of this bandwidth; NaN where unknown.
+    """Return a sensor's value, dt after the last sample, delayed like an estimate of this bandwidth; NaN where unknown.
 
-    NaN of a sensor that was not heard is bridged by a straight line, up to max_gap; then, at the first value, and after a
-    step that is no step it starts again, and is unknown until 5/g later.
+    A missing value (NaN) is bridged by a straight line, up to max_gap. After a longer gap, at the first value, and after a
+    step <= 0 it restarts, and is unknown until 5/g later.
     """
     cdef Hold h
     r.since = r.since + dt if dt > 0.0 else INFINITY
@@ -134,10 +126,10 @@ cdef double follow_reference(Reference *r, double rate, double max_gap, double d
 
 
 def reference_of(sensor_nm, dt_s, double bandwidth_rad_s, double max_gap_s=0.05):
-    """Return a sensor's torque [n] as old as estimates of this bandwidth, as the loop forms it; NaN where it is unknown.
+    """Return a sensor's torque [n] delayed like estimates of this bandwidth, as the loop forms it; NaN where unknown.
 
-    dt_s [n]: as the estimator was given it, since the last sample with inputs; NaN at samples without inputs, which count
-    for nothing. Raises ValueError for arrays of different length.
+    dt_s [n]: as given to the estimator, since the last sample with inputs; NaN at samples without inputs, which are
+    skipped. Raises ValueError for arrays of different length.
     """
     cdef const double[::1] x = np.ascontiguousarray(sensor_nm, np.float64)
     cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
@@ -158,7 +150,7 @@ def reference_of(sensor_nm, dt_s, double bandwidth_rad_s, double max_gap_s=0.05)
 
 
 cdef void _start(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
-    """Set the states of a joint that has always moved at this speed, without acceleration."""
+    """Set the states of a joint in steady motion at this speed."""
     cdef double spin = law.inertia_rate * x.motor_velocity_rad_s
     s.u = s.z = x.current_a * law.kt + spin
     s.v = s.z_v = x.motor_velocity_rad_s * law.inverse_gear
@@ -181,8 +173,8 @@ cdef void _step(const ObserverLaw *law, ObserverState *s, const Sample *x, Obser
     s.z_v = _filtered(&h, s.z_v, v, s.v)
     s.z_friction = _filtered(&h, s.z_friction, friction, s.friction)
     s.u, s.v, s.friction = u, v, friction
-    cdef double gone = h.gone if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
-    s.link_velocity += gone * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
+    cdef double decay = h.decay if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
+    s.link_velocity += decay * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
     s.link = x.link_position_rad
     out.raw_nm = (s.z - spin) * law.gear
     out.tob_nm = out.raw_nm - s.z_friction
@@ -190,43 +182,40 @@ cdef void _step(const ObserverLaw *law, ObserverState *s, const Sample *x, Obser
     out.link_velocity_rad_s = s.link_velocity
 
 
-cdef int fill_observer(ObserverLaw *law, joint, double bandwidth, double link_bandwidth) except -1:
-    """Set the parameters from a joint file."""
+cdef int fill_observer(ObserverLaw *law, joint, settings) except -1:
+    """Set the parameters from joint and settings."""
     law.gear = joint.gear_ratio
     law.inverse_gear = 1.0 / joint.gear_ratio
     law.kt = joint.torque_constant_nm_per_a
-    law.inertia_rate = joint.rotor_inertia_kgm2 * bandwidth
-    law.rate, law.link_rate = bandwidth, link_bandwidth
+    law.inertia_rate = joint.rotor_inertia_kgm2 * settings.bandwidth_rad_s
+    law.rate, law.link_rate = settings.bandwidth_rad_s, settings.link_bandwidth_rad_s
     law.friction = (<FrictionModel>FrictionModel(joint.friction)).law
     return 0
 
 
 # The observer of method fused -----------------------------------------------------------------------------------------
-
-
-class FusedObservedSample(NamedTuple):
-    """Outputs of one step of `FusedObserver`; torques [Nm, joint side], velocities [rad/s, joint side], filtered waves.
-
-    raw_nm is NaN where the torsion is impossible: the guard then starts again, as for an impossible motor torque.
-    open_nm: half width of what the torsion's slip leaves open, 0 once the slip is known and where there is none.
-    torsion_nm: as old as raw_nm, 1/g; ahead_nm: the torsion that is only 1/g_t old, less this one.
-    """
-
-    raw_nm: float
-    joint_velocity_rad_s: float
-    link_velocity_rad_s: float
-    torsion_nm: float
-    cos2: float
-    sin2: float
-    cos4: float
-    sin4: float
-    direction: float
-    open_nm: float = 0.0
-    ahead_nm: float = 0.0
+#
+#     d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))          e: kinematic error
+#     tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2      and more slips, a spring that
+#                                                                                         hardens: joint.Torsion
+#     dlo = dhi = dd/travel, each limited to [-1, 1]       Maxwell slip, between bounds: -1 and 1 at each start
+#     c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
+#     direction = g/(s+g) tanh(w/(G w0))                   of friction, delayed like tau_raw
+#
+# All pass the same filter. A torque ripple A cos(n theta_m + phi) therefore reaches tau_raw exactly linear in c_n and s_n
+# at every speed, and friction that changes sign with the motion is linear in `direction`, however fast the reversal. The
+# slip follows the filtered deflection: an element that slips would rectify the encoder's noise. Its state at the start is
+# unknown: its bounds meet after twice its travel in one direction, and until then `open` is what it may carry to either
+# side of the middle.
+#
+# With a bandwidth g_t of its own the torsion, spring and slip included, is formed from the deflection through
+# g_t/(s+g_t). `torsion_nm` is then that torque through [g/(s+g)]/[g_t/(s+g_t)], delayed by 1/g like all other outputs, and
+# `ahead_nm` the torque delayed by 1/g_t less it. With the torsion tracked, deflection and d' are those of a filter without
+# delay (`tracked`), and `torsion_nm` is that torque through g/(s+g).
 
 
 cdef double _sum_of_waves(const Wave *wave, int count, double angle) noexcept nogil:
-    """Return the sum of waves over an angle [rad]: kinematic error of orders that are not RIPPLE_ORDERS, link encoder."""
+    """Return the sum of waves over an angle [rad]: kinematic error of orders other than RIPPLE_ORDERS, error of the link encoder."""
     cdef double error = 0.0, a
     cdef int n
     for n in range(count):
@@ -238,7 +227,7 @@ cdef double _sum_of_waves(const Wave *wave, int count, double angle) noexcept no
 
 
 cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil:
-    """Return what the filter takes from a sample."""
+    """Return the inputs of the filter at a sample."""
     cdef Inputs to
     cdef double c = cos(x.motor_position_rad)  # of the angle itself: a multiple of a finite angle need not be finite
     cdef double s = sin(x.motor_position_rad)
@@ -266,12 +255,12 @@ cdef Inputs _inputs(const FusedObserverLaw *law, const Sample *x) noexcept nogil
     return to
 
 
-cdef double FADE_S = TRACKED_FADE_S
+cdef double FADE_S = 0.2  # the wave of the tracking filter is forgotten within it; chosen with its rates, docs/estimator.md
 cdef int WAVE_ORDER = RIPPLE_ORDERS[0]
 
 
 cdef void _start_track(TorsionTrack *t, double ramp, double d) noexcept nogil:
-    """Set the filter to a torsion that was read once and does not change."""
+    """Set the filter to one reading of a constant torsion."""
     t.level = d
     t.rate = t.wave = t.quarter = 0.0
     t.p00 = t.p22 = t.p33 = 1.0
@@ -282,10 +271,10 @@ cdef void _start_track(TorsionTrack *t, double ramp, double d) noexcept nogil:
 cdef inline double _track(
     TorsionTrack *t, double ramp, double wave, double dt, double c, double s, double d
 ) noexcept nogil:
-    """Take a deflection d as read, dt after the one before; return it without what is noise.
+    """Take a deflection d as read, dt after the last; return it without noise.
 
     Kalman filter of a level with a rate and of a wave over the motor's angle, whose phase moved by atan2(s, c) in this step;
-    the rate of the level and the wave are random walks, the wave fades within TRACKED_FADE_S (bounded at rest, where wave
+    the rate of the level and the wave are random walks, the wave fades within FADE_S (bounded at rest, where wave
     and level look alike). Only ratios of variances count: noise of a reading 1, of the rate (ramp dt)^4/dt^2, of the wave
     (wave dt)^2 a step, so `ramp` and `wave` are about the rates [rad/s] at which it follows them.
     """
@@ -294,7 +283,7 @@ cdef inline double _track(
     cdef double a, b, h0, h1, h2, h3, e
     c *= g
     s *= g
-    # the step before: state, then covariance, blocks (level, rate), cross, (wave, quarter)
+    # prediction: state, then covariance, blocks (level, rate), cross, (wave, quarter)
     t.level += dt * t.rate
     a = t.wave
     t.wave = c * a - s * t.quarter
@@ -311,7 +300,7 @@ cdef inline double _track(
     t.p22 = c * c * a - h0 + s * s * e + y * y
     t.p33 = s * s * a + h0 + c * c * e + y * y
     t.p23 = c * s * (a - e) + (c * c - s * s) * b
-    # the reading
+    # update by the reading
     h0, h1, h2, h3 = t.p00 + t.p02, t.p01 + t.p12, t.p02 + t.p22, t.p03 + t.p23
     a = 1.0 / (h0 + h2 + 1.0)
     e = (d - t.level - t.wave) * a
@@ -336,7 +325,7 @@ cdef inline double _track(
 
 
 cdef inline double _track_rate(const TorsionTrack *t, double motor_velocity) noexcept nogil:
-    """Return the rate of what the filter follows [rad/s]; motor_velocity [rad/s] turns the wave."""
+    """Return the rate [rad/s] of the filtered deflection; motor_velocity [rad/s] turns the wave."""
     return t.rate - WAVE_ORDER * motor_velocity * t.quarter
 
 
@@ -345,7 +334,7 @@ def tracked(
 ):
     """Return (deflection [n], rate [n]) of torsion angles as read [n], through the tracking filter.
 
-    dt_s [n]: step that ends at the sample; after one that is none, or longer than max_gap_s, the filter starts again.
+    dt_s [n]: step that ends at the sample; after one <= 0 or longer than max_gap_s the filter restarts.
     Raises ValueError for arrays of different length.
     """
     rows = [np.asarray(each, np.float64) for each in (deflection_rad, motor_position_rad, motor_velocity_rad_s, dt_s)]
@@ -392,21 +381,21 @@ cdef void _torsion(
         _slip(&law.slip[k], &s.bounds[k], step, out)
 
 
-cdef void _age(const FusedObserverLaw *law, FusedObserverState *s, const Hold *h, FusedObserved *out) noexcept nogil:
-    """Make the torsion as old as the motor path, and set by how much the young one is ahead of it.
+cdef void _delay_torsion(const FusedObserverLaw *law, FusedObserverState *s, const Hold *h, FusedObserved *out) noexcept nogil:
+    """Delay the torsion like the motor path, and set by how much the less delayed one is ahead of it.
 
-    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring. With the torsion
-    tracked the young one is of now: r = 0.
+    g/(s+g) over g_t/(s+g_t) is r + (1 - r) g/(s+g) with r = g/g_t: linear in the torque, whatever the spring. The torsion that is
+    tracked has no delay: r = 0.
     """
-    cdef double young = out.torsion_nm
-    s.torsion_z = _filtered(h, s.torsion_z, young, s.torsion)
-    s.torsion = young
-    out.torsion_nm = s.torsion_z + law.torsion_share * (young - s.torsion_z)
-    out.ahead_nm = young - out.torsion_nm
+    cdef double early = out.torsion_nm
+    s.torsion_z = _filtered(h, s.torsion_z, early, s.torsion)
+    s.torsion = early
+    out.torsion_nm = s.torsion_z + law.torsion_share * (early - s.torsion_z)
+    out.ahead_nm = early - out.torsion_nm
 
 
 cdef void _slip(const Slip *law, Bounds *z, double step, FusedObserved *out) noexcept nogil:
-    """Move a slip by a step of the deflection [rad]; add what it holds, and what its bounds leave open."""
+    """Move a slip by a step of the deflection [rad]; add its torque, and half the width of its bounds."""
     step *= law.inverse_travel
     z.low += step
     z.high += step
@@ -421,9 +410,9 @@ cdef void _slip(const Slip *law, Bounds *z, double step, FusedObserved *out) noe
 
 
 def slipped(d_rad, double travel_rad):
-    """Return z [n] of a Maxwell-slip element that follows d [n], and half the width [n] that its bounds leave open.
+    """Return z [n] of a Maxwell-slip element that follows d [n], and half the width [n] of its bounds.
 
-    Where it began is not known: z is the middle of its bounds, -1 and 1 at first and after each NaN, where z is 0.
+    Its start is unknown: z is the middle of its bounds, -1 and 1 at first and after each NaN, where z is 0.
     """
     cdef const double[::1] d = np.ascontiguousarray(d_rad, np.float64)
     middle, width = np.zeros(len(d)), np.zeros(len(d))
@@ -431,13 +420,13 @@ def slipped(d_rad, double travel_rad):
     cdef Slip law = Slip(0.5, 1.0 / travel_rad)
     cdef Bounds bounds
     cdef FusedObserved out
-    cdef double before = NAN, step
+    cdef double last = NAN, step
     cdef Py_ssize_t k
     for k in range(d.shape[0]):
-        step = d[k] - before
-        before = d[k]
+        step = d[k] - last
+        last = d[k]
         out.torsion_nm = out.open_nm = 0.0
-        if step != step:  # nothing was observed here or before
+        if step != step:  # nothing observed at this sample or the last
             bounds, step = Bounds(-1.0, 1.0), 0.0
         _slip(&law, &bounds, step, &out)
         z[k], w[k] = out.torsion_nm, out.open_nm
@@ -445,7 +434,7 @@ def slipped(d_rad, double travel_rad):
 
 
 cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s, FusedObserved *out) noexcept nogil:
-    """Set what comes out of the filter as it is."""
+    """Set the outputs that are the filter's state itself."""
     out.joint_velocity_rad_s = s.z.v
     out.link_velocity_rad_s = s.link_velocity
     out.cos1, out.sin1 = s.z.cos1, s.z.sin1
@@ -454,7 +443,7 @@ cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s,
 
 
 cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const Sample *x, FusedObserved *out) noexcept nogil:
-    """Set the states of a joint that has always moved at this speed with this torsion; the slip is unknown."""
+    """Set the states of a joint in steady motion at this speed with this torsion; the slip is unknown."""
     cdef int k
     for k in range(law.slips):
         s.bounds[k] = Bounds(-1.0, 1.0)
@@ -505,40 +494,34 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
     s.z.sin4 = _filtered(&h, s.z.sin4, now.sin4, s.last.sin4)
     s.z.direction = _filtered(&h, s.z.direction, now.direction, s.last.direction)
     s.last = now
-    cdef double gone = h.gone if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
-    s.link_velocity += gone * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
+    cdef double decay = h.decay if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
+    s.link_velocity += decay * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
     s.link = x.link_position_rad
     _torsion(law, s, s.z.d, damped, out)
     out.ahead_nm = 0.0
     if law.apart:
-        _age(law, s, &h, out)
+        _delay_torsion(law, s, &h, out)
     _set_outputs(law, s, out)
     out.raw_nm = (s.z.u - law.inertia_rate * x.motor_velocity_rad_s) * law.gear
     if not -law.torsion_limit <= out.torsion_nm <= law.torsion_limit:  # NaN included
         out.raw_nm = NAN
 
 
-cdef int fill_fused_observer(
-    FusedObserverLaw *law,
-    joint,
-    torsion,
-    double bandwidth,
-    double link_bandwidth,
-    double torsion_bandwidth,
-    tracking
-) except -1:
-    """Set the parameters from a joint file; torsion None: its torque is always 0; tracking: None for none."""
+cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, settings) except -1:
+    """Set the parameters; torsion: instead of the joint file's own, None: its torque is always 0."""
+    cdef double bandwidth = settings.bandwidth_rad_s
+    tracking = tracking_of(joint, settings)
     law.tracking = law.tracking_wave = 0.0
     if torsion is not None and tracking is not None:
         law.tracking, law.tracking_wave = tracking.rate_rad_s, tracking.wave_rad_s
-    law.apart = torsion is not None and (torsion_bandwidth != bandwidth or law.tracking > 0.0)
-    law.torsion_rate = torsion_bandwidth
-    law.torsion_share = 0.0 if law.tracking > 0.0 else bandwidth / torsion_bandwidth
+    law.torsion_rate = settings.own_torsion_bandwidth_rad_s
+    law.apart = torsion is not None and (law.torsion_rate != bandwidth or law.tracking > 0.0)
+    law.torsion_share = 0.0 if law.tracking > 0.0 else bandwidth / law.torsion_rate
     law.gear = joint.gear_ratio
     law.inverse_gear = 1.0 / joint.gear_ratio
     law.kt = joint.torque_constant_nm_per_a
     law.inertia_rate = joint.rotor_inertia_kgm2 * bandwidth
-    law.rate, law.link_rate = bandwidth, link_bandwidth
+    law.rate, law.link_rate = bandwidth, settings.link_bandwidth_rad_s
     law.torsion_limit = RAW_LIMIT * joint.rated_torque_nm
     law.stiffness = law.cubic = law.zero = law.damping = 0.0
     law.two = law.four = Wave(0.0, 0.0, 0.0)
@@ -584,87 +567,6 @@ cdef int _add_slip(FusedObserverLaw *law, double torque, double travel) except -
     return 0
 
 
-cdef _python(const FusedObserved *out):
-    return FusedObservedSample(
-        out.raw_nm,
-        out.joint_velocity_rad_s,
-        out.link_velocity_rad_s,
-        out.torsion_nm,
-        out.cos2,
-        out.sin2,
-        out.cos4,
-        out.sin4,
-        out.direction,
-        out.open_nm,
-        out.ahead_nm,
-    )
-
-
-cdef class FusedObserver:
-    """Observer of method `fused` for one joint: motor torque, velocity, torsion torque and ripple angles of one age.
-
-        d       = g/(s+g) (theta_m/G - theta_l - zero - e(theta_m))          e: kinematic error
-        tau_t   = K d + K3 d^3 + D d' + H z,   z = (lo + hi)/2,   open = H (hi - lo)/2      and more slips, a spring that
-                                                                                            hardens: joint.Torsion
-        dlo = dhi = dd/travel, each held in [-1, 1]          Maxwell slip, between bounds: -1 and 1 at each start
-        c_n, s_n = g/(s+g) cos(n theta_m), g/(s+g) sin(n theta_m)     n = RIPPLE_ORDERS
-        direction = g/(s+g) tanh(w/(G w0))                   of friction, as tau_raw knows it
-
-    All pass the same filter, so a torque ripple A cos(n theta_m + phi), which reaches tau_raw through that filter, is
-    exactly linear in c_n and s_n at every speed, and friction that turns with the motion is linear in `direction`,
-    however fast the reversal. The slip follows the filtered deflection: an element that slips would rectify the
-    encoder's noise. Where it was when the observer started is not known: its bounds meet after twice its travel in one
-    direction, and until then `open` is what it may hold to either side of the middle.
-
-    With a bandwidth g_t of its own the torsion, spring and slip included, is formed from the deflection through
-    g_t/(s+g_t). `torsion_nm` is then that torque through [g/(s+g)]/[g_t/(s+g_t)], as old as all the rest, and `ahead_nm`
-    the young torque less it.
-
-    With the torsion tracked, deflection and d' are those of a filter without lag (`tracked`), and `torsion_nm` is that torque
-    through g/(s+g).
-
-    torsion None: its torque is always 0. torsion_bandwidth_rad_s: g_t, None for g. tracking: `joint.Tracking` with wave_rad_s,
-    None for the low pass.
-    """
-
-    def __init__(
-        self,
-        joint,
-        torsion,
-        double bandwidth_rad_s,
-        double link_bandwidth_rad_s,
-        torsion_bandwidth_rad_s=None,
-        tracking=None,
-    ):
-        own = bandwidth_rad_s if torsion_bandwidth_rad_s is None else torsion_bandwidth_rad_s
-        fill_fused_observer(
-            &self.law, joint, torsion, bandwidth_rad_s, link_bandwidth_rad_s, own, tracking
-        )
-
-    def start(
-        self, double current_a, double motor_position_rad, double motor_velocity_rad_s, double link_position_rad
-    ):
-        """Set the states of a joint that has always moved at this speed with this torsion; the slip is unknown."""
-        cdef Sample x = Sample(0.0, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
-        cdef FusedObserved out
-        _start_fused(&self.law, &self.state, &x, &out)
-        return _python(&out)
-
-    def step(
-        self,
-        double dt_s,
-        double current_a,
-        double motor_position_rad,
-        double motor_velocity_rad_s,
-        double link_position_rad,
-    ):
-        """Advance by dt_s > 0 to the sample given and return the outputs at that sample."""
-        cdef Sample x = Sample(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, NAN)
-        cdef FusedObserved out
-        _step_fused(&self.law, &self.state, &x, &out)
-        return _python(&out)
-
-
 # Guard ----------------------------------------------------------------------------------------------------------------
 
 
@@ -678,13 +580,13 @@ cdef int fill_guard(GuardLaw *law, joint, settings) except -1:
 
 
 cdef void restart_guard(GuardState *g) noexcept nogil:
-    """Forget everything: the next sample starts."""
+    """Restart at the next sample."""
     g.running = g.standing = False
     g.status = STARTING
 
 
 cdef bint _garbage(GuardState *g, const Sample *x) noexcept nogil:
-    """Return whether a sample is not finite; the next good one then starts again."""
+    """Return whether a sample is not finite; the observer then restarts at the next good one."""
     if isfinite(x.current_a + x.motor_position_rad + x.motor_velocity_rad_s + x.link_position_rad):
         return False
     g.running = False
@@ -692,19 +594,19 @@ cdef bint _garbage(GuardState *g, const Sample *x) noexcept nogil:
     return True
 
 
-cdef bint _begins(const GuardLaw *law, const GuardState *g, const Sample *x) noexcept nogil:
-    """Return whether the observer is to be set to this sample."""
+cdef bint _starts(const GuardLaw *law, const GuardState *g, const Sample *x) noexcept nogil:
+    """Return whether the observer starts at this sample."""
     return not g.running or not 0.0 < x.dt_s <= law.max_gap
 
 
-cdef void _begun(const GuardLaw *law, GuardState *g, double v) noexcept nogil:
+cdef void _mark_started(const GuardLaw *law, GuardState *g, double v) noexcept nogil:
     g.running = True
     g.standing = fabs(v) < law.stop
     g.status = STARTING
 
 
 cdef bint _judge(const GuardLaw *law, GuardState *g, double raw, double v, double link_velocity) noexcept nogil:
-    """Set the status of a sample that the observer has taken; False when it is implausible."""
+    """Set the status of an observed sample; False when it is implausible."""
     # written so that NaN fails too
     if not (
         -law.raw_limit <= raw <= law.raw_limit and -LINK_SPEED_LIMIT <= link_velocity <= LINK_SPEED_LIMIT
@@ -724,12 +626,12 @@ cdef bint _judge(const GuardLaw *law, GuardState *g, double raw, double v, doubl
 cdef bint observe(
     const GuardLaw *guard, GuardState *g, const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out
 ) noexcept nogil:
-    """Take a sample; False when there is no output and the guard's status, STARTING or INVALID, says why."""
+    """Take a sample; False: no output, and the guard's status is STARTING or INVALID."""
     if _garbage(g, x):
         return False
-    if _begins(guard, g, x):
+    if _starts(guard, g, x):
         _start(law, s, x, out)
-        _begun(guard, g, out.joint_velocity_rad_s)
+        _mark_started(guard, g, out.joint_velocity_rad_s)
         return False
     _step(law, s, x, out)
     return _judge(guard, g, out.raw_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)
@@ -746,9 +648,9 @@ cdef bint observe_fused(
     """Take a sample as `observe`."""
     if _garbage(g, x):
         return False
-    if _begins(guard, g, x):
+    if _starts(guard, g, x):
         _start_fused(law, s, x, out)
-        _begun(guard, g, out.joint_velocity_rad_s)
+        _mark_started(guard, g, out.joint_velocity_rad_s)
         return False
     _step_fused(law, s, x, out)
     return _judge(guard, g, out.raw_nm, out.joint_velocity_rad_s, out.link_velocity_rad_s)

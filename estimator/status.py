@@ -39,9 +39,8 @@ TORSION: Final = 0x20
 CURRENT_FROZEN: Final = 0x40
 """Bits of faults that `jtqd.estimator.plausibility` finds."""
 
-
-CONTACT_CODES: Final = (0, 1, 2, 3)
-"""Of a contact: not watched, not known, none, there (docs/estimator.md)."""
+CONTACT_OFF, CONTACT_UNKNOWN, CONTACT_NONE, CONTACT_PRESENT = range(4)
+"""Codes of a contact; off: not watched (docs/estimator.md)."""
 
 
 class Estimate(NamedTuple):

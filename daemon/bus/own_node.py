@@ -32,9 +32,8 @@ from jtqd.drivers.own_objects import (
 from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
 from jtqd.estimator.settings import age_ms
-from jtqd.estimator.status import CONTACT_CODES, OFF, STALE
+from jtqd.estimator.status import CONTACT_NONE, CONTACT_OFF, CONTACT_PRESENT, CONTACT_UNKNOWN, OFF, STALE
 
-_NOT_WATCHED, _UNKNOWN, _NONE, _CONTACT = CONTACT_CODES
 _STANDSTILL_S = 0.2
 """A loop whose snapshot has not moved for so long is not running (it moves every 8 cycles)."""
 _MS_TO_INHIBIT = 10
@@ -135,14 +134,15 @@ class OwnNode:
     def _contact(self, joint: int, part: int) -> int:
         """Return torque rate (0) or code (1) of a joint as in the contact PDO."""
         if joint >= self._joints or not self._watches:
-            return contact_pdo.field(nan, nan, _NOT_WATCHED)[part]
+            return contact_pdo.field(nan, nan, CONTACT_OFF)[part]
         view = self._reader.read()
         if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
-            return contact_pdo.field(nan, nan, _UNKNOWN)[part]
+            return contact_pdo.field(nan, nan, CONTACT_UNKNOWN)[part]
         last = view.joints[joint]
-        there = last.input_flags & FLAG_CONTACT
-        known = _CONTACT if there else _NONE if last.input_flags & FLAG_CONTACT_KNOWN else _UNKNOWN
-        return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, known)[part]
+        code = CONTACT_NONE if last.input_flags & FLAG_CONTACT_KNOWN else CONTACT_UNKNOWN
+        if last.input_flags & FLAG_CONTACT:
+            code = CONTACT_PRESENT
+        return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, code)[part]
 
     def _contacts(self, pair: int) -> int:
         """Return the contact byte of the PDO that begins with joint `pair`."""

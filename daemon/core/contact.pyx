@@ -12,11 +12,11 @@ from jtqd.daemon.core.record cimport JointBlock
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.contact cimport (
     CONTACT_OFF,
-    CONTACT_THERE,
+    CONTACT_PRESENT,
     CONTACT_UNKNOWN,
     fill_contact,
     restart_contact,
-    watch_contact,
+    detect_contact,
 )
 
 cdef int KNOWN = cr.FLAG_CONTACT_KNOWN, THERE = cr.FLAG_CONTACT
@@ -54,16 +54,16 @@ cdef class ContactWatch:
         self.begun = 0
         while n < self.count:
             s = &self.state[n]
-            before = s.told
+            before = s.code
             if self.opposed:
-                watch_contact(
+                detect_contact(
                     &self.law[n], s, joints[n + 1].load_nm - joints[n].load_nm, joints[n].sample.motor_position_rad
                 )
-                self.report(joints[n + 1], n + 1, -s.residual_nm, s.told)
+                self.report(joints[n + 1], n + 1, -s.residual_nm, s.code)
             else:
-                watch_contact(&self.law[n], s, -joints[n].load_nm, joints[n].sample.motor_position_rad)
-            self.report(joints[n], n, s.residual_nm, s.told)
-            if s.told == CONTACT_THERE and before != CONTACT_THERE:  # a receiver stops on it, whatever was known before
+                detect_contact(&self.law[n], s, -joints[n].load_nm, joints[n].sample.motor_position_rad)
+            self.report(joints[n], n, s.residual_nm, s.code)
+            if s.code == CONTACT_PRESENT and before != CONTACT_PRESENT:  # a receiver stops on it, whatever was known before
                 self.begun += 1
             n += 2 if self.opposed else 1
 
@@ -73,7 +73,7 @@ cdef class ContactWatch:
         record.contact_nm = contact_nm
         record.input_flags &= ~(KNOWN | THERE)
         if state != CONTACT_UNKNOWN:
-            record.input_flags |= KNOWN | THERE if state == CONTACT_THERE else KNOWN
+            record.input_flags |= KNOWN | THERE if state == CONTACT_PRESENT else KNOWN
         self.fields[n] = contact_field(record.torque_rate_nm_s, contact_nm, state)
 
     cdef void withdraw(self, JointState **joints) noexcept nogil:

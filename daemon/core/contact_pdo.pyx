@@ -14,7 +14,7 @@ from libc.stdint cimport int8_t, uint8_t
 import struct
 from typing import NamedTuple
 
-from jtqd.estimator.status import CONTACT_CODES
+from jtqd.estimator.status import CONTACT_OFF, CONTACT_PRESENT, CONTACT_UNKNOWN
 
 LAYOUT = struct.Struct("<bbBB")
 NO_RATE = -0x80
@@ -22,8 +22,8 @@ RATE_UNIT_NM_S = 32.0
 POSITIVE, NEGATIVE = 3, 4
 CODE_NAMES = {0: "off", 1: "unknown", 2: "none", POSITIVE: "positive", NEGATIVE: "negative"}
 
-cdef int NONE = NO_RATE, AGAINST = NEGATIVE, NOT_WATCHED, UNKNOWN, THERE
-NOT_WATCHED, UNKNOWN, _, THERE = CONTACT_CODES
+cdef int NONE = NO_RATE, AGAINST = NEGATIVE
+cdef int OFF = CONTACT_OFF, UNKNOWN = CONTACT_UNKNOWN, THERE = CONTACT_PRESENT
 cdef double PER_NM_S = 1.0 / RATE_UNIT_NM_S, LARGEST = 127.0
 
 
@@ -56,7 +56,7 @@ cdef void encode_contact(uint8_t *data, const ContactField *one, const ContactFi
     data[3] = sequence
 
 
-NO_JOINT = contact_field(NAN, NAN, NOT_WATCHED)
+NO_JOINT = contact_field(NAN, NAN, OFF)
 
 
 def field(double torque_rate_nm_s, double contact_nm, int state):

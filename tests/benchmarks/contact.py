@@ -1,4 +1,4 @@
-"""How soon a push is told as a contact, and how often there is none: `python -m tests.benchmarks.contact DIR`.
+"""Delay of the detection of a push, and rate of false contacts: `python -m tests.benchmarks.contact DIR`.
 
 On the paper's Table I and on the two harder benches (docs/testing.md), as emulated runs with the joint files that were
 identified on each bench. Practice days set the threshold: MARGIN times the largest residual of their quiet runs. Everything
@@ -23,9 +23,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.contact import CONTACT, ContactDetector, link_loads
+from jtqd.estimator.contact import detect_contacts, link_loads
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
+from jtqd.estimator.status import CONTACT_PRESENT
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
 from jtqd.sim_can.plants import AnyPlant, load_any_plant
@@ -49,7 +50,7 @@ SETTINGS = recommended("fused")
 
 
 class Watched(NamedTuple):
-    """Residual and what is told [n]: opposed, then joint 1 alone."""
+    """Residual and code [n]: opposed, then joint 1 alone."""
 
     opposed: tuple[FloatArray, CodeArray]
     alone: tuple[FloatArray, CodeArray]
@@ -121,7 +122,7 @@ def emulated(plant: AnyPlant, seed: int, day: int, pushes: Iterable[Push] = ()) 
 
 
 def watched(joints: tuple[Joint, Joint], made: EmulatedRun, threshold_nm: float, alone_nm: float) -> Watched:
-    """Return what is told of a run."""
+    """Return residuals and codes of a run."""
     time_s, loads = made.table.time_s, []
     dt = np.diff(time_s, prepend=time_s[0])
     for number, joint in enumerate(joints, start=1):
@@ -131,14 +132,14 @@ def watched(joints: tuple[Joint, Joint], made: EmulatedRun, threshold_nm: float,
     angle = made.table.joints[1].motor_position_rad
     assert angle is not None
     return Watched(
-        ContactDetector(threshold_nm).run(loads[1] - loads[0], angle),
-        ContactDetector(alone_nm).run(-loads[0], angle),
+        detect_contacts(loads[1] - loads[0], angle, threshold_nm),
+        detect_contacts(-loads[0], angle, alone_nm),
     )
 
 
-def begun(told: CodeArray) -> int:
-    """Return how many contacts are told."""
-    there = told == CONTACT
+def begun(codes: CodeArray) -> int:
+    """Return the number of contacts."""
+    there = codes == CONTACT_PRESENT
     return int(np.count_nonzero(there[1:] & ~there[:-1]))
 
 
@@ -170,7 +171,7 @@ def drawn(
 
 
 def pushed(bench: str, models: Path, threshold_nm: float, shape: tuple[float, int], seed: int) -> list[float]:
-    """Return after how long [ms] each push of a seed's runs was told at the SYNC of its inputs; inf: not within LATE_MS.
+    """Return after how long [ms] each push of a seed's runs was detected at the SYNC of its inputs; inf: not within LATE_MS.
 
     shape: torque [Nm] and rise [ms] of the pushes.
     """
@@ -179,11 +180,11 @@ def pushed(bench: str, models: Path, threshold_nm: float, shape: tuple[float, in
     for day, run in enumerate(planned(seed)):
         pushes = drawn(run, rng, *shape)
         made = emulated(plant, seed, day, [step for _, _, steps in pushes for step in steps])
-        residual, told = watched(joints, made, threshold_nm, math.inf).opposed
+        residual, codes = watched(joints, made, threshold_nm, math.inf).opposed
         for begin, torque, _ in pushes:
             first = math.floor(1e3 * begin) + 1
             rows = slice(first, first + round(LATE_MS))
-            hit = np.flatnonzero((told[rows] == CONTACT) & (residual[rows] * torque > 0.0))
+            hit = np.flatnonzero((codes[rows] == CONTACT_PRESENT) & (residual[rows] * torque > 0.0))
             found.append(first + float(hit[0]) - 1e3 * begin if len(hit) else math.inf)
     return found
 
@@ -204,7 +205,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--bench", choices=BENCHES, action="append", help="only this one; may be repeated")
     options = parser.parse_args(arguments)
     print(
-        f"push of {options.torque:g} Nm within {options.rise_ms} ms, told after [ms]: at the SYNC of its inputs; "
+        f"push of {options.torque:g} Nm within {options.rise_ms} ms, detected after [ms]: at the SYNC of its inputs; "
         "on the bus at the latest: 1 ms more"
     )
     print(
@@ -232,8 +233,8 @@ def main(arguments: list[str]) -> int:
             alone = MARGIN * max(practice.largest_alone)
             reported = days(REPORTED, options.hours, (threshold, threshold))
             seeds = range(PUSHED, PUSHED + options.pushes)
-            told = partial(pushed, bench, models, threshold, (options.torque, options.rise_ms))
-            after = np.array([each for one in pool.map(told, seeds) for each in one])
+            delays = partial(pushed, bench, models, threshold, (options.torque, options.rise_ms))
+            after = np.array([each for one in pool.map(delays, seeds) for each in one])
             hours = reported.seconds / 3600.0
             shares = [100.0 * np.mean(after + PERIOD_MS <= limit) for limit in (3.0, 5.0)]
             print(

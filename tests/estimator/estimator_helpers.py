@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -17,6 +18,13 @@ from jtqd.sysid.train.network import Layer, export_network, forward
 SIZES = (6, 20, 40, 10, 1)
 LOW = (-6.0, -200.0, -250.0, -2.0, -2.5, -40.0)
 HIGH = (6.0, 200.0, 250.0, 2.0, 2.5, 40.0)
+
+
+def first_order_hold(rate_rad_s: float, dt_s: float) -> tuple[float, float, float]:
+    """(a, b0, b1) of z_k = a z_(k-1) + b0 u_k + b1 u_(k-1): g/(s+g), exact for an input linear between samples."""
+    x = rate_rad_s * dt_s
+    share = -math.expm1(-x) / x
+    return math.exp(-x), 1.0 - share, share - math.exp(-x)
 
 
 def joint1() -> Joint:

@@ -16,12 +16,12 @@ from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import FrictionModel, LossModel
 from jtqd.estimator.network import TorqueNetwork
-from jtqd.estimator.observer import first_order_hold
 from jtqd.estimator.settings import METHODS as ALL_METHODS
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
 from tests.estimator.estimator_helpers import (
     Motion,
+    first_order_hold,
     joint1,
     motion,
     reciprocal_efficiency,

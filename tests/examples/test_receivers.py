@@ -22,7 +22,7 @@ from examples.receivers import receive_estimate
 from jtqd.daemon.core import contact_pdo, estimate_pdo
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.hub import Hub
-from jtqd.estimator import contact, status
+from jtqd.estimator import status
 from tests.paths import ROOT
 from tests.shipped_bench import shipped_bench
 
@@ -56,7 +56,7 @@ def test_what_the_daemon_encodes_is_decoded():
         receive_estimate.decode(FRAME[:7])
 
 
-def pushed(sequence, one=contact.NONE, two=contact.NONE, rate=640.0, push=2.9):
+def pushed(sequence, one=status.CONTACT_NONE, two=status.CONTACT_NONE, rate=640.0, push=2.9):
     """A contact PDO; a push of joint 1 along its positive direction is one of joint 2 against its own."""
     return contact_pdo.encode(
         contact_pdo.field(rate, push, one), contact_pdo.field(-rate, -push, two), sequence
@@ -64,12 +64,12 @@ def pushed(sequence, one=contact.NONE, two=contact.NONE, rate=640.0, push=2.9):
 
 
 def test_contacts_that_the_daemon_encodes_are_decoded():
-    assert receive_estimate.decode_contact(pushed(17, contact.CONTACT, contact.CONTACT)) == (
+    assert receive_estimate.decode_contact(pushed(17, status.CONTACT_PRESENT, status.CONTACT_PRESENT)) == (
         (640.0, "positive"),
         (-640.0, "negative"),
         17,
     )
-    data = pushed(1, contact.OFF, contact.UNKNOWN, rate=math.nan)
+    data = pushed(1, status.CONTACT_OFF, status.CONTACT_UNKNOWN, rate=math.nan)
     assert receive_estimate.decode_contact(data)[:2] == ((None, "off"), (None, "unknown"))
     assert contact_pdo.CODE_NAMES == receive_estimate.CONTACT
     with pytest.raises(struct.error):
@@ -95,7 +95,7 @@ def test_it_prints_what_comes_over_a_unix_bus(tmp_path, monkeypatch, capsys):
                 while not ended.wait(0.01):
                     sender.send(can.Message(arbitration_id=0x1A1, data=FRAME, is_extended_id=False))
                     sender.send(can.Message(arbitration_id=0x1A0, data=FRAME, is_extended_id=False))
-                    touch = pushed(42, contact.CONTACT)
+                    touch = pushed(42, status.CONTACT_PRESENT)
                     sender.send(can.Message(arbitration_id=0x3A0, data=touch, is_extended_id=False))
 
             worker = threading.Thread(target=send)
@@ -253,8 +253,8 @@ def test_the_header_tells_contacts(transcript):
     lines = transcript(
         f"touched 1 {MS}",
         take(0x080, 1.0, bytes([7])),
-        take(0x3A0, 1.8, pushed(7, contact.CONTACT, contact.CONTACT)),
-        take(0x4A0, 1.8, pushed(7, contact.NONE, contact.UNKNOWN, rate=-9e9)),
+        take(0x3A0, 1.8, pushed(7, status.CONTACT_PRESENT, status.CONTACT_PRESENT)),
+        take(0x4A0, 1.8, pushed(7, status.CONTACT_NONE, status.CONTACT_UNKNOWN, rate=-9e9)),
         *(f"touched {joint} {2 * MS}" for joint in (1, 2, 3, 4, 5)),
         "counters",
     )
@@ -280,7 +280,7 @@ def test_no_contact_is_believed_of_a_young_pdo_of_the_last_two_syncs_only(transc
 
 
 def test_a_repeated_contact_is_heard_and_malformed_ones_are_not(transcript):
-    again = pushed(7, contact.CONTACT)
+    again = pushed(7, status.CONTACT_PRESENT)
     lines = transcript(take(0x3A0, 1.8, pushed(7)), take(0x3A0, 1.9, again), f"touched 1 {2 * MS}")
     assert lines[1:] == ["0", "positive 640 200000"]
     bad = [take(0x3A0, 1.8, each) for each in (again[:3], pushed(0), pushed(241), bytes(8))]
@@ -503,7 +503,7 @@ def test_the_program_stops_on_a_contact_and_uses_nothing_before_it_knows_of_none
             assert until(receiver.stdout, "USE")[-1].startswith("USE   valid 1.00 Nm"), (
                 "not while nobody knows"
             )
-            send(2, 0x3A0, pushed(2, contact.CONTACT))
+            send(2, 0x3A0, pushed(2, status.CONTACT_PRESENT))
             assert until(receiver.stdout, "STOP")[-1].startswith(
                 "STOP  contact positive, torque rate 640 Nm/s, age "
             )

@@ -25,10 +25,10 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
-from jtqd.estimator.contact import CONTACT, NONE, ContactDetector, link_loads
+from jtqd.estimator.contact import detect_contacts, link_loads
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.settings import recommended
-from jtqd.estimator.status import INVALID
+from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, INVALID
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, Push, emulate
 from jtqd.sim_can.plants import load_any_plant
@@ -194,9 +194,9 @@ def test_the_loop_says_what_the_arrays_say(tmp_path: Path, exact: ExactTime) -> 
             load_joint(shipped(f"trained/joint{n + 1}.yaml")), SETTINGS, *(np.array(each) for each in columns)
         )[1]
     angle = np.array([each.motor_position_rad for each in joints[0]])
-    residual, told = ContactDetector(THRESHOLD_NM).run(loads[1] - loads[0], angle)
+    residual, codes = detect_contacts(loads[1] - loads[0], angle, THRESHOLD_NM)
     np.testing.assert_array_equal([each.contact_nm for each in joints[0]], residual)
-    assert {CONTACT, NONE} < set(told.tolist())
+    assert {CONTACT_NONE, CONTACT_PRESENT} < set(codes.tolist())
 
 
 def test_alone_at_rest_each_joint_sees_its_half_of_the_push(tmp_path: Path, exact: ExactTime) -> None:

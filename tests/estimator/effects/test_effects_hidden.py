@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from jtqd.estimator.effects.array_functions import ArrayFunctions
 from jtqd.estimator.effects.effect import State
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
-from jtqd.estimator.observer import first_order_hold
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.effects.effect_signals import balances
@@ -118,11 +117,7 @@ def slow(p: Mapping[str, float], state: State, weight: FloatArray) -> FloatArray
 
 def filtered(x: FloatArray, rate_rad_s: float) -> FloatArray:
     """The observer's filter at 1 kHz: the reference then has the estimate's age."""
-    a, b0, b1 = first_order_hold(rate_rad_s, 1e-3)
-    out = [float(x[0])]
-    for before, now in pairwise(x.tolist()):
-        out.append(a * out[-1] + b0 * now + b1 * before)
-    return np.array(out)
+    return low_pass(x, np.full(len(x), 1e-3), rate_rad_s)
 
 
 def rms(x: Any, weight: FloatArray) -> float:

@@ -31,7 +31,7 @@ from jtqd.sysid.fit.residuals import PathResiduals, fused_errors, path_residuals
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S, fit_torsion
 from tests.estimator.fused_helpers import fused_joint
-from tests.estimator.test_torsion_bandwidth import lossless
+from tests.estimator.test_torsion_filters import lossless
 from tests.sysid.fit.fused_signals import (
     FUSED,
     STIFF,

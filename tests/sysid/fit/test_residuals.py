@@ -11,7 +11,7 @@ from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Tracking
-from jtqd.estimator.observer import first_order_hold, low_pass
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
@@ -20,11 +20,11 @@ from jtqd.sysid.fit.calibration import bent_square, fit_tracking
 from jtqd.sysid.fit.residuals import FusedErrors, fused_errors, path_residuals
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
-from tests.estimator.estimator_helpers import joint1
+from tests.estimator.estimator_helpers import first_order_hold, joint1
 from tests.estimator.fused_helpers import twisted
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_day_zeros import DAYS, LEARNING
-from tests.estimator.test_torsion_bandwidth import lossless
+from tests.estimator.test_torsion_filters import lossless
 from tests.estimator.test_zeros import driven
 from tests.sysid.fit.fused_signals import FUSED, STIFF, made_run, smooth_loss
 from tests.sysid.fit.test_repeatability import fused
