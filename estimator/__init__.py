@@ -1,7 +1,7 @@
 """Joint torque from motor current and encoder positions: observer, losses, fusion, network, uncertainty, status.
 
-Samples or run tables in, estimates out, in SI units; no clock, no file but a network's, no socket. Imports numpy and
-itself; onnxruntime only when a network is loaded. The public names are imported when they are first used.
+Samples or run tables in, estimates out, in SI units; no clock, no file but a network's, no socket. Imports onnxruntime
+only when a network is loaded, and its own modules when a public name is first used.
 
 The torque of a joint that turns at 1 rad/s with 3 A, from arrays:
 
@@ -31,50 +31,33 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from jtqd.estimator.errors import ConfigError
-    from jtqd.estimator.joint import Effect, Joint
-    from jtqd.estimator.methods import estimate_columns, make_estimator
-    from jtqd.estimator.network import load_network
-    from jtqd.estimator.onnx_graph import NetworkError
-    from jtqd.estimator.run import EstimateRun, JointColumns, RunTable, RunTableError
-    from jtqd.estimator.settings import METHODS, EstimatorSettings
-    from jtqd.estimator.status import Estimate
-
-__all__ = [
-    "METHODS",
-    "ConfigError",
-    "Effect",
-    "Estimate",
-    "EstimateRun",
-    "EstimatorSettings",
-    "Joint",
-    "JointColumns",
-    "NetworkError",
-    "RunTable",
-    "RunTableError",
-    "estimate_columns",
-    "load_network",
-    "make_estimator",
-]
-
-_MODULES = {
-    "METHODS": "settings",
-    "ConfigError": "checked",
-    "Effect": "joint",
-    "Estimate": "status",
-    "EstimateRun": "run",
-    "EstimatorSettings": "settings",
-    "Joint": "joint",
-    "JointColumns": "run",
-    "NetworkError": "onnx_graph",
-    "RunTable": "run",
-    "RunTableError": "run",
-    "estimate_columns": "methods",
-    "load_network": "network",
-    "make_estimator": "methods",
-}
-
-if not TYPE_CHECKING:  # each process of the daemon imports this package for a few of its modules
+    from jtqd.estimator.errors import ConfigError as ConfigError
+    from jtqd.estimator.joint import Effect as Effect
+    from jtqd.estimator.joint import Joint as Joint
+    from jtqd.estimator.methods import estimate_columns as estimate_columns
+    from jtqd.estimator.methods import make_estimator as make_estimator
+    from jtqd.estimator.network import load_network as load_network
+    from jtqd.estimator.onnx_graph import NetworkError as NetworkError
+    from jtqd.estimator.run import EstimateRun as EstimateRun
+    from jtqd.estimator.run import JointColumns as JointColumns
+    from jtqd.estimator.run import RunTable as RunTable
+    from jtqd.estimator.run import RunTableError as RunTableError
+    from jtqd.estimator.settings import METHODS as METHODS
+    from jtqd.estimator.settings import EstimatorSettings as EstimatorSettings
+    from jtqd.estimator.status import Estimate as Estimate
+else:  # each process of the daemon imports this package for a few of its modules
+    _NAMES = {
+        "errors": ("ConfigError",),
+        "joint": ("Effect", "Joint"),
+        "methods": ("estimate_columns", "make_estimator"),
+        "network": ("load_network",),
+        "onnx_graph": ("NetworkError",),
+        "run": ("EstimateRun", "JointColumns", "RunTable", "RunTableError"),
+        "settings": ("METHODS", "EstimatorSettings"),
+        "status": ("Estimate",),
+    }
+    _MODULES = {name: module for module, names in _NAMES.items() for name in names}
+    __all__ = list(_MODULES)
 
     def __getattr__(name):
         """Import a public name from its module at its first use."""
