@@ -33,6 +33,7 @@ from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.counters import COUNTERS, word_of
+from jtqd.daemon.shared.reasons import STATUS_OF_STATE
 from jtqd.drivers.drive import STATE_MASK, STATES
 from jtqd.estimator import status as st
 from jtqd.estimator.observer cimport follow_reference, restart_reference
@@ -281,12 +282,12 @@ if STATE_BITS != STATE_MASK:
     raise ImportError(f"found {STATE_MASK:02X}h, expected the state of a drive in the bits {STATE_BITS:02X}h of its statusword")
 cdef int8_t OF_STATE[STATE_BITS + 1]
 for _code in range(STATE_BITS + 1):
-    _forced = faults.STATUS_OF_STATE.get(STATES[_code], st.OFF)
+    _forced = STATUS_OF_STATE.get(STATES[_code], st.OFF)
     OF_STATE[_code] = POWERED if _forced is None else _forced
 
 
 cdef int _forced_status(int statusword) noexcept nogil:
-    """Return the status that the state of a drive forces (`faults.STATUS_OF_STATE`), POWERED for none."""
+    """Return the status that the state of a drive forces (`shared.reasons.STATUS_OF_STATE`), POWERED for none."""
     return OF_STATE[statusword & STATE_BITS]
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from jtqd.drivers.drive import State
 from jtqd.estimator import status as st
 from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 
@@ -48,14 +47,6 @@ MEANINGS: Final = {
     DRIVE_FAULT: "the drive was in fault",
     STALE: "too many consecutive cycles without a torque",
 }
-
-STATUS_OF_STATE: Final = {
-    State.OPERATION_ENABLED: None,
-    State.QUICK_STOP: None,
-    State.FAULT_REACTION: st.DRIVE_FAULT,
-    State.FAULT: st.DRIVE_FAULT,
-}
-"""Status that the state of its drive forces on a joint: None where the motor carries current; every other state is off."""
 
 
 def names_of(bits: int) -> tuple[str, ...]:

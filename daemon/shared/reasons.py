@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from math import isfinite
+from typing import Final
 
 from jtqd.daemon.shared.cycle_record import (
     FLAG_CONTACT,
@@ -13,7 +14,7 @@ from jtqd.daemon.shared.cycle_record import (
     FLAG_POSITION,
     FLAG_SENSOR,
 )
-from jtqd.daemon.shared.faults import MEANINGS, NAMES, STATUS_OF_STATE
+from jtqd.daemon.shared.faults import MEANINGS, NAMES
 from jtqd.daemon.shared.runtime_dir import About, AboutJoint
 from jtqd.daemon.shared.snapshot import NO_ZEROS, JointView, View
 from jtqd.drivers import nmt
@@ -21,6 +22,13 @@ from jtqd.drivers.drive import State, state_of
 from jtqd.estimator import status as st
 from jtqd.estimator.status import APART, LEFT, Zeros
 
+STATUS_OF_STATE: Final = {
+    State.OPERATION_ENABLED: None,
+    State.QUICK_STOP: None,
+    State.FAULT_REACTION: st.DRIVE_FAULT,
+    State.FAULT: st.DRIVE_FAULT,
+}
+"""Status that the state of its drive forces on a joint: None where the motor carries current; every other state is off."""
 SILENT_AFTER = 3.0
 """Heartbeat periods without a heartbeat after which a node is silent."""
 _FIRST_CYCLES = 20
