@@ -292,7 +292,7 @@ class RunTable:
         all_cycles: bool = False,
     ) -> None:
         self.cycles = self.left_out = 0
-        self._path, self._span, self._all = path, {"start_ns": start_ns, "end_ns": end_ns}, all_cycles
+        self._path, self._start_ns, self._end_ns, self._all = path, start_ns, end_ns, all_cycles
         there = topics_of(path)
         self._topics = {n: topic for n, topic in _JOINT_TOPICS.items() if n == 1 or topic in there}
         wanted = {f"j{n}.{column}": (n, field) for n in self._topics for column, field in RUN_FIELDS.items()}
@@ -343,7 +343,8 @@ class RunTable:
     def _rows(self) -> Iterator[dict[int, Records]]:
         """Yield rows (`_ROW`) of all joints, of the same cycles."""
         rest = {number: np.empty(0, _ROW) for number in self._topics}
-        for found in iter_topics(self._path, tuple(self._topics.values()), **self._span):
+        topics = tuple(self._topics.values())
+        for found in iter_topics(self._path, topics, start_ns=self._start_ns, end_ns=self._end_ns):
             for number, topic in self._topics.items():
                 if topic in found:
                     rest[number] = np.concatenate([rest[number], _picked(found[topic].records, topic)])

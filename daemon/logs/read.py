@@ -99,22 +99,25 @@ def iter_topics(
     *,
     start_ns: int | None = None,
     end_ns: int | None = None,
+    least: int = 1,
 ) -> Iterator[dict[str, Messages]]:
-    """Messages of several topics, span by span: of each topic those of one chunk, until the next chunk has that topic too.
+    """Messages of several topics, span by span: a span ends before a chunk with a topic that has `least` messages in it.
 
     Raises as `read_topics` does.
     """
-    found: dict[str, Messages] = {}
+    tables: dict[str, _Table] = {}
     for piece in _pieces(log_parts(path), topics, start_ns, end_ns):
-        if piece.topic in found:
-            yield found
-            found = {}
-        table = _Table(piece.topic)
-        table.add(piece._replace(expected=0))
-        if table.count:
-            found[piece.topic] = table.messages()
-    if found:
-        yield found
+        if piece.topic in tables and tables[piece.topic].count >= least:
+            yield _taken(tables)
+        expected = 0 if least == 1 else min(piece.expected, least + _FIRST_ROWS)
+        tables.setdefault(piece.topic, _Table(piece.topic)).add(piece._replace(expected=expected))
+    if tables:
+        yield _taken(tables)
+
+
+def _taken(tables: dict[str, _Table]) -> dict[str, Messages]:
+    """Return the messages of the tables, which are forgotten: they are freed when the caller drops them."""
+    return {topic: tables.pop(topic).messages() for topic in list(tables)}
 
 
 class _Piece(NamedTuple):

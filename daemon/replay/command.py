@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from collections.abc import Iterable
 from math import isnan
 from pathlib import Path
 from typing import Any
@@ -13,14 +11,16 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Schema
 
-from jtqd.daemon.logs import LogError, read_attachments
+from jtqd.daemon.logs import LogError, LogFile
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import CDR_HEADER, JOINT_ESTIMATE_SIZE
+from jtqd.daemon.recording.messages import CycleMessages
 from jtqd.daemon.recording.run_files import ACTIVE
 from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Contacts, Difference, Identity, Unknown
-from jtqd.daemon.replay.logged import SAMPLE
-from jtqd.daemon.replay.session import ReplayOptions, Result, replay_each
+from jtqd.daemon.replay.logged import ADDED, SAMPLE, STAMP
+from jtqd.daemon.replay.runs import stamps_ns
+from jtqd.daemon.replay.session import ReplayOptions, Result, as_json, content, replay_each
+from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.command_line import check_output
 from jtqd.estimator.errors import ConfigError
@@ -37,95 +37,72 @@ def number(count: int) -> str:
 
 def text(result: Result, *, compared: bool) -> str:
     """Return the report of one run; `compared`: with the differences, although the models are those of the log."""
-    lines = [*_head(result)]
-    if result.identity is not None:
-        lines += _identity(result, result.identity)
-    if compared or result.identity is None:
-        lines += [line for each in result.comparisons for line in _comparison(each, result.identity is None)]
-    return "\n".join(lines)
-
-
-def _head(result: Result) -> list[str]:
-    logs = ", ".join(str(part.path) for part in result.run.parts)
+    same = result.identity
     speed = result.seconds / max(result.replay_s, 1e-9)
     lines = [
-        logs,
+        ", ".join(map(str, result.run.logs)),
         f"  {number(result.run.cycles)} cycles, {result.seconds:.3f} s, method {result.method}; "
         f"{result.replay_s:.2f} s ({speed:.0f} times real time), reading {result.read_s:.2f} s",
     ]
-    if result.identity is None:
-        lines += [f"  joint {n}: {file}" for n, file in enumerate(result.files, start=1)]
-    if result.lost:
-        lines.append(f"  {number(result.lost)} cycles are missing in the middle of the log")
-    if result.from_si:
-        lines.append(
-            f"  {number(result.from_si)} inputs have no frame in the log: taken from the recorded SI values"
-        )
-    if result.temperatures_from_log:
-        lines.append(
-            f"  {number(result.temperatures_from_log)} times the temperature is not in the frames: taken from the log"
-        )
-    return lines
+    if same is None:
+        lines += [f"  joint {n}: {model.source}" for n, model in enumerate(result.models, start=1)]
+    for count, what in (
+        (result.lost, "cycles are missing in the middle of the log"),
+        (result.from_si, "inputs have no frame in the log: taken from the recorded SI values"),
+        (result.temperatures_from_log, "times the temperature is not in the frames: taken from the log"),
+    ):
+        if count:
+            lines.append(f"  {number(count)} {what}")
+    if same is not None:
+        lines.append(_verdict(same, int(result.run.joints[0]["cycle"][0])))
+        if same.pdos:
+            equal = f"{number(same.pdos_equal)} of {number(same.pdos)}"
+            lines.append(f"  estimate PDO on the bus: same bytes in {equal}")
+        lines += map(_contacts, same.contacts)
+        lines += map(_unknown, same.unknown)
+        lines += map(_difference, same.differences)
+    if compared or same is None:
+        for each in result.comparisons:
+            lines += _comparison(each, "now" if same is None else "replayed")
+    return "\n".join(lines)
 
 
-def _identity(result: Result, same: Identity) -> list[str]:
-    verdict = f"{number(same.identical)} of {number(same.cycles)} cycles"
-    since = same.from_cycle
-    from_on = "" if since in (None, _first_cycle(result)) else f" from cycle {number(since)} on"
-    if same.explained and since is not None and same.network_nm:
-        lines = [
-            f"  equal to {same.network_nm:.1g} Nm{from_on}; bit-identical: {verdict} (the networks were evaluated otherwise "
-            "when this log was recorded)"
-        ]
-    elif same.explained and since is not None:
-        lines = [f"  bit-identical{from_on}: {verdict}"]
-    else:
-        lines = [f"  NOT bit-identical: {verdict}"]
-    if same.pdos:
-        lines.append(
-            f"  estimate PDO on the bus: same bytes in {number(same.pdos_equal)} of {number(same.pdos)}"
-        )
-    lines += [_contacts(each) for each in same.contacts]
-    lines += [_unknown(each) for each in same.unknown]
-    lines += [_difference(each) for each in same.differences]
-    return lines
-
-
-def _first_cycle(result: Result) -> int:
-    return int(result.run.joints[0]["cycle"][0])
+def _verdict(same: Identity, first_cycle: int) -> str:
+    counts = f"{number(same.identical)} of {number(same.cycles)} cycles"
+    if not same.explained or same.from_cycle is None:
+        return f"  NOT bit-identical: {counts}"
+    from_on = "" if same.from_cycle == first_cycle else f" from cycle {number(same.from_cycle)} on"
+    if not same.network_nm:
+        return f"  bit-identical{from_on}: {counts}"
+    return (
+        f"  equal to {same.network_nm:.1g} Nm{from_on}; bit-identical: {counts} (the networks were evaluated otherwise "
+        "when this log was recorded)"
+    )
 
 
 def _contacts(each: Contacts) -> str:
-    count = (
-        "no contact"
-        if each.logged == 0
-        else "1 contact"
-        if each.logged == 1
-        else f"{number(each.logged)} contacts"
-    )
+    count = "1 contact" if each.logged == 1 else f"{number(each.logged) if each.logged else 'no'} contacts"
     if not each.different:
-        return f"  joint {each.joint}: {count} in the log, told again in the same cycles ({number(each.known)} cycles known)"
-    why = (
-        " (the detector remembers seconds, and its state was not known at the beginning)"
-        if each.excused
-        else ""
-    )
+        return (
+            f"  joint {each.joint}: {count} in the log, the same replayed ({number(each.known)} cycles known)"
+        )
+    why = " (the detector remembers seconds, and its state was not known at the beginning)"
     return (
         f"  joint {each.joint}: {count} in the log, {number(each.replayed)} replayed; other in {number(each.different)} "
-        f"cycles, first in {number(each.first_cycle or 0)}, by {_nm(each.largest_nm, '.3g')} at most{why}"
+        f"cycles, first in {number(each.first_cycle or 0)}, by {_nm(each.largest_nm, '.3g')} at most"
+        f"{why if each.excused else ''}"
     )
 
 
 def _unknown(each: Unknown) -> str:
+    where = f"  joint {each.joint}: from cycle {number(each.first_cycle)} on the observer's state"
     if each.until_end:
-        return (
-            f"  joint {each.joint}: from cycle {number(each.first_cycle)} on the observer's state is not known "
-            f"({each.reason}), and {number(each.cycles)} cycles were not enough for convergence"
+        end = (
+            f"is not known ({each.reason}), and {number(each.cycles)} cycles were not enough for convergence"
         )
-    return (
-        f"  joint {each.joint}: from cycle {number(each.first_cycle)} on the observer's state was not known "
-        f"({each.reason}); identical again {number(each.cycles)} cycles later"
-    )
+    else:
+        end = f"was not known ({each.reason}); identical again {number(each.cycles)} cycles later"
+    return f"{where} {end}"
 
 
 def _difference(each: Difference) -> str:
@@ -141,8 +118,7 @@ def _nm(value: float, form: str = ".3f") -> str:
     return "-" if isnan(value) else f"{value:{form}} Nm"
 
 
-def _comparison(each: Comparison, other: bool) -> list[str]:
-    now = "now" if other else "replayed"
+def _comparison(each: Comparison, now: str) -> list[str]:
     largest = "" if each.max_cycle is None else f" in cycle {number(each.max_cycle)}"
     lines = [
         f"  joint {each.joint}: torque differs by {_nm(each.rms_nm, '.4f')} rms, {_nm(each.max_nm, '.4f')} at most{largest}"
@@ -155,9 +131,9 @@ def _comparison(each: Comparison, other: bool) -> list[str]:
             f"{_nm(each.sensor_replayed_nm)} {now} ({better:+.1%})"
         )
     lines.append(f"    mean sigma {_nm(each.sigma_logged_nm)} as logged, {_nm(each.sigma_replayed_nm)} {now}")
+    changes = ", ".join(f"{c.logged} -> {c.replayed} {number(c.cycles)}" for c in each.changes[:6])
     share = each.status_changed / max(each.cycles, 1)
-    said = ", ".join(f"{c.logged} -> {c.replayed} {number(c.cycles)}" for c in each.changes[:6])
-    lines.append(f"    status changed in {share:.2%} of the cycles" + (f": {said}" if said else ""))
+    lines.append(f"    status changed in {share:.2%} of the cycles" + (f": {changes}" if changes else ""))
     return lines
 
 
@@ -166,18 +142,15 @@ def _comparison(each: Comparison, other: bool) -> list[str]:
 _SCHEMA = "jtqd_msgs/msg/JointEstimate"
 _CHUNK_CYCLES = 500
 _REPEAT_EVERY = 60
-_OPCODE_MESSAGE, _RECORD_REST = 0x05, 22
 _MESSAGE = np.dtype(
     [
-        ("opcode", "u1"),
-        ("rest", "<u8"),
+        ("opcode and length", "V9"),
         ("channel", "<u2"),
         ("sequence", "<u4"),
         ("log_time", "<u8"),
         ("publish_time", "<u8"),
-        ("cdr", "S4"),
-        ("sec", "<i4"),
-        ("nanosec", "<u4"),
+        ("encapsulation", "V4"),
+        ("stamp", STAMP),
         ("frame_id", "V16"),
         ("cycle", "<u8"),
         ("sync_monotonic_ns", "<i8"),
@@ -194,106 +167,61 @@ def write(path: Path, results: list[Result]) -> None:
     runs = len({each.run.number for each in results})
     if runs != 1:
         raise LogError(f"{path}: found logs of {runs} runs, expected those of one for --out")
-    joints = range(1, len(results[0].joints) + 1)
-    topics = [f"/joint/{joint}/{what}" for joint in joints for what in ("state", "replay")]
+    joints = range(len(results[0].joints))
+    topics = [f"/joint/{n + 1}/{what}" for n in joints for what in ("state", "replay")]
     schema = Schema(id=1, name=_SCHEMA, encoding="ros2msg", data=SCHEMAS[_SCHEMA].encode())
     channels = [
         Channel(id=number, topic=topic, message_encoding="cdr", metadata={}, schema_id=1)
         for number, topic in enumerate(topics, start=1)
     ]
-    head = Head([schema], channels, _attachments(results))
-    parts = [(number, (number - 1) * _MESSAGE.itemsize) for number in range(1, len(topics) + 1)]
-    file = McapFile(
-        path.with_name(path.name + ACTIVE), head, {"made by": "jtq replay"}, _first_ns(results[0])
+    with LogFile(results[0].run.logs[0]) as log:
+        attached = [NamedData(each.name, each.media_type, log.attachment(each)) for each in log.attachments]
+    attached.append(
+        NamedData("replay.json", "application/json", as_json([content(each) for each in results]))
     )
+    file = McapFile(
+        path.with_name(path.name + ACTIVE),
+        Head([schema], channels, attached),
+        {"made by": "jtq replay"},
+        int(stamps_ns(results[0].run.joints[0][:1])[0]),
+    )
+    parts = [(channel.id, n * _MESSAGE.itemsize) for n, channel in enumerate(channels)]
     builder = ChunkBuilder([schema], channels, parts, _REPEAT_EVERY)
     try:
         for result in results:
-            _add(file, builder, np.concatenate([_messages(result, n) for n in range(len(joints))], axis=1))
+            rows = np.concatenate([_messages(result, n) for n in joints], axis=1)
+            for begin in range(0, len(rows), _CHUNK_CYCLES):
+                for row in rows[begin : begin + _CHUNK_CYCLES]:
+                    builder.add_block(row.tobytes(), int(row["log_time"][0]))
+                sealed = builder.seal()
+                assert sealed is not None
+                file.append(sealed)
         file.finish(path.name)
     except OSError:
         file.abandon(remove=True)
         raise
 
 
-def _add(file: McapFile, builder: ChunkBuilder, blocks: RecordArray) -> None:
-    """Append the messages of n cycles [n, topics]."""
-    data, size = blocks.tobytes(), _MESSAGE.itemsize * blocks.shape[1]
-    for row, time_ns in enumerate(blocks["log_time"][:, 0].tolist()):
-        builder.add_block(data[row * size : (row + 1) * size], time_ns)
-        if row % _CHUNK_CYCLES == _CHUNK_CYCLES - 1:
-            _flush(file, builder)
-    _flush(file, builder)
-
-
-def _first_ns(result: Result) -> int:
-    """Send time of the first SYNC, CLOCK_REALTIME."""
-    stamp = result.run.joints[0]["header"]["stamp"][0]
-    return int(stamp["sec"]) * 1_000_000_000 + int(stamp["nanosec"])
-
-
-def _flush(file: McapFile, builder: ChunkBuilder) -> None:
-    sealed = builder.seal()
-    if sealed is not None:
-        file.append(sealed)
-
-
-def _attachments(results: list[Result]) -> list[NamedData]:
-    """Return the attachments of the first log and a description of the replay."""
-    kept = read_attachments(results[0].run.parts[0].path)
-    made = json.dumps({"schema": "jtq.replay/1", "runs": [each.to_mapping() for each in results]}).encode()
-    return [
-        *(NamedData(name, _media_type(name), data) for name, data in kept.items()),
-        NamedData("replay.json", "application/json", made),
-    ]
-
-
-def _media_type(name: str) -> str:
-    suffixes: Iterable[tuple[str, str]] = (
-        (".yaml", "application/yaml"),
-        (".json", "application/json"),
-        (".onnx", "application/octet-stream"),
-    )
-    return next((kind for suffix, kind in suffixes if name.endswith(suffix)), "text/plain")
-
-
-def _messages(result: Result, number: int) -> RecordArray:
-    """Message records of joint `number` (from 0 on): logged and replayed [n, 2]."""
-    logged, replayed = result.run.joints[number], result.joints[number]
-    assert _MESSAGE.itemsize == 31 + JOINT_ESTIMATE_SIZE
-    out = np.zeros((len(logged), 2), _MESSAGE)
-    stamp = logged["header"]["stamp"]
-    seconds, nanoseconds = stamp["sec"].astype(np.uint32), stamp["nanosec"]
-    time_ns = seconds.astype(np.uint64) * np.uint64(1_000_000_000) + nanoseconds.astype(np.uint64)
-    name = f"joint_{number + 1}\0".encode()
-    constants = {
-        "opcode": _OPCODE_MESSAGE,
-        "rest": _RECORD_REST + JOINT_ESTIMATE_SIZE,
-        "cdr": CDR_HEADER,
-        "frame_id": np.void(len(name).to_bytes(4, "little") + name + bytes(4)),
-    }
-    for field, value in constants.items():
-        out[field] = value
-    out["channel"] = [[2 * number + 1, 2 * number + 2]]
-    nothing = np.full(len(logged), np.nan)  # of a log of before: a field that it does not have
-    columns = {
-        "sequence": logged["cycle"] & 0xFFFF_FFFF,
-        "log_time": time_ns,
-        "publish_time": time_ns,
-        "sec": seconds.view(np.int32),
-        "nanosec": nanoseconds,
-        **{name: logged[name] for name in ("cycle", "sync_monotonic_ns", "sync_counter", "cycle_flags")},
-        **{
-            name: logged[name] if name in (logged.dtype.names or ()) else nothing
-            for name in SAMPLE.names or ()
-        },
-    }
-    for field, values in columns.items():
+def _messages(result: Result, n: int) -> RecordArray:
+    """Message records of joint `n`, from 0 on: logged and replayed [cycles, 2]."""
+    logged, replayed = result.run.joints[n], result.joints[n]
+    empty = bytes(layout_of(n + 1).size)
+    block = CycleMessages(n + 1).block(empty, 0, 0, flags=0, sync_counter=0, frames=0)
+    template = np.frombuffer(block, _MESSAGE, 1, n * _MESSAGE.itemsize)
+    out = np.repeat(template, 2 * len(logged)).reshape(-1, 2)
+    out["channel"] = 2 * n + 1, 2 * n + 2
+    time_ns = stamps_ns(logged)
+    columns = {"sequence": logged["cycle"] & 0xFFFF_FFFF, "log_time": time_ns, "publish_time": time_ns}
+    columns |= {name: np.full(len(logged), np.nan) for name in ADDED}  # of an older log
+    columns |= {name: logged[name] for name in logged.dtype.names or () if name in (out.dtype.names or ())}
+    for field, values in (columns | {"stamp": logged["header"]["stamp"]}).items():
         out[field] = values[:, np.newaxis]
     for field in replayed.dtype.names or ():
         out[field][:, 1] = replayed[field]
     return out
 
+
+# ---- command ----
 
 _EXAMPLES = """examples:
   jtq replay run.mcap                          check that the log's estimator reproduces the published values
@@ -365,14 +293,14 @@ def _replay(options: argparse.Namespace, replay_options: ReplayOptions, bar: _Ba
     results = replay_each(options.logs, replay_options, bar.update)
     while (result := next(results, None)) is not None:
         good &= result.good
-        made.append(result.to_mapping() if options.json else text(result, compared=options.compare))
+        made.append(content(result) if options.json else text(result, compared=options.compare))
         if options.out is not None:
             kept.append(result)
         del result
     bar.close()
     if options.out is not None:
         write(options.out, kept)
-    print(json.dumps({"schema": "jtq.replay/1", "runs": made}) if options.json else "\n\n".join(made))
+    print(as_json(made).decode() if options.json else "\n\n".join(made))
     return good
 
 

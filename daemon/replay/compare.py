@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -58,13 +58,6 @@ class Comparison:
     sigma_replayed_nm: float
     status_changed: int
     changes: tuple[StatusChange, ...]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain values for JSON, None in place of NaN."""
-        return {
-            key: None if isinstance(value, float) and np.isnan(value) else value
-            for key, value in asdict(self).items()
-        }
 
 
 def compare(
@@ -135,8 +128,8 @@ def _changes(before: npt.NDArray[np.uint16], after: npt.NDArray[np.uint16]) -> t
 
 # ---- contacts (docs/estimator.md) ----
 
-BITS = FLAG_CONTACT | FLAG_CONTACT_KNOWN
-"""Of `input_flags`: what a cycle says of a contact."""
+CONTACT_FLAGS = FLAG_CONTACT | FLAG_CONTACT_KNOWN
+"""Of `input_flags`: whether there is a contact, and whether that is known."""
 
 
 @dataclass(frozen=True)
@@ -147,10 +140,10 @@ class Contacts:
         joint: from 1 on.
         known: cycles of the log in which it is known whether there is a contact.
         logged, replayed: contacts that begin.
-        different: cycles that say something else, or of whose residual a bit differs.
+        different: cycles with other flags, or another residual, bit for bit.
         first_cycle: of them; None without any.
         largest_nm: difference of the residuals where both are known; 0 without any.
-        excused: the state of a detector was not known at the beginning: its waves remember seconds.
+        excused: the detector's state at the beginning was not known: its waves remember seconds.
     """
 
     joint: int
@@ -164,25 +157,23 @@ class Contacts:
 
     @property
     def explained(self) -> bool:
-        """Return whether the replay says what the log says, or what it had to know is not in the log."""
+        """Return whether the replay has the contacts of the log, or the log lacks the state that it would need."""
         return self.excused or not self.different
 
 
 def contacts(
     logged: Sequence[RecordArray], replayed: Sequence[RecordArray], *, excused: bool
 ) -> tuple[Contacts, ...]:
-    """Compare the joints [n each]; nothing where contacts were not known, or the replay is one in arrays."""
+    """Compare the joints [n each]; nothing for a joint whose contacts neither of the two knows."""
     found = []
     for number, (one, two) in enumerate(zip(logged, replayed, strict=True), start=1):
-        if "input_flags" not in (two.dtype.names or ()):
+        before, after = one["input_flags"] & CONTACT_FLAGS, two["input_flags"] & CONTACT_FLAGS
+        if not (before | after).any():
             continue
-        said, again = one["input_flags"] & BITS, two["input_flags"] & BITS
-        if not (said | again).any():
-            continue
-        different: BoolArray = said != again
+        different: BoolArray = before != after
         largest = 0.0
         if "contact_nm" in (one.dtype.names or ()):
-            both = ((said & again) & FLAG_CONTACT_KNOWN) != 0
+            both = ((before & after) & FLAG_CONTACT_KNOWN) != 0
             apart = np.abs(np.where(both, one["contact_nm"] - two["contact_nm"], 0.0))
             different |= ~(apart == 0.0)
             largest = float(apart.max(initial=0.0))
@@ -190,9 +181,9 @@ def contacts(
         found.append(
             Contacts(
                 number,
-                int(((said & FLAG_CONTACT_KNOWN) != 0).sum()),
-                _begun(said),
-                _begun(again),
+                int(((before & FLAG_CONTACT_KNOWN) != 0).sum()),
+                _beginnings(before),
+                _beginnings(after),
                 len(rows),
                 int(one["cycle"][rows[0]]) if len(rows) else None,
                 largest,
@@ -202,16 +193,16 @@ def contacts(
     return tuple(found)
 
 
-def _begun(bits: npt.NDArray[np.integer[Any]]) -> int:
-    there = (bits & FLAG_CONTACT) != 0
+def _beginnings(flags: npt.NDArray[np.integer[Any]]) -> int:
+    there = (flags & FLAG_CONTACT) != 0
     return int((there & ~np.concatenate(([False], there[:-1]))).sum())
 
 
-# ---- identity with the log: bit for bit, and where not, since when and why ----
+# ---- identity with the log: bit for bit, and where not, from which cycle on and why ----
 
 SETTLED_CYCLES = 200
-"""So many cycles with inputs in a row that are identical: what was not known has been forgotten (40 time constants of the
-observer at 200 rad/s), and a difference after that has another reason."""
+"""So many cycles with inputs in a row that are identical: the unknown state has faded (40 time constants of the observer at
+200 rad/s), and a later difference has another reason."""
 _FIELDS = ("torque_nm", "status", "sigma_nm", "physics_nm", "network_nm", "tob_nm")
 """In this order a difference is named by the first that shows it."""
 
@@ -232,15 +223,15 @@ class Unknown:
 
 @dataclass(frozen=True)
 class Difference:
-    """First unexplained difference of one joint."""
+    """First unexplained difference of one joint, and how many of its cycles differ; joint 0: the estimate PDOs."""
 
     joint: int
     cycle: int
     cycles: int
     field: str
-    logged: float
-    replayed: float
-    largest_nm: float
+    logged: float = np.nan
+    replayed: float = np.nan
+    largest_nm: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -252,7 +243,7 @@ class Identity:
         identical: of these, bit for bit in every number of all joints and in the bytes of the estimate PDOs.
         pdos, pdos_equal: estimate PDOs in the frames of the log, and those of the same bytes.
         unknown: where the state was not known.
-        differences: what has no reason.
+        differences: without a reason.
         from_cycle: all cycles from this one on are identical; None where the last one is not.
         network_nm: numbers that a network is part of and that differ by no more count as identical in all of this but
             `identical`, where it was evaluated otherwise when the log was recorded; 0: bits.
@@ -277,12 +268,8 @@ class Identity:
     @property
     def explained(self) -> bool:
         """Return whether all differences come from an unknown start state and then disappear."""
-        told = all(each.explained for each in self.contacts)
-        return told and not self.differences and not any(each.until_end for each in self.unknown)
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        return {**asdict(self), "bit_identical": self.whole, "explained": self.explained}
+        unsettled = any(each.until_end for each in self.unknown)
+        return not self.differences and not unsettled and all(each.explained for each in self.contacts)
 
 
 def bits_equal(logged: npt.NDArray[Any], replayed: npt.NDArray[Any]) -> BoolArray:
@@ -298,117 +285,100 @@ def identity(
     replayed: Sequence[RecordArray],
     steps: Sequence[Steps],
     estimate: tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint8], BoolArray] | None = None,
+    states: Sequence[tuple[int, int]] = (),
     *,
     network_nm: float = 0.0,
 ) -> Identity:
     """Compare n cycles of all joints, all fields of `replayed`.
 
-    `estimate`: bytes of the estimate PDOs [n, 8 PDOs] in the frames and replayed, and whether they are logged [n]; None: the
-    frames were not read. `network_nm`: what another evaluation of the networks may do to their share, in cycles where that
-    share itself differs.
+    Args:
+        logged, replayed, steps: of each joint.
+        estimate: bytes of the estimate PDOs [n, 8 PDOs] in the frames and replayed, and whether they are logged [n]; None:
+            the frames were not read.
+        states: (joint, cycle) of the estimators' states in the log that are not the replay's.
+        network_nm: largest effect of another evaluation of the networks on their share, in cycles where that share differs.
     """
     cycle = logged[0]["cycle"].astype(np.int64)
     same = bits = [_same(one, two) for one, two in zip(logged, replayed, strict=True)]
     if network_nm:
-        same = [
-            each | _same_network(one, two, network_nm)
-            for each, one, two in zip(same, logged, replayed, strict=True)
-        ]
-    recorded = pdo = np.ones(len(cycle), np.bool_)
-    if estimate is None:
-        recorded = ~pdo
-    else:
+        pairs = zip(same, logged, replayed, strict=True)
+        same = [each | _same_network(one, two, network_nm) for each, one, two in pairs]
+    recorded: BoolArray = np.zeros(len(cycle), np.bool_)
+    pdo: BoolArray = ~recorded
+    if estimate is not None:
         sent, made, recorded = estimate
         pdo = ~recorded | (sent == made).all(axis=1)
     unknown: list[Unknown] = []
     differences: list[Difference] = []
-    for n in range(len(logged)):
-        parts = _segments(len(cycle), steps[n])
-        for first, end, reason in parts:
-            settled = _settled(same[n], steps[n].used, first, end) if reason else first
+    for n, (one, two) in enumerate(zip(logged, replayed, strict=True)):
+        wrong = []
+        for first, end, reason in _segments(len(cycle), steps[n]):
+            settled = first
             if reason:
+                settled = _settled(same[n], steps[n].used, first, end)
                 after = cycle[settled] if settled < end else cycle[end - 1] + 1
                 count = int(after - cycle[first])
                 unknown.append(Unknown(n + 1, int(cycle[first]), count, reason, settled >= end))
-            wrong = np.flatnonzero(~same[n][settled:end]) + settled
-            if len(wrong):
-                differences.append(_difference(n, logged[n], replayed[n], wrong))
+            wrong += (np.flatnonzero(~same[n][settled:end]) + settled).tolist()
+        if wrong:
+            differences.append(_difference(n, one, two, wrong))
     numbers: BoolArray = np.logical_and.reduce(same)
-    every = numbers & pdo
-    if not (pdo | ~numbers).all():
-        row = int(np.argmin(pdo | ~numbers))
-        differences.append(
-            Difference(0, int(cycle[row]), int((~pdo).sum()), "estimate PDO", np.nan, np.nan, 0.0)
-        )
-    last = np.flatnonzero(~every)
-    start = 0 if not len(last) else int(last[-1]) + 1
+    if (numbers & ~pdo).any():
+        row = int(np.argmax(numbers & ~pdo))
+        differences.insert(0, Difference(0, int(cycle[row]), int((~pdo).sum()), "estimate PDO"))
+    last = np.flatnonzero(~(numbers & pdo))
+    start = int(last[-1]) + 1 if len(last) else 0
     return Identity(
         len(cycle),
         int((np.logical_and.reduce(bits) & pdo).sum()),
         int(recorded.sum()),
         int((recorded & pdo).sum()),
         tuple(sorted(unknown, key=lambda each: (each.first_cycle, each.joint))),
-        tuple(_first_of_each(differences)),
+        (*differences, *_state_differences(states, unknown)),
         int(cycle[start]) if start < len(cycle) else None,
         network_nm,
         contacts(logged, replayed, excused=bool(unknown)),
     )
 
 
-def with_states(found: Identity, states: Sequence[tuple[int, int]]) -> Identity:
-    """Return the same with the estimator's states of the log that are not the replay's: (joint, cycle) of each.
-
-    Where the state was not known at the beginning, corrections of effects need as long to settle as the estimate.
-    """
-
-    def excused(joint: int, cycle: int) -> bool:
-        return any(
-            each.joint == joint
-            and each.first_cycle <= cycle < each.first_cycle + each.cycles + SETTLED_CYCLES
-            for each in found.unknown
-        )
-
-    wrong = [(joint, cycle) for joint, cycle in states if not excused(joint, cycle)]
-    more = [
-        Difference(
-            joint, min(cycle for n, cycle in wrong if n == joint), len(those), "state", np.nan, np.nan, 0.0
-        )
-        for joint in sorted({joint for joint, _ in wrong})
-        if (those := [cycle for n, cycle in wrong if n == joint])
-    ]
-    return replace(found, differences=(*found.differences, *more)) if more else found
+def _state_differences(states: Sequence[tuple[int, int]], unknown: Sequence[Unknown]) -> Iterator[Difference]:
+    """Yield one entry per joint with other states; after an unknown state they need as long to settle as the estimate."""
+    wrong: dict[int, list[int]] = {}
+    for joint, cycle in states:
+        spans = [each for each in unknown if each.joint == joint]
+        if not any(0 <= cycle - each.first_cycle < each.cycles + SETTLED_CYCLES for each in spans):
+            wrong.setdefault(joint, []).append(cycle)
+    for joint, cycles in sorted(wrong.items()):
+        yield Difference(joint, min(cycles), len(cycles), "state")
 
 
 def _compared(replayed: RecordArray) -> list[str]:
-    """Return the fields whose identity counts: those of before; what was ADDED follows from them."""
-    return [name for name in replayed.dtype.names or () if name not in ADDED]
+    """Return the fields whose identity counts, in the order of _FIELDS; those in ADDED follow from them."""
+    names = [name for name in replayed.dtype.names or () if name not in ADDED]
+    return sorted(names, key=lambda name: _FIELDS.index(name) if name in _FIELDS else len(_FIELDS))
 
 
 def _same(logged: RecordArray, replayed: RecordArray) -> BoolArray:
-    same = np.ones(len(logged), np.bool_)
-    for name in _compared(replayed):
-        same &= _equal(logged, replayed, name, 0.0)
-    return same
+    same = [_equal(logged, replayed, name) for name in _compared(replayed)]
+    return np.asarray(np.logical_and.reduce(same))
 
 
 def _same_network(logged: RecordArray, replayed: RecordArray, limit: float) -> BoolArray:
     """Equal bit for bit but for the network's share, which differs by no more than `limit` [n]."""
     same = ~bits_equal(logged["network_nm"], replayed["network_nm"])
     for name in _compared(replayed):
-        if name in ("network_nm", "torque_nm", "sigma_nm"):
-            same &= _equal(logged, replayed, name, limit)
-        else:
-            same &= _equal(logged, replayed, name, 0.0)
+        share = name in ("network_nm", "torque_nm", "sigma_nm")
+        same &= _equal(logged, replayed, name, limit if share else 0.0)
     return same
 
 
-def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: float) -> BoolArray:
+def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: float = 0.0) -> BoolArray:
     """Equal bit for bit in this field, or, where there is a tolerance, numbers that are so near to each other [n]."""
     one, two = logged[name], replayed[name]
-    if name == "input_flags":  # contacts are compared apart: what they remember fades more slowly
-        one, two = one & ~np.uint16(BITS), two & ~np.uint16(BITS)
+    if name == "input_flags":  # contacts are compared apart: their detectors' state fades more slowly
+        one, two = one & ~np.uint16(CONTACT_FLAGS), two & ~np.uint16(CONTACT_FLAGS)
     same = bits_equal(one, two)
-    if tolerance and one.dtype.kind == "f":
+    if tolerance:
         with np.errstate(invalid="ignore"):
             same |= np.abs(one - two) <= tolerance
     return same
@@ -416,9 +386,7 @@ def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: flo
 
 def _segments(count: int, steps: Steps) -> list[tuple[int, int, str]]:
     """(first row, row after the last, reason or "") between the places where a joint's state is known or lost."""
-    places = {int(row): "" for row in steps.begins} | dict(steps.breaks)
-    if 0 not in places:
-        places[0] = ""
+    places = {0: "", **{int(row): "" for row in steps.begins}, **dict(steps.breaks)}
     rows = sorted(places)
     return [(row, end, places[row]) for row, end in zip(rows, [*rows[1:], count], strict=True)]
 
@@ -436,42 +404,17 @@ def _settled(same: BoolArray, used: BoolArray, first: int, end: int) -> int:
     return int(wrong[-1]) + 1 if counts[end] > counts[wrong[-1] + 1] else end
 
 
-def _difference(
-    number: int, logged: RecordArray, replayed: RecordArray, wrong: npt.NDArray[np.intp]
-) -> Difference:
-    row = int(wrong[0])
-    names = [name for name in _FIELDS if name in _compared(replayed)]
-    names += [name for name in _compared(replayed) if name not in names]
-    field = next(
-        name for name in names if not _equal(logged[row : row + 1], replayed[row : row + 1], name, 0.0)[0]
-    )
+def _difference(number: int, logged: RecordArray, replayed: RecordArray, wrong: list[int]) -> Difference:
+    row = slice(wrong[0], wrong[0] + 1)
+    field = next(name for name in _compared(replayed) if not _equal(logged[row], replayed[row], name)[0])
     with np.errstate(invalid="ignore"):
         apart = np.abs(logged["torque_nm"][wrong] - replayed["torque_nm"][wrong])
-    largest = float(np.nanmax(apart)) if np.isfinite(apart).any() else 0.0
     return Difference(
         number + 1,
-        int(logged["cycle"][row]),
+        int(logged["cycle"][row][0]),
         len(wrong),
         field,
-        float(logged[field][row]),
-        float(replayed[field][row]),
-        largest,
+        float(logged[field][row][0]),
+        float(replayed[field][row][0]),
+        float(np.nanmax(apart)) if np.isfinite(apart).any() else 0.0,
     )
-
-
-def _first_of_each(differences: Sequence[Difference]) -> list[Difference]:
-    """Return one entry per joint: its first difference, with all of its cycles counted."""
-    result = []
-    for number in sorted({each.joint for each in differences}):
-        those = sorted((each for each in differences if each.joint == number), key=lambda each: each.cycle)
-        first = those[0]
-        result.append(
-            Difference(
-                **{
-                    **asdict(first),
-                    "cycles": sum(each.cycles for each in those),
-                    "largest_nm": max(each.largest_nm for each in those),
-                }
-            )
-        )
-    return result

@@ -1,4 +1,4 @@
-"""What a replay takes from a log beside its messages: configuration, models, scaling, and states of the estimators.
+"""What a replay takes from a log beside its messages: configuration, joint files, scaling, and states of the estimators.
 
 The attached files are written into a directory of the caller's, under names made here: nothing that a log contains can name
 a place on this machine. Hashes are checked.
@@ -7,21 +7,20 @@ a place on this machine. Hashes are checked.
 from __future__ import annotations
 
 import hashlib
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import msgspec
 import numpy as np
 import numpy.typing as npt
 import yaml
 
 from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.core.input_pdos import JointInputs, joint_inputs
-from jtqd.daemon.logs import LogError, LogFile, iter_messages
-from jtqd.daemon.recording.schemas import ZEROS
+from jtqd.daemon.logs import LogError
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.daemon.shared.snapshot import PAST_WORDS
@@ -29,7 +28,7 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.status import PAST_LAYOUT
 from jtqd.models.files import load_yaml
 
-# ---- names and types that a replay needs of a log's messages; another version may have others ----
+# ---- fields of the messages that a replay reads: path -> type, each element's in an array ----
 
 SAMPLE = np.dtype(
     [
@@ -38,52 +37,46 @@ SAMPLE = np.dtype(
     ]
 )
 """What the loop records of a joint: the fields of `cycle_record.JointRecord`."""
-
 ADDED = ("reference_nm", "age_ms", "torque_rate_nm_s", "contact_nm")
-"""Fields that logs of before do not have; a replay makes them anew."""
-
+"""Of these, fields that older logs do not have; they follow from the others."""
 STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
-JOINT: dict[str, np.dtype[Any]] = {
+JOINT: dict[str, Any] = {
     "header.stamp": STAMP,
-    "cycle": np.dtype("<u8"),
-    "sync_monotonic_ns": np.dtype("<i8"),
-    "sync_counter": np.dtype("u1"),
-    "cycle_flags": np.dtype("u1"),
+    "cycle": "<u8",
+    "sync_monotonic_ns": "<i8",
+    "sync_counter": "u1",
+    "cycle_flags": "u1",
     **{name: SAMPLE[name] for name in SAMPLE.names or () if name not in ADDED},
 }
-"""Of /joint/N/state: path -> type."""
-FRAMES: dict[str, np.dtype[Any]] = {
-    "cycle": np.dtype("<u8"),
-    "frame_count": np.dtype("u1"),
-    "frames_left_out": np.dtype("u1"),
-    "frames.id": np.dtype("<u4"),
-    "frames.length": np.dtype("u1"),
-    "frames.data": np.dtype(("u1", 8)),
+"""Of /joint/N/state."""
+FRAMES: dict[str, Any] = {
+    "cycle": "<u8",
+    "frame_count": "u1",
+    "frames_left_out": "u1",
+    "frames.id": "<u4",
+    "frames.length": "u1",
+    "frames.data": ("u1", 8),
 }
-"""Of /can/frames: path -> type of each element."""
-PAST: dict[str, np.dtype[Any]] = {
-    "cycle": np.dtype("<u8"),
-    "past_layout": np.dtype("<u2"),
-    "past_bytes": np.dtype("<u2"),
-}
-"""Of /joint/N/zeros: path -> type of each element."""
-STATE: dict[str, np.dtype[Any]] = {"past": np.dtype(("<u8", PAST_WORDS))}
-"""The same, of this layout: another one may have another length."""
+"""Of /can/frames."""
+_STATE_HEAD: dict[str, Any] = {"cycle": "<u8", "past_layout": "<u2", "past_bytes": "<u2"}
+"""Of /joint/N/zeros."""
+_STATE: dict[str, Any] = {"past": ("<u8", PAST_WORDS)}
+"""The same, of this layout only: another one may have another length."""
 
 
-def check_fields(
-    records: npt.NDArray[np.void], needed: Mapping[str, np.dtype[Any]], path: Path, topic: str
-) -> None:
+def check_fields(records: npt.NDArray[np.void], needed: Mapping[str, Any], log: Path, topic: str) -> None:
     """Check the fields. Raises LogError for a missing field or another type."""
-    for name, expected in needed.items():
+    for name, kind in needed.items():
         found: np.dtype[Any] = records.dtype
         for step in name.split("."):
             if step not in (found.base.names or ()):
-                raise LogError(f"{path}: {topic}: found no field {name}, expected one as this jtqd writes it")
+                raise LogError(f"{log}: {topic}: found no field {name}, expected one as this jtqd writes it")
             found = found.base[step]
-        if found != expected:
-            raise LogError(f"{path}: {topic}: found {name} of type {found}, expected {expected}")
+        if found != np.dtype(kind):
+            raise LogError(f"{log}: {topic}: found {name} of type {found}, expected {np.dtype(kind)}")
 
+
+# ---- configuration, joint files, networks ----
 
 CONFIGURATION, PROVENANCE = "configuration.yaml", "provenance.json"
 
@@ -96,15 +89,35 @@ class Setup:
         config: as it was in force; its paths lead into the private directory.
         inputs: indices of each joint's PDOs among `jtqd.daemon.core.input_pdos.input_pdos`, and the devices' scaling.
         hashes: of the configuration, then joint file and network of each joint.
-        versions: of the programs that made the log, e.g. {"numpy": "2.4.6"}.
-        machine: kind of processor, e.g. "x86_64"; empty where the log does not say.
     """
 
     config: Config
     inputs: tuple[JointInputs, ...]
     hashes: tuple[str, ...]
-    versions: Mapping[str, str]
-    machine: str
+
+
+_T = TypeVar("_T")
+
+
+class _Configuration(msgspec.Struct):
+    sha256: str
+
+
+class _JointFiles(msgspec.Struct):
+    """Names of the attachments of one joint; network None: the method does not use it."""
+
+    file: str
+    file_sha256: str | None = None
+    profile: str | None = None
+    network: str | None = None
+
+
+class _Provenance(msgspec.Struct):
+    """The keys of provenance.json that are read here; `nodes`: of the boot report."""
+
+    configuration: _Configuration
+    joints: dict[str, Any] = {}
+    nodes: dict[str, Any] = {}
 
 
 def read_setup(log: Path, attachments: Mapping[str, bytes], directory: Path) -> Setup:
@@ -113,124 +126,94 @@ def read_setup(log: Path, attachments: Mapping[str, bytes], directory: Path) -> 
     Raises:
         LogError: one line; something is missing, damaged, or not what its hash says.
     """
-    text = _attachment(log, attachments, CONFIGURATION)
-    provenance = _provenance(log, _attachment(log, attachments, PROVENANCE))
-    sha256 = _text(log, provenance, "configuration", "sha256")
-    _check_hash(log, CONFIGURATION, text, sha256)
+    attached = _Attachments(log, attachments, directory)
+    text = attached.content(CONFIGURATION)
+    provenance = attached.decoded(attached.content(PROVENANCE), _Provenance)
+    sha256 = provenance.configuration.sha256
+    attached.check(CONFIGURATION, sha256)
     original = directory / "as_logged.yaml"
     original.write_bytes(text)
     try:
         mapping = load_yaml(original)
-        files = [
-            each
-            for number in range(1, MOST_JOINTS + 1)
-            if number == 1 or f"joint_{number}" in mapping
-            for each in _place(log, attachments, provenance, mapping, number, directory)
-        ]
+        hashes = [sha256]
+        for number in range(1, MOST_JOINTS + 1):
+            section = mapping.get(f"joint_{number}")
+            if isinstance(section, dict):  # anything else is load_config's to refuse
+                found = provenance.joints.get(str(number), {})
+                files = attached.decoded(found, _JointFiles, f"joints.{number}: ")
+                hashes += attached.place(section, files, number)
         rewritten = directory / CONFIGURATION
         rewritten.write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
         config = load_config(rewritten)
     except ConfigError as error:
-        raise LogError(f"{log}: its configuration: {_without(str(error), directory)}") from None
+        why = str(error).replace(f"{directory}/", "").replace(original.name, CONFIGURATION)
+        raise LogError(f"{log}: its configuration: {why}") from None
     try:
-        config = as_booted(config, provenance["nodes"])
-        inputs = tuple(joint_inputs(config, provenance))
+        config = as_booted(config, provenance.nodes)
+        inputs = tuple(joint_inputs(config, {"nodes": provenance.nodes}))
         for each in inputs:
             _check_scaling(each)
     except (KeyError, TypeError, ValueError) as error:
-        raise LogError(
-            f"{log}: {PROVENANCE}: nodes: no usable scaling ({str(error) or type(error).__name__})"
-        ) from None
-    versions = provenance.get("versions")
-    return Setup(
-        config,
-        inputs,
-        (sha256, *files),
-        {str(k): str(v) for k, v in versions.items()} if isinstance(versions, dict) else {},
-        str(provenance.get("machine", "")),
-    )
+        why = str(error) or type(error).__name__
+        raise LogError(f"{log}: {PROVENANCE}: nodes: no usable scaling ({why})") from None
+    return Setup(config, inputs, tuple(hashes))
 
 
-def _without(text: str, directory: Path) -> str:
-    """Return the message without the private directory, which is gone when somebody reads it."""
-    return text.replace(f"{directory}/", "").replace("as_logged.yaml", CONFIGURATION)
+class _Attachments:
+    """Attachments of a log, and the directory for those that must be files."""
 
+    def __init__(self, log: Path, attachments: Mapping[str, bytes], directory: Path) -> None:
+        self._log, self._found, self._directory = log, attachments, directory
 
-def _attachment(log: Path, attachments: Mapping[str, bytes], name: str) -> bytes:
-    if name not in attachments:
-        raise LogError(
-            f"{log}: found no attachment {name}, expected one: not a log of jtqd, or its beginning is missing"
-        )
-    return attachments[name]
+    def content(self, name: str) -> bytes:
+        """Return an attachment. Raises LogError."""
+        if name not in self._found:
+            raise LogError(
+                f"{self._log}: found no attachment {name}, expected one: not a log of jtqd, or its beginning is missing"
+            )
+        return self._found[name]
 
+    def decoded(self, content: Any, kind: type[_T], where: str = "") -> _T:
+        """Return bytes of JSON, or an object out of it, as `kind`. Raises LogError."""
+        try:
+            if isinstance(content, bytes):
+                return msgspec.json.decode(content, type=kind)
+            return msgspec.convert(content, kind)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise LogError(f"{self._log}: {PROVENANCE}: {where}{error}") from None
 
-def _provenance(log: Path, data: bytes) -> dict[str, Any]:
-    try:
-        content = json.loads(data)
-    except (ValueError, RecursionError):
-        raise LogError(f"{log}: {PROVENANCE}: found no JSON") from None
-    if not isinstance(content, dict):
-        raise LogError(f"{log}: {PROVENANCE}: found {type(content).__name__}, expected an object")
-    return content
+    def check(self, name: str, expected: str) -> None:
+        """Check a hash. Raises LogError."""
+        found = hashlib.sha256(self.content(name)).hexdigest()
+        if found != expected.lower():
+            raise LogError(
+                f"{self._log}: attachment {name}: found SHA-256 {found[:12]}..., "
+                f"expected {expected[:12]}...: it was changed"
+            )
 
-
-def _text(log: Path, content: Any, *keys: str) -> str:
-    """Return a text of the provenance by its path of keys."""
-    for key in keys:
-        content = content.get(key) if isinstance(content, dict) else None
-    if not isinstance(content, str):
-        raise LogError(f"{log}: {PROVENANCE}: {'.'.join(keys)}: missing")
-    return content
-
-
-def _check_hash(log: Path, name: str, data: bytes, expected: str) -> None:
-    found = hashlib.sha256(data).hexdigest()
-    if found != expected.lower():
-        raise LogError(
-            f"{log}: attachment {name}: found SHA-256 {found[:12]}..., expected {expected[:12]}...: it was changed"
-        )
-
-
-def _place(  # noqa: PLR0917
-    log: Path,
-    attachments: Mapping[str, bytes],
-    provenance: dict[str, Any],
-    mapping: dict[str, Any],
-    number: int,
-    directory: Path,
-) -> list[str]:
-    """Write one joint's files and let the configuration name them; returns their hashes.
-
-    A wrong configuration is load_config's to refuse.
-    """
-    key = f"joint_{number}"
-    section = mapping.get(key)
-    if not isinstance(section, dict):
-        return []
-    name = _text(log, provenance, "joints", str(number), "file")
-    data = _attachment(log, attachments, name)
-    said = provenance["joints"][str(number)].get("file_sha256")
-    if isinstance(said, str):
-        _check_hash(log, name, data, said)
-    file = f"{key}.yaml"
-    (directory / file).write_bytes(data)
-    section["file"] = file
-    hashes = [hashlib.sha256(data).hexdigest()]
-    profile = provenance["joints"][str(number)].get("profile")
-    if isinstance(profile, str):  # as it was then, also where one of that name ships
-        section["profile"] = f"{key}.profile.yaml"
-        (directory / section["profile"]).write_bytes(_attachment(log, attachments, profile))
-    network = section.get("network")
-    if not isinstance(network, dict):
+    def place(self, section: dict[str, Any], files: _JointFiles, number: int) -> list[str]:
+        """Write one joint's files and let its section of the configuration name them; returns their hashes."""
+        if files.file_sha256 is not None:
+            self.check(files.file, files.file_sha256)
+        section["file"] = f"joint_{number}.yaml"
+        hashes = [self._write(files.file, section["file"])]
+        if files.profile is not None:  # as it was then, also where one of that name ships
+            section["profile"] = f"joint_{number}.profile.yaml"
+            self._write(files.profile, section["profile"])
+        network = section.get("network")
+        if isinstance(network, dict) and files.network is None:
+            section.pop("network")
+        elif isinstance(network, dict):
+            network["file"] = (
+                f"joint_{number}.onnx"  # its hash is in the configuration: load_config checks it
+            )
+            hashes.append(self._write(str(files.network), network["file"]))
         return hashes
-    name = provenance["joints"][str(number)].get("network")
-    if name is None:  # the method has no use for it: it was not read
-        section.pop("network")
-        return hashes
-    data = _attachment(log, attachments, str(name))
-    (directory / f"{key}.onnx").write_bytes(data)
-    network["file"] = f"{key}.onnx"  # its hash is in the configuration, and load_config checks it
-    return [*hashes, hashlib.sha256(data).hexdigest()]
+
+    def _write(self, name: str, file: str) -> str:
+        data = self.content(name)
+        (self._directory / file).write_bytes(data)
+        return hashlib.sha256(data).hexdigest()
 
 
 def _check_scaling(inputs: JointInputs) -> None:
@@ -256,17 +239,12 @@ class EstimatorStates:
     """States of one joint's estimator.
 
     Attributes:
-        cycle: after which each holds, increasing [n].
+        cycle: after which each holds [n].
         content: `FusedEstimator.past` of each [n].
     """
 
     cycle: npt.NDArray[np.uint64]
     content: tuple[bytes, ...]
-
-    def within(self, first: int, last: int) -> EstimatorStates:
-        """Return those of the cycles `first` to `last`."""
-        here = (self.cycle >= first) & (self.cycle <= last)
-        return EstimatorStates(self.cycle[here], tuple(self.content[n] for n in np.flatnonzero(here)))
 
     def rows(self, cycle: npt.NDArray[np.uint64]) -> dict[int, bytes]:
         """Return the states by the row of `cycle` [n] before which they hold: the one behind that of their cycle."""
@@ -281,31 +259,13 @@ class EstimatorStates:
 NO_STATES = EstimatorStates(np.zeros(0, np.uint64), ())
 
 
-def joined(every: Sequence[EstimatorStates]) -> EstimatorStates:
-    """Return the states of several parts in the order of their cycles, each once."""
-    cycle, first = np.unique(np.concatenate([each.cycle for each in every]), return_index=True)
-    content = [state for each in every for state in each.content]
-    return EstimatorStates(cycle, tuple(content[n] for n in first.tolist()))
-
-
-def read_states(path: Path, joints: int) -> tuple[EstimatorStates, ...]:
-    """Return the states of each joint in a log. Raises LogError, OSError."""
-    with LogFile(path) as log:
-        there = {each.topic for n, each in log.channels.items() if not log.counts or log.counts.get(n)}
-    return tuple(_read(path, each.name) if each.name in there else NO_STATES for each in ZEROS[:joints])
-
-
-def _read(path: Path, topic: str) -> EstimatorStates:
-    cycles: list[int] = []
-    content: list[bytes] = []
-    for messages in iter_messages(path, topic):
-        records = messages.records
-        check_fields(records, PAST, path, topic)
-        records = records[records["past_layout"] == PAST_LAYOUT]
-        if len(records):
-            check_fields(records, STATE, path, topic)
-        for record in records:
-            cycles.append(int(record["cycle"]))
-            content.append(record["past"].tobytes()[: int(record["past_bytes"])])
-    order = np.argsort(np.array(cycles, np.uint64), kind="stable").tolist()
-    return EstimatorStates(np.array([cycles[n] for n in order], np.uint64), tuple(content[n] for n in order))
+def states_of(records: npt.NDArray[Any], log: Path, topic: str) -> EstimatorStates:
+    """Return the states in the messages of /joint/N/zeros [n] that have this layout. Raises LogError."""
+    check_fields(records, _STATE_HEAD, log, topic)
+    records = records[records["past_layout"] == PAST_LAYOUT]
+    if not len(records):
+        return NO_STATES
+    check_fields(records, _STATE, log, topic)
+    sizes = records["past_bytes"].tolist()
+    content = [each.tobytes()[:size] for each, size in zip(records["past"], sizes, strict=True)]
+    return EstimatorStates(records["cycle"].astype(np.uint64), tuple(content))

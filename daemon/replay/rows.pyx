@@ -47,12 +47,12 @@ cdef class CycleRows:
         wanted: of each joint, whether there was time for the network [joints, n].
         withdrawn: whether the estimate was too late [n].
         contacts: the loop's, None where they are not watched.
-        velocity: of each joint, the motor velocity as logged [joints, n], for drives that tell none; None: derived again.
+        velocity: of each joint, the motor velocity as logged [joints, n], for drives without one; None: derived again.
 
     Attributes:
         samples: of each joint, blocks of the cycle record [joints, n, bytes].
         estimates: estimate PDOs one after the other [n, 8 * PDOs].
-        temperatures_from_log: how often the frames did not tell the temperature.
+        temperatures_from_log: how often the frames gave another temperature than the log.
 
     Raises:
         ValueError: arrays that do not fit together.
@@ -136,9 +136,9 @@ cdef class CycleRows:
                 )
 
     cdef void take(self, Py_ssize_t row) noexcept nogil:
-        """Put the inputs of a row in place; where the frames tell another temperature than the log, the log is right."""
+        """Put the inputs of a row in place; where the frames give another temperature than the log, the log is right."""
         cdef Temperature *temperature
-        cdef double said
+        cdef double logged
         cdef int n, m
         for n in range(self.intake.count):
             self.intake.inputs[n].fresh = self.fresh[n, row]
@@ -146,10 +146,10 @@ cdef class CycleRows:
                 self.intake.inputs[n].values[m] = self.values[n, m, row]
         self.intake.age_temperatures(self.cycle[row])
         for n in range(self.intake.temperature_count):
-            temperature, said = &self.intake.celsius[n], self.celsius[n, row]
-            if temperature.celsius != said and not (isnan(said) and isnan(temperature.celsius)):
+            temperature, logged = &self.intake.celsius[n], self.celsius[n, row]
+            if temperature.celsius != logged and not (isnan(logged) and isnan(temperature.celsius)):
                 self.temperatures_from_log += 1
-                temperature.celsius = said
+                temperature.celsius = logged
 
     cdef void observe(self, JointCycle joint, int number, Py_ssize_t row) noexcept nogil:
         """Estimate one joint in a row."""

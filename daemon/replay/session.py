@@ -1,39 +1,28 @@
-"""A replay from logs to results: reading, estimating, comparing. No output; what `jtq replay` and `jtq batch` call."""
+"""A replay from logs to results: reading, estimating, comparing. No output; `jtq replay` and `jtq batch` call it."""
 
 from __future__ import annotations
 
 import hashlib
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
-import numpy.typing as npt
 
-from jtqd.daemon.config import Config
-from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.logs import LogError, log_parts
-from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity, with_states
+from jtqd.daemon.logs import LogError
+from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
+from jtqd.daemon.replay.inputs import Inputs
 from jtqd.daemon.replay.logged import NO_STATES, EstimatorStates, Setup
-from jtqd.daemon.replay.replayer import Model, Replayer, decode
-from jtqd.daemon.replay.runs import (
-    STRETCH_CYCLES,
-    Part,
-    Run,
-    Steps,
-    in_order,
-    lost_cycles,
-    read_pieces,
-    stretches,
-)
-from jtqd.estimator.arrays import RecordArray
+from jtqd.daemon.replay.replayer import Model, Replayer
+from jtqd.daemon.replay.runs import STRETCH_CYCLES, Progress, Run, lost_cycles, read_runs
+from jtqd.estimator.arrays import BoolArray, RecordArray
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
+from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import NATIVE_LIMIT, load_network
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.settings import METHODS, bandwidth_of
@@ -46,115 +35,57 @@ AS_LOGGED = "as logged"
 _ANY_JOINT = "extended.joint.yaml"
 
 
-@dataclass(frozen=True)
-class Models:
-    """Models of the joints, and the files they come from, with hashes; "as logged" for those of the log."""
-
-    joints: tuple[Model, ...]
-    files: tuple[str, ...]
-
-    def safety(self, config: Config) -> list[JointSafety]:
-        """Limits of the joints by the log's configuration and these joint files."""
-        return [
-            JointSafety(config.safety, each.settings, each.joint, config.period_ns) for each in self.joints
-        ]
-
-    def estimators(self) -> list[AnyEstimator]:
-        """Build new estimators without warm-up. Raises ConfigError."""
-        return [make_estimator(each.joint, each.settings, each.network) for each in self.joints]
-
-
-def logged_models(setup: Setup) -> Models:
-    """Return the models of the log. Raises ConfigError, NetworkError."""
-    settings = setup.config.estimator
-    made = []
-    for each in setup.config.joints:
-        network = None
-        if each.network is not None:
-            network = load_network(settings.method, str(each.network.path), each.network.sha256)
-        made.append(Model(each.joint, settings, network))
-        make_estimator(each.joint, settings, network)  # refused here, and not when the arrays are half done
-    return Models(tuple(made), (AS_LOGGED,) * len(made))
-
-
-def other_models(setup: Setup, directory: Path | None, method: str | None) -> Models:
-    """The log's models with what `directory` has in their place, and another method. Raises ConfigError, NetworkError.
+def models_of(setup: Setup, directory: Path | None = None, method: str | None = None) -> list[Model]:
+    """Return the log's models, those in `directory` in their place, with another method. Raises ConfigError, NetworkError.
 
     Joint files are `jointN.yaml` or `extended.jointN.yaml`, or `extended.joint.yaml` for the joint of that name;
-    networks `jointN.fused.onnx` for method fused, `jointN.onnx` for network. What is not there stays as logged.
+    networks `jointN.fused.onnx` for method fused, `jointN.onnx` for network. Files that are not there stay as logged.
     """
     settings = setup.config.estimator
+    logged_method = settings.method
     if method is not None:
         settings = replace(settings, method=method)
-    taken = 0
-    made, files = [], []
+    if directory is not None and not directory.is_dir():
+        raise ConfigError(f"{directory}: not a directory, expected one with joint files and networks")
+    found = []
     for number, each in enumerate(setup.config.joints, start=1):
-        joint, network, said = each.joint, None, []
-        path = None if directory is None else _joint_file(directory, number, each.joint)
+        joint, network, files = each.joint, None, []
+        path = None if directory is None else _joint_file(directory, number, joint)
         if path is not None:
             joint = load_joint(path)
-            said.append(_named(path))
-        network_path = None if directory is None else _network_file(directory, number, settings.method)
-        if network_path is not None:
-            network = load_network(settings.method, str(network_path))
-            said.append(_named(network_path))
-        elif METHODS[settings.method].network:
-            network = _logged_network(setup, number, settings.method)
-        taken += len(said)
-        make_estimator(joint, settings, network)  # refused here, and not when the arrays are half done
-        made.append(Model(joint, settings, network))
-        files.append(", ".join(said) or AS_LOGGED)
-    if directory is not None and not taken:
-        every = [name for number in range(1, len(made) + 1) for name in _joint_names(number)]
+            files.append(path)
+        ending = METHODS[settings.method].network_ending if METHODS[settings.method].network else None
+        if directory is not None and ending and (directory / f"joint{number}{ending}").is_file():
+            path = directory / f"joint{number}{ending}"
+            network = load_network(settings.method, str(path))
+            files.append(path)
+        elif ending and each.network is not None and settings.method == logged_method:
+            network = load_network(settings.method, str(each.network.path), each.network.sha256)
+        names = ", ".join(f"{file} ({hashlib.sha256(file.read_bytes()).hexdigest()[:12]})" for file in files)
+        estimator = make_estimator(joint, settings, network)
+        found.append(Model(joint, settings, network, estimator, names or AS_LOGGED))
+    if directory is not None and all(each.source == AS_LOGGED for each in found):
+        every = [name for number in range(1, len(found) + 1) for name in _joint_names(number)]
         names = ", ".join([*every, _ANY_JOINT])
         raise ConfigError(
             f"{directory}: found no file for these joints, expected one of {names} or a network"
         )
-    return Models(tuple(made), tuple(files))
+    return found
 
 
-def _bandwidths(run: Run, models: Models, number: int) -> tuple[float, float]:
-    """Return what makes the age of joint `number`'s estimate, in the log and in the replay [rad/s]."""
-    logged, replayed = run.setup.config.joints[number - 1].joint, models.joints[number - 1]
-    return bandwidth_of(logged, run.setup.config.estimator), bandwidth_of(replayed.joint, replayed.settings)
-
-
-def _named(path: Path) -> str:
-    return f"{path} ({hashlib.sha256(path.read_bytes()).hexdigest()[:12]})"
-
-
-def _joint_names(number: int) -> tuple[str, ...]:
+def _joint_names(number: int) -> tuple[str, str]:
     return f"joint{number}.yaml", f"extended.joint{number}.yaml"
 
 
 def _joint_file(directory: Path, number: int, logged: Joint) -> Path | None:
     """File of joint `number` in the directory, None without. Raises ConfigError for two of them."""
-    if not directory.is_dir():
-        raise ConfigError(f"{directory}: not a directory, expected one with joint files and networks")
     found = [directory / name for name in _joint_names(number) if (directory / name).is_file()]
     if len(found) > 1:
         raise ConfigError(f"{directory}: found {found[0].name} and {found[1].name}, expected one of them")
     if found:
         return found[0]
     path = directory / _ANY_JOINT
-    if path.is_file() and load_joint(path).name == logged.name:
-        return path
-    return None
-
-
-def _network_file(directory: Path, number: int, method: str) -> Path | None:
-    if not METHODS[method].network:
-        return None
-    path = directory / f"joint{number}{METHODS[method].network_ending}"
-    return path if path.is_file() else None
-
-
-def _logged_network(setup: Setup, number: int, method: str) -> AnyNetwork | None:
-    """Return the log's network where the method is still the same; another method cannot read it."""
-    file = setup.config.joints[number - 1].network
-    if file is None or method != setup.config.estimator.method:
-        return None
-    return load_network(method, str(file.path), file.sha256)
+    return path if path.is_file() and load_joint(path).name == logged.name else None
 
 
 @dataclass(frozen=True)
@@ -164,12 +95,10 @@ class ReplayOptions:
     Attributes:
         model: directory with other joint files and networks.
         method: another method of the estimator.
-        compare: differences and errors against the sensor, too.
     """
 
     model: Path | None = None
     method: str | None = None
-    compare: bool = False
 
     @property
     def other(self) -> bool:
@@ -183,8 +112,7 @@ class Result:
 
     Attributes:
         run: its logs and states.
-        files: of the models.
-        method: of the estimator.
+        models: of each joint.
         seconds, read_s, replay_s: length of the run; wall time of reading and of estimating.
         lost: cycles that are missing in the middle of the logs.
         from_si: inputs whose frame was not in the log, from the SI values beside it.
@@ -195,8 +123,7 @@ class Result:
     """
 
     run: Run
-    files: tuple[str, ...]
-    method: str
+    models: Sequence[Model]
     seconds: float
     read_s: float
     replay_s: float
@@ -212,39 +139,45 @@ class Result:
         """Return whether there is no unexplained difference."""
         return self.identity is None or self.identity.explained
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Plain values for JSON."""
-        first, last = self.run.parts[0].joints[0]["cycle"][0], self.run.parts[-1].joints[0]["cycle"][-1]
-        return {
-            "logs": [str(part.path) for part in self.run.parts],
-            "cycles": self.run.cycles,
-            "first_cycle": int(first),
-            "last_cycle": int(last),
-            "seconds": self.seconds,
-            "method": self.method,
-            "models": list(self.files),
-            "read_s": self.read_s,
-            "replay_s": self.replay_s,
-            "times_real_time": self.seconds / max(self.replay_s, 1e-9),
-            "lost_cycles": self.lost,
-            "inputs_from_si": self.from_si,
-            "temperatures_from_log": self.temperatures_from_log,
-            "identity": None if self.identity is None else _plain(self.identity.to_mapping()),
-            "joints": [each.to_mapping() for each in self.comparisons],
-        }
+    @property
+    def method(self) -> str:
+        """Return the method of the estimator."""
+        return self.models[0].settings.method
 
 
-def _plain(content: Any) -> Any:
-    """None in place of NaN, all the way down."""
-    if isinstance(content, dict):
-        return {key: _plain(value) for key, value in content.items()}
-    if isinstance(content, list | tuple):
-        return [_plain(value) for value in content]
-    return None if isinstance(content, float) and np.isnan(content) else content
+def content(result: Result) -> dict[str, Any]:
+    """Return a result as an object of `jtq.replay/1`."""
+    same = result.identity
+    cycle = result.run.joints[0]["cycle"]
+    found = {
+        "logs": [str(log) for log in result.run.logs],
+        "cycles": result.run.cycles,
+        "first_cycle": int(cycle[0]),
+        "last_cycle": int(cycle[-1]),
+        "seconds": result.seconds,
+        "method": result.method,
+        "models": [each.source for each in result.models],
+        "read_s": result.read_s,
+        "replay_s": result.replay_s,
+        "times_real_time": result.seconds / max(result.replay_s, 1e-9),
+        "lost_cycles": result.lost,
+        "inputs_from_si": result.from_si,
+        "temperatures_from_log": result.temperatures_from_log,
+        "identity": same,
+        "joints": result.comparisons,
+    }
+    plain: dict[str, Any] = msgspec.to_builtins(found)
+    if same is not None:
+        plain["identity"] |= {"bit_identical": same.whole, "explained": same.explained}
+    return plain
 
 
-Progress = Callable[[str, int, int], None]
-"""Told what is being done, how much of it, and of how much."""
+def as_json(runs: Sequence[dict[str, Any]]) -> bytes:
+    """Return what `content` made of some results as JSON (schema `jtq.replay/1`); NaN is null."""
+    return msgspec.json.encode({"schema": "jtq.replay/1", "runs": runs})
+
+
+# ---- replay ----
 
 
 def replay(
@@ -260,153 +193,99 @@ def replay_each(
     progress: Progress = lambda *_: None,
     stretch: int = STRETCH_CYCLES,
 ) -> Iterator[Result]:
-    """Replay logs; parts of one run are joined, and a directory stands for those in it.
+    """Replay logs; parts of one run are joined, and a directory stands for the logs in it.
 
-    A run of more than `stretch` cycles gives several results, one after the other: whoever lets go of each before
-    asking for the next needs memory for one of them only.
+    A run of more than `stretch` cycles gives several results, one after the other. A caller that drops each before it asks
+    for the next needs memory for one of them only.
 
     Raises LogError, ConfigError, NetworkError: one line each; OSError.
     """
     with tempfile.TemporaryDirectory(prefix="jtq-replay-") as scratch:
-        logs = in_order([log for path in paths for log in log_parts(path)])
+        runs = read_runs(paths, Path(scratch), progress, stretch)
         replayers: dict[int, Replayer] = {}
-        runs = stretches(_parts(logs, Path(scratch), progress, stretch), stretch)
         while True:
             begun = time.perf_counter()
-            run = next(runs, None)
-            if run is None:
+            found = next(runs, None)
+            if found is None:
                 return
-            yield _replay_run(run, options, progress, time.perf_counter() - begun, replayers)
-            del run  # its states take most of the memory
+            read_s = time.perf_counter() - begun
+            run, inputs = found
+            del found  # its arrays take most of the memory
+            if run.number not in replayers:
+                replayers[run.number] = Replayer(run.setup, _models(run, options))
+            replayer = replayers[run.number]
+            yield _replay_run(run, inputs, replayer, options=options, progress=progress, read_s=read_s)
+            del run, inputs
 
 
-def _parts(logs: Sequence[Path], scratch: Path, progress: Progress, stretch: int) -> Iterator[Part]:
-    for n, path in enumerate(logs):
-        progress("reading", n, len(logs))
-        directory = scratch / str(n)
-        directory.mkdir(mode=0o700)
-        yield from read_pieces(path, directory, stretch)
-
-
-def _models(run: Run, options: ReplayOptions) -> Models:
+def _models(run: Run, options: ReplayOptions) -> list[Model]:
     try:
-        if options.other:
-            return other_models(run.setup, options.model, options.method)
-        return logged_models(run.setup)
+        return models_of(run.setup, options.model, options.method)
     except (ConfigError, NetworkError) as error:
         if options.other:
             raise
-        raise LogError(f"{run.parts[0].path}: its models: {error}") from None
+        raise LogError(f"{run.logs[0]}: its models: {error}") from None
 
 
 def _replay_run(
-    run: Run, options: ReplayOptions, progress: Progress, read_s: float, replayers: dict[int, Replayer]
+    run: Run,
+    inputs: Inputs,
+    replayer: Replayer,
+    *,
+    options: ReplayOptions,
+    progress: Progress,
+    read_s: float,
 ) -> Result:
-    models = _models(run, options)
-    logged = run.joints
+    """Replay a run, or a stretch; `replayer`: new, or as the stretch before has left it."""
+    config, models = run.setup.config, replayer.models
     begun = time.perf_counter()
     steps = run.steps()
-    replayer = replayers.get(run.number)
-    if replayer is None:
-        safety = models.safety(run.setup.config)
-        replayers[run.number] = replayer = Replayer(run.setup, models.estimators(), safety)
-    found = _replayed(run, replayer, steps, progress, _known_pasts(run, models))
-    estimate = (found.sent, found.made, found.recorded)
+    states = _accepted_states(run, models, options)
+    replayed = replayer.run(
+        run.joints, inputs, steps, lambda done: progress("replaying", done, run.cycles), states
+    )
     replay_s = time.perf_counter() - begun
-    progress("replaying", run.cycles, run.cycles)
     same = None
     if not options.other:
-        same = identity(logged, found.joints, steps, estimate)
-        if not same.explained and any(each.network is not None for each in models.joints):
-            limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models.joints)
-            same = identity(logged, found.joints, steps, estimate, network_nm=limit)
-        same = with_states(same, found.pasts_differ)
-    comparisons = tuple(
-        compare(number, *both, _known(run, same, number), _bandwidths(run, models, number))
-        for number, both in enumerate(zip(logged, found.joints, strict=True), start=1)
-    )
+        compared = run.joints, replayed.joints, steps
+        pdos = inputs.estimate, replayed.estimate, inputs.recorded
+        same = identity(*compared, pdos, replayed.states_differ)
+        if not same.explained and any(each.network is not None for each in models):
+            limit = NATIVE_LIMIT * min(each.joint.rated_torque_nm for each in models)
+            same = identity(*compared, pdos, replayed.states_differ, network_nm=limit)
+    comparisons = []
+    for n, (each, model) in enumerate(zip(config.joints, models, strict=True)):
+        bandwidths = bandwidth_of(each.joint, config.estimator), bandwidth_of(model.joint, model.settings)
+        known = _known(run, same, n + 1)
+        comparisons.append(compare(n + 1, run.joints[n], replayed.joints[n], known, bandwidths))
     return Result(
         run,
-        models.files,
-        models.joints[0].settings.method,
-        run.cycles * run.setup.config.period_ns * 1e-9,
+        models,
+        run.cycles * config.period_ns * 1e-9,
         read_s,
         replay_s,
-        lost_cycles(logged[0], run.setup.config),
-        found.from_si,
-        found.temperatures,
+        lost_cycles(run.joints[0], config),
+        inputs.from_si,
+        replayed.temperatures_from_log,
         same,
-        comparisons,
-        found.joints,
+        tuple(comparisons),
+        replayed.joints,
     )
 
 
-def _known(run: Run, same: Identity | None, number: int) -> npt.NDArray[np.bool_]:
+def _accepted_states(run: Run, models: Sequence[Model], options: ReplayOptions) -> Sequence[EstimatorStates]:
+    """Return the states of the log for each model: none where something differs that the zeros were learned with."""
+    if not options.other or not any(len(each.cycle) for each in run.states):
+        return run.states
+    pairs = zip(run.states, models_of(run.setup), models, strict=True)
+    return [states if same_past(old.estimator, new.estimator) else NO_STATES for states, old, new in pairs]
+
+
+def _known(run: Run, same: Identity | None, joint: int) -> BoolArray:
     """Return cycles [n] whose state was known, as far as the comparison with the logged models has found out."""
     cycle = run.joints[0]["cycle"].astype(np.int64)
-    known: npt.NDArray[np.bool_] = np.ones(len(cycle), np.bool_)
+    known: BoolArray = np.ones(len(cycle), np.bool_)
     for each in () if same is None else same.unknown:
-        if each.joint == number and not each.until_end:
+        if each.joint == joint and not each.until_end:
             known &= (cycle < each.first_cycle) | (cycle >= each.first_cycle + each.cycles)
     return known
-
-
-def _tell(progress: Progress, before: int, total: int, row: int) -> None:
-    progress("replaying", before + row, total)
-
-
-@dataclass(frozen=True)
-class _Replayed:
-    """Results of all parts, one after the other."""
-
-    joints: tuple[RecordArray, ...]
-    sent: npt.NDArray[np.uint8]
-    made: npt.NDArray[np.uint8]
-    recorded: npt.NDArray[np.bool_]
-    from_si: int
-    temperatures: int
-    pasts_differ: tuple[tuple[int, int], ...] = ()
-
-
-def _known_pasts(run: Run, models: Models) -> list[EstimatorStates]:
-    """Return the states of the log for each model: none where something differs that the zeros were learned with."""
-    if not any(len(each.cycle) for each in run.pasts):
-        return [NO_STATES] * len(models.joints)
-    logged = logged_models(run.setup).estimators()
-    pairs = zip(run.pasts, logged, models.estimators(), strict=True)
-    return [pasts if same_past(old, new) else NO_STATES for pasts, old, new in pairs]
-
-
-def _replayed(
-    run: Run, replayer: Replayer, steps: Sequence[Steps], progress: Progress, pasts: Sequence[EstimatorStates]
-) -> _Replayed:
-    """Cycle by cycle, part by part: the raw frames of only one part are in memory at a time.
-
-    `replayer`: new, or as the stretch before has left it.
-    """
-    done, from_si, temperatures = 0, 0, 0
-    states: list[tuple[int, int]] = []
-    joints, sent, made, recorded = [], [], [], []
-    for part in run.parts:
-        end = done + len(part.joints[0])
-        frames = decode(run.setup, part.frames(), part.joints)
-        here = [each.part(done, end) for each in steps]
-        told = partial(_tell, progress, done, run.cycles)
-        result = replayer.run(part.joints, frames, here, told, pasts)
-        joints.append(result.joints)
-        sent.append(frames.estimate)
-        made.append(result.estimate)
-        recorded.append(frames.recorded)
-        from_si += frames.from_si
-        temperatures += result.temperatures_from_log
-        states += result.pasts_differ
-        done = end
-    return _Replayed(
-        tuple(np.concatenate(each) for each in zip(*joints, strict=True)),
-        np.concatenate(sent),
-        np.concatenate(made),
-        np.concatenate(recorded),
-        from_si,
-        temperatures,
-        tuple(states),
-    )

@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.replay.replayer import Replayer, decode
-from jtqd.daemon.replay.runs import read_part, steps_of
-from jtqd.daemon.replay.session import Models, other_models
+from jtqd.daemon.replay.replayer import Replayer
+from jtqd.daemon.replay.runs import read_runs
+from jtqd.daemon.replay.session import models_of
 from tests.benchmarks.measure import table
 from tests.paths import GOLDEN
 
@@ -34,29 +34,24 @@ def _best(work: Any) -> float:
 def _one(log: Path, method: str, scratch: Path) -> dict[str, Any]:
     """Times real time of one method."""
     begun = time.process_time()
-    part = read_part(log, scratch)
-    frames = decode(part.setup, part.frames(), part.joints)
+    ((run, inputs),) = read_runs([log], scratch)
     read_s = time.process_time() - begun
-    config = part.setup.config
-    models: Models = other_models(part.setup, None, method)
-    safety = models.safety(config)
-    steps = [steps_of(each, config) for each in part.joints]
-
-    estimators = models.estimators()  # compares each network with ONNX Runtime: once per replay, however long
+    models = models_of(run.setup, None, method)  # checks each network against ONNX Runtime: once per replay
+    steps = run.steps()
 
     def exact() -> None:
-        for each in estimators:
-            each.reset()
-        Replayer(part.setup, estimators, safety).run(part.joints, frames, steps)
+        for each in models:
+            each.estimator.reset()
+        Replayer(run.setup, models).run(run.joints, inputs, steps)
 
     # 1 kHz is what counts, whatever the period of the log
-    exact_us = 1e6 * _best(exact) / len(part.joints[0])
+    exact_us = 1e6 * _best(exact) / run.cycles
     return {
         "method": method,
-        "cycles": len(part.joints[0]),
+        "cycles": run.cycles,
         "exact_us": exact_us,
         "exact_times": 1000.0 / exact_us,
-        "read_us": 1e6 * read_s / len(part.joints[0]),
+        "read_us": 1e6 * read_s / run.cycles,
     }
 
 

@@ -1,13 +1,15 @@
-"""`jtq replay` on a log that was just recorded over the unix bus: bit for bit, and honest where that cannot be."""
+"""`jtq replay`: a log that was just recorded over the unix bus, bit for bit; cut and spoilt ones; models, arguments."""
 
 from __future__ import annotations
 
 import hashlib
 import json
 import os
+import shutil
 import struct
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,14 +18,14 @@ import yaml
 
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.replay.command import main
-from jtqd.daemon.replay.session import ReplayOptions, replay
+from jtqd.models.files import shipped
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance
 from tests.estimator.fused_configuration import networks
+from tests.golden.scene import SCENES, play
 from tests.paths import GOLDEN
 from tests.shipped_bench import shipped_bench
 
-pytestmark = pytest.mark.native
-
+Change = Callable[[dict[str, bytes]], dict[str, bytes]]
 VALUES = 4 + 24 + 16
 """Where the 12 numbers of a JointEstimate begin: after encapsulation, stamp and frame_id, cycle and monotonic time."""
 
@@ -58,6 +60,19 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return found[0]
 
 
+@pytest.mark.socketcan
+@pytest.mark.parametrize("name", ["faults", "network"])
+def test_a_log_of_a_real_interface_comes_out_bit_for_bit(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """SocketCAN, also after a foreign SYNC, a conflict, a node that restarted and an interface that was down."""
+    status, found, _ = run(capsys, play(name, tmp_path))
+    assert status == 0
+    assert found["identity"]["identical"] == found["cycles"]
+    assert found["identity"]["pdos"] == found["identity"]["pdos_equal"]
+    assert found["cycles"] == pytest.approx(SCENES[name].seconds * 1e6 / SCENES[name].period_us, rel=0.1)
+
+
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, dict, str]:  # type: ignore[type-arg]
     """(exit status, the one run of the JSON, stderr)."""
     status = main([*map(str, arguments), "--json"])
@@ -75,6 +90,7 @@ def one_line(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
     return err
 
 
+@pytest.mark.native
 def test_what_was_recorded_comes_out_bit_for_bit(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, found, _ = run(capsys, log)
     assert found["cycles"] == found["identity"]["identical"] == len(cycles(log))
@@ -82,15 +98,16 @@ def test_what_was_recorded_comes_out_bit_for_bit(log: Path, capsys: pytest.Captu
     assert found["identity"]["differences"] == found["identity"]["unknown"] == []
     assert status == 0
     assert main([str(log)]) == 0
-    said = capsys.readouterr().out
+    text = capsys.readouterr().out
     count = f"{found['cycles']:,}".replace(",", " ")
-    assert f"bit-identical: {count} of {count} cycles" in said
+    assert f"bit-identical: {count} of {count} cycles" in text
 
 
+@pytest.mark.native
 def test_a_log_that_begins_in_the_middle(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What the observer knew is not in it: the replay says so, and is identical again from the first state in the log on."""
+    """The observer's state is not in it: the replay reports that, and is identical from the first state in the log on."""
     begin = cycles(log)[500]
     late = cut(log, tmp_path / "late.mcap", lambda cycle: cycle >= begin)
     status, found, _ = run(capsys, late)
@@ -107,6 +124,7 @@ def test_a_log_that_begins_in_the_middle(
     assert f"bit-identical from cycle {same['from_cycle']:,} on".replace(",", " ") in capsys.readouterr().out
 
 
+@pytest.mark.native
 def test_parts_of_one_run_are_joined(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     middle = cycles(log)[900]
     one = cut(log, tmp_path / "b.mcap", lambda cycle: cycle < middle)
@@ -119,7 +137,8 @@ def test_parts_of_one_run_are_joined(log: Path, tmp_path: Path, capsys: pytest.C
     assert "given twice" in one_line(capsys, one, one)
 
 
-def test_lost_cycles_are_counted_and_forgotten(
+@pytest.mark.native
+def test_lost_cycles_are_counted_and_their_effect_ends(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """30 cycles are missing: the difference from there on has a reason, and ends."""
@@ -134,6 +153,7 @@ def test_lost_cycles_are_counted_and_forgotten(
     assert same["from_cycle"] > max(gone)
 
 
+@pytest.mark.native
 def test_a_changed_number_is_found(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One torque in the log is another by one bit."""
     state = read_topic(log, "/joint/2/state")
@@ -153,6 +173,7 @@ def test_a_changed_number_is_found(log: Path, tmp_path: Path, capsys: pytest.Cap
     assert found["identity"]["identical"] == found["cycles"] - 1
 
 
+@pytest.mark.native
 def test_the_raw_frames_are_what_is_replayed(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,10 +195,11 @@ def test_the_raw_frames_are_what_is_replayed(
     assert (one["joint"], one["cycle"]) == (1, target)
 
 
+@pytest.mark.native
 def test_other_models_and_the_file_with_both(
     log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Joint 1 with a torque constant 10 % larger: the difference, the sensor's opinion, and a file for the viewer."""
+    """Joint 1 with a torque constant 10 % larger: the difference, the error to the sensor, a file for the viewer."""
     models = tmp_path / "models"
     models.mkdir()
     text = read_attachments(log)["joint1.yaml"].decode()
@@ -209,73 +231,76 @@ def test_other_models_and_the_file_with_both(
     assert "exists" in capsys.readouterr().err
 
 
-def test_wrong_models(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert "not a directory" in one_line(capsys, log, "--model", tmp_path / "nowhere")
-    assert "found no file for these joints" in one_line(capsys, log, "--model", tmp_path)
+# ---- models and logs that cannot be used: golden logs ----
+
+LOG = GOLDEN / "faults.mcap"
+
+
+def test_wrong_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "not a directory" in one_line(capsys, LOG, "--model", tmp_path / "nowhere")
+    assert "found no file for these joints" in one_line(capsys, LOG, "--model", tmp_path)
     (tmp_path / "joint1.yaml").write_text("name: [")
-    assert "joint1.yaml" in one_line(capsys, log, "--model", tmp_path)
-    (tmp_path / "joint1.yaml").unlink()
+    assert "joint1.yaml" in one_line(capsys, LOG, "--model", tmp_path)
+    for name in ("joint1.yaml", "extended.joint1.yaml"):
+        shutil.copy(shipped("joint1.yaml"), tmp_path / name)
+    line = one_line(capsys, LOG, "--model", tmp_path)
+    assert line.endswith(f"{tmp_path}: found joint1.yaml and extended.joint1.yaml, expected one of them\n")
+    for name in ("joint1.yaml", "extended.joint1.yaml"):
+        (tmp_path / name).unlink()
     (tmp_path / "joint2.fused.onnx").write_bytes(b"no network")
-    assert "joint2.fused.onnx" in one_line(capsys, log, "--model", tmp_path)
-    assert "needs" in one_line(capsys, log, "--method", "network")
+    assert "joint2.fused.onnx" in one_line(capsys, LOG, "--model", tmp_path)
+    assert "needs" in one_line(capsys, LOG, "--method", "network")
+    assert "none: found no such directory" in one_line(capsys, LOG, "--out", tmp_path / "none" / "a.mcap")
 
 
-def test_logs_that_cannot_be_used(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def without(name: str):  # type: ignore[no-untyped-def]
-        return lambda found: {key: value for key, value in found.items() if key != name}
+def without(name: str) -> Change:
+    return lambda found: {key: value for key, value in found.items() if key != name}
 
-    def bent(name: str):  # type: ignore[no-untyped-def]
-        return lambda found: {**found, name: found[name] + b" "}
 
-    few = cycles(log)[5]
-    bad = {
-        "configuration.yaml, expected one": without("configuration.yaml"),
-        "provenance.json, expected one": without("provenance.json"),
-        "attachment configuration.yaml: found SHA-256": bent("configuration.yaml"),
-        "attachment joint1.yaml: found SHA-256": bent("joint1.yaml"),
-        "sha256 of the network": bent("joint2.fused.onnx"),
-        "found no JSON": lambda found: {**found, "provenance.json": b"{"},
-        "no usable scaling": provenance(lambda content: content["nodes"]["1"].pop("scaling")),
-        "joints.2.file: missing": provenance(lambda content: content["joints"]["2"].pop("file")),
-    }
-    for n, (text, change) in enumerate(bad.items()):
-        path = cut(log, tmp_path / f"{n}.mcap", lambda cycle: cycle < few, attachments=change)
-        assert text in one_line(capsys, path)
+def bent(name: str) -> Change:
+    return lambda found: {**found, name: found[name] + b" "}
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (without("configuration.yaml"), "configuration.yaml, expected one"),
+        (without("provenance.json"), "provenance.json, expected one"),
+        (without("joint2.yaml"), "joint2.yaml, expected one"),
+        (bent("configuration.yaml"), "attachment configuration.yaml: found SHA-256"),
+        (bent("joint1.yaml"), "attachment joint1.yaml: found SHA-256"),
+        (lambda found: {**found, "provenance.json": b"{"}, "provenance.json: Input data was truncated"),
+        (
+            lambda found: {**found, "provenance.json": b"[]"},
+            "provenance.json: Expected `object`, got `array`",
+        ),
+        (provenance(lambda content: content["nodes"]["1"].pop("scaling")), "no usable scaling"),
+        (
+            provenance(lambda content: content["joints"]["2"].pop("file")),
+            "joints.2: Object missing required field `file`",
+        ),
+    ],
+)
+def test_logs_with_other_attachments(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Change, text: str
+) -> None:
+    few = cycles(LOG)[5]
+    path = cut(LOG, tmp_path / "a.mcap", lambda cycle: cycle < few, attachments=change)
+    assert text in one_line(capsys, path)
+
+
+@pytest.mark.native
+def test_a_network_with_another_hash(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = cut(log, tmp_path / "a.mcap", attachments=bent("joint2.fused.onnx"))
+    assert "sha256 of the network" in one_line(capsys, path)
+
+
+def test_files_that_are_no_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "No such file" in one_line(capsys, tmp_path / "none.mcap")
     (tmp_path / "empty").mkdir()
     assert "found no *.mcap" in one_line(capsys, tmp_path / "empty")
     (tmp_path / "text.mcap").write_text("time_s,torque\n" * 100)
     assert "MCAP" in one_line(capsys, tmp_path / "text.mcap")
-    foreign = cut(log, tmp_path / "foreign.mcap", lambda cycle: False)
+    foreign = cut(LOG, tmp_path / "foreign.mcap", lambda cycle: False)
     assert "/joint/1/state" in one_line(capsys, foreign)
-    capsys.readouterr()
     assert main([]) == 2
-
-
-def test_a_number_that_differs_is_found(log: Path) -> None:
-    from jtqd.daemon.replay import compare as difference
-
-    (whole,) = replay([log], ReplayOptions())
-    logged, made = whole.run.joints, tuple(each.copy() for each in whole.joints)
-    row = int(np.flatnonzero(np.isfinite(made[0]["torque_nm"]))[-50])
-    made[0]["torque_nm"][row] += 1e-6
-    same = difference.identity(logged, made, whole.run.steps())
-    (one,) = same.differences
-    assert (one.joint, one.cycle, one.cycles) == (1, int(logged[0]["cycle"][row]), 1)
-    assert not same.explained
-
-
-def test_logs_of_another_version(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Fields with other names and types: one line, never numbers of something else."""
-    log = GOLDEN / "network.mcap"
-    for old, new, said in (
-        (b"motor_position_rad", b"position_of_motor_x", "found no field motor_position_rad"),
-        (b"float64 dt_s", b"int64 dt_s", "found dt_s of type int64, expected float64"),
-        (b"builtin_interfaces/Time stamp", b"float64 stamp", "found header.stamp of type float64"),
-        (b"CanFrame[16] frames", b"CanFrame[16] fraims", "found no field frames.id"),
-        (b"uint8[8] data", b"int8[8] data", "found frames.data of type"),
-    ):
-        path = tmp_path / "a.mcap"
-        cut(log, path, schema=lambda text, a=old, b=new: text.replace(a, b))  # type: ignore[misc]
-        line = one_line(capsys, path)
-        assert said in line

@@ -1,7 +1,7 @@
-"""Zeros that the estimators track, in a log: a replay from any part of it has the loop's own values again.
+"""Zeros that the estimators track, in a log: a replay from any part of it has the loop's own values.
 
-The loop's cycles run in exact time on a scripted bus that says what an emulated run measured, with a zero of both link
-encoders added; what they leave in the ring and in the snapshot becomes logs, as the recorder makes them.
+The loop's cycles run in exact time on a scripted bus that answers with the measurements of an emulated run, with a zero of
+both link encoders added; the contents of ring and snapshot become logs, as the recorder makes them.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ import pytest
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.core.intake import Intake
+from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.logs import read_attachments, read_topic
@@ -28,7 +29,7 @@ from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedD
 from jtqd.daemon.recording.messages import CycleMessages, zeros_of
 from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.replay.logged import Setup, read_setup
-from jtqd.daemon.replay.session import ReplayOptions, Result, logged_models, replay_each
+from jtqd.daemon.replay.session import ReplayOptions, Result, models_of, replay_each
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader, View
@@ -49,7 +50,7 @@ HELD_CYCLES = NEEDED[DEGRADED]
 
 @dataclass(frozen=True)
 class Recorded:
-    """What a run of the loop left: records of its cycles, views of the snapshot, one a second."""
+    """Records of the cycles of a run of the loop, and views of the snapshot, one a second."""
 
     attachments: dict[str, bytes]
     records: list[bytes]
@@ -111,16 +112,18 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
     with pytest.MonkeyPatch.context() as patch:
         clock = ExactTime().install(patch)
         setup = read_setup(GOLDEN, attachments, place)
-        config, models = setup.config, logged_models(setup)
+        config, models = setup.config, models_of(setup)
         answers = frames_of(setup)
         snapshot = place / "snapshot"
         cycle = Cycle(
             ScriptedSocket(lambda sync: answers[sync - 1]),  # type: ignore[arg-type]
             Intake(input_pdos(config), joint_temperatures(config)),
-            list(zip(setup.inputs, models.estimators(), strict=True)),
+            list(zip(setup.inputs, [each.estimator for each in models], strict=True)),
             Ring(place / "ring", 4096, rr.RECORD_SIZE),
             Snapshot(snapshot, config.period_ns * 1e-9, 0.8),
-            safety=models.safety(config),
+            safety=[
+                JointSafety(config.safety, each.settings, each.joint, config.period_ns) for each in models
+            ],
             node_id=config.node_id,
             counter_overflow=config.counter_overflow,
             wait_ns=0,
@@ -141,14 +144,14 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Recorded]:
         yield Recorded(attachments, records, views)
 
 
-def written(path: Path, run: Recorded, first: int = 0, end: int = CYCLES, *, told: bool = True) -> Path:
-    """The log of the cycles `first` to `end`; without `told` no state of an estimator is in it."""
+def written(path: Path, run: Recorded, first: int = 0, end: int = CYCLES, *, states: bool = True) -> Path:
+    """The log of the cycles `first` to `end`; without `states` no state of an estimator is in it."""
     schemas, channels = definitions()
     messages = CycleMessages(2)
     builder = ChunkBuilder(schemas, channels, messages.parts, 10)
     attachments = [NamedData(name, "text/plain", data) for name, data in run.attachments.items()]
     file = McapFile(path.with_name(path.name + ".active"), Head(schemas, channels, attachments), {}, 0)
-    views = {view.cycle: view for view in run.views if told}
+    views = {view.cycle: view for view in run.views if states}
     for record in run.records[first:end]:
         header = cr.header_of(record)
         block = messages.block(
@@ -176,16 +179,16 @@ def replayed(path: Path, **options: Any) -> Result:
     return result
 
 
-def test_the_loop_learns_and_the_snapshot_and_the_log_say_so(recorded: Recorded, tmp_path: Path) -> None:
+def test_zeros_that_the_loop_learns_are_in_snapshot_and_log(recorded: Recorded, tmp_path: Path) -> None:
     last = recorded.views[-1]
     for zero in last.zeros[:2]:
         assert zero.learned
         assert zero.link_rad == pytest.approx(ZERO_RAD, abs=2e-5)
         assert zero.link_used_rad == pytest.approx(ZERO_RAD, abs=2e-5)
-    told = read_topic(written(tmp_path / "run.mcap", recorded), "/joint/2/zeros")
-    assert told["cycle"].tolist() == [view.cycle for view in recorded.views]
-    assert told["link_rad"].tolist() == [view.zeros[1].link_rad for view in recorded.views]
-    assert told["flags"].tolist() == [view.zeros[1].flags for view in recorded.views]
+    found = read_topic(written(tmp_path / "run.mcap", recorded), "/joint/2/zeros")
+    assert found["cycle"].tolist() == [view.cycle for view in recorded.views]
+    assert found["link_rad"].tolist() == [view.zeros[1].link_rad for view in recorded.views]
+    assert found["flags"].tolist() == [view.zeros[1].flags for view in recorded.views]
 
 
 def test_a_whole_run_is_replayed_as_the_loop_was(recorded: Recorded, tmp_path: Path) -> None:
@@ -196,7 +199,7 @@ def test_a_whole_run_is_replayed_as_the_loop_was(recorded: Recorded, tmp_path: P
     assert result.identity.whole
 
 
-@pytest.mark.parametrize("first", [2200, 3497])  # 3497: just behind a state, which says nothing of it
+@pytest.mark.parametrize("first", [2200, 3497])  # 3497: just behind a state
 def test_a_log_from_the_middle_is_the_loop_again_from_its_first_state_on(
     recorded: Recorded, tmp_path: Path, first: int
 ) -> None:
@@ -217,7 +220,7 @@ def test_a_log_from_the_middle_is_the_loop_again_from_its_first_state_on(
 
 def test_without_the_states_a_log_from_the_middle_is_another_one(recorded: Recorded, tmp_path: Path) -> None:
     """What the states are there for: a zero does not fade as the observer does."""
-    result = replayed(written(tmp_path / "part.mcap", recorded, 2200, told=False))
+    result = replayed(written(tmp_path / "part.mcap", recorded, 2200, states=False))
     assert result.identity is not None
     assert not result.identity.explained
 
@@ -238,12 +241,12 @@ def test_a_state_of_the_log_that_is_not_the_replays_is_a_finding(recorded: Recor
 
 
 def test_other_losses_do_not_go_on_from_the_states(recorded: Recorded, tmp_path: Path) -> None:
-    """What was learned with the logged losses says nothing about other ones; the estimate learns anew."""
+    """Zeros that were learned with the logged losses do not hold for other ones; the estimate learns its own."""
     models = tmp_path / "models"
     models.mkdir()
     text = recorded.attachments["joint1.yaml"].decode()
     (models / "joint1.yaml").write_text(text.replace("nm_per_a: 0.062", "nm_per_a: 0.0621", 1))
     log = written(tmp_path / "part.mcap", recorded, 3500)
-    same, other = replayed(log, compare=True), replayed(log, model=models)
+    same, other = replayed(log), replayed(log, model=models)
     assert same.comparisons[0].rms_nm < 0.1
     assert other.comparisons[0].rms_nm > 0.3

@@ -1,9 +1,10 @@
-"""Rows of a log against the joints of the loop, cycle by cycle: missing inputs, late estimates, no time, temperatures."""
+"""Inputs out of raw frames; rows of a log against the joints of the loop: missing inputs, late estimates, temperatures."""
 
 from __future__ import annotations
 
 import struct
 from array import array
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,15 +15,20 @@ from jtqd.daemon.core.input_pdos import JointInputs, TemperaturePdo, drive_place
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.logs import read_topic
+from jtqd.daemon.replay.inputs import Pdo, decode, offsets
 from jtqd.daemon.replay.logged import SAMPLE
-from jtqd.daemon.replay.rows import CycleRows
+from jtqd.daemon.replay.rows import CycleRows, fields
+from jtqd.daemon.replay.runs import read_runs
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import ENABLED, PDOS, SCALE
+from tests.daemon.replay.replay_helpers import records
 from tests.estimator.fused_configuration import joint_of, network_of
+from tests.paths import GOLDEN
 
 ROWS = 1500
 PERIOD_NS = 1_000_000
@@ -138,3 +144,46 @@ def test_arrays_that_do_not_fit_are_refused() -> None:
     for first, end in ((-1, 3), (5, 3), (0, ROWS + 1)):
         with pytest.raises(ValueError, match=f"found rows {first} to {end}"):
             rows.go_on(first, end)
+
+
+def test_fields_are_those_of_the_pdo() -> None:
+    rng = np.random.default_rng(1)
+    torque = np.concatenate((rng.normal(0, 200, 3000), [np.nan, np.inf, 327.67, 327.68, -327.67, -1e300]))
+    torque = np.concatenate((torque, np.round(rng.normal(0, 10, 500), 2) + 0.005))  # ties
+    sigma = np.abs(rng.normal(0, 8, len(torque)))
+    sigma[:6] = np.nan, np.inf, -1.0, 12.7, 0.0, 12.700001
+    status = rng.choice([0, 1, 2, 3, 4, 5, 6, 15], len(torque)).astype(np.uint16)
+    expected = [estimate_pdo.field(*each) for each in zip(torque, sigma, status.tolist(), strict=True)]
+    assert list(zip(*(each.tolist() for each in fields(torque, sigma, status)), strict=True)) == expected
+
+
+def test_a_log_from_the_middle_of_a_run_has_the_turns_of_its_positions() -> None:
+    """Raw counts beside the continuous positions of the log."""
+    inputs = JointInputs(drive_places(0), None, 1e-4, 1e-3, 1e-5, 0.01, 0.0)
+    log = records([500])
+    log["motor_position_rad"], log["link_position_rad"] = (5 * 2**32 + 77) * 1e-4, (-(2**32) - 12) * 1e-5
+    pdo = Pdo((np.array([77]), np.array([-12])), np.array([True]))
+    assert offsets([pdo], log, inputs, 0) == (5 * 2**32, -(2**32))
+
+
+def test_of_a_record_without_room_for_all_frames_the_si_values_count(tmp_path: Path) -> None:
+    """The last frame in the record may be an older one: the log's SI values beside it are those that were used."""
+    log = GOLDEN / "network.mcap"
+    ((run, before),) = read_runs([log], tmp_path)
+    frames = read_topic(log, "/can/frames")
+    assert before.from_si == 0
+    rows = [300, 301, 700]
+    frames["frames"]["data"][rows] ^= 0x55
+    spoilt = decode(run.setup, frames, run.joints)
+    frames["frames_left_out"][rows] = 1
+    after = decode(run.setup, frames, run.joints)
+    assert spoilt.from_si == 0
+    assert after.from_si == sum(int(pdo.fresh[rows].sum()) for pdo in before.pdos) > 0
+    pdos = zip(before.pdos, after.pdos, spoilt.pdos, strict=True)
+    same = [
+        ((old == new)[one.fresh].all(), (old == bad)[rows].all())
+        for one, two, three in pdos
+        for old, new, bad in zip(one.values, two.values, three.values, strict=True)
+    ]
+    assert all(kept for kept, _ in same)
+    assert not all(unchanged for _, unchanged in same)
