@@ -21,8 +21,7 @@ from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.replay.inputs import Inputs, offsets
-from jtqd.daemon.replay.logged import NO_STATES, SAMPLE, EstimatorStates, Setup
+from jtqd.daemon.replay.logged import NO_STATES, SAMPLE, EstimatorStates, Inputs, Setup, offsets
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared import cycle_record as cr

@@ -22,14 +22,15 @@ import numpy.typing as npt
 from jtqd.daemon.config import Config
 from jtqd.daemon.logs import LogError, iter_messages, iter_topics, log_parts, read_attachments
 from jtqd.daemon.recording.schemas import CAN_FRAMES, ZEROS, joint_topics
-from jtqd.daemon.replay.inputs import Inputs, decode
 from jtqd.daemon.replay.logged import (
     FRAMES,
     JOINT,
     NO_STATES,
     EstimatorStates,
+    Inputs,
     Setup,
     check_fields,
+    decode,
     read_setup,
     states_of,
 )

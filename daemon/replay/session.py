@@ -15,8 +15,7 @@ import numpy as np
 
 from jtqd.daemon.logs import LogError
 from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
-from jtqd.daemon.replay.inputs import Inputs
-from jtqd.daemon.replay.logged import NO_STATES, EstimatorStates, Setup
+from jtqd.daemon.replay.logged import NO_STATES, EstimatorStates, Inputs, Setup
 from jtqd.daemon.replay.replayer import Model, Replayer
 from jtqd.daemon.replay.runs import STRETCH_CYCLES, Progress, Run, lost_cycles, read_runs
 from jtqd.estimator.arrays import BoolArray, RecordArray

@@ -11,7 +11,7 @@ import pytest
 
 from jtqd.daemon.core.input_pdos import InputPdo, input_pdos
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.replay.inputs import _held
+from jtqd.daemon.replay.logged import _held
 from jtqd.estimator.errors import ConfigError
 from tests.daemon.loop.one_drive import config_with
 from tests.daemon.snapshots import counted

@@ -16,8 +16,7 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import read_topic
-from jtqd.daemon.replay.inputs import Pdo, decode, offsets
-from jtqd.daemon.replay.logged import SAMPLE
+from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets
 from jtqd.daemon.replay.rows import CycleRows, fields
 from jtqd.daemon.replay.runs import read_runs
 from jtqd.daemon.shared.counters import COUNTERS
