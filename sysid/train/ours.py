@@ -114,7 +114,7 @@ def judge(scores: Collection[tuple[float, float]], share: float = 1.0) -> Gate:
     network that changes nothing takes nothing off, and is worse nowhere. Raises ValueError without a run.
     """
     if not scores:
-        raise ValueError("found no run left out, expected at least one")
+        raise ValueError("found no held-out run, expected at least one")
     table = np.array(list(scores), np.float64)
     network, physics = np.sqrt(table.mean(axis=0)).tolist()
     return Gate(network, physics, len(table), int((table[:, 0] > table[:, 1]).sum()), share)

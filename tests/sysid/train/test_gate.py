@@ -35,7 +35,7 @@ def test_what_changes_nothing_is_refused_with_its_numbers():
         "on 8 held-out runs it takes 0.0 % off the error of physics (RMSE 1.000 -> 1.000 Nm; expected at least 30 %) "
         "and is worse in 0 (expected at most 2 %)"
     )
-    with pytest.raises(ValueError, match="no run left out"):
+    with pytest.raises(ValueError, match="no held-out run"):
         judge([])
 
 
