@@ -1,4 +1,4 @@
-"""`jtq plot`: draw a log: estimate with its standard deviation beside the sensor, their difference, contacts."""
+"""`jtq plot`: draw estimate and standard deviation, torque sensor, their difference and contacts of a log."""
 
 from __future__ import annotations
 
@@ -26,6 +26,7 @@ from jtqd.estimator.status import (
     STARTING,
     VALID,
 )
+from jtqd.estimator.text import counted, finite
 from jtqd.sysid.report.figures import check_picture, shade
 
 _SHADES = {
@@ -77,17 +78,16 @@ def main(argv: list[str]) -> int:
         print(f"jtq plot: {text}", file=sys.stderr)
         return 1
     if arguments.json:
-        shown = None if math.isnan(rmse) else rmse
-        print(json.dumps({"paths": [str(arguments.out)], "rmse_nm": {f"joint_{joint}": shown}}))
+        print(json.dumps({"paths": [str(arguments.out)], "rmse_nm": {f"joint_{joint}": finite(rmse)}}))
     else:
         print(arguments.out)
     return 0
 
 
 def reference(log: Records) -> tuple[FloatArray, float]:
-    """Return the sensor as old as the estimate [n], and that age [ms].
+    """Return the sensor, as old as the estimate [n], and that age [ms].
 
-    A log of before its field `reference_nm` does not tell the age: then the one of every shipped configuration until then.
+    A log without the field `reference_nm` has no age; it was recorded with the default bandwidth.
     """
     if "reference_nm" in (log.dtype.names or ()):
         known = log["age_ms"][np.isfinite(log["age_ms"])]
@@ -97,7 +97,7 @@ def reference(log: Records) -> tuple[FloatArray, float]:
 
 
 def contacts(log: Records) -> BoolArray | None:
-    """Return where a contact was told [n]; None where contacts were not watched, or the log is of before there were any."""
+    """Return where a contact was reported [n]; None where contacts were not watched, or the log has no such field."""
     if "contact_nm" not in (log.dtype.names or ()) or not (log["input_flags"] & CONTACT_KNOWN).any():
         return None
     there: BoolArray = (log["input_flags"] & CONTACT) != 0
@@ -107,11 +107,9 @@ def contacts(log: Records) -> BoolArray | None:
 def draw(log: Records, joint: int, path: Path) -> float:
     """Draw panels over time: torque and sensor, then their difference; shaded where the status is not valid.
 
-    Where contacts were watched, two more: the torque from outside, its contacts shaded, and the torque rate.
+    Where contacts were watched, two more: the external torque with its contacts shaded, and the torque rate.
 
-    Returns:
-        The RMSE in the title [Nm], over what was published while the joint moved and the sensor was valid, both of one age;
-        NaN without any.
+    Returns the RMSE in the title [Nm], over the samples in motion with a valid sensor, both of one age; NaN without any.
     """
     import matplotlib as mpl
 
@@ -123,8 +121,8 @@ def draw(log: Records, joint: int, path: Path) -> float:
     published = np.isin(status, (VALID, DEGRADED, STANDSTILL))
     torque = np.where(published, log["torque_nm"], np.nan)
     sigma, sensor, age = log["sigma_nm"], *reference(log)
-    told = contacts(log)
-    ratios = (3, 1.3) if told is None else (3, 1.3, 1.3, 1.3)
+    contact = contacts(log)
+    ratios = (3, 1.3) if contact is None else (3, 1.3, 1.3, 1.3)
     figure, axes = plt.subplots(
         len(ratios), 1, figsize=(11, 1.2 + sum(ratios)), sharex=True, height_ratios=ratios
     )
@@ -150,7 +148,7 @@ def draw(log: Records, joint: int, path: Path) -> float:
     above.set_title(f"joint {joint}: {title}", fontsize=10)
     above.set_ylabel("joint torque [Nm]")
     below.set_ylabel("difference [Nm]")
-    if told is not None:
+    if contact is not None:
         for axis, values, what in zip(
             axes[2:],
             (log["contact_nm"], log["torque_rate_nm_s"]),
@@ -160,9 +158,9 @@ def draw(log: Records, joint: int, path: Path) -> float:
             axis.plot(time_s, values, color="#444444", linewidth=0.6)
             axis.set_ylabel(what)
             axis.margins(x=0)
-        begun = int(told[0]) + int((np.diff(told.astype(np.int8)) > 0).sum())
-        shade(axes[2], time_s, told, _CONTACT, None)
-        axes[2].set_title(f"{begun} contact{'s' * (begun != 1)}", fontsize=9, color=_CONTACT)
+        begun = int(contact[0]) + int((np.diff(contact.astype(np.int8)) > 0).sum())
+        shade(axes[2], time_s, contact, _CONTACT, None)
+        axes[2].set_title(counted(begun, "contact"), fontsize=9, color=_CONTACT)
     axes[-1].set_xlabel("time [s]")
     for axis in (above, below):
         axis.margins(x=0)

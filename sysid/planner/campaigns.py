@@ -66,7 +66,7 @@ class Unit:
         """Return why a campaign of this kind has no runs of these joints; "" where it has."""
         if kind == "efficiency" and len(self.joints) == 1:
             return (
-                "no efficiency: a second joint on a towing bench must set the load (--towing A,B says that two are on one); "
+                "no efficiency: a second joint on a towing bench must set the load (--towing A,B for two that are on one); "
                 "jtq campaign excitation moves a joint alone"
             )
         if kind != "excitation" and not self.measured:
@@ -168,7 +168,7 @@ def check_joints(plan: Plan, units: Sequence[Unit]) -> None:
             one, two = run.joints
             raise ConfigError(
                 f"run '{run.name}': found joints {one} and {two} driven against each other, expected joints that share a "
-                f"channel of the torque sensor; --towing {one},{two} says that they are coupled on a bench"
+                f"channel of the torque sensor; --towing {one},{two} for two that are coupled on a bench"
             )
 
 

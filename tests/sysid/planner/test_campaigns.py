@@ -246,7 +246,7 @@ def test_runs_must_fit_the_coupling_of_the_joints() -> None:
     single = Plan("p", DEFAULT_LIMITS, (Run("r", 1, (Rest(1.0),), None),))
     check_joints(pair, bench)
     check_joints(single, arm)
-    with pytest.raises(ConfigError, match="--towing 1,2 says that they are coupled"):
+    with pytest.raises(ConfigError, match="--towing 1,2 for two that are coupled"):
         check_joints(pair, arm)
     with pytest.raises(ConfigError, match="moved alone, expected a run of joints 1 and 2"):
         check_joints(single, bench)
