@@ -1,4 +1,4 @@
-"""Which joint file belongs to which joint of the runs: options --joint and --number."""
+"""Joint files and numbers of the joints in the runs, as the options --joint and --number give them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ _JOINT: Final = re.compile(r"([1-7])=(.+)")
 
 
 class UsageError(ValueError):
-    """A command line that cannot be meant; one line."""
+    """A wrong combination of options; one line."""
 
 
 def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int, Path]:
-    """Return the joint files by number, or {ALL_JOINTS: file}; without arguments those that the column map names.
+    """Return the joint files by number, or {ALL_JOINTS: file}; without arguments those of the column map.
 
     Raises UsageError.
     """
@@ -52,7 +52,7 @@ def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int
 
 
 def named_joints(files: Mapping[int, Path]) -> list[int] | None:
-    """Return the joints that `joint_files` names; None for a file that serves all."""
+    """Return the numbers of the joint files; None for a file that serves all joints."""
     return None if ALL_JOINTS in files else sorted(files)
 
 
@@ -62,7 +62,7 @@ def only(option: int | None) -> list[int] | None:
 
 
 def check_joint_files(files: Mapping[int, Path]) -> None:
-    """Refuse a file that is no joint file before runs are read, which takes its time. Raises ConfigError."""
+    """Load all joint files, before the runs are read. Raises ConfigError."""
     for path in files.values():
         load_joint(path)
 
@@ -86,7 +86,7 @@ def joints_of(files: Mapping[int, Path], runs: Sequence[RunFile]) -> dict[int, J
 
 
 def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> int:
-    """Return the number of the joint meant: the option, else the number its name ends in, else the only one there is.
+    """Return the number of a joint: the option, else the number its name ends in, else the only one of the runs.
 
     Raises ConfigError where none of these decides.
     """
@@ -105,7 +105,7 @@ def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> i
 
 
 def with_joint(runs: Sequence[RunFile], number: int) -> list[RunFile]:
-    """Return the runs that have columns of the joint; all of them where none has, so that the reader says so.
+    """Return the runs that have columns of the joint; all of them where none has, so that the caller reports it.
 
     A campaign of an arm moves one joint after the other: its directory holds runs of other joints too.
     """

@@ -61,7 +61,7 @@ class LoggedRun:
     Attributes:
         table: torque_nm is None where the log has no sensor value at all, temperature_c where the drive sent none,
             link_position_rad for a joint with one encoder.
-        missed: slots without a cycle (missed by the loop, or left silent on purpose).
+        missed: slots without a cycle (missed by the loop, or skipped on purpose).
         incomplete: cycles left out because an input was not fresh.
         incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
         longest_gap_s: longest time between two rows.
@@ -94,19 +94,19 @@ def log_to_run(
 ) -> LoggedRun:
     """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
 
-    The commander sends its first set-point in the cycle after the first of these, and ends with a quick stop: no other
-    clock is needed to know when the motion was. The cycles of a joint that is read alone are its own, whatever others did.
+    The commander sends its first set-point in the cycle after the first of these, and ends with a quick stop. A joint that
+    is read alone has its own first and last cycle.
 
     Args:
         log: MCAP of jtqd, or the parts of one run, or their directory.
-        joints: numbers of those that are wanted; None: all. Those whose drive was never enabled, or that lack an input
-            in the whole motion, are left out and reported, as long as one is left.
+        joints: numbers; None: all. Those whose drive was never enabled, or that lack an input in the whole motion, are
+            left out and reported, as long as one remains.
         all_needed: refuse the log instead of leaving joints out.
         nodes: node-IDs of the drives in the order of the log's joints, for their temperatures; None: by the
             configuration that is attached to the log, without one 1, 2, ...
         sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
             torque_nm is None.
-        enabled: further joints whose drives must be in "operation enabled" at both ends, although they are not wanted.
+        enabled: further joints whose drives must be in "operation enabled" at both ends.
         last_motion: begin after the last time without power, not at the first cycle with it.
 
     Raises:
@@ -150,7 +150,7 @@ def _run_of(
     """Return the complete cycles of a motion as a table, with an account of the others; LogError where there are none."""
     present = {f"joint {number}": _complete(number, state, log) for number, state in states.items()}
     with_sensor = _with_sensor(states.values()) if sensor else None
-    if with_sensor is not None:  # a dead sensor must not take the drives' columns with it
+    if with_sensor is not None:  # with a dead sensor the drives' columns remain
         present["sensor"] = with_sensor
     used: Flags = np.logical_and.reduce(list(present.values()))
     complete = int(np.count_nonzero(used))
@@ -199,7 +199,7 @@ def _temperatures_of(log: Path | Sequence[Path], there: Sequence[int]) -> list[T
 
 
 def _temperature_of(number: int, section: object) -> TemperatureOf:
-    """Return that of one joint by its section, which may be anything."""
+    """Return that of one joint by its section, which is not checked yet."""
     keys = section if isinstance(section, dict) else {}
     node, objects = keys.get("node"), keys.get("objects")
     own = objects.get("temperature") if isinstance(objects, dict) else None
