@@ -4,10 +4,9 @@ jtqd has booted the nodes: TPDOs, heartbeat and the watch over jtqd (1016h:1) ar
 operation, interpolation time, temperature (TPDO3) and the watch over the commander (1016h:2), and reads back each object.
 Every failure is a BootError: one line with node, object, expected and found.
 
-    quick_stop, switch_off, reset_fault, set_up, release    one drive, over any `SdoAccess`: no bus, no clock
-    sensor_units                                            the sensor
-    BenchSetup                                              all of them, over a frame socket of its own
-    Commands, Heartbeat                                     the frames that the commander sends
+    Drive, sensor_units    one drive, and the sensor, over any `SdoAccess`: no bus, no clock
+    BenchSetup             all of them, over a frame socket of its own
+    Commands, Heartbeat    the frames that the commander sends
 
 Controlwords: CiA 402-2, table "command coding". A drive is led one state at a time; each step waits until the statusword
 (`jtqd.drivers.drive`) has confirmed the last one.
@@ -160,86 +159,99 @@ class SensorUnits:
     heartbeat_ms: int
 
 
-def quick_stop(access: SdoAccess, node: int) -> None:
-    """Let the drive brake by itself if it is powered; does not wait. Raises BootError."""
-    drive = NodeObjects(access, node)
-    if not _off(drive.number(_STATUSWORD, 2)):
-        drive.write(_CONTROLWORD, QUICK_STOP_WORD, 2)
+class Drive:
+    """One drive by SDO. sleep: waits for seconds. Every method raises BootError."""
 
+    def __init__(self, access: SdoAccess, profile: DriveProfile, sleep: Sleep) -> None:
+        self.node = profile.node_id
+        self._access, self._profile, self._sleep = access, profile, sleep
+        self._objects = NodeObjects(access, profile.node_id)
 
-def switch_off(access: SdoAccess, node: int, sleep: Sleep) -> None:
-    """Bring the drive to a stop if it is powered, and take the power off; wait for its statusword.
+    def quick_stop(self) -> None:
+        """Let the drive brake by itself if it is powered; does not wait."""
+        if not _off(self._objects.number(_STATUSWORD, 2)):
+            self._objects.write(_CONTROLWORD, QUICK_STOP_WORD, 2)
 
-    Raises BootError when the drive is still powered a second later.
-    """
-    drive = NodeObjects(access, node)
-    if not _off(drive.number(_STATUSWORD, 2)):
-        quick_stop(access, node)
-        _wait(drive, _STATUSWORD, 2, _off, sleep)  # with the option codes 5 to 8 (605Ah) it stays there
-    drive.write(_CONTROLWORD, DISABLE_VOLTAGE, 2)
-    word = _wait(drive, _STATUSWORD, 2, _off, sleep)
-    if not _off(word):
-        raise BootError(node, "6041h:0", detail=f"6041h:0: expected disabled, found {describe(word)}")
+    def switch_off(self) -> None:
+        """Bring the drive to a stop if it is powered, and take the power off; wait for its statusword, a second at most."""
+        if not _off(self._objects.number(_STATUSWORD, 2)):
+            self.quick_stop()
+            self._wait(_STATUSWORD, 2, _off)  # with the option codes 5 to 8 (605Ah) it stays there
+        self._objects.write(_CONTROLWORD, DISABLE_VOLTAGE, 2)
+        word = self._wait(_STATUSWORD, 2, _off)
+        if not _off(word):
+            raise BootError(
+                self.node, "6041h:0", detail=f"6041h:0: expected disabled, found {describe(word)}"
+            )
 
+    def reset_fault(self) -> str | None:
+        """Reset a fault by a rising edge of bit 7 (transition 15); return its code (603Fh) in words, or None."""
+        word = self._objects.number(_STATUSWORD, 2)
+        if state_of(word) not in FAULTED:
+            return None
+        code = self._objects.optional_number((0x603F, 0), 2)
+        fault = "fault" if code is None else f"fault {code:04X}h"
+        for command in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
+            self._objects.write(_CONTROLWORD, command, 2)
+        word = self._wait(_STATUSWORD, 2, lambda word: state_of(word) not in FAULTED)
+        if state_of(word) in FAULTED:
+            raise BootError(self.node, "6041h:0", detail=f"{fault} cannot be reset: {describe(word)}")
+        return fault
 
-def reset_fault(access: SdoAccess, node: int, sleep: Sleep) -> str | None:
-    """Reset a fault by a rising edge of bit 7 (transition 15); return its code (603Fh) in words, None without a fault.
+    def set_up(
+        self, mode: int, timeout_ms: int, *, temperature: bool, interpolation_ms: int = INTERPOLATION_MS
+    ) -> DriveUnits:
+        """Set mode, targets of zero, 60C2h [ms], TPDO3 if `temperature` is wanted, and last the watch over the commander.
 
-    Raises BootError when the fault stays.
-    """
-    drive = NodeObjects(access, node)
-    word = drive.number(_STATUSWORD, 2)
-    if state_of(word) not in FAULTED:
-        return None
-    code = drive.optional_number((0x603F, 0), 2)
-    fault = "fault" if code is None else f"fault {code:04X}h"
-    for command in (DISABLE_VOLTAGE, FAULT_RESET, DISABLE_VOLTAGE):
-        drive.write(_CONTROLWORD, command, 2)
-    word = _wait(drive, _STATUSWORD, 2, lambda word: state_of(word) not in FAULTED, sleep)
-    if state_of(word) in FAULTED:
-        raise BootError(node, "6041h:0", detail=f"{fault} cannot be reset: {describe(word)}")
-    return fault
+        The drive must be off (`switch_off`, `reset_fault`).
+        """
+        objects, profile = self._objects, self._profile
+        boot = NodeBoot(self._access, profile, BusSettings(master_node=JTQD_NODE))
+        boot.check_device_type()
+        boot.check_identity()
+        scaling, gear_ratio = boot.read_scaling()
+        assert isinstance(scaling, DriveScaling)
+        assert gear_ratio is not None
+        if objects.number((0x6076, 0), 4) < 1:
+            raise mismatch(self.node, (0x6076, 0), "motor rated torque in mNm", expected="1..", found="0")
+        heartbeat_ms = _heartbeat(objects)
+        for communication, pdo in ((0x1400, drive_rpdo1(self.node)), (0x1401, drive_rpdo2(self.node))):
+            _require_rpdo(objects, communication, pdo)
+        tpdos = _tpdos(objects, profile)
+        self._zero_targets()
+        objects.write((0x6060, 0), mode, 1)
+        found = self._wait(_MODE_DISPLAY, 1, lambda display: display == mode)
+        if found != mode:
+            what = "mode of operation display"
+            raise mismatch(self.node, _MODE_DISPLAY, what, expected=str(mode), found=str(found))
+        objects.put((0x60C2, 1), interpolation_ms, 1, "interpolation time period value")
+        objects.put((0x60C2, 2), -3, 1, "interpolation time index")  # ms
+        if temperature:
+            _switch_on_temperature(objects)
+        objects.put(_COMMANDER_WATCH, COMMANDER_NODE << 16 | timeout_ms, 4, "consumer heartbeat time")
+        return DriveUnits(
+            self.node, mode, gear_ratio, scaling, heartbeat_ms, temperature, profile.objects, tpdos
+        )
 
+    def release(self) -> None:
+        """Switch the drive off after the motion, set its targets to zero, and end its watch over the commander."""
+        self.switch_off()
+        self._objects.put(_COMMANDER_WATCH, 0, 4, "consumer heartbeat time")
+        self._zero_targets()
 
-def set_up(
-    access: SdoAccess,
-    profile: DriveProfile,
-    mode: int,
-    timeout_ms: int,
-    sleep: Sleep,
-    *,
-    temperature: bool,
-    interpolation_ms: int = INTERPOLATION_MS,
-) -> DriveUnits:
-    """Set mode, targets of zero, 60C2h [ms], TPDO3 if `temperature` is wanted, and last the watch over the commander.
+    def _zero_targets(self) -> None:
+        self._objects.put(_TARGET_VELOCITY, 0, 4, "target velocity")
+        self._objects.put(_TARGET_TORQUE, 0, 2, "target torque")
 
-    The drive must be off (`switch_off`, `reset_fault`). Raises BootError.
-    """
-    node = profile.node_id
-    drive = NodeObjects(access, node)
-    boot = NodeBoot(access, profile, BusSettings(master_node=JTQD_NODE))
-    boot.check_device_type()
-    boot.check_identity()
-    scaling, gear_ratio = boot.read_scaling()
-    assert isinstance(scaling, DriveScaling)
-    assert gear_ratio is not None
-    if drive.number((0x6076, 0), 4) < 1:
-        raise mismatch(node, (0x6076, 0), "motor rated torque in mNm", expected="1..", found="0")
-    heartbeat_ms = _heartbeat(drive)
-    for communication, pdo in ((0x1400, drive_rpdo1(node)), (0x1401, drive_rpdo2(node))):
-        _require_rpdo(drive, communication, pdo)
-    tpdos = _tpdos(drive, profile)
-    _zero_targets(drive)
-    drive.write((0x6060, 0), mode, 1)
-    found = _wait(drive, _MODE_DISPLAY, 1, lambda display: display == mode, sleep)
-    if found != mode:
-        raise mismatch(node, _MODE_DISPLAY, "mode of operation display", expected=str(mode), found=str(found))
-    drive.put((0x60C2, 1), interpolation_ms, 1, "interpolation time period value")
-    drive.put((0x60C2, 2), -3, 1, "interpolation time index")  # ms
-    if temperature:
-        _switch_on_temperature(drive)
-    drive.put(_COMMANDER_WATCH, COMMANDER_NODE << 16 | timeout_ms, 4, "consumer heartbeat time")
-    return DriveUnits(node, mode, gear_ratio, scaling, heartbeat_ms, temperature, profile.objects, tpdos)
+    def _wait(self, key: Key, size: int, wanted: Callable[[int], bool]) -> int:
+        """Read `key` until it is as wanted, for a second at most; return its value then."""
+        found = self._objects.number(key, size)
+        for _ in range(_POLLS):
+            if wanted(found):
+                break
+            self._sleep(_POLL_S)
+            found = self._objects.number(key, size)
+        return found
 
 
 def sensor_units(access: SdoAccess, profile: SensorProfile) -> SensorUnits:
@@ -251,33 +263,6 @@ def sensor_units(access: SdoAccess, profile: SensorProfile) -> SensorUnits:
     assert isinstance(scaling, SensorScaling)
     factors = tuple(scaling.nm_per_unit[channel] for channel in profile.channels)
     return SensorUnits(profile.node_id, factors, _heartbeat(NodeObjects(access, profile.node_id)))
-
-
-def release(access: SdoAccess, node: int, sleep: Sleep) -> None:
-    """Switch the drive off after the motion, set its targets to zero, and end its watch over the commander.
-
-    Raises BootError: it did not answer, or is still powered.
-    """
-    switch_off(access, node, sleep)
-    drive = NodeObjects(access, node)
-    drive.put(_COMMANDER_WATCH, 0, 4, "consumer heartbeat time")
-    _zero_targets(drive)
-
-
-def _zero_targets(drive: NodeObjects) -> None:
-    drive.put(_TARGET_VELOCITY, 0, 4, "target velocity")
-    drive.put(_TARGET_TORQUE, 0, 2, "target torque")
-
-
-def _wait(drive: NodeObjects, key: Key, size: int, wanted: Callable[[int], bool], sleep: Sleep) -> int:
-    """Read `key` until it is as wanted, for a second at most; return its value then."""
-    found = drive.number(key, size)
-    for _ in range(_POLLS):
-        if wanted(found):
-            break
-        sleep(_POLL_S)
-        found = drive.number(key, size)
-    return found
 
 
 def _off(statusword: int) -> bool:
@@ -359,13 +344,14 @@ class BenchSetup:
         sensor: SensorProfile | None,
         timing: Timing,
     ) -> None:
-        nodes = [profile.node_id for profile in (*drives, sensor) if profile is not None]
         self._socket = open_frame_socket(
             bus, [exact(SYNC_COB_ID), exact(nmt.HEARTBEAT_BASE + COMMANDER_NODE)]
         )
-        self._drives, self._sensor, self._timing = tuple(drives), sensor, timing
+        self._sensor, self._timing = sensor, timing
         self._beating = False
-        self._access = {node: SdoClient(self._socket, node) for node in nodes}
+        self._drives = [
+            Drive(SdoClient(self._socket, profile.node_id), profile, self._sleep) for profile in drives
+        ]
 
     def prepare(
         self, setpoints: Setpoints, limits: Limits
@@ -397,35 +383,33 @@ class BenchSetup:
             raise MotionError(f"another commander is on the bus (node {COMMANDER_NODE:02X}h): stop it first")
         if SYNC_COB_ID not in heard:
             raise MotionError(f"no SYNC on {socket.bus}: jtqd must run on this bus")
-        socket.set_filters([exact(RESPONSE_ID + node) for node in self._access])
+        nodes = [drive.node for drive in self._drives]
+        nodes += [] if self._sensor is None else [self._sensor.node_id]
+        socket.set_filters([exact(RESPONSE_ID + node) for node in nodes])
 
     def _prepare(
         self, setpoints: Setpoints, limits: Limits
     ) -> tuple[tuple[DriveUnits, ...], SensorUnits | None]:
-        access = self._access
-        for profile in self._drives:
-            quick_stop(access[profile.node_id], profile.node_id)
-        for profile in self._drives:
-            switch_off(access[profile.node_id], profile.node_id, time.sleep)
-            fault = reset_fault(access[profile.node_id], profile.node_id, time.sleep)
+        for drive in self._drives:
+            drive.quick_stop()
+        for drive in self._drives:
+            drive.switch_off()
+            fault = drive.reset_fault()
             if fault is not None:
-                logging.getLogger(__name__).warning("node %d: %s was reset", profile.node_id, fault)
+                logging.getLogger(__name__).warning("node %d: %s was reset", drive.node, fault)
         round_cycles = sending_order(setpoints.joints, len(self._drives))[1]
         units = tuple(
-            set_up(
-                access[profile.node_id],
-                profile,
+            drive.set_up(
                 CST if joint == setpoints.current_joint else CSV,
                 round(self._timing.drive_timeout_s * 1e3),
-                time.sleep,
                 temperature=math.isfinite(limits.temperature_c),
                 interpolation_ms=round(round_cycles * self._timing.period_s * 1e3),
             )
-            for joint, profile in enumerate(self._drives, 1)
+            for joint, drive in enumerate(self._drives, 1)
         )
-        sensor = self._sensor
-        found = None if sensor is None else sensor_units(access[sensor.node_id], sensor)
-        return units, found
+        if self._sensor is None:
+            return units, None
+        return units, sensor_units(SdoClient(self._socket, self._sensor.node_id), self._sensor)
 
     def release(self, *, beating: bool) -> str:
         """Release all drives; return "", or the failures in one line.
@@ -434,20 +418,14 @@ class BenchSetup:
         """
         self._beating = beating
         problems = []
-        for step in (self._quick_stop, self._release):
-            for profile in self._drives:
+        for step in (Drive.quick_stop, Drive.release):
+            for drive in self._drives:
                 try:
                     self._beat()
-                    step(profile.node_id)
+                    step(drive)
                 except (BootError, BusError) as error:
                     problems.append(str(error))
         return "; ".join(dict.fromkeys(problems))
-
-    def _quick_stop(self, node: int) -> None:
-        quick_stop(self._access[node], node)
-
-    def _release(self, node: int) -> None:
-        release(self._access[node], node, self._sleep)
 
     def _sleep(self, duration_s: float) -> None:
         self._beat()

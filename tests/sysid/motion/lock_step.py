@@ -12,7 +12,7 @@ import numpy as np
 from jtqd.drivers.boot_node import BusSettings, NodeBoot
 from jtqd.drivers.drive import DriveProfile
 from jtqd.drivers.frame import FRAME
-from jtqd.drivers.sdo import Transfer
+from jtqd.drivers.sdo import SdoAccess, Transfer
 from jtqd.drivers.sensor import SensorProfile
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import Bench
@@ -20,7 +20,7 @@ from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import sources_of
 from jtqd.sysid.motion.commander import Commander
-from jtqd.sysid.motion.drives import CST, CSV, sending_order, sensor_units, set_up, switch_off
+from jtqd.sysid.motion.drives import CST, CSV, Drive, sending_order, sensor_units
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Surroundings, Timing
 from jtqd.sysid.motion.stopping import Phase
 
@@ -140,6 +140,9 @@ class LockStep:
     def access(self, node: int) -> BenchAccess:
         return BenchAccess(self, node)
 
+    def drive(self, access: SdoAccess, profile: DriveProfile) -> Drive:
+        return Drive(access, profile, self.sleep)
+
     def commander(
         self,
         setpoints: Setpoints,
@@ -152,19 +155,17 @@ class LockStep:
         timing = replace(timing or Timing(), period_s=period_s, setpoint_delay_s=0.7 * period_s)
         temperature = math.isfinite(limits.temperature_c)
         round_cycles = sending_order(setpoints.joints, len(self.nodes))[1]
-        for node in self.nodes:
-            switch_off(self.access(node), node, self.sleep)
+        drives = [self.drive(self.access(profile.node_id), profile) for profile in self.drives]
+        for drive in drives:
+            drive.switch_off()
         units = [
-            set_up(
-                self.access(node),
-                self.drives[node - 1],
-                CST if node == setpoints.current_joint else CSV,
+            drive.set_up(
+                CST if drive.node == setpoints.current_joint else CSV,
                 round(timing.drive_timeout_s * 1e3),
-                self.sleep,
                 temperature=temperature,
                 interpolation_ms=round_cycles * self.period_ms,
             )
-            for node in self.nodes
+            for drive in drives
         ]
         sensor = sensor_units(self.access(self.sensor_node), self.sensor_profile)
         self.motion = Commander(

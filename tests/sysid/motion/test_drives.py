@@ -14,12 +14,7 @@ from jtqd.sysid.motion.drives import (
     POWERED,
     QUICK_STOP_WORD,
     enabling_word,
-    quick_stop,
-    release,
-    reset_fault,
     sensor_units,
-    set_up,
-    switch_off,
 )
 from tests.sysid.motion.lock_step import BenchAccess, LockStep
 
@@ -85,14 +80,14 @@ class Bent:
 def configure(
     lock: LockStep, answers: dict[tuple[int, int], int | SdoAbort], *, temperature: bool = True
 ) -> None:
-    set_up(Bent(lock.access(1), answers), DriveProfile(1), CSV, 300, lock.sleep, temperature=temperature)
+    lock.drive(Bent(lock.access(1), answers), DriveProfile(1)).set_up(CSV, 300, temperature=temperature)
 
 
 def test_a_drive_is_configured_and_its_units_read(lock: LockStep) -> None:
     access = lock.access(2)
     access.write(0x6071, 0, b"\x10\x00")
     access.write(0x60FF, 0, b"\x10\x00\x00\x00")
-    units = set_up(access, DriveProfile(2), CST, 300, lock.sleep, temperature=True)
+    units = lock.drive(access, DriveProfile(2)).set_up(CST, 300, temperature=True)
     store = lock.bench.drives[1].store
     assert (store.number(0x6071), store.number(0x60FF)) == (0, 0), "targets of zero before the mode"
     assert store.number(0x1016, 2) == 0x0021_012C, "node 21h, 300 ms"
@@ -146,23 +141,27 @@ def test_a_drive_without_temperature_may_be_used_when_none_is_limited(lock: Lock
 
 def test_a_fault_is_reset_and_returned(lock: LockStep) -> None:
     machine = lock.bench.drives[0].machine
-    assert reset_fault(lock.access(1), 1, lock.sleep) is None
+    drive = lock.drive(lock.access(1), DriveProfile(1))
+    assert drive.reset_fault() is None
     machine.fault()
     lock.bench.drives[0]._error_code = 0x2310
-    assert reset_fault(lock.access(1), 1, lock.sleep) == "fault 2310h"
+    assert drive.reset_fault() == "fault 2310h"
     assert machine.state == cia402.SWITCH_ON_DISABLED
 
 
 def test_a_fault_that_stays_is_refused(lock: LockStep) -> None:
     lock.bench.drives[0].machine.fault()
     with pytest.raises(BootError, match=r"node 1: fault 2310h cannot be reset: fault \(statusword 0218h\)"):
-        reset_fault(Bent(lock.access(1), {(0x6041, 0): 0x0218, (0x603F, 0): 0x2310}), 1, lock.sleep)
+        lock.drive(
+            Bent(lock.access(1), {(0x6041, 0): 0x0218, (0x603F, 0): 0x2310}), DriveProfile(1)
+        ).reset_fault()
 
 
 def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> None:
     """Enabled at 1 rad/s: quick stop first, and it stands when the power is off."""
-    set_up(lock.access(1), DriveProfile(1), CSV, 300, lock.sleep, temperature=False)
     access = lock.access(1)
+    drive = lock.drive(access, DriveProfile(1))
+    drive.set_up(CSV, 300, temperature=False)
     access.write(0x60FF, 0, (1043038).to_bytes(4, "little"))
     for word in (6, 7, 15):
         access.write(0x6040, 0, word.to_bytes(2, "little"))
@@ -173,11 +172,11 @@ def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> No
     words = []
     write = access.write
     access.write = lambda i, s, d: (words.append(d) if i == 0x6040 else None, write(i, s, d))[1]  # type: ignore[method-assign,func-returns-value]
-    switch_off(access, 1, lock.sleep)
+    drive.switch_off()
     assert words == [b"\x02\x00", b"\x00\x00"]
     assert lock.states[0] == cia402.SWITCH_ON_DISABLED
     assert abs(lock.velocities[0]) < 0.02
-    quick_stop(access, 1)
+    drive.quick_stop()
     assert len(words) == 2, "a drive that is off is not commanded"
 
 
@@ -185,15 +184,16 @@ def test_a_drive_that_stays_powered_is_refused(lock: LockStep) -> None:
     with pytest.raises(
         BootError, match=r"node 1: 6041h:0: expected disabled, found operation enabled \(statusword 1237h\)"
     ):
-        switch_off(Bent(lock.access(1), {(0x6041, 0): 0x1237}), 1, lock.sleep)
+        lock.drive(Bent(lock.access(1), {(0x6041, 0): 0x1237}), DriveProfile(1)).switch_off()
 
 
 def test_after_the_motion_the_watch_ends_and_the_targets_are_zero(lock: LockStep) -> None:
     access = lock.access(2)
-    set_up(access, DriveProfile(2), CST, 300, lock.sleep, temperature=False)
+    drive = lock.drive(access, DriveProfile(2))
+    drive.set_up(CST, 300, temperature=False)
     lock.to_bench(0x721, b"\x05")
     access.write(0x6071, 0, b"\x10\x00")
-    release(access, 2, lock.sleep)
+    drive.release()
     store = lock.bench.drives[1].store
     assert (store.number(0x1016, 2), store.number(0x6071), store.number(0x60FF)) == (0, 0, 0)
     lock.sleep(1.0)
