@@ -2,7 +2,8 @@
 
 The server knows the subprotocol foxglove.sdk.v1 alone and refuses others with a text about headers. Older viewers ask for
 foxglove.websocket.v1, which has the same messages (Lichtblick's pull request 819 takes both alike): its name is exchanged
-in the handshake, and what follows passes unchanged. Whoever asks for neither, a browser for example, is told what to use.
+in the handshake, and what follows passes unchanged.
+A client that asks for neither, such as a browser, gets an answer with the protocols to use.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ def renamed(handshake: bytes, name: str) -> bytes:
 
 
 def refusal() -> bytes:
-    """Return the answer to whoever asks for no subprotocol that is known."""
+    """Return the answer to a client that asks for no known subprotocol."""
     body = _HELP.encode()
     fields = "Content-Type: text/plain", f"Content-Length: {len(body)}", "Connection: close"
     head = "\r\n".join(("HTTP/1.1 400 Bad Request", *fields, "", ""))

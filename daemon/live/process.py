@@ -164,7 +164,7 @@ class LiveServer:
 
 
 def _obstacle(address: Address) -> str:
-    """Return why nobody can listen there, or nothing: the server's own message does not always tell."""
+    """Return why nobody can listen there, or nothing: the server's own message does not always contain it."""
     try:
         family, _, _, _, where = socket.getaddrinfo(address.host, address.port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, socket.SOCK_STREAM) as probe:

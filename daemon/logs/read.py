@@ -123,7 +123,7 @@ def _taken(tables: dict[str, _Table]) -> dict[str, Messages]:
 class _Piece(NamedTuple):
     """Messages of one topic out of one chunk, with their file and schema.
 
-    expected: messages of the topic in the file, as its summary says.
+    expected: messages of the topic in the file, by its summary.
     """
 
     path: Path

@@ -126,7 +126,7 @@ def read_setup(log: Path, attachments: Mapping[str, bytes], directory: Path) -> 
     """Read the attachments of `log`; files go to `directory`, which must be empty and nobody else's.
 
     Raises:
-        LogError: one line; something is missing, damaged, or not what its hash says.
+        LogError: one line; something is missing, damaged, or does not have its hash.
     """
     attached = _Attachments(log, attachments, directory)
     text = attached.content(CONFIGURATION)

@@ -31,10 +31,10 @@ def needed(machine: str) -> str:
 
 
 def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:
-    """Return the DDS domain: as configured, else as the environment says (ROS_DOMAIN_ID), else 0.
+    """Return the DDS domain: as configured, else by the environment (ROS_DOMAIN_ID), else 0.
 
     Raises:
-        ConfigError: the environment says something else than a domain.
+        ConfigError: ROS_DOMAIN_ID is no domain.
     """
     text = environment.get(_VARIABLE, "")
     if configured is not None or not text:
