@@ -425,7 +425,7 @@ class Envelope:
 
 @dataclass(frozen=True, slots=True)
 class Fused:
-    """Section `fused` of a joint file; torsion None: a joint whose link encoder says nothing about torque.
+    """Section `fused` of a joint file; torsion None: a joint whose link encoder does not measure torque.
 
     agreement: of the two paths on runs that the fit had not seen. envelope: what the runs of the fit covered; outside of it
     the status is degraded. tracking: of the torsion. zeros: of the days. standstill: of the interval at rest. None: nothing

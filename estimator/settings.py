@@ -167,7 +167,7 @@ class PlausibilityLimits:
     """Thresholds of the plausibility checks, see the table in `plausibility`. Values out of range raise ConfigError.
 
     motor_jump_rad, mismatch_rad: motor side; twist_rad: joint side, for eccentric encoders and the like; frozen_s: of the
-    current. docs/safety.md says how far the runs of the bench stay below them.
+    current. Margins of the bench's runs: docs/safety.md.
     """
 
     motor_jump_rad: Annotated[float, limits("rad", ge=0.01, le=1e6)] = 1.0

@@ -130,7 +130,7 @@ class Zeros(NamedTuple):
         """Return what a zero beyond the limit may be."""
         return (
             f"{1e3 * self.link_rad:+.2f} mrad, limit {1e3 * self.limit_rad:.2f} mrad: the encoder has slipped, was mounted "
-            "anew, or the joint file is another joint's"
+            "again, or the joint file is another joint's"
         )
 
 

@@ -202,7 +202,7 @@ def _alone(x: FloatArray, y: FloatArray) -> tuple[float, float]:
 
 
 def _possible(x: FloatArray, y: FloatArray, joint: Joint) -> FloatArray:
-    """Return least squares of `_ladder` [5] with no friction or inertia below zero; what cannot be told is shared."""
+    """Return least squares of `_ladder` [5] with no friction or inertia below zero; what is not separable is shared."""
     friction, inertia = joint.friction, joint.rotor_inertia_kgm2 * joint.gear_ratio**2
     least = -np.array((np.inf, friction.coulomb_nm, friction.viscous_nms_per_rad, inertia, 0.0))
     size = np.sqrt(np.mean(x**2, axis=0))

@@ -93,7 +93,7 @@ LOAD: Final = f"j1.load: {{mass_kg: {MASS_KG:g}, lever_m: {LEVER_M:g}, inertia_k
 LEVEL: Final = f"j1.load: {{inertia_kgm2: {INERTIA_KGM2:.4g}}}   # no torque acts but the joint's own\n"
 
 JOINT: Final = f"""\
-# What the data sheet of the servo says.
+# From the data sheet of the servo.
 name: servo
 gear_ratio: {DATA_SHEET.gear_ratio:g}
 torque_constant_nm_per_a: {DATA_SHEET.torque_constant:g}

@@ -22,7 +22,7 @@ _SHIPPED: Final = Path(__file__).resolve().parent
 
 
 class _Loader(yaml.SafeLoader):
-    """SafeLoader that refuses a key given twice: YAML says unique, PyYAML would silently keep the last.
+    """SafeLoader that refuses a key given twice: YAML requires unique keys, PyYAML would silently keep the last.
 
     Merge keys (<<) are resolved here: which of two merged values holds is not the same in all versions of PyYAML.
     """

@@ -1,4 +1,4 @@
-"""Stribeck friction: more friction near standstill than the joint file says."""
+"""Stribeck friction: additional friction near standstill."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ CONTACT_LAYOUT = struct.Struct("<bbBB")  # torque rate 1, torque rate 2, contact
 NO_RATE = -0x80
 RATE_UNIT_NM_S = 32.0
 CONTACT = {0: "off", 1: "unknown", 2: "none", 3: "positive", 4: "negative"}
-"""What a controller stops on are the last two, and only "none" says that there is none."""
+"""A controller stops on the last two; only "none" means that there is no contact."""
 NO_TORQUE = -0x8000
 UNKNOWN_SIGMA = 255
 STATUS = {
@@ -75,8 +75,8 @@ def decode_contact(data: bytes) -> tuple[JointContact, JointContact, int]:
     rate_1, rate_2, codes, sequence = CONTACT_LAYOUT.unpack(data)
 
     def joint(rate: int, code: int) -> JointContact:
-        told = None if rate == NO_RATE else RATE_UNIT_NM_S * rate
-        return JointContact(told, CONTACT.get(code, f"unknown ({code})"))
+        torque_rate = None if rate == NO_RATE else RATE_UNIT_NM_S * rate
+        return JointContact(torque_rate, CONTACT.get(code, f"unknown ({code})"))
 
     return joint(rate_1, codes & 0x0F), joint(rate_2, codes >> 4), sequence
 
@@ -139,8 +139,8 @@ def main(arguments: list[str] | None = None) -> int:
                 if joints is None or message.dlc != LAYOUT.size:
                     continue
                 *estimates, sequence = decode(bytes(message.data))
-                told = (f"{joint}: {line(each)}" for joint, each in zip(joints, estimates, strict=True))
-                print(f"{sequence:3}  {'  '.join(told)}".rstrip(), flush=True)
+                texts = (f"{joint}: {line(each)}" for joint, each in zip(joints, estimates, strict=True))
+                print(f"{sequence:3}  {'  '.join(texts)}".rstrip(), flush=True)
                 received += 1
     except KeyboardInterrupt:
         return 0
