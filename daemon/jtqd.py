@@ -64,7 +64,7 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--ros2",
         action="store_true",
-        help="publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) says otherwise (extra: ros2)",
+        help="publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) states otherwise (extra: ros2)",
     )
     result.add_argument("--json", action="store_true", help="print the final summary as JSON")
     result.add_argument(

@@ -1,6 +1,6 @@
 """Effects of a joint file (`jtqd.estimator.effects`) as the plant's inner loop needs them. Pure.
 
-Each effect acts where `jtqd.estimator.effects.effect` says: losses on the motor side (those that are friction in the
+Each effect acts where `jtqd.estimator.effects.effect` states: losses on the motor side (those that are friction in the
 implicit friction), twist on the spring, loads between gear and sensor. What instruments read is in `plant_source`.
 
 A twist that depends on where gear and link stand alone (a kinematic error) bends the gear; any other twist is a

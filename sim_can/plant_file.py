@@ -95,8 +95,8 @@ class Day(NamedTuple):
 
     viscous: tuple[float, float] = (0.0, 0.0)  # viscous friction is 1 + this times the usual
     temperature_k: tuple[float, float] = (0.0, 0.0)
-    link_zero_rad: tuple[float, float] = (0.0, 0.0)  # added to what the link encoder says
-    sensor_zero_nm: float = 0.0  # added to what the sensor says
+    link_zero_rad: tuple[float, float] = (0.0, 0.0)  # added to what the link encoder states
+    sensor_zero_nm: float = 0.0  # added to what the sensor states
 
 
 NOMINAL_DAY = Day()
@@ -112,7 +112,7 @@ WARMING_K_PER_W: Final = 0.6
 
 @dataclass(frozen=True)
 class Deviations:
-    """How the true joint differs from its file. The defaults are a joint that is exactly as its file says."""
+    """How the true joint differs from its file. The defaults are a joint that is exactly as its file states."""
 
     friction_scale: float = 1.0
     viscous_scale: float = 1.0  # of the file's viscous friction; the difference is added to the losses

@@ -63,7 +63,7 @@ class Source(Protocol):
         """Command drive 0 or 1: OFF, VELOCITY (rad/s, motor side) or CURRENT (A). A recorded run ignores it."""
 
     def resume(self) -> None:
-        """Continue the run: a drive that was switched off, but not set up anew, is about to be enabled again.
+        """Continue the run: a drive that was switched off, but not set up again, is about to be enabled again.
 
         A recorded run ignores it.
         """

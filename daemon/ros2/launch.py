@@ -25,9 +25,7 @@ def needed(machine: str) -> str:
     """Return what is missing and how it is installed, for a machine as `platform.machine` names it."""
     if machine == _WHEELS_FOR:
         return "the package cyclonedds: pip install 'jtqd[ros2]'"
-    return (
-        f"the package cyclonedds, of which there is no wheel for {machine}: docs/ros2.md says how it is built"
-    )
+    return f"the package cyclonedds, of which there is no wheel for {machine}: docs/ros2.md states how it is built"
 
 
 def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:

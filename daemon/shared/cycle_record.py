@@ -110,7 +110,7 @@ class Header(NamedTuple):
 
 
 class JointRecord(NamedTuple):
-    """SI units, signs of docs/architecture.md; joint side unless the name says motor."""
+    """SI units, signs of docs/architecture.md; joint side unless the name states motor."""
 
     current_a: float
     motor_position_rad: float

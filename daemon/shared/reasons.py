@@ -132,7 +132,9 @@ def _doubt(zeros: Zeros) -> str:
         left = 1e6 * (zeros.link_rad - zeros.link_used_rad)
         return f"a zero of the link encoder has been found, {left:+.0f} µrad of it are not yet taken off"
     if zeros.flags & APART:
-        return "current and torsion disagree beyond their sigmas: one of them is not what the joint file says"
+        return (
+            "current and torsion disagree beyond their sigmas: one of them is not what the joint file states"
+        )
     return ""
 
 

@@ -33,7 +33,7 @@ _NOT_FORWARDED = ("HOME", "TMPDIR", "TMP", "TEMP", "OLDPWD", "PWD", "SHLVL", "_"
 
 
 class GuestError(RuntimeError):
-    """The guest did not boot or went down too early: the first line says why, then come the console's last lines."""
+    """The guest did not boot or went down too early: the first line states why, then come the console's last lines."""
 
 
 class GuestTimeoutError(GuestError):

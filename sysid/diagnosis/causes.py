@@ -130,7 +130,7 @@ def _normal_phase(values: Mapping[str, Value]) -> dict[str, Value]:
     return out
 
 
-def told_at_rest(case: Case, fit: Fit, classes: Classes) -> tuple[Fit, Classes]:
+def separated_at_rest(case: Case, fit: Fit, classes: Classes) -> tuple[Fit, Classes]:
     """Return fit and classes without friction asymmetry where the current at rest shows that it is an offset
     (`current_zero`).
     """

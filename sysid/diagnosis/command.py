@@ -76,7 +76,7 @@ def main(argv: list[str]) -> int:
             scope,
             options.relevance,
         )
-        experiment = _with_limits_said(_with_command(options, findings, joints), options, joints)
+        experiment = _with_limits_noted(_with_command(options, findings, joints), options, joints)
         findings = replace(findings, joint_files=joints, next_experiment=experiment)
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
@@ -109,7 +109,7 @@ def _with_command(
     return {**experiment, "command": campaign_command(plan, shlex.quote(options.bus), config)}
 
 
-def _with_limits_said(
+def _with_limits_noted(
     experiment: dict[str, Any] | None, options: argparse.Namespace, joints: Mapping[int, Joint]
 ) -> dict[str, Any] | None:
     """Return the next experiment with a sentence where it goes further than --limits, or --limits than the joint files."""

@@ -95,7 +95,7 @@ def _diagnosed(
         plan = next_experiment([], there, "; ".join(reasons), signals=seen) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     judged = tuple(s.number for s in usable[0])
-    usable, dataset, odd = without_odd_runs(usable, joints, scope)
+    usable, dataset, odd = without_outlier_runs(usable, joints, scope)
     case, fit = search_case(dataset, relevance)
     pieces = recordings(usable)
 
@@ -118,7 +118,7 @@ def _diagnosed(
     return replace(findings, channel_notes=notes, outlier_runs=tuple(odd), used=used)
 
 
-def without_odd_runs(
+def without_outlier_runs(
     signals: list[list[JointSignals]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
 ) -> tuple[list[list[JointSignals]], Dataset, list[OutlierRun]]:
     """Return signals and dataset without the runs that differ from all others, and how those differ: one at a time, fewer

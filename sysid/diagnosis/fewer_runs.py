@@ -28,7 +28,7 @@ from jtqd.sysid.diagnosis.search import Hypothesis, Search
 Key = tuple[str, JointName]
 Names = Callable[[int], Sequence[EffectCandidate]]
 """What is named without a recording, by its number."""
-MOST_ANEW: Final = 5
+MOST_REPEATED: Final = 5
 """Recordings up to which the others are diagnosed again from their signals on, where it matters (few runs, or something is
 unexplained); else the sums of all runs are searched again, which costs a tenth.
 """
@@ -115,7 +115,7 @@ def with_fewer(found: Found, names_without: Names) -> tuple[Found, list[str]]:
     }
     compared = Compared(case.dataset, case.search, best)
     together = [(None, case.search.hypothesis(chosen, best.model)) for chosen in sets]
-    kept, why = _borne_out(found, compared, [*beside.items(), *together])
+    kept, why = _confirmed(found, compared, [*beside.items(), *together])
     fit = case.fit(kept)  # whatever is kept: as above
     lines = [kept_text(c, compared.nm(best), compared.nm(kept)) for c in kept.chosen if c.key in gone]
     there = {c.key for c in kept.chosen}
@@ -139,7 +139,7 @@ def _named_by_fewer(
     """
     case = found.case
     count = case.search.mixed.runs
-    afresh = (found.large or found.few is not None) and count <= MOST_ANEW
+    afresh = (found.large or found.few is not None) and count <= MOST_REPEATED
     for number in range(count if count > FEWEST_RUNS else 0):
         part = case.without_recording(number)
         if moving_s(part.dataset.signals) < SHORTEST_MOVING_S:
@@ -170,7 +170,7 @@ def _same_candidates(search: Search, chosen: Sequence[EffectCandidate]) -> list[
     return out
 
 
-def _borne_out(
+def _confirmed(
     found: Found, compared: Compared, tried: Sequence[tuple[Key | None, Hypothesis]]
 ) -> tuple[Hypothesis, dict[Key, str]]:
     """Return the set that predicts the held-out runs best, what is named included, and what speaks against an effect (by its

@@ -86,7 +86,7 @@ class Unexplained:
         return by_channel
 
     def share(self, explained_nm2: float) -> float:
-        """Return left-over structure as a part of all structure; explained_nm2: of the causes, summed over channels."""
+        """Return unexplained structure as a part of all structure; explained_nm2: of the causes, summed over channels."""
         left = self.energy_nm2()
         return left / max(left + explained_nm2, 1e-30)
 

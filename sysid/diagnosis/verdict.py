@@ -13,7 +13,7 @@ from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.acceptance import Found, found_in
 from jtqd.sysid.diagnosis.bounded import bounded_values, in_the_file
 from jtqd.sysid.diagnosis.case import Case, Fit
-from jtqd.sysid.diagnosis.causes import causes_of, told_at_rest
+from jtqd.sysid.diagnosis.causes import causes_of, separated_at_rest
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import candidate_table
 from jtqd.sysid.diagnosis.experiment_choice import MOST_KINDS
@@ -54,7 +54,7 @@ def conclude(
     found, became = with_fewer(found_in(case, fit), names_without)
     bounded = bounded_values(found)
     gain = held_out_gain(case.dataset, found.named.refined)
-    named, classes = told_at_rest(case, found.named, found.classes)
+    named, classes = separated_at_rest(case, found.named, found.classes)
     left, shown = _remaining(found, named)
     explained = sum(case.energies_nm2(named))
     remains = found.remains_nm2(left)
@@ -76,7 +76,7 @@ def conclude(
         ]
         if found.left_matters:
             reasons += [*_closest(found.whole.hypothesis, causes, found.share), *left.reasons]
-        reasons += _told_from(table, case.dataset.rated_torque_nm) if found.beside else []
+        reasons += _detectable_range(table, case.dataset.rated_torque_nm) if found.beside else []
     elif causes:
         verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
     else:
@@ -155,7 +155,7 @@ def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[s
     ]
 
 
-def _told_from(table: Sequence[CandidateEvidence], rated_nm: float) -> list[str]:
+def _detectable_range(table: Sequence[CandidateEvidence], rated_nm: float) -> list[str]:
     """Return how large an effect must be to be distinguished in the presence of an unexplained residual; none is
     larger than the rated torque.
     """

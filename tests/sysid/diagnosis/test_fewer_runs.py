@@ -15,7 +15,7 @@ from jtqd.sysid.diagnosis.acceptance import UNSTEADY, Found
 from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _borne_out, with_fewer
+from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _confirmed, with_fewer
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import Noise
@@ -104,7 +104,7 @@ def test_beside_what_is_left_over_only_what_is_steady_is_kept(
     nothing, left = case.fit(compared.named), Unexplained((), (), (), (), worst_nm={MOTOR1: left_nm})
     found = Found(case, nothing, nothing, None, left, 0.01, {MOTOR1: 0.2}, ())
     key = LIBRARY[0].key
-    best, why = _borne_out(found, compared, [(key, other)])
+    best, why = _confirmed(found, compared, [(key, other)])
     assert (best is other, why) == (kept, {} if kept else {key: UNSTEADY})
 
 
@@ -172,7 +172,7 @@ def test_what_is_left_over_is_that_of_what_is_kept(monkeypatch: pytest.MonkeyPat
     found = Found.of(case, case.fit(before), case.fit(before), None, ())
     assert found.matters
     monkeypatch.setattr(fewer_runs, "_named_by_fewer", lambda *_: [("run_1", LIBRARY[:1])])
-    monkeypatch.setattr(fewer_runs, "_borne_out", lambda *_: (kept, {}))
+    monkeypatch.setattr(fewer_runs, "_confirmed", lambda *_: (kept, {}))
     monkeypatch.setattr(Compared, "__init__", lambda self, *_: None)
     monkeypatch.setattr(Compared, "nm", lambda *_: 0.3)
     after, said = with_fewer(found, lambda number: [])
