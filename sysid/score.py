@@ -46,8 +46,7 @@ from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.joints import joint_number, only, with_joint
-from jtqd.sysid.runs.options import add_columns, add_number, add_runs
+from jtqd.sysid.runs.options import add_columns, add_number, add_runs, joint_number, only, with_joint
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
 SCHEMA: Final = "jtq.score/1"

@@ -37,7 +37,7 @@ from jtqd.sysid.batch.run import (
 from jtqd.sysid.batch.summary import DIAGNOSE, REPLAY, counts, render, to_mapping
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import LOGS, TABLES
-from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files
+from jtqd.sysid.runs.options import UsageError, check_joint_files, joint_files
 from jtqd.sysid.runs.run_file import RunError
 
 BY: Final = "jtq batch"

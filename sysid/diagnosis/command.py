@@ -37,7 +37,7 @@ from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.joints import UsageError, check_joint_files, joint_files, joints_of, named_joints
+from jtqd.sysid.runs.options import UsageError, check_joint_files, joint_files, joints_of, named_joints
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
 BY: Final = "jtq diagnose"

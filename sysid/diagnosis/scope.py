@@ -10,7 +10,7 @@ from typing import Final
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.findings import SENSOR, JointName
-from jtqd.sysid.runs.joints import UsageError
+from jtqd.sysid.runs.options import UsageError
 
 _ITEM: Final = re.compile(r"(?:(?P<joint>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
 

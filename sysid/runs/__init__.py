@@ -18,7 +18,7 @@ from jtqd.sysid.runs.channels import RunIssue
 from jtqd.sysid.runs.checks import CheckedRun, CheckedRuns, check_run, check_runs
 from jtqd.sysid.runs.column_map import Column, ColumnMap
 from jtqd.sysid.runs.files import read_run, read_runs, run_paths
-from jtqd.sysid.runs.joints import joint_files, joint_number, joints_of, named_joints, only
+from jtqd.sysid.runs.options import joint_files, joint_number, joints_of, named_joints, only
 from jtqd.sysid.runs.run_file import RunError, RunFile
 from jtqd.sysid.runs.tables import write_run
 

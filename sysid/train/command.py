@@ -23,8 +23,7 @@ from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.joints import joint_number, only
-from jtqd.sysid.runs.options import add_columns, add_number, add_runs
+from jtqd.sysid.runs.options import add_columns, add_number, add_runs, joint_number, only
 from jtqd.sysid.runs.run_file import RunError, RunFile
 from jtqd.sysid.train.ours import Gate, judge, train_fused
 from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample, train_paper

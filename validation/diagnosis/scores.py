@@ -24,7 +24,7 @@ from jtqd.estimator.run import RunTableError
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Place
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.joints import joints_of
+from jtqd.sysid.runs.options import joints_of
 from jtqd.sysid.runs.run_file import RunError
 from validation.diagnosis.entries import Columns, Joint
 from validation.diagnosis.recorder import Recorder, csv_text, record

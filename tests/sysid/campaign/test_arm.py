@@ -37,8 +37,8 @@ from jtqd.sysid.planner.plan import (
 )
 from jtqd.sysid.planner.single_joint import range_of
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.joints import with_joint
 from jtqd.sysid.runs.logs import LoggedRun
+from jtqd.sysid.runs.options import with_joint
 from jtqd.sysid.runs.tables import write_run
 
 LIMITS = MotionLimits((-1.0, 2.0), 1.5, 6.0, 25.0)

@@ -12,7 +12,7 @@ from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.file_values import file_values
 from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
-from jtqd.sysid.runs.joints import UsageError
+from jtqd.sysid.runs.options import UsageError
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
