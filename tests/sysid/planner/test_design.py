@@ -373,7 +373,7 @@ def test_velocity_and_current_never_repeat_together():
 def test_progress_counts_every_evaluation():
     seen = []
     design(LIMITS, **small(starts=2), on_progress=seen.append)
-    slope = 2 * 3 * 2 + 1 + 1  # evaluations that are left over are too few for one more: motions of 13 genes
+    slope = 2 * 3 * 2 + 1 + 1  # the remaining evaluations are too few for one more: motions of 13 genes
     assert 2 * 2 * (120 - slope) < sum(seen) <= 2 * 2 * 120
 
 
