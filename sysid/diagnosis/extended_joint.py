@@ -118,7 +118,7 @@ def _first(numbers: Sequence[int], findings: Findings) -> int:
 def _record(cause: Cause) -> dict[str, Any]:
     record: dict[str, Any] = {"name": cause.name, "joint": cause.joint}
     if len(cause.names) > 1:
-        record["cannot_be_detectable_range"] = [name for name in cause.names if name != cause.name]
+        record["cannot_be_told_from"] = [name for name in cause.names if name != cause.name]
     record["ci95"] = {name: _interval(each) for name, each in cause.parameters.items()}
     return record
 

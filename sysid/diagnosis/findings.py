@@ -141,7 +141,7 @@ class Gain:
             return ""
         before, after = self.plain_nm
         return (
-            "in the presence of run-to-run variation (offset and friction of the day), which is most of the error: with it "
+            "without run-to-run variation (offset and friction of the day), which is most of the error: with it "
             f"{before:.3g} -> {after:.3g} Nm rms"
         )
 

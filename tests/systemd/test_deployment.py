@@ -215,7 +215,7 @@ def test_a_network_is_opened_only_under_its_hash() -> None:
     ]
     assert opened == ["estimator/onnx_graph.py"]
     source = (ROOT / "daemon" / "loop" / "process.py").read_text(encoding="utf-8")
-    assert "load_network(method, str(joint.network.path), joint.network.sha256, verdict)" in source
+    assert "load_network(method, str(joint.network.path), joint.network.sha256, check)" in source
 
 
 # Licences ----------------------------------------------------------------------------------------------------------------

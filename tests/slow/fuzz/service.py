@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.bus.boot import ReturningNodes
-from jtqd.daemon.bus.service import BusService, service_filters
+from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
 from jtqd.daemon.shared.conditions import Conditions
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, FRAME
@@ -171,7 +171,7 @@ def fuzz_service(directory: Path, seed: int, count: int) -> dict[str, Any]:
         "exception": first,
         "sdo_replies": sdo_replies,
         "emcys_sent": emcys,
-        "emcys_heard": service.emergencies.count,
+        "emcys_heard": sum(service.emergencies.count_of(node) for node in nodes_of(bench.config)),
         "lines": len(lines),
         "lines_per_minute": round(per_minute, 1),
         "answers_afterwards": answers,

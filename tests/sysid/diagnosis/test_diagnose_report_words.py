@@ -112,7 +112,7 @@ def test_a_gain_beside_what_runs_have_of_their_own_is_said_with_the_plain_errors
     gain = Gain(0.2, 0.1, "split; without run-to-run variation", (0.08, 0.12), plain_nm=(0.141, 0.142))
     findings = replace(examples.one_cause(), gain=gain)
     beside = (
-        "in the presence of run-to-run variation (offset and friction of the day), which is most of the error: with it "
+        "without run-to-run variation (offset and friction of the day), which is most of the error: with it "
         "0.141 -> 0.142 Nm rms"
     )
     assert (

@@ -465,4 +465,4 @@ def test_a_friction_of_the_day_that_lies_against_a_cause_speaks_against_it_with_
     assert gain.plain_nm is not None
     assert gain.plain_nm[1] > gain.plain_nm[0] > gain.rmse_before_nm > 1.3 * gain.rmse_after_nm
     assert gain.rmse_after_nm == pytest.approx(WHITE.sigma[0], rel=0.1)
-    assert gain.split.endswith("beside what each run has of its own")
+    assert gain.split.endswith("without run-to-run variation")
