@@ -442,7 +442,7 @@ def test_command_refuses_a_silly_bit_rate(path):
 
 
 SEED = 42
-SYNC = pack(0x080)  # 51 bits = 51 us at 1 Mbit/s
+BARE_SYNC = pack(0x080)  # 51 bits = 51 us at 1 Mbit/s
 HEARTBEAT = pack(0x701, b"\x05")  # 58
 ZEROS = pack(0x181, bytes(8))  # 126
 ONES = pack(0x181, b"\xff" * 8)  # 124
@@ -453,17 +453,17 @@ US = 1000
 def test_one_frame_takes_its_bits():
     wire = WireModel(1_000_000)
     assert wire.next_end() is None
-    wire.submit("a", SYNC, 5 * US)
+    wire.submit("a", BARE_SYNC, 5 * US)
     assert wire.next_end() == 56 * US
     assert wire.advance(56 * US - 1) == []
-    assert wire.advance(56 * US) == [("a", SYNC, 56 * US)]
+    assert wire.advance(56 * US) == [("a", BARE_SYNC, 56 * US)]
     assert wire.next_end() is None
     assert (wire.bits, wire.frames) == (51, 1)
 
 
 def test_bit_rate_scales_time_and_rounds_up():
     wire = WireModel(500_000)
-    wire.submit("a", SYNC, 0)
+    wire.submit("a", BARE_SYNC, 0)
     assert wire.next_end() == 102 * US
     assert WireModel(3).duration_ns(1) == 333_333_334
     with pytest.raises(ValueError, match="bit rate"):
@@ -471,10 +471,10 @@ def test_bit_rate_scales_time_and_rounds_up():
 
 
 def test_sync_then_answers_in_order_of_priority():
-    """SYNC 0..51; during it three nodes queue; 181h wins, then 701h, then the remote 701h."""
+    """BARE_SYNC 0..51; during it three nodes queue; 181h wins, then 701h, then the remote 701h."""
     wire = WireModel(1_000_000)
     remote = pack(0x701 | CAN_RTR_FLAG)
-    wire.submit("master", SYNC, 0)
+    wire.submit("master", BARE_SYNC, 0)
     assert wire.advance(10 * US) == []
     wire.submit("c", remote, 20 * US)
     wire.submit("b", HEARTBEAT, 30 * US)
@@ -482,7 +482,7 @@ def test_sync_then_answers_in_order_of_priority():
     ends = wire.advance(10_000 * US)
     remote_end = 51 + 126 + 58 + stuffed_bits(0x701 | CAN_RTR_FLAG)
     assert ends == [
-        ("master", SYNC, 51 * US),
+        ("master", BARE_SYNC, 51 * US),
         ("a", ZEROS, 177 * US),
         ("b", HEARTBEAT, 235 * US),
         ("c", remote, remote_end * US),
@@ -513,11 +513,11 @@ def test_same_moment_arbitrates_even_after_advance_to_it():
 def test_gap_on_the_wire_and_late_news_of_a_submission():
     """A hub learns late of a send: the frame still starts when it was sent if the wire was free."""
     wire = WireModel(1_000_000)
-    wire.submit("a", SYNC, 0)
-    assert wire.advance(500 * US) == [("a", SYNC, 51 * US)]
+    wire.submit("a", BARE_SYNC, 0)
+    assert wire.advance(500 * US) == [("a", BARE_SYNC, 51 * US)]
     wire.submit("b", HEARTBEAT, 100 * US)
     assert wire.next_end() == 158 * US
-    wire.submit("c", NMT, 20 * US)  # while SYNC was on the wire: starts at its end, before b
+    wire.submit("c", NMT, 20 * US)  # while BARE_SYNC was on the wire: starts at its end, before b
     assert wire.advance(500 * US) == [("c", NMT, 104 * US), ("b", HEARTBEAT, 162 * US)]
 
 
@@ -531,9 +531,9 @@ def test_fifo_within_a_sender_even_against_its_own_priorities():
 
 def test_queue_is_bounded():
     wire = WireModel(1_000_000, queue_limit=2)
-    assert [wire.submit("a", SYNC, 0) for _ in range(3)] == [True, True, False]
+    assert [wire.submit("a", BARE_SYNC, 0) for _ in range(3)] == [True, True, False]
     assert wire.pending("a") == 2
-    assert wire.submit("b", SYNC, 0)
+    assert wire.submit("b", BARE_SYNC, 0)
     assert len(wire.advance(10**9)) == 3
 
 
