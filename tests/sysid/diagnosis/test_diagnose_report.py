@@ -187,7 +187,7 @@ def test_what_is_explained_left_over_and_odd_is_said() -> None:
     found = examples.one_cause()
     text = Page(render(found)).text.translate(PLAIN_SPACE)
     assert "0.296 Nm rms to the motor balance (current against sensor), 94 % of the structured gap" in text
-    assert "57 times its standard error over leave-one-run-out" in text
+    assert "57 times its jackknife standard error (leave one run out)" in text
     assert "0.18 % of rated" in text
     assert "joint 1, motor balance; it does not matter (from 0.200 Nm on it matters)" in text
     assert "Runs that differ from the others" in text
