@@ -1,7 +1,8 @@
 """What a crash costs, by the real recorder at 1 kHz: at most 1 s, said, and every file opens after the next start."""
 
+import multiprocessing
 import os
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
@@ -38,8 +39,8 @@ NOTHING_LOST = {
 
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory):
-    """{case: its row, to be waited for}: four at a time, because they mostly wait themselves."""
-    with ThreadPoolExecutor(4) as pool:
+    """{case: its row, to be waited for}: four processes, because each case mostly waits and starts processes of its own."""
+    with ProcessPoolExecutor(4, mp_context=multiprocessing.get_context("fork")) as pool:
         yield {
             name: pool.submit(case, tmp_path_factory.mktemp(name))
             for name, case in CASES.items()
