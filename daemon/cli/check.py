@@ -14,14 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.bus.boot import boot_request
-from jtqd.daemon.cli.bus_checks import (
+from jtqd.daemon.cli.checks import (
+    FAIL,
+    GOOD,
+    CheckResult,
     check_bus,
     check_conditions,
     check_loop_timing,
     check_own_timing,
     check_stolen_time,
+    report,
 )
-from jtqd.daemon.cli.checks import FAIL, GOOD, CheckResult, report
 from jtqd.daemon.cli.running import Daemon, find_daemons, on_bus
 from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
 from jtqd.daemon.config import Config, as_booted, load_config

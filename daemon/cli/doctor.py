@@ -1,26 +1,444 @@
-"""`jtq doctor`: examine whether this machine is suitable for jtqd: kernel, rights, CAN interface, files, packages."""
+"""`jtq doctor`: examine whether this machine is suitable for jtqd: kernel, rights, CAN interface, files, packages.
+
+An interface is judged by /sys and by the output of `ip`. Nothing is changed.
+"""
 
 from __future__ import annotations
 
 import argparse
+import gzip
+import hashlib
+import json
 import os
+import platform
+import re
+import resource
+import shutil
+import socket
+import subprocess
+import time
 from collections.abc import Iterator
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
+from typing import Any
 
-from jtqd.daemon.cli.checks import FAIL, CheckResult, report
-from jtqd.daemon.cli.machine_checks import (
-    check_can,
-    check_directories,
-    check_files,
-    check_kernel,
-    check_packages,
-    check_remains,
-    check_unit,
-)
-from jtqd.daemon.cli.running import find_daemons, places
-from jtqd.daemon.config import load_config
+from jtqd import __version__
+from jtqd.daemon.bus.boot import bus_load_of
+from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, judge, report
+from jtqd.daemon.cli.running import DaemonSearch, find_daemons, places
+from jtqd.daemon.config import Config, Realtime, load_config
+from jtqd.daemon.loop.process import build_estimator
+from jtqd.daemon.shared.runtime_dir import installed
+from jtqd.drivers.bus_load import BusLoadError, check_bus_load
+from jtqd.drivers.bus_socket import AF_CAN, CAN_RAW
+from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.text import percent, size
+
+_CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
+_LOCKED_BYTES = 256 << 20
+"""Memory of the loop at its start, with a margin."""
+_SLOW_CLOCK_NS = 1_000
+_GOOD_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock", "hyperv_clocksource_tsc_page", "unknown")
+_SYS = Path("/sys/devices/system")
+_NET = Path("/sys/class/net")
+_ARPHRD_CAN = "280"
+_QUEUE = 100
+"""Frames; the default of 10 overflows when one cycle meets SDO traffic."""
+_BUS_STATE_COUNTS = ("error_warning", "error_passive", "bus_off")
+_DROP_COUNTS = ("rx_dropped", "tx_dropped", "rx_over_errors", "tx_errors", "rx_errors")
+_UNITS = (
+    "/etc/systemd/system",
+    "/run/systemd/system",
+    "/usr/local/lib/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
+)
+_UNIT = "jtqd@.service"
+_LOG_FREE = 10 << 30
+"""A working day of recording."""
+_SHM_FREE = 64 << 20
+_BYTES_AN_HOUR = 1_100_000_000
+
+
+def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
+    """Check the kernel and the rights of this user; can: SocketCAN is required."""
+    yield _kernel()
+    yield _timers()
+    yield _clocksource()
+    yield _can_sockets(required=can)
+    yield _priority(wanted)
+    yield _throttling(wanted)
+    yield _memory(wanted)
+    yield _cpu(wanted)
+    yield _governor()
+
+
+def _read(path: str | Path) -> str:
+    """Return the content of a file, "" if it cannot be read."""
+    with suppress(OSError):
+        return Path(path).read_text(errors="replace").strip()
+    return ""
+
+
+def _kernel() -> CheckResult:
+    version, text = platform.version(), f"Linux {platform.release()} {platform.machine()}"
+    if _read("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
+        return CheckResult("kernel", GOOD, f"{text}, PREEMPT_RT")
+    kind = next((each for each in ("PREEMPT_DYNAMIC", "PREEMPT") if each in version), "no preemption")
+    hint = (
+        "not a real-time kernel: a driver may delay the loop by milliseconds; `jtq check` measures how often"
+    )
+    return CheckResult("kernel", WARN, f"{text}, {kind}", hint)
+
+
+def _build_options() -> dict[str, str]:
+    """Return the build options of the running kernel, e.g. {"CONFIG_HZ": "250"}; empty if not published."""
+    text = _read(f"/boot/config-{platform.release()}")
+    with suppress(OSError, EOFError), gzip.open("/proc/config.gz", "rt") as file:
+        text = file.read()
+    return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", text, re.MULTILINE))
+
+
+def _timers() -> CheckResult:
+    hz = _build_options().get("CONFIG_HZ")
+    shown = f"HZ {hz}" if hz else "HZ unknown (the kernel does not publish its configuration)"
+    resolution = time.clock_getres(time.CLOCK_MONOTONIC)
+    if resolution <= 1e-6:
+        return CheckResult("timers", GOOD, f"high resolution ({resolution * 1e9:.0f} ns), {shown}")
+    text = f"resolution {resolution * 1e3:.3g} ms, {shown}"
+    return CheckResult("timers", FAIL, text, "CONFIG_HIGH_RES_TIMERS, and no `highres=off`")
+
+
+def _clocksource() -> CheckResult:
+    name = _read(_SYS / "clocksource/clocksource0/current_clocksource") or "unknown"
+    others = _read(_SYS / "clocksource/clocksource0/available_clocksource") or "unknown"
+    count, start = 2000, time.perf_counter_ns()
+    for _ in range(count):
+        time.monotonic_ns()
+    each_ns = (time.perf_counter_ns() - start) / count
+    slow = f"the loop reads it ten times a cycle; available: {others}"
+    return judge(
+        "clocksource",
+        f"{name}, {each_ns:.0f} ns for a reading",
+        (each_ns > _SLOW_CLOCK_NS, WARN, slow),
+        (name not in _GOOD_CLOCKS, WARN, "stability unknown: see `clocksource` in the kernel log"),
+    )
+
+
+def _can_sockets(*, required: bool) -> CheckResult:
+    try:
+        socket.socket(AF_CAN, socket.SOCK_RAW, CAN_RAW).close()
+    except OSError as error:
+        text = f"AF_CAN: {error.strerror} (errno {error.errno})"
+        if not required:
+            return CheckResult("SocketCAN", SKIP, f"{text}; not needed")
+        hint = "modprobe can can_raw; or a kernel with CONFIG_CAN and CONFIG_CAN_RAW; in systemd, RestrictAddressFamilies"
+        return CheckResult("SocketCAN", FAIL, text, hint)
+    return CheckResult("SocketCAN", GOOD, "raw CAN sockets can be opened")
+
+
+def _capability(number: int) -> bool:
+    match = re.search(r"^CapEff:\s*([0-9a-f]+)", _read("/proc/self/status"), re.MULTILINE)
+    return bool(match and int(match[1], 16) >> number & 1)
+
+
+def _priority(wanted: Realtime) -> CheckResult:
+    if not wanted.priority:
+        text = "not requested by the configuration (realtime.priority 0)"
+        return CheckResult("SCHED_FIFO", WARN, text, "80 is the default")
+    limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+    limit_text = f"RLIMIT_RTPRIO {'unlimited' if limit == resource.RLIM_INFINITY else limit}"
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(wanted.priority))
+    except OSError as error:
+        text = f"priority {wanted.priority} is refused to this user: {error.strerror}; {limit_text}"
+        hint = "LimitRTPRIO= in the unit, or /etc/security/limits.d: `jtqd - rtprio 80`"
+        return CheckResult("SCHED_FIFO", FAIL, text, hint)
+    os.sched_setscheduler(0, *before)
+    how = "CAP_SYS_NICE" if _capability(_CAP_SYS_NICE) else limit_text
+    return CheckResult("SCHED_FIFO", GOOD, f"priority {wanted.priority} is granted to this user by {how}")
+
+
+def _throttling(wanted: Realtime) -> CheckResult:
+    runtime, period = (_read(f"/proc/sys/kernel/sched_rt_{name}_us") for name in ("runtime", "period"))
+    if not runtime or not period:
+        return CheckResult("RT throttling", SKIP, "not reported by the kernel")
+    if int(runtime) < 0:
+        return CheckResult("RT throttling", GOOD, "off: a real-time process may take a whole CPU")
+    text = f"real-time processes get {int(runtime) / 1000:.0f} of {int(period) / 1000:.0f} ms"
+    if wanted.priority and int(runtime) < 0.9 * int(period):
+        hint = "sysctl kernel.sched_rt_runtime_us=950000: otherwise the loop is stopped"
+        return CheckResult("RT throttling", FAIL, text, hint)
+    return CheckResult("RT throttling", GOOD, f"{text}: far more than the loop needs")
+
+
+def _memory(wanted: Realtime) -> CheckResult:
+    if not wanted.lock_memory:
+        hint = "realtime: {lock_memory: true}"
+        return CheckResult("locked memory", WARN, "not requested by the configuration", hint)
+    limit = resource.getrlimit(resource.RLIMIT_MEMLOCK)[0]
+    if limit == resource.RLIM_INFINITY or _capability(_CAP_IPC_LOCK):
+        return CheckResult("locked memory", GOOD, "unlimited for this user")
+    hint = "LimitMEMLOCK=infinity in the unit: a page fault delays a cycle"
+    text = f"RLIMIT_MEMLOCK {limit >> 20} MiB for this user"
+    return judge("locked memory", text, (limit < _LOCKED_BYTES, FAIL, hint))
+
+
+def _cpus(text: str) -> set[int]:
+    """Parse a CPU list of the kernel, "0-2,5"."""
+    cpus: set[int] = set()
+    for part in filter(None, text.split(",")):
+        first, _, last = part.partition("-")
+        cpus |= set(range(int(first), int(last or first) + 1))
+    return cpus
+
+
+def _cpu(wanted: Realtime) -> CheckResult:
+    isolated = _read(_SYS / "cpu/isolated")
+    if wanted.cpu is None:
+        text = f"any of {len(os.sched_getaffinity(0))}" + (f"; isolated: {isolated}" if isolated else "")
+        hint = f"realtime: {{cpu: {min(_cpus(isolated))}}} would use the isolated one" if isolated else ""
+        return judge("CPU", text, (hint, WARN, hint))
+    if wanted.cpu not in _cpus(_read(_SYS / "cpu/online")):
+        return CheckResult("CPU", FAIL, f"{wanted.cpu} by the configuration: does not exist", "realtime.cpu")
+    if wanted.cpu in _cpus(isolated):
+        return CheckResult("CPU", GOOD, f"{wanted.cpu}, isolated")
+    text = f"{wanted.cpu} by the configuration, shared with other processes (isolated: {isolated or 'none'})"
+    return CheckResult("CPU", WARN, text, f"isolcpus={wanted.cpu} on the kernel command line reserves it")
+
+
+def _governor() -> CheckResult:
+    governors = {_read(path) for path in _SYS.glob("cpu/cpu[0-9]*/cpufreq/scaling_governor")} - {""}
+    text = (
+        f"governor {', '.join(sorted(governors))}" if governors else "the kernel does not scale the frequency"
+    )
+    hint = "cpupower frequency-set -g performance: a slow clock makes a cycle long"
+    return judge("cpufreq", text, (governors - {"performance"}, WARN, hint))
+
+
+# ---- CAN interfaces ----
+
+
+def interfaces() -> list[str]:
+    """Return the names of the CAN interfaces of this machine."""
+    return sorted(path.parent.name for path in _NET.glob("*/type") if _read(path) == _ARPHRD_CAN)
+
+
+def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
+    """Check the bus; None: all CAN interfaces."""
+    here = interfaces()
+    if bus is None:
+        if not here:
+            hint = "connect one; `ip link add dev vcan0 type vcan` for a test"
+            yield CheckResult("CAN interface", WARN, "none on this machine", hint)
+        for name in here:
+            yield from _interface(name, config)
+    elif bus == "sim":
+        yield CheckResult("CAN interface", SKIP, "the emulated bench needs none")
+    elif bus.startswith("unix:"):
+        yield _hub(bus)
+    elif not (_NET / bus).exists():
+        text = f"no such interface; CAN interfaces here: {', '.join(here) or 'none'}"
+        yield CheckResult(bus, FAIL, text, "check driver and name")
+    elif bus not in here:
+        yield CheckResult(bus, FAIL, "not a CAN interface")
+    else:
+        yield from _interface(bus, config)
+
+
+def _hub(bus: str) -> CheckResult:
+    try:
+        open_frame_socket(bus, []).close()
+    except BusError as error:
+        hint = "start its hub: `jtq sim --bus unix:PATH`, or python -m jtqd.drivers.hub"
+        return CheckResult("bus", FAIL, str(error), hint)
+    return CheckResult("bus", GOOD, f"{bus}: the hub answers")
+
+
+def link_of(name: str) -> dict[str, Any]:
+    """Return the output of `ip -details -statistics link` for an interface; {} without ip or interface."""
+    command = ["ip", "-json", "-details", "-statistics", "link", "show", name]
+    with suppress(OSError, ValueError, subprocess.SubprocessError):
+        done = subprocess.run(command, capture_output=True, text=True, timeout=5, check=True)
+        return dict(json.loads(done.stdout)[0])
+    return {}
+
+
+def _interface(name: str, config: Config) -> Iterator[CheckResult]:
+    link = link_of(name)
+    info = link.get("linkinfo", {})
+    kind = info.get("info_kind", "CAN")
+    up = int(_read(_NET / name / "flags") or "0", 16) & 1
+    down = f"ip link set {name} up type can bitrate {config.bitrate} restart-ms 100"
+    yield judge(name, f"up, {kind}" if up else "down", (not up, FAIL, down))
+    queue = int(_read(_NET / name / "tx_queue_len") or "0")
+    short = f"ip link set {name} txqueuelen 1000: a short queue loses frames when the bus is busy"
+    yield judge(f"{name} queue", f"txqueuelen {queue}", (queue < _QUEUE, WARN, short))
+    if not link:
+        text = "`ip` is missing, so bit rate and state are unknown"
+        yield CheckResult(f"{name} wire", SKIP, text, "install iproute2")
+    elif kind == "vcan":
+        yield CheckResult(f"{name} wire", SKIP, "virtual: no bit rate, no arbitration, no errors")
+    else:
+        yield _wire(name, info.get("info_data", {}), config)
+        yield _state(name, info)
+    counts = {each: int(_read(_NET / name / "statistics" / each) or "0") for each in _DROP_COUNTS}
+    if any(counts.values()):
+        text = ", ".join(f"{each} {count}" for each, count in counts.items() if count)
+        hint = "queue too short, or controller overruns"
+        yield CheckResult(f"{name} drops", WARN, f"{text} since the interface exists", hint)
+
+
+def _wire(name: str, data: dict[str, Any], config: Config) -> CheckResult:
+    bitrate, restart = data.get("bittiming", {}).get("bitrate", 0), data.get("restart_ms", 0)
+    wrong = f"the configuration has {config.bitrate}: ip link set {name} type can bitrate {config.bitrate}"
+    stays_off = f"ip link set {name} type can restart-ms 100: otherwise it stays off after a bus-off"
+    return judge(
+        f"{name} wire",
+        f"{bitrate} bit/s, restart-ms {restart}",
+        (bitrate != config.bitrate, FAIL, wrong),
+        (not restart, WARN, stays_off),
+    )
+
+
+def _state(name: str, info: dict[str, Any]) -> CheckResult:
+    data, counts = info.get("info_data", {}), info.get("info_xstats", {})
+    state, errors = str(data.get("state", "unknown")), data.get("berr_counter", {})
+    seen = [f"{each.replace('_', ' ')} {counts[each]}" for each in _BUS_STATE_COUNTS if counts.get(each)]
+    text = f"{state}, error counters tx {errors.get('tx', '?')} rx {errors.get('rx', '?')}"
+    dead = "check wiring, termination, bit rate, and that another node is powered"
+    return judge(
+        f"{name} state",
+        "; ".join((text, *([", ".join(seen)] if seen else []))),
+        (state in ("BUS-OFF", "ERROR-PASSIVE"), FAIL, dead),
+        (state != "ERROR-ACTIVE" or seen, WARN, "errors occurred: check wiring, termination, sample point"),
+    )
+
+
+# ---- files, directories, packages ----
+
+
+def check_files(config: Config) -> Iterator[CheckResult]:
+    """Check the files that a configuration names, by their use; the configuration itself is read already."""
+    method, load = config.estimator.method, bus_load_of(config)
+    yield CheckResult("configuration", GOOD, f"{config.path}, sha256 {config.sha256[:12]}, method {method}")
+    try:
+        check_bus_load(load)
+        yield CheckResult("bus load", GOOD, f"{percent(load.worst)} in the worst case (`jtq bus-load`)")
+    except BusLoadError as error:
+        yield CheckResult("bus load", FAIL, str(error), "`jtq bus-load` shows the share of each sender")
+    for joint in config.joints:
+        item = f"joint {joint.number}"
+        try:
+            build_estimator(config, joint).step(1e-3, 0.1, 0.0, 1.0, 0.0, 25.0)
+        except (ConfigError, NetworkError) as error:
+            yield CheckResult(item, FAIL, str(error), "jtqd will not start with it")
+            continue
+        digest = hashlib.sha256(joint.joint_path.read_bytes()).hexdigest()
+        network = f"{joint.network.path.name} {joint.network.sha256[:12]}" if joint.network else "no network"
+        text = f"{joint.joint.name}: {joint.joint_path.name} {digest[:12]}, {network}: loads and runs"
+        yield CheckResult(item, GOOD, text)
+
+
+def check_directories(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
+    """Check the directories of logs and shared memory for this user; log None: none is named."""
+    if log is None:
+        text = "jtqd writes to ./logs without --record DIR or $LOGS_DIRECTORY"
+        yield CheckResult("log directory", SKIP, text)
+    else:
+        yield _directory("log directory", log, _LOG_FREE, f"an hour takes up to {size(_BYTES_AN_HOUR)}")
+    yield _directory("shared memory", roots[0], _SHM_FREE, "ring and snapshot of a daemon take 3 MB")
+
+
+def _directory(item: str, path: Path, wanted: int, use: str) -> CheckResult:
+    parents = (path, *path.absolute().parents)
+    existing = next(each for each in parents if os.path.exists(each))  # not in a closed one
+    if not os.access(existing, os.W_OK | os.X_OK):
+        text = f"{path}: not writable for this user"
+        return CheckResult(item, FAIL, text, "owner and mode; LogsDirectory= in the unit")
+    free = shutil.disk_usage(existing).free
+    text = f"{path}: {size(free)} free, {use}" + ("; it will be created" if existing != path else "")
+    hint = f"less than {size(wanted)}: recording pauses when the disk is full"
+    return judge(item, text, (free < wanted, WARN, hint))
+
+
+def check_packages() -> Iterator[CheckResult]:
+    """Compare installed versions with the requirements of jtqd's package."""
+    try:
+        wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
+    except PackageNotFoundError:
+        text = "jtqd is not installed as a package: its requirements are unknown"
+        yield CheckResult("packages", WARN, text, "pip install .")
+        return
+    versions, wrong = [], []
+    for line in wanted:
+        name, limits = requirement(line)
+        version = installed(name)
+        versions.append(f"{name} {version}")
+        if version is None:
+            wrong.append(f"{name} is missing")
+        elif not all(fits(version, *limit) for limit in limits):
+            wrong.append(f"{name} {version}, expected {line.removeprefix(name)}")
+    text = "; ".join(wrong) or f"jtqd {__version__}, {', '.join(versions)}"
+    yield judge("packages", text, (wrong, FAIL, "pip install --upgrade jtqd, in its own environment"))
+
+
+def requirement(line: str) -> tuple[str, list[tuple[str, str]]]:
+    """Split a requirement into name and limits: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
+    name = re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0]
+    return name, re.findall(r"(>=|<=|==|<|>)\s*([0-9][0-9A-Za-z.]*)", line.partition(";")[0])
+
+
+def fits(version: str, operator: str, limit: str) -> bool:
+    """Compare the numbers of two versions; the first part that is not a number ends them."""
+    have, want = _numbers(version), _numbers(limit)
+    length = max(len(have), len(want))
+    have, want = have + (0,) * (length - len(have)), want + (0,) * (length - len(want))
+    return {">=": have >= want, "<=": have <= want, "==": have == want, "<": have < want, ">": have > want}[
+        operator
+    ]
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    match = re.match(r"\d+(?:\.\d+)*", version)
+    return tuple(map(int, match[0].split("."))) if match else ()
+
+
+def check_unit() -> CheckResult:
+    """Check the systemd unit."""
+    if not Path("/run/systemd/system").exists():
+        return CheckResult("systemd unit", SKIP, "systemd does not run here")
+    path = next((path for each in _UNITS if (path := Path(each, _UNIT)).exists()), None)
+    hint = "see docs/deployment.md; without the unit jtqd does not start at boot"
+    return judge("systemd unit", str(path or "not installed"), (path is None, WARN, hint))
+
+
+def check_remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
+    """Check for unfinished logs and runtime directories of killed daemons."""
+    running = [each.about for each in search.daemons]
+    text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
+    yield CheckResult("running jtqd", GOOD, text)
+    directories = {Path(each.log_directory) for each in running if each.log_directory}
+    directories |= {log} if log else set()
+    growing = tuple(each.log_prefix for each in running)
+    files = [
+        str(path)
+        for directory in sorted(directories)
+        for path in sorted(directory.glob("*.mcap.active"))
+        if not (growing and path.name.startswith(growing))
+    ]
+    text = ", ".join(files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")
+    yield judge("unfinished logs", text or "none", (files, WARN, "of a crash: jtq recover FILE"))
+    if search.abandoned:
+        text = ", ".join(map(str, search.abandoned))
+        hint = "runtime directories; removed by the next start, or remove them manually"
+        yield CheckResult("killed daemons", WARN, text, hint)
+
 
 SCHEMA = "jtq.doctor/1"
 _EXAMPLES = """examples:

@@ -18,17 +18,22 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.bus.boot import bus_load_of
-from jtqd.daemon.cli.device import UsageError, description, eds_survey, family_of, merged, surveyed
 from jtqd.daemon.cli.proposal import (
     OPTIONS,
     ConfigProposal,
     JointProposal,
     MissingValueError,
+    UsageError,
     Wanted,
     config_text,
+    description,
+    eds_survey,
+    family_of,
     joint_text,
+    merged,
     propose_joint,
     sensor_problems,
+    surveyed,
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
 from jtqd.daemon.profiles import Family

@@ -13,24 +13,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.cli.device import (
-    UsageError,
-    description,
-    eds_survey,
-    family_of,
-    merged,
-    surveyed,
-    unit_problems,
-)
 from jtqd.daemon.cli.init import MAX_JOINTS, add_values, node_id
 from jtqd.daemon.cli.proposal import (
     OPTIONS,
     MissingValueError,
+    UsageError,
     Wanted,
+    description,
     drive_lines,
+    eds_survey,
+    family_of,
+    merged,
     propose_joint,
     sensor_lines,
     sensor_problems,
+    surveyed,
+    unit_problems,
 )
 from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names

@@ -1,11 +1,9 @@
 """Configuration of jtqd as frozen values: `load_config` reads a file.
 
-drive       objects and TPDOs of a joint's drive
-sections    the whole file, section by section
+sections    the whole file, section by section; objects and TPDOs of a joint's drive
 load        with joint files, networks and profiles: `Config`
 """
 
-from jtqd.daemon.config.drive import ObjectsSection
 from jtqd.daemon.config.load import Config, JointConfig, NetworkFile, SensorConfig, as_booted, load_config
 from jtqd.daemon.config.sections import (
     HIGHEST_DOMAIN,
@@ -14,6 +12,7 @@ from jtqd.daemon.config.sections import (
     MAX_NODE_ID,
     ContactSettings,
     Identity,
+    ObjectsSection,
     Realtime,
     RecordingSettings,
     Ros2Settings,

@@ -12,7 +12,6 @@ from dataclasses import MISSING, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.daemon.config.drive import tpdos_of
 from jtqd.daemon.config.sections import (
     ERROR_BEHAVIOURS,
     ConfigFile,
@@ -24,6 +23,7 @@ from jtqd.daemon.config.sections import (
     Ros2Settings,
     SafetySettings,
     SensorSection,
+    tpdos_of,
 )
 from jtqd.daemon.profiles import path_of, with_profiles
 from jtqd.drivers.drive import DriveObjects, Temperature, maps_of_json, select_tpdos

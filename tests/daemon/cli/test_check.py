@@ -13,9 +13,19 @@ import pytest
 import yaml
 from rich.console import Console
 
-from jtqd.daemon.cli.bus_checks import check_bus, check_conditions, check_own_timing, check_stolen_time
 from jtqd.daemon.cli.check import main
-from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN, CheckResult, show
+from jtqd.daemon.cli.checks import (
+    FAIL,
+    GOOD,
+    SKIP,
+    WARN,
+    CheckResult,
+    check_bus,
+    check_conditions,
+    check_own_timing,
+    check_stolen_time,
+    show,
+)
 from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, identifier_text
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.realtime import stolen_s

@@ -18,8 +18,14 @@ import yaml
 
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
-from jtqd.daemon.cli.device import kept_tpdos, reported_units, unit_problems
-from jtqd.daemon.cli.proposal import Wanted, drive_lines, propose_joint
+from jtqd.daemon.cli.proposal import (
+    Wanted,
+    drive_lines,
+    kept_tpdos,
+    propose_joint,
+    reported_units,
+    unit_problems,
+)
 from jtqd.daemon.config import load_config
 from jtqd.drivers.drive import CIA_402, DriveProfile, drive_scaling
 from jtqd.drivers.pdo import Tpdo

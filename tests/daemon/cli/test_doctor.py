@@ -12,10 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.cli import machine_checks as machine
+from jtqd.daemon.cli import doctor as machine
 from jtqd.daemon.cli.checks import FAIL, GOOD, SKIP, WARN
-from jtqd.daemon.cli.doctor import main
-from jtqd.daemon.cli.machine_checks import check_directories, fits, requirement
+from jtqd.daemon.cli.doctor import check_directories, fits, main, requirement
 from jtqd.daemon.config import Realtime, load_config
 from jtqd.models.files import shipped
 from tests.drivers.hub_helpers import until_it_listens
@@ -110,7 +109,7 @@ def test_a_directory_that_does_not_exist_yet_and_a_disk_that_is_full(
 ) -> None:
     _, found = doctor("--bus", "sim", "--record", str(tmp_path / "a" / "b"))
     assert "it will be created" in found["log directory"]["text"]
-    monkeypatch.setattr("jtqd.daemon.cli.machine_checks._LOG_FREE", 1 << 60)
+    monkeypatch.setattr("jtqd.daemon.cli.doctor._LOG_FREE", 1 << 60)
     _, found = doctor("--bus", "sim", "--record", str(tmp_path))
     assert level(found, "log directory") == WARN
 

@@ -17,8 +17,7 @@ from rich.console import Console
 from rich.text import Text
 
 from jtqd.daemon.cli.running import Watch, find_daemons
-from jtqd.daemon.cli.status import Moment, Recent, StatusView, main
-from jtqd.daemon.cli.terminal import paged
+from jtqd.daemon.cli.status import Moment, Recent, StatusView, main, paged
 from jtqd.daemon.recording.run_files import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
 from jtqd.daemon.shared.events import ERROR, WARNING, Notices

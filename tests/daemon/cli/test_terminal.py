@@ -7,8 +7,7 @@ import pytest
 from rich.console import Console, Group
 from rich.text import Text
 
-from jtqd.daemon.cli.status import WINDOW_S, Moment, Recent
-from jtqd.daemon.cli.terminal import histogram, paged, sparkline
+from jtqd.daemon.cli.status import WINDOW_S, Moment, Recent, histogram, paged, sparkline
 
 
 def test_a_sparkline_spans_its_values_and_leaves_gaps():
