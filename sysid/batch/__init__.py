@@ -1,6 +1,4 @@
 """`jtq batch`: diagnose or replay many logs, here or on a dask cluster, with one summary page.
 
 In: logs and run tables, options of the command. Out: one result per group of logs, kept by content; summary and page.
-Modules: `command` (options), `run` (groups, tasks, results), `summary` (the page). Imports sysid.runs, sysid.report and, in
-tasks, `jtq` as a process.
 """

@@ -23,12 +23,28 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted, table_lines
 from jtqd.models.files import shipped
-from jtqd.sysid.campaign import processes
-from jtqd.sysid.campaign.bench import Bench, BenchConfig
-from jtqd.sysid.campaign.processes import EXACT_TIME, EXACT_TIME_BUS, ExactTimeError, ProcessError
-from jtqd.sysid.campaign.recorded import LONGEST_INTERPOLATED_S
-from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Reporter, clock_text
-from jtqd.sysid.campaign.runner import Outcome, attempt, go_through
+from jtqd.sysid.campaign.bench import (
+    EXACT_TIME,
+    EXACT_TIME_BUS,
+    Bench,
+    BenchConfig,
+    ExactTimeError,
+    ProcessError,
+    emulated_bench,
+    exact_time_ready,
+    in_exact_time,
+    run_in_exact_time,
+    unix_bus,
+)
+from jtqd.sysid.campaign.runner import (
+    BETWEEN_RUNS_S,
+    LONGEST_INTERPOLATED_S,
+    Outcome,
+    Reporter,
+    attempt,
+    clock_text,
+    go_through,
+)
 from jtqd.sysid.campaign.state import DONE, CampaignDirectory, StateError
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Timing
 from jtqd.sysid.motion.shell import stop_signals
@@ -40,12 +56,15 @@ from jtqd.sysid.planner.campaigns import (
     Unit,
     check_joints,
     make_plan_of,
+    parsed_limits,
+    range_of,
     seed_of,
+    tightest,
     unit_lines,
     units_of,
+    with_limits,
 )
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, check_plan, load_plan, travel_rad
-from jtqd.sysid.planner.single_joint import parsed_limits, range_of, tightest, with_limits
 from jtqd.sysid.progress import bar
 
 EMULATED: Final = "sim"
@@ -391,10 +410,10 @@ def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bo
     config, units = _bench_of(options)
     config.load_with_commander()  # refuses a configuration that does not fit the bus
     if options.bus == EXACT_TIME:
-        if not processes.in_exact_time():
-            return processes.run_in_exact_time(argv, options.out)
+        if not in_exact_time():
+            return run_in_exact_time(argv, options.out)
         options.bus = EXACT_TIME_BUS
-    exact_next = exact_too and options.bus == EMULATED and processes.exact_time_ready()
+    exact_next = exact_too and options.bus == EMULATED and exact_time_ready()
     made_from = recipe(options, config.joints)
     directory = CampaignDirectory(options.out)
     try:
@@ -415,7 +434,7 @@ def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bo
             flush=True,
         )
         try:
-            return processes.run_in_exact_time(argv, options.out)
+            return run_in_exact_time(argv, options.out)
         except ExactTimeError as error:
             print(f"jtq campaign: {error}; in real time again", file=sys.stderr)
             return _campaign(options, argv, exact_too=False)
@@ -443,14 +462,13 @@ def _run(
         if emulated(bus):
             # a short path: the address of a unix socket holds 107 bytes
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="jtq-campaign-")))
-            bus = bus.removeprefix(EMULATED).removeprefix(":") or processes.unix_bus(folder)
+            bus = bus.removeprefix(EMULATED).removeprefix(":") or unix_bus(folder)
             plant = options.plant or shipped(PLANT)
             # days of its own for every campaign, and for the remaining runs of one: validation runs on other days
             # than those of the training
             seed = seed_of(f"bench/{plan.name}", float(done), options.seed)
             sensor = config.sensor is not None
-            bench = processes.emulated_bench(bus, folder, plant, seed, len(config.drives), sensor=sensor)
-            stack.enter_context(bench)
+            stack.enter_context(emulated_bench(bus, folder, plant, seed, len(config.drives), sensor=sensor))
             timing = EMULATED_TIMING
         reporter = stack.enter_context(Reporter(to_do, len(plan.runs), done))
         stack.enter_context(_commander_log(reporter))

@@ -3,6 +3,12 @@
 One attempt starts jtqd, plays the motion, ends jtqd, and turns its log into a run table (`recorded`). An attempt that fails
 for want of time is repeated. Where the run can be cut, its partial runs are driven one by one (NAME~1, NAME~2, ...) and stay
 separate tables, because the joints stood elsewhere in between.
+
+The run table of a motion that was driven: short gaps of lost cycles are interpolated, and faults of the run are found.
+
+Faults are missing cycles, broken channels, wrong wiring, and a motion that did not take place. No model is judged here.
+
+Progress of a campaign on standard error: a bar with the remaining time on a terminal, else a line per run.
 """
 
 from __future__ import annotations
@@ -11,30 +17,303 @@ import json
 import os
 import re
 import shutil
+import sys
+import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+import numpy as np
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+
 from jtqd.daemon.logs import LogError
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.campaign.bench import Bench, BenchConfig, Play
-from jtqd.sysid.campaign.processes import Interrupted, Jtqd, ProcessError, StopAsked
-from jtqd.sysid.campaign.recorded import (
-    LONGEST_GAP,
-    LOST_FINDING,
-    findings,
-    gaps_of,
-    interpolate_gaps,
-    unusable,
-)
-from jtqd.sysid.campaign.reporter import Reporter
+from jtqd.sysid.campaign.bench import Bench, BenchConfig, Interrupted, Jtqd, Play, ProcessError, StopAsked
 from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, STATUSES, STOPPED, CampaignDirectory, RunState
-from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
+from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints
 from jtqd.sysid.planner.plan import Plan, Run, expand, marks_of, partial_runs
-from jtqd.sysid.runs.logs import log_to_run
+from jtqd.sysid.runs.checks import check_run
+from jtqd.sysid.runs.logs import LoggedRun, log_to_run
 from jtqd.sysid.runs.tables import write_run
+
+LONGEST_INTERPOLATED_S: Final = 0.0505
+"""50 periods of 1 ms; the trajectories' harmonics lie below 1 Hz."""
+_INTERPOLATED_SHARE: Final = 0.005
+"""Largest part of a table that is interpolated."""
+LONGEST_GAP: Final = 9.5
+"""In periods of SYNC: readers refuse a table with a gap of 10 cycles (jtqd.sysid.runs.run_file)."""
+_LOST_SHARE: Final = 0.01
+LOST_FINDING: Final = "cycles:"
+"""First word of the finding that more cycles than that are missing."""
+_LOST_END_S: Final = 0.1
+_FOLLOW_VELOCITY: Final = (0.05, 0.05)
+_FOLLOW_CURRENT: Final = (0.1, 0.05)
+"""RMS that is allowed between set-point and measurement: rad/s or A, and a part of the peak."""
+_OPPOSITE_TOLERANCE: Final = 0.02
+_LEAST_MOTION_RAD: Final = 1.0
+"""Of a link, for its motion to be compared with the other one's."""
+
+
+def gaps_of(time_s: FloatArray, longest_gap_s: float) -> list[list[float]]:
+    """Return start and end [s] of each step that is longer than longest_gap_s."""
+    places = np.flatnonzero(np.diff(time_s) > longest_gap_s)
+    return [[round(float(time_s[place]), 6), round(float(time_s[place + 1]), 6)] for place in places]
+
+
+def interpolate_gaps(
+    logged: LoggedRun, longest_gap_s: float, period_s: float = PERIOD_S
+) -> tuple[LoggedRun, int]:
+    """Interpolate gaps longer than longest_gap_s linearly; returns the run and the number of rows added, period_s apart.
+
+    The run is returned as it is where a gap is longer than LONGEST_INTERPOLATED_S, or too many rows would be added.
+    """
+    time_s = logged.table.time_s
+    steps = np.diff(time_s)
+    places = np.flatnonzero(steps > longest_gap_s)
+    if not len(places) or float(steps.max()) > LONGEST_INTERPOLATED_S:
+        return logged, 0
+    added = np.concatenate(
+        [time_s[place] + period_s * np.arange(1, round(float(steps[place]) / period_s)) for place in places]
+    )
+    if len(added) > _INTERPOLATED_SHARE * (len(added) + len(time_s)):
+        return logged, 0
+    whole: FloatArray = np.sort(np.concatenate((time_s, added)))
+
+    def at_all_times(name: str, column: FloatArray) -> FloatArray:
+        values: FloatArray = np.interp(whole, time_s, column)
+        return np.round(values) if name == "enabled" else values
+
+    joints = {number: columns.map(at_all_times) for number, columns in logged.table.joints.items()}
+    longest = float(np.diff(whole).max())
+    return replace(logged, table=RunTable(whole, joints), longest_gap_s=longest), len(added)
+
+
+def unusable(logged: LoggedRun, setpoints: Setpoints, longest_gap_s: float) -> str | None:
+    """Return why a table cannot be kept at all: a gap, or the end of the motion is missing; else None."""
+    time_s = logged.table.time_s
+    if logged.longest_gap_s > longest_gap_s:
+        at = time_s[int(np.argmax(np.diff(time_s)))]
+        return (
+            f"found a gap of {logged.longest_gap_s * 1e3:.1f} ms in the log at {at:.3f} s, "
+            f"expected at most {longest_gap_s * 1e3:.1f} ms"
+        )
+    if time_s[-1] < setpoints.duration_s - _LOST_END_S:  # lost cycles only make a motion longer
+        return f"found the last row of the log at {time_s[-1]:.3f} s, expected it after {setpoints.duration_s:.3f} s"
+    return None
+
+
+def findings(
+    logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint], *, measured: Collection[int]
+) -> tuple[str, ...]:
+    """Return the faults of a run, a line each.
+
+    Args:
+        logged: its first row belongs to the first set-point. joints: of jtqd's configuration, 1, 2, ...
+        measured: numbers of the joints of the run that have a channel of the torque sensor.
+    """
+    by_number = {number: joints[number - 1] for number in setpoints.joints}
+    return (
+        *_lost(logged),
+        *_no_sensor(logged, measured),
+        *(issue.text for issue in check_run(logged.table, by_number).refused),
+        *_followed(logged, setpoints, joints),
+        *(() if setpoints.current_joint is None else _opposite(logged, setpoints.joints, joints)),
+    )
+
+
+def _lost(logged: LoggedRun) -> Iterator[str]:
+    if logged.lost_share > _LOST_SHARE:
+        by = ", ".join(f"{name} {count}" for name, count in logged.incomplete_by.items() if count)
+        yield (
+            f"{LOST_FINDING} found {logged.lost_share:.1%} missing ({logged.missed} without a cycle, "
+            f"{logged.incomplete} incomplete{': ' + by if by else ''}), expected at most {_LOST_SHARE:.0%}"
+        )
+
+
+def _no_sensor(logged: LoggedRun, measured: Collection[int]) -> Iterator[str]:
+    for number, columns in logged.table.joints.items():
+        if columns.torque_nm is None and number in measured:
+            yield f"j{number}.torque_nm: found no value in the whole run, expected the sensor's: dead channel"
+
+
+def _followed(logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint]) -> Iterator[str]:
+    """Compare the velocity joint with its velocity, the other one with its current, at the time of each row."""
+    table = logged.table
+    place = np.minimum(np.round(table.time_s / PERIOD_S).astype(np.intp), len(setpoints) - 1)
+    mover, driver = setpoints.velocity_joint, setpoints.current_joint
+    velocity = table.joints[mover].motor_velocity_rad_s
+    assert velocity is not None  # log_to_run was asked for all columns
+    yield from _follows(
+        velocity / joints[mover - 1].gear_ratio,
+        setpoints.velocity_rad_s[place],
+        _FOLLOW_VELOCITY,
+        f"j{mover}.motor_velocity_rad_s: through the gear",
+        "rad/s",
+    )
+    if driver is not None:
+        current = table.joints[driver].current_a
+        assert current is not None
+        wanted = setpoints.current_a[place]
+        yield from _follows(current, wanted, _FOLLOW_CURRENT, f"j{driver}.current_a:", "A")
+
+
+def _follows(
+    found: FloatArray, wanted: FloatArray, allowed: tuple[float, float], what: str, unit: str
+) -> Iterator[str]:
+    rms = float(np.sqrt(np.mean((found - wanted) ** 2)))
+    limit = allowed[0] + allowed[1] * float(np.abs(wanted).max())
+    if rms > limit:
+        opposite = float(np.sqrt(np.mean((found + wanted) ** 2))) <= limit
+        yield (
+            f"{what} found {rms:.3g} {unit} rms off the set-point, expected at most {limit:.3g} {unit}"
+            f"{': it has the opposite sign' if opposite else ''}"
+        )
+
+
+def _opposite(logged: LoggedRun, pair: tuple[int, ...], joints: Sequence[Joint]) -> Iterator[str]:
+    """Compare the links, which are one body and turn oppositely; a joint with one encoder through its gear."""
+    one, two = (
+        logged.table.joint(number, joints[number - 1].gear_ratio).link_position_rad for number in pair
+    )
+    assert one is not None
+    assert two is not None
+    if max(float(np.ptp(one)), float(np.ptp(two))) < _LEAST_MOTION_RAD:
+        return
+    dx: FloatArray = one - one.mean()
+    variance = float(dx @ dx)
+    slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
+    if abs(slope + 1.0) > _OPPOSITE_TOLERANCE:
+        link = logged.table.joints[pair[1]].link_position_rad is not None
+        name = "link_position_rad:" if link else "motor_position_rad: through the gear"
+        yield f"j{pair[1]}.{name} found it turning {slope:.4g} times as far as j{pair[0]}'s, expected -1"
+
+
+BETWEEN_RUNS_S: Final = 4.0
+"""Assumed before the first run is measured: start of jtqd, set-up of the drives, run table."""
+_REFRESH_S: Final = 1.0
+"""Drawing takes 0.5 ms between two set-points."""
+
+
+def clock_text(seconds: float) -> str:
+    """62.4 -> "1:02", 3723 -> "1:02:03"."""
+    minutes, rest = divmod(round(max(seconds, 0.0)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
+
+
+class Remaining:
+    """Remaining time of a campaign: motions to be played, and the measured time between them.
+
+    Args:
+        motions_s: lengths of all runs that are to be played.
+        now: clock in seconds.
+    """
+
+    def __init__(self, motions_s: list[float], now: Callable[[], float] = time.monotonic) -> None:
+        self.total_s: Final = sum(motions_s)
+        self.played_s = 0.0
+        """Motions of the runs that are over."""
+        self._left = len(motions_s)
+        self._over = 0
+        self._now, self._began = now, now()
+
+    def end(self, motion_s: float) -> None:
+        """Count a run that is over."""
+        self.played_s += motion_s
+        self._left -= 1
+        self._over += 1
+
+    def seconds(self, played_s: float = 0.0) -> float:
+        """Return the remaining time after played_s of the current run."""
+        motion_s = self.played_s + played_s
+        between_s = BETWEEN_RUNS_S
+        if self._over:
+            begun = self._over + (played_s > 0.0)
+            between_s = max((self._now() - self._began - motion_s) / begun, 0.0)
+        return self.total_s - motion_s + between_s * self._left
+
+
+class Reporter:
+    """A context manager around the runs: the current one, and the outcome of each."""
+
+    def __init__(self, motions_s: list[float], total: int, done: int, console: Console | None = None) -> None:
+        self._console = console or Console(stderr=True)
+        self._remaining = Remaining(motions_s)
+        self._total, self._number = total, done
+        self._name = ""
+        self._shown_s = 0.0
+        self._bar = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(None),
+            TextColumn("{task.percentage:3.0f} %"),
+            TextColumn("{task.fields[left]} left"),
+            console=self._console,
+            auto_refresh=False,
+            transient=True,
+            disable=not self._console.is_terminal,
+        )
+        self._task = self._bar.add_task("", total=max(self._remaining.total_s, 1e-9), left="")
+
+    def __enter__(self) -> Reporter:
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def begin(self, name: str) -> None:
+        """Show the next run."""
+        self._name = name
+        self._number += 1
+        self._shown_s = -_REFRESH_S
+        self.on_progress(0.0, 0.0)
+
+    def on_progress(self, played_s: float, _total_s: float) -> None:
+        """Draw the bar; called by the commander between two set-points."""
+        if not self._console.is_terminal or time.monotonic() - self._shown_s < _REFRESH_S:
+            return
+        self._shown_s = time.monotonic()
+        self._bar.update(
+            self._task,
+            completed=self._remaining.played_s + played_s,
+            description=f"{self._number}/{self._total} {self._name}",
+            left=clock_text(self._remaining.seconds(played_s)),
+            refresh=True,
+        )
+
+    def attempt_failed(self, name: str, reason: str, attempt: int) -> None:
+        """Report an attempt that is repeated."""
+        self.write_line(f"{name}: attempt {attempt}: {reason}; repeated")
+
+    def end(self, name: str, motion_s: float, state: RunState) -> None:
+        """Report a run that is over."""
+        self._remaining.end(motion_s)
+        if self._console.is_terminal and state.status == DONE and not state.findings:
+            return
+        text = f"run {self._number} of {self._total}: {name}: {state.status}"
+        if state.status == DONE:
+            missing = counted(state.missed + state.incomplete, "cycle")
+            text += f", {counted(state.rows, 'row')}, {missing} missing"
+        else:
+            text += f": {state.reason}"
+        left_s = self._remaining.seconds()
+        self.write_line(text + (f"; {clock_text(left_s)} left" if left_s > 0.0 else ""))
+        for finding in state.findings:
+            self.write_line(f"{name}: {finding}")
+
+    def write_line(self, text: str) -> None:
+        """Write a line on stderr, above the bar where there is one."""
+        if self._console.is_terminal:
+            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+        else:
+            print(f"jtq campaign: {text}", file=sys.stderr, flush=True)
+
 
 ATTEMPTS: Final = 3
 _BUS_WAS_LATE: Final = re.compile(

@@ -31,8 +31,8 @@ from jtqd.sysid.diagnosis.next_experiment import (
     joint_motion_file,
 )
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
+from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
-from jtqd.sysid.planner.single_joint import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap

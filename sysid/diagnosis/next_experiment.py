@@ -18,6 +18,7 @@ from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.experiment_choice import kinds_for
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import smooth
+from jtqd.sysid.planner.campaigns import allowed_torque, missing_limits
 from jtqd.sysid.planner.experiments import (
     EXPERIMENTS,
     VELOCITY_RAD_S,
@@ -28,7 +29,6 @@ from jtqd.sysid.planner.experiments import (
     pair_runs,
 )
 from jtqd.sysid.planner.plan import Plan, check_plan, travel_rad
-from jtqd.sysid.planner.single_joint import allowed_torque, missing_limits
 
 PLAN_FILE: Final = "next_experiment.plan.yaml"
 MOTION_FILE: Final = "next_experiment.motion.csv"

@@ -17,15 +17,26 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, Final
 
+import numpy as np
+
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.joint import Joint
-from jtqd.sysid.motion.setpoints import Limits
-from jtqd.sysid.planner import single_joint
-from jtqd.sysid.planner.design import ExcitationLimits, design, starts_of
+from jtqd.estimator.joint import Joint, MotionLimits
+from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, MotionError, Setpoints
+from jtqd.sysid.planner.design import (
+    HARMONICS,
+    SHORTEST_TRAJECTORY_S,
+    ExcitationLimits,
+    MotionRange,
+    current_at,
+    design,
+    rounded_down,
+    starts_of,
+    trajectories,
+)
 from jtqd.sysid.planner.plan import (
     BETWEEN_S,
     DEFAULT_LIMITS,
@@ -33,12 +44,14 @@ from jtqd.sysid.planner.plan import (
     Fourier,
     Off,
     Plan,
+    Plateau,
     Point,
+    Rest,
     Run,
+    Segment,
     run_over,
     trajectory_run,
 )
-from jtqd.sysid.planner.single_joint import HARMONICS, SHORTEST_S, MotionRange, range_of
 
 # Joints that are moved together ---------------------------------------------------------------------------------
 
@@ -400,10 +413,10 @@ def seed_of(purpose: str, level: float, seed: int) -> int:
 
 def _trajectory_s(run_s: float, rests_s: float, trajectories: int) -> float:
     duration_s = round((run_s - rests_s) / trajectories, 3)
-    if duration_s < SHORTEST_S:
+    if duration_s < SHORTEST_TRAJECTORY_S:
         raise ConfigError(
-            f"--seconds: found {run_s:g}, expected at least {rests_s + trajectories * SHORTEST_S:g} "
-            f"({trajectories} of {SHORTEST_S:g} s and {rests_s:g} s of rest)"
+            f"--seconds: found {run_s:g}, expected at least {rests_s + trajectories * SHORTEST_TRAJECTORY_S:g} "
+            f"({trajectories} of {SHORTEST_TRAJECTORY_S:g} s and {rests_s:g} s of rest)"
         )
     return duration_s
 
@@ -417,6 +430,226 @@ def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
         joint_current_a=min(JOINT_CURRENT_A, _LIMIT_SHARE * limits.current_a),
         torque_nm=_LIMIT_SHARE * limits.torque_nm,
     )
+
+
+# One joint ------------------------------------------------------------------------------------------------------
+
+NO_LIMIT: Final = 1e6
+"""Default values of `MotionLimits`: unlimited."""
+FULL_SPEED_S: Final = 0.5
+"""Time to the fastest velocity where nothing limits the acceleration."""
+INERTIA_SHARE: Final = 0.25
+"""Part of the allowed torque that accelerates rotor and link, as the joint file has them."""
+
+
+def range_of(number: int, joint: Joint, plan: Limits) -> MotionRange:
+    """Return what joint `number` may do alone; plan: limits of the campaign, of which temperature and current hold here too.
+
+    The current is what the joint needs for the allowed torque, against its own losses.
+
+    Raises:
+        ConfigError: travel or velocity are not limited.
+    """
+    missing = missing_limits(joint, "travel_rad", "velocity_rad_s")
+    if missing:
+        raise ConfigError(
+            f"joint {number} ({joint.name}): found no {' and no '.join(missing)} in motion_limits of its joint file, "
+            f"expected it there or as --limits {number}:travel_rad=LOW:HIGH,velocity_rad_s=V, because it is moved alone"
+        )
+    limits = joint.motion_limits or MotionLimits()
+    low, high = limits.travel_rad
+    torque = allowed_torque(joint)
+    inertia = joint.gear_ratio**2 * joint.rotor_inertia_kgm2 + joint.link_inertia_kgm2
+    acceleration = min(
+        limits.acceleration_rad_s2, limits.velocity_rad_s / FULL_SPEED_S, INERTIA_SHARE * torque / inertia
+    )
+    return MotionRange(
+        Limits(
+            current_a=min(rounded_down(current_at(joint, torque, limits.velocity_rad_s)), plan.current_a),
+            velocity_rad_s=limits.velocity_rad_s,
+            torque_nm=torque,
+            travel_rad=high - low,
+            temperature_c=plan.temperature_c,
+            position_rad=(low, high),
+        ),
+        acceleration,
+    )
+
+
+def missing_limits(joint: Joint, *names: str) -> list[str]:
+    """Return which of these fields of its `motion_limits` do not limit a joint."""
+    limits = joint.motion_limits or MotionLimits()
+    return [name for name in names if float(np.max(np.abs(getattr(limits, name)))) >= NO_LIMIT]
+
+
+def allowed_torque(joint: Joint) -> float:
+    """Return the largest torque [Nm] of a joint: its rating, or less by its `motion_limits`."""
+    limits = joint.motion_limits
+    return joint.rated_torque_nm if limits is None else min(joint.rated_torque_nm, limits.torque_nm)
+
+
+def tightest(given: Limits, own: Limits) -> Limits:
+    """Return the tighter one of a plan's limits of a joint and those of its joint file, limit by limit.
+
+    Raises:
+        ConfigError: their travels have nothing in common.
+    """
+    low = max(given.position_rad[0], own.position_rad[0])
+    high = min(given.position_rad[1], own.position_rad[1])
+    if not low < high:
+        raise ConfigError(
+            f"alone.travel_rad: found {list(given.position_rad)}, expected a part of {list(own.position_rad)}, "
+            "which motion_limits are"
+        )
+    smaller = {
+        name: min(getattr(given, name), getattr(own, name))
+        for name in ("current_a", "velocity_rad_s", "torque_nm", "temperature_c")
+    }
+    return Limits(**smaller, travel_rad=high - low, position_rad=(low, high))
+
+
+def with_limits(joint: Joint, given: Mapping[str, Any] | None) -> Joint:
+    """Return the joint with these values (--limits) in place of its file's `motion_limits`. Raises ConfigError."""
+    if not given:
+        return joint
+    return replace(joint, motion_limits=replace(joint.motion_limits or MotionLimits(), **given))
+
+
+def beyond_file(joint: Joint, given: Mapping[str, Any] | None) -> str:
+    """Return which of these values (--limits) allow more than its file's `motion_limits`; "" for none."""
+    wider = []
+    for name, value in (given or {}).items():
+        file = getattr(joint.motion_limits or MotionLimits(), name)
+        if name == "travel_rad":
+            if (value[0] < file[0] or value[1] > file[1]) and max(map(abs, file)) < NO_LIMIT:
+                wider.append(f"{name} {value[0]:g}:{value[1]:g}, the file {file[0]:g}:{file[1]:g}")
+        elif file < value:
+            wider.append(f"{name} {value:g}, the file {file:g}")
+    return "; ".join(wider)
+
+
+def parsed_limits(text: str) -> dict[str, Any]:
+    """Return the limits of a text such as "travel_rad=-0.5:0.5,velocity_rad_s=1". Raises ConfigError."""
+    names = [item.name for item in fields(MotionLimits)]
+    found: dict[str, Any] = {}
+    for part in text.split(","):
+        name, _, value = part.strip().partition("=")
+        try:
+            values = tuple(float(number) for number in value.split(":"))
+        except ValueError:
+            values = ()
+        if name not in names or len(values) != (2 if name == "travel_rad" else 1):
+            raise ConfigError(
+                f"found {part.strip()!r}, expected travel_rad=LOW:HIGH or NAME=VALUE with one of {', '.join(names[1:])}"
+            )
+        found[name] = values if name == "travel_rad" else values[0]
+    MotionLimits(**found)
+    return found
+
+
+LADDER: Final = (0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Plateaus, as parts of the fastest velocity."""
+QUICK_LADDER: Final = (0.2, 0.5, 1.0)
+LONGEST_PASS_S: Final = 6.0
+SHORTEST_PASS_S: Final = 0.6
+"""A shorter plateau cannot be used by `jtq fit`; such a velocity is left out."""
+SECOND_LEVELS: Final = (0.1, 0.4, 1.0)
+"""Peak of a run's second trajectory, as a part of the fastest: slow ones give most of the information."""
+STEEPEST: Final = 1.875
+"""Peak slope of the smooth step of a ramp, in steps per ramp."""
+_TURN_WAY: Final = 0.344
+"""Way in the first half of a smooth step from one direction to the other, in velocities times its time."""
+_SHORTEST_RAMP_S: Final = 0.3
+
+
+def joint_plateau_run(number: int, motion: MotionRange, name: str, shares: Sequence[float] = LADDER) -> Run:
+    """Return constant velocities (parts of the fastest) both ways: left, right, left and back.
+
+    Each goes over as much of the travel as a pass may take. The ramps between two directions move the joint nowhere, and
+    those at the ends half of their time.
+    """
+    segments: list[Segment] = [Rest(EDGE_S, 0.0)]
+    for share in shares:
+        speed = share * motion.velocity_rad_s
+        ramp_s = max(round(STEEPEST * speed / motion.acceleration_rad_s2, 3), _SHORTEST_RAMP_S)
+        turn_s = 2.0 * ramp_s
+        reach = min(motion.reach_rad - _TURN_WAY * speed * turn_s, 0.5 * speed * LONGEST_PASS_S)
+        edge_s = round(reach / speed - 0.5 * ramp_s, 3)
+        if edge_s <= 0.0 or 2.0 * reach / speed < SHORTEST_PASS_S:
+            continue
+        pass_s = 2.0 * edge_s + ramp_s
+        segments += [
+            Plateau(-speed, 0.0, edge_s, ramp_s),
+            Plateau(speed, 0.0, pass_s, turn_s),
+            Plateau(-speed, 0.0, pass_s, turn_s),
+            Plateau(speed, 0.0, edge_s, turn_s),
+            Rest(0.3, ramp_s),
+        ]
+    segments.append(Rest(EDGE_S, 0.0))
+    return Run(name, number, tuple(segments), None)
+
+
+def joint_excitation_runs(
+    number: int,
+    motion: MotionRange,
+    count: int,
+    run_s: float,
+    *,
+    seed: int,
+    evaluations: int,
+    ladder: Sequence[float] = LADDER,
+) -> tuple[Run, ...]:
+    """Return the plateaus (`joint_plateau_run`) and `count` runs of run_s [s] with two trajectories each.
+
+    The first one uses all of the velocity, the second one a part of it (SECOND_LEVELS).
+    """
+    duration_s = round(0.5 * (run_s - 2.0 * EDGE_S - BETWEEN_S), 3)
+    levels = [1.0] * count + [SECOND_LEVELS[k % len(SECOND_LEVELS)] for k in range(count)]
+    made = trajectories(motion, levels, duration_s, seed=seed, evaluations=evaluations)
+    runs = [
+        trajectory_run(f"excitation_{k + 1:02d}", number, made[k], made[count + k], current_joint=None)
+        for k in range(count)
+    ]
+    return joint_plateau_run(number, motion, "plateaus", ladder), *runs
+
+
+def joint_variable_runs(
+    number: int, motion: MotionRange, count: int, run_s: float, *, seed: int
+) -> tuple[Run, ...]:
+    """Return `count` runs of one drawn trajectory each, for validation only."""
+    duration_s = round(run_s - 2.0 * EDGE_S, 3)
+    made = trajectories(motion, [1.0] * count, duration_s, seed=seed, evaluations=1)
+    return tuple(
+        trajectory_run(f"variable_{k:02d}", number, each, current_joint=None)
+        for k, each in enumerate(made, 1)
+    )
+
+
+APPROACH_SHARE: Final = 0.3
+"""Largest velocity of an approach, as a part of its limit."""
+APPROACH_S: Final = 1.0
+"""Shortest ramp of an approach."""
+
+
+def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) -> Setpoints:
+    """Return the motion of one joint, alone, from where it stands to another place, slowly; positions by its own encoder.
+
+    Raises:
+        MotionError: start or target are outside of its travel.
+    """
+    low, high = limits.position_rad
+    for what, position in (("stands at", start_rad), ("shall go to", target_rad)):
+        if not low <= position <= high:
+            raise MotionError(
+                f"joint {joint}: {what} {position:.3f} rad, travel_rad is {low:g} to {high:g}: move it by hand"
+            )
+    distance = target_rad - start_rad
+    speed = min(APPROACH_SHARE * limits.velocity_rad_s, max(abs(distance) / APPROACH_S, 1e-6))
+    ramp, hold = round(APPROACH_S / PERIOD_S), round((abs(distance) / speed - APPROACH_S) / PERIOD_S)
+    rising = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, ramp + 1) / ramp)
+    shape = np.concatenate((rising, np.ones(max(hold, 0)), rising[::-1], np.zeros(1)))
+    velocity = shape * (distance / (float(shape.sum()) * PERIOD_S))
+    return Setpoints(joint, velocity, np.zeros(len(velocity)), current_joint=None)
 
 
 # Campaigns ------------------------------------------------------------------------------------------------------
@@ -543,13 +776,13 @@ def _alone(kind: str, number: int, motion: MotionRange, scale: Scale) -> tuple[R
     seed = seed_of(f"alone/{kind}", float(number), scale.seed)
     if kind == "validate":
         seconds = scale.or_else("seconds", 12.0, 6.0)
-        return single_joint.variable_runs(number, motion, count, seconds, seed=seed)
-    return single_joint.excitation_runs(
+        return joint_variable_runs(number, motion, count, seconds, seed=seed)
+    return joint_excitation_runs(
         number,
         motion,
         count,
         scale.or_else("seconds", 24.0, 10.0),
         seed=seed,
         evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
-        ladder=single_joint.QUICK_LADDER if scale.quick else single_joint.LADDER,
+        ladder=QUICK_LADDER if scale.quick else LADDER,
     )

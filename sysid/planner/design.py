@@ -14,7 +14,7 @@ of eight are a design of four. With one evaluation the coefficients are drawn, n
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import repeat
@@ -29,8 +29,8 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DIRECTION_VELOCITY_RAD_S, LossModel
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.planner.fourier import MAX_HARMONICS, FourierSeries, FourierTrajectory
-from jtqd.sysid.planner.plan import Fourier
+from jtqd.sysid.motion.setpoints import Limits
+from jtqd.sysid.planner.plan import MAX_HARMONICS, Fourier, FourierSeries, FourierTrajectory
 
 FUNDAMENTAL_HZ: Final = 0.1
 GOLDEN: Final = 0.5 * (1.0 + math.sqrt(5.0))
@@ -609,6 +609,113 @@ def starts_of(evaluations: int) -> int:
 def _check_range(name: str, value: float, low: float, high: float) -> None:
     if not low <= value <= high:
         raise ConfigError(f"{name}: found {value!r}, expected {low:g} to {high:g}")
+
+
+# One joint ------------------------------------------------------------------------------------------------------
+
+SHARE: Final = 0.9
+"""Planned peaks as a part of the limits: a controller overshoots, and a limit that is met ends the run."""
+HARMONICS: Final = 5
+SHORTEST_TRAJECTORY_S: Final = 2.0
+_DIRECTION_SHARE: Final = 0.02
+"""w0 of the regressor, as a part of the fastest velocity."""
+
+
+@dataclass(frozen=True)
+class MotionRange:
+    """What a joint that is moved alone may do: `limits` of the commander, and the peak acceleration [rad/s2]."""
+
+    limits: Limits
+    acceleration_rad_s2: float
+
+    @property
+    def reach_rad(self) -> float:
+        """Largest distance of a planned motion from its start."""
+        low, high = self.limits.position_rad
+        return 0.5 * SHARE * (high - low)
+
+    @property
+    def velocity_rad_s(self) -> float:
+        """Fastest planned."""
+        return SHARE * self.limits.velocity_rad_s
+
+
+class SingleJoint:
+    """Problem of a trajectory of one length and peak velocity; a genome is its amplitudes [2 H], scaled into the range."""
+
+    dimension: Final = 2 * HARMONICS
+
+    def __init__(self, motion: MotionRange, level: float, duration_s: float) -> None:
+        self._motion, self._level, self._duration_s = motion, level, duration_s
+        self._omega = fundamentals(duration_s)[0]
+        self._coarse, self._fine = (
+            unit_motions(
+                self._omega,
+                HARMONICS,
+                duration_s,
+                np.linspace(0.0, duration_s, round(duration_s * rate_hz) + 1),
+            )
+            for rate_hz in (SEARCH_RATE_HZ, FINAL_RATE_HZ)
+        )
+
+    def _scaled(self, genomes: FloatArray, grid: tuple[FloatArray, ...]) -> tuple[FloatArray, FloatArray]:
+        """Return scales [m] and motions [3, m, n]."""
+        own = self._motion
+        motion = np.array([genomes @ each for each in grid])
+        bounds = (own.reach_rad, self._level * own.velocity_rad_s, SHARE * own.acceleration_rad_s2)
+        scale = np.min(
+            [bound / peak for bound, peak in zip(bounds, np.abs(motion).max(axis=2), strict=True)], axis=0
+        )
+        return scale, motion * scale[:, None]
+
+    def _information(self, motion: FloatArray) -> FloatArray:
+        """Return the information [m, 6, 6] of motions [3, m, n], per sample."""
+        q, w, a = motion
+        fastest = self._motion.velocity_rad_s
+        terms = (
+            np.tanh(w / (_DIRECTION_SHARE * fastest)),
+            w / fastest,
+            a / self._motion.acceleration_rad_s2,
+            np.sin(q),
+            np.cos(q),
+            np.ones_like(q),
+        )
+        x = np.stack(terms, axis=2)
+        found: FloatArray = np.swapaxes(x, 1, 2) @ x / q.shape[1]
+        return found
+
+    def criterion(self, before: FloatArray) -> Criterion:
+        """Return -log det of the information so far [6, 6] and that of each genome."""
+        return lambda genomes: -log_det(before + self._information(self._scaled(genomes, self._coarse)[1]))
+
+    def finish(self, genome: FloatArray, before: FloatArray) -> tuple[Fourier, FloatArray]:
+        """Return the segment of a genome, scaled on the grid of the set-points, and the information so far with it."""
+        scale, motion = self._scaled(genome[None, :], self._fine)
+        amplitudes = tuple((float(scale[0]) * genome).tolist())
+        trajectory = FourierTrajectory(
+            self._omega, amplitudes[:HARMONICS], amplitudes[HARMONICS:], self._duration_s
+        )
+        return Fourier.alone(trajectory), before + self._information(motion)[0]
+
+
+def trajectories(
+    motion: MotionRange, levels: Sequence[float], duration_s: float, *, seed: int, evaluations: int
+) -> list[Fourier]:
+    """Return a trajectory for each level (peak as a part of the fastest velocity), the best one given those before it.
+
+    evaluations: of each search; 1: drawn, not optimised. Raises ConfigError for runs that are too short.
+    """
+    if duration_s < SHORTEST_TRAJECTORY_S:
+        raise ConfigError(
+            f"--seconds: found trajectories of {duration_s:g} s, expected at least {SHORTEST_TRAJECTORY_S:g} s"
+        )
+    problems = (SingleJoint(motion, level, duration_s) for level in levels)
+    designed = sequence(
+        problems,
+        lambda criterion, size, rng: minimise(criterion, size, evaluations=evaluations, rng=rng),
+        seed=seed,
+    )
+    return [segment for segment, _ in designed]
 
 
 # Currents of a torque -------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
 from jtqd.sysid.motion.setpoints import Limits
-from jtqd.sysid.planner.campaigns import seed_of
+from jtqd.sysid.planner.campaigns import LADDER, STEEPEST, allowed_torque, seed_of
 from jtqd.sysid.planner.design import Bench, ExcitationLimits, current_at, design, rounded_down
 from jtqd.sysid.planner.plan import (
     EDGE_S,
@@ -35,7 +35,6 @@ from jtqd.sysid.planner.plan import (
     run_over,
     trajectory_run,
 )
-from jtqd.sysid.planner.single_joint import LADDER, STEEPEST, allowed_torque
 
 # Two joints on a towing bench -----------------------------------------------------------------------------------
 

@@ -28,8 +28,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.run_file import Content, RunError, RunFile
-from jtqd.sysid.runs.segments import runs_of
+from jtqd.sysid.runs.run_file import Content, RunError, RunFile, runs_of
 from jtqd.sysid.runs.tables import read_csv, read_parquet
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")

@@ -1,15 +1,23 @@
-"""A run as read from a file, the columns of a file before they are checked, and the error for a file that cannot be used."""
+"""A run as read from a file, the columns of a file before they are checked, and the error for a file that cannot be used.
+
+Time stamps of a recording: repeated and rounded stamps, restarts and gaps; the run table of each segment between them.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
+from typing import Final
+
+import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.run import RunTable
-from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
+from jtqd.estimator.text import counted
+from jtqd.sysid.runs.column_map import JOINTS, TIME, ColumnMap
 
 
 class RunError(ValueError):
@@ -63,3 +71,181 @@ def file_bytes(path: Path) -> tuple[bytes, str]:
 def header_place(path: Path) -> str:
     """Return the line of a table's header for messages; only text has lines."""
     return " line 1:" if ".csv" in path.suffixes else ""
+
+
+LONGEST_GAP: Final = 10.0
+"""Median steps: a longer step separates two segments. A reader of whole runs refuses it, because a fit or an observer would
+take the jump for a measurement; `read_runs(.., segments=True)` splits the run there. Shorter gaps are notes."""
+BRIDGED_S: Final = 0.025
+"""When a run is split, a gap this short is bridged: `time_base.on_even_steps` interpolates it."""
+SHORTEST_SEGMENT_S: Final = 1.0
+"""Also the least step back of the time that begins a new run; a smaller one is a wrong stamp."""
+GAP_NOTED: Final = 1.5
+_MOST_ALIKE: Final = 3
+"""Equal stamps in a row that rounding can make."""
+_LEAST_STEP: Final = 0.9995
+"""Least mean step, in usual steps, of stamps that were rounded; below it there are rows too many."""
+DEAD_ROWS: Final = 100
+"""A channel without a single non-zero value over this many rows is dead, not quiet."""
+
+
+def runs_of(content: Content, *, whole: bool) -> list[RunFile]:
+    """Check time and columns of a file and make its run table, or one for each of its segments. Raises RunError."""
+    if not whole:
+        content = _with_spread_stamps(_without_repeated_rows(content))
+    time_s, path = content.values[TIME], content.path
+    if len(time_s) < 2:
+        raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
+    starts = [] if whole else _restarts(time_s)
+    runs = [slice(a, b) for a, b in pairwise([0, *starts, len(time_s)])]
+    notes = list(content.notes)
+    for number, run in enumerate(runs, 1):
+        found = _check_time(content, run, whole=whole)
+        notes += [f"run {number}: {note}" if starts else note for note in found]
+    cuts = [[run] if whole else _between_gaps(time_s, run) for run in runs]
+    count = sum(map(len, cuts))
+
+    def length_s(cut: slice) -> float:
+        return float(time_s[cut.stop - 1] - time_s[cut.start])
+
+    long = [[cut for cut in each if count == 1 or length_s(cut) >= SHORTEST_SEGMENT_S] for each in cuts]
+    if not any(long):
+        longest = max(length_s(cut) for each in cuts for cut in each)
+        raise RunError(
+            f"{path}: found {count} segments between gaps, the longest of {longest:.3g} s, expected one of at least "
+            f"{SHORTEST_SEGMENT_S:g} s"
+        )
+    used = sum(map(len, long))
+    if starts:
+        notes.append(f"the time starts again {counted(len(starts), 'time')}: {len(runs)} runs in one file")
+    if count > len(runs):
+        used_s = sum(length_s(cut) for each in long for cut in each)
+        whole_s = sum(map(length_s, runs))
+        notes.append(
+            f"{counted(count - len(runs), 'gap')} of more than {BRIDGED_S:g} s: used as {counted(used, 'segment')} of "
+            f"{'one recording' if len(runs) == 1 else 'these runs'}, {used_s:.3g} s of {whole_s:.3g} s"
+        )
+    elif used < count:
+        notes.append(f"{counted(count - used, 'run')} of less than {SHORTEST_SEGMENT_S:g} s left out")
+    if content.columns is not None:
+        if count > 1:
+            what = (
+                "its turns in the gaps are not known: an angle of a later segment may be off by whole periods"
+            )
+            sources = content.columns.sources().items()
+            notes += [f"{key} is unwrapped, {what}" for key, column in sources if "unwrap(" in column.name]
+        notes += content.columns.remarks()
+    read: list[RunFile] = []
+    for number, each in enumerate(long, 1):
+        name = f"{path.name} (run {number} of {len(runs)})" if starts else path.name
+        for k, cut in enumerate(each, 1):
+            full_name = f"{name} ({k} of {len(each)})" if len(each) > 1 else name
+            read.append(_segment(content, cut, full_name, [] if read else notes))
+    return read
+
+
+def _without_repeated_rows(content: Content) -> Content:
+    """Return the content without rows that were written twice in a row, and a note. Two rows that share only their stamp
+    stay, to be refused: one of their times is wrong.
+    """
+    columns = np.array(list(content.values.values()))
+    again = np.concatenate(([False], np.all(columns[:, 1:] == columns[:, :-1], axis=0)))
+    if not again.any():
+        return content
+    lines = None if content.lines is None else [content.lines[int(k)] for k in np.flatnonzero(~again)]
+    note = f"{int(again.sum())} of {counted(len(again), 'row')} left out: they are the row before once more"
+    values = {key: value[~again] for key, value in content.values.items()}
+    return replace(content, values=values, lines=lines, notes=(*content.notes, note))
+
+
+def _with_spread_stamps(content: Content) -> Content:
+    """Return the content with rounded stamps that equal the one before spread between their neighbours, and a note.
+
+    It is unchanged where there are more rows than the time can hold.
+    """
+    time_s = content.values[TIME]
+    steps = np.diff(time_s)
+    if len(steps) < 2 or not np.all(steps >= 0.0) or np.all(steps > 0.0):
+        return content
+    new = np.concatenate(([True], steps > 0.0))
+    rows = np.flatnonzero(new)
+    many = np.max(np.diff(rows)) > _MOST_ALIKE or not new[-1]
+    if many or np.mean(steps) < _LEAST_STEP * np.median(steps[steps > 0.0]):
+        return content
+    spread = np.interp(np.arange(len(time_s)), rows, time_s[rows])
+    note = f"{counted(int(np.sum(~new)), 'stamp')} like the one before: rounded, spread between those around"
+    return replace(content, values={**content.values, TIME: spread}, notes=(*content.notes, note))
+
+
+def _restarts(time_s: FloatArray) -> list[int]:
+    """Return the rows at which the time starts again and goes on from there; a single wrong stamp is none."""
+    steps = np.diff(time_s)
+    rows = np.flatnonzero(steps[:-1] <= -SHORTEST_SEGMENT_S) + 1
+    return [int(row) for row in rows if 0.0 < steps[row] <= _longest_step(steps)]
+
+
+def _between_gaps(time_s: FloatArray, run: slice) -> list[slice]:
+    """Return the rows between the gaps of a run; its time rises."""
+    steps = np.diff(time_s[run])
+    ends = [0, *(np.flatnonzero(steps > _longest_step(steps)) + 1), run.stop - run.start]
+    return [slice(run.start + int(a), run.start + int(b)) for a, b in pairwise(ends)]
+
+
+def _longest_step(steps: FloatArray) -> float:
+    return max(LONGEST_GAP * float(np.median(steps)), BRIDGED_S)
+
+
+def _check_time(content: Content, run: slice, *, whole: bool) -> list[str]:
+    """Refuse time of a run that stands or runs back, and in a whole one long gaps; return notes of the short gaps."""
+    time_s, path, lines = content.values[TIME][run], content.path, content.lines
+
+    def at(row: int) -> str:
+        return f"sample {run.start + row}" if lines is None else f"line {lines[run.start + row]}"
+
+    steps = np.diff(time_s)
+    if not np.all(steps > 0.0):
+        row = int(np.argmax(steps <= 0.0)) + 1
+        several = row in _restarts(time_s)
+        raise RunError(
+            f"{path}: {at(row)}: found time {time_s[row]:.6g} s after {time_s[row - 1]:.6g} s, expected rising time"
+            f"{': one run in a file here (`jtq diagnose` takes several apart)' if several else ''}"
+        )
+    median = float(np.median(steps))
+    longest = int(np.argmax(steps))
+    if whole and steps[longest] > LONGEST_GAP * median:
+        raise RunError(
+            f"{path}: {at(longest + 1)}: found a gap of {steps[longest]:.6g} s, "
+            f"expected steps of about {median:.6g} s"
+        )
+    gaps = int(np.count_nonzero(steps > GAP_NOTED * median))
+    are = "step is" if gaps == 1 else "steps are"
+    return [f"{gaps} {are} longer than {GAP_NOTED} times the median of {median:.6g} s"] if gaps else []
+
+
+def _segment(content: Content, cut: slice, name: str, notes: Sequence[str]) -> RunFile:
+    """Return the run table of the rows of one segment."""
+    path, notes = content.path, list(notes)
+    values = {key: value[cut] for key, value in content.values.items()}
+    if content.columns is not None:
+        values = content.columns.completed(values)
+    joints: dict[int, JointColumns] = {}
+    for joint in JOINTS:
+        columns = {q: values.get(f"j{joint}.{q}") for q in COLUMN_NAMES}
+        if all(column is None for column in columns.values()):
+            continue
+        torque = columns["torque_nm"]
+        if torque is not None and len(torque) >= DEAD_ROWS and not np.any(torque):
+            notes.append(
+                f"j{joint}.torque_nm is exactly zero in all {len(torque)} rows: dead channel, not used"
+            )
+            columns["torque_nm"] = None
+        joints[joint] = JointColumns(**columns)
+    if not joints:
+        raise RunError(
+            f"{path}:{header_place(path)} found no joint's columns, expected at least one of j1.current_a, ..."
+        )
+    try:
+        table = RunTable(time_s=values[TIME], joints=joints)
+    except RunTableError as error:  # a scale of the column map that leaves the range of a float
+        raise RunError(f"{path}: {error}") from None
+    return RunFile(name, path, content.source, content.sha256, table, tuple(notes))

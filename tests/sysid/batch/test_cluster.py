@@ -11,7 +11,7 @@ import pytest
 from distributed import LocalCluster
 
 from jtqd.daemon.jtq import main as jtq
-from jtqd.sysid.batch import run
+from jtqd.sysid.batch import command
 from tests.sysid.batch.batch_helpers import arguments, fleet, results, states, summary, tasks_of, wait_for
 
 
@@ -80,7 +80,7 @@ def test_a_scheduler_that_goes_ends_the_batch_in_one_line(tmp_path, cluster, cap
 
 
 def test_no_scheduler_there(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(run, "_CONNECT_S", 1.0)
+    monkeypatch.setattr(command, "_CONNECT_S", 1.0)
     logs = fleet(tmp_path / "logs", ["a"])
     with socket.socket() as nobody:
         nobody.bind(("127.0.0.1", 0))

@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.jtq import main as jtq
-from jtqd.sysid.batch import run
-from jtqd.sysid.batch.run import (
+from jtqd.sysid.batch import command
+from jtqd.sysid.batch.command import (
     GroupError,
     Outcome,
     Task,
@@ -123,33 +123,35 @@ def test_an_edit_of_the_code_makes_another_tool(tmp_path, monkeypatch):
     package = tmp_path / "extra"
     package.mkdir()
     (package / "a.py").write_text("x = 1\n")
-    monkeypatch.setattr(run.jtqd, "__path__", [str(tmp_path)])
+    monkeypatch.setattr(command.jtqd, "__path__", [str(tmp_path)])
 
-    first = run.tool_version()
+    first = command.tool_version()
     assert re.fullmatch(r"0\.[\w.]+\+code\.[0-9a-f]{12}", first)
     (package / "notes.txt").write_text("no code")
-    assert run.tool_version() == first
+    assert command.tool_version() == first
     (package / "a.py").write_text("x = 2\n")
-    second = run.tool_version()
+    second = command.tool_version()
     (package / "a.py").rename(package / "b.py")
-    assert len({first, second, run.tool_version()}) == 3
+    assert len({first, second, command.tool_version()}) == 3
 
 
 def test_the_code_hash_covers_every_package(monkeypatch):
     seen = []
     monkeypatch.setattr(Path, "rglob", lambda self, pattern: seen.append(self.name) or [])
-    run.tool_version()
+    command.tool_version()
     assert {"daemon", "drivers", "estimator", "models", "sim_can", "sysid"} <= set(seen)
 
 
 def test_a_worker_with_other_code_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(run, "run_task", lambda task: Outcome(0, {"runs": []}, "", 1.0, "0.1.0+code.other"))
+    monkeypatch.setattr(
+        command, "run_task", lambda task: Outcome(0, {"runs": []}, "", 1.0, "0.1.0+code.other")
+    )
     touch(tmp_path, "a.mcap")
     groups, _ = find_groups([tmp_path], "file", _KINDS)
     with ThreadPoolExecutor(1) as executor:
         (row,) = run_batch(Task("replay"), {}, groups, tmp_path / "out", executor)
     assert (row.state, row.content) == ("failed", None)
-    assert row.error == f"the worker has jtqd 0.1.0+code.other, expected {run.tool_version()} as here"
+    assert row.error == f"the worker has jtqd 0.1.0+code.other, expected {command.tool_version()} as here"
     assert not (tmp_path / "out").exists()
 
 

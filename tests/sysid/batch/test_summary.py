@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.sysid.batch.run import DONE, FAILED, KEPT, Group, Row
-from jtqd.sysid.batch.summary import counts, figures_of, render, to_mapping
+from jtqd.sysid.batch.command import DONE, FAILED, KEPT, Group, Row, counts, figures_of, render, to_mapping
 
 
 def diagnosis(verdict="cause", rmse=1.25, *causes):

@@ -27,7 +27,7 @@ from jtqd.sysid.motion.setpoints import (
     Timing,
     path,
 )
-from jtqd.sysid.planner.campaigns import Scale, make_plan_of, units_of
+from jtqd.sysid.planner.campaigns import Scale, make_plan_of, range_of, units_of
 from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Plateau,
@@ -35,7 +35,6 @@ from jtqd.sysid.planner.plan import (
     Run,
     expand,
 )
-from jtqd.sysid.planner.single_joint import range_of
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.logs import LoggedRun
 from jtqd.sysid.runs.options import with_joint

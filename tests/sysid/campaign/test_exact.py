@@ -11,8 +11,8 @@ import pytest
 import yaml
 
 from jtqd.sim_can.bench_kernel import build, guest, packages
-from jtqd.sysid.campaign import command, processes
-from jtqd.sysid.campaign.processes import ProcessError
+from jtqd.sysid.campaign import bench, command
+from jtqd.sysid.campaign.bench import ProcessError
 from jtqd.sysid.campaign.runner import Outcome
 from jtqd.sysid.campaign.state import DONE, STATE_FILE, RunState
 from jtqd.sysid.runs.files import read_run
@@ -44,9 +44,7 @@ def argv(tmp_path: Path) -> list[str]:
 def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], Path]]:
     """Calls of exact time, which ends with status 3."""
     found: list[tuple[list[str], Path]] = []
-    monkeypatch.setattr(
-        processes, "run_in_exact_time", lambda argv, out: found.append((list(argv), out)) or 3
-    )
+    monkeypatch.setattr(command, "run_in_exact_time", lambda argv, out: found.append((list(argv), out)) or 3)
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
     return found
 
@@ -67,7 +65,7 @@ def test_inside_of_exact_time_the_bench_is_on_its_bus(
         command, "_run", lambda options, *_, **__: buses.append(options.bus) or Outcome({}, "ended")
     )
     assert command.main([*argv, "--bus", "exact"]) == 1
-    assert buses == [processes.EXACT_TIME_BUS]
+    assert buses == [bench.EXACT_TIME_BUS]
     assert sent == []
 
 
@@ -91,7 +89,7 @@ def test_runs_that_real_time_loses_go_on_in_exact_time_on_the_emulated_bench_alo
         lost = {"a": RunState("stopped", "SYNC missing for 51 ms, limit 50 ms")}
         return Outcome(lost, "a: SYNC missing for 51 ms, limit 50 ms", late=exact_next)
 
-    monkeypatch.setattr(processes, "exact_time_ready", lambda: ready)
+    monkeypatch.setattr(command, "exact_time_ready", lambda: ready)
     monkeypatch.setattr(command, "_run", run)
     argv += ["--bus", bus]
     assert command.main(argv) == (3 if goes else 1)
@@ -116,7 +114,7 @@ def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(
         raise guest.GuestError("the guest ended without a result")
 
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
-    monkeypatch.setattr(processes, "exact_time_ready", lambda: True)
+    monkeypatch.setattr(command, "exact_time_ready", lambda: True)
     monkeypatch.setattr(guest, "run", boot)
     monkeypatch.setattr(command, "_run", run)
     assert command.main([*argv, "--bus", "sim"]) == 0
@@ -132,7 +130,7 @@ def test_the_command_inside_is_the_same_on_another_bus(monkeypatch: pytest.Monke
         return SimpleNamespace(returncode=3)
 
     monkeypatch.setattr(guest, "run", run)
-    assert processes.run_in_exact_time(["validate", "--bus", "sim", "--quick"], Path("there")) == 3
+    assert bench.run_in_exact_time(["validate", "--bus", "sim", "--quick"], Path("there")) == 3
     [(words, options)] = ran
     assert words[-7:] == ["campaign", "validate", "--bus", "sim", "--quick", "--bus", "sim:vcan0"]
     assert command.parser().parse_args(words[-6:]).bus == "sim:vcan0"
@@ -158,20 +156,20 @@ def test_a_missing_bench_kernel_is_one_line(
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(guest, "run", run)
     with pytest.raises(ProcessError, match=words):
-        processes.run_in_exact_time(["validate"], Path("there"))
+        bench.run_in_exact_time(["validate"], Path("there"))
     assert signal.getsignal(signal.SIGTERM) is before
 
 
 def test_sigterm_ends_the_guest(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guest, "run", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
     with pytest.raises(ProcessError, match="ended by a signal"):
-        processes.run_in_exact_time(["validate"], Path("there"))
+        bench.run_in_exact_time(["validate"], Path("there"))
 
 
 def test_a_broken_override_of_the_kernel_is_no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JTQD_BENCH_KERNEL", "/nowhere")
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
-    assert not processes.exact_time_ready()
+    assert not bench.exact_time_ready()
 
 
 @pytest.mark.boots

@@ -12,7 +12,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.campaign.recorded import LONGEST_GAP, findings, interpolate_gaps, unusable
+from jtqd.sysid.campaign.runner import LONGEST_GAP, findings, interpolate_gaps, unusable
 from jtqd.sysid.motion.setpoints import Setpoints
 from jtqd.sysid.planner.campaigns import plateau_run
 from jtqd.sysid.planner.plan import expand

@@ -8,22 +8,26 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jtqd.sysid.campaign.processes import Interrupted
-from jtqd.sysid.campaign.reporter import BETWEEN_RUNS_S, Remaining, Reporter, clock_text
+from jtqd.sysid.campaign.bench import Interrupted
 from jtqd.sysid.campaign.runner import (
     ATTEMPTS,
+    BETWEEN_RUNS_S,
     Attempt,
     Outcome,
+    Remaining,
+    Reporter,
+    clock_text,
     go_through,
     stopped,
 )
 from jtqd.sysid.campaign.state import DONE, FAILED, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.commander import Pace
 from jtqd.sysid.motion.setpoints import JointSample, Limits, Monitor, MotionResult, Sample, Setpoints, Timing
-from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
 from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Fourier,
+    FourierSeries,
+    FourierTrajectory,
     Plan,
     Rest,
     Run,

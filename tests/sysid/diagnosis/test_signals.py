@@ -21,7 +21,7 @@ from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import JointSignals, SignalsError, about_zero, joint_signals
 from jtqd.sysid.diagnosis.smoothing import second_difference, smooth
-from jtqd.sysid.runs.time_base import on_even_steps
+from jtqd.sysid.runs.checks import on_even_steps
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
 from tests.sysid.diagnosis.diagnose_helpers import bench_run

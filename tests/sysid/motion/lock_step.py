@@ -19,10 +19,9 @@ from jtqd.sim_can.bench import Bench
 from jtqd.sim_can.eds_entries import sensor_node
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import sources_of
-from jtqd.sysid.motion.commander import Commander
+from jtqd.sysid.motion.commander import Commander, Phase
 from jtqd.sysid.motion.drives import CST, CSV, Drive, sending_order, sensor_units
 from jtqd.sysid.motion.setpoints import Limits, Setpoints, Surroundings, Timing
-from jtqd.sysid.motion.stopping import Phase
 
 MS = 1_000_000
 PLANT = load_plant(shipped("plant.yaml"))

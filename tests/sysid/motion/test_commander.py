@@ -11,8 +11,8 @@ from jtqd.drivers.boot_node import BootError
 from jtqd.drivers.drive import CIA_402, DriveObject, DriveProfile, map_of
 from jtqd.drivers.pdo import Tpdo
 from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
-from jtqd.sysid.motion.stopping import Phase
 from tests.sysid.motion.lock_step import MS, WARM, WIDE, LockStep, changed, plateau, turning, without
 
 OFF = (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)

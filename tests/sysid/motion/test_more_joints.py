@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.drives import sending_order
 from jtqd.sysid.motion.setpoints import (
     HELD_RAD,
@@ -18,8 +19,7 @@ from jtqd.sysid.motion.setpoints import (
     check_setpoints,
     path_range,
 )
-from jtqd.sysid.motion.stopping import Phase
-from jtqd.sysid.planner.single_joint import approach
+from jtqd.sysid.planner.campaigns import approach
 from tests.sysid.motion.lock_step import (
     MS,
     Filter,

@@ -10,8 +10,8 @@ import pytest
 from jtqd.models.files import shipped
 from jtqd.sim_can import drive_node as cia402
 from jtqd.sim_can.plant_file import load_plant
+from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.setpoints import Mark, Setpoints
-from jtqd.sysid.motion.stopping import Phase
 from jtqd.sysid.planner.plan import Off, Plateau, Rest, Run, check_run, expand
 from tests.sysid.motion.lock_step import MS, PLANT, WIDE, LockStep, changed, plateau, turning
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from jtqd.sysid.motion.commander import StopRamp
 from jtqd.sysid.motion.setpoints import (
     JointSample,
     Limits,
@@ -16,7 +17,6 @@ from jtqd.sysid.motion.setpoints import (
     Timing,
     check_setpoints,
 )
-from jtqd.sysid.motion.stopping import StopRamp
 
 LIMITS = Limits(current_a=9.0, velocity_rad_s=3.3, torque_nm=60.0, travel_rad=50.0, temperature_c=70.0)
 STILL = JointSample(0.0, 0.0, 0.0, 25.0)

@@ -12,8 +12,8 @@ from dataclasses import replace
 import pytest
 
 from jtqd.sim_can import drive_node as cia402
+from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.setpoints import Limits
-from jtqd.sysid.motion.stopping import Phase
 from tests.sysid.motion.lock_step import MS, WARM, WIDE, Frames, LockStep, changed, plateau, without
 
 SPEED = 1.5

@@ -8,8 +8,7 @@ import yaml
 
 from jtqd.sysid.planner import command as excitation_command
 from jtqd.sysid.planner.design import ExcitationLimits, design
-from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
-from jtqd.sysid.planner.plan import Plan, load_plan, segment_mapping
+from jtqd.sysid.planner.plan import FourierSeries, FourierTrajectory, Plan, load_plan, segment_mapping
 
 
 def test_segment_mapping_is_what_a_plan_reads(tmp_path):

@@ -8,7 +8,7 @@ import yaml
 
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.errors import ConfigError
-from jtqd.sysid.planner.fourier import RAMP_SHARE, FourierSeries, FourierTrajectory
+from jtqd.sysid.planner.plan import RAMP_SHARE, FourierSeries, FourierTrajectory
 
 
 def random_trajectory(seed):

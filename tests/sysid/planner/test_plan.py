@@ -15,11 +15,13 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import MotionLimits
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.motion.setpoints import Limits, path
-from jtqd.sysid.planner.campaigns import efficiency_runs, plateau_run
-from jtqd.sysid.planner.fourier import FourierSeries, FourierTrajectory
+from jtqd.sysid.planner.campaigns import efficiency_runs, plateau_run, range_of
+from jtqd.sysid.planner.campaigns import joint_plateau_run as alone_run
 from jtqd.sysid.planner.plan import (
     DEFAULT_LIMITS,
     Fourier,
+    FourierSeries,
+    FourierTrajectory,
     Plan,
     Plateau,
     Rest,
@@ -33,8 +35,6 @@ from jtqd.sysid.planner.plan import (
     smooth_step,
     travel_rad,
 )
-from jtqd.sysid.planner.single_joint import plateau_run as alone_run
-from jtqd.sysid.planner.single_joint import range_of
 
 PLAN: dict[str, Any] = {
     "schema": "jtq.plan/1",

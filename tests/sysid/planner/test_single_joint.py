@@ -11,18 +11,17 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import MotionLimits
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.motion.setpoints import path, path_range
-from jtqd.sysid.planner.campaigns import Scale, make_plan_of, units_of
-from jtqd.sysid.planner.design import log_det
-from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, Plateau, Rest, Run, check_plan, load_plan
-from jtqd.sysid.planner.single_joint import (
-    SHARE,
-    _Trajectories,
+from jtqd.sysid.planner.campaigns import (
+    Scale,
+    joint_plateau_run,
+    make_plan_of,
     parsed_limits,
-    plateau_run,
     range_of,
     tightest,
-    trajectories,
+    units_of,
 )
+from jtqd.sysid.planner.design import SHARE, SingleJoint, log_det, trajectories
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan, Plateau, Rest, Run, check_plan, load_plan
 
 LIMITS = MotionLimits((-1.0, 2.0), 1.5, 6.0, 25.0)
 JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=LIMITS)
@@ -54,11 +53,11 @@ def test_a_joint_alone_stays_in_its_range_and_comes_back(kind: str) -> None:
 
 
 def test_plateaus_in_both_directions_at_every_velocity() -> None:
-    run = plateau_run(1, RANGE, "r", (0.2, 0.5))
+    run = joint_plateau_run(1, RANGE, "r", (0.2, 0.5))
     held = sorted({each.velocity_rad_s for each in run.segments if isinstance(each, Plateau)})
     fastest = SHARE * LIMITS.velocity_rad_s
     assert held == pytest.approx([share * fastest for share in (-0.5, -0.2, 0.2, 0.5)])
-    alone = plateau_run(1, replace(RANGE, acceleration_rad_s2=1.0), "r", (0.2, 1.0))
+    alone = joint_plateau_run(1, replace(RANGE, acceleration_rad_s2=1.0), "r", (0.2, 1.0))
     assert len(alone.segments) == 2 + 5, "the fast one does not fit at this acceleration"
 
 
@@ -66,7 +65,7 @@ def test_a_search_gives_more_information_than_one_draw() -> None:
     """The velocities of a design cover more than those of a draw: it is the reason to search at all."""
 
     def information(evaluations: int) -> float:
-        task = _Trajectories(RANGE, 1.0, 3.0)
+        task = SingleJoint(RANGE, 1.0, 3.0)
         (segment,) = trajectories(RANGE, [1.0], 3.0, seed=2, evaluations=evaluations)
         amplitudes = np.array([*segment.velocity.a, *segment.velocity.b])
         return float(log_det(task.finish(amplitudes, np.zeros((6, 6)))[1]))

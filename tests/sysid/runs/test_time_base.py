@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.runs import time_base
-from jtqd.sysid.runs.time_base import on_even_steps, skew_s, unwrapped
+from jtqd.sysid.runs import checks
+from jtqd.sysid.runs.checks import on_even_steps, skew_s, unwrapped
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.runs.spoiled_runs import JOINTS, bench, checked, column, each_column, having
 
@@ -125,6 +125,6 @@ def test_a_shift_counts_where_it_halves_the_residual(
         curve[shifts // 2 + 21] = least
         return curve
 
-    monkeypatch.setattr(time_base, "_residual_shares", residual_shares)
-    found = time_base.skew_s(RunTable(t, {1: columns}), 1, PLAIN)
+    monkeypatch.setattr(checks, "_residual_shares", residual_shares)
+    found = checks.skew_s(RunTable(t, {1: columns}), 1, PLAIN)
     assert found == (late_s if late_s is None else pytest.approx(late_s))
