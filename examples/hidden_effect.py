@@ -31,7 +31,7 @@ import numpy as np
 import yaml
 
 from jtqd.daemon.logs import LogError, read_topics
-from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
+from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.command_line import count, natural, seconds
 from jtqd.estimator.errors import ConfigError

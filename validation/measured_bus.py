@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, Records, read_topic
-from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
+from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.methods import make_estimator

@@ -25,10 +25,16 @@ import foxglove
 
 from jtqd.daemon.live.gateway import Gateway
 from jtqd.daemon.live.launch import Address
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.diagnostics import LoopReader
-from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage, diagnostics, zeros_of
-from jtqd.daemon.recording.recording import SCANNED, EventLog
+from jtqd.daemon.recording.messages import (
+    SCANNED,
+    CycleMessages,
+    EventLog,
+    JointStateMessage,
+    diagnostics,
+    zeros_of,
+)
 from jtqd.daemon.shared import cycle_record as cycle
 from jtqd.daemon.shared.events import NoticesError, NoticesReader
 from jtqd.daemon.shared.ring import RingError
@@ -42,7 +48,7 @@ PERIOD_NS = 20_000_000
 
 
 class Message(NamedTuple):
-    """One message on its way to the viewers. `topic` is the channel number of `jtqd.daemon.recording.schemas`."""
+    """One message on its way to the viewers. `topic` is the channel number of `jtqd.daemon.recording.messages`."""
 
     topic: int
     time_ns: int
@@ -93,7 +99,7 @@ class LiveStream:
             )
             for topic, payload in self._cycles.payloads(block):
                 self.add(topic, realtime, payload)
-            self.add(schemas.JOINT_STATES.number, realtime, self._overview.payload(record, realtime))
+            self.add(messages.JOINT_STATES.number, realtime, self._overview.payload(record, realtime))
         self.events.new_span()
         made, self._made = self._made, []
         return made
@@ -120,7 +126,7 @@ class LiveServer:
     """
 
     def __init__(self, name: str, address: Address, joints: int = 2) -> None:
-        texts = schemas.schemas_of(joints)
+        texts = messages.schemas_of(joints)
         self._context = context = foxglove.Context()  # server and channels hold it only weakly
         self._channels = {
             topic.number: foxglove.Channel(
@@ -131,7 +137,7 @@ class LiveServer:
                 ),
                 context=context,
             )
-            for topic in schemas.topics_of(joints)
+            for topic in messages.topics_of(joints)
         }
         self._server = foxglove.start_server(
             name=name,
@@ -211,7 +217,7 @@ class Source:
         made = stream.take(self._loop.ring.read().records)
         for notice in () if self._notices is None else self._notices.read()[0]:
             stream.events.note(
-                schemas.NOTICE,
+                messages.NOTICE,
                 notice.text,
                 level=notice.level,
                 time_ns=notice.realtime_ns,
@@ -220,7 +226,7 @@ class Source:
         found = self._loop.diagnosis(time.monotonic_ns(), now_ns)
         if found is not None:
             view, statuses = found
-            stream.add(schemas.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
+            stream.add(messages.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
             for topic, payload in zeros_of(view):
                 stream.add(topic.number, view.sync_realtime_ns, payload)
         return made + stream.take()

@@ -1,7 +1,7 @@
 """Logs read back: messages as arrays, attachments, tables and frames for other programs, recovery after a crash.
 
 In come MCAP files of jtqd, its python-can writer and others; out go numpy arrays, CSV, Parquet, candump lines, whole files.
-May import numpy, mcap and the file format of `daemon.recording`; import `recover`, `export`, `can_frames`, `can_io` by name.
+May import numpy, mcap and the file format of `daemon.recording`; import `recover`, `export`, `can_io` by name.
 """
 
 from jtqd.daemon.logs.log_file import LogError, LogFile

@@ -19,9 +19,9 @@ import can
 from can.io.generic import MessageReader, SizedMessageWriter
 from mcap.writer import CompressionType, Writer
 
-from jtqd.daemon.logs.can_frames import ERROR, EXTENDED, REMOTE, can_topics, iter_frames
 from jtqd.daemon.logs.log_file import LogError
-from jtqd.daemon.recording.schemas import CAN_FRAMES, SCHEMAS
+from jtqd.daemon.logs.read import ERROR, EXTENDED, REMOTE, can_topics, iter_frames
+from jtqd.daemon.recording.messages import CAN_FRAMES, SCHEMAS
 
 _LOG = logging.getLogger("can.io.mcap")
 _CAPACITY = 16

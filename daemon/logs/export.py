@@ -21,17 +21,22 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from jtqd.daemon.logs.can_frames import can_topics, candump_lines, iter_frames
 from jtqd.daemon.logs.log_file import LogError, LogFile
 from jtqd.daemon.logs.read import (
+    ERROR,
+    EXTENDED,
+    REMOTE,
+    Frames,
     Records,
+    can_topics,
+    iter_frames,
     iter_messages,
     iter_topics,
     log_parts,
     read_attachments,
     topics_of,
 )
-from jtqd.daemon.recording.schemas import JOINTS
+from jtqd.daemon.recording.messages import JOINTS
 
 _EXAMPLES = """examples:
   jtq export csv run.mcap --out run.csv.gz              the run table: time_s, j1.current_a, ...
@@ -240,6 +245,18 @@ def _dbc_of_configuration(path: Path) -> str:
         return dbc_text(load_config(path), None)
     except ValueError as error:
         raise LogError(str(error)) from None
+
+
+def candump_lines(frames: Frames, interface: str) -> Iterator[str]:
+    """Yield frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
+    rows = zip(
+        frames.stamps_ns.tolist(), frames.ids.tolist(), frames.lengths.tolist(), frames.data, strict=True
+    )
+    for stamp, can_id, length, data in rows:
+        seconds, rest = divmod(stamp, 1_000_000_000)
+        number = f"{can_id & 0x3FFFFFFF:08X}" if can_id & (EXTENDED | ERROR) else f"{can_id & 0x7FF:03X}"
+        content = f"R{length or ''}" if can_id & REMOTE else data[:length].tobytes().hex().upper()
+        yield f"({seconds}.{rest // 1000:06d}) {interface} {number}#{content}"
 
 
 # ---- tables ----

@@ -41,8 +41,8 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from jtqd.daemon.recording.mcap_file import MAGIC, SealedChunk, attachment_index, bytes_of, index_record
+from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS
 from jtqd.daemon.recording.run_files import ACTIVE
-from jtqd.daemon.recording.schemas import CAN_FRAMES, JOINTS
 
 HEAD = struct.Struct("<BQ")
 """Opcode, and the length of what follows."""

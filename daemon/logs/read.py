@@ -19,7 +19,10 @@ from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pieces
+from jtqd.daemon.recording.messages import FRAMES_NAMES
 from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.observer import low_pass
 
 Records = NDArray[Any]
 """Messages as rows of a structured array [n]; as an array of the decoder's objects where they have no fixed form."""
@@ -516,3 +519,81 @@ def _records(batch: Batch) -> list[bytes]:
     begins = (batch.offsets + _SEQUENCE).tolist()
     ends = (batch.offsets + _PAYLOAD + batch.lengths.astype(np.int64)).tolist()
     return [batch.data[begin:end] for begin, end in zip(begins, ends, strict=True)]
+
+
+# ---- CAN frames (`jtqd_msgs/CanFrames`) ----
+
+EXTENDED, REMOTE, ERROR = 0x8000_0000, 0x4000_0000, 0x2000_0000
+"""Bits of `can_id` as in Linux: 29-bit identifier, remote frame, error frame."""
+
+
+class Frames(NamedTuple):
+    """n frames in the order of the log."""
+
+    stamps_ns: NDArray[np.int64]
+    """CLOCK_REALTIME; receive time by the kernel, where it is known."""
+    ids: NDArray[np.uint32]
+    """With the bits of Linux."""
+    lengths: NDArray[np.uint8]
+    data: NDArray[np.uint8]
+    """[n, 8], zeros behind the length."""
+
+
+def can_topics(path: Path | Sequence[Path]) -> list[str]:
+    """Topics that carry CAN frames. Raises LogError where there is none, OSError."""
+    found = [topic for topic, schema in topics_of(path).items() if schema in FRAMES_NAMES]
+    if not found:
+        raise LogError(f"{path}: found no topic with CAN frames, expected {FRAMES_NAMES[0]}")
+    return sorted(found)
+
+
+def iter_frames(
+    path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
+) -> Iterator[Frames]:
+    """Yield frames of one topic, chunk by chunk. Raises LogError, OSError."""
+    for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):
+        records = messages.records
+        names = ", ".join(records.dtype.names or ())
+        if not all(each in names for each in ("frames", "frame_count", "stamps_ns")):
+            raise LogError(f"{path}: {topic}: found fields {names}, expected those of CAN frames")
+        frames, stamps = records["frames"], records["stamps_ns"].astype(np.int64)
+        present = np.arange(frames.shape[1]) < records["frame_count"][:, None]
+        # A frame without a stamp of the kernel has that of its message.
+        stamps = np.where(stamps == 0, messages.log_times.astype(np.int64)[:, None], stamps)
+        lengths = np.minimum(frames["length"][present], 8).astype(np.uint8)
+        data = np.where(np.arange(8) < lengths[:, None], frames["data"][present], 0).astype(np.uint8)
+        yield Frames(stamps[present], frames["id"][present], lengths, data)
+
+
+# ---- the estimate on the bus, and the torque sensor ----
+
+_ESTIMATE_COB_ID = 0x1A0
+_NO_TORQUE = -0x8000
+_TORQUE_UNIT_NM = 0.01
+_NS = 1e-9
+
+
+def published_torque(frames: Records, joint: int) -> FloatArray:
+    """Return the torque [Nm] of joint 0 or 1 in the estimate PDO of each cycle [n]; NaN: no PDO, or one without a torque."""
+    raw = frames["frames"]
+    at = (raw["id"] == _ESTIMATE_COB_ID) & (np.arange(raw.shape[1]) < frames["frame_count"][:, None])
+    data = raw["data"][np.arange(len(raw)), np.argmax(at, axis=1)]
+    counts = np.ascontiguousarray(data[:, 2 * joint : 2 * joint + 2]).view("<i2")[:, 0]
+    return np.where(at.any(axis=1) & (counts != _NO_TORQUE), counts * _TORQUE_UNIT_NM, np.nan)
+
+
+def sync_time(stamp: Records) -> FloatArray:
+    """Return the time of each SYNC since the first [s]."""
+    whole = (stamp["sec"].astype(np.int64) - int(stamp["sec"][0])) * 1_000_000_000
+    return np.asarray((whole + stamp["nanosec"] - int(stamp["nanosec"][0])) * _NS)
+
+
+def reference_torque(state: Records, time_s: FloatArray, bandwidth_rad_s: float) -> FloatArray:
+    """Return the sensor torque [Nm] as received through the observer's low-pass; NaN where no sensor value came."""
+    sensor = state["sensor_torque_nm"]
+    there = np.isfinite(sensor)
+    result = np.full(len(sensor), np.nan)
+    if there.any():
+        dt_s = np.diff(time_s[there], prepend=time_s[there][0])
+        result[there] = low_pass(sensor[there], dt_s, bandwidth_rad_s)
+    return result

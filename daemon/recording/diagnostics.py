@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.messages import Status
 from jtqd.daemon.recording.run_files import MEGABYTE, Account
 from jtqd.daemon.shared import events
@@ -139,7 +139,7 @@ class Diagnostics:
 
     def _joint(self, view: View, number: int, found: Sequence[Condition]) -> Status:
         joint = view.joints[number - 1]
-        name = schemas.STATUS_NAMES.get(joint.status, str(joint.status))
+        name = messages.STATUS_NAMES.get(joint.status, str(joint.status))
         values: dict[str, float | str] = {
             "status": name,
             "torque_nm": joint.torque_nm,

@@ -13,9 +13,9 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
-from jtqd.daemon.recording.recording import ERROR, INFO, WARN, EventLog
+from jtqd.daemon.recording.messages import ERROR, INFO, WARN, EventLog
 from jtqd.daemon.recording.run_files import (
     ACTIVE,
     MEGABYTE,
@@ -25,6 +25,7 @@ from jtqd.daemon.recording.run_files import (
     part_name,
     to_remove,
 )
+from jtqd.estimator.status import DRIVE_FAULT, INVALID, STALE
 
 _RETRY_NS = 900_000_000
 """An attempt to begin a file costs little: at most this, and what was being collected, is lost when the disk is back."""
@@ -224,7 +225,7 @@ class Parts:
         self._account.written -= count
         self._account.unwritten += count
         text = f"part {self.part} was removed while it was being written: cycles lost with it: {count}"
-        self._events.report(schemas.FILE_REMOVED, text, level=ERROR, count=count)
+        self._events.report(messages.FILE_REMOVED, text, level=ERROR, count=count)
 
     # ---- obstacles ----
 
@@ -235,7 +236,7 @@ class Parts:
             f"recording pauses: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
         )
         if not self.obstacle and self._file is not None:
-            self._events.note(schemas.SPACE_LOW, text, level=ERROR)
+            self._events.note(messages.SPACE_LOW, text, level=ERROR)
             last = self._builder.seal()
             with suppress(OSError):
                 if last is not None:
@@ -260,7 +261,7 @@ class Parts:
         self.obstacle = ""
         count, self._missed = self._missed, 0
         text = f"recording continues in part {self.part}; cycles not written: {count}"
-        self._events.report(schemas.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
+        self._events.report(messages.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
     # ---- budget ----
 
@@ -278,16 +279,49 @@ class Parts:
                     continue
                 found.remove(each)
                 text = f"removed {each.path.name}: budget of {rules.budget / MEGABYTE:g} MB"
-                self._events.report(schemas.FILE_RETIRED, text, level=INFO)
+                self._events.report(messages.FILE_RETIRED, text, level=INFO)
         self._others = sum(each.size for each in found)
         over = rules.budget is not None and self.total_size > rules.budget
         if over and not self._over_budget:
             text = "the budget is exceeded by files that are not removed; recording continues"
-            self._events.report(schemas.FILE_RETIRED, text, level=WARN)
+            self._events.report(messages.FILE_RETIRED, text, level=WARN)
         self._over_budget = over
 
 
 # ---- flight recorder ----
+
+STALE_S = 1.0
+
+
+class FaultTrigger:
+    """Trigger of the flight recorder by a joint's status, once per occurrence. Pure.
+
+    joints: number of them.
+    """
+
+    def __init__(self, joints: int = 2) -> None:
+        self._statuses = (0,) * joints
+        self._stale_since: list[int | None] = [None] * joints
+
+    def changed(self, statuses: tuple[int, ...], at_ns: int) -> str:
+        """Take new statuses; returns why to save, or nothing."""
+        before, self._statuses = self._statuses, statuses
+        why = ""
+        for n, (old, new) in enumerate(zip(before, statuses, strict=True)):
+            if new != old:
+                self._stale_since[n] = at_ns if new == STALE else None
+                if new in (DRIVE_FAULT, INVALID):
+                    why = f"joint {n + 1}: {messages.STATUS_NAMES[new]}"
+        return why
+
+    def passed(self, at_ns: int) -> str:
+        """Take the time; returns why to save, or nothing."""
+        for n, since in enumerate(self._stale_since):
+            if since is not None and at_ns - since > STALE_S * _NS:
+                self._stale_since[n] = None
+                return f"joint {n + 1}: STALE for more than {STALE_S:g} s"
+        return ""
+
 
 AFTER_S = 5.0
 _NOTICED_S = 0.1
@@ -355,7 +389,7 @@ class FlightRecorder:
         if not begun:
             return
         self.saved += 1
-        self._events.report(schemas.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
+        self._events.report(messages.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
         self._parts.open(why)
         while self._memory:
             span, at_ns = self._memory.popleft()

@@ -13,12 +13,10 @@ from mcap.records import Channel, Schema
 
 from jtqd.daemon.logs import LogError, LogFile
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import CycleMessages
+from jtqd.daemon.recording.messages import SCHEMAS, CycleMessages
 from jtqd.daemon.recording.run_files import ACTIVE
-from jtqd.daemon.recording.schemas import SCHEMAS
 from jtqd.daemon.replay.compare import Comparison, Contacts, Difference, Identity, Unknown
-from jtqd.daemon.replay.logged import ADDED, SAMPLE, STAMP
-from jtqd.daemon.replay.runs import stamps_ns
+from jtqd.daemon.replay.logged import ADDED, SAMPLE, STAMP, stamps_ns
 from jtqd.daemon.replay.session import ReplayOptions, Result, as_json, content, replay_each
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.estimator.arrays import RecordArray

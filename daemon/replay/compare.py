@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from jtqd.daemon.replay.logged import ADDED
+from jtqd.daemon.replay.logged import ADDED, Steps
 from jtqd.daemon.replay.rows import fields
-from jtqd.daemon.replay.runs import Steps
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.estimator.arrays import BoolArray, FloatArray, RecordArray
 from jtqd.estimator.observer import reference_of

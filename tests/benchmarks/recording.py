@@ -21,7 +21,6 @@ from typing import Any
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from jtqd.daemon.recording import schemas
 from jtqd.daemon.recording.messages import CycleMessages
 from jtqd.daemon.recording.recorder import RecorderRequest, Session
 from jtqd.daemon.recording.run_files import Account
@@ -152,8 +151,8 @@ def _library(records: list[bytes], path: Path) -> float:
         )
         writer.start("ros2")
         channels = {}
-        for topic in (schemas.JOINT_1, schemas.JOINT_2, schemas.CAN_FRAMES):
-            text = schemas.SCHEMAS[topic.schema].encode()
+        for topic in (messages.JOINT_1, messages.JOINT_2, messages.CAN_FRAMES):
+            text = messages.SCHEMAS[topic.schema].encode()
             schema = writer.register_schema(topic.schema, "ros2msg", text)
             channels[topic.number] = writer.register_channel(topic.name, "cdr", schema)
         begin = time.process_time()

@@ -9,9 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.replay.replayer import Replayer
-from jtqd.daemon.replay.runs import read_runs
-from jtqd.daemon.replay.session import models_of
+from jtqd.daemon.replay.logged import read_runs
+from jtqd.daemon.replay.session import Replayer, models_of
 from tests.benchmarks.measure import table
 from tests.paths import GOLDEN
 

@@ -17,7 +17,7 @@ import yaml
 
 from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.logs import read_attachments, read_topic, read_topics, topics_of
-from jtqd.daemon.logs.can_frames import iter_frames
+from jtqd.daemon.logs.read import iter_frames
 from jtqd.daemon.replay.session import ReplayOptions, replay
 from jtqd.drivers import own_objects
 from jtqd.drivers.can_unix import UnixBus

@@ -13,7 +13,7 @@ from pathlib import Path
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.shared.events import FILE, Notices
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -22,7 +22,7 @@ from tests.daemon.recording.recorder_bench import DEFINITIONS, put, record_of
 from tests.paths import ROOT
 
 SUBPROTOCOL = "foxglove.sdk.v1"
-TYPES = {topic.name: topic.schema for topic in schemas.TOPICS}
+TYPES = {topic.name: topic.schema for topic in messages.TOPICS}
 _MESSAGE_DATA = 1
 
 
@@ -117,7 +117,7 @@ class Viewer:
         self.socket = self._connection.__enter__()
         self.texts, self.channels, self.messages = [], {}, {}
         self._subscribed = {}
-        self._until(lambda: len(self.channels) == len(schemas.TOPICS))
+        self._until(lambda: len(self.channels) == len(messages.TOPICS))
         wanted = [c for c in self.channels.values() if topics is None or c["topic"] in topics]
         self._subscribed = {n: channel["topic"] for n, channel in enumerate(wanted, start=100)}
         self.send(

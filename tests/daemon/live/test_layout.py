@@ -8,7 +8,7 @@ import pytest
 
 from jtqd.daemon.jtq import main as jtq
 from jtqd.daemon.live.layout import layout
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN, MOST_JOINTS
 from tests.daemon.live.viewer_log import Topics
 
@@ -81,9 +81,9 @@ def test_every_path_selects_a_number(shipped, topics, joints):
 def test_the_other_panels_have_topics_of_the_types_they_take(shipped, topics):
     panels = shipped["configById"]
     names = {topic: definition.name for topic, definition in topics.definitions.items()}
-    assert names[panels["DiagnosticSummary!summary"]["topicToRender"]] == schemas.DIAGNOSTICS.schema
-    assert names[panels["RosOut!log"]["topicToRender"]] == schemas.LOG.schema
-    assert names[panels["RawMessages!event"]["topicPath"]] == schemas.EVENTS.schema
+    assert names[panels["DiagnosticSummary!summary"]["topicToRender"]] == messages.DIAGNOSTICS.schema
+    assert names[panels["RosOut!log"]["topicToRender"]] == messages.LOG.schema
+    assert names[panels["RawMessages!event"]["topicPath"]] == messages.EVENTS.schema
 
 
 def test_the_scripts_use_fields_that_exist(shipped, topics):
@@ -109,8 +109,8 @@ def test_the_scripts_give_band_residual_and_contact(shipped, joints):
 
 
 def test_viewers_name_status_and_kind_of_event(topics):
-    assert topics.names_of_values("/joint/1/state", "status") == schemas.STATUS_NAMES
-    assert topics.names_of_values("/events", "kind") == schemas.EVENT_NAMES
+    assert topics.names_of_values("/joint/1/state", "status") == messages.STATUS_NAMES
+    assert topics.names_of_values("/events", "kind") == messages.EVENT_NAMES
     assert topics.names_of_values("/joint/1/state", "statusword") == {}
 
 

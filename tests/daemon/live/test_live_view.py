@@ -11,7 +11,7 @@ import pytest
 from jtqd.daemon.live.gateway import OLDER, PROTOCOL
 from jtqd.daemon.live.launch import Address, address
 from jtqd.daemon.live.process import LiveStream
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.messages import JOINT_ESTIMATE_SIZE, CycleMessages
 from jtqd.daemon.shared import cycle_record
 from tests.daemon.live.live_view_helpers import LiveProcess, Memory, Viewer
@@ -40,39 +40,39 @@ def of(messages, topic):
 def test_one_set_of_messages_in_20_ms_with_the_bytes_of_the_log():
     messages = stream().take(record_of(n) for n in range(100, 200))
     for topic, size in (
-        (schemas.JOINT_1, JOINT_ESTIMATE_SIZE),
-        (schemas.JOINT_2, JOINT_ESTIMATE_SIZE),
-        (schemas.CAN_FRAMES, CycleMessages(2).frames_size),
+        (messages.JOINT_1, JOINT_ESTIMATE_SIZE),
+        (messages.JOINT_2, JOINT_ESTIMATE_SIZE),
+        (messages.CAN_FRAMES, CycleMessages(2).frames_size),
     ):
         found = of(messages, topic)
         assert [len(message.payload) for message in found] == [size] * 5
         assert [message.time_ns for message in found] == [
             START_NS + n * 1_000_000 for n in range(100, 200, 20)
         ]
-    name = schemas.JOINT_2.schema
-    joint = Definition(name, schemas.SCHEMAS[name]).decode(of(messages, schemas.JOINT_2)[1].payload)
+    name = messages.JOINT_2.schema
+    joint = Definition(name, messages.SCHEMAS[name]).decode(of(messages, messages.JOINT_2)[1].payload)
     fields = dict(zip(cycle_record.JointRecord._fields, joint_values(120, 2), strict=True))
     assert {field: joint[field] for field in fields} == fields
-    assert len(of(messages, schemas.JOINT_STATES)) == 5
+    assert len(of(messages, messages.JOINT_STATES)) == 5
 
 
 def test_what_lasts_one_cycle_is_an_event_although_its_cycle_is_left_out():
     records = [
         record_of(n, statuses=(4 if n == 107 else 2, 2), missed=3 if n > 112 else 0) for n in range(100, 119)
     ]
-    name = schemas.EVENTS.schema
+    name = messages.EVENTS.schema
     events = [
-        Definition(name, schemas.SCHEMAS[name]).decode(message.payload)
-        for message in of(stream().take(records), schemas.EVENTS)
+        Definition(name, messages.SCHEMAS[name]).decode(message.payload)
+        for message in of(stream().take(records), messages.EVENTS)
     ]
     told = [(each["kind"], each["joint"], each["before"], each["after"], each["count"]) for each in events]
     assert told == [
-        (schemas.STATUS_CHANGED, 1, 2, 4, 0),
-        (schemas.STATUS_CHANGED, 1, 4, 2, 0),
-        (schemas.SLOTS_MISSED, 0, 0, 0, 3),
+        (messages.STATUS_CHANGED, 1, 2, 4, 0),
+        (messages.STATUS_CHANGED, 1, 4, 2, 0),
+        (messages.SLOTS_MISSED, 0, 0, 0, 3),
     ]
     assert [each["cycle"] for each in events] == [107, 108, 113]
-    texts = [message.payload for message in of(stream().take(records), schemas.LOG)]
+    texts = [message.payload for message in of(stream().take(records), messages.LOG)]
     assert b"joint 1: VALID -> STALE" in texts[0]
     assert texts[0][12] == 30, "a warning"
     assert texts[1][12] == 20, "good news"
@@ -82,7 +82,7 @@ def test_nobody_is_told_of_changes_while_nobody_looked():
     made = stream()
     made.take([record_of(1, statuses=(2, 2))])
     made.forget()
-    assert of(made.take([record_of(500, statuses=(6, 2), missed=9)]), schemas.EVENTS) == []
+    assert of(made.take([record_of(500, statuses=(6, 2), missed=9)]), messages.EVENTS) == []
 
 
 @pytest.mark.parametrize(
@@ -131,8 +131,8 @@ def test_a_viewer_gets_the_topics_and_schemas_of_the_log_at_50_hz(memory):
             for channel in viewer.channels.values()
         }
         assert found == {
-            topic.name: ("cdr", topic.schema, "ros2msg", schemas.SCHEMAS[topic.schema])
-            for topic in schemas.TOPICS
+            topic.name: ("cdr", topic.schema, "ros2msg", messages.SCHEMAS[topic.schema])
+            for topic in messages.TOPICS
         }
         feeding = memory.feeding(3000, statuses=lambda n: (4 if n % 500 == 33 else 2, 2))
         viewer.wait_for("/joint/1/state")
@@ -154,8 +154,8 @@ def test_a_viewer_gets_the_topics_and_schemas_of_the_log_at_50_hz(memory):
             *viewer.messages
         }
         kinds = [message["kind"] for _, message in viewer.messages["/events"]]
-        assert kinds.count(schemas.STATUS_CHANGED) >= 4, "each lasted one cycle"
-        notices = [m["text"].strip() for _, m in viewer.messages["/events"] if m["kind"] == schemas.NOTICE]
+        assert kinds.count(messages.STATUS_CHANGED) >= 4, "each lasted one cycle"
+        notices = [m["text"].strip() for _, m in viewer.messages["/events"] if m["kind"] == messages.NOTICE]
         assert notices == ["node 3: no heartbeat for 0.3 s"]
         names = [status["name"] for status in viewer.messages["/diagnostics"][0][1]["status"]]
         assert names[0] == "jtqd: loop"

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from tests.daemon.recording.cdr_decoder import Definition
 from tests.paths import ROOT
 
@@ -49,8 +49,8 @@ class Topics:
     @classmethod
     def of_bus(cls, joints):
         """Those in the log of a bus with so many joints."""
-        made, texts = cls(), schemas.schemas_of(joints)
-        for topic in schemas.topics_of(joints):
+        made, texts = cls(), messages.schemas_of(joints)
+        for topic in messages.topics_of(joints):
             made.define(topic.name, topic.schema, texts[topic.schema])
         return made
 

@@ -9,10 +9,9 @@ from typing import NamedTuple
 from mcap.records import Channel, Schema
 
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
-from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
-from jtqd.daemon.recording.recording import EventLog, Recording
+from jtqd.daemon.recording.messages import CycleMessages, EventLog, JointStateMessage, definitions
+from jtqd.daemon.recording.recorder import Recording
 from jtqd.daemon.recording.run_files import Account
-from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 
 START_NS = 1_700_000_000_000_000_000

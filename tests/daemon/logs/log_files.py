@@ -12,10 +12,9 @@ from mcap.writer import CompressionType, Writer
 
 from jtqd.daemon.logs.can_io import McapCanWriter
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import JointStateMessage
-from jtqd.daemon.recording.recording import EventLog, Recording
+from jtqd.daemon.recording.messages import EventLog, JointStateMessage, definitions
+from jtqd.daemon.recording.recorder import Recording
 from jtqd.daemon.recording.run_files import Account
-from jtqd.daemon.recording.schemas import definitions
 from tests.daemon.logs.campaign_log import Cycle, Joint, builder_of, write_log
 
 ATTACHMENTS = [

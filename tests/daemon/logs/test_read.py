@@ -32,11 +32,11 @@ from jtqd.daemon.logs import (
     read_topics,
     topics_of,
 )
-from jtqd.daemon.logs.can_frames import iter_frames
 from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import ChunkError, LogFile, Source
+from jtqd.daemon.logs.read import iter_frames
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile
-from jtqd.daemon.recording.schemas import SCHEMAS
+from jtqd.daemon.recording.messages import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
 from jtqd.daemon.replay.session import ReplayOptions
 from jtqd.daemon.replay.session import replay as replayed

@@ -12,7 +12,7 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.core.input_pdos import JointInputs, drive_places, input_pdos
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.replay.replayer import _Counters
+from jtqd.daemon.replay.session import _Counters
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings

@@ -11,13 +11,11 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile
-from jtqd.daemon.recording.messages import CycleMessages, JointStateMessage
-from jtqd.daemon.recording.recorder import RecorderRequest, Session
-from jtqd.daemon.recording.recording import EventLog, Recording
+from jtqd.daemon.recording.messages import CycleMessages, EventLog, JointStateMessage, definitions
+from jtqd.daemon.recording.recorder import RecorderRequest, Recording, Session
 from jtqd.daemon.recording.run_files import Account
-from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.ring import Ring
 from tests.daemon import ring_records as rr
@@ -25,7 +23,7 @@ from tests.daemon.recording.cdr_decoder import Definition
 from tests.paths import ROOT
 
 START_NS = 1_700_000_000_000_000_000
-DEFINITIONS = {name: Definition(name, text) for name, text in schemas.SCHEMAS.items()}
+DEFINITIONS = {name: Definition(name, text) for name, text in messages.SCHEMAS.items()}
 SYNC = struct.pack("<IB3x8s", 0x080, 1, b"\x01")
 TPDO = struct.pack("<IB3x8s", 0x181, 8, bytes(range(8)))
 
@@ -132,12 +130,12 @@ class RecorderProcess:
 
 def messages_of(*paths):
     """{topic: [(log time, decoded message)]} of finished files, by the library's reader, CRCs checked."""
-    found = {topic.name: [] for topic in schemas.TOPICS}
+    found = {topic.name: [] for topic in messages.TOPICS}
     for path in paths:
         with open(path, "rb") as file:
             reader = make_reader(file, validate_crcs=True)
             for schema, channel, message in reader.iter_messages(log_time_order=False):
-                assert schema.data.decode() == schemas.SCHEMAS[schema.name]
+                assert schema.data.decode() == messages.SCHEMAS[schema.name]
                 found[channel.topic].append((message.log_time, DEFINITIONS[schema.name].decode(message.data)))
     return found
 

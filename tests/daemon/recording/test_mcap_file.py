@@ -13,7 +13,7 @@ from mcap.stream_reader import StreamReader
 
 from jtqd.daemon.recording import mcap_file as appender
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.schemas import definitions
+from jtqd.daemon.recording.messages import definitions
 from tests.daemon.recording.recorder_bench import START_NS, cycles_of, metadata_of, one_file, record_of
 
 

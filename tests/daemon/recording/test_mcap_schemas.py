@@ -6,13 +6,13 @@ import struct
 
 import pytest
 
-from jtqd.daemon.recording import messages, schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.cdr_decoder import Definition
 
-DEFINITIONS = {name: Definition(name, text) for name, text in schemas.SCHEMAS.items()}
+DEFINITIONS = {name: Definition(name, text) for name, text in messages.SCHEMAS.items()}
 JOINT = DEFINITIONS["jtqd_msgs/msg/JointEstimate"]
 FRAMES = DEFINITIONS["jtqd_msgs/msg/CanFrames"]
 NOW = 1_700_000_000_123_456_789
@@ -139,7 +139,7 @@ def test_joint_state_for_names_of_every_length(names):
 def test_event():
     texts = ["", "joint 1: VALID -> STALE", "x" * 500, "Größe"]
     payloads = [
-        messages.event(NOW, schemas.STATUS_CHANGED, text, index=2**40, count=5, joint=1, change=(2, 4))
+        messages.event(NOW, messages.STATUS_CHANGED, text, index=2**40, count=5, joint=1, change=(2, 4))
         for text in texts
     ]
     assert len({len(payload) for payload in payloads}) == 1
@@ -207,8 +207,8 @@ def test_status_constants_are_those_of_the_pdo():
 
 
 def test_every_topic_has_a_complete_schema():
-    assert {topic.schema for topic in schemas.TOPICS} == set(schemas.SCHEMAS)
-    assert len({topic.number for topic in schemas.TOPICS}) == len(schemas.TOPICS)
+    assert {topic.schema for topic in messages.TOPICS} == set(messages.SCHEMAS)
+    assert len({topic.number for topic in messages.TOPICS}) == len(messages.TOPICS)
     for definition in DEFINITIONS.values():
         for fields, _ in definition.types.values():
             for _, kind, _ in fields:

@@ -12,13 +12,12 @@ from mcap.stream_reader import StreamReader
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.logs.recover import recover_unfinished
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.launch import RecorderProcess, recording_request
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
+from jtqd.daemon.recording.messages import ERROR, WARN, EventLog, definitions
 from jtqd.daemon.recording.recorder import RecorderRequest, main
-from jtqd.daemon.recording.recording import ERROR, WARN, EventLog
 from jtqd.daemon.recording.run_files import parse_part, part_files
-from jtqd.daemon.recording.schemas import definitions
 from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
@@ -42,7 +41,7 @@ def in_file_order(path):
     """(topic, log time) of every message as it stands in the file."""
     with open(path, "rb") as file:
         records = list(StreamReader(file).records)
-    names = {topic.number: topic.name for topic in schemas.TOPICS}
+    names = {topic.number: topic.name for topic in messages.TOPICS}
     return [(names[each.channel_id], each.log_time) for each in records if isinstance(each, Message)]
 
 
@@ -61,10 +60,10 @@ def test_what_is_heard_of_late_stands_at_its_time(tmp_path):
         recording.add(record_of(n))
         if n in (60, 61):
             late_ns = START_NS + (30 - n % 2) * MS + 500
-            recording.events.note(schemas.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
+            recording.events.note(messages.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
     recording.flush()
     sink.end()
-    cycles = {topic.name for topic in (*schemas.JOINTS, schemas.CAN_FRAMES)}
+    cycles = {topic.name for topic in (*messages.JOINTS, messages.CAN_FRAMES)}
     assert all(times == sorted(times) for times in times_by_topic(path).values())
     others = [(topic, time) for topic, time in in_file_order(path) if topic not in cycles]
     assert [time for _, time in others] == sorted(time for _, time in others)
@@ -86,7 +85,7 @@ def test_cycles_keep_their_order_when_the_clock_is_set_back(tmp_path):
     for n in range(50):
         recording.add(record_of(n, start_ns=START_NS - (3600 * 10**9 if n >= 25 else 0)))
         if n == 40:
-            recording.events.note(schemas.NOTICE, "late", level=WARN, time_ns=START_NS)
+            recording.events.note(messages.NOTICE, "late", level=WARN, time_ns=START_NS)
     recording.flush()
     sink.end()
     assert cycles_of(path) == list(range(50))
@@ -127,10 +126,10 @@ def test_what_tells_of_loss_is_written_however_much_happens(tmp_path):
     builder = ChunkBuilder(*definitions(), [], 60)
     events = EventLog(builder.add)
     for n in range(80):
-        events.note(schemas.STATUS_CHANGED, f"{n}", level=WARN)
-    events.note(schemas.RECORDS_LOST, "lost", level=ERROR)
+        events.note(messages.STATUS_CHANGED, f"{n}", level=WARN)
+    events.note(messages.RECORDS_LOST, "lost", level=ERROR)
     assert events.left_out == 30
-    assert builder.seal().chunks[0].counts[schemas.EVENTS.number] == 51
+    assert builder.seal().chunks[0].counts[messages.EVENTS.number] == 51
 
 
 def test_a_recorder_that_is_told_to_end_before_it_has_begun_records_what_there_is(tmp_path):

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from jtqd.daemon.recording import diagnostics, messages, schemas
+from jtqd.daemon.recording import diagnostics, messages
 from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared.conditions import Condition
@@ -117,7 +117,7 @@ def test_loop_that_stands_still(bench):
 )
 def test_joint(bench, status, level):
     found = bench.look(statuses=(status, 2))
-    assert found["joint 1"][:2] == (level, schemas.STATUS_NAMES[status])
+    assert found["joint 1"][:2] == (level, messages.STATUS_NAMES[status])
     assert found["joint 2"][0] == OK
 
 
@@ -188,7 +188,7 @@ def test_notices_of_the_supervisor_become_events_and_log_lines(tmp_path):
     texts = [
         (event["count"], event["text"].rstrip())
         for _, event in found["/events"]
-        if event["kind"] == schemas.NOTICE
+        if event["kind"] == messages.NOTICE
     ]
     assert texts == [(2, "node 2: boot-up"), (1, "node 1: EMCY 8611h following error")]
     lines = [(line["level"], line["msg"].rstrip()) for _, line in found["/log"]]

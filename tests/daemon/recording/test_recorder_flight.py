@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.recording.recording import FaultTrigger
+from jtqd.daemon.recording.parts import FaultTrigger
 from tests.daemon.recording.recorder_bench import (
     DEFINITIONS,
     ROOT,

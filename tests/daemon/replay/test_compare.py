@@ -9,8 +9,7 @@ import pytest
 
 from jtqd.daemon.replay.command import _contacts
 from jtqd.daemon.replay.compare import SETTLED_CYCLES, bits_equal, contacts, identity
-from jtqd.daemon.replay.logged import SAMPLE
-from jtqd.daemon.replay.runs import BEGINS, Steps, steps_of
+from jtqd.daemon.replay.logged import BEGINS, SAMPLE, Steps, steps_of
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.estimator.arrays import RecordArray
 from tests.daemon.replay.replay_helpers import CONFIG, records

@@ -16,9 +16,8 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
 from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.logs import read_topic
-from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets
+from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets, read_runs
 from jtqd.daemon.replay.rows import CycleRows, fields
-from jtqd.daemon.replay.runs import read_runs
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import load_network

@@ -13,7 +13,7 @@ import pytest
 
 from jtqd.daemon.logs import LogError, read_topic
 from jtqd.daemon.replay import command, session
-from jtqd.daemon.replay.runs import BEGINS, LOST, Run, lost_cycles, read_runs, steps_of
+from jtqd.daemon.replay.logged import BEGINS, LOST, Run, lost_cycles, read_runs, steps_of
 from jtqd.daemon.replay.session import ReplayOptions, Result, replay, replay_each
 from tests.daemon.replay.replay_helpers import CONFIG, MS, cut, cycles, records
 from tests.paths import GOLDEN

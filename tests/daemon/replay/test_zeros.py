@@ -26,8 +26,7 @@ from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.core.status import NEEDED
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import CycleMessages, zeros_of
-from jtqd.daemon.recording.schemas import definitions
+from jtqd.daemon.recording.messages import CycleMessages, definitions, zeros_of
 from jtqd.daemon.replay.logged import Setup, read_setup
 from jtqd.daemon.replay.session import ReplayOptions, Result, models_of, replay_each
 from jtqd.daemon.shared import cycle_record as cr

@@ -8,7 +8,7 @@ import typing
 import pytest
 
 import jtqd
-from jtqd.daemon.recording import schemas
+from jtqd.daemon.recording import messages
 from jtqd.daemon.ros2 import messages as idl
 from jtqd.daemon.ros2.messages import header
 from jtqd.daemon.shared import cycle_record, faults
@@ -127,9 +127,9 @@ def test_constants_of_the_torque_state_are_those_of_the_estimate():
 
 
 def test_the_package_has_the_messages_of_the_logs_as_they_are_there():
-    texts = schemas.schemas_of(2) | schemas.schemas_of(cycle_record.MOST_JOINTS)
+    texts = messages.schemas_of(2) | messages.schemas_of(cycle_record.MOST_JOINTS)
     expected = {}
-    for name, text in (schemas.schemas_of(cycle_record.MOST_JOINTS) | schemas.schemas_of(2)).items():
+    for name, text in (messages.schemas_of(cycle_record.MOST_JOINTS) | messages.schemas_of(2)).items():
         if name.startswith("jtqd_msgs/"):
             own, *nested = text.split("=" * 80 + "\n")
             expected[name.split("/")[-1]] = own
