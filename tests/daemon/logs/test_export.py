@@ -11,7 +11,6 @@ import subprocess
 import sys
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import can
 import numpy as np
@@ -26,7 +25,6 @@ from tests.daemon.logs.campaign_log import Cycle, Joint, regular, write_log
 from tests.daemon.logs.log_files import ATTACHMENTS, ours
 from tests.paths import ROOT
 
-BIN = Path(sys.executable).parent
 CYCLES = 120
 
 
@@ -157,23 +155,23 @@ def test_span_in_seconds(log, tmp_path, capsys):
 # ---- frames ----
 
 
-def test_candump_lines_and_the_dbc_are_what_cantools_takes(tmp_path):
+def test_candump_lines_and_the_dbc_are_what_cantools_takes(tmp_path, capsys):
     """Lines out of the log, decoded by the DBC of the shipped configuration as plain integers."""
     pytest.importorskip("cantools")
     position = (1000).to_bytes(4, "little") + (-7).to_bytes(4, "little", signed=True)
     cycle = Cycle(1, 1_000_000, (Joint(), Joint()), [(0x181, position), (0x701, b"\5")])
     log = write_log(tmp_path / "a.mcap", [cycle])
-    lines = run(BIN / "jtq", "export", "candump", log)
-    assert lines.stdout.splitlines() == [
+    assert main(["candump", str(log)]) == 0
+    lines = capsys.readouterr().out
+    assert lines.splitlines() == [
         "(1700000000.001000) can0 181#E8030000F9FFFFFF",
         "(1700000000.001000) can0 701#05",
     ]
     dbc = tmp_path / "bus.dbc"
-    made = run(
-        BIN / "jtq", "export", "dbc", "--config", ROOT / "models" / "bench.yaml", "--out", dbc, "--json"
-    )
-    assert json.loads(made.stdout)["messages"] > 10
-    decoded = run(sys.executable, "-m", "cantools", "decode", "--single-line", dbc, stdin=lines.stdout).stdout
+    config = ROOT / "models" / "bench.yaml"
+    assert main(["dbc", "--config", str(config), "--out", str(dbc), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["messages"] > 10
+    decoded = run(sys.executable, "-m", "cantools", "decode", "--single-line", dbc, stdin=lines).stdout
     assert re.search(r"drive_1_TPDO1\(motor_position: 1000, link_position: -7\)", decoded)
     assert "(nmt_state: operational)" in decoded
 
