@@ -12,7 +12,7 @@ from functools import partial
 from math import inf, isfinite, nan
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.core import contact_pdo
+from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.estimate_pdo import field
 from jtqd.daemon.shared.counters import OBJECT_2200, RECORDER_LOST
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
@@ -134,15 +134,15 @@ class OwnNode:
     def _contact(self, joint: int, part: int) -> int:
         """Return torque rate (0) or code (1) of a joint as in the contact PDO."""
         if joint >= self._joints or not self._watches:
-            return contact_pdo.field(nan, nan, CONTACT_OFF)[part]
+            return estimate_pdo.contact_field(nan, nan, CONTACT_OFF)[part]
         view = self._reader.read()
         if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
-            return contact_pdo.field(nan, nan, CONTACT_UNKNOWN)[part]
+            return estimate_pdo.contact_field(nan, nan, CONTACT_UNKNOWN)[part]
         last = view.joints[joint]
         code = CONTACT_NONE if last.input_flags & FLAG_CONTACT_KNOWN else CONTACT_UNKNOWN
         if last.input_flags & FLAG_CONTACT:
             code = CONTACT_PRESENT
-        return contact_pdo.field(last.torque_rate_nm_s, last.contact_nm, code)[part]
+        return estimate_pdo.contact_field(last.torque_rate_nm_s, last.contact_nm, code)[part]
 
     def _contacts(self, pair: int) -> int:
         """Return the contact byte of the PDO that begins with joint `pair`."""

@@ -1,16 +1,79 @@
 """One cycle of the loop; cycle.pyx."""
 
 from cpython.object cimport PyObject
-from libc.stdint cimport int64_t, uint32_t, uint64_t
+from libc.stdint cimport int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 
-from jtqd.daemon.core.bus cimport Bus
-from jtqd.daemon.core.contact cimport ContactWatch
-from jtqd.drivers.frame_socket cimport Frame
-from jtqd.daemon.core.intake cimport Intake
-from jtqd.daemon.core.joint cimport JointCycle, JointState
+from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
+from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS, CycleFrames, RecordRing
 from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
-from jtqd.daemon.core.snapshot cimport SnapshotWriter
+from jtqd.drivers.frame_socket cimport Frame, FrameSocket
+from jtqd.estimator.sample cimport Learned
+
+# The snapshot: structs that lie in memory as `jtqd.daemon.shared.snapshot` has them
+
+cdef struct InputBlock:  # `INPUT` of the snapshot
+    int64_t used_ns, delay_ns, low_ns, high_ns
+    int64_t late, lost, duplicates, rejected, missed, in_a_row, too_short, too_long
+
+cdef struct ViewBlock:  # a `JointView`
+    double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm, sensor_nm
+    uint16_t statusword
+    uint8_t status, sensor_status
+    uint16_t input_flags, latched
+    double reference_nm, age_ms
+    double torque_rate_nm_s, contact_nm
+
+cdef struct MeasuredBlock:  # a `Measured`
+    double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, sensor_nm, temperature_c
+
+cdef enum:
+    STATE_WORDS = 192  # room for the state of an estimator
+
+cdef struct LearnedBlock:  # `LEARNED`: zeros, and the estimator's state after the cycle of the last estimate
+    Learned zeros
+    uint64_t size  # of the state in bytes; 0: there is none
+    uint64_t state[STATE_WORDS]
+
+cdef struct EstimateBlock:
+    int64_t cycle
+    uint64_t sync_counter
+    int64_t sync_realtime_ns, sync_monotonic_ns
+    int64_t status_since[MOST_JOINTS]
+    ViewBlock joints[MOST_JOINTS]
+    MeasuredBlock measured[MOST_JOINTS]
+
+cdef class SnapshotWriter:
+    cdef uint64_t[::1] counters, work, late, status_cycles, restarts, sequence
+    cdef int64_t[::1] node_heard
+    cdef uint8_t[::1] inputs, node_states, unconfigured, learned, estimate
+    cdef Intake intake
+    cdef FrameSocket bus
+    cdef int joints
+    cdef int64_t bits, bits_complete
+    cdef int64_t bits_of[MOST_INPUTS]
+    cdef int64_t used_ns[MOST_INPUTS]
+    cdef int64_t delay_ns[MOST_INPUTS]
+    cdef int status[MOST_JOINTS]
+    cdef int64_t since[MOST_JOINTS]
+    cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
+    cdef void count_status(self, int joint, int status) noexcept nogil
+    cdef void begin(self) noexcept nogil
+    cpdef int flush(self, int64_t missed, int64_t sync_ns) except -1
+    cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
+    cdef void flush_nodes(self) noexcept nogil
+    cdef void write_learned(self, int number, JointCycle joint) noexcept nogil
+    cdef void end(
+        self,
+        int64_t cycle,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        int64_t sync_monotonic_ns,
+        JointState **joints,
+    ) noexcept nogil
+
+cdef class PythonSocket(FrameSocket):
+    cdef int count_dropped(self) except -1
 
 cdef enum:
     MOST_ESTIMATES = 2
@@ -31,7 +94,7 @@ cdef class Cycle:
     cdef JointState *states[MOST_JOINTS]  # theirs
     cdef RecordRing records
     cdef Clock clock
-    cdef Bus bus
+    cdef FrameSocket bus
     cdef int counter_overflow
     cdef int64_t heartbeat_cycles
     cdef int estimates  # PDOs: one for each two joints

@@ -1,12 +1,11 @@
 from collections.abc import Sequence
 from typing import Final
 
-from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.input_pdos import JointInputs
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.joint import ContactWatch, JointCycle
 from jtqd.daemon.core.schedule import Clock, Grid
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import FrameSocket
@@ -17,6 +16,12 @@ CYCLE_ENDED: Final[int]
 SLOT_PASSED: Final[int]
 RUN_ENDED: Final[int]
 clock: Clock
+
+class SnapshotWriter:
+    def __init__(self, snapshot: Snapshot, intake: Intake, socket: FrameSocket) -> None: ...
+    def flush(self, missed: int, sync_ns: int) -> int: ...
+
+def frame_counts(intake: Intake) -> dict[str, dict[str, int]]: ...
 
 class ConfiguredNodes:
     def __init__(self, snapshot: Snapshot, intake: Intake, joints: Sequence[JointCycle]) -> None: ...

@@ -11,53 +11,47 @@ counter and a stale estimate.
 """
 
 from cpython.object cimport PyObject
-from libc.stdint cimport int64_t, uint8_t, uint32_t
-from libc.string cimport memset
+from libc.stdint cimport int64_t, uint8_t, uint32_t, uint64_t
+from libc.string cimport memcpy, memset
 
 from typing import Final
 
-from jtqd.daemon.core.bus cimport Bus, bus_of
-from jtqd.daemon.core.contact cimport ContactWatch
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
-from jtqd.drivers.frame_socket cimport Frame
-from jtqd.daemon.core.intake cimport Input, Intake
-from jtqd.daemon.core.joint cimport JointCycle
-from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.record cimport CycleFrames, Header, RecordRing
+from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, NOT_HEARD, Input, Intake
+from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
+from jtqd.daemon.core.record cimport CycleFrames, Header, JointBlock, RecordRing
 from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
-from jtqd.daemon.core.snapshot cimport SnapshotWriter
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared import snapshot as shared
 from jtqd.daemon.shared.counters import word_of
-from jtqd.drivers import nmt, own_objects
+from jtqd.drivers import frame_socket, nmt, own_objects
+from jtqd.drivers.frame import worst_case_bits
+from jtqd.drivers.frame_socket cimport Frame, FrameSocket
 from jtqd.drivers.frame_socket import BusDown
 from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator import status as st
 
 STARTING_CYCLES: Final = 20
 """Cycles at the start that are published as "starting": the arrival bands and the filters see their first inputs."""
-_SNAPSHOT_EVERY: Final = 8
-_CLOCK_READING_NS: Final = 20_000
-"""Both clocks are read within this, or their difference is not taken."""
 CYCLE_ENDED: Final = 0
 """`Cycle.go_on`: the last slot's cycle has ended, and the grid stands at that slot."""
 SLOT_PASSED: Final = 1
 """... the last slot passed without a cycle, and the grid stands at the next one."""
 RUN_ENDED: Final = 2
 """... no cycle begins any more."""
-_LAST_NUMBER: Final = 240
-"""Of the cycles of a SYNC without counter, in estimate PDO and record."""
-_LAST_CALL_NS: Final = 100_000
-"""Before the next SYNC; nobody waits for inputs from here on."""
 
-cdef int64_t FIRST_CYCLES = STARTING_CYCLES, SNAPSHOT_EVERY = _SNAPSHOT_EVERY
-cdef int64_t CLOCK_READING_NS = _CLOCK_READING_NS, LAST_CALL_NS = _LAST_CALL_NS
+cdef int64_t FIRST_CYCLES = STARTING_CYCLES, SNAPSHOT_EVERY = 8
+cdef int64_t CLOCK_READING_NS = 20_000  # both clocks are read within this, or their difference is not taken
+cdef int64_t LAST_CALL_NS = 100_000  # before the next SYNC: nobody waits for inputs from here on
+cdef int LAST_NUMBER = 240  # of the cycles of a SYNC without counter, in estimate PDO and record
 cdef int ENDED = CYCLE_ENDED, PASSED = SLOT_PASSED, OVER = RUN_ENDED
 cdef uint32_t COMPLETE = cr.FLAG_COMPLETE, PUBLISHED = cr.FLAG_PUBLISHED, WITHDRAWN = cr.FLAG_WITHDRAWN
 cdef uint32_t BEFORE_NEXT_SYNC = cr.FLAG_BEFORE_NEXT_SYNC, SYNC_CONFIRMED = cr.FLAG_SYNC_CONFIRMED
 cdef uint32_t RESET = cr.FLAG_RESET
 cdef uint32_t SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint8_t OPERATIONAL = nmt.OPERATIONAL
-cdef int STALE = st.STALE, OFF = st.OFF, LAST_NUMBER = _LAST_NUMBER
+cdef int STALE = st.STALE, OFF = st.OFF
 cdef int BUS_ERRORS = word_of("bus_errors"), OVERRUNS = word_of("overruns")
 cdef int LATCH_RESETS = word_of("latch_resets"), CONTACTS = word_of("contacts")
 cdef int COUNTED[4]  # of the record: what came in its cycle
@@ -69,8 +63,50 @@ ESTIMATE[:] = own_objects.ESTIMATE_BASES
 cdef uint32_t CONTACT[MOST_ESTIMATES]
 CONTACT[:] = own_objects.CONTACT_BASES
 
+cdef int CAPACITY = frame_socket.CAPACITY
+
 clock = Clock()
 """Of all cycles that are made from here on; tests replace it."""
+
+
+cdef class PythonSocket(FrameSocket):
+    """What takes the place of a frame socket in a test, through its Python methods."""
+
+    cdef int take(self) except -1:
+        """Copy what `receive` gives."""
+        cdef int count = self.sock.receive(), n
+        cdef const unsigned char[::1] frames
+        self.count_dropped()
+        if count > CAPACITY:
+            raise ValueError(f"found {count} frames at once, expected at most {CAPACITY}")
+        if count:
+            frames = self.sock.frames
+            memcpy(self.frames_c, &frames[0], count * sizeof(Frame))
+            stamps_ns, own = self.sock.stamps_ns, self.sock.own
+            for n in range(count):
+                self.stamps_c[n], self.own_c[n] = stamps_ns[n], own[n]
+        return count
+
+    cdef bint put(self, const Frame *frame) except -1:
+        """As `send`."""
+        taken = self.sock.send((<const char *> frame)[:sizeof(Frame)])
+        self.count_dropped()
+        return taken
+
+    cdef bint ready(self, int64_t timeout_ns) except -1:
+        """As `wait`."""
+        return self.sock.wait(timeout_ns * 1e-9)
+
+    cdef int count_dropped(self) except -1:
+        self.tx_dropped, self.rx_dropped = self.sock.tx_dropped, self.sock.rx_dropped
+        return 0
+
+
+cdef FrameSocket socket_of(object socket):
+    """Return a frame socket as it is, and what takes its place in a test as one."""
+    if isinstance(socket, FrameSocket):
+        return socket
+    return PythonSocket(socket, "test", unix=False, receive_own=True, error_frames=False, capacity=CAPACITY)
 
 
 cdef Frame _frame(uint32_t can_id, int length) noexcept nogil:
@@ -79,6 +115,230 @@ cdef Frame _frame(uint32_t can_id, int length) noexcept nogil:
     memset(&frame, 0, sizeof(Frame))
     frame.id, frame.length = can_id, length
     return frame
+
+
+# Snapshot -------------------------------------------------------------------------------------------------------------
+
+cdef extern from *:
+    """
+    static inline void begin_write(uint64_t *sequence) {
+        __atomic_store_n(sequence, *sequence | 1, __ATOMIC_RELAXED);
+        __atomic_thread_fence(__ATOMIC_RELEASE);
+    }
+    static inline void end_write(uint64_t *sequence) {
+        __atomic_store_n(sequence, *sequence + 1, __ATOMIC_RELEASE);
+    }
+    """
+    void begin_write(uint64_t *sequence) noexcept nogil
+    void end_write(uint64_t *sequence) noexcept nogil
+
+cdef int CYCLES = word_of("cycles"), MISSED = word_of("missed"), CYCLES_COMPLETE = word_of("complete")
+cdef int CYCLES_PUBLISHED = word_of("published"), PUBLISHED_LATE = word_of("published_late")
+cdef int WORK_MAX = word_of("work_max_ns"), LATE_MAX = word_of("late_max_ns"), BITS = word_of("bits_worst_case")
+cdef int TX_DROPPED = word_of("tx_dropped"), RX_DROPPED = word_of("rx_dropped")
+
+cdef int64_t WORK_BIN_NS = shared.WORK_BIN_NS, LATE_BIN_NS = shared.LATE_BIN_NS
+cdef int64_t LAST_WORK_BIN = shared.WORK_BINS - 1, LAST_LATE_BIN = shared.LATE_BINS - 1
+cdef int CODES = shared.STATUS_CODES
+
+if (sizeof(InputBlock), sizeof(EstimateBlock), sizeof(LearnedBlock), NODES) != (
+    shared.INPUT.size,
+    shared.ESTIMATE_SIZE,
+    shared.LEARNED.size,
+    shared.MAX_NODE,
+):
+    raise ImportError("the snapshot has another layout than the one that is compiled in")
+
+
+cdef ViewBlock _view(const JointState *joint) noexcept nogil:
+    """Return a joint's `JointView`."""
+    cdef const JointBlock *s = &joint.sample
+    return ViewBlock(
+        s.torque_nm,
+        s.sigma_nm,
+        s.tob_nm,
+        s.physics_nm,
+        s.network_nm,
+        s.sensor_torque_nm,
+        s.statusword,
+        s.status,
+        s.sensor_status,
+        s.input_flags,
+        joint.latched,
+        s.reference_nm,
+        s.age_ms,
+        s.torque_rate_nm_s,
+        s.contact_nm,
+    )
+
+
+cdef MeasuredBlock _measured(const JointState *joint) noexcept nogil:
+    """Return a joint's `Measured`."""
+    cdef const JointBlock *s = &joint.sample
+    return MeasuredBlock(
+        s.current_a,
+        s.motor_position_rad,
+        s.motor_velocity_rad_s,
+        s.link_position_rad,
+        s.sensor_torque_nm,
+        s.temperature_c,
+    )
+
+
+cdef class SnapshotWriter:
+    """Writes into a `Snapshot`.
+
+    Args:
+        snapshot: the memory.
+        intake: counts frames and inputs, from here on in the snapshot's words.
+        socket: counts the frames that it drops.
+    """
+
+    def __init__(self, snapshot, Intake intake, socket):
+        cdef int n
+        if intake.count > shared.MAX_INPUTS:
+            raise ValueError(f"found {intake.count} inputs, the snapshot has room for {shared.MAX_INPUTS}")
+        self.intake = intake
+        self.bus = socket_of(socket)
+        self.counters = intake.counters = snapshot.counters
+        self.work, self.late, self.status_cycles = snapshot.work, snapshot.late, snapshot.status_cycles
+        self.inputs, self.node_heard, self.node_states = snapshot.inputs, snapshot.node_heard, snapshot.node_states
+        self.unconfigured, self.restarts, self.learned = snapshot.unconfigured, snapshot.restarts, snapshot.learned
+        self.sequence, self.estimate, self.joints = snapshot.sequence, snapshot.estimate, snapshot.joints
+        for n in range(MOST_JOINTS):
+            self.status[n] = -1
+        self.bits_complete = worst_case_bits(1) + (self.joints + 1) // 2 * worst_case_bits(8)
+        for n in range(intake.count):
+            self.bits_of[n] = worst_case_bits(intake.inputs[n].length)
+            self.bits_complete += self.bits_of[n]
+
+    cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil:
+        """Count one cycle, with the flags of its record; times in ns, `missed` slots so far."""
+        cdef int64_t bits = self.bits_complete, late = max(late_ns, 0)
+        cdef int n
+        self.counters[CYCLES] += 1
+        self.counters[MISSED] = missed
+        if flags & COMPLETE:
+            self.counters[CYCLES_COMPLETE] += 1
+        else:
+            for n in range(self.intake.count):
+                if not self.intake.inputs[n].fresh:
+                    bits -= self.bits_of[n]
+        if flags & PUBLISHED:
+            self.counters[CYCLES_PUBLISHED] += 1
+            if not flags & BEFORE_NEXT_SYNC:
+                self.counters[PUBLISHED_LATE] += 1
+        self.bits += bits
+        self.counters[WORK_MAX] = max(self.counters[WORK_MAX], <uint64_t> work_ns)
+        self.counters[LATE_MAX] = max(self.counters[LATE_MAX], <uint64_t> late)
+        self.work[min(work_ns // WORK_BIN_NS, LAST_WORK_BIN)] += 1
+        self.late[min(late // LATE_BIN_NS, LAST_LATE_BIN)] += 1
+
+    cdef void count_status(self, int joint, int status) noexcept nogil:
+        """Count the published status of one joint in one cycle."""
+        self.status_cycles[CODES * joint + status] += 1
+
+    cdef void begin(self) noexcept nogil:
+        """Mark the snapshot as inconsistent until `end` (inputs included)."""
+        begin_write(&self.sequence[0])
+
+    cpdef int flush(self, int64_t missed, int64_t sync_ns) except -1:
+        """Copy inputs, nodes and the counts of other objects; `sync_ns` is the cycle's SYNC (CLOCK_MONOTONIC)."""
+        self.flush_inputs(sync_ns)
+        self.counters[MISSED] = missed
+        self.counters[BITS] = self.bits  # not in every cycle: readers divide it by the time between two snapshots
+        self.counters[TX_DROPPED] = self.bus.tx_dropped
+        self.counters[RX_DROPPED] = self.bus.rx_dropped
+        self.flush_nodes()
+        return 0
+
+    cdef void flush_nodes(self) noexcept nogil:
+        """Copy heartbeats, restarts, and the nodes that wait for their configuration."""
+        cdef int node
+        for node in range(NODES):
+            if self.intake.nodes.unconfigured[node]:
+                self.unconfigured[node] = 1
+            if self.intake.nodes.state[node] == NOT_HEARD:
+                continue
+            self.node_states[node] = self.intake.nodes.state[node]
+            self.node_heard[node] = self.intake.nodes.heard_ns[node]
+            if self.intake.nodes.restarts[node]:
+                self.restarts[node] = self.intake.nodes.restarts[node]
+
+    cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil:
+        """Write one `InputView` for each PDO."""
+        cdef InputBlock *blocks = <InputBlock *> &self.inputs[0]
+        cdef Input *state
+        cdef int n
+        for n in range(self.intake.count):
+            state = &self.intake.inputs[n]
+            if state.fresh:
+                self.used_ns[n] = sync_ns
+                self.delay_ns[n] = state.stamp_ns - self.intake.sync_stamp_ns
+            blocks[n] = InputBlock(
+                self.used_ns[n],
+                self.delay_ns[n],
+                state.band_low_ns,
+                state.band_high_ns,
+                state.late,
+                state.lost,
+                state.duplicates,
+                state.rejected,
+                state.missed,
+                state.in_a_row,
+                state.too_short,
+                state.too_long,
+            )
+
+    cdef void write_learned(self, int number, JointCycle joint) noexcept nogil:
+        """Write what the estimator of joint `number`, from 0 on, has learned, and its state; between `begin` and `end`."""
+        cdef LearnedBlock *block = &(<LearnedBlock *> &self.learned[0])[number]
+        cdef size_t size = 0
+        cdef const void *state = joint.learned(&block.zeros, &size)
+        block.size = 0
+        if state != NULL and size <= sizeof(block.state):
+            block.size = size
+            memcpy(block.state, state, size)
+
+    cdef void end(
+        self,
+        int64_t cycle,
+        int sync_counter,
+        int64_t sync_realtime_ns,
+        int64_t sync_monotonic_ns,
+        JointState **joints,
+    ) noexcept nogil:
+        """Write the last estimate; the snapshot is consistent again."""
+        cdef EstimateBlock *block = <EstimateBlock *> &self.estimate[0]
+        cdef int n
+        block.cycle, block.sync_counter = cycle, sync_counter
+        block.sync_realtime_ns, block.sync_monotonic_ns = sync_realtime_ns, sync_monotonic_ns
+        for n in range(self.joints):
+            if joints[n].sample.status != self.status[n]:
+                self.status[n], self.since[n] = joints[n].sample.status, cycle
+            block.status_since[n] = self.since[n]
+            block.joints[n], block.measured[n] = _view(joints[n]), _measured(joints[n])
+        end_write(&self.sequence[0])
+
+
+def frame_counts(Intake intake):
+    """Return late, lost, duplicate and rejected frames by PDO name; for a temperature, how often it became unknown."""
+    counts = {
+        pdo.name: {
+            "late": intake.inputs[n].late,
+            "lost": intake.inputs[n].lost,
+            "duplicate": intake.inputs[n].duplicates,
+            "rejected": intake.inputs[n].rejected,
+        }
+        for n, pdo in enumerate(intake.pdos)
+    }
+    for n, each in enumerate(intake.temperatures):
+        lost, rejected = intake.celsius[n].lost, intake.celsius[n].rejected
+        counts[each.name] = {"late": 0, "lost": lost, "duplicate": 0, "rejected": rejected}
+    return counts
+
+
+# The cycle ------------------------------------------------------------------------------------------------------------
 
 
 class ConfiguredNodes:
@@ -183,7 +443,7 @@ cdef class Cycle:
         for n in range(self.count):
             joint = self.joints[n]
             self.at[n], self.states[n] = <PyObject *> joint, &joint.now
-        self.clock, self.bus = clock, bus_of(socket)
+        self.clock, self.bus = clock, socket_of(socket)
         self.records, self.frames = RecordRing(ring, self.count), CycleFrames(self.count)
         self.frames.begin(self.records.slot())
         self.budget, self.wake_up = NetworkBudget(self.count), WakeUp(wait_ns, deadline_ns)
@@ -247,9 +507,9 @@ cdef class Cycle:
         count = self.receive()
         if count:
             for n in range(count):
-                intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
+                intake.drain_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
             intake.drained()
-            self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
+            self.frames.keep(self.bus.frames_c, self.bus.stamps_c, count)
         self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
         intake.begin(self.counter)
         before_ns = self.clock.monotonic()
@@ -276,12 +536,12 @@ cdef class Cycle:
             count = self.receive()
             if count:
                 for n in range(count):
-                    intake.take_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
-                self.frames.keep(self.bus.frames, self.bus.stamps_ns, count)
+                    intake.take_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
+                self.frames.keep(self.bus.frames_c, self.bus.stamps_c, count)
                 if intake.missing == 0:
                     break
             left_ns = deadline_ns - self.clock.monotonic()
-            if left_ns <= 0 or not self.bus.wait(left_ns):
+            if left_ns <= 0 or not self.bus.ready(left_ns):
                 break
         if intake.close():
             self.flags |= COMPLETE
@@ -371,8 +631,8 @@ cdef class Cycle:
         count = self.receive()
         if count:
             for n in range(count):
-                intake.drain_frame(&self.bus.frames[n], self.bus.stamps_ns[n], self.bus.own[n])
-                self.keep_for_next(&self.bus.frames[n], self.bus.stamps_ns[n])
+                intake.drain_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
+                self.keep_for_next(&self.bus.frames_c[n], self.bus.stamps_c[n])
             intake.drained()
         if not intake.gap_wanted:
             return False

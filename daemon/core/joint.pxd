@@ -1,11 +1,12 @@
 """One joint in the loop; joint.pyx."""
 
-from libc.stdint cimport int64_t
+from libc.stdint cimport int64_t, uint8_t
 
-from jtqd.daemon.core.estimate_pdo cimport Published
+from jtqd.daemon.core.estimate_pdo cimport ContactField, Published
 from jtqd.daemon.core.intake cimport Input, Intake
-from jtqd.daemon.core.record cimport JointBlock
+from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.daemon.core.status cimport JointRules
+from jtqd.estimator.contact cimport ContactLaw, ContactState
 from jtqd.estimator.sample cimport Estimator, Learned
 
 cdef enum:
@@ -63,3 +64,16 @@ cdef class JointCycle:
     cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil
     cdef bint derive(self, int64_t sync_ns) noexcept nogil
     cpdef void withdraw(self, int status) noexcept nogil
+
+cdef class ContactWatch:
+    cdef readonly int count
+    cdef readonly bint sends
+    cdef bint opposed
+    cdef ContactLaw law[MOST_JOINTS]
+    cdef ContactState state[MOST_JOINTS]
+    cdef ContactField fields[MOST_JOINTS]
+    cdef int begun  # contacts that began in the last cycle
+    cdef void watch(self, JointState **joints) noexcept nogil
+    cdef void report(self, JointState *joint, int n, double contact_nm, int state) noexcept nogil
+    cdef void withdraw(self, JointState **joints) noexcept nogil
+    cdef void encode(self, uint8_t *data, int pair, int sequence) noexcept nogil

@@ -1,10 +1,10 @@
 from collections.abc import Sequence
 from typing import Final
 
+from jtqd.daemon.config import Config
 from jtqd.daemon.core.input_pdos import JointInputs
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.status import JointCounts
+from jtqd.daemon.core.status import JointCounts, JointSafety
 from jtqd.estimator.methods import AnyEstimator
 
 STAMP_ACCURACY_NS: Final[int]
@@ -38,3 +38,19 @@ class JointCycle:
     def rescale(self, node_id: int, factors: Sequence[float]) -> None: ...
     def withdraw(self, status: int) -> None: ...
     def observe(self, sync_ns: int, starting: bool, network_wanted: bool) -> None: ...
+
+class ContactWatch:
+    def __init__(
+        self,
+        thresholds_nm: Sequence[float],
+        *,
+        opposed: bool = False,
+        sends: bool = True,
+        period_s: float = 0.001,
+    ) -> None: ...
+    @property
+    def count(self) -> int: ...
+    @property
+    def sends(self) -> bool: ...
+
+def contacts_of(config: Config) -> ContactWatch | None: ...

@@ -1,4 +1,4 @@
-"""One joint in the loop: counts of this cycle into SI units, estimate, status, its fields of PDO and record.
+"""One joint in the loop: counts of this cycle into SI units, estimate, status, its fields of PDO and record; contacts.
 
 Quantities that a drive may not send:
 
@@ -10,19 +10,34 @@ Quantities that a drive may not send:
 
 cimport cython
 from libc.math cimport INFINITY, NAN, isnan
-from libc.stdint cimport int64_t
+from libc.stdint cimport int64_t, uint8_t
 
 from dataclasses import replace
 from typing import Final
 
-from jtqd.estimator.block cimport copied
-from jtqd.daemon.core.estimate_pdo cimport Published, field_of, has_torque
+from jtqd.daemon.core.estimate_pdo cimport (
+    NO_JOINT,
+    ContactField,
+    contact_field_of,
+    encode_contact_into,
+    field_of,
+    has_torque,
+)
 from jtqd.daemon.core.intake cimport Input, Intake
-from jtqd.daemon.core.joint_safety import JointSafety
-from jtqd.daemon.core.record cimport JointBlock
+from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.daemon.core.status cimport JointRules
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator import status as st
+from jtqd.estimator.block cimport copied
+from jtqd.estimator.contact cimport (
+    CONTACT_PRESENT,
+    CONTACT_UNKNOWN,
+    ContactState,
+    detect_contact,
+    fill_contact,
+    restart_contact,
+)
 from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
 from jtqd.estimator.sample import PythonEstimator
 
@@ -308,3 +323,89 @@ cdef const int64_t *_number_at(Intake intake, place) except NULL:
     """Return where a number lies when its PDO has come (`drivers.drive.Place`); raises ValueError without such an entry."""
     cdef Input *state = _input(intake, place.pdo, place.entry + 1)
     return &state.values[<int> place.entry]
+
+
+# Contacts of all joints ------------------------------------------------------------------------------------------------
+#
+# The rules of one detector stand in `jtqd.estimator.contact`. Joints that turn one link against each other (`opposed`: 1 and
+# 2, 3 and 4) share a detector, in the frame of the first; alone, each has its own.
+
+cdef int KNOWN = cr.FLAG_CONTACT_KNOWN, THERE = cr.FLAG_CONTACT
+
+
+cdef class ContactWatch:
+    """Detectors of a bus.
+
+    Args:
+        thresholds_nm: of each joint.
+        opposed: joints 1 and 2, and 3 and 4, turn one link against each other; the smaller threshold of the two counts.
+        sends: the contact PDOs are sent.
+        period_s: of SYNC.
+
+    Raises:
+        ValueError: opposed joints that are not in twos; a threshold or period that is none.
+    """
+
+    def __init__(self, thresholds_nm, *, bint opposed=False, bint sends=True, double period_s=0.001):
+        cdef int n
+        self.count, self.opposed, self.sends = len(thresholds_nm), opposed, sends
+        if not 1 <= self.count <= MOST_JOINTS or (opposed and self.count % 2):
+            raise ValueError(f"found {self.count} joints, expected 1 to {MOST_JOINTS}, and 2 or 4 that are opposed")
+        for n in range(self.count):
+            least = min(thresholds_nm[n : n + 2]) if opposed and n % 2 == 0 else thresholds_nm[n]
+            fill_contact(&self.law[n], least, period_s)
+        for n in range(MOST_JOINTS):
+            restart_contact(&self.state[n])
+            self.fields[n] = NO_JOINT
+
+    cdef void watch(self, JointState **joints) noexcept nogil:
+        """Take the loads of a cycle; sets the joints' fields of the record."""
+        cdef int n = 0, before
+        cdef ContactState *s
+        self.begun = 0
+        while n < self.count:
+            s = &self.state[n]
+            before = s.code
+            if self.opposed:
+                detect_contact(
+                    &self.law[n], s, joints[n + 1].load_nm - joints[n].load_nm, joints[n].sample.motor_position_rad
+                )
+                self.report(joints[n + 1], n + 1, -s.residual_nm, s.code)
+            else:
+                detect_contact(&self.law[n], s, -joints[n].load_nm, joints[n].sample.motor_position_rad)
+            self.report(joints[n], n, s.residual_nm, s.code)
+            if s.code == CONTACT_PRESENT and before != CONTACT_PRESENT:  # a receiver stops on it, whatever was known before
+                self.begun += 1
+            n += 2 if self.opposed else 1
+
+    cdef void report(self, JointState *joint, int n, double contact_nm, int state) noexcept nogil:
+        """Write one joint's fields of the record and of the PDO."""
+        cdef JointBlock *record = &joint.sample
+        record.contact_nm = contact_nm
+        record.input_flags &= ~(KNOWN | THERE)
+        if state != CONTACT_UNKNOWN:
+            record.input_flags |= KNOWN | THERE if state == CONTACT_PRESENT else KNOWN
+        self.fields[n] = contact_field_of(record.torque_rate_nm_s, contact_nm, state)
+
+    cdef void withdraw(self, JointState **joints) noexcept nogil:
+        """Of a cycle whose answer came too late: nothing is known."""
+        cdef int n
+        for n in range(self.count):
+            joints[n].sample.torque_rate_nm_s = NAN
+            self.report(joints[n], n, NAN, CONTACT_UNKNOWN)
+
+    cdef void encode(self, uint8_t *data, int pair, int sequence) noexcept nogil:
+        """Write the four bytes of joints 2 pair + 1 and 2 pair + 2."""
+        cdef const ContactField *second = &self.fields[2 * pair + 1] if 2 * pair + 1 < self.count else &NO_JOINT
+        encode_contact_into(data, &self.fields[2 * pair], second, sequence)
+
+
+def contacts_of(config):
+    """Return the detectors of contacts as configured; None for none."""
+    contact = config.contact
+    if contact is None:
+        return None
+    thresholds = [contact.threshold_of(joint.joint.rated_torque_nm) for joint in config.joints]
+    return ContactWatch(
+        thresholds, opposed=contact.opposed, sends=contact.pdo, period_s=config.period_ns * 1e-9
+    )

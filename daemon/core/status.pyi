@@ -1,17 +1,14 @@
 from typing import Any, Final, Protocol
 
-from jtqd.daemon.config import SafetySettings
-from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.config import Config, SafetySettings
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.plausibility import Plausibility
+from jtqd.estimator.settings import EstimatorSettings
 
 NEEDED: Final[dict[int, int]]
 
 class JointCounts(Protocol):
-    """Where a joint counts: the loop's snapshot, or two arrays in a replay.
-
-    Attributes:
-        counters: unsigned 64-bit words in the order of `jtqd.daemon.shared.counters.COUNTERS`.
-        errors: sum of squared errors and number of samples of each joint, float64.
-    """
+    """Where a joint counts: the loop's snapshot, or two arrays of its layout in a replay."""
 
     counters: Any
     errors: Any
@@ -25,6 +22,19 @@ class JointStatus:
     def update(self, status: int, found: int) -> int: ...
     def late(self) -> int: ...
     def reset_latch(self) -> bool: ...
+
+class JointSafety:
+    plausibility: Final[Plausibility | None]
+    torque_limit_nm: Final[float]
+    def __init__(
+        self,
+        settings: SafetySettings | None = None,
+        estimator: EstimatorSettings | None = None,
+        joint: Joint | None = None,
+        period_ns: int = 1_000_000,
+    ) -> None: ...
+
+def safety_of(config: Config) -> list[JointSafety]: ...
 
 class JointRules:
     def __init__(self, number: int, tally: JointCounts, safety: JointSafety, with_network: bool) -> None: ...

@@ -2,7 +2,7 @@
 
     estimate and inputs  ->  faults of this cycle  ->  status with hysteresis and latches  ->  status and flags
 
-`JointSafety` (`joint_safety.py`) holds limits and checks, `JointStatus` the hysteresis, `JointTally` counts, and `JointRules` applies the rules
+`JointSafety` holds limits and checks, `JointStatus` the hysteresis, `JointTally` counts, and `JointRules` applies the rules
 of docs/safety.md to one cycle after the other: a number leaves only through `JointRules.judge`. What it needs beside the
 estimate comes from the log again: the inputs, `cr.FLAG_WITHDRAWN` (`late`), `cr.FLAG_RESET` (`reset_latch`),
 `FLAG_NETWORK_SKIPPED`. So a replay gives the same.
@@ -29,6 +29,7 @@ from libc.stdint cimport int8_t, int64_t, uint64_t
 
 from typing import Final
 
+from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core.estimate_pdo cimport has_torque
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
@@ -39,28 +40,12 @@ from jtqd.estimator import status as st
 from jtqd.estimator.observer cimport follow_reference, restart_reference
 from jtqd.estimator.plausibility cimport Plausibility
 from jtqd.estimator.sample cimport Sample, Values
+from jtqd.estimator.settings import bandwidth_of
 
-NEEDED: Final = {
-    st.DEGRADED: 100,
-    st.STARTING: 1,
-    st.OFF: 20,
-    st.STALE: 5,
-    st.INVALID: 50,
-    st.DRIVE_FAULT: 100,
-}
+NEEDED: Final = {st.DEGRADED: 100, st.STARTING: 1, st.OFF: 20, st.STALE: 5, st.INVALID: 50, st.DRIVE_FAULT: 100}
 """Cycles in a row that must be better before this status is left; the last of them is published already."""
-RELAPSE: Final = 10
-MOST: Final = 4
-
 _ORDER: Final = (
-    st.VALID,
-    st.STANDSTILL,
-    st.DEGRADED,
-    st.STARTING,
-    st.OFF,
-    st.STALE,
-    st.INVALID,
-    st.DRIVE_FAULT,
+    st.VALID, st.STANDSTILL, st.DEGRADED, st.STARTING, st.OFF, st.STALE, st.INVALID, st.DRIVE_FAULT
 )
 
 cdef enum:
@@ -77,7 +62,7 @@ cdef int WORST = len(_ORDER)
 cdef int STANDS = RANKS[st.STANDSTILL]
 cdef int WITH_NUMBER = RANKS[st.DEGRADED]  # up to this rank a torque is published
 cdef int RANK_INVALID = RANKS[st.INVALID]
-cdef int64_t RELAPSE_TIMES = RELAPSE, MOST_TIMES = MOST
+cdef int64_t RELAPSE = 10, MOST = 4
 
 cdef int FAULT_NOT_FINITE = faults.NOT_FINITE, FAULT_OUT_OF_RANGE = faults.OUT_OF_RANGE
 cdef int FAULT_DEVIATION = faults.DEVIATION, FAULT_DRIVE = faults.DRIVE_FAULT, FAULT_STALE = faults.STALE
@@ -192,13 +177,13 @@ cdef class JointStatus:
     cdef void fall(self, int status) noexcept nogil:
         """Change to a worse status."""
         if _rank(self.now.held) <= WITH_NUMBER < _rank(status):
-            self.now.factor = min(2 * self.now.factor, MOST_TIMES) if self.now.since < self.now.window else 1
+            self.now.factor = min(2 * self.now.factor, MOST) if self.now.since < self.now.window else 1
         self.now.needed = self.cycles(status)
 
     cdef void rise(self, int status) noexcept nogil:
         """Change to a better status after the hold time."""
         if _rank(status) <= WITH_NUMBER < _rank(self.now.held):
-            self.now.since, self.now.window = 0, RELAPSE_TIMES * self.now.needed
+            self.now.since, self.now.window = 0, RELAPSE * self.now.needed
         if _rank(status) <= WITH_NUMBER:
             self.now.reasons = 0
         self.now.held, self.now.calm = status, 0
@@ -270,6 +255,51 @@ cdef class JointTally:
         self.errors[3 * self.number] += aligned_nm * aligned_nm
         self.errors[3 * self.number + 1] += now_nm * now_nm
         self.errors[3 * self.number + 2] += 1.0
+
+
+# Limits and checks of a joint ------------------------------------------------------------------------------------------
+
+TORQUE_RANGE_NM: Final = 327.67
+"""Of the field of the estimate PDO."""
+
+
+class JointSafety:
+    """Limits and checks of one joint, for the loop or a replay of its log; without a joint file those that need none.
+
+    Attributes:
+        settings: as configured (`SafetySettings`).
+        plausibility: checks of its inputs, None for none.
+        torque_limit_nm: a torque beyond it is never published.
+        network_limit_nm: a network further from physics than this has been dropped by the estimator.
+        deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
+        sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
+        bandwidth_rad_s: that makes the estimate's age; 0 without a joint: its sensor is taken as it is.
+        max_gap_s: that a sensor of the same age bridges.
+    """
+
+    def __init__(self, settings=None, estimator=None, joint=None, period_ns=1_000_000):
+        self.settings = settings or SafetySettings()
+        self.plausibility = None
+        self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, INFINITY
+        self.deviation_cycles, self.sensor_zero_nm = 0, 0.0
+        self.bandwidth_rad_s, self.max_gap_s = 0.0, 0.05
+        if self.settings.latch & faults.DEVIATION:
+            self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
+        if joint is None or estimator is None:
+            return
+        rated_nm = joint.rated_torque_nm
+        self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator), estimator.max_gap_s
+        self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * rated_nm)
+        self.network_limit_nm = estimator.network_limit * rated_nm
+        self.sensor_zero_nm = estimator.sensor_zero_nm(rated_nm)
+        if self.settings.plausibility is not None:
+            limits = self.settings.plausibility
+            self.plausibility = Plausibility(joint, estimator.torque_limit, limits, period_ns * 1e-9)
+
+
+def safety_of(config):
+    """Return the configured limits and checks of each joint."""
+    return [JointSafety(config.safety, config.estimator, each.joint, config.period_ns) for each in config.joints]
 
 
 # The rules of docs/safety.md ------------------------------------------------------------------------------------------

@@ -20,13 +20,12 @@ from types import FrameType
 from typing import Any
 
 from jtqd.daemon.config import Config, JointConfig, as_booted, load_config
-from jtqd.daemon.core.contact import contacts_of
-from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle
+from jtqd.daemon.core.cycle import RUN_ENDED, SLOT_PASSED, Cycle, frame_counts
 from jtqd.daemon.core.input_pdos import input_pdos, joint_inputs, joint_temperatures
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint_safety import safety_of
+from jtqd.daemon.core.joint import contacts_of
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.core.snapshot import frame_counts
+from jtqd.daemon.core.status import safety_of
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.cycle_record import layout_of

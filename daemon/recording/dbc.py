@@ -9,8 +9,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from jtqd.daemon.core.contact_pdo import CODE_NAMES, NO_RATE, RATE_UNIT_NM_S
-from jtqd.daemon.core.estimate_pdo import NO_TORQUE, SIGMA_UNIT_NM, SIGMA_UNKNOWN, TORQUE_UNIT_NM
+from jtqd.daemon.core.estimate_pdo import (
+    CODE_NAMES,
+    NO_RATE,
+    NO_TORQUE,
+    RATE_UNIT_NM_S,
+    SIGMA_UNIT_NM,
+    SIGMA_UNKNOWN,
+    TORQUE_UNIT_NM,
+)
 from jtqd.drivers.drive import NOT_MEASURED, drive_tpdo3, places
 from jtqd.drivers.emcy import EMCY_BASE
 from jtqd.drivers.nmt import HEARTBEAT_BASE, STATES

@@ -3,9 +3,8 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from jtqd.daemon.core.contact import ContactWatch
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint import ContactWatch, JointCycle
 from jtqd.estimator.arrays import BoolArray, CodeArray, FloatArray, IntegerArray
 
 Codes = npt.NDArray[np.intc]

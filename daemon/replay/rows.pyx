@@ -8,7 +8,7 @@ from libc.string cimport memcpy
 import numpy as np
 
 from jtqd.daemon.core.cycle import STARTING_CYCLES
-from jtqd.daemon.core.contact cimport ContactWatch
+from jtqd.daemon.core.joint cimport ContactWatch
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into, field_of
 from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature
 from jtqd.daemon.core.joint cimport JointCycle, JointState

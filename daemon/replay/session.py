@@ -22,11 +22,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 
-from jtqd.daemon.core.contact import contacts_of
 from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.joint import JointCycle, contacts_of
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.logs import LogError
 from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
 from jtqd.daemon.replay.logged import (

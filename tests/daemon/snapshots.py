@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from jtqd.daemon.core.cycle import SnapshotWriter
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.snapshot import SnapshotWriter
 from jtqd.daemon.shared import snapshot as shared
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
@@ -54,6 +54,9 @@ class EstimateWriter:
 
 class _NoBus:
     tx_dropped = rx_dropped = 0
+
+    def fileno(self) -> int:
+        return -1
 
 
 class IntakeSeen:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.joint_safety import safety_of
+from jtqd.daemon.core.status import safety_of
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.plausibility import FROZEN_RAD

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from examples.receivers import receive_estimate
-from jtqd.daemon.core import contact_pdo, estimate_pdo
+from jtqd.daemon.core import estimate_pdo
 from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.hub import Hub
 from jtqd.estimator import status
@@ -58,8 +58,8 @@ def test_what_the_daemon_encodes_is_decoded():
 
 def pushed(sequence, one=status.CONTACT_NONE, two=status.CONTACT_NONE, rate=640.0, push=2.9):
     """A contact PDO; a push of joint 1 along its positive direction is one of joint 2 against its own."""
-    return contact_pdo.encode(
-        contact_pdo.field(rate, push, one), contact_pdo.field(-rate, -push, two), sequence
+    return estimate_pdo.encode_contact(
+        estimate_pdo.contact_field(rate, push, one), estimate_pdo.contact_field(-rate, -push, two), sequence
     )
 
 
@@ -71,7 +71,7 @@ def test_contacts_that_the_daemon_encodes_are_decoded():
     )
     data = pushed(1, status.CONTACT_OFF, status.CONTACT_UNKNOWN, rate=math.nan)
     assert receive_estimate.decode_contact(data)[:2] == ((None, "off"), (None, "unknown"))
-    assert contact_pdo.CODE_NAMES == receive_estimate.CONTACT
+    assert estimate_pdo.CODE_NAMES == receive_estimate.CONTACT
     with pytest.raises(struct.error):
         receive_estimate.decode_contact(FRAME)
 

@@ -12,12 +12,11 @@ import pytest
 
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import ContactSettings, load_config
-from jtqd.daemon.core.contact import ContactWatch
-from jtqd.daemon.core.contact_pdo import NO_RATE, ContactPdo, decode
 from jtqd.daemon.core.cycle import Cycle
+from jtqd.daemon.core.estimate_pdo import NO_RATE, ContactPdo, decode_contact
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint import JointCycle
+from jtqd.daemon.core.joint import ContactWatch, JointCycle
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
@@ -125,7 +124,7 @@ class Loop:
     def sent(self) -> list[ContactPdo]:
         frames = [each for each in self.socket.sent if int.from_bytes(each[:4], "little") == 0x3A0]
         assert all(each[4] == 4 for each in frames)
-        return [decode(each[8:12]) for each in frames]
+        return [decode_contact(each[8:12]) for each in frames]
 
     def records(self) -> list[bytes]:
         return [bytes(each) for each in self.ring.read(limit=512).records]

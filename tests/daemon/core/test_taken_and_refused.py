@@ -13,9 +13,8 @@ import pytest
 from jtqd.daemon.core.input_pdos import InputPdo, TemperaturePdo
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.record import RecordRing
-from jtqd.daemon.core.status import JointRules
+from jtqd.daemon.core.status import JointRules, JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.ring import Ring

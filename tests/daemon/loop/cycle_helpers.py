@@ -15,8 +15,8 @@ from jtqd.daemon.core import cycle as cycle_module
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, drive_places
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import Grid, PythonClock
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared.ring import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import BusDown
@@ -96,6 +96,9 @@ class ScriptedSocket:
         self.pending: list[tuple[bytes, bool]] = []
         self.syncs = 0
         self.down = False
+
+    def fileno(self) -> int:
+        return -1
 
     def send(self, data: bytes) -> bool:
         if self.down:

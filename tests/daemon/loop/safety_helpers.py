@@ -8,7 +8,7 @@ from math import pi, sin
 from typing import NamedTuple
 
 from jtqd.daemon.config import SafetySettings
-from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.status import JointSafety
 from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped

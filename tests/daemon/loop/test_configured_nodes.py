@@ -13,9 +13,8 @@ import pytest
 
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.config import load_config
-from jtqd.daemon.core.cycle import ConfiguredNodes, Cycle
+from jtqd.daemon.core.cycle import ConfiguredNodes, Cycle, SnapshotWriter
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.snapshot import SnapshotWriter
 from jtqd.daemon.loop.process import Duties
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.estimator.status import INVALID

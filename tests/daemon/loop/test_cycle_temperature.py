@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 
+from jtqd.daemon.core.cycle import frame_counts
 from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.core.input_pdos import TemperaturePdo
-from jtqd.daemon.core.snapshot import frame_counts
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import SnapshotReader

@@ -6,9 +6,9 @@ from collections.abc import Callable
 
 import pytest
 
+from jtqd.daemon.core.cycle import frame_counts
 from jtqd.daemon.core.input_pdos import InputPdo
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.snapshot import frame_counts
 from tests.daemon.snapshots import counted
 
 PAIR = struct.Struct("<ii")

@@ -11,9 +11,9 @@ import yaml
 
 from jtqd.daemon.bus.boot import boot_request, bus_load_of
 from jtqd.daemon.config import load_config
+from jtqd.daemon.core.cycle import frame_counts
 from jtqd.daemon.core.input_pdos import InputPdo, TemperaturePdo, joint_inputs, joint_temperatures
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.snapshot import frame_counts
 from jtqd.drivers.boot import DriveNode
 from jtqd.drivers.drive import Temperature
 from tests.daemon.snapshots import counted

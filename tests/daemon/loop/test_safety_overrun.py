@@ -16,8 +16,8 @@ from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.core.input_pdos import JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED

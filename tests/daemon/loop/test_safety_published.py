@@ -15,7 +15,7 @@ import pytest
 
 from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core.estimate_pdo import decode
-from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.snapshot import SnapshotReader

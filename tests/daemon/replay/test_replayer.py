@@ -14,7 +14,7 @@ from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.input_pdos import JointInputs, TemperaturePdo, drive_places
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.core.joint_safety import JointSafety
+from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.logs import read_topic
 from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets, read_runs
 from jtqd.daemon.replay.rows import CycleRows, fields

@@ -21,9 +21,8 @@ import pytest
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures
 from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.core.joint_safety import JointSafety
 from jtqd.daemon.core.schedule import Grid
-from jtqd.daemon.core.status import NEEDED
+from jtqd.daemon.core.status import NEEDED, JointSafety
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CycleMessages, definitions, zeros_of

@@ -1,9 +1,0 @@
-from jtqd.daemon.core.intake import Intake
-from jtqd.daemon.shared.snapshot import Snapshot
-from jtqd.drivers.frame_socket import FrameSocket
-
-class SnapshotWriter:
-    def __init__(self, snapshot: Snapshot, intake: Intake, socket: FrameSocket) -> None: ...
-    def flush(self, missed: int, sync_ns: int) -> int: ...
-
-def frame_counts(intake: Intake) -> dict[str, dict[str, int]]: ...
