@@ -15,7 +15,7 @@ from typing import Any
 
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler installed, also in the first second.
 from jtqd import __version__
-from jtqd.daemon.live.launch import NEEDED, Address, address, installed
+from jtqd.daemon.live import NEEDED, Address, address, installed
 from jtqd.estimator.command_line import command_parser, seconds
 
 _EXAMPLES = """examples:
@@ -114,8 +114,8 @@ def _run(arguments: argparse.Namespace, stop_requests: list[int]) -> int:
     if arguments.live is not None and not installed():
         print(f"jtqd: {NEEDED}", file=sys.stderr)
         return 1
+    from jtqd.daemon import ros2
     from jtqd.daemon.config import load_config
-    from jtqd.daemon.ros2 import launch as ros2
     from jtqd.daemon.supervisor.process import ConfigurationRefused, Supervisor, SupervisorError
     from jtqd.drivers.frame_socket import BusError
     from jtqd.estimator.errors import ConfigError

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.daemon.config import Config, as_booted
-from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.events import RateLimit
+from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import nmt
 from jtqd.drivers.boot import BootRequest, DriveNode, SensorNode, Sync

@@ -6,6 +6,7 @@ configuration. It runs in the supervisor, so that no SDO client can delay a cycl
 
 from __future__ import annotations
 
+import struct
 import time
 from collections.abc import Callable
 from functools import partial
@@ -14,10 +15,12 @@ from math import inf, isfinite, nan
 from jtqd.daemon.config import Config
 from jtqd.daemon.core import estimate_pdo
 from jtqd.daemon.core.estimate_pdo import field
+from jtqd.daemon.shared.conditions import Change
 from jtqd.daemon.shared.counters import OBJECT_2200, RECORDER_LOST
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader
 from jtqd.drivers.boot_node import signature
+from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, ErrorHistory
 from jtqd.drivers.object_dictionary import ObjectStore, SdoServer
 from jtqd.drivers.own_objects import (
     BUS_FIELDS,
@@ -198,3 +201,118 @@ class OwnNode:
                 of_estimate = name == "age_ms"
                 value = age_ms(joint.joint, config.estimator) if of_estimate else getattr(joint.joint, name)
                 store.set_number(index, sub, value)
+
+
+# Its errors ----
+
+_FIELD = struct.Struct("<HHB")
+_INHIBIT = 0x1015
+_INHIBIT_UNIT_S = 1e-4
+_WAITING = 64
+"""Errors that may wait; there are fewer different ones than that."""
+
+Error = tuple[int, int]
+"""(code, detail)"""
+
+
+class OwnErrors:
+    """Errors of jtqd's own node: those present, 1001h, 1003h, and the EMCY messages, with inhibit time.
+
+    An error is a code with a detail (which PDO, which node). There is one message when it occurs and one when it ends:
+    EMCY 0000h with the register of the errors that are still present. The manufacturer's field holds code and detail:
+
+        bytes 0..1  error code, 0000h for an end
+        byte  2     error register 1001h
+        bytes 3..4  the code that ended (0000h only), else 0
+        bytes 5..6  detail: COB-ID or node-ID
+        byte  7     joints concerned: bit 0 joint 1, bit 1 joint 2
+
+    Between two messages passes the inhibit time 1015h. Errors that occur meanwhile wait, in order; one that has ended before
+    its message could be sent has none, but it is in the history.
+
+    Args:
+        store: its object dictionary; 1001h, 1003h and 1015h are kept and read there.
+    """
+
+    def __init__(self, store: ObjectStore) -> None:
+        self._store = store
+        self._history = ErrorHistory(store)
+        self._present: dict[Error, tuple[int, int]] = {}  # -> register, joints
+        self._sent: set[Error] = set()
+        self._queue: dict[Error, int] = {}  # errors with a message to be sent -> joints
+        self._not_before = -inf
+
+    def follow(self, change: Change) -> None:
+        """Raise or clear the error of a condition; conditions without an EMCY code are ignored."""
+        emcy, subject = change.definition.emcy, change.subject
+        if emcy is None:
+            return
+        detail = emcy.detail + subject.number
+        if change.present:
+            joints = subject.joints if emcy.names_joints else 0
+            self.report(emcy.code, detail, joints=joints, register=emcy.register)
+        else:
+            self.reset(emcy.code, detail)
+
+    @property
+    def present(self) -> list[Error]:
+        """The errors that are present, in order."""
+        return list(self._present)
+
+    def report(self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION) -> bool:
+        """Report an error as present; return False if it is already."""
+        error = code, detail
+        if error in self._present:
+            return False
+        self._present[error] = register | GENERIC, joints
+        self._store.set_number(0x1001, 0, self.register)
+        self._history.push(code | detail << 16)
+        if error in self._sent:
+            self._queue.pop(error, None)  # its end had not been sent: nothing has changed for a receiver
+        elif len(self._queue) < _WAITING:
+            self._queue[error] = joints
+        return True
+
+    def reset(self, code: int, detail: int = 0) -> bool:
+        """Report the end of an error; return False if it was not present."""
+        error = code, detail
+        if error not in self._present:
+            return False
+        _, joints = self._present.pop(error)
+        self._store.set_number(0x1001, 0, self.register)
+        if error in self._sent:
+            self._queue[error] = joints
+        else:
+            self._queue.pop(error, None)
+        return True
+
+    def report_once(
+        self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION
+    ) -> None:
+        """Report a single occurrence, such as a recovery from bus-off: an EMCY message and a history entry."""
+        if self.report(code, detail, joints=joints, register=register):
+            del self._present[code, detail]
+            self._store.set_number(0x1001, 0, self.register)
+
+    def tick(self, now_s: float) -> bytes | None:
+        """Return the EMCY message that is due (8 bytes for COB-ID 080h + node-ID) and count it as sent."""
+        if not self._queue or now_s < self._not_before:
+            return None
+        error, joints = next(iter(self._queue.items()))
+        del self._queue[error]
+        self._not_before = now_s + self._store.number(_INHIBIT) * _INHIBIT_UNIT_S
+        code, detail = error
+        if error in self._sent and error not in self._present:
+            self._sent.discard(error)
+            return EMCY.pack(NO_ERROR, self.register, _FIELD.pack(code, detail & 0xFFFF, joints))
+        if error in self._present:
+            self._sent.add(error)
+        return EMCY.pack(code, self.register | GENERIC, _FIELD.pack(0, detail & 0xFFFF, joints))
+
+    @property
+    def register(self) -> int:
+        """Return the error register 1001h."""
+        register = 0
+        for bits, _ in self._present.values():
+            register |= bits
+        return register

@@ -7,38 +7,166 @@ moves frames, times and lines between the other modules of this package.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jtqd.daemon.bus.boot import ReturningNodes
-from jtqd.daemon.bus.errors import (
-    ACTIVE,
-    BUS_OFF,
-    DOWN,
-    PASSIVE,
-    STATE_NAMES,
-    WARNING,
-    BusChange,
-    BusState,
-    EmcyLog,
-    OwnErrors,
-)
 from jtqd.daemon.bus.nodes import NodeCare, NodeEvent, NodeWatch
-from jtqd.daemon.bus.own_node import OwnNode
+from jtqd.daemon.bus.own_node import OwnErrors, OwnNode
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy, nmt
-from jtqd.drivers.emcy import describe, name_of
+from jtqd.drivers.emcy import (
+    NO_ERROR,
+    Emergency,
+    describe,
+    name_of,
+    parse,
+)
 from jtqd.drivers.filters import CanFilter, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.object_dictionary import ObjectStore
-from jtqd.drivers.own_objects import COMMANDER_NODE
+from jtqd.drivers.own_objects import BUS_FIELDS, COMMANDER_NODE
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
+
+ACTIVE, WARNING, PASSIVE, BUS_OFF, DOWN = 0, 1, 2, 3, 4
+STATE_NAMES = ("error active", "error warning", "error passive", "bus-off", "interface down")
+
+# Classes of the error message, in its identifier
+_TX_TIMEOUT, _LOST_ARBITRATION, _CONTROLLER, _PROTOCOL, _TRANSCEIVER = 0x01, 0x02, 0x04, 0x08, 0x10
+_NO_ACK, _BUS_OFF, _BUS_ERROR, _RESTARTED, _COUNTERS = 0x20, 0x40, 0x80, 0x100, 0x200
+# data[1] of _CONTROLLER
+_OVERFLOW, _WARNING_BITS, _PASSIVE_BITS, _ACTIVE_BIT = 0x03, 0x0C, 0x30, 0x40
+
+
+class BusChange(NamedTuple):
+    """The state has changed from `before` to `after`."""
+
+    before: int
+    after: int
+
+
+class BusState:
+    """State of the CAN controller and counts of one interface, from the error messages of its driver (linux/can/error.h).
+
+    The kernel's driver sends them as frames with CAN_ERR_FLAG to sockets that ask for them: error warning, error passive,
+    bus-off and restart, lost arbitration, missing acknowledge, protocol errors, overruns, and where it can the two error
+    counters. vcan and the unix hub make none, but carry those that a node sends.
+
+    Attributes:
+        counts: by the names of `BUS_FIELDS`.
+    """
+
+    def __init__(self) -> None:
+        self.counts = dict.fromkeys(BUS_FIELDS, 0)
+
+    @property
+    def state(self) -> int:
+        """ACTIVE .. DOWN."""
+        return self.counts["state"]
+
+    def values(self) -> tuple[int, ...]:
+        """Return the values in the order of `BUS_FIELDS`."""
+        return tuple(self.counts.values())
+
+    def error_frame(self, can_id: int, data: bytes) -> BusChange | None:
+        """Take one message of the driver and return the change of state, if any; a short one is read as far as possible."""
+        counts = self.counts
+        data = data.ljust(8, b"\0")
+        for bit, name in (
+            (_TX_TIMEOUT, "tx_timeouts"),
+            (_LOST_ARBITRATION, "arbitration_lost"),
+            (_TRANSCEIVER, "transceiver"),
+            (_NO_ACK, "no_acknowledge"),
+        ):
+            counts[name] += bool(can_id & bit)
+        counts["protocol_errors"] += bool(can_id & (_PROTOCOL | _BUS_ERROR))
+        if can_id & _COUNTERS:
+            counts["tx_errors"], counts["rx_errors"] = data[6], data[7]
+        if can_id & _CONTROLLER and data[1] & _OVERFLOW:
+            counts["overruns"] += 1
+        if can_id & _RESTARTED:
+            counts["restarts"] += 1
+            return self._become(ACTIVE)
+        if can_id & _BUS_OFF:
+            return self._become(BUS_OFF)
+        if can_id & _CONTROLLER:
+            return self._controller(data[1])
+        return None
+
+    def down(self) -> BusChange | None:
+        """Note that the interface is down (ENETDOWN)."""
+        return self._become(DOWN)
+
+    def alive(self) -> BusChange | None:
+        """Note a received frame: the interface is up, and its controller is not bus-off.
+
+        Some drivers report no restart, and an interface that was set up starts error active without a message.
+        """
+        return self._become(ACTIVE) if self.state in (BUS_OFF, DOWN) else None
+
+    def _controller(self, bits: int) -> BusChange | None:
+        if bits & _PASSIVE_BITS:
+            return self._become(PASSIVE)
+        if bits & _WARNING_BITS:
+            return self._become(WARNING)
+        return self._become(ACTIVE) if bits & _ACTIVE_BIT else None
+
+    def _become(self, state: int) -> BusChange | None:
+        before = self.state
+        if state == before:
+            return None
+        self.counts["state"] = state
+        name = {WARNING: "warnings", PASSIVE: "passives", BUS_OFF: "bus_offs", DOWN: "downs"}.get(state)
+        if name is not None:
+            self.counts[name] += 1
+        return BusChange(before, state)
+
+
+class _Node:
+    def __init__(self) -> None:
+        self.last: Emergency | None = None
+        self.count = 0
+        self.limit = RateLimit()
+
+
+class EmcyLog:
+    """EMCY messages of these nodes: the last one of each, how many, and few lines. Those of other nodes are ignored.
+
+    There is a line at once for the first message of a code; repetitions are counted and mentioned in the next line, so that
+    a storm is a few lines in five seconds.
+    """
+
+    def __init__(self, nodes: Iterable[int]) -> None:
+        self._nodes = {node: _Node() for node in nodes}
+
+    def receive(self, node: int, data: bytes, now_s: float) -> str | None:
+        """Take a message and return the line to be logged, if any."""
+        seen = self._nodes.get(node)
+        if seen is None:
+            return None
+        seen.last = emergency = parse(data)
+        seen.count += 1
+        refused = seen.limit.admit((emergency.code, emergency.register), now_s)
+        if refused is None:
+            return None
+        over = emergency.code == NO_ERROR and not emergency.register
+        what = "EMCY 0000h: error reset" if over else describe(emergency)
+        return f"node {node}: {what}" + (f" ({refused} more before)" if refused else "")
+
+    def count_of(self, node: int) -> int:
+        """Return the number of messages of a node."""
+        return self._nodes[node].count
+
+    def last(self, node: int) -> Emergency | None:
+        """Return the last message of a node, or None."""
+        return self._nodes[node].last
+
 
 FILE = "bus.json"
 _HEARTBEATS = ("not watched", "awaited", "heard", "lost")

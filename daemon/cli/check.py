@@ -30,8 +30,8 @@ from jtqd.daemon.cli.traffic import Traffic, drive, leave, listen, silent
 from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
-from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.conditions import read_conditions
+from jtqd.daemon.shared.processes import Child, ChildError
 from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.estimator.command_line import command_parser, seconds

@@ -40,7 +40,7 @@ from jtqd.daemon.shared.events import ERROR, WARNING, Notice
 from jtqd.daemon.shared.reasons import contact_line, contact_of, drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
-from jtqd.daemon.supervisor.table import COLOURS, bus_load, first_that_fits, plain_line
+from jtqd.daemon.supervisor.display import COLOURS, bus_load, first_that_fits, plain_line
 from jtqd.drivers import nmt
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.status import NAMES, PUBLISHED

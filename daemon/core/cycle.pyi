@@ -6,7 +6,7 @@ from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import ContactWatch, JointCycle
 from jtqd.daemon.core.schedule import Clock, Grid
 from jtqd.daemon.core.status import JointSafety
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import FrameSocket
 from jtqd.estimator.methods import AnyEstimator

@@ -1,4 +1,4 @@
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
 
 class RecordRing:
     def __init__(self, ring: Ring, joints: int = 2) -> None: ...

@@ -12,7 +12,6 @@ import sys
 from jtqd.estimator.block cimport copied
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared import ring as shared_ring
 
 cdef extern from *:
     """
@@ -53,13 +52,13 @@ cdef Layout _layout(int joints) except *:
 
 
 cdef class RecordRing:
-    """The ring's memory (`jtqd.daemon.shared.ring.Ring`): the count of records lies in it, and nowhere else.
+    """The ring's memory (`jtqd.daemon.shared.cycle_record.Ring`): the count of records lies in it, and nowhere else.
 
     joints: of which a record holds the blocks.
     """
 
     def __init__(self, ring, int joints=2):
-        cdef Py_ssize_t word = shared_ring.COUNT_WORD
+        cdef Py_ssize_t word = cr.COUNT_WORD
         self.memory = ring
         self.head, self.records, self.slots = ring.words, ring.records, ring.size
         self.written = &self.head[word]

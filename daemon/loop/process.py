@@ -27,11 +27,9 @@ from jtqd.daemon.core.joint import contacts_of
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.core.status import safety_of
 from jtqd.daemon.loop import realtime
-from jtqd.daemon.shared.child_process import Child, ChildError
-from jtqd.daemon.shared.cycle_record import layout_of
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring, layout_of
+from jtqd.daemon.shared.processes import Child, ChildError, LoopWatchdog, Notifier, watchdog_seconds
 from jtqd.daemon.shared.snapshot import Snapshot
-from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
 from jtqd.drivers.filters import CanFilter, any_format
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE

@@ -17,8 +17,7 @@ from jtqd.daemon.recording.run_files import MEGABYTE, Account
 from jtqd.daemon.shared import events
 from jtqd.daemon.shared.conditions import CATALOGUE, SHOWN_BY_COUNTERS, Condition, read_conditions, worst
 from jtqd.daemon.shared.counters import Shown, shown_in
-from jtqd.daemon.shared.cycle_record import layout_of
-from jtqd.daemon.shared.ring import RingReader
+from jtqd.daemon.shared.cycle_record import RingReader, layout_of
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import nmt
 

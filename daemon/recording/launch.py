@@ -18,10 +18,9 @@ from typing import Any
 from jtqd.daemon.config import Config
 from jtqd.daemon.recording.dbc import dbc_text
 from jtqd.daemon.recording.run_files import Account, ProgressFile, free_run, part_files
-from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.events import FILE as NOTICES
+from jtqd.daemon.shared.processes import Child, ChildError, StartChild
 from jtqd.daemon.shared.runtime_dir import versions
-from jtqd.daemon.shared.side_process import StartChild
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.own_objects import own_sheet
 

@@ -48,10 +48,9 @@ from jtqd.daemon.recording.run_files import (
     part_files,
 )
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.child_process import Child, ChildError
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS, layout_of
 from jtqd.daemon.shared.events import NoticesError, NoticesReader
-from jtqd.daemon.shared.ring import RingError, RingReader
+from jtqd.daemon.shared.processes import Child, ChildError
 from jtqd.daemon.shared.snapshot import SnapshotError
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
@@ -73,7 +72,7 @@ class RecorderRequest:
     """Paths and constants of one recording; megabytes are of 1 000 000 bytes. The supervisor writes it as JSON.
 
     Attributes:
-        ring: file of the ring of cycle records (`jtqd.daemon.shared.ring`).
+        ring: file of the ring of cycle records (`jtqd.daemon.shared.cycle_record`).
         directory: where the MCAP files go; made when it does not exist.
         prefix: beginning of their names (`jtqd.daemon.recording.run_files`).
         run: name of the run; another recorder of the same run goes on with its numbers. None: a new one.

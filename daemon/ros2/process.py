@@ -11,7 +11,7 @@ STALE, without torque, with a growing age. Nothing that the network sends reache
 read-only.
 
 REQUEST is the JSON of `recording.launch.loop_request` with "domain_id", "interface" and "rate_hz". The answer is
-{"publishing": what} or {"failed": why} (`shared.side_process`).
+{"publishing": what} or {"failed": why} (`shared.processes`).
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ from jtqd.daemon.ros2.messages import (
     Message,
     diagnostic_array,
 )
-from jtqd.daemon.shared.ring import RingError
-from jtqd.daemon.shared.side_process import CannotBegin, Stop, run_side_process
+from jtqd.daemon.shared.cycle_record import RingError
+from jtqd.daemon.shared.processes import CannotBegin, Stop, run_side_process
 from jtqd.daemon.shared.snapshot import SnapshotError
 
 TOPICS: Final[dict[type[Message], str]] = {

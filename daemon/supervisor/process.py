@@ -23,14 +23,14 @@ from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
 from jtqd.daemon.config import Config, JointConfig, Ros2Settings, as_booted
 from jtqd.daemon.core.input_pdos import input_pdos, names_of_inputs, sensor_index
-from jtqd.daemon.live.launch import Address, LiveView
+from jtqd.daemon.live import Address, LiveView
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.recording.launch import RecorderProcess, recording_request
-from jtqd.daemon.ros2.launch import Ros2Publisher
-from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
+from jtqd.daemon.ros2 import Ros2Publisher
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import EventLog, Notices, OperatorLog, Priority
+from jtqd.daemon.shared.processes import Child, ChildError, ChildSilence, StartChild
 from jtqd.daemon.shared.runtime_dir import (
     About,
     AboutJoint,
@@ -41,12 +41,10 @@ from jtqd.daemon.shared.runtime_dir import (
     versions,
     write_about,
 )
-from jtqd.daemon.shared.side_process import StartChild
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.daemon.supervisor.display import Display, Summary, summary_of
 from jtqd.daemon.supervisor.health import Health
 from jtqd.daemon.supervisor.service import Service
-from jtqd.daemon.supervisor.summary import Summary, summary_of
-from jtqd.daemon.supervisor.table import Display
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
 from jtqd.drivers.drive import tpdos_as_json

@@ -19,8 +19,8 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
 from jtqd.daemon.shared.counters import RECORDER_LOST, TABLE
 from jtqd.daemon.shared.events import OperatorLog, Priority
+from jtqd.daemon.shared.processes import Notifier
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
-from jtqd.daemon.shared.systemd import Notifier
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
 

@@ -25,7 +25,7 @@ from jtqd.daemon.recording.messages import CycleMessages
 from jtqd.daemon.recording.recorder import RecorderRequest, Session
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.ring import RingReader
+from jtqd.daemon.shared.cycle_record import RingReader
 from tests.benchmarks.contender import ROOT
 from tests.benchmarks.measure import mark, table
 from tests.daemon import ring_records as rr

@@ -11,7 +11,7 @@ from typing import Any
 
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.loop.process import Duties
-from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier
+from jtqd.daemon.shared.processes import LoopWatchdog, Notifier
 from tests.benchmarks.measure import mark
 from tests.daemon.loop.cycle_helpers import inputs, make, turn
 

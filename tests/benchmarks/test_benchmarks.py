@@ -38,6 +38,9 @@ class Bus:
         self.frames, self.stamps_ns, self.own = bytearray(512), (), ()
         self.tx_dropped = self.rx_dropped = 0
 
+    def fileno(self):
+        return -1
+
     def monotonic_ns(self):
         return self.clock_ns
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, header_of, layout_of
-from jtqd.daemon.shared.ring import COUNT_WORD, Ring
+from jtqd.daemon.shared.cycle_record import COUNT_WORD, MOST_JOINTS, PAIR, Ring, header_of, layout_of
 
 RECORD_SIZE, FRAME_CAPACITY = PAIR.size, PAIR.frame_capacity
 _BY_SIZE = {layout_of(joints).size: layout_of(joints) for joints in range(1, MOST_JOINTS + 1)}

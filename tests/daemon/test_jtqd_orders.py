@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.supervisor.process import wait_for
 from jtqd.drivers.filters import exact
 from jtqd.drivers.frame_socket import open_frame_socket

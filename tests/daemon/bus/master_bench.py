@@ -11,8 +11,8 @@ from typing import Self
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request
 from jtqd.daemon.bus.service import BusService, service_filters
 from jtqd.daemon.config import load_config
-from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.conditions import Conditions
+from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_RTR_FLAG, FRAME, pack

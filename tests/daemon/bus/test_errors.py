@@ -5,7 +5,8 @@ import tracemalloc
 
 import pytest
 
-from jtqd.daemon.bus.errors import (
+from jtqd.daemon.bus.own_node import OwnErrors
+from jtqd.daemon.bus.service import (
     ACTIVE,
     BUS_OFF,
     DOWN,
@@ -14,7 +15,6 @@ from jtqd.daemon.bus.errors import (
     BusChange,
     BusState,
     EmcyLog,
-    OwnErrors,
 )
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.drivers.emcy import Emergency, describe, name_of, parse

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.bus.errors import OwnErrors
-from jtqd.daemon.bus.own_node import OwnNode
+from jtqd.daemon.bus.own_node import OwnErrors, OwnNode
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.conditions import Subject

@@ -21,7 +21,7 @@ from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.ring import Ring, RingReader
+from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.contact import detect_contacts, link_loads

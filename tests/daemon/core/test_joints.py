@@ -11,7 +11,7 @@ from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.ring import Ring, RingReader
+from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.estimator.estimator import JointEstimator

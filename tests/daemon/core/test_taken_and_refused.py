@@ -17,7 +17,7 @@ from jtqd.daemon.core.record import RecordRing
 from jtqd.daemon.core.status import JointRules, JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import INVALID

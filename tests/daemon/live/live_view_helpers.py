@@ -15,7 +15,6 @@ from websockets.sync.client import connect
 
 from jtqd.daemon.recording import messages
 from jtqd.daemon.shared.events import FILE, Notices
-from jtqd.daemon.shared.ring import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import DEFINITIONS, put, record_of

@@ -14,9 +14,9 @@ import pytest
 
 from jtqd.daemon import jtqd
 from jtqd.daemon.config import load_config
-from jtqd.daemon.live.launch import Address, LiveView
-from jtqd.daemon.shared import side_process
-from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.live import Address, LiveView
+from jtqd.daemon.shared import processes as side_process
+from jtqd.daemon.shared.processes import Child
 from tests.daemon.live.live_view_helpers import ROOT, Memory, Viewer
 
 pytestmark = pytest.mark.native

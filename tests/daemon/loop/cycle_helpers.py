@@ -17,7 +17,7 @@ from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, d
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid, PythonClock
 from jtqd.daemon.core.status import JointSafety
-from jtqd.daemon.shared.ring import Ring, RingReader
+from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import BusDown
 from jtqd.estimator.estimator import JointEstimator

@@ -20,8 +20,7 @@ from jtqd.daemon.core.schedule import RESERVED_NS, NetworkBudget
 from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED
-from jtqd.daemon.shared.ring import RingReader
+from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Effect

@@ -17,7 +17,7 @@ from jtqd.daemon.recording.messages import CycleMessages, EventLog, JointStateMe
 from jtqd.daemon.recording.recorder import RecorderRequest, Recording, Session
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.cdr_decoder import Definition
 from tests.paths import ROOT

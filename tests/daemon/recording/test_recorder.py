@@ -19,7 +19,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from jtqd.daemon.recording.recorder import RecorderRequest, RequestError
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.ring import COUNT_WORD
+from jtqd.daemon.shared.cycle_record import COUNT_WORD
 from tests.daemon.recording.recorder_bench import (
     DEFINITIONS,
     ROOT,

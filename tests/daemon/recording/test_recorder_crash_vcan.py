@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.recording.run_files import part_files
-from jtqd.daemon.shared.ring import RingReader
+from jtqd.daemon.shared.cycle_record import RingReader
 from jtqd.models.files import shipped
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import cycles_of, messages_of

@@ -18,8 +18,8 @@ from jtqd.daemon.recording.mcap_file import ChunkBuilder
 from jtqd.daemon.recording.messages import ERROR, WARN, EventLog, definitions
 from jtqd.daemon.recording.recorder import RecorderRequest, main
 from jtqd.daemon.recording.run_files import parse_part, part_files
-from jtqd.daemon.shared.child_process import Child
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
+from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.daemon.supervisor.process import SupervisorError, log_directory
 from jtqd.models.files import shipped

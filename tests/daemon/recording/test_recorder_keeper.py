@@ -9,9 +9,9 @@ import pytest
 
 from jtqd.daemon.recording import launch
 from jtqd.daemon.recording.launch import RecorderProcess
-from jtqd.daemon.shared.child_process import Child
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
+from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import Snapshot
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import put, record_of

@@ -29,7 +29,7 @@ from jtqd.daemon.recording.messages import CycleMessages, definitions, zeros_of
 from jtqd.daemon.replay.logged import Setup, read_setup
 from jtqd.daemon.replay.session import ReplayOptions, Result, models_of, replay_each
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.ring import Ring, RingReader
+from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader, View
 from jtqd.estimator.status import DEGRADED
 from jtqd.models.files import shipped

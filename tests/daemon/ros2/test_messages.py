@@ -4,9 +4,9 @@ import math
 
 import pytest
 
+from jtqd.daemon import ros2 as launch
 from jtqd.daemon.config import Config, Ros2Settings, load_config
 from jtqd.daemon.recording.messages import Status
-from jtqd.daemon.ros2 import launch
 from jtqd.daemon.ros2.messages import JointMessages, diagnostic_array
 from jtqd.daemon.ros2.process import domain_xml
 from jtqd.daemon.shared import cycle_record as cr

@@ -16,8 +16,8 @@ import pytest
 
 from jtqd.daemon import jtqd
 from jtqd.daemon.config import Ros2Settings, load_config
-from jtqd.daemon.ros2.launch import Ros2Publisher
-from jtqd.daemon.shared.child_process import Child
+from jtqd.daemon.ros2 import Ros2Publisher
+from jtqd.daemon.shared.processes import Child
 from tests.daemon.live.live_view_helpers import Memory
 from tests.daemon.ros2.publisher_helpers import Process, Publisher, Reader, own_domain, request_of
 from tests.paths import ROOT
@@ -171,7 +171,7 @@ def test_a_unit_that_forbids_network_sockets_is_said(memory):
         "def refused(*_): raise OSError(97, 'Address family not supported by protocol')\n"
         "socket.if_nameindex = refused\n"
         "from jtqd.daemon.ros2.process import begin\n"
-        "from jtqd.daemon.shared.side_process import run_side_process\n"
+        "from jtqd.daemon.shared.processes import run_side_process\n"
         "sys.exit(run_side_process([sys.argv[1]], 'publishing', begin))"
     )
     with Process("-c", forbidden, _request(memory)) as publisher:

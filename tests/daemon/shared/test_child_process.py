@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from jtqd.daemon.shared.child_process import Child, ChildError, ChildSilence
+from jtqd.daemon.shared.processes import Child, ChildError, ChildSilence
 
 
 def child(statement: str) -> Child:

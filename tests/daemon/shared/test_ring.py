@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from jtqd.daemon.shared.ring import COUNT_WORD, Ring, RingError, RingReader
+from jtqd.daemon.shared.cycle_record import COUNT_WORD, Ring, RingError, RingReader
 from tests.daemon.ring_records import append
 
 SIZE = 64

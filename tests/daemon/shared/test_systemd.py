@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.shared.systemd import LoopWatchdog, Notifier, watchdog_seconds
+from jtqd.daemon.shared.processes import LoopWatchdog, Notifier, watchdog_seconds
 
 
 @pytest.fixture

@@ -17,9 +17,8 @@ from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
+from jtqd.daemon.supervisor.display import LiveTable, Summary, plain_line, summary_of
 from jtqd.daemon.supervisor.process import about
-from jtqd.daemon.supervisor.summary import Summary, summary_of
-from jtqd.daemon.supervisor.table import LiveTable, plain_line
 from tests.daemon.cli import status_daemon
 from tests.daemon.snapshots import EstimateWriter
 

@@ -7,7 +7,7 @@ import pytest
 from rich.console import Console
 
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from jtqd.daemon.supervisor.table import LiveTable
+from jtqd.daemon.supervisor.display import LiveTable
 from tests.daemon.snapshots import EstimateWriter
 
 NAN = float("nan")

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.daemon.supervisor.summary import Summary
+from jtqd.daemon.supervisor.display import Summary
 from tests.daemon.supervisor.watch_views import view
 
 US = (1.0, 2.0, 3.0)

@@ -13,8 +13,8 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.recording.diagnostics import Diagnostics
 from jtqd.daemon.shared.reasons import degraded_reason
 from jtqd.daemon.shared.snapshot import LEARNED, NO_ZEROS, Snapshot, SnapshotReader
+from jtqd.daemon.supervisor.display import summary_of
 from jtqd.daemon.supervisor.service import metrics_text
-from jtqd.daemon.supervisor.summary import summary_of
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator import status
 from jtqd.estimator.status import DEGRADED, Zeros

@@ -14,7 +14,7 @@ from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, d
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.loop.process import run
-from jtqd.daemon.shared.ring import Ring
+from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings

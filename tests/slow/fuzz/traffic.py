@@ -59,6 +59,9 @@ class BusInTime:
         self._coming: list[tuple[int, int, bytes, bool]] = []
         self._order = 0
 
+    def fileno(self) -> int:
+        return -1
+
     def installed(self) -> AbstractContextManager[object]:
         """The clock is that of the cycles that are made meanwhile."""
         return patch.multiple(cycle_module, clock=PythonClock(self))

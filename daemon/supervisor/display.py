@@ -1,0 +1,400 @@
+"""What the operator sees of a run: the live table on a terminal or a line every few seconds, and the final summary."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from math import isfinite
+from types import TracebackType
+from typing import Any
+
+from rich.box import HEAVY_HEAD, Box
+from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.live import Live
+from rich.measure import Measurement
+from rich.table import Table
+from rich.text import Text
+
+from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
+from jtqd.daemon.shared.counters import Shown, shown_in
+from jtqd.daemon.shared.events import INFO, OperatorLog, Priority
+from jtqd.daemon.shared.reasons import contact_of, contact_text
+from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
+from jtqd.estimator.status import NAMES, PUBLISHED
+from jtqd.estimator.text import counted, finite, number, percent
+
+COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
+"""Style of a status; what is not here is bad news."""
+
+_COLUMNS = {
+    "joint": 5,
+    "torque [Nm]": 10,
+    "sigma [Nm]": 10,
+    "sensor [Nm]": 10,
+    "error [Nm]": 10,
+    "contact": 8,
+    "status": max(map(len, NAMES.values())),
+}
+"""Heading and least width, so that the table does not jump when a value gets longer."""
+_DISPENSABLE = ("sensor [Nm]", "error [Nm]", "sigma [Nm]")
+_CONTACT = "contact"
+"""A column, and in the line below a count, where contacts are watched."""
+
+
+def bus_load(previous: View, now: View, bitrate: int) -> float:
+    """Return the bus load between two views with worst-case stuffing; NaN without time in between."""
+    seconds = (now.sync_realtime_ns - previous.sync_realtime_ns) * 1e-9
+    bits = now.counters["bits_worst_case"] - previous.counters["bits_worst_case"]
+    return bits / seconds / bitrate if previous.sync_realtime_ns and seconds > 0 else float("nan")
+
+
+def first_that_fits(tables: Iterable[Table], console: Console, options: ConsoleOptions) -> Table | None:
+    """Return the first of the tables that the terminal has room for without cutting; None: none of them."""
+    unlimited = options.update(max_width=1000)
+    fitting = (
+        table for table in tables if Measurement.get(console, unlimited, table).maximum <= options.max_width
+    )
+    return next(fitting, None)
+
+
+class LiveTable:
+    """Live table of the loop, as wide as the terminal allows; the status is shown at any width.
+
+    In a narrow terminal columns go in the order of `_DISPENSABLE`, then the frame, and in the end each joint is a line.
+    """
+
+    def __init__(
+        self,
+        reader: SnapshotReader,
+        previous: View,
+        view: View,
+        bitrate: int,
+        title: str,
+        *,
+        contacts: bool = False,
+    ) -> None:
+        self._title = title
+        self._columns = [name for name in _COLUMNS if contacts or name != _CONTACT]
+        self._line = loop_line(reader, previous, view, bitrate, contacts=contacts)
+        self._rows = [_cells(number, joint) for number, joint in enumerate(view.joints, start=1)]
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render for the width of the terminal (called by rich)."""
+        yield self._widest_that_fits(console, options)
+        yield Text(self._line)
+
+    def _widest_that_fits(self, console: Console, options: ConsoleOptions) -> RenderableType:
+        tables = (
+            self._table([name for name in self._columns if name not in _DISPENSABLE[:dropped]], box)
+            for dropped in range(len(_DISPENSABLE) + 1)
+            for box in ((HEAVY_HEAD, None) if dropped == len(_DISPENSABLE) else (HEAVY_HEAD,))
+        )
+        table = first_that_fits(tables, console, options)
+        if table is not None:
+            return table
+        lines = (
+            Text.assemble(
+                f"{row['joint']}: {_with_unit(row['torque [Nm]'])}", row["status"], self._touched(row)
+            )
+            for row in self._rows
+        )
+        return Group(self._title, *lines)
+
+    def _touched(self, row: dict[str, str | Text]) -> str | Text:
+        shown = row[_CONTACT]
+        there = _CONTACT in self._columns and isinstance(shown, Text)
+        return Text.assemble(" contact ", shown) if there else ""
+
+    def _table(self, names: list[str], box: Box | None) -> Table:
+        table = Table(title=self._title, title_justify="left", box=box, pad_edge=box is not None)
+        for name in names:
+            table.add_column(
+                name, justify="right" if "[Nm]" in name else "left", min_width=_COLUMNS[name], no_wrap=True
+            )
+        for row in self._rows:
+            table.add_row(*(row[name] for name in names))
+        return table
+
+
+def _cells(joint_number: int, joint: JointView) -> dict[str, str | Text]:
+    """Return the cells of one joint."""
+    name = NAMES.get(joint.status, str(joint.status))
+    known = joint.status in PUBLISHED
+    touched = contact_text(joint)
+    return {
+        "joint": str(joint_number),
+        "torque [Nm]": number(joint.torque_nm) if known else "-",
+        "sigma [Nm]": number(joint.sigma_nm) if known else "-",
+        "sensor [Nm]": number(joint.reference_nm),
+        "error [Nm]": number(joint.torque_nm - joint.reference_nm) if known else "-",
+        _CONTACT: Text(touched, style="bold red") if contact_of(joint) else touched,
+        "status": Text(name, style=COLOURS.get(name, "bold red")),
+    }
+
+
+def loop_line(reader: SnapshotReader, previous: View, view: View, bitrate: int, *, contacts: bool) -> str:
+    """Return cycle time, missed cycles, bus load and, where they are watched, contacts in one line."""
+    p50, p99, worst = reader.work_us(0.5, 0.99, 1.0)
+    counters = view.counters
+    load = bus_load(previous, view, bitrate)
+    return (
+        f"cycle {counters['cycles']}  work p50 {p50:.0f} us, p99 {p99:.0f} us, max {worst:.0f} us  "
+        f"missed {counters['missed']}  stale inputs {counters['stale_inputs']}  bus load {percent(load)}"
+        + (f"  contacts {counters['contacts']}" if contacts else "")
+    )
+
+
+def plain_line(
+    reader: SnapshotReader, previous: View, view: View, bitrate: int, *, contacts: bool = False
+) -> str:
+    """Return the state as one line without control characters, for a log."""
+    joints = "  ".join(f"joint {n} {_plain(joint)}" for n, joint in enumerate(view.joints, start=1))
+    return f"{joints}  {loop_line(reader, previous, view, bitrate, contacts=contacts)}"
+
+
+def _plain(joint: JointView) -> str:
+    name = NAMES.get(joint.status, str(joint.status))
+    touched = f", contact {contact_text(joint)}" if contact_of(joint) else ""
+    if joint.status not in PUBLISHED:
+        return name + touched
+    return f"{name} {number(joint.torque_nm)} +- {number(joint.sigma_nm)} Nm{touched}"
+
+
+def _with_unit(torque: str | Text) -> str:
+    return "" if str(torque) == "-" else f"{torque} Nm "
+
+
+_TABLE_PERIOD_S = 0.2
+_LOG_PERIOD_S = 5.0
+
+
+class Display:
+    """Use it as a context manager; `turn` whenever there is time.
+
+    Args:
+        reader: of the loop's snapshot.
+        bitrate: of the bus [bit/s].
+        title: of the table.
+        log: takes the lines.
+        contacts: they are watched.
+    """
+
+    def __init__(
+        self, reader: SnapshotReader, bitrate: int, title: str, log: OperatorLog, *, contacts: bool = False
+    ) -> None:
+        console = Console(stderr=True)
+        self._terminal = console.is_terminal
+        self._live = Live(console=console, auto_refresh=False, transient=False)
+        self._reader, self._bitrate, self._title, self._log = reader, bitrate, title, log
+        self._contacts = contacts
+        self._previous = reader.read()
+        self._shown = time.monotonic()
+
+    def __enter__(self) -> Display:
+        self._live.__enter__()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._live.__exit__(kind, error, trace)
+
+    def turn(self, now: float) -> None:
+        """Show what is due at `now` (CLOCK_MONOTONIC [s])."""
+        if now - self._shown < (_TABLE_PERIOD_S if self._terminal else _LOG_PERIOD_S):
+            return
+        view = self._reader.read()
+        if self._terminal:
+            table = LiveTable(
+                self._reader, self._previous, view, self._bitrate, self._title, contacts=self._contacts
+            )
+            self._live.update(table, refresh=True)
+        else:
+            line = plain_line(self._reader, self._previous, view, self._bitrate, contacts=self._contacts)
+            self._log(line.removeprefix("jtqd: "), Priority.INFO)
+        self._previous, self._shown = view, now
+
+
+# The final summary ----
+
+_LOST = 0.05
+"""Share of missed slots beyond which real time is reported as not kept."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Final figures of one run.
+
+    Attributes:
+        view: last reading of the snapshot.
+        work_us, late_us: p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us].
+        refused: real-time settings that the kernel did not grant.
+        recording: the recorder's account; None where nothing was recorded.
+        error: the failure that ended the run, if any.
+        inputs: late, lost, duplicate and rejected frames of each PDO by its name.
+        conditions: those that were present at any time; `first_s` counts from the begin of the run.
+        stolen_s: processor time that a hypervisor took (`daemon/loop/realtime.py`).
+        contacts: they were watched.
+    """
+
+    view: View
+    work_us: Sequence[float]
+    late_us: Sequence[float]
+    refused: Sequence[str] = ()
+    recording: dict[str, Any] | None = None
+    error: str | None = None
+    inputs: dict[str, dict[str, int]] = field(default_factory=dict)
+    conditions: Sequence[Occurrences] = ()
+    stolen_s: float = 0.0
+    contacts: bool = False
+
+    @property
+    def exit_status(self) -> int:
+        """Return the exit status: 0 done, 1 ended by a failure, 3 done with cycles missing in the log."""
+        if self.error:
+            return 1
+        return 3 if self.recording is not None and self.recording.get("lost", 0) else 0
+
+    def content(self) -> dict[str, Any]:
+        """Return the summary as plain data for JSON."""
+        view, counters = self.view, self.view.counters
+
+        def by_joint(values: Iterable[Any]) -> dict[str, Any]:
+            return {f"joint_{n}": value for n, value in enumerate(values, start=1)}
+
+        return {
+            "cycles": counters["cycles"],
+            "missed": counters["missed"],
+            "stale_inputs": counters["stale_inputs"],
+            "work_us": dict(zip(("p50", "p99", "max"), map(finite, self.work_us), strict=True)),
+            "late_us": dict(zip(("p50", "p99", "max"), map(finite, self.late_us), strict=True)),
+            "rmse_nm": by_joint(map(finite, view.rmse_nm)),
+            "rmse_now_nm": by_joint(map(finite, view.rmse_now_nm)),
+            "age_ms": by_joint(finite(each.age_ms) for each in view.joints),
+            "zeros": by_joint(each.content() for each in view.zeros),
+            "contacts": counters["contacts"] if self.contacts else None,
+            "deviations": by_joint(self._deviations(n) for n in range(1, len(view.joints) + 1)),
+            "conditions": [
+                each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
+                for each in self.conditions
+            ],
+            "counters": counters,
+            "stolen_s": round(self.stolen_s, 2),
+            "not_granted": list(self.refused),
+            "inputs": self.inputs,
+            "recording": self.recording,
+            "error": self.error,
+        }
+
+    def _deviations(self, joint: int) -> int:
+        return sum(
+            each.times
+            for each in self.conditions
+            if (each.name, each.subject) == ("deviation", f"joint {joint}")
+        )
+
+    def _timing(self) -> list[str]:
+        counters = self.view.counters
+        cycles, missed = counters["cycles"], counters["missed"]
+        quantiles = "p50 {:.0f} us, p99 {:.0f} us, max {:.0f} us"
+        lines = [
+            f"cycles        {cycles}, missed {missed}, stale inputs {counters['stale_inputs']}",
+            f"cycle work    {quantiles.format(*self.work_us)} (from wake-up to hand-over)",
+            f"SYNC lateness {quantiles.format(*self.late_us)}",
+        ]
+        if missed > _LOST * (cycles + missed):
+            why = " (jtqd was not granted all that it asked for)" if self.refused else ""
+            share = 100.0 * missed / (cycles + missed)
+            lines.append(
+                f"real time     not kept: {share:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
+            )
+        if self.stolen_s > 0.0:
+            lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
+        return lines
+
+    def _recorded(self) -> list[str]:
+        account = self.recording
+        if account is None:
+            return ["log           none"]
+        lost, parts = account.get("lost", 0), len(account.get("paths", ()))
+        nothing = "no trigger" if account.get("flight_recordings") == 0 else "it could not be written"
+        shown = account.get("path") or f"none: {account.get('error') or nothing}"
+        shown += f" (the last of {parts} parts)" if parts > 1 else ""
+        shown += f", {counted(lost, 'cycle')} lost" if lost else ""
+        left = [f"              {each} (left by a killed recorder)" for each in account.get("left", [])]
+        return [f"log           {shown}", *left]
+
+    def text(self) -> str:
+        """Return the summary as text."""
+        view, counters, lines = self.view, self.view.counters, self._timing()
+        for n, (rmse, now, joint) in enumerate(
+            zip(view.rmse_nm, view.rmse_now_nm, view.joints, strict=False)
+        ):
+            shown = "no reference"
+            if isfinite(rmse):
+                age = joint.age_ms
+                older = f", both {age:.2f} ms old ({now:.3f} Nm against it now)" if age > 0.0 else " now"
+                shown = f"{rmse:.3f} Nm against the sensor in motion{older}"
+            lines.append(f"RMSE joint {n + 1}  {shown}")
+        zeros = enumerate(view.zeros, start=1)
+        lines += [f"zeros joint {joint} {each.text}" for joint, each in zeros if each.tracked]
+        if self.contacts:
+            lines.append(f"contacts      {counters['contacts'] or 'none'}")
+        happened = [each for each in self.conditions if CATALOGUE[each.name].severity > INFO]
+        for n, each in enumerate(happened):
+            times = "once" if each.times == 1 else f"{each.times} times"
+            lines.append(
+                f"{'' if n else 'conditions':<13} {each.subject}: {each.name.replace('_', ' ')} {times}, "
+                f"{each.total_s:.1f} s in all, first after {each.first_s:.1f} s"
+            )
+        for title, selected in (("no torque", Shown.SUMMARY_TORQUE), ("bus", Shown.SUMMARY_BUS)):
+            found = [
+                f"{name.removeprefix('fault_').replace('_', ' ')} {counters[name]}"
+                for name in shown_in(selected)
+                if counters[name]
+            ]
+            if found:
+                lines.append(f"{title:<13} {', '.join(found)}")
+        for name, counts in self.inputs.items():
+            shown = ", ".join(f"{kind} {count}" for kind, count in counts.items() if count)
+            if shown:
+                lines.append(f"  {name:<24} {shown}")
+        lines += self._recorded()
+        if self.error:
+            lines.append(f"ended by      {self.error}")
+        return "\n".join(lines)
+
+
+def summary_of(
+    reader: SnapshotReader,
+    result: dict[str, Any],
+    refused: list[str],
+    recording: dict[str, Any] | None,
+    *,
+    history: Sequence[Occurrences],
+    began_s: float,
+    stolen_s: float,
+    contacts: bool = False,
+) -> Summary:
+    """Return the summary of a finished run.
+
+    Args:
+        reader: snapshot of its loop.
+        result: last answer of the loop.
+        refused, recording, stolen_s, contacts: as in `Summary`.
+        history: conditions that were present at any time.
+        began_s: begin of the run (CLOCK_MONOTONIC).
+    """
+    return Summary(
+        view=reader.read(),
+        work_us=reader.work_us(0.5, 0.99, 1.0),
+        late_us=reader.late_us(0.5, 0.99, 1.0),
+        refused=refused,
+        recording=recording,
+        error=result.get("error") or result.get("failed"),
+        inputs=result.get("counters", {}),
+        conditions=tuple(each._replace(first_s=max(0.0, each.first_s - began_s)) for each in history),
+        stolen_s=stolen_s,
+        contacts=contacts,
+    )
