@@ -27,7 +27,7 @@ BUS_FIELDS = (
     "tx_timeouts",
     "downs",
 )
-"""Sub-indices 1.. of 2205h (`daemon/bus/errors.py`): state 0 error active, 1 warning, 2 passive, 3 bus-off, 4
+"""Sub-indices 1.. of 2205h (`daemon/bus/service.py`): state 0 error active, 1 warning, 2 passive, 3 bus-off, 4
 interface down; the controller's two error counters as last reported; then how often each error has occurred."""
 
 ROOM = (2, 4)

@@ -57,19 +57,13 @@ cdef class SnapshotWriter:
     cdef int status[MOST_JOINTS]
     cdef int64_t since[MOST_JOINTS]
     cdef void count(self, int flags, int64_t work_ns, int64_t late_ns, int64_t missed) noexcept nogil
-    cdef void count_status(self, int joint, int status) noexcept nogil
     cdef void begin(self) noexcept nogil
     cpdef int flush(self, int64_t missed, int64_t sync_ns) except -1
     cdef void flush_inputs(self, int64_t sync_ns) noexcept nogil
     cdef void flush_nodes(self) noexcept nogil
     cdef void write_learned(self, int number, JointCycle joint) noexcept nogil
     cdef void end(
-        self,
-        int64_t cycle,
-        int sync_counter,
-        int64_t sync_realtime_ns,
-        int64_t sync_monotonic_ns,
-        JointState **joints,
+        self, int64_t cycle, int sync_counter, int64_t sync_realtime_ns, int64_t sync_monotonic_ns, JointState **joints
     ) noexcept nogil
 
 cdef class PythonSocket(FrameSocket):
@@ -115,9 +109,9 @@ cdef class Cycle:
     cpdef int publish(self) except -1
     cpdef int record(self) except -1
     cpdef bint pass_slot(self) except -1
-    cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
     cdef void withdraw(self, int status) noexcept
     cpdef int write_snapshot(self) except -1
     cdef bint send_estimate(self) except -1
+    cdef int drain(self) except -1
     cdef int receive(self) except -1
     cdef bint send(self, const Frame *frame) except -1

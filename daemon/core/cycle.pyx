@@ -142,56 +142,16 @@ cdef int64_t LAST_WORK_BIN = shared.WORK_BINS - 1, LAST_LATE_BIN = shared.LATE_B
 cdef int CODES = shared.STATUS_CODES
 
 if (sizeof(InputBlock), sizeof(EstimateBlock), sizeof(LearnedBlock), NODES) != (
-    shared.INPUT.size,
-    shared.ESTIMATE_SIZE,
-    shared.LEARNED.size,
-    shared.MAX_NODE,
+    shared.INPUT.size, shared.ESTIMATE_SIZE, shared.LEARNED.size, shared.MAX_NODE
 ):
     raise ImportError("the snapshot has another layout than the one that is compiled in")
-
-
-cdef ViewBlock _view(const JointState *joint) noexcept nogil:
-    """Return a joint's `JointView`."""
-    cdef const JointBlock *s = &joint.sample
-    return ViewBlock(
-        s.torque_nm,
-        s.sigma_nm,
-        s.tob_nm,
-        s.physics_nm,
-        s.network_nm,
-        s.sensor_torque_nm,
-        s.statusword,
-        s.status,
-        s.sensor_status,
-        s.input_flags,
-        joint.latched,
-        s.reference_nm,
-        s.age_ms,
-        s.torque_rate_nm_s,
-        s.contact_nm,
-    )
-
-
-cdef MeasuredBlock _measured(const JointState *joint) noexcept nogil:
-    """Return a joint's `Measured`."""
-    cdef const JointBlock *s = &joint.sample
-    return MeasuredBlock(
-        s.current_a,
-        s.motor_position_rad,
-        s.motor_velocity_rad_s,
-        s.link_position_rad,
-        s.sensor_torque_nm,
-        s.temperature_c,
-    )
 
 
 cdef class SnapshotWriter:
     """Writes into a `Snapshot`.
 
-    Args:
-        snapshot: the memory.
-        intake: counts frames and inputs, from here on in the snapshot's words.
-        socket: counts the frames that it drops.
+    snapshot: the memory; intake: counts frames and inputs, from here on in the snapshot's words; socket: counts the frames
+    that it drops.
     """
 
     def __init__(self, snapshot, Intake intake, socket):
@@ -234,10 +194,6 @@ cdef class SnapshotWriter:
         self.work[min(work_ns // WORK_BIN_NS, LAST_WORK_BIN)] += 1
         self.late[min(late // LATE_BIN_NS, LAST_LATE_BIN)] += 1
 
-    cdef void count_status(self, int joint, int status) noexcept nogil:
-        """Count the published status of one joint in one cycle."""
-        self.status_cycles[CODES * joint + status] += 1
-
     cdef void begin(self) noexcept nogil:
         """Mark the snapshot as inconsistent until `end` (inputs included)."""
         begin_write(&self.sequence[0])
@@ -276,18 +232,9 @@ cdef class SnapshotWriter:
                 self.used_ns[n] = sync_ns
                 self.delay_ns[n] = state.stamp_ns - self.intake.sync_stamp_ns
             blocks[n] = InputBlock(
-                self.used_ns[n],
-                self.delay_ns[n],
-                state.band_low_ns,
-                state.band_high_ns,
-                state.late,
-                state.lost,
-                state.duplicates,
-                state.rejected,
-                state.missed,
-                state.in_a_row,
-                state.too_short,
-                state.too_long,
+                self.used_ns[n], self.delay_ns[n], state.band_low_ns, state.band_high_ns,
+                state.late, state.lost, state.duplicates, state.rejected,
+                state.missed, state.in_a_row, state.too_short, state.too_long,
             )
 
     cdef void write_learned(self, int number, JointCycle joint) noexcept nogil:
@@ -301,41 +248,42 @@ cdef class SnapshotWriter:
             memcpy(block.state, state, size)
 
     cdef void end(
-        self,
-        int64_t cycle,
-        int sync_counter,
-        int64_t sync_realtime_ns,
-        int64_t sync_monotonic_ns,
-        JointState **joints,
+        self, int64_t cycle, int sync_counter, int64_t sync_realtime_ns, int64_t sync_monotonic_ns, JointState **joints
     ) noexcept nogil:
         """Write the last estimate; the snapshot is consistent again."""
         cdef EstimateBlock *block = <EstimateBlock *> &self.estimate[0]
+        cdef const JointBlock *s
         cdef int n
         block.cycle, block.sync_counter = cycle, sync_counter
         block.sync_realtime_ns, block.sync_monotonic_ns = sync_realtime_ns, sync_monotonic_ns
         for n in range(self.joints):
-            if joints[n].sample.status != self.status[n]:
-                self.status[n], self.since[n] = joints[n].sample.status, cycle
+            s = &joints[n].sample
+            if s.status != self.status[n]:
+                self.status[n], self.since[n] = s.status, cycle
             block.status_since[n] = self.since[n]
-            block.joints[n], block.measured[n] = _view(joints[n]), _measured(joints[n])
+            block.joints[n] = ViewBlock(
+                s.torque_nm, s.sigma_nm, s.tob_nm, s.physics_nm, s.network_nm, s.sensor_torque_nm,
+                s.statusword, s.status, s.sensor_status, s.input_flags, joints[n].latched,
+                s.reference_nm, s.age_ms, s.torque_rate_nm_s, s.contact_nm,
+            )
+            block.measured[n] = MeasuredBlock(
+                s.current_a, s.motor_position_rad, s.motor_velocity_rad_s, s.link_position_rad, s.sensor_torque_nm,
+                s.temperature_c,
+            )
         end_write(&self.sequence[0])
 
 
 def frame_counts(Intake intake):
     """Return late, lost, duplicate and rejected frames by PDO name; for a temperature, how often it became unknown."""
-    counts = {
-        pdo.name: {
-            "late": intake.inputs[n].late,
-            "lost": intake.inputs[n].lost,
-            "duplicate": intake.inputs[n].duplicates,
-            "rejected": intake.inputs[n].rejected,
-        }
+    kinds = "late", "lost", "duplicate", "rejected"
+    rows = [
+        (pdo.name, (intake.inputs[n].late, intake.inputs[n].lost, intake.inputs[n].duplicates, intake.inputs[n].rejected))
         for n, pdo in enumerate(intake.pdos)
-    }
-    for n, each in enumerate(intake.temperatures):
-        lost, rejected = intake.celsius[n].lost, intake.celsius[n].rejected
-        counts[each.name] = {"late": 0, "lost": lost, "duplicate": 0, "rejected": rejected}
-    return counts
+    ] + [
+        (each.name, (0, intake.celsius[n].lost, 0, intake.celsius[n].rejected))
+        for n, each in enumerate(intake.temperatures)
+    ]
+    return {name: dict(zip(kinds, counts, strict=True)) for name, counts in rows}
 
 
 # The cycle ------------------------------------------------------------------------------------------------------------
@@ -344,9 +292,8 @@ def frame_counts(Intake intake):
 class ConfiguredNodes:
     """Nodes that restarted, were changed or were absent at the start; they are used after the supervisor configured them.
 
-    Rare, and therefore Python. A configuration counts that the supervisor noted after the node had begun to wait: a node that
-    was only stopped is configured again without ever waiting, and that must not answer for its next restart. And it must have
-    begun after the node's last boot-up message: a node may restart when its boot has just ended and is not yet noted.
+    Rare, and therefore Python. A configuration counts that the supervisor noted after the node had begun to wait (one that was
+    only stopped is configured again without ever waiting), and that began after the node's last boot-up message.
     """
 
     def __init__(self, snapshot, intake, joints):
@@ -390,22 +337,19 @@ cdef class Cycle:
         joints: inputs and estimator of each joint, 1 to 4 of them.
         ring, snapshot: shared memory towards recorder and viewers.
         safety: limits and checks of each joint; None for those that need no joint file.
-        node_id: own node-ID; the estimate PDOs are 180h + node_id (joints 1 and 2) and 280h + node_id (joints 3 and 4, where
-            there are more than two), the heartbeat 700h + node_id.
+        node_id: own node-ID, added to the bases of estimate PDOs, contact PDOs and heartbeat.
         counter_overflow: SYNC counter runs 1..overflow (1019h); 0: SYNC without counter.
         wait_ns, deadline_ns: from SYNC to the wake-up for the inputs (it follows their arrival) and to the end of the wait.
         heartbeat_cycles: cycles between two heartbeats.
         grid: time grid; its slot is the current cycle's.
-        contacts: watches for contacts of all joints, and where it `sends`, sends the contact PDOs 380h + node_id and
-            480h + node_id; None: nobody does.
+        contacts: watches for contacts of all joints; None: nobody does.
 
     Attributes:
         joints: what is kept of each joint.
         configured_nodes: nodes that restarted or are in doubt, until they are configured.
         flags: of the cycle's record.
-        sync_ns: when its SYNC was sent, CLOCK_MONOTONIC.
+        sync_ns, late_ns: when its SYNC was sent (CLOCK_MONOTONIC), and by how much that was late.
         work_start_ns: when it woke up for its inputs.
-        late_ns: by how much its SYNC was late.
         sent_ns: when its estimate had been handed to the socket.
     """
 
@@ -434,10 +378,8 @@ cdef class Cycle:
         limits = safety or [JointSafety() for _ in joints]
         self.intake, self.snapshot, self.grid = intake, snapshot, grid
         self.joints = tuple([
-            JointCycle(
-                n, inputs, estimator, intake=intake, snapshot=snapshot, period_ns=grid.period_ns, safety=limits[n]
-            )
-            for n, (inputs, estimator) in enumerate(joints)
+            JointCycle(n, inputs, each, intake=intake, snapshot=snapshot, period_ns=grid.period_ns, safety=limits[n])
+            for n, (inputs, each) in enumerate(joints)
         ])
         self.count = len(joints)
         for n in range(self.count):
@@ -504,11 +446,8 @@ cdef class Cycle:
         self.flags, self.next_flags = self.next_flags, 0
         for n in range(4):
             self.counted[n] = intake.counters[COUNTED[n]]
-        count = self.receive()
+        count = self.drain()
         if count:
-            for n in range(count):
-                intake.drain_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
-            intake.drained()
             self.frames.keep(self.bus.frames_c, self.bus.stamps_c, count)
         self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
         intake.begin(self.counter)
@@ -596,16 +535,9 @@ cdef class Cycle:
         cdef int n
         cdef int64_t work_ns = self.clock.monotonic() - self.work_start_ns, missed = self.grid.missed
         self.frames.record.header[0] = Header(
-            self.index,
-            self.sync_ns,
-            self.sync_realtime_ns,
-            self.flags,
-            min(work_ns, MOST_WORK_NS),
-            min(self.late_ns, MOST_LATE_NS),
-            missed,
-            self.counter,
-            self.frames.count,
-            min(self.frames.left_out, BYTE),
+            self.index, self.sync_ns, self.sync_realtime_ns,
+            self.flags, min(work_ns, MOST_WORK_NS), min(self.late_ns, MOST_LATE_NS), missed,
+            self.counter, self.frames.count, min(self.frames.left_out, BYTE),
             min(intake.counters[COUNTED[0]] - self.counted[0], BYTE),
             min(intake.counters[COUNTED[1]] - self.counted[1], BYTE),
             min(intake.counters[COUNTED[2]] - self.counted[2], BYTE),
@@ -614,7 +546,7 @@ cdef class Cycle:
         )
         for n in range(self.count):
             self.frames.record.joints[n] = self.states[n].sample
-            self.writer.count_status(n, self.states[n].status)
+            self.writer.status_cycles[CODES * n + self.states[n].status] += 1
         self.frames.record.tail[0] = self.index
         self.records.commit()
         self.writer.count(self.flags, work_ns, self.late_ns, missed)
@@ -625,15 +557,16 @@ cdef class Cycle:
     cpdef bint pass_slot(self) except -1:
         """Pass the slot without SYNC where the intake asks for it, to tell late frames from lost ones; return whether it did."""
         cdef Intake intake = self.intake
-        cdef int count, n
+        cdef Input *state
+        cdef const Frame *frame
+        cdef int n
         if not (intake.gap_wanted or intake.gap.open):
             return False
-        count = self.receive()
-        if count:
-            for n in range(count):
-                intake.drain_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
-                self.keep_for_next(&self.bus.frames_c[n], self.bus.stamps_c[n])
-            intake.drained()
+        for n in range(self.drain()):  # there is no record: what belongs to no cycle goes into the next one
+            frame = &self.bus.frames_c[n]
+            state = intake.input_with(frame.id)
+            if intake.temperature_with(frame.id) != NULL or (state != NULL and state.age_ns):
+                self.frames.keep_for_next(frame, self.bus.stamps_c[n])
         if not intake.gap_wanted:
             return False
         intake.pass_slot()
@@ -665,12 +598,6 @@ cdef class Cycle:
         if self.watches:
             self.contacts.withdraw(self.states)
 
-    cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
-        """Of a slot without a record, what belongs to no cycle goes into the next record."""
-        cdef Input *state = self.intake.input_with(frame.id)
-        if self.intake.temperature_with(frame.id) != NULL or (state != NULL and state.age_ns):
-            self.frames.keep_for_next(frame, stamp_ns)
-
     cpdef int write_snapshot(self) except -1:
         """Copy counters, inputs and the last estimate into the snapshot."""
         cdef int n
@@ -688,14 +615,21 @@ cdef class Cycle:
         cdef int n
         for n in range(self.estimates):
             second = &self.states[2 * n + 1].published if 2 * n + 1 < self.count else &NOBODY
-            encode_into(
-                self.estimate_frames[n].data, &self.states[2 * n].published, second, self.counter
-            )
+            encode_into(self.estimate_frames[n].data, &self.states[2 * n].published, second, self.counter)
             sent = self.send(&self.estimate_frames[n]) and sent
         for n in range(self.contact_pdos):
             self.contacts.encode(self.contact_frames[n].data, n, self.counter)
             self.send(&self.contact_frames[n])
         return sent
+
+    cdef int drain(self) except -1:
+        """Take the frames that came after the last cycle was closed; return their number."""
+        cdef int count = self.receive(), n
+        if count:
+            for n in range(count):
+                self.intake.drain_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
+            self.intake.drained()
+        return count
 
     cdef int receive(self) except -1:
         """Take what has come; a bus that is down gives nothing and is counted."""

@@ -21,41 +21,29 @@ from jtqd.drivers.drive import (
 from jtqd.drivers.pdo import ACYCLIC, PdoMap
 from jtqd.drivers.sensor import sensor_tpdo1, sensor_tpdo2
 
-_DRIVE_FACTORS = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
+DRIVE_FACTORS = ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit")
 POSITIONS = ("motor_position", "link_position")
 """Quantities whose PDOs are FLAG_POSITION of a record; the others are FLAG_MOTION."""
 
 
 @dataclass(frozen=True)
 class InputPdo:
-    """One TPDO that is an input: the loop waits for it, unless it has an age.
-
-    Attributes:
-        cob_id: 11-bit identifier.
-        length: bytes of its mapping; any other length is rejected (CiA 301: 8210h).
-        layout: precompiled unpacking of the mapped objects.
-        node_id: its producer.
-        name: as it appears in counters and events, e.g. "181h drive 1 TPDO1".
-        age_ns: 0 for one that is sent at each SYNC; of another one, for how long its last frame counts.
-    """
+    """One TPDO that is an input: the loop waits for it, unless it has an age."""
 
     cob_id: int
     length: int
+    """Bytes of its mapping; any other length is rejected (CiA 301: 8210h)."""
     layout: struct.Struct
     node_id: int
     name: str
+    """As it appears in counters and events, e.g. "181h drive 1 TPDO1"."""
     age_ns: int = 0
+    """0 for one that is sent at each SYNC; of another one, for how long its last frame counts."""
 
 
 @dataclass(frozen=True)
 class TemperaturePdo:
-    """TPDO3 of a drive: the temperature of its joint, at any time.
-
-    Attributes:
-        cob_id, node_id, name: as of an `InputPdo`, e.g. "381h drive 1 TPDO3".
-        life_cycles: slots after which a value is forgotten.
-        c_per_unit: degrees Celsius per unit of its object.
-    """
+    """TPDO3 of a drive: the temperature of its joint, at any time; a value is forgotten after `life_cycles` slots."""
 
     cob_id: int
     node_id: int
@@ -66,23 +54,19 @@ class TemperaturePdo:
 
 @dataclass(frozen=True)
 class JointInputs:
-    """Where one joint's inputs lie among the intake's PDOs, and their scaling.
-
-    Attributes:
-        places: of each quantity of the drive (`drive.DriveObjects`), its PDO and its entry there.
-        sensor: index of the sensor's PDO, None without reference.
-        temperature: index among the intake's temperatures, None where the drive sends none.
-        motor_rad_per_count, motor_rad_s_per_unit, link_rad_per_count, ampere_per_unit, sensor_nm_per_unit: scaling, SI.
-    """
+    """Where one joint's inputs lie among the intake's PDOs, and their scaling (SI)."""
 
     places: Mapping[str, Place]
+    """Of each quantity of the drive (`drive.DriveObjects`), its PDO and its entry there."""
     sensor: int | None
+    """Index of the sensor's PDO, None without reference."""
     motor_rad_per_count: float
     motor_rad_s_per_unit: float
     link_rad_per_count: float
     ampere_per_unit: float
     sensor_nm_per_unit: float
     temperature: int | None = None
+    """Index among the intake's temperatures, None where the drive sends none."""
 
     @property
     def positions(self) -> frozenset[int]:
@@ -115,9 +99,13 @@ def names_of_inputs(config: Config, number: int) -> tuple[str, str]:
     """Return the names of the PDOs with the positions of joint `number` (from 0), and of those with its other quantities."""
     joint, pdos = config.joints[number], input_pdos(config)
     found = drive_places(first_inputs(config)[number], joint.tpdos, joint.objects)
-    positions = sorted({place.pdo for name, place in found.items() if name in POSITIONS})
-    others = sorted({place.pdo for name, place in found.items() if name not in POSITIONS})
-    return tuple(" and ".join(pdos[n].name for n in each) for each in (positions, others))  # type: ignore[return-value]
+    positions = {place.pdo for name, place in found.items() if name in POSITIONS}
+    others = {place.pdo for name, place in found.items() if name not in POSITIONS}
+    return _joined(pdos, positions), _joined(pdos, others)
+
+
+def _joined(pdos: list[InputPdo], numbers: set[int]) -> str:
+    return " and ".join(pdos[n].name for n in sorted(numbers))
 
 
 def input_pdos(config: Config) -> list[InputPdo]:
@@ -168,22 +156,20 @@ def joint_temperatures(config: Config) -> list[TemperaturePdo]:
     ]
 
 
-def _scaling(report: dict[str, Any], node: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """Return the factors of a node; zeros for an absent one, whose factors come with its configuration."""
-    booted = report["nodes"].get(str(node))
-    return dict.fromkeys(names, 0.0) if booted is None else booted["scaling"]
-
-
 def joint_inputs(config: Config, report: dict[str, Any]) -> list[JointInputs]:
-    """Return the inputs of each joint: places in `input_pdos`, and the scaling of the boot report."""
+    """Return the inputs of each joint: places in `input_pdos`, and the scaling of the boot report.
+
+    An absent node has zeros: its factors come with its configuration.
+    """
+    scalings = {int(node): booted["scaling"] for node, booted in report["nodes"].items()}
     result, firsts = [], first_inputs(config)
     measured = [joint.number for joint in config.joints if joint.temperature]
     for number, joint in enumerate(config.joints):
-        drive = _scaling(report, joint.node_id, _DRIVE_FACTORS)
+        drive = scalings.get(joint.node_id, dict.fromkeys(DRIVE_FACTORS, 0.0))
         sensor_nm = 0.0
         if joint.sensor_channel is not None and config.sensor is not None:
-            scaling = _scaling(report, config.sensor.node_id, ("nm_per_unit",))
-            sensor_nm = scaling["nm_per_unit"][str(joint.sensor_channel)] if scaling["nm_per_unit"] else 0.0
+            channels = scalings.get(config.sensor.node_id, {}).get("nm_per_unit")
+            sensor_nm = channels[str(joint.sensor_channel)] if channels else 0.0
         result.append(
             JointInputs(
                 places=drive_places(firsts[number], joint.tpdos, joint.objects),

@@ -47,22 +47,12 @@ from jtqd.drivers import drive, nmt
 from jtqd.drivers import frame as can_frame
 from jtqd.drivers.pdo import SYNC_COB_ID
 
-_LONGEST: Final = 10
-"""Slots of a gap; after that SYNC goes on and the debts stay."""
-_PAUSE: Final = 20
-"""Cycles between two gaps: a bus that loses frames all the time must not lose its SYNC as well."""
-_QUARANTINE: Final = 5
-"""Cycles with exactly one frame each before a PDO is used again whose account was closed without its frame."""
-_BAND_MARGIN_NS: Final = 50_000
-"""Allowance around the learned delays: one frame of 135 bits may have been in the way less than twice."""
-_NARROW_NS: Final = 200_000
-"""A band wider than this cannot tell a late frame from one in time."""
-_BAND_LEAK: Final = 1.0 / 1024.0
-"""The band shrinks towards the present delays with a time constant of about a second at 1 kHz."""
-
-cdef int64_t LONGEST = _LONGEST, PAUSE = _PAUSE, QUARANTINE = _QUARANTINE
-cdef int64_t BAND_MARGIN_NS = _BAND_MARGIN_NS, NARROW_NS = _NARROW_NS
-cdef double BAND_LEAK = _BAND_LEAK
+cdef int64_t LONGEST = 10  # slots of a gap; after that SYNC goes on and the debts stay
+cdef int64_t PAUSE = 20  # cycles between two gaps: a bus that loses frames all the time must not lose its SYNC as well
+cdef int64_t QUARANTINE = 5  # cycles with exactly one frame each before a PDO is used again whose account was closed without its frame
+cdef int64_t BAND_MARGIN_NS = 50_000  # around the learned delays: one frame of 135 bits may have been in the way less than twice
+cdef int64_t NARROW_NS = 200_000  # a band wider than this cannot tell a late frame from one in time
+cdef double BAND_LEAK = 1.0 / 1024.0  # the band shrinks towards the present delays with a time constant of about 1 s at 1 kHz
 cdef int64_t NEVER = <int64_t> 1 << 62
 
 cdef int STALE_INPUTS = word_of("stale_inputs"), LATE_FRAMES = word_of("late_frames")
@@ -137,11 +127,7 @@ cdef bint _differs(const Input *state, const Frame *frame) noexcept nogil:
 cdef bint _usual(const Input *state, int64_t delay_ns) noexcept nogil:
     """Return whether the delay of a frame shows that it is this cycle's own, while an earlier one is missing."""
     cdef int64_t low = state.band_low_ns, high = state.band_high_ns
-    return (
-        delay_ns >= 0
-        and high - low <= NARROW_NS
-        and low - BAND_MARGIN_NS <= delay_ns <= high + BAND_MARGIN_NS
-    )
+    return delay_ns >= 0 and high - low <= NARROW_NS and low - BAND_MARGIN_NS <= delay_ns <= high + BAND_MARGIN_NS
 
 
 cdef void _learn(Input *state, int64_t delay_ns) noexcept nogil:
@@ -158,9 +144,8 @@ cdef void _learn(Input *state, int64_t delay_ns) noexcept nogil:
 
 # A joint's temperature ------------------------------------------------------------------------------------------------
 #
-# TPDO3 comes by an event timer, not with SYNC, so it belongs to no cycle: a value holds from the cycle that took its frame
-# until the next one, or until it is `life_cycles` old. Its age is counted in slots and not by stamps, because CLOCK_REALTIME
-# may be stepped, and so that the frames and cycle numbers of a log alone tell what each cycle had.
+# A value holds from the cycle that took its frame until the next one, or until it is `life_cycles` old, counted in slots and
+# not by stamps: CLOCK_REALTIME may be stepped, and the frames and cycle numbers of a log alone tell what each cycle had.
 
 
 cdef bint _receive(Temperature *temperature, const Frame *frame) noexcept nogil:
@@ -201,13 +186,11 @@ cdef int _node(int node_id) except -1:
 cdef class Intake:
     """Inputs of one cycle after the other.
 
-    Per cycle: `begin()` when the SYNC has been sent, `take(...)` for each batch of frames until it returns True or the
-    deadline has passed, `close()`, then `fresh` and `values`; `drain(...)` for what arrives before the next SYNC. Where
-    `gap_wanted` is then True, `pass_slot()` takes the place of the next cycle, and no SYNC is sent in its slot.
+    Per cycle: `begin()` when the SYNC has been sent, `take(...)` until it returns True or the deadline has passed, `close()`,
+    then `fresh` and `values`; `drain(...)` for what arrives before the next SYNC. Where `gap_wanted` is then True,
+    `pass_slot()` takes the place of the next cycle, and no SYNC is sent in its slot.
 
-    Args:
-        pdos: the expected PDOs (`InputPdo`); results are indexed in this order.
-        temperatures: joint temperatures that may come at any time (`TemperaturePdo`).
+    pdos: expected (`InputPdo`), results are indexed in this order; temperatures: may come at any time (`TemperaturePdo`).
 
     Attributes:
         counters: words of the table of counters; those of a snapshot once a loop has one.
@@ -241,25 +224,13 @@ cdef class Intake:
             self.nodes.wanted += not pdo.age_ns
         for n, each in enumerate(self.temperatures):
             node = _node(each.node_id)
-            self.celsius[n] = Temperature(
-                each.cob_id, node, each.life_cycles, NEVER, False, NAN, each.c_per_unit, 0, 0
-            )
+            self.celsius[n] = Temperature(each.cob_id, node, each.life_cycles, NEVER, False, NAN, each.c_per_unit, 0, 0)
             self.temperature_of[<int> each.cob_id] = n
 
     # Python values ----------------------------------------------------------------------------------------------------
 
     def take(self, const uint8_t[::1] frames, stamps_ns, own, int count):
-        """Sort `count` frames in.
-
-        Args:
-            frames: `count` times 16 bytes of `struct can_frame`.
-            stamps_ns: kernel receive stamps, CLOCK_REALTIME.
-            own: True for echoes of our own frames.
-            count: number of frames.
-
-        Returns:
-            True when every expected PDO of this cycle is there.
-        """
+        """Sort in `count` frames of 16 bytes with their kernel stamps, `own` for echoes; True when all PDOs are there."""
         cdef Frame frame
         cdef int n
         for n in range(count):
@@ -268,7 +239,7 @@ cdef class Intake:
         return self.missing == 0
 
     def drain(self, const uint8_t[::1] frames, stamps_ns, own, int count):
-        """Take frames received after the cycle was closed: late, or duplicates. Arguments as of `take`."""
+        """Take frames received after the cycle was closed, late ones or duplicates, as `take`."""
         cdef Frame frame
         cdef int n
         for n in range(count):
@@ -370,11 +341,7 @@ cdef class Intake:
             self.missing -= state.wanted
 
     cpdef bint close(self) noexcept:
-        """Close the cycle at the deadline, or when all inputs are received: decide which are used.
-
-        Returns:
-            True when every PDO of the nodes that are configured is a valid input of this cycle.
-        """
+        """Decide which inputs are used; True when every PDO of the nodes that are configured is a valid one."""
         cdef int64_t sync_ns = self.sync_stamp_ns, last_ns = 0, delay
         cdef bint complete = True
         cdef Input *state

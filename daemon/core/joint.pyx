@@ -23,6 +23,7 @@ from jtqd.daemon.core.estimate_pdo cimport (
     field_of,
     has_torque,
 )
+from jtqd.daemon.core.input_pdos import DRIVE_FACTORS
 from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.daemon.core.status cimport JointRules
@@ -67,17 +68,16 @@ cdef class JointCycle:
     """State of one joint from cycle to cycle, in the loop or in a replay of its log.
 
     Args:
-        number: 0 for joint 1, 1 for joint 2, ...
-        inputs: which PDOs are its inputs, and their scaling (`jtqd.daemon.core.input_pdos.JointInputs`).
-        estimator: its estimator; one in Python is called through the interpreter.
+        number: from 0 on.
+        inputs: which PDOs are its inputs, and their scaling (`JointInputs`).
+        estimator: one in Python is called through the interpreter.
         intake: decides which PDOs are fresh.
         snapshot: counts fallbacks and squared errors.
         period_ns: of the SYNC.
         safety: limits and checks; None for those that need no joint file.
 
     Attributes:
-        published: its fields of the estimate PDO, see `estimate_pdo.field`.
-        status: as published.
+        published: its fields of the estimate PDO (`estimate_pdo.field`); status: as published.
         sample: its block of the cycle record, a `JointRecord`.
     """
 
@@ -130,10 +130,7 @@ cdef class JointCycle:
     cdef int set_scale(self, inputs) except -1:
         """Take the scaling of the inputs."""
         self.scale = Scale(
-            inputs.motor_rad_per_count,
-            inputs.motor_rad_s_per_unit,
-            inputs.link_rad_per_count,
-            inputs.ampere_per_unit,
+            inputs.motor_rad_per_count, inputs.motor_rad_s_per_unit, inputs.link_rad_per_count, inputs.ampere_per_unit,
             inputs.sensor_nm_per_unit,
         )
         self.inputs = inputs
@@ -175,15 +172,7 @@ cdef class JointCycle:
         if not any(factors):
             return
         if self.node_id == node_id:
-            motor, speed, link, ampere = factors
-            scaled = replace(
-                inputs,
-                motor_rad_per_count=motor,
-                motor_rad_s_per_unit=speed,
-                link_rad_per_count=link,
-                ampere_per_unit=ampere,
-            )
-            self.set_scale(scaled)
+            self.set_scale(replace(inputs, **dict(zip(DRIVE_FACTORS, factors, strict=True))))
         elif inputs.sensor is not None and pdos[inputs.sensor].node_id == node_id:
             first = min([n for n, pdo in enumerate(pdos) if pdo.node_id == node_id])
             self.set_scale(replace(inputs, sensor_nm_per_unit=factors[inputs.sensor - first]))
@@ -199,8 +188,7 @@ cdef class JointCycle:
     cpdef void observe(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil:
         """Estimate from the inputs of the cycle whose SYNC went out at `sync_ns` (CLOCK_MONOTONIC).
 
-        While `starting`, an estimate that would be published has status 1 instead. Without `network_wanted` there is no time
-        for the network in this cycle, and it is physics only.
+        starting: a published status is 1 instead; not network_wanted: there is no time for it, the cycle is physics only.
         """
         cdef int flags = self.reference()
         self.now.sample.temperature_c = self.celsius[0]
@@ -239,9 +227,7 @@ cdef class JointCycle:
         sample.temperature_c = record.temperature_c
         self.core.advance(&sample, network_wanted, &e)
         record.reference_nm = self.rules.reference(sample.dt_s, record.sensor_torque_nm)
-        status = self.rules.judge(
-            &e, &sample, record.reference_nm, statusword, starting, network_wanted, &flags
-        )
+        status = self.rules.judge(&e, &sample, record.reference_nm, statusword, starting, network_wanted, &flags)
         self.now.published = field_of(e.torque_nm, e.sigma_nm, status)
         if not has_torque(status):
             e.torque_nm = e.sigma_nm = NAN
@@ -336,14 +322,8 @@ cdef int KNOWN = cr.FLAG_CONTACT_KNOWN, THERE = cr.FLAG_CONTACT
 cdef class ContactWatch:
     """Detectors of a bus.
 
-    Args:
-        thresholds_nm: of each joint.
-        opposed: joints 1 and 2, and 3 and 4, turn one link against each other; the smaller threshold of the two counts.
-        sends: the contact PDOs are sent.
-        period_s: of SYNC.
-
-    Raises:
-        ValueError: opposed joints that are not in twos; a threshold or period that is none.
+    thresholds_nm: of each joint; opposed: the smaller threshold of the two counts; sends: the contact PDOs are sent; period_s: of
+    SYNC. Raises ValueError for opposed joints that are not in twos, and a threshold or period that is none.
     """
 
     def __init__(self, thresholds_nm, *, bint opposed=False, bint sends=True, double period_s=0.001):
@@ -406,6 +386,4 @@ def contacts_of(config):
     if contact is None:
         return None
     thresholds = [contact.threshold_of(joint.joint.rated_torque_nm) for joint in config.joints]
-    return ContactWatch(
-        thresholds, opposed=contact.opposed, sends=contact.pdo, period_s=config.period_ns * 1e-9
-    )
+    return ContactWatch(thresholds, opposed=contact.opposed, sends=contact.pdo, period_s=config.period_ns * 1e-9)

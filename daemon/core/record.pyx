@@ -46,16 +46,11 @@ _check_layout()
 cdef Layout _layout(int joints) except *:
     """Return the layout for a number of joints; raises ValueError for any but 1..4."""
     found = cr.layout_of(joints)
-    return Layout(
-        joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.tail_offset, found.size
-    )
+    return Layout(joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.tail_offset, found.size)
 
 
 cdef class RecordRing:
-    """The ring's memory (`jtqd.daemon.shared.cycle_record.Ring`): the count of records lies in it, and nowhere else.
-
-    joints: of which a record holds the blocks.
-    """
+    """The ring's memory (`jtqd.daemon.shared.cycle_record.Ring`) for records of this number of joints."""
 
     def __init__(self, ring, int joints=2):
         cdef Py_ssize_t word = cr.COUNT_WORD
@@ -64,9 +59,7 @@ cdef class RecordRing:
         self.written = &self.head[word]
         self.layout = _layout(joints)
         if <uint64_t> self.records.shape[0] != self.slots * self.layout.size:
-            raise ValueError(
-                f"found a ring of {self.records.shape[0]} bytes for {self.slots} cycles of {joints} joints"
-            )
+            raise ValueError(f"found a ring of {self.records.shape[0]} bytes for {self.slots} cycles of {joints} joints")
 
     cdef Record slot(self) noexcept nogil:
         """Return the memory of the record that the next `commit` publishes."""
@@ -85,14 +78,7 @@ cdef class RecordRing:
 
 
 cdef class CycleFrames:
-    """Frames of a cycle, copied unchanged into its record: 16 bytes each beside their stamps.
-
-    joints: of the record.
-
-    Attributes:
-        count: frames stored in it.
-        left_out: frames of the cycle that found no room.
-    """
+    """Frames of a cycle, copied unchanged into its record; `count` are stored in it, `left_out` found no room."""
 
     def __init__(self, int joints=2):
         self.layout = _layout(joints)

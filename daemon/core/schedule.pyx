@@ -11,18 +11,13 @@ from typing import Final
 
 from jtqd.daemon.core.record cimport MOST_JOINTS
 
-_STEP_NS: Final = 160
-_MARGIN_NS: Final = 10_000
-_SHORTEST_NS: Final = 50_000
 RESERVED_NS: Final = 40_000
 """For making and sending the estimate PDO."""
 FORGET_CYCLES: Final = 1024
 """Time constant in cycles without the network."""
-_SETTLE_CYCLES: Final = 16
-"""... and with it."""
 
-cdef int64_t STEP_NS = _STEP_NS, MARGIN_NS = _MARGIN_NS, SHORTEST_NS = _SHORTEST_NS
-cdef int64_t RESERVE_NS = RESERVED_NS, FORGET = FORGET_CYCLES, SETTLE = _SETTLE_CYCLES
+cdef int64_t STEP_NS = 160, MARGIN_NS = 10_000, SHORTEST_NS = 50_000  # of `WakeUp`
+cdef int64_t RESERVE_NS = RESERVED_NS, FORGET = FORGET_CYCLES, SETTLE = 16  # cycles with the network
 
 cdef enum:
     TIMER_ABSTIME = 1
@@ -86,10 +81,7 @@ cdef class Grid:
     A slot is missed when it cannot be begun within half a period of its time: a SYNC later than that would leave its
     successor less than half a cycle, and drives would see two SYNCs in quick succession.
 
-    Attributes:
-        slot_ns: time of the current slot.
-        period_ns: between two slots.
-        missed: slots skipped so far.
+    slot_ns: time of the current slot; period_ns: between two slots; missed: slots skipped so far.
     """
 
     def __init__(self, int64_t start_ns, int64_t period_ns):
@@ -119,9 +111,7 @@ cdef class Grid:
 cdef class WakeUp:
     """When to wake up for the inputs of a cycle: when 99 of 100 times all have come; each one waited for is a wake-up more.
 
-    Attributes:
-        wait_ns: from SYNC to the wake-up.
-        deadline_ns: from SYNC to the end of the wait for inputs; the wake-up never comes later.
+    wait_ns, deadline_ns: from SYNC to the wake-up, and to the end of the wait for inputs, after which it never comes.
     """
 
     def __init__(self, int64_t wait_ns, int64_t deadline_ns):
@@ -141,12 +131,9 @@ cdef class NetworkBudget:
     Call `begin` at the start of the estimates of a cycle, `wanted` before that of each joint and `ended` after the last. A
     joint leaves time for those that come after it.
 
-    joints: number of them.
-
-    How long a joint's estimate takes with its network is learned: the shorter of its last two times, which one stall of the
-    machine does not change, at once upwards and slowly downwards. The first slow call of a network cannot be foreseen:
-    such a cycle is late as a whole and withdrawn. After the second the network is left out; after FORGET_CYCLES or so it is
-    tried again. When inputs come so late that there is no time, it is left out at once.
+    How long a joint's estimate takes with its network is learned: the shorter of its last two times, at once upwards and slowly
+    downwards. A cycle with the first slow call is late as a whole and withdrawn; after the second the network is left out, and
+    tried again after FORGET_CYCLES or so. When inputs come so late that there is no time, it is left out at once.
     """
 
     def __init__(self, int joints=2):

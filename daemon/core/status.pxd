@@ -45,14 +45,8 @@ cdef class JointRules:
     cdef Reference seen
     cdef double reference(self, double dt, double sensor_nm) noexcept nogil
     cdef int judge(
-        self,
-        const Values *estimate,
-        const Sample *sample,
-        double reference_nm,
-        int statusword,
-        bint starting,
-        bint network_wanted,
-        int *flags,
+        self, const Values *estimate, const Sample *sample, double reference_nm,
+        int statusword, bint starting, bint network_wanted, int *flags,
     ) noexcept nogil
     cdef int stale(self, int *flags) noexcept nogil
     cdef int fault_flags(self) noexcept nogil

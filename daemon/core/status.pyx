@@ -74,17 +74,12 @@ cdef int _rank(int status) noexcept nogil:
     return RANKS[status] if 0 <= status < CODES else WORST
 
 
-cdef int64_t _wait(int status) noexcept nogil:
-    """Return the cycles after which a status may be left."""
-    return WAITS[status] if 0 <= status < CODES else 1
-
-
 cdef int _worse(int a, int b) noexcept nogil:
     return a if _rank(a) >= _rank(b) else b
 
 
 cdef int _status_of(int latched) noexcept nogil:
-    """As `faults.status_of`."""
+    """Return the status that is published while these faults are latched, as `faults.status_of`."""
     if latched & FAULT_DRIVE:
         return DRIVE_FAULT
     return STALE if latched == FAULT_STALE else INVALID
@@ -95,12 +90,7 @@ cdef int _status_of(int latched) noexcept nogil:
 
 @cython.final
 cdef class JointStatus:
-    """State of one joint.
-
-    Attributes:
-        latched: bits of the faults that are latched (`daemon/shared/cycle_record.py`).
-        latches: how often a fault was latched, since the tally set it to 0.
-    """
+    """State of one joint; `latched` are the bits of its latched faults, `latches` those not yet counted by the tally."""
 
     def __init__(self, settings):
         limit = settings.stale_latch_cycles
@@ -191,7 +181,8 @@ cdef class JointStatus:
 
     cdef int64_t cycles(self, int status) noexcept nogil:
         """Return the hold time of a status in cycles."""
-        return _wait(status) if _rank(status) <= WITH_NUMBER else _wait(status) * self.now.factor
+        cdef int64_t wait = WAITS[status] if 0 <= status < CODES else 1
+        return wait if _rank(status) <= WITH_NUMBER else wait * self.now.factor
 
 
 # Counts ---------------------------------------------------------------------------------------------------------------
@@ -324,10 +315,7 @@ cdef int _forced_status(int statusword) noexcept nogil:
 cdef class JointRules:
     """The rules for joint `number` (from 0 on), one cycle after the other.
 
-    number, tally: where it counts; safety: limits and checks (`JointSafety`); with_network: the estimator uses one.
-
-    Attributes:
-        status: hysteresis and latches.
+    tally: where it counts; safety: limits and checks (`JointSafety`); with_network: the estimator uses one.
     """
 
     def __init__(self, int number, tally, safety, bint with_network):
@@ -355,14 +343,8 @@ cdef class JointRules:
         return follow_reference(&self.seen, self.bandwidth, self.max_gap, dt, sensor_nm)
 
     cdef int judge(
-        self,
-        const Values *estimate,
-        const Sample *sample,
-        double reference_nm,
-        int statusword,
-        bint starting,
-        bint network_wanted,
-        int *flags,
+        self, const Values *estimate, const Sample *sample, double reference_nm,
+        int statusword, bint starting, bint network_wanted, int *flags,
     ) noexcept nogil:
         """Return the status to publish and set its bits of `input_flags`.
 
@@ -372,11 +354,7 @@ cdef class JointRules:
         cdef int found = 0, status = estimate.status, forced = _forced_status(statusword)
         if self.is_checked:
             found = self.plausibility.check(
-                sample.dt_s,
-                sample.motor_position_rad,
-                sample.motor_velocity_rad_s,
-                sample.link_position_rad,
-                sample.current_a,
+                sample.dt_s, sample.motor_position_rad, sample.motor_velocity_rad_s, sample.link_position_rad, sample.current_a
             )
         if self.with_network and not network_wanted:
             flags[0] |= FLAG_NETWORK_SKIPPED

@@ -223,7 +223,7 @@ SIZE = _Views(memoryview(b"")).size
 
 
 class Snapshot(_Views):
-    """Writer's side, one per loop: the memory that `daemon/core/snapshot.pyx` writes into.
+    """Writer's side, one per loop: the memory that `daemon/core/cycle.pyx` writes into.
 
     It has room for four joints.
 
