@@ -48,7 +48,7 @@ from jtqd.daemon.recording.run_files import (
     part_files,
 )
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.cycle_record import MOST_JOINTS, layout_of
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS, RingError, RingReader, layout_of
 from jtqd.daemon.shared.events import NoticesError, NoticesReader
 from jtqd.daemon.shared.processes import Child, ChildError
 from jtqd.daemon.shared.snapshot import SnapshotError

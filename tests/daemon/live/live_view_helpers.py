@@ -14,6 +14,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from jtqd.daemon.recording import messages
+from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.daemon.shared.events import FILE, Notices
 from jtqd.daemon.shared.snapshot import Snapshot
 from tests.daemon import ring_records as rr
