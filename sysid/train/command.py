@@ -231,7 +231,7 @@ def _train_joint(
 ) -> dict[str, Any]:
     iterations = options.iterations or _ITERATIONS[options.network]
     claimed = None
-    hashes = {Path(run.name).name: run.sha256 for run in runs}
+    hashes = {run.name: run.sha256 for run in runs}
 
     def say(n: int, loss: float) -> None:
         if (n + 1) % 100 == 0:

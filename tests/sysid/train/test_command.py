@@ -18,10 +18,10 @@ JOINT = str(shipped("joint1.yaml"))
 def run(tmp_path):
     """A run file of a joint that turns to and fro under load; `sensor` replaces its torque."""
 
-    def made(name="a.csv", sensor=None, count=3000):
+    def made(name="a.csv", sensor=None, count=3000, hz=0.5):
         t = np.arange(count) * 1e-3
-        v = np.sin(2 * np.pi * 0.5 * t)
-        angle = (1 - np.cos(2 * np.pi * 0.5 * t)) / np.pi
+        v = np.sin(2 * np.pi * hz * t)
+        angle = (1 - np.cos(2 * np.pi * hz * t)) / (2 * np.pi * hz)
         current = 2.0 * np.sign(v) + np.sin(2 * np.pi * 1.7 * t)
         torque = 8.0 * np.sign(v) + 0.01 * np.cos(53.0 * t) if sensor is None else np.full(count, sensor)
         joint = JointColumns(
@@ -34,6 +34,7 @@ def run(tmp_path):
             temperature_c=None,
         )
         path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
         write_run(path, RunTable(time_s=t, joints={1: joint}))
         return str(path)
 
@@ -100,3 +101,17 @@ def test_missing_run_and_too_few_runs_of_the_loss_fit(run, tmp_path, capsys):
     assert "no.csv: found no such file or directory" in capsys.readouterr().err
     assert jtq(["fit", "losses", run(), "--joint", JOINT]) == 1
     assert "found 1 run, expected at least 6" in capsys.readouterr().err
+
+
+def test_runs_of_one_name_in_two_folders_keep_their_own_hashes(run, tmp_path, monkeypatch):
+    """The network names every run that it was trained on: `jtq evaluate` refuses them by these hashes."""
+    seen = {}
+
+    def trained(blocks, joint, hashes, **_):
+        seen.update(hashes)
+        raise ValueError("enough")
+
+    monkeypatch.setattr(train_command, "train_paper", trained)
+    paths = [run("one/a.csv"), run("other/a.csv", hz=0.7)]
+    assert train_command.main([paths[0], *arguments(paths[1], tmp_path)]) == 1
+    assert len(set(seen.values())) == len(seen) == 2
