@@ -47,8 +47,7 @@ from jtqd.sysid.campaign.emulated import emulated
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import variable_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan
-from jtqd.sysid.report.figures import STYLE, check_picture
-from jtqd.sysid.report.page import LIGHT
+from jtqd.sysid.report.page import LIGHT, STYLE, check_picture
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import write_run

@@ -36,7 +36,7 @@ from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.fit.few_runs import PRIOR
 from jtqd.sysid.fit.plateaus import effective_samples
-from jtqd.sysid.report import figures as parts
+from jtqd.sysid.report import page as parts
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run

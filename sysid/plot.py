@@ -27,7 +27,7 @@ from jtqd.estimator.status import (
     VALID,
 )
 from jtqd.estimator.text import counted, finite
-from jtqd.sysid.report.figures import check_picture, shade
+from jtqd.sysid.report.page import check_picture, shade
 
 _SHADES = {
     STANDSTILL: "#dcecf2",

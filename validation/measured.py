@@ -199,7 +199,7 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
     import matplotlib as mpl
     from matplotlib import pyplot as plt
 
-    from jtqd.sysid.report import figures as parts
+    from jtqd.sysid.report import page as parts
 
     mpl.use("Agg")  # files only; a display is not needed
     heights = (4, 3, 2) if panels[0].differences else (3, 2)
@@ -234,7 +234,7 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
 
 def panel(case: Case) -> Panel:
     """Return what is drawn of a case."""
-    from jtqd.sysid.report import figures as parts
+    from jtqd.sysid.report import page as parts
 
     before = f"before: joint file as shipped, RMSE {case.before.rmse_nm:.2f} Nm"
     after = f"after: losses fitted on {case.fitted_on}, RMSE {case.after.rmse_nm:.2f} Nm"

@@ -315,7 +315,7 @@ def bus_table(results: Sequence[BusRun]) -> Table:
 
 def panels(results: Sequence[BusRun]) -> list[Panel]:
     """Return what is drawn of one joint: both configurations of each run."""
-    from jtqd.sysid.report import figures as parts
+    from jtqd.sysid.report import page as parts
 
     labels = {"before": "before: joint file as shipped", "after": "after: losses fitted on the other run"}
     found = []

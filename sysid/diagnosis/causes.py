@@ -17,7 +17,7 @@ from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS
 from jtqd.sysid.diagnosis.refine import parameter, places
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.stability import stability
-from jtqd.sysid.fit.friction import student_975
+from jtqd.sysid.fit.plateaus import student_975
 
 _INACCURATE: Final = 0.015
 """Half width of the 95 % interval, as part of an effect's size, for what the equations here simplify: no interval is

@@ -1,6 +1,5 @@
 """Compare every method with the torque sensor on runs that no model was made from: `jtq evaluate`.
 
-In: runs, a directory of models. Out: table, evaluation.json, evaluation.html. Modules: `command`, `inputs` (runs that may
-be used), `methods` (models and estimates), `scores`, `evaluation` (all tables and targets), `report` (values, text, page),
-`card` (accuracy card of one's own joint, `--card`). Imports estimator, models, sysid.runs, sysid.fit, sysid.report.
+In: runs, a directory of models. Out: table, evaluation.json, evaluation.html. Modules: `command`, `inputs` (models, runs,
+estimates), `scores`, `evaluation` (all tables and targets), `report` (values, text, page), `card` (accuracy card, `--card`).
 """

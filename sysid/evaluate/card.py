@@ -26,7 +26,7 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
-from jtqd.sysid.evaluate.methods import TITLES, JointModels, Samples
+from jtqd.sysid.evaluate.inputs import TITLES, JointModels, Samples
 from jtqd.sysid.evaluate.report import indented_table
 from jtqd.sysid.evaluate.scores import (
     NOMINAL,
@@ -39,8 +39,7 @@ from jtqd.sysid.evaluate.scores import (
     standstill,
 )
 from jtqd.sysid.report import page
-from jtqd.sysid.report.figures import STYLE, page_svg, plain
-from jtqd.sysid.report.page import LIGHT
+from jtqd.sysid.report.page import LIGHT, STYLE, page_svg, plain
 from jtqd.sysid.runs.channels import RunIssue
 
 SCHEMA: Final = "jtq.accuracy/1"

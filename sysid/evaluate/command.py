@@ -24,8 +24,7 @@ from jtqd.sysid.evaluate.card import (
     write_png,
 )
 from jtqd.sysid.evaluate.evaluation import evaluate, loop_time
-from jtqd.sysid.evaluate.inputs import Inputs, read_inputs
-from jtqd.sysid.evaluate.methods import JointModels, load_models, take_samples
+from jtqd.sysid.evaluate.inputs import Inputs, JointModels, load_models, read_inputs, take_samples
 from jtqd.sysid.evaluate.report import as_mapping, report_html, text_lines
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.channels import RunIssue

@@ -20,8 +20,7 @@ from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.text import counted
-from jtqd.sysid.evaluate.inputs import EvaluatedRun
-from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples, take_samples
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS, TITLES, EvaluatedRun, JointModels, Samples, take_samples
 from jtqd.sysid.evaluate.scores import (
     ALLOWED,
     LIMIT_NM,

@@ -17,7 +17,7 @@ from jtqd.estimator.joint import QUADRANTS
 from jtqd.estimator.text import counted, table_lines
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.evaluation import Evaluation, Target, mse, mse_ratio, worse_runs
-from jtqd.sysid.evaluate.methods import OURS, PAPERS, TITLES, JointModels, Samples
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS, TITLES, JointModels, Samples
 from jtqd.sysid.evaluate.scores import (
     LEVELS,
     PAPER_MSE_NM2,
@@ -41,9 +41,8 @@ from jtqd.sysid.evaluate.scores import (
 )
 from jtqd.sysid.fit.efficiency import QUADRANT_TITLES
 from jtqd.sysid.report import page
-from jtqd.sysid.report.figures import SENSOR, STANDING, page_svg, plain, shade, thinned
 from jtqd.sysid.report.numbers import DASH
-from jtqd.sysid.report.page import LIGHT
+from jtqd.sysid.report.page import LIGHT, SENSOR, STANDING, page_svg, plain, shade, thinned
 
 # Plain values ------------------------------------------------------------------------------------------------------------
 

@@ -46,7 +46,7 @@ from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import METHODS
 from jtqd.estimator.status import DEGRADED
 from jtqd.estimator.uncertainty import GAUSS
-from jtqd.sysid.evaluate.methods import OURS, PAPERS_BANDWIDTH, TITLES, Samples, settings_of
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS_BANDWIDTH, TITLES, Samples, settings_of
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 
 # Errors ------------------------------------------------------------------------------------------------------------------

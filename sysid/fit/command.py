@@ -33,13 +33,12 @@ from jtqd.sysid.fit.efficiency import (
     written_findings,
 )
 from jtqd.sysid.fit.few_runs import MOST_RUNS, FewRunsFit, fit_few_runs
-from jtqd.sysid.fit.friction import fit_no_load, no_load
 from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
 from jtqd.sysid.fit.losses import PER_K_PRIOR
-from jtqd.sysid.fit.plateaus import PlateauRules, mean_temperature, plateaus_of
+from jtqd.sysid.fit.plateaus import PlateauRules, fit_no_load, mean_temperature, no_load, plateaus_of
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
-from jtqd.sysid.report.figures import check_picture
+from jtqd.sysid.report.page import check_picture
 from jtqd.sysid.runs.channels import RunIssue
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, runs_of_joint

@@ -38,8 +38,8 @@ from jtqd.estimator.losses import (
     static_friction,
 )
 from jtqd.estimator.text import table_lines
-from jtqd.sysid.fit.plateaus import Plateau, mean_temperature
-from jtqd.sysid.report.figures import plain
+from jtqd.sysid.fit.plateaus import SAME_VELOCITY_RAD_S, Plateau, mean_temperature
+from jtqd.sysid.report.page import plain
 from jtqd.sysid.runs.channels import RunIssue
 
 COEFFICIENTS: Final = ("p00", "p10", "p01", "p20", "p11", "p02")
@@ -47,9 +47,8 @@ FEWEST_DISTINCT: Final = len(COEFFICIENTS) + 1
 """Least operating points per quadrant: six coefficients, and one more to check them."""
 HIGHEST_CONDITION: Final = 3000.0
 """Of the columns scaled to unit length: 30 to 60 for the points of section II. Beyond this the data do not span Eq. (8)."""
-SAME_VELOCITY_RAD_S: Final = 0.03
 SAME_CURRENT_A: Final = 0.1
-"""Plateaus closer than both of these are the same operating point measured again."""
+"""Plateaus closer than this and SAME_VELOCITY_RAD_S are the same operating point measured again."""
 OFFSET_SHARE: Final = 0.01
 """Largest offset of the sensor from day to day, as a share of rated torque: 0.4 Nm of 40 Nm."""
 

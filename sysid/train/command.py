@@ -25,8 +25,8 @@ from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, joint_number, only
 from jtqd.sysid.runs.run_file import RunError, RunFile
+from jtqd.sysid.train.network import TrainedNetwork, paper_block, split_by_sample, train_paper
 from jtqd.sysid.train.ours import Gate, judge, train_fused
-from jtqd.sysid.train.paper import TrainedNetwork, paper_block, split_by_sample, train_paper
 
 _WHAT = {
     "paper": "The paper's network (section III): current, angles and velocities of both sides and the efficiency "

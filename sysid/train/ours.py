@@ -26,23 +26,23 @@ from jtqd.estimator.onnx_graph import perceptron_content
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.text import counted
 from jtqd.estimator.uncertainty import Fusion, network_shares
-from jtqd.sysid.fit.calibration import conformal_scale
-from jtqd.sysid.fit.envelope import envelope_of
-from jtqd.sysid.fit.fused import folds
+from jtqd.sysid.fit.calibration import conformal_scale, loss_and_width
+from jtqd.sysid.fit.fused import envelope_of, folds
 from jtqd.sysid.fit.losses import fit_loss
-from jtqd.sysid.fit.residuals import loss_and_width
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
 from jtqd.sysid.train.network import (
     IR_VERSION,
     OPSET,
     Trained,
+    TrainedNetwork,
+    digest_of,
     folded_layers,
     hidden_output,
     serialised,
+    thinned,
     train,
 )
-from jtqd.sysid.train.paper import TrainedNetwork, digest_of, thinned
 
 LEAST_GAIN: Final = 0.30
 """Of the error (RMSE) of physics that a network takes off."""

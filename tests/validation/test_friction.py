@@ -10,7 +10,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.fit.friction import FitError
+from jtqd.sysid.fit.plateaus import FitError
 from validation.goals.friction import fit_friction
 
 Array = NDArray[np.float64]

@@ -19,7 +19,7 @@ from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate
 from jtqd.sim_can.plant_file import PlantParameters
 from jtqd.sim_can.towing.bench_file import TowingBench
-from jtqd.sysid.evaluate.methods import OURS, PAPERS
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.fit.torsion import deflection
 from jtqd.sysid.planner.plan import Plateau, Rest, Run

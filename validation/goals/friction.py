@@ -29,8 +29,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
-from jtqd.sysid.fit.friction import COULOMB, VISCOUS, FitError, student_975
-from jtqd.sysid.fit.plateaus import effective_samples
+from jtqd.sysid.fit.plateaus import COULOMB, VISCOUS, FitError, effective_samples, student_975
 
 STRIBECK = "stribeck_nm"
 STANDSTILL_RAD_S = 0.02  # joint side; below it the direction is mostly noise and stiction decides

@@ -14,7 +14,7 @@ from functools import partial
 from typing import Final, NamedTuple
 
 from jtqd.estimator.command_line import count, natural
-from jtqd.sysid.evaluate.methods import OURS, PAPERS
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS
 from validation.goals.identify import FIT_SEED, FULL, JUDGE_SEED, QUICK, TINY, PlantFile, Sizes, the_three
 from validation.goals.judge import OWN, REGRESSION, TITLES, Changed, Column, Figure, column
 from validation.study import Report, Table, UsageError, in_processes

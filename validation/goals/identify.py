@@ -44,7 +44,7 @@ from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.planner.campaigns import Scale, make_plan, outside_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Run
-from jtqd.sysid.train.paper import paper_block, train_paper
+from jtqd.sysid.train.network import paper_block, train_paper
 
 SIDES: Final = ("joint_1", "joint_2")
 Mapped = dict[str, Any]

@@ -23,7 +23,7 @@ from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings, bandwidth_of, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.uncertainty import GAUSS
-from jtqd.sysid.evaluate.methods import OURS, PAPERS, SETTLE_S
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS, SETTLE_S
 from jtqd.sysid.planner.campaigns import seed_of
 from jtqd.sysid.planner.plan import Run
 from validation.goals.identify import (

@@ -29,9 +29,8 @@ from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import EstimatorSettings, bandwidth_of
 from jtqd.models.files import shipped
 from jtqd.sim_can.towing.bench_file import AngleWave, TowedJoint, TowingBench
-from jtqd.sysid.fit.calibration import calibrated, fit_sigma
-from jtqd.sysid.fit.repeatability import fit_zeros
-from jtqd.sysid.fit.residuals import path_residuals
+from jtqd.sysid.fit.calibration import calibrated, fit_sigma, path_residuals
+from jtqd.sysid.fit.fused import fit_zeros
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.planner.campaigns import make_plan
 from jtqd.sysid.planner.plan import Run

@@ -43,8 +43,8 @@ from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.few_runs import PRIOR, Prior, fit_few_runs
-from jtqd.sysid.fit.friction import FitError
 from jtqd.sysid.fit.losses import LossFitError
+from jtqd.sysid.fit.plateaus import FitError
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.planner.campaigns import variable_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS

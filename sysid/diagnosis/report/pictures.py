@@ -14,9 +14,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.findings import Findings, Trace
 from jtqd.sysid.diagnosis.report.words import balance_title
-from jtqd.sysid.report.figures import page_svg, thinned
 from jtqd.sysid.report.numbers import number
-from jtqd.sysid.report.page import LIGHT
+from jtqd.sysid.report.page import LIGHT, page_svg, thinned
 
 MOST: Final = 6
 """Figures on a page; the other runs are in its table."""

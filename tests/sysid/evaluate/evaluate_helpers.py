@@ -20,7 +20,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.evaluate.command import main
-from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.inputs import Samples
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.tables import write_run
 from jtqd.sysid.train.network import export_network

@@ -14,7 +14,7 @@ from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.evaluate.card import Card, load_edges, make_card, speed_edges, temperature_edges
 from jtqd.sysid.evaluate.command import main
-from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.inputs import Samples
 from jtqd.sysid.runs.tables import write_run
 from tests.sysid.evaluate.evaluate_helpers import emulated, samples, write_models
 

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from jtqd.sysid.evaluate.evaluation import TIMED, Evaluation, LoopTime, Target, loop_time, targets
-from jtqd.sysid.evaluate.inputs import EvaluatedRun, read_inputs
-from jtqd.sysid.evaluate.methods import JointModels, Samples, load_models
+from jtqd.sysid.evaluate.inputs import EvaluatedRun, JointModels, Samples, load_models, read_inputs
 from jtqd.sysid.evaluate.scores import (
     Jump,
     Outside,

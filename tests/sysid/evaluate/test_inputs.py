@@ -15,8 +15,7 @@ import pytest
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint
 from jtqd.sysid.evaluate.command import main
-from jtqd.sysid.evaluate.inputs import by_marks, read_inputs
-from jtqd.sysid.evaluate.methods import load_models
+from jtqd.sysid.evaluate.inputs import by_marks, load_models, read_inputs
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.tables import write_run

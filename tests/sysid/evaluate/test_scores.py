@@ -13,8 +13,7 @@ from jtqd.estimator.joint import QUADRANTS, Envelope
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.sysid.evaluate.evaluation import worse_runs
-from jtqd.sysid.evaluate.inputs import by_data
-from jtqd.sysid.evaluate.methods import Samples
+from jtqd.sysid.evaluate.inputs import Samples, by_data
 from jtqd.sysid.evaluate.scores import (
     LEVELS,
     PlateauScore,
@@ -39,7 +38,7 @@ from jtqd.sysid.evaluate.scores import (
     worst_plateau,
 )
 from jtqd.sysid.fit.plateaus import Mean, Plateau
-from jtqd.sysid.report.figures import thinned
+from jtqd.sysid.report.page import thinned
 from jtqd.sysid.runs.tables import read_truth, truth_path, write_truth
 from tests.sysid.evaluate.evaluate_helpers import samples
 

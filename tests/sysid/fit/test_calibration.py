@@ -18,6 +18,8 @@ from jtqd.sysid.fit.calibration import (
     OTHER_MOTIONS,
     OTHER_MOTIONS_LEARNED,
     SATURATION_RAD_S,
+    FusedErrors,
+    PathResiduals,
     Standing,
     bent_square,
     calibrated,
@@ -25,13 +27,13 @@ from jtqd.sysid.fit.calibration import (
     early_factor,
     fit_sigma,
     fit_standstill,
+    fused_errors,
     normal_bound,
     sensor_offsets,
     tracking_section,
     unbiased_level,
 )
-from jtqd.sysid.fit.repeatability import fit_zeros
-from jtqd.sysid.fit.residuals import FusedErrors, PathResiduals, fused_errors
+from jtqd.sysid.fit.fused import fit_zeros
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
 from tests.sysid.fit.test_repeatability import RATED, fused, runs_of_days
 

@@ -5,7 +5,7 @@ import pytest
 
 from jtqd.estimator.joint import Envelope
 from jtqd.estimator.uncertainty import envelope_weights
-from jtqd.sysid.fit.envelope import BEYOND_SHARE, MOST_WIDER, envelope_of, velocity_step, widened
+from jtqd.sysid.fit.fused import BEYOND_SHARE, MOST_WIDER, envelope_of, velocity_step, widened
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,15 @@ import pytest
 
 from jtqd.estimator.joint import Friction
 from jtqd.estimator.losses import FrictionModel
-from jtqd.sysid.fit.friction import FitError, fit_no_load, no_load, student_975
-from jtqd.sysid.fit.plateaus import Mean, Plateau, effective_samples
+from jtqd.sysid.fit.plateaus import (
+    FitError,
+    Mean,
+    Plateau,
+    effective_samples,
+    fit_no_load,
+    no_load,
+    student_975,
+)
 from tests.estimator.estimator_helpers import joint1
 
 

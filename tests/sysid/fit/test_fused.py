@@ -24,10 +24,9 @@ from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate, 
 from jtqd.sim_can.plant import joint_friction
 from jtqd.sim_can.plant_file import Day
 from jtqd.sysid.fit import fused as fits
-from jtqd.sysid.fit.calibration import calibrated
+from jtqd.sysid.fit.calibration import PathResiduals, calibrated, fused_errors, path_residuals
 from jtqd.sysid.fit.fused import FOLDS, FusedFit, fit_fused, folds
 from jtqd.sysid.fit.losses import PER_K_PRIOR, fit_loss
-from jtqd.sysid.fit.residuals import PathResiduals, fused_errors, path_residuals
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S, fit_torsion
 from tests.estimator.fused_helpers import fused_joint

@@ -11,9 +11,9 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Agreement, DayZeros, Fused, FusedSigma
 from jtqd.estimator.path_difference import turn_waves
-from jtqd.sysid.fit import repeatability
-from jtqd.sysid.fit.repeatability import LOWERED, QUANTILE, correlation, fit_agreement, fit_turn, fit_zeros
-from jtqd.sysid.fit.residuals import FusedErrors, PathResiduals, fused_errors
+from jtqd.sysid.fit import fused as fits
+from jtqd.sysid.fit.calibration import FusedErrors, PathResiduals, fused_errors
+from jtqd.sysid.fit.fused import LOWERED, QUANTILE, correlation, fit_agreement, fit_turn, fit_zeros
 from tests.estimator.test_fused_estimator import NARROW
 
 K, RATED, DAYS = 12000.0, 40.0, 24
@@ -100,7 +100,7 @@ def test_tracked_offsets_reduce_error_and_spread() -> None:
 def agreement_with(monkeypatch: pytest.MonkeyPatch, blocks: list[tuple[FloatArray, ...]]) -> Agreement | None:
     """The section where the estimator finds these levels, one entry per call."""
     asked = iter(blocks)
-    monkeypatch.setattr(repeatability, "levels", lambda usual, *_: next(asked))
+    monkeypatch.setattr(fits, "levels", lambda usual, *_: next(asked))
     return fit_agreement(runs_of_days(0.4)[:1], fused(), RATED)
 
 
@@ -124,7 +124,7 @@ def test_the_doubt_of_ordinary_days_is_that_beyond_the_levels_found(monkeypatch:
         ones = np.ones(400)
         return ones, ones, ones, ones, ones * (5.0 if len(asked) == 1 else 2.0)
 
-    monkeypatch.setattr(repeatability, "levels", levels)
+    monkeypatch.setattr(fits, "levels", levels)
     found = fit_agreement(runs_of_days(0.4)[:1], fused(), RATED)
     assert found is not None
     assert asked[1:] == [replace(found, lowered_nm=0.0)]

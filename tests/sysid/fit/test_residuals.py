@@ -16,8 +16,7 @@ from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
 from jtqd.estimator.uncertainty import Fusion
-from jtqd.sysid.fit.calibration import bent_square, fit_tracking
-from jtqd.sysid.fit.residuals import FusedErrors, fused_errors, path_residuals
+from jtqd.sysid.fit.calibration import FusedErrors, bent_square, fit_tracking, fused_errors, path_residuals
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
 from tests.estimator.estimator_helpers import first_order_hold, joint1

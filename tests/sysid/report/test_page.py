@@ -7,7 +7,7 @@ import re
 import pytest
 
 from jtqd.sysid.report import page
-from jtqd.sysid.report.figures import page_svg
+from jtqd.sysid.report.page import page_svg
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")

@@ -8,8 +8,8 @@ import pytest
 
 from jtqd.models.files import shipped
 from jtqd.sysid.train import command as train_command
+from jtqd.sysid.train.network import TrainedNetwork
 from jtqd.sysid.train.ours import judge, judged_scores, safe_share
-from jtqd.sysid.train.paper import TrainedNetwork
 
 GOOD = (0.48, 1.0)  # MSE: 30.7 % off the RMSE
 FAIR = (0.50, 1.0)  # 29.3 %

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork
-from jtqd.sysid.train.network import forward, train
+from jtqd.sysid.train.network import (
+    PaperBlock,
+    digest_of,
+    forward,
+    split_by_sample,
+    thinned,
+    train,
+    train_paper,
+)
 from jtqd.sysid.train.ours import (
     export_gated,
     gated_output,
@@ -16,7 +24,6 @@ from jtqd.sysid.train.ours import (
     scaled,
     training_envelope,
 )
-from jtqd.sysid.train.paper import PaperBlock, digest_of, split_by_sample, thinned, train_paper
 
 
 def silent(n, loss):
@@ -112,7 +119,7 @@ def test_too_few_runs_are_refused():
 
 
 def test_thinning_keeps_every_kth_sample(monkeypatch):
-    monkeypatch.setattr("jtqd.sysid.train.paper.SAMPLES", 100)
+    monkeypatch.setattr("jtqd.sysid.train.network.SAMPLES", 100)
     kept = thinned([np.arange(150.0), np.arange(1000.0, 1150.0)])
     assert len(kept) == 100
     assert kept[:2].tolist() == [0.0, 3.0]
