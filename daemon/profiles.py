@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-import jtqd.drivers.profiles
+import jtqd.drivers
 from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.estimator.decoder import FieldError, Text, choice, decode, limits
 from jtqd.estimator.errors import ConfigError
@@ -26,7 +26,7 @@ OPTIONS: Final = ("encoder_counts", "link_encoder_counts", "gear_ratio_numerator
 """Values of the operator: options of `jtq init`; a gear ratio as numerator and denominator."""
 INIT: Final = "init."
 """Prefix of numbers that `jtq init` uses for objects of CiA 402; they are no keys of the configuration."""
-_FOLDER: Final = Path(jtqd.drivers.profiles.__file__).resolve().parent
+_FOLDER: Final = Path(jtqd.drivers.__file__).resolve().parent / "profiles"
 _JOINTS: Final = tuple(f"joint_{number}" for number in range(1, 5))
 _Unsigned32 = Annotated[int, limits(ge=0, le=0xFFFF_FFFF)]
 

@@ -4,9 +4,9 @@ Frames come in and go out as 16 bytes (`struct can_frame`); numbers are those of
 It imports nothing else of jtqd. python-can is imported by `can_unix` alone, and canopen's EDS parser by
 `object_dictionary.read_eds` when it is called. Import the modules themselves:
 
-    frame, filters              the 16 bytes, kernel filters
-    frame_socket, bus_socket    SocketCAN or a unix socket, all frames by one system call; opening them
-    hub, relay                  hub of a unix bus with a modelled wire, `python -m jtqd.drivers.hub`; its members
+    frame                       the 16 bytes
+    frame_socket, bus_socket    SocketCAN or a unix socket, all frames by one system call; opening them, filters
+    hub                         hub of a unix bus with a modelled wire, `python -m jtqd.drivers.hub`
     object_dictionary, pdo      objects typed by an EDS and their SDO server; PDO mappings as `struct`
     sdo, nmt, emcy              SDO client, NMT commands and states, EMCY codes (CiA 301)
     drive, sensor               objects, TPDOs and scaling of a drive (CiA 402) and of a torque sensor (CiA 404)

@@ -40,9 +40,9 @@ from msgspec import Meta, Struct
 
 from jtqd.drivers import nmt
 from jtqd.drivers.boot_node import BootedNode, BootError, BusSettings, NodeBoot, Profile, reset_during_boot
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.drive import BY_TORQUE, CIA_402, DriveObjects, DriveProfile, Temperature, map_of
 from jtqd.drivers.emcy import EMCY_BASE, HISTORY_INDEX, Emergency, name_of, parse, register_text
-from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import ANY_IDENTITY, Identity, entries_to_json, read_eds

@@ -11,8 +11,7 @@ from typing import Any
 
 import can
 
-from jtqd.drivers.bus_socket import PREFIX
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import PREFIX, CanFilter
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
     CAN_EFF_MASK,

@@ -1,10 +1,11 @@
 import socket
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 from jtqd.drivers.bus_socket import BusDown as BusDown
 from jtqd.drivers.bus_socket import BusError as BusError
 from jtqd.drivers.bus_socket import BusGone as BusGone
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import CanFilter
+from jtqd.drivers.hub import WireModel
 
 CAPACITY: int
 
@@ -57,3 +58,38 @@ class FrameSocket:
     def wait(self, timeout_s: float | None) -> bool: ...
     def set_filters(self, filters: Iterable[CanFilter] | None) -> None: ...
     def close(self) -> None: ...
+
+MAX_CLIENTS: int
+BACKLOG: int
+TX_QUEUE: int
+
+class HubCounters:
+    frames: int
+    malformed: int
+    dropped: int
+    refused: int
+    tx_full: int
+
+class Member: ...
+
+class LocalPort(Member):
+    def send(self, frame16: bytes) -> bool: ...
+    def detach(self) -> None: ...
+
+class Client(Member): ...
+
+class Relay:
+    counters: HubCounters
+    wire: WireModel | None
+    _listener: socket.socket
+    _clients: dict[int, Client]
+    _answering_ns: int | None
+    def __init__(self, listener: socket.socket, wire: WireModel | None = None) -> None: ...
+    def attach(
+        self, on_frame: Callable[[bytes, int], None], wanted: Iterable[int] | None = None
+    ) -> LocalPort: ...
+    def remove(self, member: Member) -> None: ...
+    @property
+    def clients(self) -> int: ...
+    def serve(self, timeout_s: float) -> None: ...
+    def run_once(self, timeout_s: float | None) -> None: ...

@@ -1,7 +1,7 @@
 """Hub of a unix bus: `python -m jtqd.drivers.hub unix:PATH [--bitrate 1000000]`, or embedded beside local nodes.
 
-`relay` (compiled) passes the frames on; here are the socket's file, the command, and the model of a wire that frames cross
-first when a bit rate is given.
+`frame_socket.Relay` (compiled) passes the frames on; here are the socket's file, the command, and the model of a wire that
+frames cross first when a bit rate is given.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from typing import NamedTuple
 
 from jtqd.drivers.bus_socket import PREFIX, BusError, reachable, require_directory
 from jtqd.drivers.frame import FRAME, arbitration_key, stuffed_bits
-from jtqd.drivers.relay import BACKLOG, MAX_CLIENTS, TX_QUEUE, Relay
+from jtqd.drivers.frame_socket import BACKLOG, MAX_CLIENTS, TX_QUEUE, Relay
 
 # The wire
 

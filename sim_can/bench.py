@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from jtqd.drivers.filters import CanFilter, exact
+from jtqd.drivers.bus_socket import CanFilter, exact
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
 from jtqd.drivers.pdo import SYNC_COB_ID

@@ -9,10 +9,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from jtqd.drivers import eds
+from jtqd.drivers import object_dictionary
 from jtqd.drivers.object_dictionary import Entry, entries_from_json, entries_to_json, read_eds
 
-FOLDER = Path(eds.__file__).parent
+FOLDER = Path(object_dictionary.__file__).parent / "eds"
 DRIVE, SENSOR = "drive.eds", "torque_sensor.eds"
 _CHILD_S = 20.0
 _cache: dict[tuple[int, str], list[Entry]] = {}

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import jtqd.drivers.eds
 from jtqd.daemon.shared.counters import OBJECT_2200
+from jtqd.drivers import object_dictionary
 from jtqd.drivers.own_objects import (
     BUS_FIELDS,
     CONTACT_BASES,
@@ -30,7 +30,7 @@ from jtqd.drivers.own_objects import (
 from jtqd.drivers.pdo import INVALID as PDO_INVALID
 from jtqd.drivers.pdo import NO_RTR
 
-FOLDER = Path(jtqd.drivers.eds.__file__).parent
+FOLDER = Path(object_dictionary.__file__).parent / "eds"
 REVISION = 0x0001_0000  # major 1 (CANopen behaviour), minor 0
 FOUR_JOINTS = 0x0002_0000  # of jtqd with a second estimate PDO
 

@@ -27,7 +27,7 @@ from jtqd.drivers.emcy import (
     name_of,
     parse,
 )
-from jtqd.drivers.filters import CanFilter, exact
+from jtqd.drivers.bus_socket import CanFilter, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.object_dictionary import ObjectStore

@@ -30,7 +30,7 @@ from jtqd.daemon.loop import realtime
 from jtqd.daemon.shared.cycle_record import Ring, layout_of
 from jtqd.daemon.shared.processes import Child, ChildError, LoopWatchdog, Notifier, watchdog_seconds
 from jtqd.daemon.shared.snapshot import Snapshot
-from jtqd.drivers.filters import CanFilter, any_format
+from jtqd.drivers.bus_socket import CanFilter, any_format
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import SYNC_COB_ID

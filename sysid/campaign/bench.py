@@ -27,7 +27,7 @@ from jtqd.daemon.config import Config, JointConfig, SensorConfig, load_config
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
 from jtqd.drivers.bus_socket import PREFIX
 from jtqd.drivers.drive import CIA_402, DriveProfile, Temperature
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import Identity
 from jtqd.drivers.own_objects import COMMANDER_NODE

@@ -24,6 +24,7 @@ from typing import Final
 
 from jtqd.drivers import nmt
 from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot, NodeObjects, mismatch
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.drive import (
     DriveObjects,
     DriveProfile,
@@ -37,7 +38,6 @@ from jtqd.drivers.drive import (
     select_tpdos,
     state_of,
 )
-from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE

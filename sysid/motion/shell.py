@@ -16,8 +16,8 @@ from contextlib import closing, contextmanager
 from types import FrameType
 from typing import Final
 
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.drive import DriveProfile
-from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import CAPACITY, BusError, FrameSocket, open_frame_socket
 from jtqd.drivers.sensor import SensorProfile

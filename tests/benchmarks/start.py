@@ -12,7 +12,7 @@ from typing import Any
 
 from jtqd.daemon.core.estimate_pdo import LAYOUT
 from jtqd.daemon.shared.runtime_dir import instance_name
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.estimator.status import PUBLISHED
 from tests.benchmarks.contender import ROOT

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from jtqd.daemon.core.estimate_pdo import decode
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.estimator.status import VALID
 from tests.paths import ROOT

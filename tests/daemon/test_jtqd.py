@@ -20,8 +20,8 @@ from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.logs import read_topic
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, FLAG_POSITION
 from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.can_unix import UnixBus
-from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator.status import STALE

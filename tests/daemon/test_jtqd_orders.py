@@ -13,7 +13,7 @@ import pytest
 
 from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.supervisor.process import wait_for
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame_socket import open_frame_socket
 from tests.daemon.slow_bench import slow_configuration
 

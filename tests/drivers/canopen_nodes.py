@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from typing import Any, Self
 
 from jtqd.drivers.boot import BootBus, BootReport, BootRequest, boot, parse_request
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.drivers.filters import CanFilter, any_format, exact
+from jtqd.drivers.bus_socket import CanFilter, any_format, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusError, BusGone, open_frame_socket
 from jtqd.drivers.hub import Hub

@@ -11,7 +11,7 @@ import time
 
 import pytest
 
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame import (
     CAN_EFF_FLAG,
     CAN_ERR_FLAG,

@@ -10,7 +10,7 @@ import subprocess
 
 import pytest
 
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, pack
 from jtqd.drivers.frame_socket import BusDown, BusError, BusGone, open_frame_socket
 

@@ -15,7 +15,7 @@ from typing import Any, Self
 import yaml
 
 from jtqd.daemon.core.estimate_pdo import decode
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.models.files import shipped

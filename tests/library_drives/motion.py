@@ -8,8 +8,8 @@ import time
 import pytest
 
 from jtqd.drivers.boot import BootReport
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.drivers.drive import DriveScaling
-from jtqd.drivers.filters import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from tests.library_drives.nodes import GEAR

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2
-from jtqd.drivers.filters import exact
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub

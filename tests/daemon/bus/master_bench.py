@@ -14,7 +14,7 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.conditions import Conditions
 from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.drivers.frame import CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore

@@ -20,7 +20,7 @@ import yaml
 
 from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket
 from jtqd.models.files import shipped

@@ -19,7 +19,7 @@ import pytest
 import yaml
 
 from jtqd.daemon.cli import init, probe
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.models.files import shipped
 from tests.library_drives.bench import LibraryBench

@@ -9,7 +9,7 @@ import pytest
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop.process import build_estimator, loop_filters, warm_up
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.onnx_graph import NetworkError

@@ -22,7 +22,7 @@ import yaml
 
 from jtqd.daemon.core.estimate_pdo import LAYOUT, NO_TORQUE, PUBLISHED_STATUSES
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, open_frame_socket
 from jtqd.drivers.nmt import NOT_OPERATIONAL

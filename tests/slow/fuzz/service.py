@@ -14,7 +14,7 @@ from typing import Any
 from jtqd.daemon.bus.boot import ReturningNodes
 from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
 from jtqd.daemon.shared.conditions import Conditions
-from jtqd.drivers.filters import CanFilter
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_ERR_FLAG, CAN_RTR_FLAG, CAN_SFF_MASK, FRAME
 from jtqd.drivers.frame_socket import CAPACITY
 from jtqd.drivers.object_dictionary import ObjectStore

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from jtqd.drivers.filters import exact
+from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame import FRAME
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.sysid.motion.setpoints import Limits, MotionError, Timing

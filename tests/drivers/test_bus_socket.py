@@ -5,8 +5,8 @@ import struct
 
 import pytest
 
-from jtqd.drivers import filters as bpf
-from jtqd.drivers.filters import checked, exact
+from jtqd.drivers import bus_socket
+from jtqd.drivers.bus_socket import checked_filters, exact
 from jtqd.drivers.frame import CAN_ERR_FLAG, pack
 
 SYNC = pack(0x080, b"\x01")
@@ -14,7 +14,7 @@ SYNC = pack(0x080, b"\x01")
 
 def test_lengths_other_than_16_are_stopped_by_the_filter_program():
     a, b = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    bpf.attach(b, checked(None), False)
+    bus_socket.attach_filters(b, checked_filters(None), False)
     for message in [b"x" * 15, SYNC, b"y" * 17, b""]:
         a.send(message)
     b.setblocking(False)
@@ -27,7 +27,7 @@ def test_lengths_other_than_16_are_stopped_by_the_filter_program():
 
 def test_program_of_one_filter_by_hand():
     """080h data frame: constants are byte-swapped on a little-endian host, jumps never exceed one."""
-    code = bpf.program([exact(0x80)], False)
+    code = bus_socket.bpf_program([exact(0x80)], False)
     swapped = struct.unpack(">I", struct.pack("=I", 0xC00007FF))[0]
     assert code == [
         (0x80, 0, 0, 0),  # A = length
