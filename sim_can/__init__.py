@@ -6,12 +6,14 @@ Imports estimator, drivers, models and, to play a run (`play`), `jtqd.sysid.runs
 
 | module | what it has |
 |---|---|
+| `drives` | drives' loops, instruments, and the frame of a plant: what all benches share |
 | `plant_file` | plant files as values: `load_plant`, `PlantParameters`; how days differ |
-| `towing`, `plants` | benches with laws of their own, and any of the three kinds of file: `load_any_plant` |
-| `plant`, `effect_plant` | the equations, without (compiled) and with effects of joint files |
-| `source`, `plant_source`, `play` | what the nodes measure: `Source`, from the plant or from a measured run |
+| `plant`, `effect_plant` | their equations, without (compiled) and with effects of joint files |
+| `towing` | benches with laws of their own |
+| `source`, `plant_source`, `play` | what the nodes measure: `Source`, from any plant (`load_any_plant`) or a measured run |
 | `emulated_run` | runs without a bus: `emulate_run`, `JointCommand` |
-| `bench`, `bench_loop`, `command` | the nodes, the bus around them, `jtq sim` |
+| `canopen_node`, `devices`, `transmit` | nodes on the bus: CANopen services, drive and sensor, their TPDOs |
+| `bench`, `command` | the nodes with the bus around them, `jtq sim` |
 | `bench_kernel` | a Linux kernel as an ordinary process: SocketCAN on any machine |
 
 Half a second of joint 1 at 1 rad/s against 2 A of joint 2:

@@ -1,22 +1,37 @@
-"""The emulated bench: drives and a torque sensor around their sources. Frames and times in, frames out.
+"""The emulated bench: drives and a torque sensor around their sources, its event loop on a bus, and what a cycle costs.
 
-While no master commands the drives the bench moves them itself (`jtqd.sim_can.demo`). No socket, no clock.
+`Bench` has no socket and no clock: frames and times in, frames out. While no master commands the drives it moves them itself
+(`jtqd.sim_can.drives`). `run` is the bus, the clocks and the signals around it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ctypes
+import gc
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Protocol
 
-from jtqd.drivers.bus_socket import CanFilter, exact
+from jtqd.drivers.bus_socket import PREFIX, CanFilter, exact
+from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2
+from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE, MAX_LENGTH
+from jtqd.drivers.frame_socket import BusDown, BusError, open_frame_socket
+from jtqd.drivers.hub import Hub
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
-from jtqd.drivers.pdo import SYNC_COB_ID
+from jtqd.drivers.pdo import SYNC_COB_ID, PdoMap
 from jtqd.drivers.sdo import REQUEST_ID
+from jtqd.drivers.sensor import sensor_tpdo1
 from jtqd.sim_can.canopen_node import CanopenNode
-from jtqd.sim_can.demo import demo_current, demo_velocity
-from jtqd.sim_can.drive_node import DEFAULT_INTERPOLATION_S, OPERATION_ENABLED, DriveNode
+from jtqd.sim_can.devices import DEFAULT_INTERPOLATION_S, OPERATION_ENABLED, DriveNode, SensorNode
+from jtqd.sim_can.drives import demo_current, demo_velocity
 from jtqd.sim_can.eds_entries import sensor_node
-from jtqd.sim_can.sensor_node import SensorNode
+from jtqd.sim_can.plant_source import AnyPlant, PlantSource
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveSignals, Source
 
 CLOCK_STEP_NS = 100_000_000  # stamps and steady clock never differ by this from SYNC to SYNC, unless CLOCK_REALTIME was set
@@ -189,3 +204,260 @@ class Bench:
         if not self.sync_count or self._played():
             return False
         return any(drive.machine.powered for drive in self.drives)
+
+
+# The bench on a bus
+
+_PR_SET_TIMERSLACK = 29
+_RETRY_S = 0.2  # between two looks at an interface that is down
+_NOT_DATA = CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG
+_LONGEST_WAIT_S = 1.0
+_LINGER_STEP_S = 0.05
+
+
+class _StopError(Exception):
+    """SIGINT or SIGTERM."""
+
+
+def _stop(_number: int, _frame: FrameType | None) -> None:
+    raise _StopError
+
+
+def _log(text: str) -> None:
+    print(f"bench: {text}", file=sys.stderr, flush=True)
+
+
+class _Bus(Protocol):
+    """Bus as the loop uses it."""
+
+    def send(self, frame16: bytes) -> bool:
+        """Send a frame; False: the queue is full and the frame is lost."""
+
+    def serve(self, timeout_s: float) -> None:
+        """Wait up to timeout_s for frames, give them to the bench, send its answers."""
+
+    def linger(self, end_ns: int | None) -> None:
+        """Stay silent until no other member needs the bus, or until end_ns."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+class _EmbeddedHub:
+    """Unix bus whose hub is in this process; the bench is a local port of it."""
+
+    def __init__(self, path: str, bitrate: int | None, bench: Bench) -> None:
+        self._hub = Hub(path, bitrate)
+        self._bench = bench
+        self._port = self._hub.attach(
+            self._on_frame, [each.can_id for each in bench_filters(len(bench.drives))]
+        )
+        self.send = self._port.send
+        self.serve = self._hub.serve
+        self.close = self._hub.close
+
+    def linger(self, end_ns: int | None) -> None:
+        """Keep the hub for its other members, as a wire stays when a node goes silent."""
+        self._port.detach()
+        if self._hub.clients:
+            _log("the nodes have stopped; the bus closes when its last client disconnects")
+        while self._hub.clients and (end_ns is None or time.monotonic_ns() < end_ns):
+            self._hub.run_once(_LONGEST_WAIT_S if end_ns is None else _LINGER_STEP_S)
+
+    def _on_frame(self, frame16: bytes, stamp_ns: int) -> None:
+        can_id, length, data = FRAME.unpack(frame16)
+        for frame in self._bench.on_frame(can_id, data[:length], stamp_ns, time.monotonic_ns()):
+            self.send(frame)
+
+
+class _Socket:
+    """Bus of which the bench is one member: SocketCAN, or a unix bus whose hub runs elsewhere."""
+
+    def __init__(self, bus: str, bench: Bench) -> None:
+        self._socket = open_frame_socket(bus, bench_filters(len(bench.drives)))
+        self._bench = bench
+        self._down = False
+        self.close = self._socket.close
+
+    def linger(self, end_ns: int | None) -> None:
+        """Return at once: the bus does not depend on the bench."""
+
+    def send(self, frame16: bytes) -> bool:
+        try:
+            return self._socket.send(frame16)
+        except BusDown:
+            self._log_down()
+            return False
+
+    def serve(self, timeout_s: float) -> None:
+        socket = self._socket
+        if not socket.wait(timeout_s):
+            return
+        try:
+            count = socket.receive()
+        except BusDown:
+            self._log_down()
+            time.sleep(
+                _RETRY_S
+            )  # the kernel reports it once; the same socket works again when the link is up
+            return
+        if count and self._down:
+            self._down = False
+            _log("the interface is up again")
+        now_ns = time.monotonic_ns()
+        frames, stamps, lengths = bytes(socket.frames[: count * FRAME_SIZE]), socket.stamps_ns, socket.lengths
+        for i in range(count):
+            if lengths[i] != FRAME_SIZE:
+                continue
+            can_id, length, data = FRAME.unpack_from(frames, i * FRAME_SIZE)
+            if can_id & _NOT_DATA or length > MAX_LENGTH:
+                continue
+            for frame in self._bench.on_frame(can_id, data[:length], stamps[i], now_ns):
+                self.send(frame)
+
+    def _log_down(self) -> None:
+        if not self._down:
+            self._down = True
+            _log("the interface is down, waiting for it")
+
+
+def _open(bus: str, bitrate: int | None, bench: Bench) -> _Bus:
+    """Open the bus; a unix bus without a hub gets one here."""
+    if not bus.startswith(PREFIX):
+        return _Socket(bus, bench)
+    path = bus[len(PREFIX) :]
+    try:
+        joined = _Socket(bus, bench)
+    except BusError:
+        if not path or not Path(path).parent.is_dir():
+            raise
+        return _EmbeddedHub(path, bitrate, bench)
+    if bitrate is not None:
+        _log(f"{bus} already has a hub, --bitrate is ignored")
+    return joined
+
+
+def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | None = None) -> int:
+    """Run the bench until SIGINT, SIGTERM, the end of a played run or `duration_s`. Returns 0.
+
+    Raises:
+        BusError: the bus cannot be opened or has gone.
+    """
+    before = {number: signal.signal(number, _stop) for number in (signal.SIGTERM, signal.SIGINT)}
+    # the default slack of 50 us on every timeout is a frame on the wire at 1 Mbit/s
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    line: _Bus | None = None
+    try:
+        line = _open(bus, bitrate, bench)
+        gc.collect()
+        gc.freeze()
+        end_ns = None if duration_s is None else time.monotonic_ns() + round(duration_s * 1e9)
+        _tick(line, bench)
+        print(f"bench ready on {bus}", file=sys.stderr, flush=True)  # other processes wait for this line
+        _loop(line, bench, end_ns)
+    except _StopError:
+        pass
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # leaving takes a moment and happens once
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+        if line is not None:
+            line.close()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    return 0
+
+
+def _tick(line: _Bus, bench: Bench) -> None:
+    for frame in bench.tick(time.monotonic_ns()):
+        line.send(frame)
+
+
+def _loop(line: _Bus, bench: Bench, end_ns: int | None) -> None:
+    """Serve frames as they come and timers when they are due; sleep in between."""
+    while not bench.over:
+        now_ns = time.monotonic_ns()
+        if end_ns is not None and now_ns >= end_ns:
+            return
+        due_ns = bench.due_ns
+        if now_ns >= due_ns:
+            _tick(line, bench)
+            due_ns = bench.due_ns
+        wake_ns = due_ns if end_ns is None else min(due_ns, end_ns)
+        line.serve(min(max(wake_ns - now_ns, 0) * 1e-9, _LONGEST_WAIT_S))
+    _log("the run has ended")
+    line.linger(end_ns)
+
+
+# CPU time of a cycle
+
+CYCLE_NS = 1_000_000
+BLOCK = 50
+
+
+@dataclass(frozen=True)
+class Cost:
+    """CPU time in microseconds per 1 ms cycle: medians over blocks of BLOCK cycles."""
+
+    plant_step_us: float  # both joints with their drives' control loops
+    source_us: float  # plant step with encoders, noise and sensor
+    sync_us: float  # everything a SYNC does: source, state machines, five TPDOs packed
+    substeps: int
+    cycles: int
+
+
+def map_pdos(bench: Bench) -> None:
+    """Write the PDO mapping that jtqd writes at boot by SDO, and start the nodes."""
+    maps = [(node, pdo) for node in (1, 2) for pdo in (drive_tpdo1(node), drive_tpdo2(node))]
+    for node, pdo in [*maps, (3, sensor_tpdo1(3))]:
+        number = (pdo.cob_id - 0x80) // 0x100 - 1
+        for index, subindex, value, size in _mapping_writes(0x1800 + number, pdo):
+            request = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
+            bench.on_frame(REQUEST_ID + node, request + value.to_bytes(4, "little"), 0, 0)
+    bench.on_frame(0x000, b"\x01\x00", 0, 0)
+
+
+def _mapping_writes(index: int, pdo: PdoMap) -> list[tuple[int, int, int, int]]:
+    """Return the SDO writes (index, subindex, value, size in bytes) that map the TPDO at `index`."""
+    entries = [(index + 0x200, entry, word, 4) for entry, word in enumerate(pdo.words, 1)]
+    return [
+        (index, 1, 0xC000_0000 | pdo.cob_id, 4),
+        (index + 0x200, 0, 0, 1),
+        *entries,
+        (index + 0x200, 0, len(pdo.words), 1),
+        (index, 2, pdo.transmission_type, 1),
+        (index, 1, 0x4000_0000 | pdo.cob_id, 4),
+    ]
+
+
+def measure(parameters: AnyPlant, cycles: int = 4000) -> Cost:
+    """Run the demo motion for `cycles` SYNCs and measure; three benches, so that no part is a difference of
+    two others.
+    """
+    full = Bench(PlantSource(parameters))
+    map_pdos(full)
+    stamps = [0]
+
+    def sync() -> None:
+        stamps[0] += CYCLE_NS
+        full.on_frame(SYNC_COB_ID, b"\x01", stamps[0], stamps[0])
+
+    whole = _median_us(sync, cycles)
+    source = PlantSource(parameters)
+    for drive, moving in enumerate(full.drives):
+        source.command(drive, *moving.source_command())
+    reading = _median_us(lambda: source.advance(0.001), cycles)
+    plant = source.plant
+    stepping = _median_us(lambda: plant.step(0.001), cycles)
+    substeps = round(0.001 / plant.substep_s)
+    return Cost(stepping, reading, whole, substeps, cycles)
+
+
+def _median_us(call: Callable[[], object], cycles: int) -> float:
+    """Return the median CPU time of a call in microseconds, over blocks of BLOCK calls."""
+    blocks = []
+    for _ in range(max(1, cycles // BLOCK)):
+        start = time.process_time_ns()
+        for _ in range(BLOCK):
+            call()
+        blocks.append((time.process_time_ns() - start) / (BLOCK * 1000.0))
+    return sorted(blocks)[len(blocks) // 2]

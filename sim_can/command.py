@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.sim_can.eds_entries import EdsChild
 
 if TYPE_CHECKING:
-    from jtqd.sim_can.plants import AnyPlant
+    from jtqd.sim_can.plant_source import AnyPlant
     from jtqd.sim_can.source import Source
 
 # what needs numpy is imported in functions: the EDS child reads meanwhile, and --help is quick
@@ -134,7 +135,7 @@ def _usage(options: argparse.Namespace) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     from jtqd.models.files import shipped
-    from jtqd.sim_can.plants import load_any_plant
+    from jtqd.sim_can.plant_source import load_any_plant
 
     if options.cost:
         return _print_cost(options, load_any_plant(options.plant or shipped(PLANT)))
@@ -166,19 +167,18 @@ def _played(options: argparse.Namespace) -> Source:
 
 
 def _serve(options: argparse.Namespace, sources: list[Source], profile: str) -> int:
-    from jtqd.sim_can.bench import Bench
-    from jtqd.sim_can.bench_loop import run
+    from jtqd.sim_can.bench import Bench, run
 
     bench = Bench(sources[0], profile, sources[1:], with_sensor=not options.no_sensor)
     return run(options.bus, bench, options.bitrate, options.duration)
 
 
 def _print_cost(options: argparse.Namespace, parameters: AnyPlant) -> int:
-    from jtqd.sim_can.cost import measure
+    from jtqd.sim_can.bench import measure
 
     cost = measure(parameters)
     if options.json:
-        print(json.dumps(cost.as_json()))
+        print(json.dumps(asdict(cost)))
         return 0
     rows = (
         (f"plant step of 1 ms: two joints, drives' loops, {cost.substeps} substeps", cost.plant_step_us),

@@ -15,9 +15,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sim_can.effect_plant import EffectPlant
-from jtqd.sim_can.plant_source import PlantSource
-from jtqd.sim_can.plants import AnyDay, AnyPlant
-from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings
+from jtqd.sim_can.plant_source import AnyPlant, PlantSource
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, Day, DriveRatings
 
 SENSOR_NM_PER_UNIT = 0.001  # 6132h:1 = 3 decimal digits
 TEMPERATURE_C_PER_UNIT = 0.1  # 3001h
@@ -73,7 +72,7 @@ def emulate_run(
     seed: int = 0,
     period_s: float = 0.001,
     *,
-    day: int | AnyDay | None = None,
+    day: int | Day | None = None,
 ) -> RunTable:
     """Return the table of `emulate`: what was measured, and nothing else."""
     return emulate(plant, commands, duration_s, seed, period_s, day=day).table
@@ -86,7 +85,7 @@ def emulate(
     seed: int = 0,
     period_s: float = 0.001,
     *,
-    day: int | AnyDay | None = None,
+    day: int | Day | None = None,
     pushes: Sequence[Push] = (),
 ) -> EmulatedRun:
     """Run both joints from rest for duration_s; return what was measured every period_s, and the true torques beside it.
@@ -115,7 +114,7 @@ def emulate(
         source.begin_day(plant.run_to_run.day(seed, day))
     else:
         source = PlantSource(plant, seed)
-        source.begin_day(day)
+        source.begin_day(day or Day())
     rows = np.empty((count, 2 * _SIGNALS + 1))
     truth = np.empty((count, 2))
     # velocity targets are joint side here, motor side in the drives

@@ -1,12 +1,35 @@
-"""State and constants of the bench as flat blocks; the equations stand in plant.pyx."""
+"""Joints of a plant file as flat blocks; the equations stand in plant.pyx."""
 
 cimport cython
 
-from jtqd.sim_can.drive_control cimport DriveControl
-from jtqd.sim_can.losses cimport JointFriction
-from jtqd.sim_can.losses cimport JointTemperature
+from jtqd.sim_can.drives cimport TwoJoints
 
-cdef struct Constants:  # `JointConstants` as a block
+@cython.final
+cdef class JointTemperature:
+    cdef double usual, reference, kelvin_per_w, time_constant, viscous_per_k, coulomb_per_k
+    cdef double ambient, heat_j, time_s
+    cdef public double celsius
+    cdef readonly double viscous, coulomb
+    cpdef bint add(self, double power_w, double dt_s) noexcept
+    cdef void factors(self) noexcept
+
+@cython.final
+cdef class LossTable:
+    cdef readonly double torque_limit, per_torque_step, per_velocity_step
+    cdef readonly int last_row
+    cdef readonly object forward, reverse
+    cdef double[:, ::1] forward_rows, reverse_rows
+    cdef int columns
+    cdef double at(self, double torque, double velocity) noexcept nogil
+
+@cython.final
+cdef class JointFriction:
+    cdef LossTable table
+    cdef double scale, stribeck, inverse_vs, reach, constant, viscous
+    cpdef void differ(self, double constant_nm, double viscous_nms_per_rad) noexcept
+    cdef double at(self, double torque, double velocity) noexcept nogil
+
+cdef struct Constants:  # `plant_file.JointConstants` as a block
     double gear_ratio, torque_constant, rotor_inertia, stiffness, damping
     double ripple_nm, ripple_order, ripple_phase
     double error_rad, error_order, error_phase, error_slope
@@ -18,34 +41,12 @@ cdef struct JointState:  # of one joint in its own frame
     double torsion  # δ within a control cycle
     double loss_w  # power of the friction in the last integration step
 
-@cython.final
-cdef class Pair:
-    cdef Plant plant  # keeps the values alive
-    cdef double *one
-    cdef double *two
-    cdef double *at(self, int k) except NULL
-
-cdef class Plant:
-    cdef readonly object parameters
-    cdef readonly tuple friction, drives, temperatures, _joints, _link_inertia
-    cdef public double substep_s, link_position, link_velocity
-    cdef JointFriction friction_1, friction_2
-    cdef DriveControl drive_1, drive_2
-    cdef JointTemperature temperature_1, temperature_2
+cdef class Plant(TwoJoints):
+    cdef readonly tuple friction, temperatures
+    cdef public list motor_position, motor_velocity, slip, loss_w
     cdef Constants constants[2]
-    cdef JointState state[2]
     cdef double link_inertia[2]
-    cdef double coulomb_nm[2]
-    cdef double viscous_nms_per_rad[2]
-    cdef double viscous_scale[2]
-    cdef double day_viscous[2]
+    cdef object day_viscous
     cdef bint warming
-    cdef double external_nm, next_external_nm, until_next_s  # on link 2, joint 1's frame
-    cdef Pair pair(self, double *one, double *two)
-    cdef void set_friction(self, int k, JointFriction friction, JointTemperature temperature) noexcept
-    cpdef step(self, double dt_s)
-    cdef void warm(self, double dt_s) noexcept
-    cpdef _integrate(self, int steps, double h)
-    cdef double torsion_of(self, int k) noexcept nogil
-    cdef double torque_of(self, int k) noexcept nogil
-    cpdef double sensor_torque(self) except? -1.0
+    cdef JointState state(self, int k) except *
+    cdef double torque(self, int k) except? -1.0

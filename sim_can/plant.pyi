@@ -1,69 +1,63 @@
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from typing import Final
 
-from jtqd.sim_can.drive_control import DriveControl
-from jtqd.sim_can.losses import JointFriction, JointTemperature, LossTable
-from jtqd.sim_can.plant_file import JointPlant, PlantParameters
+from jtqd.sim_can.drives import TwoJoints
+from jtqd.sim_can.plant_file import JointConstants, JointPlant, PlantParameters, Thermal
 
-CONTROL_CYCLE_S: Final[float]
+UPDATE_S: Final[float]
 
-class JointConstants(NamedTuple):
-    gear_ratio: float
-    torque_constant: float
-    rotor_inertia: float
-    stiffness: float
-    damping: float
-    ripple_nm: float
-    ripple_order: float
-    ripple_phase: float
-    error_rad: float
-    error_order: float
-    error_phase: float
-    error_slope: float
-    slip_nm: float
-    per_travel: float
+class JointTemperature:
+    celsius: float
+    viscous: float
+    coulomb: float
+    def __init__(self, thermal: Thermal) -> None: ...
+    def start(self, difference_k: float) -> None: ...
+    def add(self, power_w: float, dt_s: float) -> bool: ...
+
+LOWEST_TABLE_VELOCITY_RAD_S: Final[float]
+VELOCITY_STEP_RAD_S: Final[float]
+HIGHEST_TABLE_VELOCITY_RAD_S: Final[float]
+TORQUE_STEPS: Final[int]
+
+class LossTable:
+    torque_limit: float
+    per_torque_step: float
+    per_velocity_step: float
+    last_row: int
+    forward: memoryview
+    reverse: memoryview
+    def __init__(
+        self,
+        loss: Callable[[float, float], float],
+        gear_ratio: float,
+        torque_constant_nm_per_a: float,
+        highest_current_a: float,
+    ) -> None: ...
+    def magnitude(self, torque_nm: float, velocity_rad_s: float) -> float: ...
+
+class JointFriction:
+    def __init__(
+        self,
+        table: LossTable,
+        scale: float = 1.0,
+        viscous_nms_per_rad: float = 0.0,
+        stribeck_nm: float = 0.0,
+        stribeck_velocity_rad_s: float = 0.05,
+    ) -> None: ...
+    def differ(self, constant_nm: float, viscous_nms_per_rad: float) -> None: ...
+    def __call__(self, torque_nm: float, velocity_rad_s: float) -> float: ...
 
 def relaxed_angle(constants: JointConstants, bend_rad: Callable[[float], float] | None = None) -> float: ...
 def loss_table(side: JointPlant) -> LossTable: ...
 def joint_friction(side: JointPlant, table: LossTable | None = None) -> JointFriction: ...
 
-class Pair:
-    def __len__(self) -> int: ...
-    def __getitem__(self, k: int) -> float: ...
-    def __setitem__(self, k: int, value: float) -> None: ...
-    def __iter__(self) -> Iterator[float]: ...
-
-class Plant:
+class Plant(TwoJoints):
     parameters: PlantParameters
     friction: tuple[JointFriction, JointFriction]
-    drives: tuple[DriveControl, DriveControl]
     temperatures: tuple[JointTemperature, JointTemperature]
-    substep_s: float
-    link_position: float
-    link_velocity: float
-    _joints: tuple[JointConstants, JointConstants]
-    _link_inertia: tuple[float, float]
+    motor_position: list[float]
+    motor_velocity: list[float]
+    slip: list[float]
+    loss_w: list[float]
     def __init__(self, parameters: PlantParameters) -> None: ...
-    @property
-    def motor_position(self) -> Pair: ...
-    @motor_position.setter
-    def motor_position(self, values: Sequence[float]) -> None: ...
-    @property
-    def motor_velocity(self) -> Pair: ...
-    @motor_velocity.setter
-    def motor_velocity(self, values: Sequence[float]) -> None: ...
-    @property
-    def slip(self) -> Pair: ...
-    @slip.setter
-    def slip(self, values: Sequence[float]) -> None: ...
-    @property
-    def _loss_w(self) -> Pair: ...
-    def begin_run(self) -> None: ...
-    def begin_day(self, day: Any) -> None: ...
-    def command(self, drive: int, mode: int, target: float) -> None: ...
-    def push(self, torque_nm: float, after_s: float = 0.0) -> None: ...
-    def step(self, dt_s: float) -> None: ...
-    def _integrate(self, steps: int, h: float) -> None: ...
-    def joint_torques(self) -> tuple[float, float]: ...
-    def sensor_torque(self) -> float: ...
     def energy(self) -> float: ...

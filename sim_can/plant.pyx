@@ -15,67 +15,231 @@ and the sensor are one rigid body, and the joints face each other, so θl2 = -θ
 
 The sensor's torque is positive along the positive current of either joint.
 
+A gear's losses depend on what it transmits, F(τ, v), not on the motor's current: `LossTable` turns the joint file's law of
+current and velocity into a table of that, `JointFriction` adds what the true joint differs from its file,
+`JointTemperature` is one thermal mass that the friction warms.
+
 Integration is semi-implicit Euler (velocities first, then positions with the new velocities). Friction is
 implicit: within a step its impulse can stop the motor but never turn it round, h F/(G Jm) against |w|. So a
 joint sticks at exactly zero velocity, does not creep, and no step size makes friction unstable. Pure: no
 clock.
 """
 
-from libc.math cimport ceil, cos, fabs, fmax, fmin, isfinite, rint, sin
+from libc.math cimport NAN, cos, exp, fabs, fmax, fmin, sin
 
-from jtqd.sim_can.drive_control cimport DriveControl
-from jtqd.sim_can.losses cimport JointFriction, LossTable
-from jtqd.sim_can.losses cimport JointTemperature
+from jtqd.sim_can.drives cimport Truth, TwoJoints
 
+from array import array
 from dataclasses import replace
-from typing import Final, NamedTuple
+from typing import Final
 
 from jtqd.estimator.losses import LossModel
-from jtqd.sim_can.plant_file import NOMINAL_DAY
 from jtqd.sim_can.plant_file import substep_limit
 
-CONTROL_CYCLE_S: Final = 0.001
+# Losses and temperature
 
-cdef double CONTROL_CYCLE = CONTROL_CYCLE_S
+UPDATE_S: Final = 0.1
+"""Of the temperature; with time constants of at least 10 s a step is below 1 % of any change."""
 
-
-class JointConstants(NamedTuple):
-    """Constants of one joint for the inner loop, SI units."""
-
-    gear_ratio: float
-    torque_constant: float
-    rotor_inertia: float
-    stiffness: float
-    damping: float
-    ripple_nm: float
-    ripple_order: float
-    ripple_phase: float
-    error_rad: float  # E, kinematic error
-    error_order: float
-    error_phase: float
-    error_slope: float  # G E k: e' in units of 1/G
-    slip_nm: float  # H, hysteresis
-    per_travel: float
+cdef double UPDATE = UPDATE_S
 
 
-def _constants(side):
-    d = side.deviations
-    return JointConstants(
-        side.joint.gear_ratio,
-        side.torque_constant,
-        side.rotor_inertia,
-        side.stiffness,
-        side.damping,
-        d.ripple_nm,
-        d.ripple_order_per_motor_rev,
-        d.ripple_phase_rad,
-        d.kinematic_error_rad,
-        d.kinematic_error_order_per_motor_rev,
-        d.kinematic_error_phase_rad,
-        side.joint.gear_ratio * d.kinematic_slope,
-        d.hysteresis_nm,
-        1.0 / d.hysteresis_travel_rad,
-    )
+cdef class JointTemperature:
+    """Temperature T of one joint: warmed by its own losses, cooled by its surroundings, felt by its friction.
+
+        T' = (T_ambient + R P - T) / tau          P: power of the losses [W]
+        viscous share of the losses times exp(-b (T - T_ref)), Coulomb share times exp(-c (T - T_ref))
+
+    One thermal mass, as the grease that carries the viscous friction has no thermometer of its own either: the measured
+    temperature is this one. `viscous` and `coulomb` are the factors of the two shares at the present temperature.
+    """
+
+    def __init__(self, thermal):
+        self.usual = thermal.ambient_c
+        self.reference = thermal.reference_c
+        self.kelvin_per_w, self.time_constant = thermal.kelvin_per_w, thermal.time_constant_s
+        self.viscous_per_k, self.coulomb_per_k = thermal.viscous_per_k, thermal.coulomb_per_k
+        self.start(0.0)
+
+    def start(self, double difference_k):
+        """Begin a day in surroundings of `difference_k` above the usual ones, with the joint as warm as these."""
+        self.ambient = self.celsius = self.usual + difference_k
+        self.heat_j = self.time_s = 0.0
+        self.factors()
+
+    cpdef bint add(self, double power_w, double dt_s) noexcept:
+        """The losses were power_w for dt_s. True when temperature and factors are new: each UPDATE_S."""
+        cdef double final
+        self.heat_j += power_w * dt_s
+        self.time_s += dt_s
+        if self.time_s < UPDATE:
+            return False
+        final = self.ambient + self.kelvin_per_w * self.heat_j / self.time_s
+        self.celsius = final + (self.celsius - final) * exp(-self.time_s / self.time_constant)
+        self.heat_j = self.time_s = 0.0
+        self.factors()
+        return True
+
+    cdef void factors(self) noexcept:
+        cdef double above = self.celsius - self.reference
+        self.viscous = exp(-self.viscous_per_k * above)
+        self.coulomb = exp(-self.coulomb_per_k * above)
+
+
+LOWEST_TABLE_VELOCITY_RAD_S: Final = 0.2
+"""Table I holds for 0.2 to 3 rad/s and up to 5 A. Below 0.2 rad/s an estimator's loss law may be smoothed through zero
+velocity; a real joint sticks there. So the table is taken from 0.2 rad/s on and continued below as a straight line.
+"""
+VELOCITY_STEP_RAD_S: Final = 0.1
+HIGHEST_TABLE_VELOCITY_RAD_S: Final = 3.6
+TORQUE_STEPS: Final = 400
+
+cdef double COLUMNS = TORQUE_STEPS
+cdef double LAST_COLUMN = TORQUE_STEPS - 1e-9
+
+
+cdef class LossTable:
+    """F(τ, v) >= 0 [Nm]: loss of a joint that transmits τ at joint velocity v, by bilinear interpolation.
+
+    A law given over current (Table I: τ = η(i, v) G Kt i) is inverted once: at constant velocity the motor
+    must carry both, so G Kt i = τ + loss(i, v) for every i; where i moves, (τ, loss) is a curve, and this
+    table holds its points. Friction then depends on what the gear transmits, not on the motor current: the
+    same at standstill of the motor's inertia term, different when the rotor accelerates (τ, not i, loads the
+    teeth). In steady state both are the same and η is Table I's.
+
+    Args:
+        loss: loss(current [A], joint velocity [rad/s]) -> Nm, signed like the velocity.
+        gear_ratio: G. torque_constant_nm_per_a: Kt of the law (the nominal one, also where the plant's true
+        Kt deviates).
+        highest_current_a: the law is tabulated for |i| up to this; beyond, the loss stays what it is there.
+
+    Attributes:
+        forward, reverse: magnitudes for either direction of motion; rows by velocity k * 0.1 rad/s, columns by torque.
+    """
+
+    def __init__(self, loss, double gear_ratio, double torque_constant_nm_per_a, double highest_current_a):
+        nm_per_a = gear_ratio * torque_constant_nm_per_a
+        self.torque_limit = nm_per_a * highest_current_a
+        self.per_torque_step = TORQUE_STEPS / (2.0 * self.torque_limit)
+        self.per_velocity_step = 1.0 / VELOCITY_STEP_RAD_S
+        self.last_row = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) - 1
+        self.columns = TORQUE_STEPS + 1
+        self.forward = self.forward_rows = _rows(loss, nm_per_a, highest_current_a, +1.0)
+        self.reverse = self.reverse_rows = _rows(loss, nm_per_a, highest_current_a, -1.0)
+
+    def magnitude(self, double torque_nm, double velocity_rad_s):
+        """Return F(τ, v) in Nm, never negative; the sign of v selects the direction (v = 0 counts as forward)."""
+        return self.at(torque_nm, velocity_rad_s)
+
+    cdef double at(self, double torque, double velocity) noexcept nogil:
+        """As `magnitude`, for the plant. Whatever is not a number lies at the table's end."""
+        cdef const double *low = &self.reverse_rows[0, 0] if velocity < 0.0 else &self.forward_rows[0, 0]
+        cdef const double *high
+        cdef double x = fabs(velocity) * self.per_velocity_step
+        cdef double y = (torque + self.torque_limit) * self.per_torque_step
+        cdef double low_value
+        cdef int k = self.last_row, m
+        if x < k + 1.0:
+            k = <int>x
+        else:
+            x = k + 1.0
+        if y < 0.0:
+            y = 0.0
+        elif not y < COLUMNS:
+            y = LAST_COLUMN
+        m = <int>y
+        y -= m
+        low += k * self.columns + m
+        high = low + self.columns
+        low_value = low[0] + y * (low[1] - low[0])
+        return low_value + (x - k) * (high[0] + y * (high[1] - high[0]) - low_value)
+
+
+def _rows(loss, double nm_per_a, double highest, double sign):
+    """Return the magnitudes of the loss for one direction of motion."""
+    cdef int count = round(HIGHEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S) + 1
+    cdef int first = round(LOWEST_TABLE_VELOCITY_RAD_S / VELOCITY_STEP_RAD_S)
+    cdef int last = 6 * TORQUE_STEPS
+    cdef int k, n, m, columns = TORQUE_STEPS + 1
+    # not numpy's arrays: it would be 11 MB in a process that needs no more of it
+    table = memoryview(array("d", bytes(8 * count * columns))).cast("B").cast("d", (count, columns))
+    cdef double[:, ::1] rows = table
+    cdef double[::1] losses = array("d", bytes(8 * (last + 1)))
+    cdef double[::1] torques = array("d", bytes(8 * (last + 1)))
+    cdef double v, i, clipped, at = NAN, value = NAN, x
+    for k in range(first, count):
+        v, at = sign * k * VELOCITY_STEP_RAD_S, NAN
+        for n in range(last + 1):
+            # three times the range in current, so that the curve covers the torque grid where η is small, too
+            i = _between(-3.0 * highest, 3.0 * highest, n, last)
+            clipped = fmax(-highest, fmin(i, highest))
+            if clipped != at:
+                at, value = clipped, loss(clipped, v)
+            losses[n], torques[n] = value, nm_per_a * i - value
+            if n:  # a law may bend back where it is extrapolated; the inverse needs a rising curve
+                torques[n] = fmax(torques[n], torques[n - 1])
+        n = 0
+        for m in range(columns):
+            x = _between(-nm_per_a * highest, nm_per_a * highest, m, TORQUE_STEPS)
+            while n < last - 1 and torques[n + 1] <= x:
+                n += 1
+            rows[k, m] = fmax(sign * _on_line(x, &torques[n], &losses[n]), 0.0)
+    for k in range(first):
+        for m in range(columns):
+            rows[k, m] = fmax(rows[first, m] - (first - k) * (rows[first + 1, m] - rows[first, m]), 0.0)
+    return table
+
+
+cdef double _between(double low, double high, int n, int steps) noexcept nogil:
+    """Return the n-th of `steps` + 1 numbers from low to high."""
+    return high if n == steps else low + n * ((high - low) / steps)
+
+
+cdef double _on_line(double x, const double *xs, const double *ys) noexcept nogil:
+    """Return the value at x of the line through two points."""
+    return ys[0] + (x - xs[0]) * ((ys[1] - ys[0]) / (xs[1] - xs[0]))
+
+
+cdef class JointFriction:
+    """Friction magnitude of one true joint: scaled loss table, constant and viscous parts, Stribeck peak.
+
+    F(τ, v) = scale * table(τ, v) + c0 + c1 |v| + Fs exp(-(v / vs)²), never below zero. c0 and c1 are what the
+    joint's Coulomb and viscous friction differ from its file's (`differ`), with temperature and from day to
+    day. The Stribeck term is below 1e-6 Fs at 0.2 rad/s for vs <= 0.05 rad/s.
+    """
+
+    def __init__(
+        self,
+        LossTable table not None,
+        double scale=1.0,
+        double viscous_nms_per_rad=0.0,
+        double stribeck_nm=0.0,
+        double stribeck_velocity_rad_s=0.05,
+    ):
+        self.table = table
+        self.scale = scale
+        self.stribeck = stribeck_nm
+        self.inverse_vs = 1.0 / stribeck_velocity_rad_s
+        self.reach = 4.0 * stribeck_velocity_rad_s if stribeck_nm > 0.0 else -1.0
+        self.differ(0.0, viscous_nms_per_rad)
+
+    cpdef void differ(self, double constant_nm, double viscous_nms_per_rad) noexcept:
+        """Set how much more (or less) Coulomb and viscous friction there is than in the table."""
+        self.constant = constant_nm
+        self.viscous = viscous_nms_per_rad
+
+    def __call__(self, double torque_nm, double velocity_rad_s):
+        """Return the magnitude in Nm at transmitted torque τ and joint velocity v (its sign gives the direction)."""
+        return self.at(torque_nm, velocity_rad_s)
+
+    cdef double at(self, double torque, double velocity) noexcept nogil:
+        """As `__call__`, for the plant."""
+        cdef double speed = fabs(velocity), x
+        cdef double force = self.scale * self.table.at(torque, velocity) + self.viscous * speed + self.constant
+        if speed < self.reach:
+            x = speed * self.inverse_vs
+            force += self.stribeck * exp(-x * x)
+        return force if force > 0.0 else 0.0
 
 
 def relaxed_angle(constants, bend_rad=None):
@@ -113,7 +277,7 @@ def joint_friction(side, table=None):
     return JointFriction(table, d.friction_scale, viscous, d.stribeck_nm, d.stribeck_velocity_rad_s)
 
 
-# One joint in its own frame -------------------------------------------------------------------------------------------
+# One joint in its own frame
 
 
 cdef double torsion(const Constants *c, double turned, double angle, double link) noexcept nogil:
@@ -159,172 +323,62 @@ cdef void turn(const Constants *c, JointState *s, double link, double h) noexcep
     s.slip = fmin(fmax(s.slip + c.per_travel * (s.torsion - before), -1.0), 1.0) if c.slip_nm else s.slip
 
 
-cdef class Pair:
-    """A value of both joints, read and set by index 0 and 1; equal to any sequence of the same two values."""
-
-    def __len__(self):
-        return 2
-
-    def __getitem__(self, int k):
-        return self.at(k)[0]
-
-    def __setitem__(self, int k, double value):
-        self.at(k)[0] = value
-
-    def __eq__(self, other):
-        if isinstance(other, (Pair, list, tuple)):
-            return [*self] == [*other]
-        return NotImplemented
-
-    __hash__ = None
-
-    def __repr__(self):
-        return repr([*self])
-
-    cdef double *at(self, int k) except NULL:
-        if not 0 <= k < 2:
-            raise IndexError("joints are 0 and 1")
-        return self.two if k else self.one
+# Both joints
 
 
-# Both joints ----------------------------------------------------------------------------------------------------------
-
-
-cdef class Plant:
+cdef class Plant(TwoJoints):
     """State and equations of the bench. Angles in rad, velocities in rad/s; `link_*` is joint 1's frame.
 
     Public state (may be set before a run): motor_position, motor_velocity (of both joints, motor side),
     link_position, link_velocity, slip (z of both joints); `drives` are the control loops, `temperatures` the
-    joints' thermal states. Joint files with effects need `jtqd.sim_can.effect_plant.EffectPlant` (ValueError here).
+    joints' thermal states, loss_w the power of both joints' friction in the last integration step [W]. Joint files with
+    effects need `jtqd.sim_can.effect_plant.EffectPlant` (ValueError here).
     """
 
     def __init__(self, parameters):
         if parameters.has_effects and type(self) is Plant:
             raise ValueError("found joints with effects, expected none: use EffectPlant")
-        self.parameters = parameters
+        TwoJoints.__init__(self, parameters, substep_limit(parameters))
         one, two = parameters.joints
         table = loss_table(one)
         same = one.joint == two.joint and one.drive.current_limit_a == two.drive.current_limit_a
-        self.friction_1 = joint_friction(one, table)
-        self.friction_2 = joint_friction(two, table if same else None)
-        self.drive_1, self.drive_2 = DriveControl(one), DriveControl(two)
-        self.temperature_1, self.temperature_2 = JointTemperature(one.thermal), JointTemperature(two.thermal)
-        self.friction = (self.friction_1, self.friction_2)
-        self.drives = (self.drive_1, self.drive_2)
-        self.temperatures = (self.temperature_1, self.temperature_2)
-        self._joints = (_constants(one), _constants(two))
-        self._link_inertia = (one.link_inertia, two.link_inertia)
+        self.friction = (joint_friction(one, table), joint_friction(two, table if same else None))
+        self.temperatures = (JointTemperature(one.thermal), JointTemperature(two.thermal))
         for k, side in enumerate(parameters.joints):
-            self.constants[k] = self._joints[k]._asdict()
-            self.link_inertia[k] = side.link_inertia
-            self.coulomb_nm[k] = side.joint.friction.coulomb_nm
-            self.viscous_nms_per_rad[k] = side.joint.friction.viscous_nms_per_rad
-            self.viscous_scale[k] = side.deviations.viscous_scale
-            self.state[k] = JointState(angle=relaxed_angle(self._joints[k]), velocity=0.0, slip=0.0, torsion=0.0, loss_w=0.0)
-        self.day_viscous[0], self.day_viscous[1] = NOMINAL_DAY.viscous
+            self.constants[k] = side.constants._asdict()
+            self.link_inertia[k] = side.true_joint.link_inertia_kgm2
         self.warming = any(side.thermal.kelvin_per_w > 0.0 for side in parameters.joints)
-        self.substep_s = substep_limit(parameters)
-        self.link_position = self.link_velocity = 0.0
-        self.external_nm = self.next_external_nm = self.until_next_s = 0.0
-
-    @property
-    def motor_position(self):
-        """Angles of both motors, rad."""
-        return self.pair(&self.state[0].angle, &self.state[1].angle)
-
-    @motor_position.setter
-    def motor_position(self, values):
-        self.state[0].angle, self.state[1].angle = values
-
-    @property
-    def motor_velocity(self):
-        """Velocities of both motors, rad/s."""
-        return self.pair(&self.state[0].velocity, &self.state[1].velocity)
-
-    @motor_velocity.setter
-    def motor_velocity(self, values):
-        self.state[0].velocity, self.state[1].velocity = values
-
-    @property
-    def slip(self):
-        """z of both joints."""
-        return self.pair(&self.state[0].slip, &self.state[1].slip)
-
-    @slip.setter
-    def slip(self, values):
-        self.state[0].slip, self.state[1].slip = values
-
-    @property
-    def _loss_w(self):
-        """Power of the friction of both joints in the last integration step, W."""
-        return self.pair(&self.state[0].loss_w, &self.state[1].loss_w)
-
-    cdef Pair pair(self, double *one, double *two):
-        cdef Pair pair = Pair.__new__(Pair)
-        pair.plant, pair.one, pair.two = self, one, two
-        return pair
-
-    def begin_run(self):
-        """Start a run: the drives are about to be enabled; the time that effects may depend on counts from here."""
+        self.motor_position = [relaxed_angle(side.constants) for side in parameters.joints]
+        self.motor_velocity, self.slip, self.loss_w = [0.0, 0.0], [0.0, 0.0], [0.0, 0.0]
+        self.day_viscous = (0.0, 0.0)
 
     def begin_day(self, day):
         """Set friction and temperature of another day; both joints are as warm as their surroundings."""
-        self.day_viscous[0], self.day_viscous[1] = day.viscous
-        self.temperature_1.start(day.temperature_k[0])
-        self.temperature_2.start(day.temperature_k[1])
-        self.set_friction(0, self.friction_1, self.temperature_1)
-        self.set_friction(1, self.friction_2, self.temperature_2)
+        self.day_viscous = day.viscous
+        for k in range(2):
+            self.temperatures[k].start(day.temperature_k[k])
+            self.set_friction(k)
 
-    cdef void set_friction(self, int k, JointFriction friction, JointTemperature temperature) noexcept:
+    def set_friction(self, int k):
         """Set the Coulomb and viscous friction of the present day and temperature, as differences to the file's."""
-        cdef double viscous = self.viscous_scale[k] * (1.0 + self.day_viscous[k]) * temperature.viscous
-        friction.differ(
-            (temperature.coulomb - 1.0) * self.coulomb_nm[k], (viscous - 1.0) * self.viscous_nms_per_rad[k]
-        )
+        side, temperature = self.parameters.joints[k], self.temperatures[k]
+        cdef double viscous = side.deviations.viscous_scale * (1.0 + self.day_viscous[k]) * temperature.viscous
+        cdef double coulomb_nm = side.joint.friction.coulomb_nm, viscous_nms = side.joint.friction.viscous_nms_per_rad
+        self.friction[k].differ((temperature.coulomb - 1.0) * coulomb_nm, (viscous - 1.0) * viscous_nms)
 
-    def command(self, int drive, int mode, double target):
-        """Set mode and target of drive 0 or 1; see `jtqd.sim_can.source`."""
-        self.drives[drive].command(mode, target, self.state[drive].velocity)
-
-    def push(self, double torque_nm, double after_s=0.0):
-        """Push the links with torque_nm [Nm, joint 1's frame], on joint 2's side of the sensor, from after_s [s] on."""
-        self.next_external_nm, self.until_next_s = torque_nm, after_s
-
-    cpdef step(self, double dt_s):
-        """Advance by dt_s: whole control cycles of about 1 ms, each in equal integration steps of at most `substep_s`.
-
-        Raises ValueError for a time that is not finite.
-        """
-        cdef double cycle
-        cdef int cycles, steps
-        if dt_s <= 0.0:
-            return
-        if not isfinite(dt_s):
-            raise ValueError(f"found a step of {dt_s} s, expected a finite one")
-        cycles = <int>fmax(1.0, rint(dt_s / CONTROL_CYCLE))
-        cycle = dt_s / cycles
-        # the small excess keeps stamps that jitter by a few nanoseconds at the same number of steps
-        steps = <int>fmax(1.0, ceil(cycle / self.substep_s - 1e-3))
-        for _ in range(cycles):
-            self.drive_1.plan(cycle)
-            self.drive_2.plan(cycle)
-            self._integrate(steps, cycle / steps)
-            if self.warming:
-                self.warm(cycle)
-
-    cdef void warm(self, double dt_s) noexcept:
-        """Add the losses of dt_s seconds to the joints' temperatures."""
-        if self.temperature_1.add(self.state[0].loss_w, dt_s):
-            self.set_friction(0, self.friction_1, self.temperature_1)
-        if self.temperature_2.add(self.state[1].loss_w, dt_s):
-            self.set_friction(1, self.friction_2, self.temperature_2)
+    cdef int warm(self, double dt_s) except -1:
+        cdef int k
+        if self.warming:
+            for k in range(2):
+                if (<JointTemperature>self.temperatures[k]).add(self.loss_w[k], dt_s):
+                    self.set_friction(k)
+        return 0
 
     cpdef _integrate(self, int steps, double h):
-        """Integrate `steps` steps of h seconds."""
         cdef const Constants *c1 = &self.constants[0]
         cdef const Constants *c2 = &self.constants[1]
-        cdef JointState *one = &self.state[0]
-        cdef JointState *two = &self.state[1]
+        cdef JointState one = self.state(0), two = self.state(1)
+        cdef JointFriction friction_1 = self.friction[0], friction_2 = self.friction[1]
         cdef double link = self.link_position, link_velocity = self.link_velocity
         cdef double per_link = h / (self.link_inertia[0] + self.link_inertia[1])
         cdef double i1, i2, torque_1, torque_2
@@ -333,48 +387,55 @@ cdef class Plant:
         for _ in range(steps):
             i1 = self.drive_1.step(h, one.velocity)
             i2 = self.drive_2.step(h, two.velocity)
-            torque_1 = push(c1, one, self.friction_1, i1, link_velocity, h)
-            torque_2 = push(c2, two, self.friction_2, i2, -link_velocity, h)
-            if self.external_nm != self.next_external_nm:
-                self.until_next_s -= h
-                if self.until_next_s < 0.0:
-                    self.external_nm = self.next_external_nm
-            link_velocity += per_link * (torque_1 - torque_2 + self.external_nm)  # (2)
+            torque_1 = push(c1, &one, friction_1, i1, link_velocity, h)
+            torque_2 = push(c2, &two, friction_2, i2, -link_velocity, h)
+            link_velocity += per_link * (torque_1 - torque_2 + self.external(h))  # (2)
             link += h * link_velocity
-            turn(c1, one, link, h)
-            turn(c2, two, -link, h)
+            turn(c1, &one, link, h)
+            turn(c2, &two, -link, h)
         self.link_position, self.link_velocity = link, link_velocity
+        self.motor_position = [one.angle, two.angle]
+        self.motor_velocity = [one.velocity, two.velocity]
+        self.slip, self.loss_w = [one.slip, two.slip], [one.loss_w, two.loss_w]
 
-    cdef double torsion_of(self, int k) noexcept nogil:
-        """Return δ of a joint in rad, own frame."""
-        cdef double angle = self.state[k].angle, link = -self.link_position if k else self.link_position
-        return torsion(&self.constants[k], angle / self.constants[k].gear_ratio, angle, link)
+    cdef JointState state(self, int k) except *:
+        """Return the state of a joint, own frame."""
+        cdef JointState s
+        cdef double link = -self.link_position if k else self.link_position
+        s.angle, s.velocity, s.slip, s.loss_w = self.motor_position[k], self.motor_velocity[k], self.slip[k], self.loss_w[k]
+        s.torsion = torsion(&self.constants[k], s.angle / self.constants[k].gear_ratio, s.angle, link)
+        return s
 
-    cdef double torque_of(self, int k) noexcept nogil:
-        """Return τ of a joint in Nm, own frame."""
+    cdef Truth truth(self, int k) except *:
+        cdef Truth truth
+        truth.motor_rad, truth.motor_rad_s = self.motor_position[k], self.motor_velocity[k]
+        truth.link_rad = -self.link_position if k else self.link_position
+        truth.current_a = (self.drive_2 if k else self.drive_1).current_a
+        truth.celsius = (<JointTemperature>self.temperatures[k]).celsius
+        return truth
+
+    cdef double torque(self, int k) except? -1.0:
+        """Return τ of a joint in Nm, own frame, Eq. (3)."""
         cdef const Constants *c = &self.constants[k]
-        cdef const JointState *s = &self.state[k]
+        cdef JointState s = self.state(k)
         cdef double link_velocity = -self.link_velocity if k else self.link_velocity
-        cdef double rate = s.velocity / c.gear_ratio * transmission(c, s.angle) - link_velocity
-        return spring(c, self.torsion_of(k), rate, s.slip)
+        return spring(c, s.torsion, s.velocity / c.gear_ratio * transmission(c, s.angle) - link_velocity, s.slip)
 
     def joint_torques(self):
-        """Return (τ1, τ2): torque of each flexible spline in Nm, Eq. (3), own frames."""
-        return self.torque_of(0), self.torque_of(1)
+        return self.torque(0), self.torque(1)
 
     cpdef double sensor_torque(self) except? -1.0:
-        """Return the true torque in the sensor, Nm: τ1 - Jl1 dwl1/dt."""
-        cdef double one = self.torque_of(0), two = self.torque_of(1)
+        cdef double one = self.torque(0), two = self.torque(1)  # τ1 - Jl1 dwl1/dt
         return one - self.link_inertia[0] / (self.link_inertia[0] + self.link_inertia[1]) * (one - two + self.external_nm)
 
     def energy(self):
         """Return kinetic and elastic energy and the ripple's potential, J. Without motor current it can only fall."""
         cdef double total = 0.5 * (self.link_inertia[0] + self.link_inertia[1]) * self.link_velocity**2
         cdef const Constants *c
-        cdef const JointState *s
+        cdef JointState s
         for k in range(2):
-            c, s = &self.constants[k], &self.state[k]
-            total += 0.5 * c.rotor_inertia * s.velocity**2 + 0.5 * c.stiffness * self.torsion_of(k) ** 2
+            c, s = &self.constants[k], self.state(k)
+            total += 0.5 * c.rotor_inertia * s.velocity**2 + 0.5 * c.stiffness * s.torsion**2
             total += 0.5 * c.slip_nm / c.per_travel * s.slip**2
             if c.ripple_order > 0.0:
                 total += (

@@ -15,12 +15,68 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 from jtqd.estimator.decoder import FieldError, Text, below, choice, in_file, limits, read
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import Effect, ScalarFunctions, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, load_yaml
-from jtqd.sim_can.drive_file import USUAL_DRIVE, DriveParameters, SensorParameters
-from jtqd.sim_can.joint_effects import changed_joint, uses_temperature
+from jtqd.sim_can.source import USUAL_DRIVE, Day, DriveParameters, MeasurementParameters, SensorParameters
 
 REFERENCE_C: Final = 25.0
+
+
+# Effects of a joint file
+
+PROBES = (0.0, 0.37, 1.9, 4.4)
+PROBE_TORSION_RAD = 1.0e-3
+"""Angles [rad] and a torsion at which hooks are called once: to classify them, and to check that they are finite."""
+
+
+def effects_of(joint: Joint) -> list[tuple[Effect, Values]]:
+    """Return the joint's effects of the library, each with its parameters."""
+    return [(EFFECTS[entry.name], dict(entry.parameters)) for entry in joint.effects]
+
+
+def changed_joint(joint: Joint) -> Joint:
+    """Return the joint with the values that its effects replace (inertias, damping)."""
+    for effect, values in effects_of(joint):
+        joint = effect.joint(values, joint)
+    return joint
+
+
+def uses_temperature(joint: Joint) -> bool:
+    """Return whether any effect of the joint depends on the temperature, with its parameters."""
+    cold, warm = probe_state(0.4, PROBE_TORSION_RAD), probe_state(0.4, PROBE_TORSION_RAD)
+    for state, celsius in ((cold, 20.0), (warm, 40.0)):
+        state.temperature_c = celsius
+        state.current_rate_a_s = state.torque_rate_nm_s = state.torsion_rate_rad_s = 1.0
+    for effect, values in effects_of(joint):
+        for name in effect.hooks:
+            call = getattr(effect, name)
+            if call(values, cold, joint, ScalarFunctions()) != call(values, warm, joint, ScalarFunctions()):
+                return True
+    return False
+
+
+def probe_state(position_rad: float, torsion_rad: float = 0.0) -> State:
+    """Return a state in which everything that the inner loop knows is a number."""
+    return State(
+        current_a=1.0,
+        velocity_rad_s=0.5,
+        direction=1.0,
+        motor_position_rad=position_rad,
+        motor_acceleration_rad_s2=0.0,
+        link_position_rad=0.1,
+        link_velocity_rad_s=0.5,
+        link_acceleration_rad_s2=0.0,
+        coupling_position_rad=0.1,
+        torque_nm=1.0,
+        torsion_rad=torsion_rad,
+        temperature_c=30.0,
+        time_s=1.0,
+    )
+
+
+# Plant files
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,15 +126,10 @@ class RunToRun:
         """Whether one day differs from another."""
         return self != RunToRun()
 
-    @property
-    def nominal_day(self) -> Day:
-        """The day without any difference."""
-        return NOMINAL_DAY
-
     def day(self, seed: int, n: int) -> Day:
         """Day n = 0, 1, 2, ... of a bench with this seed; every value lies within its half width."""
         if not self.varies:
-            return NOMINAL_DAY
+            return Day()
         # a text as seed: the noise generator of the same seed must not give the same numbers
         start = random.Random(f"run to run {seed}")
         u = [2.0 * ((start.random() + n * step) % 1.0) - 1.0 for step in _STEPS]
@@ -88,18 +139,6 @@ class RunToRun:
             link_zero_rad=(self.link_zero_rad * u[4], self.link_zero_rad * u[5]),
             sensor_zero_nm=self.sensor_zero_nm * u[6],
         )
-
-
-class Day(NamedTuple):
-    """One day; the defaults are the nominal day. Pairs are of joint 1 and joint 2."""
-
-    viscous: tuple[float, float] = (0.0, 0.0)  # viscous friction is 1 + this times the usual
-    temperature_k: tuple[float, float] = (0.0, 0.0)
-    link_zero_rad: tuple[float, float] = (0.0, 0.0)  # added to what the link encoder states
-    sensor_zero_nm: float = 0.0  # added to what the sensor states
-
-
-NOMINAL_DAY = Day()
 
 
 PROFILES: Final = ("demo", "rest")
@@ -210,15 +249,29 @@ class _DeviationsFile:
 
 
 @dataclass(frozen=True)
-class MeasurementParameters:
-    """Encoders and current measurement of a drive (`measurement`)."""
+class Measurement(MeasurementParameters):
+    """The same with the current's offset."""
 
-    motor_counts_per_rev: Annotated[int, limits(ge=16, le=1 << 24)] = 65536
-    link_counts_per_rev: Annotated[int, limits(ge=16, le=1 << 26)] = 524288
-    link_noise_rad: Annotated[float, limits("rad", ge=0.0)] = 0.0
-    velocity_filter_s: Annotated[float, limits("s", ge=0.0, le=0.1)] = 0.001
-    current_noise_a: Annotated[float, limits("A", ge=0.0)] = 0.0
     current_offset_a: Annotated[float, limits("A")] = 0.0
+
+
+class JointConstants(NamedTuple):
+    """True constants of one joint for the inner loop, SI units."""
+
+    gear_ratio: float
+    torque_constant: float
+    rotor_inertia: float
+    stiffness: float
+    damping: float
+    ripple_nm: float
+    ripple_order: float
+    ripple_phase: float
+    error_rad: float  # E, kinematic error
+    error_order: float
+    error_phase: float
+    error_slope: float  # G E k: e' in units of 1/G
+    slip_nm: float  # H, hysteresis
+    per_travel: float
 
 
 @dataclass(frozen=True)
@@ -228,7 +281,7 @@ class JointPlant:
     joint: Joint
     deviations: Deviations = field(default_factory=Deviations)
     drive: DriveParameters = USUAL_DRIVE
-    measurement: MeasurementParameters = field(default_factory=MeasurementParameters)
+    measurement: Measurement = field(default_factory=Measurement)
     thermal: Thermal = field(default_factory=Thermal)
 
     @cached_property
@@ -246,30 +299,26 @@ class JointPlant:
         )
         return changed_joint(joint)
 
-    @property
-    def torque_constant(self) -> float:
-        """True Kt, Nm/A; effects on it are losses."""
-        return self.true_joint.torque_constant_nm_per_a
-
-    @property
-    def rotor_inertia(self) -> float:
-        """True Jm, kgm² on the motor side."""
-        return self.true_joint.rotor_inertia_kgm2
-
-    @property
-    def stiffness(self) -> float:
-        """True K, Nm/rad; effects on it are twists."""
-        return self.true_joint.stiffness_nm_per_rad
-
-    @property
-    def damping(self) -> float:
-        """True damping of the gear, Nms/rad."""
-        return self.true_joint.damping_nms_per_rad
-
-    @property
-    def link_inertia(self) -> float:
-        """True Jl, kgm²."""
-        return self.true_joint.link_inertia_kgm2
+    @cached_property
+    def constants(self) -> JointConstants:
+        """Return the constants of the inner loop; effects on torque constant and stiffness are losses and twists."""
+        joint, d = self.true_joint, self.deviations
+        return JointConstants(
+            joint.gear_ratio,
+            joint.torque_constant_nm_per_a,
+            joint.rotor_inertia_kgm2,
+            joint.stiffness_nm_per_rad,
+            joint.damping_nms_per_rad,
+            d.ripple_nm,
+            d.ripple_order_per_motor_rev,
+            d.ripple_phase_rad,
+            d.kinematic_error_rad,
+            d.kinematic_error_order_per_motor_rev,
+            d.kinematic_error_phase_rad,
+            joint.gear_ratio * d.kinematic_slope,
+            d.hysteresis_nm,
+            1.0 / d.hysteresis_travel_rad,
+        )
 
 
 @dataclass(frozen=True)
@@ -329,7 +378,7 @@ class _JointFile:
     joint: Text
     deviations: _DeviationsFile = _DeviationsFile()
     drive: DriveParameters = USUAL_DRIVE
-    measurement: MeasurementParameters = MeasurementParameters()
+    measurement: Measurement = Measurement()
     thermal: Thermal = field(default_factory=Thermal)
 
 
@@ -384,20 +433,18 @@ def substep_limit(
     ω² <= the sum of K / J over what a mass hangs on bounds every mode (Gershgorin). Damping D: D h / J <=
     0.25. A sticking hysteresis element is a spring beside K; a kinematic error changes the gear ratio.
     """
-    one, two = parameters.joints
-    link = one.link_inertia + two.link_inertia
-    damping = one.damping + two.damping
+    sides = parameters.joints
+    constants = [side.constants for side in sides]
+    link = sum(side.true_joint.link_inertia_kgm2 for side in sides)
     stiffness = [
-        side.stiffness * factor + side.deviations.hysteresis_stiffness
-        for side, factor in zip((one, two), stiffer, strict=True)
+        c.stiffness * factor + side.deviations.hysteresis_stiffness
+        for c, side, factor in zip(constants, sides, stiffer, strict=True)
     ]
     squares = [2.0 * sum(stiffness) / link]
-    rates = [damping / link]
-    for side, spring, bend in zip((one, two), stiffness, steeper, strict=True):
-        steepest = 1.0 + side.joint.gear_ratio * side.deviations.kinematic_slope + bend
-        inertia = side.rotor_inertia * (side.joint.gear_ratio / steepest) ** 2
+    rates = [sum(c.damping for c in constants) / link]
+    for c, spring, bend in zip(constants, stiffness, steeper, strict=True):
+        inertia = c.rotor_inertia * (c.gear_ratio / (1.0 + c.error_slope + bend)) ** 2
         squares.append(2.0 * spring / inertia)
-        rates.append(side.damping / inertia)
+        rates.append(c.damping / inertia)
     step = min(parameters.substep_s, 0.25 / math.sqrt(max(squares)))
-    fastest = max(rates)
-    return min(step, 0.25 / fastest) if fastest > 0.0 else step
+    return min(step, 0.25 / max(rates)) if max(rates) > 0.0 else step

@@ -7,193 +7,34 @@ current and without a node on the bus.
 from __future__ import annotations
 
 import random
-from collections import deque
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from pathlib import Path
 
-from jtqd.estimator.effects.effect import Effect, ScalarFunctions, State, Values
-from jtqd.estimator.joint import Joint
-from jtqd.sim_can.effect_plant import EffectPlant
-from jtqd.sim_can.instruments import Instruments
-from jtqd.sim_can.joint_effects import effects_of
+from jtqd.models.files import load_joint, load_yaml
+from jtqd.sim_can.drives import Instruments, Noise, TwoJoints
+from jtqd.sim_can.effect_plant import EffectPlant, Readings
 from jtqd.sim_can.plant import Plant
-from jtqd.sim_can.plant_file import JointPlant, PlantParameters
-from jtqd.sim_can.plants import AnyDay, AnyPlant
-from jtqd.sim_can.signals import Noise
-from jtqd.sim_can.source import OFF, ChannelSignal, DriveRatings, DriveSignals, Source
+from jtqd.sim_can.plant_file import JointPlant, PlantParameters, load_plant
+from jtqd.sim_can.source import OFF, ChannelSignal, Day, DriveRatings, DriveSignals, Source
+from jtqd.sim_can.towing import bench_file
 from jtqd.sim_can.towing.bench_file import TowedJoint, TowingBench
-from jtqd.sim_can.towing.instruments import Instruments as TowingInstruments
 from jtqd.sim_can.towing.plant import TowingPlant
 
-Errors = tuple[float, float, float]
-"""What motor encoder [rad, motor side], link encoder [rad] and current [A] read above the truth."""
+AnyPlant = PlantParameters | TowingBench
 
 
-class _Truth(NamedTuple):
-    """True values of the quantities that a channel delay acts on, at one time."""
+def load_any_plant(path: Path) -> AnyPlant:
+    """Read a bench file, known by its key `towing`, or what `load_plant` reads.
 
-    time_s: float
-    currents: tuple[float, float]
-    link_rad: float  # of joint 1
-    torque_nm: float
+    Joint files named in it are looked up beside it.
 
-
-def _between(early: _Truth, late: _Truth, time_s: float) -> _Truth:
-    share = (time_s - early.time_s) / (late.time_s - early.time_s)
-
-    def mix(a: float, b: float) -> float:
-        return a + share * (b - a)
-
-    return _Truth(
-        time_s,
-        (mix(early.currents[0], late.currents[0]), mix(early.currents[1], late.currents[1])),
-        mix(early.link_rad, late.link_rad),
-        mix(early.torque_nm, late.torque_nm),
-    )
-
-
-class _Past:
-    """Samples of the truth over the last `span_s`; before the first one it was as in the first one."""
-
-    def __init__(self, span_s: float) -> None:
-        self._span_s = span_s
-        self._samples: deque[_Truth] = deque()
-
-    def add(self, now: _Truth) -> None:
-        samples = self._samples
-        if samples and now.time_s <= samples[-1].time_s:
-            samples.pop()
-        samples.append(now)
-        while len(samples) > 2 and samples[1].time_s <= now.time_s - self._span_s:
-            samples.popleft()
-
-    def ago(self, delay_s: float) -> _Truth:
-        """Return the truth of delay_s ago, between samples by a straight line; 0: of the last sample before this one."""
-        samples = self._samples
-        if delay_s <= 0.0:
-            return samples[-2] if len(samples) > 1 else samples[-1]
-        time_s = samples[-1].time_s - delay_s
-        if time_s <= samples[0].time_s:
-            return samples[0]._replace(time_s=time_s)
-        for k in range(len(samples) - 2, -1, -1):
-            if samples[k].time_s <= time_s:
-                return _between(samples[k], samples[k + 1], time_s)
-        raise AssertionError("the first sample is earlier")
-
-
-class _Reading:
-    """One hook of one effect, with a state of its own.
-
-    Its rates are means over its own delay d, so that truth - d * rate is the truth d ago.
+    Raises:
+        ConfigError: unreadable file, unknown or missing key, value out of range; the message names file and key.
     """
-
-    def __init__(self, effect: Effect, name: str, values: Values, joint: Joint, number: int) -> None:
-        self._call: Callable[..., Any] = getattr(effect, name)
-        self._values = values
-        self.joint = joint
-        self._number = number
-        self._functions = ScalarFunctions()
-        self.state = State()
-        self.delay_s = abs(values.get("delay_s", 0.0))
-        self.at_motor = name == "link_rad" and effect.at_motor_of(values)
-
-    def update(self, plant: EffectPlant, truth: _Truth, past: _Past) -> None:
-        """Set the hook's state to the truth in this joint's own frame."""
-        number, state = self._number, self.state
-        sign = -1.0 if number else 1.0
-        inner = plant.effects[number].state
-        for name in ("direction", "velocity_rad_s", "motor_position_rad", "torsion_rad", "torque_nm"):
-            setattr(state, name, getattr(inner, name))
-        state.motor_acceleration_rad_s2 = inner.motor_acceleration_rad_s2
-        state.link_acceleration_rad_s2 = inner.link_acceleration_rad_s2
-        state.temperature_c, state.time_s = inner.temperature_c, inner.time_s
-        state.current_a = truth.currents[number]
-        state.link_position_rad, state.coupling_position_rad = sign * truth.link_rad, truth.link_rad
-        before = past.ago(self.delay_s)
-        span_s = truth.time_s - before.time_s
-        if span_s > 0.0:
-            state.current_rate_a_s = (truth.currents[number] - before.currents[number]) / span_s
-            state.torque_rate_nm_s = (truth.torque_nm - before.torque_nm) / span_s
-            state.link_velocity_rad_s = sign * (truth.link_rad - before.link_rad) / span_s
-        else:
-            state.current_rate_a_s = state.torque_rate_nm_s = 0.0
-            state.link_velocity_rad_s = sign * plant.link_velocity
-
-    def error(self) -> float:
-        """Return the hook's value at the state."""
-        return float(self._call(self._values, self.state, self.joint, self._functions))
-
-
-class Readings:
-    """Errors by effects of all instruments of one bench; `read` once per sample, after the plant's step.
-
-    An error of the motor's encoder, which the library expresses as one of the link's (motor_side=1), is the motor's here.
-    """
-
-    def __init__(self, plant: EffectPlant) -> None:
-        self._plant = plant
-        sides = [side.true_joint for side in plant.parameters.joints]
-        entries = [(k, *entry) for k, joint in enumerate(sides) for entry in effects_of(joint)]
-        first = next((k for k, effect, values in entries if effect.at_sensor_of(values)), 0)
-        self._current: list[list[_Reading]] = [[], []]
-        self._position: list[list[_Reading]] = [[], []]
-        self._sensor: list[_Reading] = []
-        for k, effect, values in entries:
-            for name, readings in (
-                ("current_a", self._current[k]),
-                ("link_rad", self._position[k]),
-                ("sensor_nm", self._sensor if k == first else []),
-            ):
-                if name in effect.hooks:
-                    readings.append(_Reading(effect, name, values, sides[k], k))
-        self._all = [
-            *self._current[0],
-            *self._current[1],
-            *self._position[0],
-            *self._position[1],
-            *self._sensor,
-        ]
-        self._past = _Past(max((reading.delay_s for reading in self._all), default=0.0))
-        self._time_s = 0.0
-
-    def read(self, torque_nm: float, dt_s: float) -> tuple[tuple[Errors, Errors], float]:
-        """Return the errors of both joints' instruments, and what the sensor reads where torque_nm is the truth.
-
-        dt_s: time since the last call.
-        """
-        self._time_s += dt_s
-        plant = self._plant
-        one, two = plant.drives
-        truth = _Truth(self._time_s, (one.current_a, two.current_a), plant.link_position, torque_nm)
-        self._past.add(truth)
-        for reading in self._all:
-            reading.update(plant, truth, self._past)
-        return (self._of_joint(0), self._of_joint(1)), self._of_sensor(torque_nm)
-
-    def _of_joint(self, k: int) -> Errors:
-        motor = link = current = 0.0
-        for reading in self._current[k]:
-            current += reading.error()
-        for reading in self._position[k]:
-            if reading.at_motor:
-                motor -= reading.joint.gear_ratio * reading.error()
-            else:
-                link += reading.error()
-        return motor, link, current
-
-    def _of_sensor(self, truth_nm: float) -> float:
-        """Return what the sensor reads. Its hooks depend on just that, linearly: a secant is exact."""
-        if not self._sensor:
-            return truth_nm
-        low, high = (self._sensor_errors(truth_nm + more) for more in (0.0, 1.0))
-        return truth_nm + low / (1.0 - (high - low))
-
-    def _sensor_errors(self, reading_nm: float) -> float:
-        error = 0.0
-        for reading in self._sensor:
-            reading.state.torque_nm = reading_nm
-            error += reading.error()
-        return error
+    mapping = load_yaml(path)
+    if bench_file.KEY not in mapping:
+        return load_plant(path)
+    return bench_file.bench_from_mapping(mapping, str(path), lambda name: load_joint(path.parent / name))
 
 
 def ratings_of(side: JointPlant | TowedJoint) -> DriveRatings:
@@ -208,38 +49,6 @@ def ratings_of(side: JointPlant | TowedJoint) -> DriveRatings:
     )
 
 
-class _Simulated:
-    """Plant of joint files, its instruments, and their errors by effects. Raises ConfigError as `EffectPlant` does."""
-
-    def __init__(self, parameters: PlantParameters, noise: Noise) -> None:
-        self._readings: Readings | None = None
-        if parameters.has_effects:
-            self.plant: Plant = EffectPlant(parameters)
-            self._readings = Readings(self.plant)
-        else:
-            self.plant = Plant(parameters)
-        self.instruments = Instruments(parameters, noise)
-
-    def read(self, dt_s: float) -> None:
-        """Sample everything, dt_s after the last time."""
-        torque_nm, errors = self.plant.sensor_torque(), None
-        if self._readings is not None:
-            errors, torque_nm = self._readings.read(torque_nm, dt_s)
-        self.instruments.read(self.plant, dt_s, torque_nm, errors)
-
-
-class _Towing:
-    """Bench with laws of its own, and its instruments."""
-
-    def __init__(self, parameters: TowingBench, noise: Noise) -> None:
-        self.plant = TowingPlant(parameters)
-        self.instruments = TowingInstruments(parameters, noise)
-
-    def read(self, dt_s: float) -> None:
-        """Sample everything, dt_s after the last time."""
-        self.instruments.read(self.plant, dt_s, self.plant.sensor_torque())
-
-
 class PlantSource:
     """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit.
 
@@ -250,13 +59,16 @@ class PlantSource:
     def __init__(self, parameters: AnyPlant, seed: int = 0, noise_seed: str | None = None) -> None:
         self.ratings = tuple(ratings_of(side) for side in parameters.joints)
         noise = Noise(random.Random(seed if noise_seed is None else noise_seed).random)
-        made: _Simulated | _Towing = (
-            _Towing(parameters, noise)
-            if isinstance(parameters, TowingBench)
-            else _Simulated(parameters, noise)
-        )
-        self.plant: Plant | TowingPlant = made.plant
-        self._instruments, self._read = made.instruments, made.read
+        self.plant: TwoJoints
+        self._readings: Readings | None = None
+        if isinstance(parameters, TowingBench):
+            self.plant = TowingPlant(parameters)
+        elif parameters.has_effects:
+            self.plant = EffectPlant(parameters)
+            self._readings = Readings(self.plant)
+        else:
+            self.plant = Plant(parameters)
+        self._instruments = Instruments(parameters, noise)
         self.drives = self._instruments.drives
         self.channels = (self._instruments.channel,)
         self._widths = parameters.run_to_run
@@ -266,16 +78,18 @@ class PlantSource:
         self.day_number = 0
         self.begin_day(self._widths.day(seed, 0))
 
-    def begin_day(self, values: AnyDay | None = None) -> None:
-        """Set what another day brings (None: the nominal day's). The joints stay where they are."""
-        values = self._widths.nominal_day if values is None else values
-        self.plant.begin_day(values)
-        self._instruments.begin_day(values)
+    def begin_day(self, day: Day) -> None:
+        """Set what another day brings; the joints stay where they are."""
+        self.plant.begin_day(day)
+        self._instruments.begin_day(day)
 
     def advance(self, dt_s: float) -> bool:
         """Integrate by dt_s and sample everything. An emulated run has no end: always True."""
         self.plant.step(dt_s)
-        self._read(dt_s)
+        torque_nm, errors = self.plant.sensor_torque(), None
+        if self._readings is not None:
+            errors, torque_nm = self._readings.read(torque_nm, dt_s)
+        self._instruments.read(self.plant, dt_s, torque_nm, errors)
         return True
 
     def command(self, drive: int, mode: int, target: float) -> None:

@@ -2,7 +2,7 @@
 
 from libc.stdint cimport int64_t, uint8_t
 
-from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
+from jtqd.sim_can.drives cimport ChannelSignal, DriveSignals
 
 cdef class Value:
     cdef int64_t number(self) except? -1

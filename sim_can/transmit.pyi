@@ -2,7 +2,7 @@ from collections.abc import Callable
 from typing import Final
 
 from jtqd.drivers.pdo import PdoMap
-from jtqd.sim_can.signals import ChannelSignal, DriveSignals
+from jtqd.sim_can.drives import ChannelSignal, DriveSignals
 
 NEVER_NS: Final[int]
 NOT_VALID: Final[int]

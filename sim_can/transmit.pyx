@@ -9,7 +9,7 @@ from libc.stdint cimport int32_t, int64_t
 from libc.string cimport memcpy, memset
 
 from jtqd.drivers.frame_socket cimport Frame
-from jtqd.sim_can.signals cimport ChannelSignal, DriveSignals
+from jtqd.sim_can.drives cimport ChannelSignal, DriveSignals
 
 from jtqd.drivers import drive, pdo as pdos
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.sim_can.bench_kernel import build, guest, packages, vcan
+from jtqd.sim_can.bench_kernel import build, guest
 from tests.native_pace import NativePace
 
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # tests that import onnxruntime themselves
@@ -79,7 +79,7 @@ class SocketCanTests:
         chosen = [item for item in items if item.get_closest_marker("socketcan")]
         if not chosen or self.config.option.collectonly:
             return
-        if vcan.ensure():
+        if build.ensure_vcan():
             self.summary = f"{len(chosen)} tests on this host's own vcan0"
             return
         self.waiting = {item.nodeid: item for item in chosen}
@@ -124,14 +124,14 @@ class SocketCanTests:
         try:
             with capture.global_and_fixture_disabled():  # a build tells its progress
                 build.ensure()
-                packages.require(packages.TESTS)
+                build.require(build.TESTS)
                 self.guest = guest.Guest(
                     self._guest_pytest(),
                     time_travel=not real_time,
                     env={FORWARDED: "1", "PYTEST_ADDOPTS": ""},
                     directory=self.config.rootpath,
                 )
-        except packages.MissingPackagesError as error:
+        except build.MissingPackagesError as error:
             self.skip_reason = str(error)
         self.started = time.monotonic()
 

@@ -161,7 +161,7 @@ def test_no_circles() -> None:
             "daemon.loop.process",
             {"onnxruntime", "canopen", "can", "mcap", "rich", "argparse", "_hashlib", "cyclonedds"},
         ),
-        ("sim_can.bench_loop", {"onnxruntime", "canopen", "can", "_hashlib"}),
+        ("sim_can.bench", {"onnxruntime", "canopen", "can", "_hashlib"}),
         ("sim_can.plant_source", {"numpy", "onnxruntime"}),
     ],
 )

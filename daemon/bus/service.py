@@ -20,6 +20,7 @@ from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy, nmt
+from jtqd.drivers.bus_socket import CanFilter, exact
 from jtqd.drivers.emcy import (
     NO_ERROR,
     Emergency,
@@ -27,7 +28,6 @@ from jtqd.drivers.emcy import (
     name_of,
     parse,
 )
-from jtqd.drivers.bus_socket import CanFilter, exact
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.object_dictionary import ObjectStore

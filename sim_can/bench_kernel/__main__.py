@@ -5,7 +5,7 @@ import signal
 import sys
 from typing import NoReturn
 
-from jtqd.sim_can.bench_kernel import build, guest, packages, vcan
+from jtqd.sim_can.bench_kernel import build, guest
 
 EXIT_TIMEOUT, EXIT_NO_GUEST = 124, 125  # as timeout(1) and env(1) have them
 
@@ -57,8 +57,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _build(options: argparse.Namespace) -> int:
-    there = options.unless_vcan and vcan.ensure()
-    packages.require(packages.TESTS if there else (*packages.TESTS, *build.needs()))  # asked for once
+    there = options.unless_vcan and build.ensure_vcan()
+    build.require(build.TESTS if there else (*build.TESTS, *build.needs()))  # asked for once
     if there:
         print("bench kernel: not needed, this host has vcan0", file=sys.stderr)
         return 0

@@ -1,4 +1,4 @@
-"""Build the bench kernel once and keep it in the user's cache, outside the checkout."""
+"""Build the bench kernel once and keep it in the user's cache, outside the checkout; the packages that it needs."""
 
 from __future__ import annotations
 
@@ -7,25 +7,151 @@ import hashlib
 import os
 import platform
 import shutil
+import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, NamedTuple
 
-from jtqd.sim_can.bench_kernel.packages import (
-    BUILD,
-    GUEST,
-    SOURCE_ARCHIVE,
-    SOURCE_PACKAGE,
-    Requirement,
-    find_program,
-    require,
+# Debian packages
+
+SOURCE_PACKAGE = "linux-source-6.1"
+SOURCE_ARCHIVE = f"/usr/src/{SOURCE_PACKAGE}.tar.xz"
+
+
+class Requirement(NamedTuple):
+    """One Debian package and the program (bare name) or file (absolute path) that shows it is there."""
+
+    package: str
+    proof: str
+
+
+BUILD = (
+    Requirement(SOURCE_PACKAGE, SOURCE_ARCHIVE),
+    Requirement("gcc", "gcc"),
+    Requirement("libc6-dev", "/usr/include/stdio.h"),
+    Requirement("make", "make"),
+    Requirement("flex", "flex"),
+    Requirement("bison", "bison"),
+    Requirement("bc", "bc"),
+    Requirement("libelf-dev", "/usr/include/libelf.h"),
+    Requirement("xz-utils", "xz"),
 )
+GUEST = (Requirement("iproute2", "ip"),)
+TESTS = (Requirement("can-utils", "candump"),)
+SYSTEMD = (
+    Requirement("systemd", "/lib/systemd/systemd"),
+    Requirement("udev", "/lib/systemd/systemd-udevd"),
+    Requirement("dbus", "/usr/bin/dbus-daemon"),
+    Requirement("python3-venv", "/usr/bin/python3"),
+)
+
+
+class MissingPackagesError(RuntimeError):
+    """Packages are needed that are not installed and may not be installed by this user."""
+
+    def __init__(self, packages: Iterable[str]) -> None:
+        self.packages = tuple(packages)
+        super().__init__(
+            "the bench kernel needs Debian packages that are not installed: "
+            f"{' '.join(self.packages)}; install them with: sudo apt-get install {' '.join(self.packages)}"
+        )
+
+
+def find_program(name: str) -> str | None:
+    """Path of a program; looks into the sbin directories too, which are not in every user's PATH."""
+    return shutil.which(name, path=os.environ.get("PATH", "") + ":/usr/sbin:/sbin:/usr/bin:/bin")
+
+
+def missing(
+    requirements: Iterable[Requirement],
+    which: Callable[[str], str | None] = find_program,
+    exists: Callable[[str], bool] = os.path.exists,
+) -> list[str]:
+    """Return names of the packages whose program or file is not there, in the order of `requirements`."""
+    return [
+        need.package
+        for need in requirements
+        if not (exists(need.proof) if need.proof.startswith("/") else which(need.proof))
+    ]
+
+
+def require(requirements: Iterable[Requirement], *, install: bool = True) -> None:
+    """Make sure that all packages are there; as root, install what is not.
+
+    Raises MissingPackagesError when packages are missing and this user may not install them (or `install` is
+    false), RuntimeError when apt-get fails.
+    """
+    wanted = tuple(requirements)
+    lacking = missing(wanted)
+    if not lacking:
+        return
+    if not install or os.geteuid() != 0 or find_program("apt-get") is None:
+        raise MissingPackagesError(lacking)
+    print(f"bench kernel: apt-get install {' '.join(lacking)}", file=sys.stderr, flush=True)
+    _apt_get("update")
+    # Recommended packages are left out: those of linux-source alone are several hundred megabytes.
+    _apt_get("install", "-y", "--no-install-recommends", *lacking)
+    still = missing(wanted)
+    if still:
+        raise MissingPackagesError(still)
+
+
+def _apt_get(*arguments: str) -> None:
+    done = subprocess.run(
+        ["apt-get", "-q", *arguments],
+        env={**os.environ, "DEBIAN_FRONTEND": "noninteractive"},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        errors="replace",
+        check=False,
+    )
+    if done.returncode != 0:
+        last = "\n".join(done.stdout.splitlines()[-15:])
+        raise RuntimeError(f"apt-get {' '.join(arguments)} failed with status {done.returncode}:\n{last}")
+
+
+# The host's own kernel
+
+
+def vcan_ready(name: str = "vcan0") -> bool:
+    """Return whether a raw CAN socket can be bound to the interface and the interface is up."""
+    try:
+        with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+            probe.bind((name,))
+        with open(f"/sys/class/net/{name}/flags") as flags:
+            return bool(int(flags.read(), 16) & 1)  # IFF_UP
+    except OSError:
+        return False
+
+
+def ensure_vcan(name: str = "vcan0") -> bool:
+    """Like vcan_ready(); as root, the interface is created and brought up first where the kernel can do that."""
+    if vcan_ready(name):
+        return True
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError:
+        return False
+    ip = find_program("ip")
+    if ip is None or os.geteuid() != 0:
+        return False
+    for arguments in (
+        ("link", "add", "dev", name, "type", "vcan"),
+        ("link", "set", name, "txqueuelen", "1000", "up"),
+    ):
+        subprocess.run([ip, *arguments], capture_output=True, check=False)
+    return vcan_ready(name)
+
+
+# The build
 
 CONFIG_FILE = Path(__file__).with_name("bench_kernel.config")
 OVERRIDE = "JTQD_BENCH_KERNEL"
@@ -150,7 +276,7 @@ def needs() -> tuple[Requirement, ...]:
 def ensure(*, install: bool = True) -> Path:
     """Path of the kernel binary; built first when it is not in the cache (2 to 5 minutes).
 
-    Raises packages.MissingPackagesError naming what is missing and may not be installed, BuildError when the
+    Raises MissingPackagesError naming what is missing and may not be installed, BuildError when the
     build fails.
     """
     require(needs(), install=install)

@@ -63,7 +63,7 @@ def run(
     """Run `command` in a guest of its own and return its result; arguments as in Guest.
 
     `sinks` receives standard output and standard error while the command runs.
-    Raises GuestTimeoutError, GuestError, build.BuildError, packages.MissingPackagesError.
+    Raises GuestTimeoutError, GuestError, build.BuildError, build.MissingPackagesError.
     """
     with Guest(
         command, time_travel=time_travel, out_dir=out_dir, env=env, memory=memory, systemd=systemd

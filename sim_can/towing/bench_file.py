@@ -9,14 +9,14 @@ from __future__ import annotations
 import math
 import random
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 from jtqd.estimator.decoder import FieldError, Text, below, in_file, limits, parsed, read
 from jtqd.estimator.errors import Verbatim
 from jtqd.estimator.joint import Joint
-from jtqd.sim_can.drive_file import USUAL_DRIVE, DriveParameters, SensorParameters
+from jtqd.sim_can.source import USUAL_DRIVE, Day, DriveParameters, MeasurementParameters, SensorParameters
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,49 +40,18 @@ class DayWidths:
         """Whether one day differs from another."""
         return self != DayWidths()
 
-    @property
-    def nominal_day(self) -> Day:
-        """The day without any difference."""
-        return Day()
-
     def day(self, seed: int, number: int) -> Day:
         """Return day 0, 1, 2, ... of a bench with this seed."""
 
-        def joint(side: int) -> JointDay:
-            return JointDay(
-                **{
-                    name: getattr(self, name) * _uniform(f"{seed} day {number} joint {side} {name}")
-                    for name in JointDay._fields
-                }
-            )
+        def draw(of: str) -> float:
+            return random.Random(f"{seed} day {number} {of}").uniform(-1.0, 1.0)
 
-        zero = self.sensor_zero_nm * _uniform(f"{seed} day {number} sensor")
-        return Day((joint(1), joint(2)), zero)
+        def pair(name: str) -> tuple[float, float]:
+            width: float = getattr(self, name)
+            return width * draw(f"joint 1 {name}"), width * draw(f"joint 2 {name}")
 
-
-def _uniform(text: str) -> float:
-    """Return the number of -1 .. 1 that belongs to a text."""
-    return random.Random(text).uniform(-1.0, 1.0)
-
-
-class JointDay(NamedTuple):
-    """Values of one joint on one day, as differences to the usual ones."""
-
-    viscous: float = 0.0
-    coulomb: float = 0.0
-    temperature_k: float = 0.0
-    motor_zero_rad: float = 0.0
-    link_zero_rad: float = 0.0
-    current_zero_a: float = 0.0
-    current_gain: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Day:
-    """One day; the default is the nominal one."""
-
-    joints: tuple[JointDay, JointDay] = field(default=(JointDay(), JointDay()))
-    sensor_zero_nm: float = 0.0
+        pairs = {each.name: pair(each.name) for each in fields(self) if each.name != "sensor_zero_nm"}
+        return Day(sensor_zero_nm=self.sensor_zero_nm * draw("sensor"), **pairs)
 
 
 KEY: Final = "towing"
@@ -208,14 +177,9 @@ class Warmth:
 
 
 @dataclass(frozen=True)
-class Measurement:
-    """Encoders and current measurement of a drive: `jtqd.sim_can.towing.instruments`."""
+class Measurement(MeasurementParameters):
+    """The same with errors of the scales and of the current's measurement: `jtqd.sim_can.drives.Encoders`."""
 
-    motor_counts_per_rev: Annotated[int, limits(ge=16, le=1 << 24)] = 65536
-    link_counts_per_rev: Annotated[int, limits(ge=16, le=1 << 26)] = 524288
-    link_noise_rad: Annotated[float, limits("rad", ge=0.0)] = 0.0
-    velocity_filter_s: Annotated[float, limits("s", ge=0.0, le=0.1)] = 0.001
-    current_noise_a: Annotated[float, limits("A", ge=0.0)] = 0.0
     motor_errors: tuple[AngleWave, ...] = ()
     link_errors: tuple[AngleWave, ...] = ()
     current_ripple: tuple[CurrentWave, ...] = ()

@@ -2,20 +2,8 @@
 
 cimport cython
 
-from jtqd.sim_can.drive_control cimport DriveControl
+from jtqd.sim_can.drives cimport TwoJoints, Waves
 
-
-cdef enum: MOST_WAVES = 8
-
-cdef struct Waves:
-    int count
-    double order[MOST_WAVES]
-    double amplitude[MOST_WAVES]
-    double phase[MOST_WAVES]
-
-cdef Waves waves_of(entries) except *
-cdef double waves_at(const Waves *waves, double angle) noexcept nogil
-cdef double waves_slope(const Waves *waves, double angle) noexcept nogil
 
 @cython.final
 cdef class BristleFriction:
@@ -67,7 +55,6 @@ cdef class TrueJoint:
     cdef readonly Gear gear
     cdef readonly BristleFriction friction
     cdef readonly Warmth warmth
-    cdef readonly DriveControl drive
     cdef double ratio, per_ratio, inertia  # of the rotor, joint side
     cdef double torque_constant, per_k, reference_c, saturation, per_current
     cdef Waves cogging
@@ -79,17 +66,10 @@ cdef class TrueJoint:
     cdef double torque(self, double link_velocity) noexcept
     cdef double push(self, double current, double link_velocity, double h) noexcept
     cdef void turn(self, double link, double h) noexcept
-    cdef void warm(self, double dt_s) noexcept
+    cdef void heat(self, double dt_s) noexcept
 
 @cython.final
-cdef class TowingPlant:
-    cdef readonly object parameters
+cdef class TowingPlant(TwoJoints):
     cdef readonly TrueJoint one, two
-    cdef readonly tuple joints, drives
-    cdef readonly double substep_s
-    cdef public double link_position, link_velocity
+    cdef readonly tuple joints
     cdef double inertia_1, inertia_2
-    cdef double external_nm, next_external_nm, until_next_s  # on link 2, joint 1's frame
-    cpdef step(self, double dt_s)
-    cdef void integrate(self, int steps, double h) noexcept
-    cpdef double sensor_torque(self) except? -1.0

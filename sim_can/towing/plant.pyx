@@ -23,44 +23,11 @@ Temperatures: grease, warmed by the friction, and housing with the thermometer, 
 Semi-implicit Euler: velocities first, then angles with the new velocities; friction implicit. Pure: no clock.
 """
 
-from libc.math cimport ceil, copysign, cos, exp, fabs, fmax, fmin, isfinite, pow, rint, sin
+from libc.math cimport copysign, exp, fabs, fmax, fmin, pow
 
-from jtqd.sim_can.drive_control cimport DriveControl
+from jtqd.sim_can.drives cimport Truth, TwoJoints, waves_at, waves_of, waves_slope
 
-from dataclasses import astuple
 from typing import Final
-
-
-cdef Waves waves_of(entries) except *:
-    """Return the waves of a bench file's list: order per turn, amplitude, phase; at most MOST_WAVES (IndexError)."""
-    cdef Waves waves
-    waves.count = 0
-    for order, amplitude, phase in map(astuple, entries):
-        if waves.count == MOST_WAVES:
-            raise IndexError(f"found more than {MOST_WAVES} waves")
-        waves.order[waves.count] = order
-        waves.amplitude[waves.count] = amplitude
-        waves.phase[waves.count] = phase
-        waves.count += 1
-    return waves
-
-
-cdef double waves_at(const Waves *waves, double angle) noexcept nogil:
-    """Return the sum at this angle."""
-    cdef double total = 0.0
-    cdef int k
-    for k in range(waves.count):
-        total += waves.amplitude[k] * cos(waves.order[k] * angle + waves.phase[k])
-    return total
-
-
-cdef double waves_slope(const Waves *waves, double angle) noexcept nogil:
-    """Return the sum's derivative with respect to the angle."""
-    cdef double total = 0.0
-    cdef int k
-    for k in range(waves.count):
-        total -= waves.amplitude[k] * waves.order[k] * sin(waves.order[k] * angle + waves.phase[k])
-    return total
 
 
 cdef class BristleFriction:
@@ -226,11 +193,6 @@ cdef double _share(double time_s, double constant_s) noexcept:
     return 1.0 - exp(-time_s / constant_s)
 
 
-CONTROL_CYCLE_S: Final = 0.001
-
-cdef double CONTROL_CYCLE = CONTROL_CYCLE_S
-
-
 cdef class TrueJoint:
     """One joint with its drive; `side`: `bench_file.TowedJoint`. angle, velocity: of the motor [rad, rad/s]."""
 
@@ -244,7 +206,6 @@ cdef class TrueJoint:
         self.gear = Gear(side.gear, self.ratio)
         self.friction = BristleFriction(side.friction, side.joint.rated_torque_nm, self.inertia)
         self.warmth = Warmth(side.warmth)
-        self.drive = DriveControl(side)
         self.angle = self.velocity = self.loss_w = 0.0
         self.begin_day(0.0, 0.0, 0.0)
 
@@ -281,83 +242,56 @@ cdef class TrueJoint:
         self.angle += h * self.velocity
         self.gear.turn(self.angle, link)
 
-    cdef void warm(self, double dt_s) noexcept:
+    cdef void heat(self, double dt_s) noexcept:
         """Add the losses of dt_s seconds to the temperatures."""
         if self.warmth.add(self.loss_w, dt_s):
             self.friction.warm(self.day_coulomb * self.warmth.coulomb, self.day_viscous * self.warmth.viscous)
 
 
-cdef class TowingPlant:
+cdef class TowingPlant(TwoJoints):
     """Both joints and the link between them; `parameters`: `bench_file.TowingBench`. `link_*` is joint 1's frame."""
 
     def __init__(self, parameters):
-        self.parameters = parameters
+        TwoJoints.__init__(self, parameters, parameters.longest_step_s)
         self.one, self.two = (TrueJoint(side) for side in parameters.joints)
         self.joints = (self.one, self.two)
-        self.drives = (self.one.drive, self.two.drive)
         self.inertia_1, self.inertia_2 = (side.link_inertia_kgm2 for side in parameters.joints)
-        self.substep_s = parameters.longest_step_s
-        self.link_position = self.link_velocity = 0.0
-        self.external_nm = self.next_external_nm = self.until_next_s = 0.0
         self.one.gear.relax(0.0, 0.0)
         self.two.gear.relax(0.0, 0.0)
 
-    def begin_run(self):
-        """Start a run: the drives are about to be enabled."""
-
     def begin_day(self, day):
-        """Set friction and temperatures of another day (`days.Day`); the joints stay where they are."""
-        for joint, values in zip(self.joints, day.joints, strict=True):
-            joint.begin_day(values.temperature_k, values.coulomb, values.viscous)
+        for k, joint in enumerate(self.joints):
+            joint.begin_day(day.temperature_k[k], day.coulomb[k], day.viscous[k])
 
-    def command(self, int drive, int mode, double target):
-        """Set mode and target of drive 0 or 1; see `jtqd.sim_can.source`."""
-        self.drives[drive].command(mode, target, self.joints[drive].velocity)
-
-    def push(self, double torque_nm, double after_s=0.0):
-        """Push the links with torque_nm [Nm, joint 1's frame], on joint 2's side of the sensor, from after_s [s] on."""
-        self.next_external_nm, self.until_next_s = torque_nm, after_s
-
-    cpdef step(self, double dt_s):
-        """Advance by dt_s: whole control cycles of about 1 ms, each in equal integration steps. Raises ValueError."""
-        cdef double cycle
-        cdef int cycles, steps
-        if dt_s <= 0.0:
-            return
-        if not isfinite(dt_s):
-            raise ValueError(f"found a step of {dt_s} s, expected a finite one")
-        cycles = <int>fmax(1.0, rint(dt_s / CONTROL_CYCLE))
-        cycle = dt_s / cycles
-        # the small excess keeps stamps that jitter by a few nanoseconds at the same number of steps
-        steps = <int>fmax(1.0, ceil(cycle / self.substep_s - 1e-3))
-        for _ in range(cycles):
-            self.one.drive.plan(cycle)
-            self.two.drive.plan(cycle)
-            self.integrate(steps, cycle / steps)
-            self.one.warm(cycle)
-            self.two.warm(cycle)
-
-    cdef void integrate(self, int steps, double h) noexcept:
+    cpdef _integrate(self, int steps, double h):
         cdef TrueJoint one = self.one, two = self.two
         cdef double per_link = h / (self.inertia_1 + self.inertia_2)
         cdef double torque_1, torque_2
         for _ in range(steps):
-            torque_1 = one.push(one.drive.step(h, one.velocity), self.link_velocity, h)
-            torque_2 = two.push(two.drive.step(h, two.velocity), -self.link_velocity, h)
-            if self.external_nm != self.next_external_nm:
-                self.until_next_s -= h
-                if self.until_next_s < 0.0:
-                    self.external_nm = self.next_external_nm
-            self.link_velocity += per_link * (torque_1 - torque_2 + self.external_nm)
+            torque_1 = one.push(self.drive_1.step(h, one.velocity), self.link_velocity, h)
+            torque_2 = two.push(self.drive_2.step(h, two.velocity), -self.link_velocity, h)
+            self.link_velocity += per_link * (torque_1 - torque_2 + self.external(h))
             self.link_position += h * self.link_velocity
             one.turn(self.link_position, h)
             two.turn(-self.link_position, h)
 
+    cdef int warm(self, double dt_s) except -1:
+        self.one.heat(dt_s)
+        self.two.heat(dt_s)
+        return 0
+
+    cdef Truth truth(self, int k) except *:
+        cdef TrueJoint joint = self.two if k else self.one
+        cdef Truth truth
+        truth.motor_rad, truth.motor_rad_s = joint.angle, joint.velocity
+        truth.link_rad = -self.link_position if k else self.link_position
+        truth.current_a = (self.drive_2 if k else self.drive_1).current_a
+        truth.celsius = joint.warmth.housing_c
+        return truth
+
     def joint_torques(self):
-        """Return (τ1, τ2) in Nm, own frames."""
         return self.one.torque(self.link_velocity), self.two.torque(-self.link_velocity)
 
     cpdef double sensor_torque(self) except? -1.0:
-        """Return the true torque in the sensor, Nm: τ1 - J1 dω_link/dt."""
         cdef double one = self.one.torque(self.link_velocity), two = self.two.torque(-self.link_velocity)
         return one - self.inertia_1 / (self.inertia_1 + self.inertia_2) * (one - two + self.external_nm)

@@ -25,9 +25,8 @@ from typing import Any, Final, NoReturn
 
 from jtqd.daemon.config import Config, JointConfig, SensorConfig, load_config
 from jtqd.drivers.bus_load import BusLoad, BusLoadError, Row, check_bus_load, configured_load, heartbeat_row
-from jtqd.drivers.bus_socket import PREFIX
+from jtqd.drivers.bus_socket import PREFIX, exact
 from jtqd.drivers.drive import CIA_402, DriveProfile, Temperature
-from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import Identity
 from jtqd.drivers.own_objects import COMMANDER_NODE
@@ -36,7 +35,7 @@ from jtqd.drivers.sensor import SensorProfile
 from jtqd.estimator.decoder import FieldError, below, in_file
 from jtqd.estimator.errors import ConfigError, Verbatim
 from jtqd.estimator.joint import Joint
-from jtqd.sim_can.bench_kernel import build, guest, packages
+from jtqd.sim_can.bench_kernel import build, guest
 from jtqd.sysid.motion.setpoints import (
     Limits,
     MotionResult,
@@ -503,7 +502,7 @@ def in_exact_time() -> bool:
 def exact_time_ready() -> bool:
     """Return whether the bench kernel is there, and this process is not in it."""
     try:
-        return not in_exact_time() and build.find() is not None and not packages.missing(packages.GUEST)
+        return not in_exact_time() and build.find() is not None and not build.missing(build.GUEST)
     except RuntimeError:
         return False
 

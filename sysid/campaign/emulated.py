@@ -24,7 +24,7 @@ from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, TimeFunction, emulate
-from jtqd.sim_can.plants import AnyPlant, load_any_plant
+from jtqd.sim_can.plant_source import AnyPlant, load_any_plant
 from jtqd.sysid.planner.campaigns import KINDS, Scale, make_plan
 from jtqd.sysid.planner.plan import Plan, Run, expand, marks_of
 from jtqd.sysid.progress import progress

@@ -9,7 +9,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, LossModel
-from jtqd.sim_can.losses import TORQUE_STEPS, LossTable
+from jtqd.sim_can.plant import TORQUE_STEPS, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
 
 _SLOPE: Final = 0.0075
@@ -20,7 +20,7 @@ class BaseLoss:
     """Losses of one joint file as the simulation has them, loss0(tau, v), signed like the velocity [Nm, joint side].
 
     The law of the emulated plant for this file (`jtqd.sim_can.plant_file.plant_of_joint`): with an efficiency the table of
-    `jtqd.sim_can.losses` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
+    `jtqd.sim_can.plant` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
     near rest, where a simulation's smoothing would matter, are not used by the diagnosis.
     """
 

@@ -29,7 +29,7 @@ from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_PRESENT
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
-from jtqd.sim_can.plants import AnyPlant, load_any_plant
+from jtqd.sim_can.plant_source import AnyPlant, load_any_plant
 from jtqd.sysid.campaign import emulated as campaign
 from jtqd.sysid.fit import command as fit
 from jtqd.sysid.planner.campaigns import Scale, make_plan

@@ -16,7 +16,7 @@ from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, CONTACT_UNKNOWN
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
-from jtqd.sim_can.plants import load_any_plant
+from jtqd.sim_can.plant_source import load_any_plant
 
 SETTINGS = recommended("fused")
 THRESHOLD_NM = 0.6

@@ -4,8 +4,7 @@ import math
 import struct
 
 from jtqd.drivers.frame import FRAME
-from jtqd.sim_can.bench import Bench
-from jtqd.sim_can.cost import map_pdos
+from jtqd.sim_can.bench import Bench, map_pdos
 from jtqd.sim_can.source import VELOCITY, ChannelSignal, DriveRatings, DriveSignals
 
 MS = 1_000_000

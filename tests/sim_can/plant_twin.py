@@ -89,14 +89,14 @@ class TwinPlant:
             side, g = self.sides[k], 1.0 / self.sides[k].joint.gear_ratio
             torsion = self.motor_position[k] * g - sign * self.link_position
             rate = self.motor_velocity[k] * g - sign * self.link_velocity
-            torques.append(side.stiffness * torsion + side.joint.damping_nms_per_rad * rate)
+            torques.append(side.constants.stiffness * torsion + side.joint.damping_nms_per_rad * rate)
         for k in (0, 1):
             side, d, g = self.sides[k], self.sides[k].deviations, 1.0 / self.sides[k].joint.gear_ratio
-            per_motor = h / side.rotor_inertia
+            per_motor = h / side.constants.rotor_inertia
             per_joint = per_motor * g
             angle = d.ripple_order_per_motor_rev * self.motor_position[k] + d.ripple_phase_rad
             w = self.motor_velocity[k] + (
-                per_motor * side.torque_constant * currents[k]
+                per_motor * side.constants.torque_constant * currents[k]
                 - per_joint * (torques[k] + d.ripple_nm * math.cos(angle))
             )
             stop = per_joint * self.friction(k, torques[k], w * g)
@@ -112,6 +112,6 @@ class TwinPlant:
             side, ratio = self.sides[k], self.sides[k].joint.gear_ratio
             torsion = self.motor_position[k] / ratio - sign * self.link_position
             rate = self.motor_velocity[k] / ratio - sign * self.link_velocity
-            torques.append(side.stiffness * torsion + side.joint.damping_nms_per_rad * rate)
+            torques.append(side.constants.stiffness * torsion + side.joint.damping_nms_per_rad * rate)
         share = self.link_inertia[0] / sum(self.link_inertia)
         return torques[0] - share * (torques[0] - torques[1])

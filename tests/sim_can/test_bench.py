@@ -13,7 +13,7 @@ from jtqd.drivers.nmt import RESET_COMMUNICATION, RESET_NODE, START
 from jtqd.drivers.own_objects import COMMANDER_NODE
 from jtqd.models.files import shipped
 from jtqd.sim_can.bench import bench_filters
-from jtqd.sim_can.drive_control import DriveControl
+from jtqd.sim_can.drives import DriveControl
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, VELOCITY

@@ -17,8 +17,8 @@ from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
 from jtqd.drivers.sensor import sensor_tpdo1
+from jtqd.sim_can.bench import map_pdos
 from jtqd.sim_can.command import main
-from jtqd.sim_can.cost import map_pdos
 
 pytestmark = pytest.mark.native
 

@@ -11,9 +11,8 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.demo import demo_current, demo_velocity
-from jtqd.sim_can.effect_plant import EffectPlant
-from jtqd.sim_can.joint_effects import EffectFriction, JointEffects
+from jtqd.sim_can.drives import demo_current, demo_velocity
+from jtqd.sim_can.effect_plant import EffectFriction, EffectPlant, JointEffects
 from jtqd.sim_can.plant import Plant, joint_friction
 from jtqd.sim_can.plant_file import (
     Day,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.demo import demo_current, demo_velocity
+from jtqd.sim_can.drives import demo_current, demo_velocity
 from jtqd.sim_can.plant import Plant, joint_friction, loss_table
 from jtqd.sim_can.plant_file import (
     Deviations,

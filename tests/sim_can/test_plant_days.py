@@ -8,9 +8,8 @@ import pytest
 
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
-from jtqd.sim_can.losses import JointTemperature
-from jtqd.sim_can.plant import Plant, joint_friction
-from jtqd.sim_can.plant_file import NOMINAL_DAY, Day, RunToRun, Thermal, load_plant
+from jtqd.sim_can.plant import JointTemperature, Plant, joint_friction
+from jtqd.sim_can.plant_file import Day, RunToRun, Thermal, load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
 
@@ -69,7 +68,7 @@ def test_days_belong_to_their_seed_and_number():
     assert WIDTHS.day(3, 5) == WIDTHS.day(3, 5)
     assert WIDTHS.day(3, 5) != WIDTHS.day(3, 6)
     assert WIDTHS.day(3, 5) != WIDTHS.day(4, 5)
-    assert RunToRun().day(3, 5) == NOMINAL_DAY == Day()
+    assert RunToRun().day(3, 5) == Day()
     only_zero = RunToRun(sensor_zero_nm=0.3).day(3, 5)
     assert only_zero == Day(sensor_zero_nm=WIDTHS.day(3, 5).sensor_zero_nm)
 
@@ -131,7 +130,7 @@ def extra_losses(parameters, of_day, speed=1.5, current=2.0):
 def test_warm_joint_loses_less_by_its_viscous_and_coulomb_share():
     thermal = Thermal(viscous_per_k=0.03, coulomb_per_k=0.01)
     parameters = replace(PLAIN, joints=tuple(replace(side, thermal=thermal) for side in PLAIN.joints))
-    assert extra_losses(parameters, NOMINAL_DAY) == pytest.approx([0.0, 0.0], abs=5e-3)
+    assert extra_losses(parameters, Day()) == pytest.approx([0.0, 0.0], abs=5e-3)
     found = extra_losses(parameters, Day(temperature_k=(10.0, -5.0)))
     friction = JOINT.friction
     for k, above in enumerate((10.0, -5.0)):
@@ -190,20 +189,16 @@ def test_emulated_runs_are_reproducible_and_each_day_has_its_own_noise():
 
 def test_nominal_day_of_a_plain_plant_is_every_day():
     plain = load_plant(shipped("plant.yaml"))
-    runs = [columns(emulate_run(plain, MOTION, 0.3, 4, day=given)) for given in (None, NOMINAL_DAY)]
+    runs = [columns(emulate_run(plain, MOTION, 0.3, 4, day=given)) for given in (None, Day())]
     assert np.array_equal(*runs)
     assert np.all(runs[0][4] == 25.0)
 
 
 def test_another_day_begins_when_a_drive_is_enabled_after_both_were_off():
     source = PlantSource(CAMPAIGN, seed=9)
-
-    def zero():
-        return source._instruments.sensor.offset_nm
-
     days = [CAMPAIGN.run_to_run.day(9, n).sensor_zero_nm for n in range(4)]
     source.advance(0.0)
-    assert zero() == days[0]  # the first run's day, before it is enabled, too
+    assert source._instruments.day_zero_nm == days[0]  # the first run's day, before it is enabled, too
     for drive, mode, number in (
         (0, VELOCITY, 0),
         (1, CURRENT, 0),
@@ -221,7 +216,8 @@ def test_another_day_begins_when_a_drive_is_enabled_after_both_were_off():
     ):
         source.command(drive, mode, 0.0)
         source.advance(0.001)
-        assert (source.day_number, zero()) == (number, days[number]), (drive, mode)
+        assert source.day_number == number, (drive, mode)
+        assert source._instruments.day_zero_nm == days[number]
 
 
 def test_without_run_to_run_a_joint_stays_warm_when_it_is_enabled_again():

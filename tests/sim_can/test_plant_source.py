@@ -10,8 +10,8 @@ import yaml
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.cost import measure
-from jtqd.sim_can.demo import PERIOD_S, demo_current, demo_velocity
+from jtqd.sim_can.bench import measure
+from jtqd.sim_can.drives import PERIOD_S, demo_current, demo_velocity
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import (
     JointPlant,
@@ -99,12 +99,13 @@ def test_motor_velocity_is_the_filtered_difference_of_counts():
     count = 2 * math.pi / 65536
     for k in range(1000):
         plant.motor_position[0] = 12.34 * 0.001 * k
-        source._instruments.encoders[0].sample(source.drives[0], 0.001, plant.motor_position[0], 0.0, 0.0)
+        source._instruments.read(plant, 0.001, 0.0)
         if k > 20:
             assert abs(source.drives[0].motor_velocity_rad_s - 12.34) <= count / 0.001
     for k in range(1000):
         t = 0.001 * k
-        source._instruments.encoders[0].sample(source.drives[0], 0.001, 500.0 * t * t, 0.0, 0.0)
+        plant.motor_position[0] = 500.0 * t * t
+        source._instruments.read(plant, 0.001, 0.0)
     late = (1000.0 * t - source.drives[0].motor_velocity_rad_s) / 1000.0
     # backward difference 0.5 ms; discrete low pass of 1 ms: h e/(1-e), e = exp(-h/tau)
     assert late == pytest.approx(0.0005 + 0.001 * math.exp(-1) / (1 - math.exp(-1)), abs=0.0002)

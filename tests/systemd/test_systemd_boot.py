@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from jtqd.sim_can.bench_kernel import build, guest, packages
+from jtqd.sim_can.bench_kernel import build, guest
 from tests.systemd.systemd_wheels import ROOT, make_environment, make_wheels
 
 DRIVER = Path(__file__).with_name("systemd_driver.py")
@@ -42,9 +42,9 @@ LONG = (
 def needs() -> str | None:
     """What is missing here to boot systemd."""
     try:
-        packages.require(packages.SYSTEMD)
+        build.require(build.SYSTEMD)
         build.ensure()
-    except (packages.MissingPackagesError, build.BuildError, RuntimeError) as error:
+    except (build.MissingPackagesError, build.BuildError, RuntimeError) as error:
         return str(error)
     return None
 

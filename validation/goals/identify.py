@@ -35,7 +35,7 @@ from jtqd.estimator.run import JointColumns, ObservedRun, RunTable
 from jtqd.estimator.settings import EstimatorSettings, recommended
 from jtqd.models.files import load_joint, load_yaml, shipped
 from jtqd.sim_can.plant_file import plant_from_mapping
-from jtqd.sim_can.plants import AnyPlant
+from jtqd.sim_can.plant_source import AnyPlant
 from jtqd.sim_can.towing import bench_file
 from jtqd.sysid.campaign.emulated import emulated_with_truth
 from jtqd.sysid.fit.efficiency import default_current_min, eta_points, fit_efficiency

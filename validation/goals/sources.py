@@ -243,8 +243,8 @@ def day_zeros(bench: TowingBench, runs: Sequence[Driven], seed: int, number: int
     ratio = bench.joints[number - 1].joint.gear_ratio
     found = {}
     for k, run in enumerate(runs):
-        day = bench.run_to_run.day(seed, k).joints[number - 1]
-        found[run.name] = day.link_zero_rad - day.motor_zero_rad / ratio
+        day = bench.run_to_run.day(seed, k)
+        found[run.name] = day.link_zero_rad[number - 1] - day.motor_zero_rad[number - 1] / ratio
     return found
 
 

@@ -30,7 +30,7 @@ from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, INVALID
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, Push, emulate
-from jtqd.sim_can.plants import load_any_plant
+from jtqd.sim_can.plant_source import load_any_plant
 from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, ExactTime, ScriptedSocket, frame
 from tests.paths import JTQD_EDS

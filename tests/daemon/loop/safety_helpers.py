@@ -12,7 +12,7 @@ from jtqd.daemon.core.status import JointSafety
 from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.demo import demo_current, demo_velocity
+from jtqd.sim_can.drives import demo_current, demo_velocity
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
 

@@ -34,7 +34,7 @@ from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader, View
 from jtqd.estimator.status import DEGRADED
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate
-from jtqd.sim_can.plants import load_any_plant
+from jtqd.sim_can.plant_source import load_any_plant
 from tests.daemon import ring_records as rr
 from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, SENSOR, ExactTime, ScriptedSocket, frame
 from tests.paths import ROOT

@@ -13,7 +13,7 @@ import time
 import pytest
 
 from jtqd.sim_can.bench_kernel import __main__ as command
-from jtqd.sim_can.bench_kernel import build, guest, packages
+from jtqd.sim_can.bench_kernel import build, guest
 
 FRAME = struct.Struct("<IB3x8s")
 SOL_CAN_RAW, CAN_RAW_FILTER, CAN_RAW_ERR_FILTER = 101, 1, 2
@@ -113,7 +113,7 @@ def kernel():
         pytest.skip("no guest in the guest")
     try:
         return build.ensure()
-    except packages.MissingPackagesError as error:
+    except build.MissingPackagesError as error:
         pytest.skip(str(error))
 
 
@@ -235,19 +235,19 @@ def test_missing_packages_are_named_in_order():
     def exists(path):
         return path != "/usr/include/libelf.h"
 
-    assert packages.missing(packages.BUILD, which, exists) == ["flex", "bc", "libelf-dev"]
-    assert packages.missing(packages.BUILD, lambda _: "/x", lambda _: True) == []
-    assert packages.missing(packages.BUILD, lambda _: None, lambda _: False) == [
+    assert build.missing(build.BUILD, which, exists) == ["flex", "bc", "libelf-dev"]
+    assert build.missing(build.BUILD, lambda _: "/x", lambda _: True) == []
+    assert build.missing(build.BUILD, lambda _: None, lambda _: False) == [
         *("linux-source-6.1", "gcc", "libc6-dev", "make", "flex", "bison", "bc", "libelf-dev", "xz-utils")
     ]
 
 
 def test_require_names_the_packages_where_it_may_not_install(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
-    absent = packages.Requirement("no-such-package", "/no/such/file")
-    with pytest.raises(packages.MissingPackagesError, match="apt-get install no-such-package"):
-        packages.require([absent, packages.Requirement("dash", "sh")])
-    packages.require([packages.Requirement("dash", "sh")])
+    absent = build.Requirement("no-such-package", "/no/such/file")
+    with pytest.raises(build.MissingPackagesError, match="apt-get install no-such-package"):
+        build.require([absent, build.Requirement("dash", "sh")])
+    build.require([build.Requirement("dash", "sh")])
 
 
 def test_a_build_asks_once_for_all_that_it_and_the_tests_need(monkeypatch, capsys):
@@ -255,8 +255,8 @@ def test_a_build_asks_once_for_all_that_it_and_the_tests_need(monkeypatch, capsy
     monkeypatch.setattr(build, "find", lambda: None)
     monkeypatch.setattr(build.platform, "machine", lambda: "x86_64")
     absent = {"flex", "candump", "ip"}
-    monkeypatch.setattr(packages, "find_program", lambda name: None if name in absent else f"/usr/bin/{name}")
-    monkeypatch.setattr(packages.missing, "__defaults__", (packages.find_program, lambda _: True))
+    monkeypatch.setattr(build, "find_program", lambda name: None if name in absent else f"/usr/bin/{name}")
+    monkeypatch.setattr(build.missing, "__defaults__", (build.find_program, lambda _: True))
     assert command.main(["build"]) == 1
     assert "apt-get install can-utils flex iproute2\n" in capsys.readouterr().err
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import jtqd.models
-from jtqd.sim_can.plants import load_any_plant
+from jtqd.sim_can.plant_source import load_any_plant
 from jtqd.sim_can.towing.bench_file import DayWidths, TowedJoint, TowingBench
 from jtqd.sim_can.towing.plant import TowingPlant
 

@@ -10,8 +10,8 @@ import pytest
 from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import load_joint, load_yaml
 from jtqd.sim_can.emulated_run import JointCommand, emulate, emulate_run
-from jtqd.sim_can.source import CURRENT, VELOCITY
-from jtqd.sim_can.towing.bench_file import DayWidths, JointDay, bench_from_mapping
+from jtqd.sim_can.source import CURRENT, VELOCITY, Day
+from jtqd.sim_can.towing.bench_file import DayWidths, bench_from_mapping
 from jtqd.sim_can.towing.plant import UPDATE_S, Gear, Warmth
 from tests.sim_can.towing.benches import BAD_DAY, FOLDER, PLAIN, TYPICAL, plant_of
 
@@ -161,10 +161,10 @@ def test_a_day_sets_zeros_and_gains_of_the_instruments() -> None:
     one, read = usual.joints[1], other.joints[1]
     assert np.mean(read.torque_nm - one.torque_nm) == pytest.approx(day.sensor_zero_nm, abs=1e-3)
     assert np.mean(read.link_position_rad - one.link_position_rad) == pytest.approx(
-        day.joints[0].link_zero_rad, abs=2e-6
+        day.link_zero_rad[0], abs=2e-6
     )
     gain = float(np.dot(read.current_a, one.current_a) / np.dot(one.current_a, one.current_a))
-    assert gain == pytest.approx(1.0 + day.joints[0].current_gain, abs=1e-3)
+    assert gain == pytest.approx(1.0 + day.current_gain[0], abs=1e-3)
 
 
 def test_days_are_drawn_within_their_widths_and_repeat() -> None:
@@ -172,13 +172,13 @@ def test_days_are_drawn_within_their_widths_and_repeat() -> None:
     days = [widths.day(7, n) for n in range(200)]
     assert days[3] == widths.day(7, 3)
     assert days[3] != widths.day(8, 3)
-    for name in JointDay._fields:
-        drawn = np.array([[getattr(joint, name) for joint in day.joints] for day in days])
+    for name in set(Day._fields) - {"sensor_zero_nm"}:
+        drawn = np.array([getattr(day, name) for day in days])
         width = getattr(widths, name)
         assert np.max(np.abs(drawn)) <= width
         assert np.max(np.abs(drawn)) > 0.95 * width
         assert abs(np.corrcoef(drawn.T)[0, 1]) < 0.25
-    assert DayWidths().day(7, 3) == DayWidths().nominal_day
+    assert DayWidths().day(7, 3) == Day()
 
 
 def test_grease_is_warmed_first_and_viscosity_falls_by_vogels_law() -> None:
@@ -240,13 +240,11 @@ def test_what_is_wrong_with_a_bench_file_is_named(change, expected: str) -> None
 
 
 def test_the_true_torques_stand_beside_what_was_measured() -> None:
-    day = PLAIN.run_to_run.nominal_day
     run = emulate(
         replace(PLAIN, sensor=replace(PLAIN.sensor, gain=2.0, offset_nm=1.0)),
         commands(),
         1.0,
         seed=5,
-        day=day,
     )
     inertia = [side.link_inertia_kgm2 for side in PLAIN.joints]
     one, two = run.joint_torque_nm.T

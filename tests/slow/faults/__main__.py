@@ -9,7 +9,7 @@ import sys
 from collections.abc import Iterable
 from typing import Any
 
-from jtqd.sim_can.bench_kernel import guest, vcan
+from jtqd.sim_can.bench_kernel import build, guest
 from tests.slow.faults.cases import CASES, with_library
 from tests.slow.faults.runner import Outcome, play
 
@@ -121,7 +121,7 @@ def main(arguments: list[str] | None = None) -> int:
             f"no case {', '.join(sorted(unknown))} is played on the bus (docs/testing.md says where it is shown)"
         )
     bus = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
-    if not vcan.ensure(bus):
+    if not build.ensure_vcan(bus):
         command = [sys.executable, "-m", "tests.slow.faults", *(arguments or sys.argv[1:])]
         sinks = (sys.stdout.buffer, sys.stderr.buffer)
         return guest.run(command, time_travel=True, sinks=sinks).returncode

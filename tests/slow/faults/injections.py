@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.sim_can.canopen_node import CURRENT, CanopenNode
-from jtqd.sim_can.drive_node import OVERCURRENT
+from jtqd.sim_can.devices import OVERCURRENT
 from tests.slow.faults.listener import Seen
 
 if TYPE_CHECKING:

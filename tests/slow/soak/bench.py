@@ -21,8 +21,7 @@ from typing import Any
 
 from jtqd.drivers.frame import CAN_ERR_FLAG, FRAME, pack
 from jtqd.models.files import shipped
-from jtqd.sim_can.bench import Bench
-from jtqd.sim_can.bench_loop import run
+from jtqd.sim_can.bench import Bench, run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from tests.slow.faults import injections as acts

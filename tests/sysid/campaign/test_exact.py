@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 
-from jtqd.sim_can.bench_kernel import build, guest, packages
+from jtqd.sim_can.bench_kernel import build, guest
 from jtqd.sysid.campaign import bench, command
 from jtqd.sysid.campaign.bench import ProcessError
 from jtqd.sysid.campaign.runner import Outcome
@@ -142,7 +142,7 @@ def test_the_command_inside_is_the_same_on_another_bus(monkeypatch: pytest.Monke
     ("raised", "words"),
     [
         (build.BuildError("no compiler"), "exact time: no compiler"),
-        (packages.MissingPackagesError(["flex"]), "flex"),
+        (build.MissingPackagesError(["flex"]), "flex"),
         (guest.GuestError("the guest ended"), "the guest ended"),
         (KeyboardInterrupt(), "the same command continues"),
     ],

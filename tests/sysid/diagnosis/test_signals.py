@@ -14,7 +14,7 @@ from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import DRIVING_CURRENT_MAX_A, FrictionModel, LossModel
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.losses import JointFriction, LossTable
+from jtqd.sim_can.plant import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied

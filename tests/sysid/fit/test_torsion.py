@@ -17,7 +17,7 @@ from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S, EstimatorSettings
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
-from jtqd.sim_can.plants import AnyPlant, load_any_plant
+from jtqd.sim_can.plant_source import AnyPlant, load_any_plant
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.fit.torsion import (
     TRACKING_RAD_S,

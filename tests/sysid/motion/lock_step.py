@@ -232,7 +232,7 @@ class LockStep:
 
     @property
     def states(self) -> tuple[int, ...]:
-        """jtqd.sim_can.drive_node states of all drives."""
+        """jtqd.sim_can.devices states of all drives."""
         return tuple(drive.machine.state for drive in self.bench.drives)
 
     def setpoints_sent(self, after_ms: int = 0) -> list[tuple[int, int, int]]:

@@ -10,7 +10,7 @@ import pytest
 from jtqd.drivers.boot_node import BootError
 from jtqd.drivers.drive import CIA_402, DriveObject, DriveProfile, map_of
 from jtqd.drivers.pdo import Tpdo
-from jtqd.sim_can import drive_node as cia402
+from jtqd.sim_can import devices as cia402
 from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.setpoints import MotionError, MotionResult, Setpoints
 from tests.sysid.motion.lock_step import MS, WARM, WIDE, LockStep, changed, plateau, turning, without

@@ -6,7 +6,7 @@ from jtqd.drivers.boot_node import BootError
 from jtqd.drivers.drive import DriveProfile, State, state_of
 from jtqd.drivers.sdo import NO_OBJECT, NO_SUBINDEX, SdoAbort
 from jtqd.drivers.sensor import SensorProfile
-from jtqd.sim_can import drive_node as cia402
+from jtqd.sim_can import devices as cia402
 from jtqd.sysid.motion.drives import (
     CST,
     CSV,

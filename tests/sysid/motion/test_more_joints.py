@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.sim_can import drive_node as cia402
+from jtqd.sim_can import devices as cia402
 from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.drives import sending_order
 from jtqd.sysid.motion.setpoints import (

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.models.files import shipped
-from jtqd.sim_can import drive_node as cia402
+from jtqd.sim_can import devices as cia402
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.setpoints import Mark, Setpoints

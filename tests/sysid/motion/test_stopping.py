@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pytest
 
-from jtqd.sim_can import drive_node as cia402
+from jtqd.sim_can import devices as cia402
 from jtqd.sysid.motion.commander import Phase
 from jtqd.sysid.motion.setpoints import Limits
 from tests.sysid.motion.lock_step import MS, WARM, WIDE, Frames, LockStep, changed, plateau, without

@@ -1,13 +1,13 @@
-"""Emulated CiA 402 drive: state machine, object dictionary and PDOs around one drive of a `Source`. Pure.
+"""Emulated devices around a `Source`: drives (CiA 402) and a torque sensor (CiA 404) with two channels. Pure.
 
 `StateMachine` follows CiA 402-2, table "statusword bits by state": controlword in, state and statusword out; numbers in its
-comments are the transitions. `DriveNode` is the device.
+comments are the transitions. `DriveNode` and `SensorNode` are the devices.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from fractions import Fraction
 from typing import Final
 
@@ -16,9 +16,9 @@ from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 from jtqd.sim_can.canopen_node import CURRENT as CURRENT_ERROR
 from jtqd.sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
-from jtqd.sim_can.eds_entries import DRIVE, entries_of
-from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, DriveRatings, DriveSignals, Source
-from jtqd.sim_can.transmit import DriveValue
+from jtqd.sim_can.eds_entries import DRIVE, SENSOR, entries_of
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, ChannelSignal, DriveRatings, DriveSignals, Source
+from jtqd.sim_can.transmit import Channel, ChannelValue, DriveValue
 
 NOT_READY: Final = 0
 SWITCH_ON_DISABLED: Final = 1
@@ -365,3 +365,52 @@ def _ratio(gear_ratio: float) -> tuple[int, int]:
     """Return numerator and denominator of 6091h."""
     ratio = Fraction(gear_ratio).limit_denominator(10_000)
     return ratio.numerator, ratio.denominator
+
+
+AUTOZERO = 0x6F72_657A  # "zero" in 6125h
+MAX_DECIMALS = 9
+
+
+class SensorNode(CanopenNode):
+    """Sensor as node `node_id`. Channel 1 is the first of `signals`; channel 2 is valid only where there is a second."""
+
+    def __init__(self, signals: Sequence[ChannelSignal], node_id: int) -> None:
+        super().__init__(ObjectStore(entries_of(node_id, SENSOR), node_id))
+        self.store.set_number(0x1018, 4, 0x1000 + node_id)
+        self.store.keep_as_default(0x1018, 4)
+        self._channels: list[Channel] = []
+        for number in (1, 2):
+            signal = signals[number - 1] if number <= len(signals) else None
+            channel = Channel(signal, self.store.number(0x6132, number))
+            self._channels.append(channel)
+            self.getters[0x9130, number] = ChannelValue(channel, 32)
+            self.getters[0x7130, number] = ChannelValue(channel, 16)
+            # the second channel is read in 16 bits (two digits), so its status is that of the 16-bit value
+            self.getters[0x6150, number] = ChannelValue(channel, 32 if number == 1 else 16, status=True)
+            self.handlers[0x6125, number] = _autozero(channel)
+            self.handlers[0x6132, number] = _decimals(channel)
+        self.connect()
+
+    def on_reset(self) -> None:
+        """Return to the power-on state: zero and decimals as delivered."""
+        for number, channel in enumerate(self._channels, 1):
+            channel.zero_nm = 0.0
+            channel.set_decimals(self.store.number(0x6132, number))
+
+
+def _autozero(channel: Channel) -> Callable[[int], None]:
+    def handler(value: int) -> None:
+        if value != AUTOZERO:
+            raise SdoAbort(VALUE_RANGE)
+        channel.autozero()
+
+    return handler
+
+
+def _decimals(channel: Channel) -> Callable[[int], None]:
+    def handler(value: int) -> None:
+        if value > MAX_DECIMALS:
+            raise SdoAbort(VALUE_RANGE)
+        channel.set_decimals(value)
+
+    return handler

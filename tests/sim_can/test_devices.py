@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from jtqd.sim_can.drive_node import (
+from jtqd.sim_can.devices import (
     FAULT,
     FAULT_REACTION,
     NOT_READY,
