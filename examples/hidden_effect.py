@@ -6,9 +6,9 @@
         python -m examples.hidden_effect --effect torque_constant --bus sim:vcan0 --out DIR
 
 A secret plant file -> `jtq campaign` on the bench that it makes -> `jtq diagnose` with the nominal joint files -> jtqd
-with the nominal and with the extended joint files on fresh motions of the same bench -> `jtq diagnose` once more, with
-the extended files. Every step is a command of its own, printed before it runs; docs/diagnosis.md, "End to end over the
-bus".
+with the nominal and with the extended joint files on fresh motions of the same bench -> `jtq diagnose` once more on the
+first runs, with the extended files. Every step is a command of its own, printed before it runs. `jtq score` gives the
+errors of both files' simulations on any runs.
 
 The secret bench differs from the nominal joint files by one effect of joint 1 alone; noise, drives and the days
 (`run_to_run`) are those of the campaign's bench. Its joints are otherwise what `jtq sim --plant` makes of their files.
@@ -17,23 +17,22 @@ The secret bench differs from the nominal joint files by one effect of joint 1 a
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import json
-import math
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import yaml
 
 from jtqd.daemon.logs import LogError, read_topics
-from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
-from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.command_line import check_installed, count, make_directory, natural, seconds
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.methods import estimate_columns
@@ -47,7 +46,8 @@ from jtqd.sysid.campaign.emulated import emulated
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import variable_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan
-from jtqd.sysid.report.page import LIGHT, STYLE, check_picture
+from jtqd.sysid.report.figures import STYLE, check_picture
+from jtqd.sysid.report.page import LIGHT
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import write_run
@@ -57,6 +57,7 @@ SECRET_JOINT: Final = 1
 NAMES: Final = ("torque_constant", "torque_ripple", "kinematic_error")
 _PLANT: Final = "campaign_plant.yaml"
 _KT_LOW: Final = 0.94
+"""The torque constant is 6 % low."""
 _FRESH_SEED: Final = 1000
 """Added to the seed: no motion of the fresh runs is one of the diagnosed runs."""
 _DRIVE_ON: Final = 0x27
@@ -65,13 +66,6 @@ NO_BUS: Final = "none"
 _FINDINGS: Final = 3
 _STDERR: Final = 2
 _METHODS: Final = ("efficiency", "tob")
-_NEEDED: Final = ("scipy", "matplotlib", "jinja2")
-Row = tuple[str, float, float]
-"""Label of an error, and its value before and after [Nm]."""
-
-
-class StepError(RuntimeError):
-    """A command of the toolbox failed; the reason is in its log."""
 
 
 def nominal_file(number: int) -> Path:
@@ -81,12 +75,12 @@ def nominal_file(number: int) -> Path:
 
 def secrets(joint: Joint) -> Mapping[str, Effect]:
     """Effects that can be hidden in `joint`, by name."""
+    low = {"torque_constant_nm_per_a": _KT_LOW * joint.torque_constant_nm_per_a}
+    wave = {"order_per_motor_rev": 2.0}
     made = (
-        Effect(
-            "torque_constant", {"torque_constant_nm_per_a": _KT_LOW * joint.torque_constant_nm_per_a}
-        ),  # 6 % low
-        Effect("torque_ripple", {"amplitude_nm": 0.8, "order_per_motor_rev": 2.0, "phase_rad": 0.7}),
-        Effect("kinematic_error", {"amplitude_rad": 1.0e-4, "order_per_motor_rev": 2.0, "phase_rad": 0.9}),
+        Effect("torque_constant", low),
+        Effect("torque_ripple", {"amplitude_nm": 0.8, **wave, "phase_rad": 0.7}),
+        Effect("kinematic_error", {"amplitude_rad": 1.0e-4, **wave, "phase_rad": 0.9}),
     )
     return {effect.name: effect for effect in made}
 
@@ -127,54 +121,61 @@ def write_config(path: Path, joint_files: Mapping[int, Path], method: str) -> Pa
 def plans(runs: int, fresh: int, seconds: float, seed: int) -> tuple[Plan, Plan]:
     """Plans of the runs to diagnose and of the fresh ones: drawn Fourier motions, none in both. Raises ConfigError."""
     joints = (load_joint(nominal_file(1)), load_joint(nominal_file(2)))
-    limits = DEFAULT_LIMITS
-    return (
-        Plan("hidden effect", limits, variable_runs(limits, runs, seconds, seed=seed, joints=joints)),
-        Plan(
-            "hidden effect fresh",
-            limits,
-            variable_runs(limits, fresh, seconds, seed=seed + _FRESH_SEED, joints=joints),
-        ),
-    )
+
+    def plan(name: str, count: int, seed: int) -> Plan:
+        drawn = variable_runs(DEFAULT_LIMITS, count, seconds, seed=seed, joints=joints)
+        return Plan(name, DEFAULT_LIMITS, drawn)
+
+    return plan("hidden effect", runs, seed), plan("hidden effect fresh", fresh, seed + _FRESH_SEED)
 
 
 def log_rmse(logs: Sequence[Path], number: int, settings: EstimatorSettings) -> float:
     """Return the RMSE [Nm] of what joint `number` published in all logs while its drive was on and the joint moved.
 
     The sensor is filtered like the estimate. Standstill, where the estimate is an interval, does not count.
-    Raises LogError.
     """
-    return _rms([_log_errors(log, number, settings.bandwidth_rad_s) for log in logs], f"{number}")
+    errors = []
+    for log in logs:
+        state, frames = read_topics(log, (f"/joint/{number}/state", "/can/frames")).values()
+        if not np.array_equal(state["cycle"], frames["cycle"]):
+            raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
+        sensor = reference_torque(state, sync_time(state["header"]["stamp"]), settings.bandwidth_rad_s)
+        moving = ((state["statusword"] & _DRIVE_MASK) == _DRIVE_ON) & (state["status"] == VALID)
+        errors.append((published_torque(frames, number - 1) - sensor)[moving])
+    return rms(errors)
+
+
+class Estimated(NamedTuple):
+    """Torque and low-passed sensor of a run [n], and where the joint moves."""
+
+    torque_nm: FloatArray
+    sensor_nm: FloatArray
+    moving: BoolArray
+
+
+def estimated(table: RunTable, number: int, joint: Joint, settings: EstimatorSettings) -> Estimated:
+    """Return the whole-run estimate of a joint."""
+    columns = table.joint(number, joint.gear_ratio)
+    assert columns.torque_nm is not None
+    found = estimate_columns(joint, settings, None, table.time_s, columns)
+    steps = np.diff(table.time_s, prepend=table.time_s[0])
+    sensor = low_pass(columns.torque_nm, steps, settings.bandwidth_rad_s)
+    return Estimated(found.torque_nm, sensor, found.status == VALID)
 
 
 def table_rmse(tables: Sequence[RunTable], number: int, joint: Joint, settings: EstimatorSettings) -> float:
-    """Return the RMSE [Nm] of the whole-run estimate of run tables, in motion. Raises LogError."""
-    errors = []
-    for table in tables:
-        columns = table.joint(number, joint.gear_ratio)
-        result = estimate_columns(joint, settings, None, table.time_s, columns)
-        assert columns.torque_nm is not None
-        steps = np.diff(table.time_s, prepend=table.time_s[0])
-        error = result.torque_nm - low_pass(columns.torque_nm, steps, settings.bandwidth_rad_s)
-        errors.append(error[(result.status == VALID) & np.isfinite(error)])
-    return _rms(errors, f"{number}")
+    """Return the RMSE [Nm] of the whole-run estimate of run tables, in motion."""
+    found = [estimated(table, number, joint, settings) for table in tables]
+    return rms([(each.torque_nm - each.sensor_nm)[each.moving] for each in found])
 
 
-def _rms(errors: Sequence[FloatArray], joint: str) -> float:
-    whole = np.concatenate(errors) if errors else np.empty(0)
+def rms(errors: Sequence[FloatArray]) -> float:
+    """Return the root mean square of all finite values. Raises LogError without any."""
+    whole = np.concatenate(errors)
+    whole = whole[np.isfinite(whole)]
     if not len(whole):
-        raise LogError(f"joint {joint}: found no estimate in motion, expected some")
+        raise LogError("found no estimate in motion, expected some")
     return float(np.sqrt(np.mean(np.square(whole))))
-
-
-def _log_errors(log: Path, number: int, bandwidth_rad_s: float) -> FloatArray:
-    state, frames = read_topics(log, (f"/joint/{number}/state", "/can/frames")).values()
-    if not np.array_equal(state["cycle"], frames["cycle"]):
-        raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
-    sensor = reference_torque(state, sync_time(state["header"]["stamp"]), bandwidth_rad_s)
-    error = published_torque(frames, number - 1) - sensor
-    on = (state["statusword"] & _DRIVE_MASK) == _DRIVE_ON
-    return np.asarray(error[on & (state["status"] == VALID) & np.isfinite(error)], np.float64)
 
 
 def draw(path: Path, run_file: Path, result: Mapping[str, Any], extended: Path, method: str) -> None:
@@ -196,29 +197,17 @@ def draw(path: Path, run_file: Path, result: Mapping[str, Any], extended: Path, 
             2, 1, figsize=(9.0, 4.2), sharex=True, layout="constrained", height_ratios=(1.3, 1.0)
         )
         for name, joint in joints.items():
-            columns = table.joint(SECRET_JOINT, joint.gear_ratio)
-            assert columns.torque_nm is not None
-            steps = np.diff(table.time_s, prepend=table.time_s[0])
-            sensor = low_pass(columns.torque_nm, steps, settings.bandwidth_rad_s)
-            estimate = estimate_columns(joint, settings, None, table.time_s, columns)
-            moving = np.where(estimate.status == VALID, 1.0, np.nan)
-            error = (estimate.torque_nm - sensor) * moving
-            label = f"{name}: {float(np.sqrt(np.nanmean(error**2))):.2f} Nm rms"
+            torque, sensor, moves = estimated(table, SECRET_JOINT, joint, settings)
+            moving = np.where(moves, 1.0, np.nan)
+            error = (torque - sensor) * moving
             if name == "before":
                 above.plot(table.time_s, sensor, color=LIGHT["ink"], linewidth=1.2, label="torque sensor")
-            above.plot(
-                table.time_s,
-                estimate.torque_nm * moving,
-                color=LIGHT[name],
-                linewidth=0.9,
-                label=f"{name} the diagnosis",
-            )
-            below.plot(table.time_s, error, color=LIGHT[name], linewidth=0.8, label=label)
-        above.set_title(
-            f"hidden: {result['hidden']['name']} of joint {SECRET_JOINT}; found: {named}",
-            loc="left",
-            fontsize=11,
-        )
+            line = {"color": LIGHT[name], "linewidth": 0.9}
+            above.plot(table.time_s, torque * moving, **line, label=f"{name} the diagnosis")
+            label = f"{name}: {float(np.sqrt(np.nanmean(error**2))):.2f} Nm rms"
+            below.plot(table.time_s, error, **line | {"linewidth": 0.8}, label=label)
+        title = f"hidden: {result['hidden']['name']} of joint {SECRET_JOINT}; found: {named}"
+        above.set_title(title, loc="left", fontsize=11)
         above.set_ylabel("joint torque [Nm]")
         below.set_ylabel("estimate - sensor [Nm]")
         below.set_xlabel("time of a run that the diagnosis has not seen [s]")
@@ -233,46 +222,35 @@ def draw(path: Path, run_file: Path, result: Mapping[str, Any], extended: Path, 
 def main(arguments: list[str] | None = None) -> int:
     """Run all steps and print the table; exit status 0 done, 1 failure, 2 usage."""
     options = _parser().parse_args(arguments)
-    missing = [name for name in _NEEDED if importlib.util.find_spec(name) is None]
-    if missing:
-        print(
-            f"hidden_effect: {', '.join(missing)} not installed: pip install 'jtqd[analysis]'",
-            file=sys.stderr,
-        )
-        return 1
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        check_installed("analysis", "scipy", "matplotlib", "jinja2")
+        make_directory(options.out)
         if options.picture is not None:
             check_picture(options.picture)
         result = run(options)
         if options.picture is not None:
-            fresh = sorted((options.out / "fresh_nominal").glob("*.csv.gz"))[0]
+            fresh = min((options.out / "fresh_nominal").glob("*.csv.gz"))
             extended = options.out / "diagnosis" / f"extended.joint{SECRET_JOINT}.yaml"
             draw(options.picture, fresh, result, extended, options.method)
-    except (StepError, ConfigError, RunError, LogError) as error:
+    except (ModuleNotFoundError, RuntimeError, ConfigError, RunError, LogError, OSError) as error:
         print(f"hidden_effect: {error}", file=sys.stderr)
-        return 1
-    except OSError as error:
-        print(f"hidden_effect: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
         return 1
     print(json.dumps(result, indent=1) if options.json else "\n".join(lines(result)))
     return 0
 
 
 def run(options: argparse.Namespace) -> dict[str, Any]:
-    """Run all steps and return their results. Raises StepError, ConfigError, RunError, LogError, OSError."""
+    """Run all steps and return their results. Raises RuntimeError, ConfigError, RunError, LogError, OSError."""
     out: Path = options.out
     nominal = {number: nominal_file(number) for number in NUMBERS}
     plant = write_secret(out / "secret", options.effect)
     diagnosed, fresh = plans(options.runs, options.fresh_runs, options.seconds, options.seed)
-    bench = _Bench(options, plant)
-    bench.play(diagnosed, "runs", nominal)
+    play = partial(_play, options, plant)
+    play(diagnosed, "runs", nominal)
     found = _diagnose(out / "runs", nominal, out / "diagnosis")
     extended = {number: out / "diagnosis" / f"extended.joint{number}.yaml" for number in NUMBERS}
-    before = bench.play(fresh, "fresh_nominal", nominal)
-    after = bench.play(fresh, "fresh_extended", extended)
-    fresh_before = _diagnose(out / "fresh_nominal", nominal, out / "diagnosis_fresh_nominal")
-    fresh_after = _diagnose(out / "fresh_extended", extended, out / "diagnosis_fresh_extended")
+    before = play(fresh, "fresh_nominal", nominal)
+    after = play(fresh, "fresh_extended", extended)
     again = _diagnose(out / "runs", extended, out / "diagnosis_extended")
     hidden = secrets(load_joint(nominal[SECRET_JOINT]))[options.effect]
     return {
@@ -280,24 +258,16 @@ def run(options: argparse.Namespace) -> dict[str, Any]:
         "verdict": found["verdict"],
         "causes": found["causes"],
         "gain": found["gain"],
-        "simulation": {
-            number: {
-                balance: (_gap(fresh_before, number, balance), _gap(fresh_after, number, balance))
-                for balance in ("motor", "torsion")
-            }
-            for number in NUMBERS
-        },
         "jtqd": {number: (before[number], after[number]) for number in NUMBERS},
         "method": options.method,
         "bus": options.bus,
         "extended_on_the_same_runs": _verdict(again),
-        "extended_on_fresh_runs": _verdict(fresh_after),
     }
 
 
 def lines(result: Mapping[str, Any]) -> list[str]:
     """Return the result as text: hidden effect, diagnosis, and errors before and after."""
-    hidden, gain = result["hidden"], result["gain"]
+    hidden, gain, on_bus = result["hidden"], result["gain"], result["bus"] != NO_BUS
     values = ", ".join(f"{name} {value:.4g}" for name, value in hidden["parameters"].items())
     out = [
         f"hidden  {hidden['name']} of joint {hidden['joint']}: {values}",
@@ -308,48 +278,39 @@ def lines(result: Mapping[str, Any]) -> list[str]:
             f"{name} {each['value']:.4g}{_interval(each)}" for name, each in cause["parameters"].items()
         )
         out.append(f"        {' or '.join(cause['class'])} of joint {cause['joint']}: {parameters}")
-    where = "jtqd on fresh runs" if result["bus"] != NO_BUS else "estimator on fresh runs"
-    rows: list[Row] = []
-    if gain["rmse_before_nm"] is not None:
-        rows.append((f"diagnosis: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"]))
-    for number, balances in result["simulation"].items():
-        rows += [
-            (f"simulation on fresh runs: joint {number}, {b} balance", *both) for b, both in balances.items()
-        ]
+    rows = [(f"diagnosis: {gain['split']}", gain["rmse_before_nm"], gain["rmse_after_nm"])]
+    where = f"{'jtqd' if on_bus else 'estimator'} on fresh runs"
     rows += [(f"{where}: joint {n}, method {result['method']}", *both) for n, both in result["jtqd"].items()]
+    rows = [row for row in rows if row[1] is not None]
     wide = max(len(row[0]) for row in rows)
     out += ["", f"{'error against the sensor, Nm rms':<{wide}}  before   after  reduced by"]
-    out += [f"{what:<{wide}}  {b:6.3f}  {a:6.3f}  {_reduction(b, a):>10}" for what, b, a in rows]
-    out += ["", f"extended files, same runs:  {result['extended_on_the_same_runs']}"]
-    out += [f"extended files, fresh runs: {result['extended_on_fresh_runs']}"]
-    return out
+    for what, before, after in rows:
+        reduced = f"{100.0 * (1.0 - after / before):.0f} %" if before > 0.0 else "-"
+        out.append(f"{what:<{wide}}  {before:6.3f}  {after:6.3f}  {reduced:>10}")
+    return [*out, "", f"with the extended files, the same runs: {result['extended_on_the_same_runs']}"]
 
 
-class _Bench:
-    """The secret bench on a bus, with jtqd; or without a bus, with the estimator alone."""
-
-    def __init__(self, options: argparse.Namespace, plant: Path) -> None:
-        self._options = options
-        self._plant = plant
-        self._settings = EstimatorSettings(method=options.method)
-
-    def play(self, plan: Plan, name: str, joints: Mapping[int, Path]) -> dict[int, float]:
-        """Play a plan into out/name while jtqd estimates with these joint files; return its error per joint [Nm rms]."""
-        out: Path = self._options.out / name
-        if self._options.bus == NO_BUS:
-            out.mkdir(exist_ok=True)
-            tables = emulated(plan, self._plant, self._options.seed)
-            for run_name, table in tables.items():
-                write_run(out / f"{run_name}.csv.gz", table)
-            kept = [read_run(out / f"{run_name}.csv.gz").table for run_name in tables]
-            return {n: table_rmse(kept, n, load_joint(file), self._settings) for n, file in joints.items()}
-        file = self._options.out / f"{plan.name.replace(' ', '_')}.plan.yaml"
-        file.write_text(plan.to_yaml(), encoding="utf-8")
-        config = write_config(self._options.out / f"{name}.jtqd.yaml", joints, self._options.method)
-        bench = ("--bus", self._options.bus, "--plant", str(self._plant), "--seed", str(self._options.seed))
-        _jtq("campaign", str(file), *bench, "--config", str(config), "--out", str(out))
-        logs = [out / f"{each.name}.mcap" for each in plan.runs]
-        return {number: log_rmse(logs, number, self._settings) for number in joints}
+def _play(
+    options: argparse.Namespace, plant: Path, plan: Plan, name: str, joints: Mapping[int, Path]
+) -> dict[int, float]:
+    """Play a plan into out/name on the secret bench: with a bus while jtqd estimates with these joint files, else with the
+    estimator alone. Return the error of the estimate per joint [Nm rms].
+    """
+    out: Path = options.out / name
+    settings = EstimatorSettings(method=options.method)
+    if options.bus == NO_BUS:
+        out.mkdir(exist_ok=True)
+        files = [out / f"{each.name}.csv.gz" for each in plan.runs]
+        for file, table in zip(files, emulated(plan, plant, options.seed).values(), strict=True):
+            write_run(file, table)
+        kept = [read_run(file).table for file in files]
+        return {n: table_rmse(kept, n, load_joint(file), settings) for n, file in joints.items()}
+    planned = options.out / f"{plan.name.replace(' ', '_')}.plan.yaml"
+    planned.write_text(plan.to_yaml(), encoding="utf-8")
+    config = write_config(options.out / f"{name}.jtqd.yaml", joints, options.method)
+    bench = ("--bus", options.bus, "--plant", str(plant), "--seed", str(options.seed))
+    _jtq("campaign", str(planned), *bench, "--config", str(config), "--out", str(out))
+    return {n: log_rmse([out / f"{each.name}.mcap" for each in plan.runs], n, settings) for n in joints}
 
 
 def _diagnose(runs: Path, joints: Mapping[int, Path], out: Path) -> dict[str, Any]:
@@ -360,19 +321,12 @@ def _diagnose(runs: Path, joints: Mapping[int, Path], out: Path) -> dict[str, An
 
 
 def _jtq(*arguments: str) -> None:
-    """Run a command of the toolbox; its results go to standard error. Raises StepError."""
+    """Run a command of the toolbox; its results go to standard error. Raises RuntimeError."""
     print(f"$ jtq {' '.join(arguments)}", file=sys.stderr, flush=True)
     command = [sys.executable, "-m", "jtqd.daemon.jtq", *arguments]
     status = subprocess.run(command, check=False, stdout=_STDERR).returncode
     if status not in (0, _FINDINGS):
-        raise StepError(f"jtq {arguments[0]} ended with exit status {status}")
-
-
-def _gap(findings: Mapping[str, Any], joint: int, balance: str) -> float:
-    for gap in findings["gaps"]:
-        if (gap["joint"], gap["balance"]) == (joint, balance):
-            return float(gap["rmse_nm"])
-    return math.nan
+        raise RuntimeError(f"jtq {arguments[0]} ended with exit status {status}")
 
 
 def _verdict(findings: Mapping[str, Any]) -> str:
@@ -383,10 +337,6 @@ def _verdict(findings: Mapping[str, Any]) -> str:
 def _interval(value: Mapping[str, Any]) -> str:
     low, high = value["ci95"]
     return "" if low is None or high is None or low == high else f" [{low:.4g}, {high:.4g}]"
-
-
-def _reduction(before: float, after: float) -> str:
-    return f"{100.0 * (1.0 - after / before):.0f} %" if before > 0.0 else "-"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -16,12 +16,6 @@ KEPT = 0.75
 """Part of the promised reduction that an estimate shows: it has errors of its own beside the simulation's."""
 
 
-def shown(capsys: pytest.CaptureFixture[str], arguments: list[str]) -> dict[str, Any]:
-    assert main([*arguments, "--json"]) == 0
-    result: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return result
-
-
 def check(result: dict[str, Any]) -> None:
     hidden = result["hidden"]
     (cause,) = result["causes"]
@@ -39,29 +33,17 @@ def check(result: dict[str, Any]) -> None:
     assert result["extended_on_the_same_runs"] == "no_gap"
 
 
-def test_found_and_gained_without_a_bus(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    options = ["--runs", "4", "--fresh-runs", "2", "--seconds", "10"]
-    check(
-        shown(
-            capsys,
-            ["--effect", "torque_constant", "--bus", "none", "--out", str(tmp_path / "demo"), *options],
-        )
-    )
-
-
-@pytest.mark.campaign
-@pytest.mark.socketcan
-def test_found_and_gained_over_the_bus(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    "bus",
+    ["none", pytest.param("sim:vcan0", marks=(pytest.mark.campaign, pytest.mark.socketcan))],
+)
+def test_found_and_gained(
+    bus: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
-    options = ["--runs", "4", "--fresh-runs", "2", "--seconds", "10"]
-    check(
-        shown(
-            capsys,
-            ["--effect", "torque_constant", "--bus", "sim:vcan0", "--out", str(tmp_path / "demo"), *options],
-        )
-    )
+    options = ["--runs", "4", "--fresh-runs", "2", "--seconds", "10", "--json"]
+    assert main(["--effect", "torque_constant", "--bus", bus, "--out", str(tmp_path / "demo"), *options]) == 0
+    check(json.loads(capsys.readouterr().out))
 
 
 @pytest.mark.parametrize("name", NAMES)

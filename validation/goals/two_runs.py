@@ -3,10 +3,9 @@
     python -m validation two_runs                                          three plants; three minutes
     python -m validation two_runs --world mujoco                           a minute
     python -m validation two_runs --world kinova --joints 2 3 4 5 6 7      a second
-    python -m validation two_runs --priors --first 500 --seeds 15          numbers of the prior, where they were chosen
 
 Ours is what `jtq fit losses` makes of one run (`sysid.fit.few_runs`, method `fused` without torsion). Beside it stand the
-joint file as it was (`tob`), `tob` with Coulomb and viscous friction fitted (`friction.py`), the baselines of the
+joint file as it was (`tob`), `tob` with Coulomb and viscous friction fitted (`fit_friction`), the baselines of the
 goals' table that need one encoder, and
 
     current and speed     tau = a0 + a1 tau_raw + a2 s + a3 v + a4 s |tau_raw|
@@ -26,6 +25,7 @@ of its runs have been looked at many times: practice, not proof.
 from __future__ import annotations
 
 import argparse
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
@@ -35,16 +35,19 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import count
-from jtqd.estimator.joint import Joint
+from jtqd.estimator.joint import Friction, Joint
+from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.fit.few_runs import PRIOR, Prior, fit_few_runs
+from jtqd.sysid.fit.few_runs import fit_few_runs
+from jtqd.sysid.fit.friction import FitError, student_975
 from jtqd.sysid.fit.losses import LossFitError
-from jtqd.sysid.fit.plateaus import FitError
+from jtqd.sysid.fit.plateaus import effective_samples
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.planner.campaigns import variable_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS
@@ -54,7 +57,6 @@ from validation.diagnosis.benches import made
 from validation.diagnosis.entries import Hidden
 from validation.diagnosis.mujoco_bench import MujocoBench
 from validation.diagnosis.trials import run_table
-from validation.goals.friction import fit_friction
 from validation.goals.identify import (
     BASELINES,
     NUMBERS,
@@ -76,8 +78,11 @@ _WINDOW_S: Final = (2.0, 5.0)
 _MOVING_RAD_S: Final = 0.05
 _MOVING_SHARE: Final = 0.5
 _TRIES: Final = 40
-
-
+COULOMB, VISCOUS = "coulomb_nm", "viscous_nms_per_rad"
+_BANDWIDTH_RAD_S: Final = 200.0
+_STANDSTILL_RAD_S: Final = 0.02
+"""Joint side; below it stiction decides."""
+_HIGHEST_CONDITION: Final = 30.0
 INSIDE: Final = (85.0, 95.0)
 """Of an honest 90 % interval [%], as on the bench `bad_day`."""
 OURS: Final = "ours"
@@ -180,7 +185,7 @@ def _row(case: Case, judged: Run, fitted: Run) -> Row:
     )
     joints = {OURS: fit_few_runs([known], joint).joint, "file": joint}
     with suppress(FitError):  # too little motion for a fit without a prior
-        joints["tob"] = replace(joint, friction=fit_friction(fitted.time_s, fitted.columns, joint).friction)
+        joints["tob"] = replace(joint, friction=fit_friction(fitted.time_s, fitted.columns, joint))
     example = Example(known.seen, known.sensor_nm, known.sensor_nm, known.moving)
     found = {
         name: estimate_columns(each, settings[name], None, judged.time_s, judged.columns)
@@ -211,17 +216,64 @@ def _row(case: Case, judged: Run, fitted: Run) -> Row:
     )
 
 
-def errors_of_ours(case: Case, priors: Sequence[Prior]) -> FloatArray:
-    """Return the RMSE of ours with each prior, judged on each run [priors, 2], in parts of the rated torque."""
-    fused, joint = EstimatorSettings(method="fused"), case.joint
-    found = np.zeros((len(priors), 2))
-    signals = [run_signals(run.name, joint, fused, run.time_s, run.columns) for run in case.runs]
-    for n, (judged, seen, known) in enumerate(zip(case.runs, signals, signals[::-1], strict=True)):
-        for k, prior in enumerate(priors):
-            fitted = fit_few_runs([known], joint, prior).joint
-            torque = estimate_columns(fitted, fused, None, judged.time_s, judged.columns).torque_nm
-            found[k, n] = np.sqrt(np.nanmean((torque - seen.sensor_nm)[seen.moving] ** 2))
-    return found / joint.rated_torque_nm
+def fit_friction(time_s: FloatArray, run: JointColumns, joint: Joint) -> Friction:
+    """Return Coulomb and viscous friction by least squares on a run in motion, all else in the joint file taken as true.
+
+        LP(G (Kt i - Jm domega_m/dt) - tau) = LP(Fc s(w) + Fv w)        LP: the observer's low pass, w = omega_m/G
+
+    LP(domega_m/dt) = g (omega_m - LP(omega_m)) is exact. A term keeps the file's value where the run cannot separate it from
+    the other one (condition number), or where its best value is negative. Raises FitError where the run cannot serve.
+    """
+    current, omega_m, torque = run.current_a, run.motor_velocity_rad_s, run.torque_nm
+    if current is None or omega_m is None or torque is None:
+        raise FitError("found a run without current, velocity or torque_nm, expected all of them")
+    dt_s = np.diff(time_s, prepend=time_s[0])
+    speed = omega_m / joint.gear_ratio
+    moving = np.abs(speed) > _STANDSTILL_RAD_S
+    momentum = joint.rotor_inertia_kgm2 * _BANDWIDTH_RAD_S * omega_m
+    motor = low_pass(joint.torque_constant_nm_per_a * current + momentum, dt_s, _BANDWIDTH_RAD_S) - momentum
+    target = (joint.gear_ratio * motor - low_pass(torque, dt_s, _BANDWIDTH_RAD_S))[moving]
+    none = replace(joint.friction, coulomb_nm=0.0, viscous_nms_per_rad=0.0, stribeck_nm=0.0)
+    units = {n: FrictionModel(replace(none, **{n: 1.0})).torque_many(speed) for n in (COULOMB, VISCOUS)}
+    columns = {n: low_pass(unit, dt_s, _BANDWIDTH_RAD_S)[moving] for n, unit in units.items()}
+    if len(target) < 10 * len(columns):
+        raise FitError(f"found {len(target)} rows in motion, expected at least {10 * len(columns)}")
+    free = [COULOMB, VISCOUS]
+    if (
+        np.linalg.cond(np.column_stack([c / np.linalg.norm(c) for c in columns.values()]))
+        > _HIGHEST_CONDITION
+    ):
+        free.remove(VISCOUS)
+    values, half_widths, effective = _solve(columns, target, joint.friction, free)
+    while negative := [name for name in free if values[name] < 0.0]:
+        free.remove(min(negative, key=lambda name: values[name] / max(half_widths[name], 1e-12)))
+        values, half_widths, effective = _solve(columns, target, joint.friction, free)
+    if effective < 2.0 * len(free):
+        raise FitError(f"found {effective:.1f} independent rows, expected 2 per fitted term")
+    return replace(joint.friction, **values)
+
+
+def _solve(
+    columns: Mapping[str, FloatArray], target: FloatArray, file: Friction, free: Sequence[str]
+) -> tuple[dict[str, float], dict[str, float], float]:
+    """Return values and 95 % half widths of the free terms, and the independent rows: only those count in the widths."""
+    values = {name: float(getattr(file, name)) for name in columns}
+    rest = target - sum((values[n] * c for n, c in columns.items() if n not in free), start=0.0)
+    if not free:
+        return values, {}, effective_samples(rest)
+    matrix = np.column_stack([columns[name] for name in free])
+    solution = np.linalg.lstsq(matrix, rest, rcond=None)[0]
+    rest = rest - matrix @ solution
+    effective = effective_samples(rest)
+    freedom = max(effective - len(free), 1.0)
+    variance = float(rest @ rest) / len(rest) * effective / freedom
+    inverse = np.linalg.pinv(matrix.T @ matrix) * (len(rest) / effective)
+    widths = [student_975(freedom) * math.sqrt(variance * float(each)) for each in np.diag(inverse)]
+    return (
+        values | dict(zip(free, solution.tolist(), strict=True)),
+        dict(zip(free, widths, strict=True)),
+        effective,
+    )
 
 
 def _inside(error: FloatArray, half: FloatArray, where: BoolArray) -> float:
@@ -378,27 +430,6 @@ def summary_table(rows: Sequence[Row]) -> Table:
     )
 
 
-def prior_table(cases: Sequence[Case]) -> Table:
-    """Return how the error changes with each number of the prior halved and doubled, one line per number."""
-    changed = [PRIOR] + [
-        PRIOR._replace(**{name: factor * getattr(PRIOR, name)})
-        for name in Prior._fields
-        for factor in (0.5, 2.0)
-    ]
-    error: dict[str, FloatArray] = {}
-    for world in dict.fromkeys(case.world for case in cases):
-        every = np.concatenate([errors_of_ours(c, changed) for c in cases if c.world == world], axis=1)
-        error[world] = np.sqrt(np.mean(every**2, axis=1))
-    rows = [("as it is", *(f"{100.0 * each[0]:.2f} % of rated" for each in error.values()))]
-    for n, name in enumerate(Prior._fields):
-        cells = (
-            ", ".join(f"{100.0 * (each[1 + 2 * n + k] / each[0] - 1.0):+.0f} %" for k in range(2))
-            for each in error.values()
-        )
-        rows.append((f"{name} = {getattr(PRIOR, name):g}, halved, doubled", *cells))
-    return Table(("RMSE", *error), rows)
-
-
 def _percent(row: Row, name: str) -> float:
     return 100.0 * row.rmse_nm[row.best_simple if name == "best" else name] / row.rated_nm
 
@@ -412,7 +443,6 @@ def options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--world", choices=("plants", "mujoco", "kinova"), default="plants")
     parser.add_argument("--first", type=int, metavar="SEED", help="of plants and mujoco")
     parser.add_argument("--seeds", type=count, default=25, metavar="N", help="default %(default)s")
-    parser.add_argument("--priors", action="store_true", help="how the error of ours changes with its prior")
     parser.add_argument(
         "--joints",
         type=int,
@@ -442,7 +472,5 @@ def run(options: argparse.Namespace) -> Report:
     else:
         cases = [case for plant in the_three() for case in plant_cases(plant, seeds)]
     named = {"seeds": f"{seeds[0]} to {seeds[-1]}"}
-    if options.priors:
-        return Report([prior_table(cases)], named)
     rows = [row for case in cases for row in rows_of(case)]
     return Report([summary_table(rows)], named, values=rows)
