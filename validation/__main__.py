@@ -33,7 +33,7 @@ STUDIES: Final = {
     "reproduce": ("validation.reproduce", "all campaigns, fits, training and evaluation"),
     "trials": ("validation.diagnosis.trials", "diagnosis: effects hidden by the project's generator"),
     "benches": (
-        "validation.diagnosis.bench_trials",
+        "validation.diagnosis.benches",
         "diagnosis: effects hidden in MuJoCo and in measured runs",
     ),
     "oracle": ("validation.diagnosis.oracle", "size from which an effect is visible, or would be reported"),

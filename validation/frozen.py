@@ -86,8 +86,7 @@ def _trials(directory: Path) -> Iterator[Path]:
     """Write the runs and joint files of the trials; yield the folder of each."""
     import yaml
 
-    from validation.diagnosis.bench_trials import Counts, jobs
-    from validation.diagnosis.benches import BENCHES
+    from validation.diagnosis.benches import BENCHES, Counts, jobs
     from validation.diagnosis.entries import Hidden
     from validation.diagnosis.recorder import PRESETS
     from validation.diagnosis.scores import write

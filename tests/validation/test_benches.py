@@ -11,8 +11,7 @@ from tests.validation.balances import binned, expected, rms, signals, slow_enoug
 from validation.diagnosis.benches import Bench, hidden_size, key, sizes
 from validation.diagnosis.entries import ENTRIES, SENSOR, Hidden, Set
 from validation.diagnosis.measured_bench import JOINTS, MeasuredBench, acceleration, recordings
-from validation.diagnosis.mujoco_bench import MujocoBench
-from validation.diagnosis.mujoco_plant import JointPlant, model_xml
+from validation.diagnosis.mujoco_bench import JointPlant, MujocoBench, model_xml
 from validation.diagnosis.oracle import residuals
 
 SEED = 11

@@ -18,6 +18,7 @@ from validation.generator import plant as plant_module
 from validation.generator.draw import (
     LINK_COUNTS,
     MOTOR_COUNTS,
+    UNKNOWN,
     Case,
     Order,
     _late,
@@ -27,7 +28,6 @@ from validation.generator.draw import (
     follow_up,
 )
 from validation.generator.motions import Reference
-from validation.generator.unknown import UNKNOWN
 
 SEED = int(np.random.default_rng().integers(10**6))
 EXTRA = (  # second parameters that carry an effect, and variants

@@ -18,8 +18,7 @@ import pytest
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
 from validation.__main__ import FAILED, MISSED, USAGE, main
 from validation.diagnosis import bench_trials, scores, trials
-from validation.diagnosis.bench_trials import Counts, campaign, jobs, read
-from validation.diagnosis.benches import key, sizes
+from validation.diagnosis.benches import Counts, campaign, jobs, key, read, sizes
 from validation.diagnosis.entries import SENSOR, Columns, Hidden
 from validation.diagnosis.measured_bench import MeasuredBench
 from validation.diagnosis.more_data import OWN, held_out_rms, sets_of, step, steps

@@ -278,6 +278,57 @@ def at_sensor(name: str) -> bool:
     return name.startswith("sensor_")
 
 
+class Bench:
+    """Base of the benches that share nothing with the project's plant.
+
+    foreign: kinds that are in no library; of_sensor: those at the sensor; joints: where others can be; channels: how many of
+    CHANNELS can be late. real: with nothing hidden there may still be something in its runs: every set is judged beside the
+    set with nothing hidden of the same seed.
+    """
+
+    name: str
+    real: bool = False
+    effects: Sequence[str]
+    foreign: Sequence[str]
+    of_sensor: Sequence[str]
+    joints: Sequence[int | str] = (1, 2)
+    channels: int = 3
+
+    def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
+        """Return the set of this seed: same joints, motions, noise and changes from run to run whatever is hidden.
+
+        quiet: without noise, quantisation and changes from run to run.
+        """
+        raise NotImplementedError
+
+    def unseen(self) -> Bench:
+        """Return the bench with what its joint files leave in runs that they were not fitted to; itself if to none."""
+        return self
+
+    def places(self, name: str) -> Sequence[int | str]:
+        """Return where an effect or a foreign kind can be: at joints, or at the sensor."""
+        return (SENSOR,) if at_sensor(name) or name in self.of_sensor else self.joints
+
+    def variants(self, name: str) -> Sequence[str]:
+        """Return the variants of an effect, one empty text where it has none."""
+        return CHANNELS[: self.channels] if name == "channel_delay" else ("",)
+
+
+def joint_columns(
+    number: int, velocity: Callable[[Array], Array], *, motor_rad: Array, link_rad: Array, **others: Array
+) -> Columns:
+    """Return the columns of a joint; velocity: makes those of both encoders from their positions."""
+    columns = {
+        "current_a": others["current_a"],
+        "motor_position_rad": motor_rad,
+        "motor_velocity_rad_s": velocity(motor_rad),
+        "link_position_rad": link_rad,
+        "link_velocity_rad_s": velocity(link_rad),
+        **others,
+    }
+    return {f"j{number}.{name}": values for name, values in columns.items()}
+
+
 # Of what is in no library: its truth, with the places where it is right to look.
 
 

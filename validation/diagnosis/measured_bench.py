@@ -24,15 +24,14 @@ from typing import Any, Final
 import numpy as np
 
 from validation.diagnosis.entries import (
-    CHANNELS,
     SENSOR,
     Array,
+    Bench,
     Columns,
     Hidden,
     Joint,
     Set,
     Truth,
-    at_sensor,
     bench_parameters,
     clip_sensor,
     foreign_truth,
@@ -77,7 +76,7 @@ _SHIFTS_S: Final = tuple(np.arange(-3e-3, 3.01e-3, 0.5e-3).tolist())
 _DRAW, _DAYS, _HIDDEN = range(3)
 
 
-class MeasuredBench:
+class MeasuredBench(Bench):
     """The bench; unseen: with the ladder of each second of a recording fitted to its other seconds (`unseen`)."""
 
     name = "measured"
@@ -120,15 +119,9 @@ class MeasuredBench:
         "frozen_current",
         "dropping_sensor",
     )
-
-    def places(self, name: str) -> Sequence[int | str]:
-        """Return where an effect or a foreign kind can be; one joint alone."""
-        foreign = ("clipping_sensor", "vibrating_frame", "dropping_sensor")
-        return (SENSOR,) if at_sensor(name) or name in foreign else (1,)
-
-    def variants(self, name: str) -> Sequence[str]:
-        """Return the variants of an effect: there is no link encoder that could be late."""
-        return CHANNELS[:2] if name == "channel_delay" else ("",)
+    of_sensor = ("clipping_sensor", "vibrating_frame", "dropping_sensor")
+    joints = (1,)
+    channels = 2
 
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
         """Return one set."""
@@ -193,13 +186,11 @@ def _gain(joint: Joint) -> float:
 
 
 def _speed(run: Columns, joint: Joint) -> Array:
-    v: Array = run["j1.motor_velocity_rad_s"] / joint["gear_ratio"]
-    return v
+    return np.asarray(run["j1.motor_velocity_rad_s"] / joint["gear_ratio"])
 
 
 def _direction(v: Array) -> Array:
-    s: Array = np.tanh(v / _SLOW_RAD_S)
-    return s
+    return np.asarray(np.tanh(v / _SLOW_RAD_S))
 
 
 def acceleration(v: Array) -> Array:
@@ -207,8 +198,7 @@ def acceleration(v: Array) -> Array:
     width = 15
     kernel = np.arange(width) - width // 2
     slope = np.convolve(np.pad(v, width // 2, mode="edge"), -kernel / (kernel @ kernel), "valid")
-    result: Array = slope / STEP_S
-    return result
+    return np.asarray(slope / STEP_S)
 
 
 def _without_ladder(run: Columns, joint: Joint, *, unseen: bool) -> Columns:
@@ -247,8 +237,7 @@ def _without_ladder(run: Columns, joint: Joint, *, unseen: bool) -> Columns:
 
 
 def _fitted(ladder: Array, left: Array, where: Array) -> Array:
-    c: Array = np.linalg.lstsq(ladder[where], left[where], rcond=1e-3)[0]
-    return c
+    return np.asarray(np.linalg.lstsq(ladder[where], left[where], rcond=1e-3)[0])
 
 
 def _mirrored(run: Columns, sign: float) -> Columns:
@@ -287,13 +276,11 @@ def _loss(of: Callable[[Columns, Array, Joint, Mapping[str, float]], Array]) -> 
 
 def _wave(table: Columns, v: Array, joint: Joint, p: Mapping[str, float]) -> Array:
     angle = p["order_per_motor_rev"] * table["j1.motor_position_rad"] + p["phase_rad"]
-    wave: Array = p["amplitude_nm"] * np.cos(angle)
-    return wave
+    return np.asarray(p["amplitude_nm"] * np.cos(angle))
 
 
 def _link(table: Columns, joint: Joint) -> Array:
-    angle: Array = table["j1.motor_position_rad"] / joint["gear_ratio"]
-    return angle
+    return np.asarray(table["j1.motor_position_rad"] / joint["gear_ratio"])
 
 
 def _other_constant(table: Columns, joint: Joint, p: Mapping[str, float]) -> None:
@@ -370,8 +357,7 @@ def _spans(
 
 def _in(table: Columns, spans: Sequence[tuple[float, float]]) -> Array:
     t = table["time_s"]
-    inside: Array = np.any([(t >= low) & (t < high) for low, high in spans], axis=0)
-    return inside
+    return np.asarray(np.any([(t >= low) & (t < high) for low, high in spans], axis=0))
 
 
 Tables = Sequence[Columns]

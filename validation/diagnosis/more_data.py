@@ -23,8 +23,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause, Findings, joint_text
 from jtqd.sysid.diagnosis.leave_one_out import FALL
-from validation.diagnosis.bench_trials import Counts, jobs
-from validation.diagnosis.benches import bench_option, made
+from validation.diagnosis.benches import Counts, bench_option, jobs, made
 from validation.diagnosis.entries import SENSOR, Columns, Set
 from validation.diagnosis.entries import Joint as JointFile
 from validation.diagnosis.recorder import PRESETS, Recorder

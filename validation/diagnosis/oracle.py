@@ -31,8 +31,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
-from validation.diagnosis.benches import FILE, Bench, bench_option, key, made, sizes
-from validation.diagnosis.entries import ENTRIES, Array, Columns, Hidden, Joint, Set, rated_nm
+from validation.diagnosis.benches import FILE, bench_option, key, made, sizes
+from validation.diagnosis.entries import ENTRIES, Array, Bench, Columns, Hidden, Joint, Set, rated_nm
 from validation.diagnosis.recorder import PRESETS
 from validation.diagnosis.scores import judged
 from validation.study import Report, Table

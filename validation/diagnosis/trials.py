@@ -44,9 +44,8 @@ from validation.diagnosis.scores import (
     judged,
     score,
 )
-from validation.generator.draw import Case, Order, draw_many, follow_up
+from validation.generator.draw import UNKNOWN, Case, Order, draw_many, follow_up
 from validation.generator.motions import Reference
-from validation.generator.unknown import UNKNOWN
 from validation.study import ROOT, Report, Table, UsageError, in_processes, share_table
 
 KINDS: Final = ("nothing", "one", "least", "two", "unknown")
