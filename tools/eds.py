@@ -571,10 +571,7 @@ SHEETS: tuple[Callable[[], Sheet], ...] = (drive, torque_sensor, *(partial(jtqd_
 def main() -> int:
     """Write the files; there are no arguments."""
     if len(sys.argv) > 1:
-        print(
-            "usage: python -m tools.eds   (writes the data sheets in drivers/eds)",
-            file=sys.stderr,
-        )
+        print("usage: python -m tools.eds   (writes the data sheets in drivers/eds)", file=sys.stderr)
         return 0 if sys.argv[1] in ("-h", "--help") else 2
     for sheet in (make() for make in SHEETS):
         (FOLDER / sheet.file_name).write_text(render(sheet), encoding="ascii", newline="\n")

@@ -32,10 +32,7 @@ STUDIES: Final = {
     ),
     "reproduce": ("validation.reproduce", "all campaigns, fits, training and evaluation"),
     "trials": ("validation.diagnosis.trials", "diagnosis: effects hidden by the project's generator"),
-    "benches": (
-        "validation.diagnosis.benches",
-        "diagnosis: effects hidden in MuJoCo and in measured runs",
-    ),
+    "benches": ("validation.diagnosis.benches", "diagnosis: effects hidden in MuJoCo and in measured runs"),
     "oracle": ("validation.diagnosis.oracle", "size from which an effect is visible, or would be reported"),
     "more_data": ("validation.diagnosis.more_data", "diagnosis: what one more run changes"),
     "frozen": ("validation.frozen", "results that a restructuring must not change, beside the stored ones"),

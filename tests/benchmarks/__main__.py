@@ -82,7 +82,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _measure(name: str, directory: Path, options: argparse.Namespace) -> tuple[Any, str]:
-    """(content for JSON, text) of one benchmark."""
     small = {
         "start": (start, {}),
         "recording": (recording, {"seconds": 5.0 if options.quick else 30.0}),

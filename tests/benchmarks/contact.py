@@ -103,7 +103,6 @@ def planned(seed: int) -> tuple[Run, ...]:
 
 @cache
 def world(bench: str, models: Path) -> tuple[AnyPlant, tuple[Joint, Joint]]:
-    """Return the bench and its identified joints."""
     return load_any_plant(shipped(BENCHES[bench])), (
         load_joint(models / "joint1.yaml"),
         load_joint(models / "joint2.yaml"),
@@ -111,7 +110,6 @@ def world(bench: str, models: Path) -> tuple[AnyPlant, tuple[Joint, Joint]]:
 
 
 def emulated(plant: AnyPlant, seed: int, day: int, pushes: Iterable[Push] = ()) -> EmulatedRun:
-    """Return the run of this number, on its day."""
     run = planned(seed)[day]
     points = expand(run)
     speed, current = points.velocity_rad_s.tolist(), points.current_a.tolist()
@@ -122,7 +120,6 @@ def emulated(plant: AnyPlant, seed: int, day: int, pushes: Iterable[Push] = ()) 
 
 
 def watched(joints: tuple[Joint, Joint], made: EmulatedRun, threshold_nm: float, alone_nm: float) -> Watched:
-    """Return residuals and codes of a run."""
     time_s, loads = made.table.time_s, []
     dt = np.diff(time_s, prepend=time_s[0])
     for number, joint in enumerate(joints, start=1):
@@ -132,19 +129,16 @@ def watched(joints: tuple[Joint, Joint], made: EmulatedRun, threshold_nm: float,
     angle = made.table.joints[1].motor_position_rad
     assert angle is not None
     return Watched(
-        detect_contacts(loads[1] - loads[0], angle, threshold_nm),
-        detect_contacts(-loads[0], angle, alone_nm),
+        detect_contacts(loads[1] - loads[0], angle, threshold_nm), detect_contacts(-loads[0], angle, alone_nm)
     )
 
 
 def begun(codes: CodeArray) -> int:
-    """Return the number of contacts."""
     there = codes == CONTACT_PRESENT
     return int(np.count_nonzero(there[1:] & ~there[:-1]))
 
 
 def quiet(bench: str, models: Path, thresholds: tuple[float, float], seed: int) -> Days:
-    """Return the quiet days of one seed."""
     plant, joints = world(bench, models)
     found = [watched(joints, emulated(plant, seed, day), *thresholds) for day in range(len(planned(seed)))]
     return Days(

@@ -27,7 +27,6 @@ class Task:
     priority: int = 80
 
     def to_json(self) -> str:
-        """As an argument of the process."""
         return json.dumps(asdict(self) | {"directory": str(self.directory)})
 
 
@@ -43,7 +42,6 @@ _ASIDE_S = 0.2
 
 
 def serve(make: Callable[[Task], Runner]) -> int:
-    """Main of a Python contender."""
     content = json.loads(sys.argv[1])
     runner = make(Task(content["bus"], Path(content["directory"]), content["cpu"], content["priority"]))
     print("ready", flush=True)
@@ -89,19 +87,16 @@ class Process:
         return line
 
     def start(self, cycles: int, first_slot_ns: int | None = None) -> None:
-        """Begin a round."""
         assert self._process.stdin is not None
         first = "" if first_slot_ns is None else f" {first_slot_ns}"
         self._process.stdin.write(f"run {cycles}{first}\n")
         self._process.stdin.flush()
 
     def result(self) -> dict[str, Any]:
-        """Wait for the end of the round."""
         content: dict[str, Any] = json.loads(self._line())
         return content
 
     def run(self, cycles: int) -> dict[str, Any]:
-        """One round."""
         self.start(cycles)
         return self.result()
 
@@ -116,5 +111,4 @@ class Process:
 
 
 def python(module: str, *arguments: str) -> list[str]:
-    """Command of a module of this package."""
     return [sys.executable, "-P", "-m", f"tests.benchmarks.{module}", *arguments]

@@ -68,7 +68,6 @@ class CanopenLoop:
         gc.disable()
 
     def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
-        """Connect, run one round, disconnect."""
         self._network = canopen.Network(bus=UnixBus(self._bus))
         self._network.connect()
         maps = self._subscribe()

@@ -50,7 +50,6 @@ class JtqdLoop:
         return cycle, grid, socket
 
     def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
-        """One round of `cycles` slots."""
         cycle, grid, socket = self.connect()
         meter = CycleMeter()
         grid.slot_ns = first_slot_ns or time.monotonic_ns() + 2 * grid.period_ns
@@ -70,7 +69,6 @@ class Measured:
         return getattr(self.cycle, name)
 
     def go_on(self, slots: int, end_ns: int) -> int:
-        """Go through one slot, whatever is asked for."""
         cycle, meter = self.cycle, self._meter
         outcome = cycle.go_on(1, end_ns)
         if outcome == CYCLE_ENDED:

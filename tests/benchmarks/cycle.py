@@ -74,7 +74,6 @@ def _c_command(program: Path, bus: Path, task: Task) -> list[str]:
 
 
 def text(result: dict[str, Any]) -> str:
-    """Table, targets and ratios."""
     core = "quiet core" if result["quiet_core"] else "core shared with the system"
     spacing = f"frames at {result['bitrate']} bit/s" if result["bitrate"] else "frames at once"
     lines = [

@@ -39,7 +39,6 @@ class Fixture:
 
     @property
     def config(self) -> Path:
-        """Configuration with method network."""
         return self.directory / "bench.yaml"
 
     @property
@@ -61,7 +60,6 @@ class SmallNetwork:
     output_std: float
 
     def onnx(self, joint: str) -> bytes:
-        """The same as an ONNX file for the joint of this name."""
         metadata = {
             "features": list(FEATURES),
             "envelope_low": list(ENVELOPE_LOW),

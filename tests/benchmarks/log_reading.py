@@ -133,7 +133,6 @@ def _library(path: Path) -> np.ndarray[Any, Any]:
 
 
 def text(result: dict[str, Any]) -> str:
-    """As a table."""
     rows = [
         [name, f"{result['us_per_message'][key]:.2f}", f"{result['hour_s'][key]:.1f}"]
         for name, key in (

@@ -57,13 +57,11 @@ class Loop:
     late_us: list[float] = field(default_factory=list)
 
     def add(self, cycles: int, result: dict[str, Any]) -> None:
-        """Take in one round."""
         self.slots += cycles
         self.missed.append(result["missed"])
         self.late_us += [value * 1e-3 for value in result["late_ns"]]
 
     def figures(self) -> dict[str, Any]:
-        """Counts and quantiles."""
         return {
             "slots": self.slots,
             "missed": sum(self.missed),
@@ -177,7 +175,6 @@ class Sleeper:
         """Do what belongs to a slot that was begun in time."""
 
     def run(self, cycles: int, first_slot_ns: int | None = None) -> dict[str, Any]:
-        """One round."""
         meter = CycleMeter()
         grid = Grid(first_slot_ns or time.monotonic_ns() + 2 * _PERIOD_NS, _PERIOD_NS)
         end_ns = grid.slot_ns + cycles * _PERIOD_NS

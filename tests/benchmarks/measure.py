@@ -51,7 +51,6 @@ class CycleMeter:
         self.cpu_ns.append(time.process_time_ns())
 
     def result(self, missed: int) -> dict[str, Any]:
-        """As one JSON line for the benchmark."""
         return {
             "cpu_ns": self.cpu_ns,
             "answer_ns": self.answer_ns,
@@ -77,7 +76,6 @@ class Samples:
     switches: int = 0
 
     def add(self, result: dict[str, Any]) -> None:
-        """Take in one round."""
         ends = result["cpu_ns"][SETTLE_CYCLES:]
         costs = [(after - before) * 1e-3 for before, after in pairwise(ends)]
         self.cpu_us += costs
@@ -91,7 +89,6 @@ class Samples:
         self.switches += result["switches"]
 
     def figures(self) -> dict[str, float]:
-        """Quantiles and counts."""
         cycles = max(self.cycles, 1)
         return {
             "cpu_median_us": quantile(self.cpu_us, 0.5),
@@ -134,7 +131,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def mark(value: float, limit: float, *, at_least: bool = False) -> str:
-    """PASS or over (under), with the limit."""
     if isnan(value):
         return "not measured"
     good = value >= limit if at_least else value <= limit

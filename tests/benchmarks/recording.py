@@ -97,7 +97,6 @@ def _daemon(directory: Path, disk: Path, seconds: float) -> tuple[dict[str, Any]
 
 
 def _recorder(daemon: subprocess.Popen[str]) -> int:
-    """Process-ID of the recorder, once it is there."""
     deadline = time.monotonic() + 30.0
     while time.monotonic() < deadline and daemon.poll() is None:
         for pid in Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split():
@@ -178,7 +177,6 @@ def _block(messages: CycleMessages, record: bytes) -> bytes:
 
 
 def text(result: dict[str, Any]) -> str:
-    """The same for people."""
     size, share = result["gb_per_hour"], result["core_percent"]
     library = "... by mcap's Writer, without overview, events, fdatasync"
     rows = [

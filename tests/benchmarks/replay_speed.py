@@ -31,7 +31,6 @@ def _best(work: Any) -> float:
 
 
 def _one(log: Path, method: str, scratch: Path) -> dict[str, Any]:
-    """Times real time of one method."""
     begun = time.process_time()
     ((run, inputs),) = read_runs([log], scratch)
     read_s = time.process_time() - begun
@@ -55,7 +54,6 @@ def _one(log: Path, method: str, scratch: Path) -> dict[str, Any]:
 
 
 def run(directory: Path) -> list[dict[str, Any]]:
-    """One entry per method."""
     results = []
     for method, log in METHODS.items():
         scratch = directory / method
@@ -65,7 +63,6 @@ def run(directory: Path) -> list[dict[str, Any]]:
 
 
 def text(results: list[dict[str, Any]]) -> str:
-    """Table, target marked."""
     rows = [
         [
             each["method"],

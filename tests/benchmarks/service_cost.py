@@ -77,7 +77,6 @@ def _median_us(
 
 
 def text(result: dict[str, Any]) -> str:
-    """The table."""
     snapshot_ns, average_ns = result["snapshot_ns"], result["snapshot_ns"] / EVERY
     return "\n".join(
         (

@@ -78,7 +78,6 @@ class StagedLoop(JtqdLoop):
 
 
 def run(fixture: Fixture, *, seconds: float, quiet: bool) -> dict[str, Any]:
-    """One round without and one with timers."""
     where = host.cpus()
     traffic = host.traffic(fixture.directory, where)
     task = Task(f"unix:{fixture.directory / 'bus'}", fixture.directory, where.loop)
@@ -95,7 +94,6 @@ def run(fixture: Fixture, *, seconds: float, quiet: bool) -> dict[str, Any]:
 
 
 def text(result: dict[str, Any]) -> str:
-    """Stages, their sum, and what is left of the whole."""
     stages = result["stages"]
     rows = [
         [name, f"{stages[name]['median_us']:.1f}", f"{stages[name]['p99_us']:.1f}", what]

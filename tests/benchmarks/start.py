@@ -109,7 +109,6 @@ def _alive(daemon: subprocess.Popen[bytes]) -> None:
 
 
 def _family(root: int) -> list[int]:
-    """The process and all its descendants."""
     parents = {}
     for each in Path("/proc").iterdir():
         if each.name.isdigit():
@@ -139,7 +138,6 @@ def _memory(pid: int) -> dict[str, Any] | None:
 
 
 def text(result: dict[str, Any]) -> str:
-    """Times, memory per process, targets."""
     rows = [[each["name"], f"{each['rss_mb']:.1f}", f"{each['pss_mb']:.1f}"] for each in result["processes"]]
     rows.append(["together", f"{result['rss_mb']:.1f}", f"{result['pss_mb']:.1f}"])
     return "\n".join(

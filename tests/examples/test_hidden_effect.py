@@ -34,8 +34,7 @@ def check(result: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    "bus",
-    ["none", pytest.param("sim:vcan0", marks=(pytest.mark.campaign, pytest.mark.socketcan))],
+    "bus", ["none", pytest.param("sim:vcan0", marks=(pytest.mark.campaign, pytest.mark.socketcan))]
 )
 def test_found_and_gained(
     bus: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

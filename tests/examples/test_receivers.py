@@ -340,11 +340,7 @@ def test_beside_jtqd_withheld_late_and_lost_estimates(program, tmp_path: Path) -
 
     def start(*command: object) -> "subprocess.Popen[str]":
         side = subprocess.Popen(
-            [*map(str, command)],
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
+            [*map(str, command)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
         sides.append(side)
         return side
@@ -399,7 +395,6 @@ def with_contacts(directory: Path) -> Path:
 
 
 def children_of(pid: int) -> list[int]:
-    """Process-IDs of all descendants."""
     parents = {}
     for process in Path("/proc").glob("[0-9]*"):
         try:

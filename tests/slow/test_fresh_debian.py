@@ -33,7 +33,6 @@ def lacking() -> str | None:
 
 
 def packages() -> list[str]:
-    """What README tells a user of Debian to install."""
     found = re.search(
         r"^ {4}sudo apt-get install ([\w. -]+)$", (ROOT / "README.md").read_text(), re.MULTILINE
     )

@@ -18,7 +18,6 @@ from tests.slow.soak.run import soak
 
 @pytest.mark.campaign
 def test_a_minute_of_faults() -> None:
-    """Each kind at least once."""
     with tempfile.TemporaryDirectory(prefix="js") as directory:  # short: it holds a socket
         report = soak(Path(directory), 75.0, seed=1)
     print(report.text())

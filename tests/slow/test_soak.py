@@ -28,7 +28,6 @@ MS = 1_000_000
 
 
 def records_of(cycles: int) -> Records:
-    """The log of the same."""
     index = np.arange(cycles)
     zeros = np.zeros(cycles, np.int64)
     return Records(
@@ -37,7 +36,6 @@ def records_of(cycles: int) -> Records:
 
 
 def tally_of(frames: list[tuple[int, int, bytes]]) -> SyncTally:
-    """Heard in two parts."""
     tally = SyncTally()
     tally.add(heard_of(frames[: len(frames) // 3]))
     tally.add(heard_of(frames[len(frames) // 3 :]))
@@ -48,7 +46,6 @@ COUNTERS = {"cycles": 1000, "missed": 0, "sync_gaps": 0}
 
 
 def without_syncs(first: int, last: int) -> list[tuple[int, int, bytes]]:
-    """The SYNCs of these cycles were not heard."""
     return [each for each in healthy(1000) if not (each[1] == SYNC and first * MS <= each[0] < last * MS)]
 
 

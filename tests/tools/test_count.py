@@ -46,5 +46,5 @@ def test_private_words_are_found_in_prose_and_identifiers(
     (tmp_path / "a.py").write_text("\n".join(lines))
     found = [(word, number) for word, _, number, _ in count.places(["a.py"])]
     assert sorted(found) == [
-        *(("left over", 2), ("left over", 3), ("odd run", 5), ("says", 5), ("told", 1), ("told", 2)),
+        *(("left over", 2), ("left over", 3), ("odd run", 5), ("says", 5), ("told", 1), ("told", 2))
     ]

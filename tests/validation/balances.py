@@ -96,7 +96,6 @@ def slow_enough(name: str, p: Mapping[str, float], s: Signals) -> Array:
 
 
 def binned(x: Array, moving: Array, size: int = 10) -> Array:
-    """Return means over `size` samples that all move."""
     n = len(x) // size * size
     full = moving[:n].reshape(-1, size).all(axis=1)
     means: Array = x[:n].reshape(-1, size).mean(axis=1)[full]

@@ -251,12 +251,9 @@ def test_unknown_thing_shows_at_its_place_and_little_elsewhere(unknown_cases: li
             if place["axis"] == "frequency":
                 here[:] = True
             elif place["axis"] != "channel" and place.get("run", f"run{k}") == f"run{k}":
-                x = {
-                    "time": s.time_s,
-                    "current": s.current_a,
-                    "velocity": s.v,
-                    "link_angle": s.link_rad,
-                }[place["axis"]]
+                x = {"time": s.time_s, "current": s.current_a, "velocity": s.v, "link_angle": s.link_rad}[
+                    place["axis"]
+                ]
                 low, high = place["low"], place["high"]
                 if place["axis"] == "link_angle":
                     here |= np.mod(x - low, 2 * np.pi) < high - low
@@ -306,10 +303,7 @@ def test_further_runs_come_from_the_same_bench() -> None:
     order = Order(8, (("sensor_offset", "sensor", {"offset_nm": 5.0}),), runs=1, duration_s=2.0)
     t = np.arange(3000) * 1e-3
     ramp = np.minimum(t, 0.5)
-    asked = [
-        Reference(0, ramp, 0.0 * t),
-        Reference(1, ramp[:2000], 0.5 * ramp[:2000]),
-    ]
+    asked = [Reference(0, ramp, 0.0 * t), Reference(1, ramp[:2000], 0.5 * ramp[:2000])]
     first, second = follow_up(order, asked)
     assert len(first["time_s"]) == 3000
     assert len(second["time_s"]) == 2000

@@ -203,7 +203,6 @@ def test_a_unix_bus_outlives_the_run_that_was_played_on_it(tmp_path) -> None:
 
 
 def answered(socket, wait_s) -> set[int]:
-    """Identifiers of what comes within wait_s of a SYNC."""
     socket.send(pack(0x080, b"\x01"))
     found: set[int] = set()
     end = time.monotonic() + wait_s

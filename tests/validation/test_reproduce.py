@@ -129,7 +129,6 @@ def test_outside_plan_has_half_as_much_load_again_and_is_within_its_limits(tmp_p
 
 
 def trained(directory):
-    """Copy the shipped models to `directory`."""
     for file in shipped("trained/joint1.yaml").parent.iterdir():
         (directory / file.name).write_bytes(file.read_bytes())
 

@@ -62,12 +62,7 @@ def figures(judged: Sequence[Judged], dt_s: float) -> Flagged:
             inside = np.nanmean(result.inside(GAUSS)[moving])
             first = first_s(flags, moving, dt_s)
             rows.append(
-                (
-                    flags[moving].mean(),
-                    inside,
-                    np.nanmean(error**2),
-                    *(first <= limit for limit in WITHIN_S),
-                )
+                (flags[moving].mean(), inside, np.nanmean(error**2), *(first <= limit for limit in WITHIN_S))
             )
     degraded, inside, square, *within = np.mean(np.array(rows, np.float64), axis=0)
     return Flagged(

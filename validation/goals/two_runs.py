@@ -86,11 +86,7 @@ _HIGHEST_CONDITION: Final = 30.0
 INSIDE: Final = (85.0, 95.0)
 """Of an honest 90 % interval [%], as on the bench `bad_day`."""
 OURS: Final = "ours"
-METHODS: Final[Mapping[str, str]] = {
-    OURS: "ours",
-    "tob": "`tob`, friction fitted",
-    "file": "joint file",
-}
+METHODS: Final[Mapping[str, str]] = {OURS: "ours", "tob": "`tob`, friction fitted", "file": "joint file"}
 """Estimators of jtqd, with a sigma."""
 RCOND: Final = 1e-3
 """What a run does not excite at all is left out of the regressions, too: some would err by 1e9 Nm else."""

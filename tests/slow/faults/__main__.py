@@ -24,7 +24,6 @@ Where this machine has no SocketCAN, it runs in the bench kernel, with exact tim
 
 
 def as_json(outcome: Outcome) -> dict[str, Any]:
-    """One outcome."""
     return {
         "case": outcome.case.key,
         "title": outcome.case.title,
@@ -43,7 +42,6 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
 
 
 def cells(outcome: Outcome) -> list[str]:
-    """Cells of the table."""
     seen = as_json(outcome)
     statuses = [",".join(map(str, each)) or "-" for each in seen["status"]]
     expected = outcome.case.counters
@@ -62,18 +60,7 @@ def cells(outcome: Outcome) -> list[str]:
     ]
 
 
-HEAD = (
-    "case",
-    "fault",
-    "injected",
-    "proof",
-    "status 1 / 2",
-    "EMCY",
-    "counters",
-    "noticed",
-    "recovered",
-    "",
-)
+HEAD = ("case", "fault", "injected", "proof", "status 1 / 2", "EMCY", "counters", "noticed", "recovered", "")
 
 
 def line(outcome: Outcome) -> str:
@@ -84,7 +71,6 @@ def line(outcome: Outcome) -> str:
 
 
 def row(texts: Iterable[str]) -> str:
-    """One row of the table in docs/testing.md."""
     return "| " + " | ".join(texts) + " |"
 
 
@@ -95,7 +81,6 @@ def _ms(value: float | None) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Returns the exit status."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.slow.faults",
         epilog=_EXAMPLES,

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,164 +25,79 @@ Passed = Iterable[tuple[int, int, bytes]]
 Act = Callable[["Rig"], object]
 
 
+def _nothing(_rig: Rig) -> None:
+    pass
+
+
+def _as_it_is(can_id: int, data: bytes) -> Passed:
+    return ((0, can_id, data),)
+
+
+@dataclass(frozen=True)
 class Fault:
-    """Between the nodes and the bus. This one changes nothing."""
+    """Between the nodes and the bus; this one changes nothing.
 
-    def begin(self, rig: Rig) -> None:
-        """Its time begins: after an estimate, before the next SYNC."""
+    Attributes:
+        begin, end: done after an estimate, before the next SYNC.
+        each_cycle: done after the nodes have answered a SYNC.
+        hears: whether the nodes hear a frame of jtqd.
+        passes: what goes out for a frame that a node sends.
+    """
 
-    def end(self, rig: Rig) -> None:
-        """Its time is over."""
-
-    def hears(self, can_id: int) -> bool:
-        """Whether the nodes hear a frame of jtqd."""
-        return True
-
-    def each_cycle(self, rig: Rig) -> None:
-        """After the nodes have answered a SYNC."""
-
-    def passes(self, can_id: int, data: bytes) -> Passed:
-        """What goes out for a frame that a node sends now."""
-        return ((0, can_id, data),)
+    begin: Act = _nothing
+    end: Act = _nothing
+    each_cycle: Act = _nothing
+    hears: Callable[[int], bool] = lambda can_id: True
+    passes: Callable[[int, bytes], Passed] = _as_it_is
 
 
-class Lost(Fault):
-    """Frames with these identifiers do not reach the bus."""
-
-    def __init__(self, *ids: int) -> None:
-        self._ids = frozenset(ids)
-
-    def passes(self, can_id: int, data: bytes) -> Passed:
-        """Nothing for those."""
-        return () if can_id in self._ids else ((0, can_id, data),)
+def changed(change: Callable[[int, bytes], Iterable[tuple[int, bytes]]], *ids: int) -> Fault:
+    """Frames with these identifiers are replaced by what `change` makes of them: (identifier, data) each."""
+    return Fault(
+        passes=lambda can_id, data: (
+            [(0, *each) for each in change(can_id, data)] if can_id in ids else _as_it_is(can_id, data)
+        )
+    )
 
 
-class Deaf(Fault):
-    """The nodes do not hear these identifiers."""
-
-    def __init__(self, *ids: int) -> None:
-        self._ids = frozenset(ids)
-
-    def hears(self, can_id: int) -> bool:
-        """Not those."""
-        return can_id not in self._ids
+def lost(*ids: int) -> Fault:
+    return changed(lambda can_id, data: (), *ids)
 
 
-class Cut(Fault):
-    """Nothing gets through in either direction; error messages tell it when it begins and ends."""
-
-    def __init__(self, begins: tuple[int, bytes], ends: tuple[int, bytes]) -> None:
-        self._begins, self._ends = begins, ends
-
-    def begin(self, rig: Rig) -> None:
-        """The driver's first message."""
-        rig.send(*self._begins)
-
-    def end(self, rig: Rig) -> None:
-        """Its last one."""
-        rig.send(*self._ends)
-
-    def hears(self, can_id: int) -> bool:
-        """Nothing."""
-        return False
-
-    def passes(self, can_id: int, data: bytes) -> Passed:
-        """Nothing."""
-        return ()
+def deaf(*ids: int) -> Fault:
+    return Fault(hears=lambda can_id: can_id not in ids)
 
 
-class Late(Fault):
-    """Frames with these identifiers (none named: all) come later."""
-
-    def __init__(self, delay_us: float, *ids: int) -> None:
-        self._delay_ns, self._ids = round(delay_us * 1000), frozenset(ids)
-
-    def passes(self, can_id: int, data: bytes) -> Passed:
-        """The same, later."""
-        late = not self._ids or can_id in self._ids
-        return ((self._delay_ns if late else 0, can_id, data),)
+def cut(begins: tuple[int, bytes], ends: tuple[int, bytes]) -> Fault:
+    """Nothing gets through in either direction; error messages of the driver report its begin and its end."""
+    return Fault(
+        begin=lambda rig: rig.send(*begins),
+        end=lambda rig: rig.send(*ends),
+        hears=lambda can_id: False,
+        passes=lambda can_id, data: (),
+    )
 
 
-class Changed(Fault):
-    """Frames with these identifiers are replaced by what `change` makes of them: a list of (identifier, data)."""
-
-    def __init__(self, change: Callable[[int, bytes], list[tuple[int, bytes]]], *ids: int) -> None:
-        self._change, self._ids = change, frozenset(ids)
-
-    def passes(self, can_id: int, data: bytes) -> Passed:
-        """What the change makes of it."""
-        if can_id not in self._ids:
-            return ((0, can_id, data),)
-        return [(0, *each) for each in self._change(can_id, data)]
+def late(delay_us: float, *ids: int) -> Fault:
+    """Frames with these identifiers (without any: all) come later."""
+    delay_ns = round(delay_us * 1000)
+    return Fault(passes=lambda can_id, data: ((delay_ns if not ids or can_id in ids else 0, can_id, data),))
 
 
-class Frozen(Fault):
+def frozen(*ids: int) -> Fault:
     """Frames with these identifiers keep the data of their first one."""
-
-    def __init__(self, *ids: int) -> None:
-        self._ids = frozenset(ids)
-        self._kept: dict[int, bytes] = {}
-
-    def passes(self, can_id: int, data: bytes) -> Passed:
-        """The first data again."""
-        return ((0, can_id, self._kept.setdefault(can_id, data) if can_id in self._ids else data),)
+    kept: dict[int, bytes] = {}
+    return changed(lambda can_id, data: [(can_id, kept.setdefault(can_id, data))], *ids)
 
 
-class Added(Fault):
-    """Something is done when it begins, in each cycle, and when it ends."""
-
-    def __init__(self, each: Act | None = None, *, first: Act | None = None, last: Act | None = None) -> None:
-        self._each, self._first, self._last = each, first, last
-
-    def begin(self, rig: Rig) -> None:
-        """The first thing."""
-        if self._first is not None:
-            self._first(rig)
-
-    def each_cycle(self, rig: Rig) -> None:
-        """The repeated thing."""
-        if self._each is not None:
-            self._each(rig)
-
-    def end(self, rig: Rig) -> None:
-        """The last thing."""
-        if self._last is not None:
-            self._last(rig)
-
-
-class AndThen(Fault):
-    """A filter with something that is done when it begins and ends."""
-
-    def __init__(self, inner: Fault, *, first: Act | None = None, last: Act | None = None) -> None:
-        self._inner, self._first, self._last = inner, first, last
-        self.hears, self.passes, self.each_cycle = inner.hears, inner.passes, inner.each_cycle  # type: ignore[method-assign]
-
-    def begin(self, rig: Rig) -> None:
-        """The first thing."""
-        if self._first is not None:
-            self._first(rig)
-
-    def end(self, rig: Rig) -> None:
-        """The last thing."""
-        if self._last is not None:
-            self._last(rig)
-
-
-class Stopped(Fault):
+def stopped(flood: Act = _nothing) -> Fault:
     """The loop process is stopped (SIGSTOP); `flood` is sent meanwhile."""
 
-    def __init__(self, flood: Act | None = None) -> None:
-        self._flood = flood
-
-    def begin(self, rig: Rig) -> None:
-        """SIGSTOP, and the flood."""
+    def begin(rig: Rig) -> None:
         os.kill(rig.loop_pid, signal.SIGSTOP)
-        if self._flood is not None:
-            self._flood(rig)
+        flood(rig)
 
-    def end(self, rig: Rig) -> None:
-        """SIGCONT."""
-        os.kill(rig.loop_pid, signal.SIGCONT)
+    return Fault(begin, lambda rig: os.kill(rig.loop_pid, signal.SIGCONT))
 
 
 # What the cases do with the bench.
@@ -191,7 +107,6 @@ _FAST_RAD_S = 40.0
 
 
 def foreign_sync(rig: Rig, data: bytes) -> None:
-    """A SYNC of somebody else just after ours."""
     rig.watcher.spoil()
     rig.inject(0x080, data)
 
@@ -209,11 +124,10 @@ def reset(rig: Rig) -> None:
 def shorter() -> Fault:
     """181h with 0, 1, ... 7 bytes."""
     lengths = itertools.cycle(range(8))
-    return Changed(lambda can_id, data: [(can_id, data[: next(lengths)])], 0x181)
+    return changed(lambda can_id, data: [(can_id, data[: next(lengths)])], 0x181)
 
 
 def node(rig: Rig, number: int) -> CanopenNode:
-    """A node of the bench."""
     return rig.bench.nodes[number - 1]
 
 
@@ -225,33 +139,19 @@ def restart(rig: Rig, number: int = 1) -> None:
 
 
 def set_state(rig: Rig, number: int, state: int) -> None:
-    """The node is in another NMT state, and says nothing."""
     node(rig, number).state = state
 
 
 def store(rig: Rig, number: int) -> ObjectStore:
-    """Its object dictionary."""
     return node(rig, number).store
 
 
 def link(rig: Rig, state: str) -> None:
-    """The interface goes up or down."""
     subprocess.run(["ip", "link", "set", rig.bus, state], check=True)
 
 
 def step_clock(seconds: float) -> None:
-    """CLOCK_REALTIME jumps."""
     time.clock_settime(time.CLOCK_REALTIME, time.clock_gettime(time.CLOCK_REALTIME) + seconds)
-
-
-def stop_supervisor(rig: Rig) -> None:
-    """SIGSTOP to the supervisor."""
-    os.kill(rig.process.pid, signal.SIGSTOP)
-
-
-def go_on_supervisor(rig: Rig) -> None:
-    """SIGCONT."""
-    os.kill(rig.process.pid, signal.SIGCONT)
 
 
 def returns_with(number: int, index: int, subindex: int, value: int | None) -> Fault:
@@ -267,24 +167,12 @@ def returns_with(number: int, index: int, subindex: int, value: int | None) -> F
         store(rig, number).keep_as_default(index, subindex)
         restart(rig, number)
 
-    return Added(first=first, last=lambda rig: _set(rig, was[0]))
-
-
-class _Mute(Fault):
-    """Node 1 restarts and hears no SDO."""
-
-    def begin(self, rig: Rig) -> None:
-        """The restart."""
-        restart(rig, 1)
-
-    def hears(self, can_id: int) -> bool:
-        """All but its requests."""
-        return can_id != 0x601
+    return Fault(first, lambda rig: _set(rig, was[0]))
 
 
 def mute_restart() -> Fault:
-    """Node 1 restarts and does not answer."""
-    return _Mute()
+    """Node 1 restarts and hears no SDO request."""
+    return Fault(restart, hears=lambda can_id: can_id != 0x601)
 
 
 def reconfigure(rig: Rig) -> None:
@@ -321,7 +209,7 @@ def changes(number: int, index: int, subindex: int, factor: float) -> Fault:
         was.append(store(rig, number).number(index, subindex))
         store(rig, number).set_number(index, subindex, round(was[0] * factor))
 
-    return Added(first=first, last=lambda rig: store(rig, number).set_number(index, subindex, was[0]))
+    return Fault(first, lambda rig: store(rig, number).set_number(index, subindex, was[0]))
 
 
 def sdo_reads(rig: Rig) -> None:
@@ -354,22 +242,15 @@ def forget(rig: Rig, number: int) -> None:
 # What shows that a fault is there.
 
 
-def _stands_still(name: str, pid: int) -> Seen:
+def stands_still(name: str, pid: int) -> Seen:
     state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
     return Seen(state == "T", f"{name} in state {state}")
 
 
 def loop_stands_still(rig: Rig) -> Seen:
-    """The kernel says that it is stopped."""
-    return _stands_still("loop", rig.loop_pid)
-
-
-def supervisor_stands_still(rig: Rig) -> Seen:
-    """The same of the process beside the loop."""
-    return _stands_still("supervisor", rig.process.pid)
+    return stands_still("loop", rig.loop_pid)
 
 
 def link_is_down(rig: Rig) -> Seen:
-    """The kernel says that the interface is not up."""
     up = int(Path(f"/sys/class/net/{rig.bus}/flags").read_text(), 16) & 1
     return Seen(not up, f"{rig.bus} is {'up' if up else 'down'}")

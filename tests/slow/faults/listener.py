@@ -59,7 +59,6 @@ class Heard:
         return sum(self.bytes(n).startswith(starts) for n in at)
 
     def bytes(self, n: int) -> bytes:
-        """Data of a frame."""
         return bytes(self.data[n, : self.lengths[n]])
 
     @property
@@ -112,11 +111,9 @@ class Ears(threading.Thread):
 
     @property
     def dropped(self) -> int:
-        """See the class."""
         return self._socket.rx_dropped
 
     def run(self) -> None:
-        """Take what has come, again and again."""
         with suppress(PermissionError):  # of this thread: it must not wait for other programs
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(30))
         while not self._ended:
@@ -124,7 +121,6 @@ class Ears(threading.Thread):
             self.listen()
 
     def listen(self) -> None:
-        """Take what has come by now."""
         with self._lock:
             self._take()
 
@@ -143,7 +139,6 @@ class Ears(threading.Thread):
                 self._chunks.append((bytes(socket.frames[: 16 * count]), stamps_ns))
 
     def heard(self) -> Heard:
-        """Everything since the last call."""
         chunks = [self._chunks.popleft() for _ in range(len(self._chunks))]
         frames = np.frombuffer(b"".join(data for data, _ in chunks), FRAME)
         stamps_ns = np.concatenate([np.empty(0, np.int64), *(stamps for _, stamps in chunks)])
@@ -158,7 +153,6 @@ class Ears(threading.Thread):
 
 
 def joined(parts: list[Heard]) -> Heard:
-    """Several in a row as one."""
     frames = np.concatenate([np.empty(0, FRAME), *(each.frames for each in parts)])
     stamps_ns = np.concatenate([np.empty(0, np.int64), *(each.stamps_ns for each in parts)])
     return Heard(frames, stamps_ns, parts[0].sync_length if parts else 1)
@@ -175,9 +169,17 @@ class Seen:
 Proof = Callable[[Heard], Seen]
 
 
-def all_of(*proofs: Proof) -> Proof:
-    """Each of them."""
+def at_least(least: float, count: Callable[[Heard], float], text: str) -> Proof:
+    """So many, or so much; text: with a place for what was found."""
 
+    def proof(heard: Heard) -> Seen:
+        found = count(heard)
+        return Seen(found >= least, text.format(found))
+
+    return proof
+
+
+def all_of(*proofs: Proof) -> Proof:
     def proof(heard: Heard) -> Seen:
         seen = [each(heard) for each in proofs]
         return Seen(all(each.ok for each in seen), ", ".join(each.text for each in seen))
@@ -185,174 +187,146 @@ def all_of(*proofs: Proof) -> Proof:
     return proof
 
 
+def _names(ids: tuple[int, ...]) -> str:
+    return " ".join(f"{each:03X}h" for each in ids)
+
+
 def frames(least: int, can_id: int, *starts: bytes) -> Proof:
     """So many frames with this identifier (flags included); `starts`: whose data begin with one of these."""
-
-    def proof(heard: Heard) -> Seen:
-        found = heard.count(can_id, *starts)
-        kind = f" {starts[0].hex()}" if len(starts) == 1 else " of the kind" if starts else ""
-        return Seen(found >= least, f"{found} x {can_id:03X}h{kind}")
-
-    return proof
+    kind = f" {starts[0].hex()}" if len(starts) == 1 else " of the kind" if starts else ""
+    return at_least(least, lambda heard: heard.count(can_id, *starts), f"{{}} x {can_id:03X}h{kind}")
 
 
 def of_length(least: int, can_id: int, length: int) -> Proof:
-    """So many frames of this length."""
-
-    def proof(heard: Heard) -> Seen:
-        found = int(np.count_nonzero(heard.lengths[heard.at(can_id)] == length))
-        return Seen(found >= least, f"{found} x {can_id:03X}h of {length} bytes")
-
-    return proof
+    return at_least(
+        least,
+        lambda heard: np.count_nonzero(heard.lengths[heard.at(can_id)] == length),
+        f"{{}} x {can_id:03X}h of {length} bytes",
+    )
 
 
 def withheld(least: int, *ids: int) -> Proof:
     """So many cycles in which this did not come within the deadline, for each identifier."""
-
-    def proof(heard: Heard) -> Seen:
-        found = min(heard.without(each) for each in ids)
-        return Seen(
-            found >= least, f"{found} cycles without {' '.join(f'{each:03X}h' for each in ids)} in time"
-        )
-
-    return proof
+    text = f"{{}} cycles without {_names(ids)} in time"
+    return at_least(least, lambda heard: min(heard.without(each) for each in ids), text)
 
 
 def later(least: int, can_id: int, delay_us: float) -> Proof:
-    """So many frames that came later than this after SYNC."""
-
-    def proof(heard: Heard) -> Seen:
-        found = int(np.count_nonzero(heard.delays_ns(can_id) >= delay_us * 1000))
-        return Seen(found >= least, f"{found} x {can_id:03X}h later than {delay_us:g} us")
-
-    return proof
+    return at_least(
+        least,
+        lambda heard: np.count_nonzero(heard.delays_ns(can_id) >= delay_us * 1000),
+        f"{{}} x {can_id:03X}h later than {delay_us:g} us",
+    )
 
 
 def after(least: int, can_id: int, other: int) -> Proof:
     """So many cycles in which this frame came after the other one."""
 
-    def proof(heard: Heard) -> Seen:
+    def count(heard: Heard) -> int:
         one, two = (np.searchsorted(heard.syncs, heard.at(each)) for each in (can_id, other))
         cycles = np.intersect1d(one, two)
-        first, second = (
-            heard.at(each)[np.searchsorted(of, cycles)] for each, of in ((can_id, one), (other, two))
-        )
-        found = int(np.count_nonzero(first > second))
-        return Seen(found >= least, f"{found} cycles with {can_id:03X}h after {other:03X}h")
+        first = heard.at(can_id)[np.searchsorted(one, cycles)]
+        second = heard.at(other)[np.searchsorted(two, cycles)]
+        return np.count_nonzero(first > second)
 
-    return proof
+    return at_least(least, count, f"{{}} cycles with {can_id:03X}h after {other:03X}h")
 
 
 def doubled(least: int, can_id: int) -> Proof:
-    """So many cycles with two of these frames."""
-
-    def proof(heard: Heard) -> Seen:
+    def count(heard: Heard) -> int:
         _, counts = np.unique(np.searchsorted(heard.syncs, heard.at(can_id)), return_counts=True)
-        found = int(np.count_nonzero(counts > 1))
-        return Seen(found >= least, f"{found} cycles with two {can_id:03X}h")
+        return np.count_nonzero(counts > 1)
 
-    return proof
+    return at_least(least, count, f"{{}} cycles with two {can_id:03X}h")
 
 
 def silent(least_s: float, *ids: int) -> Proof:
     """None of these for so long, within what was heard."""
 
-    def proof(heard: Heard) -> Seen:
+    def longest_s(heard: Heard) -> float:
         ends = [0, len(heard.ids) - 1] if len(heard.ids) else []
         at = np.unique([*heard.at(*ids), *ends]).astype(int)
-        longest_s = float(np.diff(heard.stamps_ns[at]).max(initial=0)) * 1e-9
-        return Seen(
-            longest_s >= least_s, f"no {' '.join(f'{each:03X}h' for each in ids)} for {longest_s:.2f} s"
-        )
+        return float(np.diff(heard.stamps_ns[at]).max(initial=0)) * 1e-9
 
-    return proof
+    return at_least(least_s, longest_s, f"no {_names(ids)} for {{:.2f}} s")
 
 
 def counter_jumps(least: int) -> Proof:
     """So many SYNCs whose counter does not follow on the one before."""
 
-    def proof(heard: Heard) -> Seen:
+    def count(heard: Heard) -> int:
         counters = heard.data[heard.syncs, 0].astype(int)
-        found = int(np.count_nonzero((counters[1:] - counters[:-1]) % 240 != 1))
-        return Seen(found >= least, f"{found} jumps of the SYNC counter")
+        return np.count_nonzero((counters[1:] - counters[:-1]) % 240 != 1)
 
-    return proof
+    return at_least(least, count, "{} jumps of the SYNC counter")
 
 
 def clock_stepped(seconds: float) -> Proof:
-    """The kernel's stamps jumped by at least this."""
-
-    def proof(heard: Heard) -> Seen:
-        found = float(np.abs(np.diff(heard.stamps_ns)).max(initial=0)) * 1e-9
-        return Seen(found >= seconds, f"stamps jumped by {found:.0f} s")
-
-    return proof
+    return at_least(
+        seconds,
+        lambda heard: float(np.abs(np.diff(heard.stamps_ns)).max(initial=0)) * 1e-9,
+        "stamps jumped by {:.0f} s",
+    )
 
 
 def statuswords(least: int, node: int, mask: int, value: int) -> Proof:
     """So many statuswords (6041h in TPDO2) of the node with these bits."""
 
-    def proof(heard: Heard) -> Seen:
+    def count(heard: Heard) -> int:
         words = np.ascontiguousarray(heard.data[heard.at(0x280 + node)][:, 6:8]).view("<u2")
-        found = int(np.count_nonzero(words & mask == value))
-        return Seen(found >= least, f"{found} statuswords {value:02X}h of node {node}")
+        return np.count_nonzero(words & mask == value)
 
-    return proof
+    return at_least(least, count, f"{{}} statuswords {value:02X}h of node {node}")
 
 
 def sensor_status(least: int, bits: int) -> Proof:
     """So many PDOs of the torque sensor with all of these bits of 6150h."""
-
-    def proof(heard: Heard) -> Seen:
-        found = int(np.count_nonzero(heard.data[heard.at(0x183), 4] & bits == bits))
-        return Seen(found >= least, f"{found} x 183h with {bits:02X}h in 6150h")
-
-    return proof
+    return at_least(
+        least,
+        lambda heard: np.count_nonzero(heard.data[heard.at(0x183), 4] & bits == bits),
+        f"{{}} x 183h with {bits:02X}h in 6150h",
+    )
 
 
 def position_jump(counts: int) -> Proof:
     """The motor position of node 1 jumped by at least this."""
-
-    def proof(heard: Heard) -> Seen:
-        found = int(np.abs(np.diff(heard.positions(1)[:, 0])).max(initial=0))
-        return Seen(found >= counts, f"motor position jumped by {found} counts")
-
-    return proof
+    return at_least(
+        counts,
+        lambda heard: int(np.abs(np.diff(heard.positions(1)[:, 0])).max(initial=0)),
+        "motor position jumped by {} counts",
+    )
 
 
 def stuck(least: int, column: int) -> Proof:
-    """Node 1's motor (0) or link (1) position kept its value so many times in a row while its drive said that it turns."""
+    """Node 1's motor (0) or link (1) position kept its value so many times in a row while its drive reported motion."""
 
-    def proof(heard: Heard) -> Seen:
-        column_of = heard.positions(1)[:, column]
-        changes = np.flatnonzero(np.diff(column_of))
-        longest = int(np.diff(np.concatenate([[-1], changes, [len(column_of) - 1]])).max(initial=0))
+    def longest(heard: Heard) -> int:
+        values = heard.positions(1)[:, column]
+        ends = np.concatenate([[-1], np.flatnonzero(np.diff(values)), [len(values) - 1]])
         turning = bool(np.any(heard.velocities(1) != 0))
-        what = ("motor", "link")[column]
-        return Seen(longest >= least and turning, f"{what} position the same in {longest} frames in a row")
+        return int(np.diff(ends).max(initial=0)) if turning else 0
 
-    return proof
+    what = ("motor", "link")[column]
+    return at_least(least, longest, f"{what} position the same in {{}} frames in a row, turning")
 
 
 def velocity_against_position(least: int) -> Proof:
     """So many cycles in which node 1's motor velocity has the other sign than the change of its position."""
 
-    def proof(heard: Heard) -> Seen:
+    def count(heard: Heard) -> int:
         steps, velocities = np.diff(heard.positions(1)[:, 0]), heard.velocities(1)[1:]
-        count = min(len(steps), len(velocities))
-        found = int(np.count_nonzero(steps[:count] * velocities[:count] < 0))
-        return Seen(found >= least, f"{found} velocities against the position")
+        size = min(len(steps), len(velocities))
+        return np.count_nonzero(steps[:size] * velocities[:size] < 0)
 
-    return proof
+    return at_least(least, count, "{} velocities against the position")
 
 
 def two_answers(can_id: int, index: int, subindex: int) -> Proof:
     """SDO answers on this object held two different values."""
     multiplexer = index.to_bytes(2, "little") + bytes([subindex])
 
-    def proof(heard: Heard) -> Seen:
-        data = [heard.bytes(n) for n in heard.at(can_id)]
-        answers = {each for each in data if each[:1] and each[0] & 0xE0 == 0x40 and each[1:4] == multiplexer}
-        return Seen(len(answers) > 1, f"{len(answers)} values of {index:04X}h:{subindex} read")
+    def count(heard: Heard) -> int:
+        data = {heard.bytes(n) for n in heard.at(can_id)}
+        return sum(each[:1] != b"" and each[0] & 0xE0 == 0x40 and each[1:4] == multiplexer for each in data)
 
-    return proof
+    return at_least(2, count, f"{{}} values of {index:04X}h:{subindex} read")

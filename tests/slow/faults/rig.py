@@ -39,7 +39,6 @@ DEADLINE_NS = 800_000
 """Inputs that are sent later than this after SYNC count as withheld (`inputs.deadline_us` is 850)."""
 SYNC, OWN_EMCY, ESTIMATE = 0x080, 0x0A0, 0x1A0
 _NEEDED = ({0x181, 0x281}, {0x182, 0x282})
-_LOOK_AGAIN_NS = 10 * MS
 _RESTED_NS = 350 * MS
 """Longer than a node is let be after its boot (`jtqd.daemon.bus.boot`)."""
 
@@ -101,7 +100,6 @@ class Watcher:
         self._complete = (False, False)
 
     def estimate(self, data: bytes, at_ns: int) -> None:
-        """An estimate PDO."""
         if len(data) != LAYOUT.size:
             self._break(f"an estimate of {len(data)} bytes")
             return
@@ -122,7 +120,6 @@ class Watcher:
         self._answered = True
 
     def emcy(self, data: bytes, at_ns: int) -> None:
-        """An EMCY of jtqd."""
         code, ended = int.from_bytes(data[0:2], "little"), int.from_bytes(data[3:5], "little")
         detail = int.from_bytes(data[5:7], "little")
         self.told.append(Emergency(at_ns, code, ended))
@@ -139,12 +136,10 @@ class Watcher:
         return len(last) == count and all(each in GOOD for one in last for each in one.status)
 
     def bad(self) -> tuple[frozenset[int], frozenset[int]]:
-        """Statuses without torque that each joint has had."""
         one, two = (frozenset(each.status[n] for each in self.seen) - GOOD for n in (0, 1))
         return one, two
 
     def first_bad_ns(self) -> int | None:
-        """When the first estimate without a torque came."""
         return next((each.at_ns for each in self.seen if not GOOD.issuperset(each.status)), None)
 
     def well_again_ns(self) -> int | None:
@@ -160,7 +155,6 @@ class Watcher:
 
 
 def rises(before: dict[str, int], after: dict[str, int]) -> dict[str, int]:
-    """Counters that have risen, but those that always do."""
     return {name: after[name] - n for name, n in before.items() if after[name] > n and name not in _FLOWING}
 
 
@@ -277,7 +271,6 @@ class Rig:
         self.emit(self.bench.on_frame(can_id, data, time.time_ns(), now_ns))
 
     def counters(self) -> dict[str, int]:
-        """Of the snapshot."""
         return self.reader.read().counters
 
     def configured(self) -> bool:
@@ -294,11 +287,9 @@ class Rig:
         return self.configured() and time.monotonic_ns() - self._booting_ns > _RESTED_NS
 
     def report(self) -> Any:
-        """`bus.json`."""
         return json.loads(next((self._directory / "run").glob("*/bus.json")).read_text())
 
     def said(self) -> str:
-        """Everything on jtqd's standard error."""
         return (self._directory / "stderr").read_text()
 
     def until(self, condition: Callable[[], bool], longest_s: float) -> bool:

@@ -165,7 +165,6 @@ def _healthy(rig: Rig, case: Case) -> tuple[list[str], Heard]:
 
 
 def judge(outcome: Outcome) -> list[str]:
-    """What is not as the case expects."""
     case, wrong = outcome.case, []
     for joint, expected, found in ((1, case.one, outcome.one), (2, case.two, outcome.two)):
         if not (expected - STARTING <= found <= expected) or bool(expected) != bool(found):

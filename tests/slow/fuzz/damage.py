@@ -11,7 +11,6 @@ import yaml
 
 
 def damage_bytes(source: random.Random, data: bytes) -> tuple[str, bytes]:
-    """(what was done, the damaged bytes)."""
     kind = source.choice(("flip", "flips", "cut", "zeros", "noise", "repeat", "insert", "ends", "text"))
     out = bytearray(data)
     at = source.randrange(len(out) or 1)

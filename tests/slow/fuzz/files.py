@@ -270,12 +270,7 @@ def targets(directory: Path) -> list[Target]:
         Target("boot request", request, ".json", _json_tree, _read_request, (RequestError,)),
         Target("EDS", eds, ".eds", damage_bytes, lambda path: read_eds(path, 0x20), (EdsError,)),
         Target(
-            "network, ours",
-            network,
-            ".onnx",
-            damage_bytes,
-            _network("fused"),
-            (NetworkError, ConfigError),
+            "network, ours", network, ".onnx", damage_bytes, _network("fused"), (NetworkError, ConfigError)
         ),
         Target(
             "network, paper",

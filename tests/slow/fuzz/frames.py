@@ -58,11 +58,9 @@ class Oracle:
 
     @property
     def findings(self) -> int:
-        """Errors of the loop."""
         return self.stale + self.believed + self.leaked + self.wrong_sequence
 
     def judge(self, cycle: Cycle, bus: BusInTime, kind: str, *, strict: bool) -> None:
-        """The cycle that has just ended."""
         self.published += 1
         intake = cycle.intake
         right = [not intake.fresh(n) or is_of(bus.syncs, n, intake.values(n)) for n in range(4)]
@@ -109,7 +107,6 @@ class FrameReport:
         return not self.exceptions and not self.oracle.findings and self.oracle.valid > self.cycles // 10
 
     def as_json(self) -> dict[str, Any]:
-        """Counts by name."""
         oracle = self.oracle
         return {
             "seed": self.seed,

@@ -83,7 +83,6 @@ def looks_alike(frame: bytes) -> bool:
 
 
 def _now(rig: Rig, pid: int) -> Stretch:
-    """Totals until now."""
     counters = rig.counters()
     cpu_ns = int(Path(f"/proc/{pid}/schedstat").read_text().split()[0])
     work, late = (np.array(each, np.int64) for each in (rig.reader.work_bins(), rig.reader.late_bins()))

@@ -67,7 +67,6 @@ class BusInTime:
         return patch.multiple(cycle_module, clock=PythonClock(self))
 
     def installed_in_loop(self) -> AbstractContextManager[object]:
-        """It takes the place of module `time` in the loop."""
         return patch.multiple(loop_module, time=self)
 
     # Module `time` -------------------------------------------------------------------------------------------------------
@@ -152,7 +151,6 @@ def frame(can_id: int, data: bytes, length: int | None = None) -> bytes:
 
 
 def genuine(number: int) -> tuple[bytes, ...]:
-    """The five PDOs that answer SYNC `number`."""
     speed = SPEED + number % NUMBERS
     return (
         frame(0x181, I32.pack(number, LINK + number)),
@@ -329,7 +327,6 @@ class Traffic:
         return [(self._time(now_ns), frame(can_id, draw.randbytes(5 if can_id == 0x183 else 8)), False)]
 
     def _replay(self, now_ns: int) -> list[Arrival]:
-        """Somebody sends old inputs again."""
         if not self._old or self.random.random() < 0.5:
             return []
         return [(self._time(now_ns), self.random.choice(self._old), False)]

@@ -40,7 +40,6 @@ class Records:
 
 
 def read_records(paths: Iterable[Path]) -> Records:
-    """From the parts of one log, chunk by chunk."""
     columns: list[NDArray[np.int64]] = []
     for path in paths:
         for found in iter_messages(path, "/can/frames"):
@@ -73,7 +72,6 @@ class SyncTally:
         self._stamps: list[NDArray[np.int64]] = []
 
     def add(self, heard: Heard) -> None:
-        """More of them."""
         syncs = heard.syncs
         self._counters.append(heard.data[syncs, 0].astype(np.int64))
         self._stamps.append(heard.stamps_ns[syncs].copy())
@@ -195,7 +193,6 @@ class EstimateTally:
         self._last = 0
 
     def add(self, heard: Heard) -> None:
-        """More of them."""
         syncs, at = heard.syncs, heard.at(ESTIMATE)
         counters = np.concatenate([[self._last], heard.data[syncs, 0]]).astype(np.int64)
         self._last = int(counters[-1])

@@ -25,7 +25,7 @@ from jtqd.sim_can.bench import Bench, run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from tests.slow.faults import injections as acts
-from tests.slow.faults.injections import Added, Changed, Cut, Fault, Late, Lost
+from tests.slow.faults.injections import Fault
 
 MS = 1_000_000
 SENSOR = 0x183
@@ -37,15 +37,15 @@ def fault_of(order: dict[str, Any]) -> Fault:
     """What an order means. Raises KeyError for one that is none."""
     node, ids = order.get("node", 1), order.get("ids", ())
     kinds = {
-        "lost": lambda: Lost(*ids),
-        "late": lambda: Late(order["delay_us"], *ids),
-        "bus-off": lambda: Cut((BUS_OFF, bytes(8)), (RESTARTED, bytes(8))),
-        "sensor invalid": lambda: Changed(lambda can_id, data: [(can_id, data[:4] + b"\x01")], SENSOR),
-        "drive fault": lambda: Added(
-            first=lambda rig: acts.drive_fault(rig, node), last=lambda rig: acts.release(rig, node)
+        "lost": lambda: acts.lost(*ids),
+        "late": lambda: acts.late(order["delay_us"], *ids),
+        "bus-off": lambda: acts.cut((BUS_OFF, bytes(8)), (RESTARTED, bytes(8))),
+        "sensor invalid": lambda: acts.changed(lambda can_id, data: [(can_id, data[:4] + b"\x01")], SENSOR),
+        "drive fault": lambda: Fault(
+            lambda rig: acts.drive_fault(rig, node), lambda rig: acts.release(rig, node)
         ),
-        "restart": lambda: Added(first=lambda rig: acts.restart(rig, node)),
-        "forget": lambda: Added(first=lambda rig: acts.forget(rig, node)),
+        "restart": lambda: Fault(lambda rig: acts.restart(rig, node)),
+        "forget": lambda: Fault(lambda rig: acts.forget(rig, node)),
     }
     return kinds[order["kind"]]()
 
@@ -77,18 +77,15 @@ class OrderedBench(Bench):
         return min(due, self._delayed[0][0]) if self._delayed else due
 
     def on_frame(self, can_id: int, data: bytes, stamp_ns: int, now_ns: int) -> list[bytes]:
-        """As of the bench."""
         self._turn(now_ns)
         heard = self._fault.hears(can_id)
         return self._out(super().on_frame(can_id, data, stamp_ns, now_ns) if heard else [], now_ns)
 
     def tick(self, now_ns: int) -> list[bytes]:
-        """As of the bench."""
         self._turn(now_ns)
         return self._out(super().tick(now_ns), now_ns)
 
     def emit(self, frames: list[bytes]) -> None:
-        """What an act makes a node say."""
         self._said += frames
 
     def send(self, can_id: int, data: bytes) -> None:
@@ -96,7 +93,6 @@ class OrderedBench(Bench):
         self._told.append(pack(can_id, data))
 
     def _turn(self, now_ns: int) -> None:
-        """Begin the next order, or end the one that is over."""
         order = self._order
         if order is None:
             if not self.orders:
@@ -131,7 +127,6 @@ class OrderedBench(Bench):
 
 
 def main() -> int:
-    """Run until told to stop."""
     parser = argparse.ArgumentParser(prog="python -m tests.slow.soak.bench")
     parser.add_argument("--bus", required=True)
     parser.add_argument("--seed", type=int, default=1, help="of the noise")

@@ -246,7 +246,6 @@ def _stopped(name: str, seconds: float) -> Callable[[Scene], Proof]:
 
 
 def _by_the_kernel(_heard: Heard) -> Seen:
-    """`Scene.stop` and `Scene.kill` have asked the kernel."""
     return Seen(True, "the kernel says so")
 
 

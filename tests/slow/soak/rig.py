@@ -22,10 +22,7 @@ from jtqd.models.files import shipped
 from tests.paths import ROOT
 from tests.slow.faults.listener import Ears
 
-_NAMES = {
-    "jtqd.daemon.loop.process": "loop",
-    "jtqd.daemon.recording.recorder": "recorder",
-}
+_NAMES = {"jtqd.daemon.loop.process": "loop", "jtqd.daemon.recording.recorder": "recorder"}
 _MARKS = 200
 OVERFLOW = 240
 """Of the counter in SYNC."""
@@ -109,7 +106,6 @@ class Rig:
 
     @property
     def listener(self) -> Ears:
-        """The listener that was asked for."""
         assert self.ears is not None
         return self.ears
 
@@ -131,7 +127,6 @@ class Rig:
         return json.loads((self.runtime / "bus.json").read_text())
 
     def counters(self) -> dict[str, int]:
-        """Of the snapshot, as it is now."""
         return dict(self.reader.read().counters)
 
     def processes(self) -> dict[str, int]:

@@ -51,11 +51,9 @@ class SoakReport:
                 self.findings.append(f"{name} grows by {slope:.1f} +- {half:.1f} kB/s")
 
     def as_json(self) -> dict[str, Any]:
-        """All of it."""
         return dict(vars(self))
 
     def text(self) -> str:
-        """A table."""
         lines = [
             f"seed {self.seed}, {self.seconds:.0f} s, {sum(map(len, self.faults.values()))} faults",
             f"{'fault':20}{'times':>6}{'recovered after s: median':>27}{'max':>7}",
@@ -84,7 +82,6 @@ class MemoryWatch:
         self._samples: dict[tuple[str, int], list[tuple[float, int]]] = {}
 
     def look(self, rig: Rig, now_s: float) -> None:
-        """One sample of each process."""
         for name, pid in rig.processes().items():
             try:
                 self._samples.setdefault((name, pid), []).append((now_s, rss_kb(pid)))
@@ -129,7 +126,6 @@ class Soak:
         self._begun_s = time.monotonic()
 
     def run(self, seconds: float, stop: Callable[[], bool] = lambda: False) -> SoakReport:
-        """For so long, or until `stop()`."""
         say_s = _SAY_EVERY_S
         while self._now_s() < seconds and not stop() and self._rig.daemon.poll() is None:
             self._order = self._order or self._source.sample(self._kinds, len(self._kinds))
@@ -220,11 +216,9 @@ class Soak:
         return joints and not view.unconfigured and written is not None and written.cycles >= until
 
     def _quiet(self) -> bool:
-        """Every error of jtqd has been taken back."""
         return not self._rig.bus_report()["errors"]
 
     def _count(self) -> None:
-        """Every cycle and every SYNC is accounted for."""
         rig, report = self._rig, self.report
         result = rig.result
         lost = int((result.get("recording") or {}).get("lost", 0))
@@ -262,7 +256,6 @@ class _Told:
         self._missing = ""
 
     def look(self) -> bool:
-        """Now."""
         fault, view = self._fault, self._rig.reader.read()
         words = self._recent + self._rig.said()[self._begun :]
         missing = []
@@ -277,7 +270,6 @@ class _Told:
         return not missing
 
     def said(self) -> str:
-        """The end of what has been said since."""
         return self._rig.said()[self._begun :][-1000:]
 
     def missing(self) -> str:

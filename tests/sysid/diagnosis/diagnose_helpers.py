@@ -51,7 +51,6 @@ def bench_run(
 
 
 def write_runs(folder: Path, count: int = 3, **kinds: Any) -> list[Path]:
-    """Run files a.csv, b.csv.gz, ..."""
     paths = []
     for k in range(count):
         path = folder / f"{'abcdefgh'[k]}.csv{'.gz' if k % 2 else ''}"

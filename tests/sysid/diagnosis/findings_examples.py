@@ -168,7 +168,6 @@ def two_causes() -> Findings:
 
 
 def no_gap() -> Findings:
-    """Nothing hidden."""
     return Findings(
         verdict="no_gap",
         reasons=("no effect of the library and no map stands out of the noise",),
@@ -200,7 +199,6 @@ def unexplained() -> Findings:
 
 
 def insufficient() -> Findings:
-    """One short run, no torque sensor to speak of."""
     plan = two_causes().next_experiment
     assert plan is not None
     return Findings(
@@ -234,7 +232,6 @@ def insufficient() -> Findings:
 
 
 def sensor() -> Findings:
-    """The sensor's gain, which both joints see alike."""
     return replace(
         two_causes(),
         verdict="cause",
@@ -279,7 +276,6 @@ EXAMPLES: Mapping[str, Callable[[], Findings]] = {
 
 
 def main(directory: Path) -> None:
-    """Write the pages."""
     from jtqd.sysid.diagnosis.report.page import render
 
     for name, make in EXAMPLES.items():

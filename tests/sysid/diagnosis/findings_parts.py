@@ -45,12 +45,10 @@ SENSOR_EFFECTS: Mapping[str, tuple[str, float, str]] = {
 
 
 def value(middle: float, half: float, unit: str) -> Value:
-    """A parameter with a symmetric interval."""
     return Value(middle, (middle - half, middle + half), unit)
 
 
 def given(number: float, unit: str = "") -> Value:
-    """A parameter that is not fitted."""
     return Value(number, (number, number), unit)
 
 

@@ -423,11 +423,7 @@ def cell(text: str, row: int, column: int, content: str) -> str:
     ],
 )
 def test_bad_run_files(
-    tmp_path: Path,
-    core: Core,
-    capsys: pytest.CaptureFixture[str],
-    spoil: Callable[[str], str],
-    wanted: str,
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str], spoil: Callable[[str], str], wanted: str
 ) -> None:
     path = write_runs(tmp_path, 1)[0]
     path.write_text(spoil(path.read_text()))

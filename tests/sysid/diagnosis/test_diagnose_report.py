@@ -74,12 +74,10 @@ class Page(html.parser.HTMLParser):
 
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
-    """Every example, rendered once."""
     return {name: render(make()) for name, make in examples.EXAMPLES.items()}
 
 
 def text_of(page: str) -> str:
-    """What a reader sees, spaces as plain ones."""
     return re.sub(r"\s+", " ", Page(page).text.translate(PLAIN_SPACE))
 
 
@@ -123,9 +121,7 @@ def test_the_curves_that_can_be_zoomed_are_the_traces() -> None:
     data = json.loads(picture.data)
     assert [curve["role"] for curve in data["curves"]] == ["before", "after", "soft", "soft"]
     for curve, values in zip(
-        data["curves"],
-        (trace.before_nm, trace.after_nm, trace.velocity_rad_s, trace.torque_nm),
-        strict=True,
+        data["curves"], (trace.before_nm, trace.after_nm, trace.velocity_rad_s, trace.torque_nm), strict=True
     ):
         whole = np.frombuffer(base64.b64decode(curve["values"]), "<i2")
         back = np.where(whole == -32768, np.nan, whole * curve["scale"])

@@ -148,7 +148,6 @@ def _integrated(name: str, p: dict[str, float], turned: float, number: int) -> J
 
 
 def angle_of(velocity: FloatArray, turned: float) -> FloatArray:
-    """Trapezoidal integral of the velocity."""
     steps = np.concatenate(([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1])))) / RATE_HZ
     result: FloatArray = turned + steps
     return result

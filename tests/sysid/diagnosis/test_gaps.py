@@ -50,7 +50,6 @@ def noise(seed: int) -> FloatArray:
 def told(
     residual: Residual, channel: Channel = MOTOR1, lines: tuple[Line, ...] = (), seed: int = 0
 ) -> tuple[list[Location], dict[str, AxisMap]]:
-    """Places of six runs."""
     axes = [motion(seed + k) for k in range(6)]
     parts = [residual(a, k) + noise(seed + k) for k, a in enumerate(axes)]
     runs: list[RunData] = [

@@ -25,7 +25,6 @@ MOTOR2 = Channel(2, "motor")
 
 
 def coloured(a: FloatArray, noise: FloatArray) -> FloatArray:
-    """x_t = sum a_k x_{t-k} + e_t from rest."""
     out = np.zeros(len(noise))
     for t, e in enumerate(noise):
         past = out[max(0, t - len(a)) : t][::-1]
@@ -87,12 +86,7 @@ def small_run(invalid: dict[Channel, list[int]]) -> RunData:
         for part in parts:
             part[:ORDER] = 0.0
         run.channels[c] = ChannelData(
-            valid,
-            parts[2][:, 0],
-            parts[0],
-            np.array(index, np.intp),
-            parts[1],
-            np.array(families, np.intp),
+            valid, parts[2][:, 0], parts[0], np.array(index, np.intp), parts[1], np.array(families, np.intp)
         )
     return run
 
@@ -122,7 +116,6 @@ def filters() -> FloatArray:
 
 
 def innovations() -> FloatArray:
-    """Covariance of the innovations of all channels."""
     one = NOISE.correlation * np.outer(NOISE.sigma, NOISE.sigma)
     return np.asarray(np.kron(one, np.eye(COUNT)), np.float64)
 

@@ -34,7 +34,6 @@ BARE = replace(PLAIN, damping_nms_per_rad=0.0, link_inertia_kgm2=0.0)
 
 
 def made_up(joint: Joint, seed: int = 1, number: int = 1, both: bool = True) -> JointSignals:
-    """Signals whose residuals are of no interest."""
     s = state(seed)
     nothing = np.zeros(len(s.time_s))
     return JointSignals(

@@ -27,7 +27,6 @@ NAME: Final = "torque_constant_nm_per_a"
 
 
 def polled(table: RunTable, every: int) -> RunTable:
-    """Every so many rows of a run, nothing averaged."""
     (columns,) = table.joints.values()
     names = ("current_a", "motor_position_rad", "link_position_rad", "torque_nm")
     values = {name: getattr(columns, name)[::every] for name in names}

@@ -87,11 +87,7 @@ def test_a_run_by_the_equations_leaves_nothing() -> None:
 @pytest.mark.parametrize(
     ("change", "effect", "parameters"),
     [
-        (
-            {"torque_constant_nm_per_a": 0.084},
-            "torque_constant",
-            {"torque_constant_nm_per_a": 0.084},
-        ),
+        ({"torque_constant_nm_per_a": 0.084}, "torque_constant", {"torque_constant_nm_per_a": 0.084}),
         ({"rotor_inertia_kgm2": 9e-5}, "rotor_inertia", {"rotor_inertia_kgm2": 9e-5}),
         ({"link_inertia_kgm2": 0.4}, "link_inertia", {"link_inertia_kgm2": 0.4}),
         (
@@ -192,7 +188,6 @@ BASE = BaseLoss(JOINT)
 
 
 def zero_signals(true_nm: np.ndarray, velocity: np.ndarray, zero_nm: float) -> JointSignals:
-    """A run whose only error is the sensor's zero."""
     measured = true_nm + zero_nm
     n = len(true_nm)
     state = State(
@@ -211,10 +206,7 @@ def zero_signals(true_nm: np.ndarray, velocity: np.ndarray, zero_nm: float) -> J
 def test_the_law_is_the_emulated_plants_of_the_same_file() -> None:
     side = plant_of_joint(JOINT).joints[0]
     table = LossTable(
-        LossModel(JOINT).loss,
-        JOINT.gear_ratio,
-        JOINT.torque_constant_nm_per_a,
-        side.drive.current_limit_a,
+        LossModel(JOINT).loss, JOINT.gear_ratio, JOINT.torque_constant_nm_per_a, side.drive.current_limit_a
     )
     d = side.deviations
     friction = JointFriction(

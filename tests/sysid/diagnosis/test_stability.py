@@ -48,13 +48,7 @@ def asked(more_nm: FloatArray | float, runs: int = 6, spread: float = 0.0) -> St
     name = "viscous_nms_per_rad"
     present = PresentEffect(EFFECTS["viscous_friction"], 1, {name: 2.0 + size}, (name,))
     refined = Refined(
-        (present,),
-        found.covariance,
-        np.zeros(1),
-        mixed(),
-        found.variances,
-        np.zeros((runs, 1)),
-        tuple(made),
+        (present,), found.covariance, np.zeros(1), mixed(), found.variances, np.zeros((runs, 1)), tuple(made)
     )
     return stability(refined, WHITE, [{name: 2.0}])[0]
 

@@ -173,7 +173,6 @@ def gaussian(seed: int, count: int = 12000) -> FloatArray:
 
 
 def limits(nm: float) -> dict[Channel, EventLimits]:
-    """What moves or wanders by this much is no noise."""
     return {MOTOR1: EventLimits(AR, STEP_S, jump_nm=nm, wander_nm=nm)}
 
 
