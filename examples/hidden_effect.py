@@ -30,7 +30,7 @@ import numpy as np
 import yaml
 
 from jtqd.daemon.logs import LogError, read_topics
-from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
+from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import check_installed, count, make_directory, natural, seconds
 from jtqd.estimator.errors import ConfigError
@@ -46,8 +46,7 @@ from jtqd.sysid.campaign.emulated import emulated
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import variable_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plan
-from jtqd.sysid.report.figures import STYLE, check_picture
-from jtqd.sysid.report.page import LIGHT
+from jtqd.sysid.report.page import LIGHT, STYLE, check_picture
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import write_run

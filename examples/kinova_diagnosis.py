@@ -33,7 +33,7 @@ from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Trace, to_mapping
 from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
 from jtqd.sysid.diagnosis.signals import JointSignals
-from jtqd.sysid.report import figures as parts
+from jtqd.sysid.report import page as parts
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run

@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.daemon.logs import LogError, Records, read_topic
-from jtqd.daemon.logs.published import published_torque, reference_torque, sync_time
+from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
 from jtqd.estimator.command_line import make_directory
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.joint import Friction, Joint
@@ -554,7 +554,7 @@ def bus_table(results: Sequence[BusRun]) -> Table:
 
 def bus_panels(results: Sequence[BusRun]) -> list[Panel]:
     """Return what is drawn of one joint: both configurations of each run."""
-    from jtqd.sysid.report import figures as parts
+    from jtqd.sysid.report import page as parts
 
     labels = {"before": "before: joint file as shipped", "after": "after: losses fitted on the other run"}
     found = []

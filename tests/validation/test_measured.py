@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.logs import read_topic
-from jtqd.daemon.logs.published import published_torque
+from jtqd.daemon.logs.read import published_torque
 from jtqd.drivers.frame import FRAME, pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator.status import STALE, STARTING

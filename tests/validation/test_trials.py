@@ -17,7 +17,7 @@ import pytest
 
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value
 from validation.__main__ import FAILED, MISSED, USAGE, main
-from validation.diagnosis import bench_trials, scores, trials
+from validation.diagnosis import benches, scores, trials
 from validation.diagnosis.benches import Counts, campaign, jobs, key, read, sizes
 from validation.diagnosis.entries import SENSOR, Columns, Hidden
 from validation.diagnosis.measured_bench import MeasuredBench
@@ -40,7 +40,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Recorder]:
         cause = Cause("current_offset", 1, ("current_offset",), {}, 100.0, 0.5, 1.0, "motor")
         return Findings("cause", (), ("run1.csv",), (1,), causes=(cause,))
 
-    monkeypatch.setattr(bench_trials, "judged", instead)
+    monkeypatch.setattr(benches, "judged", instead)
     return calls
 
 
@@ -195,7 +195,7 @@ def test_what_the_recorder_does_itself_is_no_wrong_name(
         cause = Cause("channel_delay", "sensor", ("channel_delay",), {}, 100.0, 0.5, 1.0, "motor")
         return Findings("cause", (), ("run1.csv",), (1,), causes=(cause,))
 
-    monkeypatch.setattr(bench_trials, "judged", late)
+    monkeypatch.setattr(benches, "judged", late)
     for recorder, wrong in (("ages", ()), ("full", ("channel_delay of sensor",))):
         path = tmp_path / f"{recorder}.jsonl"
         campaign(path, "measured", 5, recorder, FEW, kinds=["nothing"])

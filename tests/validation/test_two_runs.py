@@ -11,7 +11,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.run import JointColumns
 from jtqd.models.files import shipped
-from jtqd.sysid.fit.friction import FitError
+from jtqd.sysid.fit.plateaus import FitError
 from validation.__main__ import main
 from validation.goals.identify import plant_file
 from validation.goals.two_runs import (

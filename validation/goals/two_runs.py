@@ -45,9 +45,8 @@ from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.few_runs import fit_few_runs
-from jtqd.sysid.fit.friction import FitError, student_975
 from jtqd.sysid.fit.losses import LossFitError
-from jtqd.sysid.fit.plateaus import effective_samples
+from jtqd.sysid.fit.plateaus import FitError, effective_samples, student_975
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.planner.campaigns import variable_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS
