@@ -1,4 +1,4 @@
-"""A range of the link's turn that costs something each time the link passes it: a cover that rubs, a cable that pulls.
+"""Events locked to the angle of the link: a range of angle that costs torque per pass (a rubbing cover, a pulling cable).
 
 Where the runs begin at different angles, often one of them only gets there, a few times; then no other run can confirm a
 map over the angle. What confirms it are the other passes: every one deviates, and the rest of the time nothing does. The

@@ -1,4 +1,4 @@
-"""Losses of a joint file as the simulation has them."""
+"""Loss torque of a joint file as the simulation computes it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What runs say of a value that cannot be below zero where their best value is: at most so much, and no cause.
+"""One-sided bounds: the upper limit of a value that cannot be negative while its best fit is zero or below. It is no cause.
 
 A friction or inertia that is far smaller than in the joint file is near the end of what is possible, and noise puts its
 best value beyond it as often as not. Such a value is never named (`guards`): the fit wants more than there can be. What

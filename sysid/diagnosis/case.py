@@ -1,4 +1,4 @@
-"""The runs of a diagnosis with all that effects in them are judged by, and the effects fitted to them."""
+"""The case of a diagnosis: its runs, the statistics by which effects are judged, and the effects fitted to the runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where something shows: one balance of one joint, and a line in it."""
+"""Place of a finding: one balance of one joint, and a spectral line in it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Zero of the current sensor, as read while the power stage is off or the joint rests: an extra row of the regression.
+"""Offset of the current sensor while the power stage is off or the joint rests: an additional row of the regression.
 
 While a joint turns, an offset of the current and an asymmetric friction are the same torque in every sample. With the power
 stage off no current flows, whatever friction does: what is read then is the current sensor's own error, which only effects

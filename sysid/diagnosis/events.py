@@ -1,4 +1,4 @@
-"""Moments at which a channel does what its noise never does, and seconds with a deviating mean for no reason that shows.
+"""Events: moments at which a channel leaves its noise, and seconds whose mean deviates without a visible cause.
 
 Events are no effect of the library, and a least-squares fit gives them more weight than anything else. So they are found
 first in what the causes leave; where there are some, the search is made again without them (`Dataset.without_events`).

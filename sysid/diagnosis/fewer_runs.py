@@ -1,4 +1,4 @@
-"""What fewer runs would have named: more data must not make a diagnosis worse without a word.
+"""Causes that a subset of the runs supports and the full set does not: each is reported with its reason.
 
 Every recording is left out in turn and the others are searched again, by the same rules. An effect that they name and all
 runs together do not is kept where it predicts the held-out runs clearly better, each with the coefficients of the others

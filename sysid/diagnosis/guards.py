@@ -1,4 +1,4 @@
-"""Why an effect that fits is still no cause: what a person would object to before believing it.
+"""Guards: criteria by which an effect that improves the fit is not accepted as a cause.
 
 The search asks whether an effect lowers the deviance of the whitened residual. That is not all: a parameter may lie at the
 end of what is physically possible (where the fit wants more than there can be), two effects may be large and cancel each

@@ -1,4 +1,4 @@
-"""Leave-one-run-out confirmation: with fewer than four runs what is named must hold on each held-out run.
+"""Leave-one-run-out confirmation: with fewer than four runs an accepted effect must hold on each held-out run.
 
 With many runs the sum over held-out runs decides whether an effect is present. With two or three, one run can carry
 that sum,

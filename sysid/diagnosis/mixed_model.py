@@ -1,4 +1,4 @@
-"""Linear mixed model over runs: effects are common to all runs, nuisances (zero, viscous friction, ...) differ.
+"""Linear mixed model over runs: effects are common to all runs, nuisances (offset, viscous friction, ...) differ.
 
     y_r = X_r beta + Z_r u_r + e,   u_r ~ N(0, V),   e ~ N(0, 1) after whitening
 

@@ -1,4 +1,4 @@
-"""Noise of the channels as it is: coloured in time, shared between channels. From residuals to whitened sums.
+"""Noise of the channels: coloured in time and correlated between channels. Residuals become whitened sums.
 
 Each channel's noise is an autoregression (Yule-Walker over the valid stretches, Levinson's recursion); what is left is
 correlated between channels, because one sensor serves all of them, and is weighted by the inverse of its covariance.

@@ -1,4 +1,4 @@
-"""Runs whose channels differ from those of the other runs: another gain, zero or delay than all the rest.
+"""Outlier runs: runs whose channels differ from those of all others in gain, offset or delay.
 
 A loose plug, a sensor zeroed again or another filter of the drive belongs to one run and to no joint. An effect of the joint
 is in all runs, a change from day to day is small; what is in one run alone and beyond any day is that run's:

@@ -1,4 +1,4 @@
-"""Which runs are pieces of one recording: they share its zero, its friction of the day and its mistakes, and count once.
+"""Runs that are segments of one recording: they share its offset, its friction of the day and its errors, and count once.
 
 A run left out shows nothing when another piece of the same recording is still there. Pieces are known by their names
 ("a.csv (2 of 3)", as the reader takes a recording with gaps apart), or by going on where another one ends: stamps,

@@ -1,4 +1,4 @@
-"""What a diagnosis may name: effects that the user leaves out or takes as given, and references that are no sensor's."""
+"""Scope of a diagnosis: effects that the user excludes or declares as present, and references that are no sensor."""
 
 from __future__ import annotations
 

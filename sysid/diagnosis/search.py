@@ -1,4 +1,4 @@
-"""Which effects are there: beam search over the library by BIC, one after another, all refitted jointly.
+"""Search for effects: beam search over the library by BIC, one effect at a time, all refitted jointly.
 
 BIC = deviance of the mixed model + ln(n_eff) per parameter. An effect enters when it lowers BIC by ENTER and when its
 parameters are physically plausible; it stays when nothing that came later replaces it. Held out: the coefficients

@@ -1,4 +1,4 @@
-"""Whether an effect has the same size wherever it acts: what is asked of it in the presence of an unexplained residual.
+"""Stability of an effect over operating conditions: a requirement in the presence of an unexplained residual.
 
 The unexplained residual is no noise: it is neither independent from sample to sample nor the same everywhere, and what
 an effect

@@ -1,4 +1,4 @@
-"""What the causes leave over, and whether it is structure: maps, events, lines that are not noise."""
+"""Unexplained residual: maps, events and lines in it that are not noise."""
 
 from __future__ import annotations
 
