@@ -106,20 +106,11 @@ LogEvent = Callable[[str, int, str], None]
 
 
 class ReturningNodes:
-    """Boots nodes that the loop reports as restarted, that are not operational, that were absent at the start, or for which
-    `request` asks.
+    """Boots nodes that restarted, are not operational, were absent at the start, or for which `request` asks.
 
-    A node that comes back with another scaling than at the start stays out: the loop's factors are those of the start.
-
-    Args:
-        config, bus: as for the first boot.
-        report: report of the first boot; nodes that are booted later are added.
-        start_child: makes a child process from (module, arguments, name).
-        log: takes topic, node and line of an event.
-
-    Attributes:
-        busy: node that is being booted; 0: none.
-        absent: optional nodes that have not been booted yet.
+    A node that comes back with another scaling than at the start stays out: the loop's factors are those of the start. The
+    report of the first boot gets the nodes that are booted later. `busy`: node that is being booted, 0 for none; `absent`:
+    optional nodes that have not been booted yet.
     """
 
     def __init__(
@@ -144,11 +135,7 @@ class ReturningNodes:
         self._in_error: set[int] = set()
 
     def note_error(self, node: int, register: int) -> None:
-        """Take the error register (1001h) of a node's EMCY.
-
-        A drive with an error of communication (a foreign SYNC, a master's heartbeat that it missed) may refuse to be started
-        until it has been reset.
-        """
+        """Take the error register (1001h) of an EMCY: a drive with an error of communication may have to be reset."""
         if register & COMMUNICATION:
             self._in_error.add(node)
         else:
@@ -172,11 +159,7 @@ class ReturningNodes:
     ) -> dict[str, Any] | None:
         """Return the report of a node that has just been configured: {"node": number, ...}. Call often.
 
-        Args:
-            view: last reading of the snapshot.
-            present: whether a node was heard recently; no boot is started for one that is not there.
-            reader: reports to the loop that a node is configured.
-            now_s: CLOCK_MONOTONIC.
+        present: whether a node was heard recently; reader: reports to the loop that a node is configured.
         """
         if self._child is not None:
             running = self._child.alive()  # before its answer is read: the last one is then complete
@@ -188,12 +171,8 @@ class ReturningNodes:
             # Where the loop has counted fewer restarts (it missed a boot-up message), it compares with its own count.
             most, self._restarts = self._restarts + _boot_ups(answer, node), view.restarts[node]
             if view.restarts[node] > most:
-                self._refuse(
-                    node,
-                    f"node {node} restarted during its configuration: configuring again",
-                    now_s,
-                )
-                booted = None
+                text = f"node {node} restarted during its configuration: configuring again"
+                booted = self._refuse(node, text, now_s)
             else:
                 booted = self._accepted(node, answer, now_s)
             if booted is None:
@@ -241,12 +220,10 @@ class ReturningNodes:
 
     def _accepted(self, node: int, answer: dict[str, Any] | None, now_s: float) -> dict[str, Any] | None:
         """Return the node's part of the report, if it may be used."""
-        if answer is None or not answer["ok"]:
-            reason = (
-                "the boot process ended without a report" if answer is None else answer["error"]["message"]
-            )
-            self._refuse(node, f"boot in service: {reason}", now_s)
-            return None
+        if answer is None:
+            return self._refuse(node, "boot in service: the boot process ended without a report", now_s)
+        if not answer["ok"]:
+            return self._refuse(node, f"boot in service: {answer['error']['message']}", now_s)
         now: dict[str, Any] = answer["nodes"][str(node)]
         then = self._report["nodes"].get(str(node))
         if then is None:
@@ -254,13 +231,10 @@ class ReturningNodes:
         for key in ("scaling", "gear_ratio"):
             if now[key] != then[key]:
                 text = f"node {node} has another {key} than at the start: expected {then[key]}, found {now[key]}: not used"
-                self._refuse(node, text, now_s)
-                return None
+                return self._refuse(node, text, now_s)
         if now.get("tpdos") != then.get("tpdos"):
-            self._refuse(
-                node, f"node {node} has other TPDOs than at the start: not used; restart jtqd", now_s
-            )
-            return None
+            text = f"node {node} has other TPDOs than at the start: not used; restart jtqd"
+            return self._refuse(node, text, now_s)
         if now["serial"] != then["serial"]:
             text = f"another device: serial number {now['serial']:08X}h, before {then['serial']:08X}h"
             self._log("boot", node, f"node {node}: {text}")
@@ -271,14 +245,13 @@ class ReturningNodes:
         wrong = gear_ratio_error(self._config, node, now.get("gear_ratio"))
         if wrong is None and as_booted(self._config, {str(node): now}) != self._config:
             wrong = f"node {node} has other TPDOs than expected at the start, when it was absent: not used; restart jtqd"
-        if wrong is None:
-            return now
-        self._refuse(node, wrong, now_s)
-        return None
+        return now if wrong is None else self._refuse(node, wrong, now_s)
 
-    def _refuse(self, node: int, text: str, now_s: float) -> None:
+    def _refuse(self, node: int, text: str, now_s: float) -> dict[str, Any] | None:
+        """Report why the node is not used; return nothing that may be used."""
         if self._limit.admit(text, now_s) is not None:
             self._log("boot", node, text)
+        return None
 
 
 def _boot_ups(answer: dict[str, Any] | None, node: int) -> int:

@@ -32,11 +32,8 @@ _OTHERS = 16
 
 
 class NodeEvent(NamedTuple):
-    """One event of a node.
-
-    `kind`: lost, never, back, doubled and single begin and end conditions, with details in `text`; restarted, state,
-    malformed and foreign are events with a whole line, or "" where there were too many. `since_s`: when.
-    """
+    """One event of a node: lost, never, back, doubled and single begin and end conditions, with details in `text`;
+    restarted, state, malformed and foreign have a whole line, or "" where there were too many."""
 
     kind: str
     node: int
@@ -49,7 +46,6 @@ class _Watch:
         self.state = NOT_WATCHED
         self.heard_s = -inf
         self.since_s = 0.0
-        self.lost_s = 0.0
         self.last_state: int | None = None
         self.window: list[float] = []
         self.doubled = False
@@ -60,9 +56,7 @@ class NodeWatch:
     """Heartbeat consumers of all nodes (CiA 301, 7.2.8.3.2.2), with the boot timeout that the standard lacks.
 
     A node is watched from the moment it is configured. One without a first heartbeat within the timeout is reported as one
-    that stops sending it: a consumer that waits for the first heartbeat would never miss it. A frame that is not one byte,
-    or has an unknown state, is counted as malformed. Two producers with one node-ID show by nearly twice the configured
-    rate.
+    that stops sending it. Two producers with one node-ID show by nearly twice the configured rate.
 
     Args:
         nodes: their node-IDs.
@@ -111,21 +105,19 @@ class NodeWatch:
         if len(data) != 1 or data[0] not in STATES:
             self.malformed += 1
             found = f"{len(data)} bytes" if len(data) != 1 else f"state {data[0]:02X}h"
-            return [self._event("malformed", node, watch, now_s, lambda: f"invalid heartbeat ({found})")]
+            return [self._event("malformed", node, watch, now_s, f"invalid heartbeat ({found})")]
         events = []
         watch.heard_s = now_s
         if data[0] == 0:
             watch.window.clear()
-            events.append(
-                self._event("restarted", node, watch, now_s, lambda: "it has restarted (boot-up message)")
-            )
+            events.append(self._event("restarted", node, watch, now_s, "it has restarted (boot-up message)"))
         elif watch.state == LOST:
             events.append(NodeEvent("back", node, "", now_s))
         if watch.state in (WAITING, LOST):
             watch.state = ACTIVE
         if data[0] and watch.last_state is not None and data[0] != watch.last_state:
             name = STATES[data[0]]
-            events.append(self._event("state", node, watch, now_s, lambda: f"it is {name} now"))
+            events.append(self._event("state", node, watch, now_s, f"it is {name} now"))
         watch.last_state = data[0] or None
         if data[0]:
             events += self._rate(node, watch, now_s)
@@ -136,16 +128,13 @@ class NodeWatch:
         self._ticked_s = now_s
         events = []
         for node, watch in self._watches.items():
-            if (
-                watch.state not in (WAITING, ACTIVE)
-                or now_s - max(watch.heard_s, watch.since_s) <= self._timeout_s
-            ):
+            last_s = max(watch.heard_s, watch.since_s)
+            if watch.state not in (WAITING, ACTIVE) or now_s - last_s <= self._timeout_s:
                 continue
-            never = watch.state == WAITING
-            watch.state, watch.lost_s = LOST, max(watch.heard_s, watch.since_s)
+            kind, text = ("never", " since its boot") if watch.state == WAITING else ("lost", "")
+            watch.state = LOST
             watch.window.clear()
-            kind, text = ("never", " since its boot") if never else ("lost", "")
-            events.append(NodeEvent(kind, node, f"{self._timeout_s:g} s{text}", watch.lost_s))
+            events.append(NodeEvent(kind, node, f"{self._timeout_s:g} s{text}", last_s))
         return events
 
     def _rate(self, node: int, watch: _Watch, now_s: float) -> list[NodeEvent]:
@@ -173,11 +162,11 @@ class NodeWatch:
         return [NodeEvent("foreign", node, line, 0.0)]
 
     @staticmethod
-    def _event(kind: str, node: int, watch: _Watch, now_s: float, text: Callable[[], str]) -> NodeEvent:
+    def _event(kind: str, node: int, watch: _Watch, now_s: float, text: str) -> NodeEvent:
         refused = watch.limit.admit(kind, now_s)
         if refused is None:
             return NodeEvent(kind, node, "", now_s)
-        line = f"node {node}: {text()}" + (f" ({refused} more before)" if refused else "")
+        line = f"node {node}: {text}" + (f" ({refused} more before)" if refused else "")
         return NodeEvent(kind, node, line, now_s)
 
 
@@ -217,9 +206,8 @@ def checks_of(node: Mapping[str, Any]) -> list[Check]:
     checks = []
     for index, subindex, value in node["watched"]:
         mask = _ALL
-        if (
-            index in _COB_IDS and subindex == 1
-        ):  # bit 30 is the device's own; of a PDO that is off nothing else matters
+        if index in _COB_IDS and subindex == 1:
+            # bit 30 is the device's own; of a PDO that is off nothing else matters
             mask = _INVALID if value & _INVALID else _CAN_ID | _INVALID
         checks.append(Check(index, subindex, mask, value & mask))
     if node["gear_ratio"] is not None:
@@ -232,15 +220,10 @@ class ConfigurationWatch:
 
     1020h, where a node has it, shows a write to its configuration: it holds the signature of the boot until then (CiA 301).
     It need not cover the scaling, and a value may change by other ways than an SDO. So all objects on which the meaning of
-    its PDOs depends are read cyclically (`jtqd.drivers.boot_node`): COB-ID, transmission type and mapping of the TPDOs,
-    rated current, encoder resolutions, gear ratio, the sensor's unit and decimals. Every `SIGNATURE_EVERY`th reading is
-    that of the signature.
+    its PDOs depends are read cyclically (`jtqd.drivers.boot_node`); every `SIGNATURE_EVERY`th reading is the signature's.
 
-    A signature that is gone while these are unchanged (the commander maps RPDOs) is logged once. The mode of operation that
-    a drive displays (6061h) does not affect the estimate; a change of it is logged.
-
-    Args:
-        report: the node's part of the boot report.
+    A signature that is gone while these are unchanged (the commander maps RPDOs) is logged once, and so is a change of the
+    displayed mode of operation (6061h), which does not affect the estimate.
     """
 
     def __init__(self, report: Mapping[str, Any]) -> None:
@@ -257,12 +240,7 @@ class ConfigurationWatch:
         return self._objects[self._position]
 
     def result(self, value: bytes | None, refusal: int | None = None) -> ConfigurationMismatch | None:
-        """Take the value of the object named by `next`; return the mismatch, or None.
-
-        Args:
-            value: of the object; None where there was none.
-            refusal: abort code of a node that refused; None with `value` None: no answer.
-        """
+        """Take the value of the object named by `next`, or the abort code of the refusal; return the mismatch, or None."""
         check = self.next()
         self._turn += 1
         if check is not self._signature:
@@ -310,17 +288,10 @@ _SDO_TIMEOUT_S = 0.3
 
 
 class NodeCare:
-    """Call `turn` often, and the other methods for what arrives.
+    """Boots, presence and configuration of the nodes: call `turn` often, and the other methods for what arrives.
 
-    Args:
-        nodes: silence of each node-ID after which an SDO request is repeated [s].
-        reader: reports to the loop which nodes are configured.
-        returning: boots nodes.
-        heartbeats: of the nodes, watched from their boot on.
-        log: takes topic, node and line of an event.
-
-    Attributes:
-        changed: nodes that are configured otherwise than at their boot, and how that shows.
+    nodes: silence of each node-ID after which an SDO request is repeated [s]. `changed`: nodes that are configured otherwise
+    than at their boot, and how that shows.
     """
 
     def __init__(
@@ -383,13 +354,9 @@ class NodeCare:
 
     def sdo_counts(self, node: int) -> dict[str, int]:
         """Return the counts of SDO requests repeated, unanswered and refused, and of unrelated answers."""
-        queue = self._queues[node]
-        return {
-            "repeats": queue.repeats,
-            "silences": queue.timeouts,
-            "refusals": queue.refusals,
-            "ignored": queue.ignored,
-        }
+        q = self._queues[node]
+        counts = q.repeats, q.timeouts, q.refusals, q.ignored
+        return dict(zip(("repeats", "silences", "refusals", "ignored"), counts, strict=True))
 
     def _watch_nodes(self, view: View, now_s: float) -> None:
         """Boot nodes that need it, poll their presence, and check the configuration of the others."""
@@ -413,9 +380,8 @@ class NodeCare:
             self._check_one(view, now_s)
 
     def _present(self, node: int, now_s: float) -> bool:
-        return self._present_until.get(node, 0.0) > now_s or self._heartbeats.heard_within(
-            node, _PRESENT_S, now_s
-        )
+        answered = self._present_until.get(node, 0.0) > now_s
+        return answered or self._heartbeats.heard_within(node, _PRESENT_S, now_s)
 
     def _others_talk_to(self, node: int, now_s: float) -> bool:
         return now_s < self._others_until.get(node, 0.0)

@@ -9,16 +9,16 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from math import inf, isfinite, nan
+from operator import or_
 
 from jtqd.daemon.config import Config
-from jtqd.daemon.core import estimate_pdo
-from jtqd.daemon.core.estimate_pdo import field
+from jtqd.daemon.core.estimate_pdo import contact_field, field
 from jtqd.daemon.shared.conditions import Change
 from jtqd.daemon.shared.counters import OBJECT_2200, RECORDER_LOST
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
-from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader
+from jtqd.daemon.shared.snapshot import NO_ZEROS, SnapshotReader, View
 from jtqd.drivers.boot_node import signature
 from jtqd.drivers.emcy import COMMUNICATION, EMCY, GENERIC, NO_ERROR, ErrorHistory
 from jtqd.drivers.object_dictionary import ObjectStore, SdoServer
@@ -44,12 +44,7 @@ _MS_TO_INHIBIT = 10
 
 
 class OwnNode:
-    """Object dictionary and SDO server.
-
-    Args:
-        store: object dictionary from jtqd.eds, or from jtqd4.eds with more than two joints (`own_sheet`).
-        config: configuration in force; its joints' parameters are readable in 2202h, 2203h, 2208h, 2209h.
-        reader: snapshot of the loop.
+    """Object dictionary (`store`, from the EDS of `own_sheet`) and SDO server.
 
     Attributes:
         recorder_lost: cycles that are in no log.
@@ -59,9 +54,7 @@ class OwnNode:
     """
 
     def __init__(self, store: ObjectStore, config: Config, reader: SnapshotReader) -> None:
-        self._reader = reader
-        self._store = store
-        self._server = SdoServer(store)
+        self._reader, self._store, self._server = reader, store, SdoServer(store)
         self._last_cycle, self._last_change = -1, time.monotonic()
         self.recorder_lost = self._asked = 0
         self.bus: Callable[[], tuple[int, ...]] = lambda: (0,) * len(BUS_FIELDS)
@@ -90,12 +83,11 @@ class OwnNode:
             store.on_read(0x2100, joint + 1, partial(self._field, joint, 0))
             store.on_read(0x2101, joint + 1, partial(self._field, joint, 1))
             store.on_read(0x2104, joint + 1, partial(self._latched, joint))
-        for pair, index in zip(range(0, self._room, 2), (0x2102, 0x2105), strict=False):
-            store.on_read(index, 0, partial(self._statuses, pair))
-        for joint in range(self._room):
             store.on_read(0x2106, joint + 1, partial(self._contact, joint, 0))
-        for pair, index in zip(range(0, self._room, 2), (0x2107, 0x2108), strict=False):
-            store.on_read(index, 0, partial(self._contacts, pair))
+        pairs = zip(range(0, self._room, 2), (0x2102, 0x2105), (0x2107, 0x2108), strict=False)
+        for pair, statuses, contacts in pairs:
+            store.on_read(statuses, 0, partial(self._nibbles, self._field, pair, 2))
+            store.on_read(contacts, 0, partial(self._nibbles, self._contact, pair, 1))
         store.on_read(0x2103, 0, lambda: self._reader.read().sync_counter)
         store.on_read(0x2110, 0, lambda: int(self._asked > self._reader.resets_done))
         store.on_write(0x2110, 0, self._reset)
@@ -125,31 +117,32 @@ class OwnNode:
         if joint >= self._joints:
             return field(nan, inf, OFF)[part]
         view = self._reader.read()
-        if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
-            return field(nan, inf, STALE)[part]  # the loop stands still: its last estimate is old
+        if self._stands_still(view):
+            return field(nan, inf, STALE)[part]
         last = view.joints[joint]
         return field(last.torque_nm, last.sigma_nm, last.status)[part]
 
-    def _statuses(self, pair: int) -> int:
-        """Return the status byte of the PDO that begins with joint `pair`."""
-        return self._field(pair, 2) | self._field(pair + 1, 2) << 4
+    def _stands_still(self, view: View) -> bool:
+        """Return whether the loop's last estimate is old."""
+        return view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S
+
+    @staticmethod
+    def _nibbles(part_of: Callable[[int, int], int], pair: int, part: int) -> int:
+        """Return the byte of status or contact of the PDO that begins with joint `pair`."""
+        return part_of(pair, part) | part_of(pair + 1, part) << 4
 
     def _contact(self, joint: int, part: int) -> int:
         """Return torque rate (0) or code (1) of a joint as in the contact PDO."""
         if joint >= self._joints or not self._watches:
-            return estimate_pdo.contact_field(nan, nan, CONTACT_OFF)[part]
+            return contact_field(nan, nan, CONTACT_OFF)[part]
         view = self._reader.read()
-        if view.cycle == self._last_cycle and time.monotonic() - self._last_change > _STANDSTILL_S:
-            return estimate_pdo.contact_field(nan, nan, CONTACT_UNKNOWN)[part]
+        if self._stands_still(view):
+            return contact_field(nan, nan, CONTACT_UNKNOWN)[part]
         last = view.joints[joint]
         code = CONTACT_NONE if last.input_flags & FLAG_CONTACT_KNOWN else CONTACT_UNKNOWN
         if last.input_flags & FLAG_CONTACT:
             code = CONTACT_PRESENT
-        return estimate_pdo.contact_field(last.torque_rate_nm_s, last.contact_nm, code)[part]
-
-    def _contacts(self, pair: int) -> int:
-        """Return the contact byte of the PDO that begins with joint `pair`."""
-        return self._contact(pair, 1) | self._contact(pair + 1, 1) << 4
+        return contact_field(last.torque_rate_nm_s, last.contact_nm, code)[part]
 
     def _latched(self, joint: int) -> int:
         """Return the latched bits of `daemon/shared/cycle_record.py`."""
@@ -203,7 +196,7 @@ class OwnNode:
                 store.set_number(index, sub, value)
 
 
-# Its errors ----
+# Its errors ------------------------------------------------------------------------------------------------------------
 
 _FIELD = struct.Struct("<HHB")
 _INHIBIT = 0x1015
@@ -228,10 +221,7 @@ class OwnErrors:
         byte  7     joints concerned: bit 0 joint 1, bit 1 joint 2
 
     Between two messages passes the inhibit time 1015h. Errors that occur meanwhile wait, in order; one that has ended before
-    its message could be sent has none, but it is in the history.
-
-    Args:
-        store: its object dictionary; 1001h, 1003h and 1015h are kept and read there.
+    its message could be sent has none, but it is in the history (1003h of `store`).
     """
 
     def __init__(self, store: ObjectStore) -> None:
@@ -286,12 +276,10 @@ class OwnErrors:
             self._queue.pop(error, None)
         return True
 
-    def report_once(
-        self, code: int, detail: int = 0, *, joints: int = 0, register: int = COMMUNICATION
-    ) -> None:
+    def report_once(self, code: int) -> None:
         """Report a single occurrence, such as a recovery from bus-off: an EMCY message and a history entry."""
-        if self.report(code, detail, joints=joints, register=register):
-            del self._present[code, detail]
+        if self.report(code):
+            del self._present[code, 0]
             self._store.set_number(0x1001, 0, self.register)
 
     def tick(self, now_s: float) -> bytes | None:
@@ -312,7 +300,4 @@ class OwnErrors:
     @property
     def register(self) -> int:
         """Return the error register 1001h."""
-        register = 0
-        for bits, _ in self._present.values():
-            register |= bits
-        return register
+        return reduce(or_, (bits for bits, _ in self._present.values()), 0)

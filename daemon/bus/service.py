@@ -18,6 +18,7 @@ from jtqd.daemon.bus.own_node import OwnErrors, OwnNode
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import THE_BUS, Conditions, Subject
 from jtqd.daemon.shared.events import RateLimit
+from jtqd.daemon.shared.runtime_dir import write_whole
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy, nmt
 from jtqd.drivers.bus_socket import CanFilter, exact
@@ -45,21 +46,17 @@ _OVERFLOW, _WARNING_BITS, _PASSIVE_BITS, _ACTIVE_BIT = 0x03, 0x0C, 0x30, 0x40
 
 
 class BusChange(NamedTuple):
-    """The state has changed from `before` to `after`."""
+    """The state has changed."""
 
     before: int
     after: int
 
 
 class BusState:
-    """State of the CAN controller and counts of one interface, from the error messages of its driver (linux/can/error.h).
+    """State of the CAN controller and `counts` by the names of `BUS_FIELDS`, from error messages of its driver.
 
-    The kernel's driver sends them as frames with CAN_ERR_FLAG to sockets that ask for them: error warning, error passive,
-    bus-off and restart, lost arbitration, missing acknowledge, protocol errors, overruns, and where it can the two error
-    counters. vcan and the unix hub make none, but carry those that a node sends.
-
-    Attributes:
-        counts: by the names of `BUS_FIELDS`.
+    The kernel's driver sends them as frames with CAN_ERR_FLAG to sockets that ask for them (linux/can/error.h). vcan and
+    the unix hub make none, but carry those that a node sends.
     """
 
     def __init__(self) -> None:
@@ -138,8 +135,7 @@ class _Node:
 class EmcyLog:
     """EMCY messages of these nodes: the last one of each, how many, and few lines. Those of other nodes are ignored.
 
-    There is a line at once for the first message of a code; repetitions are counted and mentioned in the next line, so that
-    a storm is a few lines in five seconds.
+    There is a line at once for the first message of a code; repetitions are counted and mentioned in the next line.
     """
 
     def __init__(self, nodes: Iterable[int]) -> None:
@@ -170,60 +166,6 @@ class EmcyLog:
 
 FILE = "bus.json"
 _HEARTBEATS = ("not watched", "awaited", "heard", "lost")
-
-
-class BusReport:
-    """Keeps `bus.json` in `directory`: the bus as the supervisor sees it, replaced as a whole when it has changed.
-
-        {"state": "error active", "counts": {2205h by name}, "foreign_nmt": 0,
-         "nodes": {"1": {"heartbeat": "heard", "emcy": 2, "last_emcy": "EMCY 2310h (...)", "absent": false, "sdo": {...}}},
-         "errors": [{"code": "8250h", "name": "RPDO timeout", "detail": "181h"}], "error_register": 17}
-
-    A write that fails is ignored, as nothing depends on the file.
-    """
-
-    def __init__(self, directory: Path) -> None:
-        self._path = directory / FILE
-        self._new = directory / (FILE + ".new")
-        self._last = ""
-
-    def write(self, service: BusService) -> None:
-        """Replace the file when something has changed."""
-        text = json.dumps(content(service))
-        if text == self._last:
-            return
-        with suppress(OSError):
-            self._new.write_text(text, encoding="utf-8")
-            self._new.chmod(0o640)
-            self._new.replace(self._path)
-            self._last = text
-
-
-def content(service: BusService) -> dict[str, Any]:
-    """Return the content of `bus.json` as plain data."""
-    nodes = {}
-    for node, state in service.heartbeats.states().items():
-        last = service.emergencies.last(node)
-        nodes[str(node)] = {
-            "heartbeat": _HEARTBEATS[state],
-            "emcy": service.emergencies.count_of(node),
-            "last_emcy": None if last is None else describe(last),
-            "absent": node in service.returning.absent,
-            "sdo": service.care.sdo_counts(node),
-        }
-    errors = [
-        {"code": f"{code:04X}h", "name": name_of(code), "detail": f"{detail:03X}h"}
-        for code, detail in service.errors.present
-    ]
-    return {
-        "state": STATE_NAMES[service.bus.state],
-        "counts": {name: value for name, value in service.bus.counts.items() if name != "state"},
-        "foreign_nmt": service.foreign_nmt,
-        "malformed_heartbeats": service.heartbeats.malformed,
-        "nodes": nodes,
-        "errors": errors,
-        "error_register": service.errors.register,
-    }
 
 
 _BATCHES = 8
@@ -265,6 +207,12 @@ def nodes_of(config: Config) -> list[int]:
     ]
 
 
+def node_subjects(config: Config) -> dict[int, Subject]:
+    """Return every node of the configuration, by its node-ID."""
+    joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
+    return {node: Subject(f"node {node}", node, joints.get(node, 0), node) for node in nodes_of(config)}
+
+
 def sdo_timeouts_s(config: Config) -> dict[int, float]:
     """Return the silence of each node after which an SDO request is repeated."""
     timeouts_ms = {joint.node_id: joint.sdo_timeout_ms for joint in config.joints}
@@ -278,14 +226,13 @@ class BusService:
 
     Args:
         socket: frame socket with `service_filters` and error messages.
-        config: in force.
-        report: of the first boot.
+        config, report: in force, and of the first boot.
         reader: snapshot of the loop.
         store: object dictionary of the own node.
         returning: boots nodes in service.
         conditions: updated from here; each change of one that has a code is an EMCY.
         log: takes topic, node and line of an event.
-        directory: where `bus.json` is kept up to date; None: nowhere.
+        directory: where `bus.json` is kept up to date, for `jtq status`; None: nowhere.
     """
 
     def __init__(
@@ -304,8 +251,7 @@ class BusService:
         self.socket = socket
         self._config, self._log, self._conditions = config, log, conditions
         nodes = nodes_of(config)
-        joints = {joint.node_id: 1 << n for n, joint in enumerate(config.joints)}
-        self._subjects = {node: Subject(f"node {node}", node, joints.get(node, 0), node) for node in nodes}
+        self._subjects = node_subjects(config)
         self.bus, self.emergencies = BusState(), EmcyLog(nodes)
         self.heartbeats = NodeWatch(
             tuple(nodes),
@@ -316,11 +262,8 @@ class BusService:
         self.errors = OwnErrors(store)
         conditions.subscribe(self.errors.follow)
         self.own = OwnNode(store, config, reader)
-        self.own.bus, self.own.nodes, self.own.emergencies = (
-            self.bus.values,
-            lambda node: self.care.state(node, self._view),
-            self._emergency,
-        )
+        self.own.bus, self.own.emergencies = self.bus.values, self._emergency
+        self.own.nodes = lambda node: self.care.state(node, self._view)
         self.returning = returning
         self.care = NodeCare(sdo_timeouts_s(config), reader, returning, self.heartbeats, log)
         self._limit = RateLimit()
@@ -329,8 +272,33 @@ class BusService:
         self.foreign_nmt = 0
         self._heard = False
         self._refused_calls = 0
-        self._report = None if directory is None else BusReport(directory)
+        self._directory, self._written = directory, ""
         self._first = report
+
+    def content(self) -> dict[str, Any]:
+        """Return the content of `bus.json`."""
+        nodes = {}
+        for node, state in self.heartbeats.states().items():
+            last = self.emergencies.last(node)
+            nodes[str(node)] = {
+                "heartbeat": _HEARTBEATS[state],
+                "emcy": self.emergencies.count_of(node),
+                "last_emcy": None if last is None else describe(last),
+                "absent": node in self.returning.absent,
+                "sdo": self.care.sdo_counts(node),
+            }
+        return {
+            "state": STATE_NAMES[self.bus.state],
+            "counts": {name: value for name, value in self.bus.counts.items() if name != "state"},
+            "foreign_nmt": self.foreign_nmt,
+            "malformed_heartbeats": self.heartbeats.malformed,
+            "nodes": nodes,
+            "errors": [
+                {"code": f"{code:04X}h", "name": name_of(code), "detail": f"{detail:03X}h"}
+                for code, detail in self.errors.present
+            ],
+            "error_register": self.errors.register,
+        }
 
     def begin(self, now_s: float) -> None:
         """Start the service when the nodes are operational; drop frames of the boot except EMCY and own requests."""
@@ -374,10 +342,13 @@ class BusService:
                 message = self.errors.tick(now_s)
                 if message is not None:
                     self.socket.send(pack(0x080 + self._config.node_id, message))
-        if now_s >= self._report_due:
+        if self._directory is not None and now_s >= self._report_due:
             self._report_due = now_s + _REPORT_S
-            if self._report is not None:
-                self._report.write(self)
+            text = json.dumps(self.content())
+            if text != self._written:
+                with suppress(OSError):  # nothing depends on the file
+                    write_whole(self._directory / FILE, text)
+                    self._written = text
 
     # Frames ---------------------------------------------------------------------------------------------------------------
 
@@ -467,11 +438,8 @@ class BusService:
                 name, present = _NODE_CONDITIONS[kind]
                 subject = self._subjects[node]
                 self._conditions.update(name, subject, present, now_s, text, since_s=since_s)
-            if (
-                kind in _NODE_LINES
-                and text
-                and not (kind in ("restarted", "state") and node == self.returning.busy)
-            ):
+            of_boot = kind in ("restarted", "state") and node == self.returning.busy
+            if kind in _NODE_LINES and text and not of_boot:
                 self._log("heartbeat", node, text)
 
     # Own node ----------------------------------------------------------------------------------------------

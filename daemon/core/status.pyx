@@ -18,7 +18,7 @@ The statuses have an order, from good to bad:
   had to wait) waits twice as long each time, at most MOST times as long: an input that comes and goes makes a joint that is
   stale, not one that flickers. A single lost frame costs little.
 - A fault that is latched (`safety.latch`) stays until `reset_latch()`: its status, or a worse one, is published whatever
-  the inputs say. Status 5, 4 or 15, see `jtqd.daemon.shared.faults.status_of`.
+  the inputs say. Status 5, 4 or 15 (`_status_of`).
 
 No clock and no randomness: the same statuses and faults give the same answer again, in the loop and from a log.
 """
@@ -79,7 +79,7 @@ cdef int _worse(int a, int b) noexcept nogil:
 
 
 cdef int _status_of(int latched) noexcept nogil:
-    """Return the status that is published while these faults are latched, as `faults.status_of`."""
+    """Return the status that is published while these faults are latched."""
     if latched & FAULT_DRIVE:
         return DRIVE_FAULT
     return STALE if latched == FAULT_STALE else INVALID

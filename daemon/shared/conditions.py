@@ -1,15 +1,10 @@
 """Conditions: what is wrong at present with a joint, a node, a PDO, the bus, the loop, the recorder or the machine.
 
-`CATALOGUE` is the one list of everything that jtqd reports as present for some time, with its severity, its text and its
-EMCY code. The supervisor's parts observe and call `Conditions.update`; everybody else sees a view of the same set:
-
-    journal, standard error, /events    a line when a condition begins and when it ends (`Conditions.lines`)
-    EMCY, 1001h, 1003h                  `Conditions.subscribe`, each change at once
-    conditions.json                     `present()`, for `jtq status`, `jtq check`, the recorder's and live /diagnostics
-    metrics, final summary              `present()`, `history()`
-
-What only happens (a boot-up message, an EMCY of a node, an NMT command of somebody else) is no condition but an event
-(`jtqd.daemon.shared.events`).
+`CATALOGUE` is the one list of everything that jtqd reports as present for some time. The supervisor's parts observe and
+call `Conditions.update`; everybody else sees a view of the same set: lines in journal and /events (`lines`), EMCY, 1001h
+and 1003h (`subscribe`), `conditions.json` for `jtq status`, `jtq check` and /diagnostics (`present`), metrics and summary
+(`history`). What only happens (a boot-up message, an EMCY of a node, an NMT command of somebody else) is an event
+(`events`).
 
 >>> conditions = Conditions()
 >>> drive = Subject("node 2", 2, joints=0b10)
@@ -24,7 +19,6 @@ What only happens (a boot-up message, an EMCY of a node, an NMT command of someb
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -33,6 +27,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from jtqd.daemon.shared.events import ERROR, INFO, WARNING
+from jtqd.daemon.shared.runtime_dir import write_whole
 
 FILE = "conditions.json"
 """Name of the file in the runtime directory of a daemon."""
@@ -64,31 +59,28 @@ class Emcy(NamedTuple):
 
 @dataclass(frozen=True)
 class Definition:
-    """One row of the catalogue.
-
-    Attributes:
-        name: as in files, metrics and docs.
-        about: what it is about (`JOINT` .. `MACHINE`).
-        severity: INFO, WARNING or ERROR of `jtqd.daemon.shared.events`.
-        text: one sentence in the present tense; {} takes the details.
-        ended: text of the line at its end, before "after 2.3 s"; "" where an event reports it.
-        topic: of the event that a line becomes (`jtqd.daemon.shared.events.Notice`).
-        emcy: of the EMCY messages of its begin and end; None: none.
-        hold_s: a change that does not last so long is none.
-        repeat_s: while it is present, its line comes again so often; such lines have a rate limit of their own.
-        logged: a line when it begins and when it ends; not where another condition or an event has the same line.
-    """
+    """One row of the catalogue."""
 
     name: str
+    """As in files, metrics and docs."""
     about: str
+    """JOINT .. MACHINE."""
     severity: int
+    """INFO, WARNING or ERROR of `events`."""
     text: str
+    """One sentence in the present tense; {} takes the details."""
     ended: str = ""
+    """Text of the line at its end, before "after 2.3 s"; "" where an event reports it."""
     topic: str = "input"
+    """Of the event that a line becomes (`events.Notice`)."""
     emcy: Emcy | None = None
+    """Of the EMCY messages of its begin and end; None: none."""
     hold_s: float = 0.0
+    """A change that does not last so long is none."""
     logged: bool = True
+    """A line when it begins and when it ends; not where another condition or an event has the same line."""
     repeat_s: float = inf
+    """While it is present, its line comes again so often; such lines have a rate limit of their own."""
 
 
 _HOLD_S = 0.1
@@ -221,8 +213,8 @@ class Line(NamedTuple):
     def rate_class(self) -> str:
         """Lines of one class share a rate limit; "": none.
 
-        A fault of a joint may come and go with its cable: few lines of each joint reach the operator. What waits for the
-        operator is not limited with them.
+        A fault may come and go with its cable: few lines of each joint. What waits for the operator is not limited with
+        them.
         """
         if self.definition.about not in (JOINT, PDO):
             return ""
@@ -243,8 +235,7 @@ class Occurrences(NamedTuple):
 class _State:
     """State of one condition of one subject, and the lines that are due.
 
-    A begin sooner than QUIET_S after the last line about one is reported together with its end, or with those that
-    follow: neither a flicker nor a flapping contact floods the log.
+    A begin sooner than QUIET_S after the last line about one is reported together with its end, or with those that follow.
     """
 
     def __init__(self, definition: Definition, subject: Subject) -> None:
@@ -257,7 +248,7 @@ class _State:
         self._unlogged, self._unlogged_s = 0, 0.0
         self._logged, self._not_before_s = False, -inf
         self._repeat_s = inf
-        self._again = False
+        self.again = False
         self._texts: dict[str, float] = {}
 
     def update(self, reading: bool, now_s: float, since_s: float) -> bool:
@@ -268,31 +259,18 @@ class _State:
             return False
         self.present = reading
         if reading:
-            self.since_s, self.count, self._unlogged = (
-                self._reading_since_s,
-                self.count + 1,
-                self._unlogged + 1,
-            )
+            self.since_s, self.count = self._reading_since_s, self.count + 1
+            self._unlogged += 1
             self.first_s = self.first_s if self.count > 1 else self.since_s
         else:
             lasted_s = self._reading_since_s - self.since_s
             self.total_s, self._unlogged_s = self.total_s + lasted_s, self._unlogged_s + lasted_s
         return True
 
-    def describe(self, text: str, *, again: bool = False) -> None:
-        """Take the text that holds now; `again`: worth another line."""
-        self._again = self._again or again
-        self.text = text
-
     def no_end_line(self) -> None:
         """Suppress the line at its end, because another line reports it."""
-        self._logged = self._again = False
+        self._logged = self.again = False
         self._unlogged, self._unlogged_s = 0, 0.0
-
-    def _may_repeat(self, now_s: float) -> bool:
-        """Return whether a present condition may have another line: with details that no recent line had."""
-        self._texts = {text: at_s for text, at_s in self._texts.items() if now_s - at_s < QUIET_S}
-        return self._again and self.text not in self._texts
 
     def line(self, now_s: float) -> Line | None:
         """Return the line that is due, if any."""
@@ -301,9 +279,12 @@ class _State:
             return None
         may = now_s >= self._not_before_s
         if self.present:
-            if not (self._may_repeat(now_s) or now_s >= self._repeat_s if self._logged else may):
+            if self._logged:  # another line only with details that no recent line had
+                self._texts = {text: at_s for text, at_s in self._texts.items() if now_s - at_s < QUIET_S}
+                may = (self.again and self.text not in self._texts) or now_s >= self._repeat_s
+            if not may:
                 return None
-            self._logged, self._again, self._not_before_s = True, False, now_s + QUIET_S
+            self._logged, self.again, self._not_before_s = True, False, now_s + QUIET_S
             self._repeat_s = now_s + definition.repeat_s
             self._texts[self.text] = now_s
             return Line(definition, self.subject, definition.severity, f"{self.subject.name}: {self.text}")
@@ -348,10 +329,7 @@ class Conditions:
         """Take what a part has observed; call it with every reading or with every change.
 
         Args:
-            name: of the catalogue.
-            subject: what it is about.
-            present: as observed.
-            now_s: time of the observation.
+            name, subject, present, now_s: condition of the catalogue as observed at this time.
             details: for the text's {}; a function is asked only where the text is needed.
             since_s: when it began or ended, where that is known better than by `now_s`.
             log_again: although it is present already, these details are worth another line.
@@ -366,7 +344,8 @@ class Conditions:
         changed = state.update(present, now_s, now_s if since_s is None else since_s)
         if state.present and present:
             text = details() if callable(details) else details
-            state.describe(state.definition.text.format(text), again=log_again and not changed)
+            state.text = state.definition.text.format(text)
+            state.again |= log_again and not changed
         if not changed:
             return
         if superseded and not state.present:
@@ -381,15 +360,10 @@ class Conditions:
     def present(self) -> list[Condition]:
         """Return every present condition, the worst first, then the oldest."""
         found = [
-            Condition(
-                state.definition.name,
-                state.subject.name,
-                state.definition.severity,
-                state.text,
-                round(state.since_s * 1e9),
-            )
+            Condition(d.name, state.subject.name, d.severity, state.text, round(state.since_s * 1e9))
             for state in self._states.values()
             if state.present
+            for d in (state.definition,)
         ]
         return sorted(found, key=lambda each: (-each.severity, each.since_ns))
 
@@ -401,15 +375,10 @@ class Conditions:
     def history(self, now_s: float) -> list[Occurrences]:
         """Return every condition that was present at any time, in the order of the first time."""
         found = [
-            Occurrences(
-                state.definition.name,
-                state.subject.name,
-                state.count,
-                state.total_s + (now_s - state.since_s if state.present else 0.0),
-                state.first_s,
-            )
-            for state in self._states.values()
+            Occurrences(name, subject, state.count, state.total_s + lasts_s, state.first_s)
+            for (name, subject), state in self._states.items()
             if state.count
+            for lasts_s in (now_s - state.since_s if state.present else 0.0,)
         ]
         return sorted(found, key=lambda each: each.first_s)
 
@@ -418,7 +387,7 @@ class ConditionsFile:
     """Keeps `conditions.json` in `directory` up to date; write errors are ignored, as nothing depends on the file."""
 
     def __init__(self, directory: Path) -> None:
-        self._path, self._new = directory / FILE, directory / (FILE + ".new")
+        self._path = directory / FILE
         self._last: Sequence[Condition] | None = None
 
     def write(self, present: Sequence[Condition]) -> None:
@@ -427,10 +396,7 @@ class ConditionsFile:
             return
         with suppress(OSError):
             rows = [asdict(each) for each in present]
-            with open(self._new, "w", encoding="utf-8") as file:
-                os.fchmod(file.fileno(), 0o640)
-                json.dump({"schema": SCHEMA, "conditions": rows}, file)
-            self._new.replace(self._path)
+            write_whole(self._path, json.dumps({"schema": SCHEMA, "conditions": rows}))
             self._last = present
 
 

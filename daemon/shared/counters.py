@@ -27,21 +27,16 @@ class Shown(Flag):
 
 
 class Counter(NamedTuple):
-    """One counter.
-
-    Attributes:
-        name: in every view.
-        sub: sub-index of object 2200h; 0: not there. Receivers know a counter by it: it never changes, a new one comes last.
-        text: what is counted.
-        shown: views with a selection.
-        is_maximum: a largest value in place of a count.
-    """
+    """One counter, by the same name in every view."""
 
     name: str
     sub: int
+    """Sub-index of object 2200h; 0: not there. Receivers know a counter by it: it never changes, a new one comes last."""
     text: str
+    """What is counted."""
     shown: Shown = Shown.NOWHERE
     is_maximum: bool = False
+    """A largest value in place of a count."""
 
 
 _BUS_STATUS: Final = Shown.BUS | Shown.STATUS
@@ -79,11 +74,11 @@ TABLE: Final = (
     *(
         Counter(
             f"fault_{faults.NAMES[bit]}",
-            _FIRST_FAULT_SUB + n,
+            sub,
             f"faults that began: {faults.MEANINGS[bit]}",
             Shown.SUMMARY_TORQUE,
         )
-        for n, bit in enumerate(faults.COUNTED)
+        for sub, bit in enumerate(faults.COUNTED, start=_FIRST_FAULT_SUB)
     ),
     Counter("latches", 35, "faults that were latched", Shown.STATUS | Shown.SUMMARY_TORQUE),
     Counter("latch_resets", 36, "joints whose latched faults a reset released", Shown.SUMMARY_TORQUE),

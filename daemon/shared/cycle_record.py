@@ -16,13 +16,14 @@ The ring of records: `Ring`.
 from __future__ import annotations
 
 import mmap
-import os
 import re
 import struct
 from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
+
+from jtqd.daemon.shared.runtime_dir import new_memory
 
 MOST_JOINTS: Final = 4
 """Joints of one bus: two estimate PDOs of two each."""
@@ -82,8 +83,7 @@ FLAG_POSITION, FLAG_MOTION, FLAG_SENSOR, FLAG_TEMPERATURE = 1, 2, 4, 8
 """`input_flags` of record and snapshot: TPDO1, TPDO2 and the sensor's PDO are of this cycle; the temperature is known."""
 FLAG_NETWORK_SKIPPED, FLAG_LATCHED = 0x10, 0x20
 FLAG_CONTACT_KNOWN, FLAG_CONTACT = 0x40, 0x80
-"""... no time for the network; a fault is latched; contacts are watched and known; there is one. Bits 8 to 15: low byte of
-the faults below."""
+"""... no time for the network; a fault is latched; contacts are watched and known; there is one."""
 TEMPERATURE_LIFE_S = 2.0
 """Four frames in a row are missing then; a joint needs minutes to become noticeably warmer."""
 
@@ -143,10 +143,8 @@ class JointRecord(NamedTuple):
     status: int
     sensor_status: int
     input_flags: int
-    """Bit n set: input n of this joint (0 TPDO1, 1 TPDO2, 2 sensor) is of this cycle; bit 3: temperature_c is known; bit 4:
-    no time for the network; bit 5: a fault is latched; bit 6: whether there is a contact is known; bit 7: there
-    is; bits 8 to 15: the faults (`faults.py`) for which there is no torque: of this cycle, of one not long ago, or
-    latched."""
+    """The flags FLAG_POSITION to FLAG_CONTACT; bits 8 to 15: the faults (`faults.py`) for which there is no torque: of this
+    cycle, of one not long ago, or latched."""
 
 
 def selection(header: Collection[str], joint: Collection[str], joints: int) -> struct.Struct:
@@ -194,38 +192,19 @@ class RingError(Exception):
 
 
 class Ring:
-    """Writer's side: memory that the loop fills (`daemon/core/record.pyx`).
+    """Writer's side: memory of `slots` records that the loop fills (`daemon/core/record.pyx`), in a new file on a tmpfs.
 
-    Args:
-        path: new file on a tmpfs; an older one is replaced, and its reader keeps the old memory.
-        slots: number of records kept.
-        record_size: bytes of one record.
-
-    Attributes:
-        words: 64-bit words of the header page.
-        records: memory of all records.
-        size: number of records kept.
+    The file holds a header page (64-bit `words`) and the `records`. The writer fills the slot of record n and then stores n
+    + 1 as the count; it overwrites the oldest record when the reader is slow or gone.
     """
 
     def __init__(self, path: Path, slots: int, record_size: int) -> None:
-        self._memory = _created(path, slots, record_size)
-        view = memoryview(self._memory)
+        head = _LAYOUT.pack(_MAGIC, slots, record_size)
+        view = memoryview(new_memory(path, _HEADER_SIZE + slots * record_size, head, 0o600))
         # One 8-byte store. `struct.pack_into` writes zeros first: the reader would at times see a count of 0.
         self.words = view[:_HEADER_SIZE].cast("Q")
         self.records = view[_HEADER_SIZE:]
         self.size = slots
-
-
-def _created(path: Path, slots: int, record_size: int) -> mmap.mmap:
-    temporary = path.with_name(path.name + ".new")
-    with open(temporary, "w+b") as file:
-        os.fchmod(file.fileno(), 0o600)
-        # A full tmpfs refuses here, and not by SIGBUS in the middle of a cycle.
-        os.posix_fallocate(file.fileno(), 0, _HEADER_SIZE + slots * record_size)
-        memory = mmap.mmap(file.fileno(), 0)
-    _LAYOUT.pack_into(memory, 0, _MAGIC, slots, record_size)
-    os.replace(temporary, path)
-    return memory
 
 
 class Batch(NamedTuple):
@@ -236,7 +215,11 @@ class Batch(NamedTuple):
 
 
 class RingReader:
-    """Reader's side; starts at the oldest record still there.
+    """Reader's side: copies whole records and counts those it has missed; starts at the oldest one still there.
+
+    Each record begins and ends with its index, larger from record to record. Where stores become visible out of order (ARM)
+    the count can be seen before the record: a copy whose two ends differ is torn, and one whose index is not larger than
+    the last is what lay in the slot a lap ago. Both are dropped and counted.
 
     Raises:
         RingError: the file is no ring, or of another record size.
@@ -248,15 +231,12 @@ class RingReader:
                 self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:
             raise RingError(f"{path}: cannot be read as a ring of cycles: {error}") from None
-        magic, slots, size = (
-            _LAYOUT.unpack_from(self._memory, 0) if len(self._memory) >= _HEADER_SIZE else (0, 0, 0)
-        )
+        long_enough = len(self._memory) >= _HEADER_SIZE
+        magic, slots, size = _LAYOUT.unpack_from(self._memory, 0) if long_enough else (0, 0, 0)
         if magic != _MAGIC or size != record_size or len(self._memory) != _HEADER_SIZE + slots * size:
             raise RingError(f"{path}: not a ring of {record_size}-byte records (found record size {size})")
         self._words = memoryview(self._memory)[:_HEADER_SIZE].cast("Q")
-        self._slots = slots
-        self._record_size = record_size
-        self._newest = -1
+        self._slots, self._record_size, self._newest = slots, record_size, -1
         self.position: int = max(0, self._count() - slots)
 
     def _count(self) -> int:
@@ -274,18 +254,15 @@ class RingReader:
         self.position += lost
         first, last = self.position, min(count, self.position + limit)
         size, memory = self._record_size, self._memory
-        copies = []
-        for n in range(first, last):
-            offset = _HEADER_SIZE + (n % self._slots) * size
-            copies.append(memory[offset : offset + size])
+        offsets = (_HEADER_SIZE + n % self._slots * size for n in range(first, last))
+        copies = [memory[offset : offset + size] for offset in offsets]
         # The writer may be filling slot `count % slots` right now: that record is overwritten too.
         overwritten = min(len(copies), max(0, self._count() + 1 - self._slots - first))
-        good, newest = [], self._newest
+        good = []
         for record in copies[overwritten:]:
             index = int.from_bytes(record[:8], "little")
-            if record[:8] == record[-8:] and index > newest:
+            if record[:8] == record[-8:] and index > self._newest:
                 good.append(record)
-                newest = index
-        self._newest = newest
+                self._newest = index
         self.position = last
         return Batch(good, lost + len(copies) - len(good))

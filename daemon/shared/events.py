@@ -3,19 +3,11 @@
 Under systemd standard error is the journal's (JOURNAL_STREAM): a line then begins with <N>, its priority as in sd-daemon(3)
 (`SyslogLevelPrefix=yes`), without the program's name, which the journal has.
 
-The file `notices` of the runtime directory is a bounded ring with one writer (the supervisor) and any number of readers
-(recorder, `jtq` tools). It holds the last `CAPACITY` notices. A reader that comes late gets the number of those it has
-missed, and nobody waits for anybody.
-
-    notices = Notices(directory / FILE)                       # writer
-    notices.add(WARNING, "heartbeat", 3, "node 3: no heartbeat for 0.3 s")
-
-    reader = NoticesReader(directory / FILE)                  # raises NoticesError: no such file, another layout
-    news, lost = reader.read()                                # notices since the last call, and how many were overwritten
-
-Layout: head 32 bytes (magic u64, capacity u64, count of notices written u64, reserved), then slots of 256 bytes: number u64
-(1.. ; written last, so that a torn slot shows), realtime_ns i64, level u8, node u8, length of topic u8, length of text u8,
-topic 20 bytes, text 212 bytes (UTF-8, cut to fit).
+The file `notices` of the runtime directory is a ring of the last `CAPACITY` notices with one writer (the supervisor) and
+any number of readers; one that comes late gets the number of those it has missed. Layout: head 32 bytes (magic u64,
+capacity u64, count of notices written u64, reserved), then slots of 256 bytes: number u64 (1.. ; written last, so that a
+torn slot shows), realtime_ns i64, level u8, node u8, length of topic u8, length of text u8, topic 20 bytes, text 212 bytes
+(UTF-8, cut to fit).
 """
 
 from __future__ import annotations
@@ -27,10 +19,13 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from enum import IntEnum
 from math import inf
 from pathlib import Path
 from typing import NamedTuple, TextIO
+
+from jtqd.daemon.shared.runtime_dir import new_memory
 
 FILE = "notices"
 """Name of the file in the runtime directory of a daemon."""
@@ -51,23 +46,16 @@ class NoticesError(Exception):
 
 
 class Notice(NamedTuple):
-    """One notice.
-
-    Attributes:
-        number: 1, 2, ... in the order of writing.
-        realtime_ns: CLOCK_REALTIME when it was written.
-        level: INFO, WARNING or ERROR.
-        node: node-ID that it is about; 0 for none (the bus, the daemon).
-        topic: what kind: "boot", "heartbeat", "emcy", "bus", "pdo", "nmt", "sync", "input",
-            "fault", "loop", "recorder", "machine" (`jtqd.daemon.shared.conditions`).
-        text: one line for the operator.
-    """
+    """One notice, numbered 1, 2, ... in the order of writing."""
 
     number: int
     realtime_ns: int
     level: int
+    """INFO, WARNING or ERROR."""
     node: int
+    """Node-ID that it is about; 0 for none (the bus, the daemon)."""
     topic: str
+    """"boot", "heartbeat", "emcy", "bus", "pdo", "nmt", "sync", "input", "fault", "loop", "recorder" or "machine"."""
     text: str
 
 
@@ -75,15 +63,9 @@ class Notices:
     """Writer's side, with a new file; a reader of the old one goes on reading that."""
 
     def __init__(self, path: Path, capacity: int = CAPACITY) -> None:
-        temporary = path.with_name(path.name + ".new")
-        size = _HEAD.size + capacity * _SLOT.size
-        with open(temporary, "w+b") as file:
-            os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
-            os.posix_fallocate(file.fileno(), 0, size)  # a full tmpfs refuses here, not by SIGBUS
-            self._memory = mmap.mmap(file.fileno(), 0)
+        head = _HEAD.pack(_MAGIC, capacity, 0)
+        self._memory = new_memory(path, _HEAD.size + capacity * _SLOT.size, head)
         self._capacity, self._count = capacity, 0
-        _HEAD.pack_into(self._memory, 0, _MAGIC, capacity, 0)
-        os.replace(temporary, path)
 
     def add(self, level: int, topic: str, node: int, text: str) -> None:
         """Write one; the oldest is overwritten. `topic` and `text` are cut to their room."""
@@ -98,11 +80,7 @@ class Notices:
 
 
 class NoticesReader:
-    """Reader's side; starts with the oldest notice that is still there.
-
-    Raises:
-        NoticesError: nothing to read at the path, or of another layout.
-    """
+    """Reader's side; starts with the oldest notice. Raises NoticesError: nothing there, or of another layout."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -110,9 +88,7 @@ class NoticesReader:
                 self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:
             raise NoticesError(f"{path}: no notices: {error}") from None
-        if len(self._memory) < _HEAD.size:
-            raise NoticesError(f"{path}: no notices of this version")
-        magic, self._capacity, _ = _HEAD.unpack_from(self._memory, 0)
+        magic, self._capacity, _ = _HEAD.unpack(self._memory[: _HEAD.size].ljust(_HEAD.size, b"\0"))
         if magic != _MAGIC or len(self._memory) != _HEAD.size + self._capacity * _SLOT.size:
             raise NoticesError(f"{path}: no notices of this version")
         self._read = 0
@@ -137,11 +113,10 @@ class NoticesReader:
         written, realtime_ns, level, node, topic_length, text_length, topic, text = _SLOT.unpack(raw)
         if written != number or _WORD.unpack_from(self._memory, offset)[0] != number:
             return None
-        name, line = (
-            topic[:topic_length].decode(errors="replace"),
-            text[:text_length].decode(errors="replace"),
+        name, line = topic[:topic_length], text[:text_length]
+        return Notice(
+            number, realtime_ns, level, node, name.decode(errors="replace"), line.decode(errors="replace")
         )
-        return Notice(number, realtime_ns, level, node, name, line)
 
 
 def _cut(text: str, size: int) -> bytes:
@@ -185,14 +160,9 @@ def in_journal(stream: TextIO, environment: Mapping[str, str] = os.environ) -> b
 
 
 class OperatorLog:
-    """Write lines to standard error or the journal.
+    """Write lines to `stream` (None: standard error), with priorities where it is the journal's or `journal` is True.
 
     Lines of one kind come at most `BURST` times in `WINDOW_S`; the next one gives the number of suppressed ones.
-
-    Args:
-        stream: where to; standard error by default.
-        journal: with priorities; None: where the stream is the journal's.
-        clock: CLOCK_MONOTONIC [s].
     """
 
     def __init__(
@@ -202,9 +172,8 @@ class OperatorLog:
         journal: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._stream = stream
+        self._stream, self._clock = stream, clock
         self._journal = in_journal(stream or sys.stderr) if journal is None else journal
-        self._clock = clock
         self._written: dict[str, deque[float]] = {}
         self._suppressed: dict[str, int] = {}
 
@@ -222,22 +191,14 @@ class OperatorLog:
             lines = "similar line was" if count == 1 else "similar lines were"
             more = f" ({count} {lines} suppressed)" if count else ""
         for line in (text + more).splitlines():
-            self._write(f"<{int(priority)}>{line}" if self._journal else f"jtqd: {line}")
+            with suppress(OSError):  # its reader has gone; the loop goes on
+                shown = f"<{int(priority)}>{line}" if self._journal else f"jtqd: {line}"
+                print(shown, file=self._stream or sys.stderr, flush=True)
         return True
-
-    def _write(self, line: str) -> None:
-        try:
-            print(line, file=self._stream or sys.stderr, flush=True)
-        except OSError:  # its reader has gone; the loop goes on
-            pass
 
 
 class EventLog:
-    """Write lines to the operator and to the notices, from which they get into the log's /events and /log.
-
-    Attributes:
-        notices: may be set later; before it, lines are only for the operator.
-    """
+    """Write lines to the operator and to the `notices`, once these are set, for the log's /events and /log."""
 
     def __init__(self, log: OperatorLog) -> None:
         self._log = log

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-from jtqd.estimator import status as st
 from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 
 NOT_FINITE: Final = 0x01
@@ -52,10 +51,3 @@ MEANINGS: Final = {
 def names_of(bits: int) -> tuple[str, ...]:
     """Return the names of the faults in `bits`, in the order of their bits."""
     return tuple(name for bit, name in NAMES.items() if bits & bit)
-
-
-def status_of(bits: int) -> int:
-    """Return the status that is published while these faults are latched; `bits` is not 0."""
-    if bits & DRIVE_FAULT:
-        return st.DRIVE_FAULT
-    return st.STALE if bits == STALE else st.INVALID

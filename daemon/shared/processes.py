@@ -51,9 +51,9 @@ def _die_with_parent() -> None:
 
 
 class Child:
-    """A Python module as a process of its own, with JSON lines on its standard input and output.
+    """A Python module as a process of its own, with JSON lines on its standard input and output; its standard error is ours.
 
-    Its standard error is ours. It gets SIGTERM when we die, however we die.
+    It gets SIGTERM when we die, however we die.
     """
 
     def __init__(self, module: str, arguments: Sequence[str] = (), *, name: str | None = None) -> None:
@@ -75,10 +75,7 @@ class Child:
 
     @property
     def outputs(self) -> list[int]:
-        """File descriptor of its standard output, for select; none once it is closed.
-
-        A closed one is always readable: a wait on it for the end of the process would spin.
-        """
+        """File descriptor of its standard output, for select; none once it is closed, as it would always be readable."""
         assert self.process.stdout is not None
         return [] if self._closed else [self.process.stdout.fileno()]
 
@@ -94,19 +91,15 @@ class Child:
     def send(self, message: Any) -> None:
         """Send one JSON line; that a child has gone shows when its answer is waited for."""
         assert self.process.stdin is not None
-        try:
+        with suppress(BrokenPipeError, ValueError):
             self.process.stdin.write(json.dumps(message).encode() + b"\n")
             self.process.stdin.flush()
-        except (BrokenPipeError, ValueError):
-            pass
 
     def end_of_input(self) -> None:
         """Close its standard input: nothing more will be sent."""
         assert self.process.stdin is not None
-        try:
+        with suppress(BrokenPipeError):
             self.process.stdin.close()
-        except BrokenPipeError:
-            pass
 
     def poll_answer(self) -> dict[str, Any] | None:
         """Return the next JSON line, if any."""
@@ -125,12 +118,7 @@ class Child:
         return answer
 
     def answer(self, timeout_s: float) -> dict[str, Any]:
-        """Wait for the next JSON line.
-
-        Raises:
-            ChildSilence: the time is up.
-            ChildError: the process ended without one.
-        """
+        """Wait for the next JSON line. Raises ChildSilence when the time is up, ChildError when the process has ended."""
         deadline = time.monotonic() + timeout_s
         while True:
             ended = not self.alive()  # asked first: its last answer is then in the pipe
@@ -142,15 +130,12 @@ class Child:
             left = deadline - time.monotonic()
             if left <= 0:
                 raise ChildSilence(f"{self.name} did not answer within {timeout_s:g} s")
-            self._rest(min(left, _LONGEST_WAIT_S))
-
-    def _rest(self, longest_s: float) -> None:
-        """Wait until there is output or, after the end of output, until the process has ended."""
-        if not self._closed:
-            select.select(self.outputs, [], [], longest_s)
-            return
-        with suppress(subprocess.TimeoutExpired):
-            self.process.wait(longest_s)
+            longest_s = min(left, _LONGEST_WAIT_S)
+            if self._closed:
+                with suppress(subprocess.TimeoutExpired):
+                    self.process.wait(longest_s)
+            else:
+                select.select(self.outputs, [], [], longest_s)
 
     def end(self, timeout_s: float = 5.0) -> int | None:
         """SIGTERM, wait, SIGKILL if it must be; returns the exit status (None if it had to be killed)."""
@@ -166,7 +151,7 @@ class Child:
             return None
 
 
-# Beside the loop ----
+# Beside the loop ------------------------------------------------------------------------------------------------------
 
 _STARTS = 5
 """One that dies more often than this in a minute is not started again."""
@@ -179,11 +164,8 @@ StartChild = Callable[[str, list[str], str], Child]
 class SideProcess:
     """The supervisor's side of one such process in one run of jtqd.
 
-    Args:
-        start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
-        module: run with the request as its only argument.
-        title: in the lines for the operator, such as "live view".
-        began: key of the answer that tells how it began.
+    start_child: (module, arguments, name) -> child, which the supervisor ends; module: run with the request as its only
+    argument; title: in the lines for the operator; began: key of the answer that tells how it began.
     """
 
     def __init__(self, start_child: StartChild, module: str, title: str, began: str) -> None:
@@ -239,7 +221,7 @@ def _report(text: str) -> None:
     print(f"jtqd: {text}", file=sys.stderr, flush=True)
 
 
-# ---- in the process ----
+# ... in the process
 
 
 class Stop:
@@ -265,10 +247,8 @@ def run_side_process(
 ) -> int:
     """Run the process with the request in its command line; returns the exit status: 0 ended in order, 1 a failure.
 
-    Args:
-        arguments: None: those of this process.
-        began: key of the answer.
-        begin: request -> (answer, serve until stopped). Raises CannotBegin.
+    arguments: None: those of this process; began: key of the answer; begin: request -> (answer, serve until stopped), raises
+    CannotBegin.
     """
     request = json.loads((sys.argv[1:] if arguments is None else arguments)[0])
     stop = Stop()
@@ -288,18 +268,14 @@ def _answer(content: dict[str, str]) -> None:
         print(json.dumps(content), flush=True)
 
 
-# systemd ----
+# systemd --------------------------------------------------------------------------------------------------------------
 
 _FEED_SHARE = 0.1
 """The watchdog is fed ten times within its time: nine of these may be late."""
 
 
 class Notifier:
-    """Sends to the service manager.
-
-    Args:
-        environment: holds NOTIFY_SOCKET (a path, or @ and an abstract name), WATCHDOG_USEC and WATCHDOG_PID.
-    """
+    """Sends datagrams to $NOTIFY_SOCKET (a path, or @ and an abstract name), by a socket that is connected once."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         self._socket: socket.socket | None = None
@@ -340,10 +316,7 @@ class Notifier:
 class LoopWatchdog:
     """Feeds systemd's watchdog from the loop: call `advanced` after some cycles; every n-th cycle sends one datagram.
 
-    Args:
-        notifier: where to.
-        period_ns: of the cycle.
-        watchdog_s: time after which the service manager takes the loop for dead; None: there is no watchdog.
+    watchdog_s: after which the service manager takes the loop for dead; None: there is no watchdog.
     """
 
     def __init__(self, notifier: Notifier, period_ns: int, watchdog_s: float | None) -> None:

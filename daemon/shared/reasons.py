@@ -49,13 +49,9 @@ _SENSOR_STATUS = {1: "not valid", 2: "positive overload", 4: "negative overload"
 
 
 def joint_reason(about: About, number: int, view: View, earlier: View) -> str:
-    """Explain the status of a joint; "" where nothing needs a reason.
+    """Explain the status of joint `number`, from 1 on; "" where nothing needs a reason.
 
-    Args:
-        about: of the daemon.
-        number: of the joint, from 1 on.
-        view: the reading.
-        earlier: one from a moment before; what has been counted since then points at a cause.
+    earlier: a reading from a moment before; what has been counted since then points at a cause.
     """
     joint, seen = about.joints[number - 1], view.joints[number - 1]
     if seen.latched:
@@ -131,11 +127,8 @@ def _doubt(zeros: Zeros) -> str:
     if zeros.flags & LEFT:
         left = 1e6 * (zeros.link_rad - zeros.link_used_rad)
         return f"a zero of the link encoder has been found, {left:+.0f} µrad of it are not yet taken off"
-    if zeros.flags & APART:
-        return (
-            "current and torsion disagree beyond their sigmas: one of them is not what the joint file states"
-        )
-    return ""
+    apart = "current and torsion disagree beyond their sigmas: one of them is not what the joint file states"
+    return apart if zeros.flags & APART else ""
 
 
 def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier: View) -> str:
@@ -151,14 +144,10 @@ def _stale(about: About, joint: AboutJoint, seen: JointView, view: View, earlier
 def stale_reason(
     node: int, names: Sequence[str], seen: JointView, view: View, earlier: Mapping[str, int]
 ) -> str:
-    """Explain status 4 (stale), the likeliest cause first.
+    """Explain status 4 (stale) of the joint with this drive, the likeliest cause first.
 
-    Args:
-        node: the joint's drive.
-        names: of its PDOs with positions, and of those with its other quantities; several are joined by "and".
-        seen: the joint's estimate.
-        view: the reading it is from.
-        earlier: counters of an earlier reading; what has risen since then may be the cause.
+    names: of its PDOs with positions, and of those with its other quantities (joined by "and"); earlier: counters of an
+    earlier reading; what has risen since then may be the cause.
     """
 
     def rose(name: str) -> bool:

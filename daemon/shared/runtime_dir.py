@@ -1,27 +1,25 @@
 """The runtime directory of a running jtqd: ring, snapshot and description of one daemon, on a tmpfs.
 
-The directory is open to the daemon's group (0750): the snapshot, `about.json` and the recorder's account can be read by its
-members (`jtq status`); what only the daemon's own processes need (`ring`, `lock`, `control`) stays with its user.
+The directory is open to the daemon's group (0750): its members can read the snapshot, `about.json` and the recorder's
+account (`jtq status`); what only the daemon's own processes need (`ring`, `lock`, `control`) stays with its user.
 
-`about.json` is what a running jtqd is, for tools that look at it: written by the supervisor at its start, before the nodes
-are booted, and again where a drive has other TPDOs than the configuration. Numbers that change are in the snapshot.
+`about.json` is what a running jtqd is: written by the supervisor before the nodes are booted, and again where a drive has
+other TPDOs than the configuration. Numbers that change are in the snapshot.
 """
 
 from __future__ import annotations
 
 import fcntl
 import json
+import mmap
 import os
 import platform
 import re
 import time
 from contextlib import suppress
 from dataclasses import dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
-
-import msgspec
 
 from jtqd.estimator.sha256 import sha256_hex
 
@@ -31,17 +29,32 @@ _LOCK = "lock"
 _ATTEMPTS = 100
 
 
+def write_whole(path: Path, text: str, mode: int = 0o640) -> None:
+    """Write a file whole or not at all, by default readable by the daemon's group. Raises OSError."""
+    new = path.with_name(path.name + ".new")
+    with open(new, "w", encoding="utf-8") as file:
+        os.fchmod(file.fileno(), mode)
+        file.write(text)
+    os.replace(new, path)
+
+
+def new_memory(path: Path, size: int, head: bytes, mode: int = 0o640) -> mmap.mmap:
+    """Make shared memory that begins with `head`; a reader of an older file at `path` keeps that one. Raises OSError."""
+    new = path.with_name(path.name + ".new")
+    with open(new, "w+b") as file:
+        os.fchmod(file.fileno(), mode)
+        os.posix_fallocate(file.fileno(), 0, size)  # a full tmpfs refuses here, not by SIGBUS in a cycle
+        memory = mmap.mmap(file.fileno(), 0)
+    memory[: len(head)] = head
+    os.replace(new, path)
+    return memory
+
+
 def claim(bus: str) -> tuple[Path, int]:
     """Make the directory of the instance on `bus` and claim it until this process ends, however it ends.
 
-    It lies under $RUNTIME_DIRECTORY (systemd), $XDG_RUNTIME_DIR or /dev/shm.
-
-    Returns:
-        The directory, and the descriptor that holds the claim.
-
-    Raises:
-        BlockingIOError: another process holds it; the message names it.
-        OSError: it cannot be made, or belongs to somebody else.
+    It lies under $RUNTIME_DIRECTORY (systemd), $XDG_RUNTIME_DIR or /dev/shm. Returns it, and the descriptor that holds the
+    claim. Raises BlockingIOError where another process holds it, OSError where it cannot be made or is somebody else's.
     """
     base = os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0] or os.environ.get("XDG_RUNTIME_DIR", "")
     root = Path(base) if base else Path("/dev/shm")
@@ -188,20 +201,18 @@ class About:
 
 def write_about(directory: Path, content: About) -> None:
     """Write it whole or not at all. Raises OSError."""
-    new = directory / (FILE + ".new")
-    with open(new, "w", encoding="utf-8") as file:
-        os.fchmod(file.fileno(), 0o640)
-        json.dump({"schema": SCHEMA} | msgspec.to_builtins(content), file)
-    os.replace(new, directory / FILE)
+    import msgspec  # here and below: readers of the memory alone do without it
+
+    write_whole(directory / FILE, json.dumps({"schema": SCHEMA} | msgspec.to_builtins(content)))
 
 
 def read_about(path: Path) -> About:
     """Read an `about.json`.
 
-    Raises:
-        AboutError: it cannot be read, is not JSON, or is of another version.
-        PermissionError: it belongs to a daemon of another user and group.
+    Raises AboutError where it cannot be read or is of another version, PermissionError for another user's and group's.
     """
+    import msgspec
+
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["schema"] != SCHEMA:
@@ -228,6 +239,8 @@ _PACKAGES = ("jtqd", "numpy", "onnxruntime", "python-can", "canopen", "mcap")
 
 def installed(name: str) -> str | None:
     """Version of an installed package."""
+    from importlib.metadata import PackageNotFoundError, version
+
     try:
         return version(name)
     except PackageNotFoundError:
@@ -236,6 +249,5 @@ def installed(name: str) -> str | None:
 
 def versions() -> dict[str, str]:
     """Versions of Python and of the packages that an estimate and its log depend on, for `about.json` and the log."""
-    return {name: installed(name) or "not installed" for name in _PACKAGES} | {
-        "python": platform.python_version()
-    }
+    found = {name: installed(name) or "not installed" for name in _PACKAGES}
+    return found | {"python": platform.python_version()}

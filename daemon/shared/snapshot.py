@@ -11,11 +11,14 @@ import os
 import struct
 import time
 from collections.abc import Sequence
+from itertools import accumulate
+from math import nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jtqd.daemon.shared.counters import COUNTERS, word_of
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+from jtqd.daemon.shared.runtime_dir import new_memory
 from jtqd.estimator.status import Zeros
 
 STATUS_CODES = 16
@@ -23,7 +26,7 @@ MAX_NODE = 128
 
 
 class JointView(NamedTuple):
-    """Last estimate of one joint; NaN where unknown. `sensor_nm` is the sensor in the same cycle."""
+    """Last estimate of one joint, as in the cycle record (`JointRecord`); `sensor_nm` is the sensor in the same cycle."""
 
     torque_nm: float
     sigma_nm: float
@@ -35,16 +38,13 @@ class JointView(NamedTuple):
     status: int
     sensor_status: int
     input_flags: int
-    """Inputs and faults of that cycle, as in the cycle record (`daemon/shared/cycle_record.py`)."""
     latched: int = 0
-    """Bits of the faults that are latched (`daemon/shared/cycle_record.py`)."""
-    reference_nm: float = float("nan")
-    """The sensor as old as the estimate (`daemon/shared/cycle_record.py`): what the estimate is compared with."""
-    age_ms: float = float("nan")
-    """Group delay of the estimate."""
-    torque_rate_nm_s: float = float("nan")
-    contact_nm: float = float("nan")
-    """As in the cycle record; bits of `input_flags` tell whether there is a contact."""
+    """Bits of the faults that are latched (`faults.py`)."""
+    reference_nm: float = nan
+    """The sensor as old as the estimate: what the estimate is compared with."""
+    age_ms: float = nan
+    torque_rate_nm_s: float = nan
+    contact_nm: float = nan
 
 
 class Measured(NamedTuple):
@@ -81,7 +81,7 @@ class InputView(NamedTuple):
     """Frames of a wrong length (8210h, 8220h); both are among the rejected."""
 
 
-NOT_MEASURED = Measured(*(float("nan"),) * 6)
+NOT_MEASURED = Measured(*(nan,) * 6)
 NO_ZEROS = Zeros(*(0.0,) * 7, 0, 0)
 """Of an estimator that learns nothing."""
 
@@ -125,17 +125,16 @@ class View(NamedTuple):
 def quantiles(bins: Sequence[int], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
     """Quantiles [us] of a histogram with bins of `bin_ns`, upper edge of their bin; see `SnapshotReader.work_us`."""
     total = sum(bins)
-    result = []
+    edges = []
     for share in shares:
-        wanted, seen, edge = share * total, 0, float("nan")
-        for n, count in enumerate(bins):
-            seen += count
-            if total and seen >= wanted and count:
-                top_ns = largest_ns if share >= 1.0 or n == len(bins) - 1 else (n + 1) * bin_ns
-                edge = min(top_ns, largest_ns or top_ns) / 1000.0
-                break
-        result.append(edge)
-    return result
+        found = (n for n, seen in enumerate(accumulate(bins)) if bins[n] and seen >= share * total)
+        n = next(found, None)
+        if n is None:
+            edges.append(nan)
+            continue
+        top_ns = largest_ns if share >= 1.0 or n == len(bins) - 1 else (n + 1) * bin_ns
+        edges.append(min(top_ns, largest_ns or top_ns) / 1000.0)
+    return edges
 
 
 WORK_BINS, WORK_BIN_NS = 500, 4_000
@@ -166,51 +165,33 @@ class SnapshotError(Exception):
 
 
 class _Views:
-    """Views of the snapshot's memory, in their order in it.
-
-    Attributes:
-        orders: requests of the supervisor and their execution: [resets requested, executed, changed nodes reported, taken,
-            signs of life of the supervisor].
-        counters: the words of `counters.TABLE`.
-        sequence: odd while the snapshot is being written.
-        estimate: the last estimate: times, status, `JointView` and `Measured` of all joints.
-        errors: of each joint the sums of squared errors against the sensor of the estimate's age and against the sensor
-            now, and the number of samples.
-        work: histogram of the work per cycle, `WORK_BIN_NS` per bin, the last bin takes the rest.
-        late: histogram of the SYNC's lateness, `LATE_BIN_NS` per bin.
-        status_cycles: cycles that joint 1 has spent in each of the 16 status codes, then joint 2, ...
-        inputs: one `INPUT` for each input PDO.
-        node_heard: kernel stamp of the last heartbeat of each node-ID [ns].
-        node_states: state in that heartbeat.
-        configured: number of times each node-ID has been configured; written by the supervisor.
-        unconfigured: 1 for each node-ID that restarted and has not been configured since.
-        node_factors: four scaling factors of each node-ID that was absent at the start; written by the supervisor.
-        restarts: boot-up messages of each node-ID.
-        configured_for: of each node-ID, the `restarts` after which it was last configured; written by the supervisor.
-        doubts: number of times each node-ID was found with a changed configuration; written by the supervisor.
-        learned: of each joint a `LEARNED`; as `estimate`, guarded by the sequence.
-    """
+    """Views of the snapshot's memory, in their order in it; `learned` is guarded by the sequence as `estimate` is."""
 
     def __init__(self, memory: memoryview) -> None:
         self._memory: Any = memory
         self.size = _HEAD.size
+        # resets requested by the supervisor, executed; changed nodes reported, taken; signs of life of the supervisor
         self.orders = self._next("Q", 5)
         self.counters = self._next("Q", len(COUNTERS))
-        self.sequence = self._next("Q", 1)
+        self.sequence = self._next("Q", 1)  # odd during a write
         self.estimate = self._next("B", ESTIMATE_SIZE)
+        # per joint: sums of squared errors against the sensor of the estimate's age and the sensor now, number of samples
         self.errors = self._next("d", 3 * MOST_JOINTS)
-        self.work = self._next("Q", WORK_BINS)
+        self.work = self._next("Q", WORK_BINS)  # histograms: the last bin takes the rest
         self.late = self._next("Q", LATE_BINS)
         self.status_cycles = self._next("Q", MOST_JOINTS * STATUS_CODES)
         self.inputs = self._next("B", MAX_INPUTS * INPUT.size)
-        self.node_heard = self._next("q", MAX_NODE)
+        # by node-ID; those marked s are written by the supervisor
+        self.node_heard = self._next("q", MAX_NODE)  # kernel stamp of the last heartbeat [ns], and its state
         self.node_states = self._next("B", MAX_NODE)
-        self.configured = self._next("B", MAX_NODE)
-        self.unconfigured = self._next("B", MAX_NODE)
-        self.node_factors = self._next("d", 4 * MAX_NODE)
+        self.configured = self._next("B", MAX_NODE)  # s: how often
+        self.unconfigured = self._next("B", MAX_NODE)  # 1: restarted and not configured since
+        self.node_factors = self._next("d", 4 * MAX_NODE)  # s: scaling of one that was absent at the start
         self.restarts = self._next("Q", MAX_NODE)
-        self.configured_for = self._next("Q", MAX_NODE)
-        self.doubts = self._next("B", MAX_NODE)
+        self.configured_for = self._next(
+            "Q", MAX_NODE
+        )  # s: the `restarts` after which it was last configured
+        self.doubts = self._next("B", MAX_NODE)  # s: how often it was found with a changed configuration
         self.learned = self._next("B", MOST_JOINTS * LEARNED.size)
 
     def _next(self, code: str, count: int) -> Any:
@@ -223,23 +204,12 @@ SIZE = _Views(memoryview(b"")).size
 
 
 class Snapshot(_Views):
-    """Writer's side, one per loop: the memory that `daemon/core/cycle.pyx` writes into.
-
-    It has room for four joints.
-
-    Attributes:
-        joints: number of joints.
-    """
+    """Writer's side, one per loop: the memory that `daemon/core/cycle.pyx` writes into, with room for four joints."""
 
     def __init__(self, path: Path, period_s: float, worst_load: float, joints: int = 2) -> None:
         self.joints = joints
-        temporary = path.with_name(path.name + ".new")
-        with open(temporary, "w+b") as file:
-            os.fchmod(file.fileno(), 0o640)  # the daemon's group may look
-            os.posix_fallocate(file.fileno(), 0, SIZE)  # a full tmpfs refuses here, not by SIGBUS
-            memory = mmap.mmap(file.fileno(), 0)
-        _HEAD.pack_into(memory, 0, _MAGIC, os.getpid(), period_s, worst_load, joints)
-        os.replace(temporary, path)
+        head = _HEAD.pack(_MAGIC, os.getpid(), period_s, worst_load, joints)
+        memory = new_memory(path, SIZE, head)
         super().__init__(memoryview(memory))
 
     def factors(self, node_id: int) -> tuple[float, ...]:
@@ -248,11 +218,7 @@ class Snapshot(_Views):
 
 
 class SnapshotReader:
-    """Reader's side.
-
-    Raises:
-        SnapshotError: nothing to read at the path, or of another layout.
-    """
+    """Reader's side. Raises SnapshotError where there is nothing to read at the path, or of another layout."""
 
     def __init__(self, path: Path, *, supervisor: bool = False) -> None:
         access = mmap.ACCESS_WRITE if supervisor else mmap.ACCESS_READ
@@ -292,8 +258,7 @@ class SnapshotReader:
         learned = [LEARNED.unpack_from(views.learned, n * LEARNED.size) for n in joints]
         aligned, now = (
             tuple(
-                (errors[3 * n + k] / errors[3 * n + 2]) ** 0.5 if errors[3 * n + 2] else float("nan")
-                for n in joints
+                (errors[3 * n + k] / errors[3 * n + 2]) ** 0.5 if errors[3 * n + 2] else nan for n in joints
             )
             for k in (0, 1)
         )
@@ -333,11 +298,11 @@ class SnapshotReader:
         return quantiles(self.late_bins(), LATE_BIN_NS, self._views.counters[word_of("late_max_ns")], shares)
 
     def work_bins(self) -> tuple[int, ...]:
-        """Return the histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`; the last takes the rest."""
+        """Return the histogram of the work per cycle: cycles in each bin of `WORK_BIN_NS`."""
         return tuple(self._views.work)
 
     def late_bins(self) -> tuple[int, ...]:
-        """Return the histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`; the last takes the rest."""
+        """Return the histogram of the SYNC's lateness: cycles in each bin of `LATE_BIN_NS`."""
         return tuple(self._views.late)
 
     @property
@@ -348,10 +313,7 @@ class SnapshotReader:
     # Of the supervisor only -------------------------------------------------------------------------------------------
 
     def note_configured(self, node_id: int, restarts: int) -> None:
-        """Report to the loop that a node has been configured.
-
-        `restarts`: its `View.restarts` when that began; the loop does not use a node that has restarted since.
-        """
+        """Report that a node is configured; `restarts`: when that began. The loop does not use one that restarted since."""
         views = self._views
         views.configured_for[node_id] = restarts
         views.configured[node_id] = (views.configured[node_id] + 1) % 256
@@ -359,8 +321,7 @@ class SnapshotReader:
     def note_factors(self, node_id: int, factors: Sequence[float]) -> None:
         """Report the scaling of a node that was absent at the start, before `note_configured`.
 
-        A drive: rad per count and rad/s per unit of the motor, rad per count of the link, A per unit. A sensor: Nm per unit
-        of its channels.
+        A drive: `input_pdos.DRIVE_FACTORS`. A sensor: Nm per unit of its channels.
         """
         for n, factor in enumerate((*factors, 0.0, 0.0, 0.0, 0.0)[:4]):
             self._views.node_factors[4 * node_id + n] = factor
