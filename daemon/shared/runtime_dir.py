@@ -32,10 +32,14 @@ _ATTEMPTS = 100
 def write_whole(path: Path, text: str, mode: int = 0o640) -> None:
     """Write a file whole or not at all, by default readable by the daemon's group. Raises OSError."""
     new = path.with_name(path.name + ".new")
-    with open(new, "w", encoding="utf-8") as file:
-        os.fchmod(file.fileno(), mode)
-        file.write(text)
-    os.replace(new, path)
+    try:
+        with open(new, "w", encoding="utf-8") as file:
+            os.fchmod(file.fileno(), mode)
+            file.write(text)
+        os.replace(new, path)
+    except OSError:
+        new.unlink(missing_ok=True)
+        raise
 
 
 def new_memory(path: Path, size: int, head: bytes, mode: int = 0o640) -> mmap.mmap:

@@ -45,26 +45,19 @@ class _Connection:
     """One client: waits for its request, then for the reply."""
 
     def __init__(self, sock: socket.socket, until_s: float) -> None:
-        self.socket = sock
-        self.until_s = until_s
+        self.socket, self.until_s = sock, until_s
         self.answer: Answer | None = None
 
 
 class ControlServer:
-    """Listens at `path`.
+    """Listens at `path`; an older socket there is replaced. Raises OSError.
 
-    Args:
-        path: of the socket; an older one is replaced.
-        handlers: of each verb; called with the request, they return the reply, or a function that has it later, or raise
-            ControlError.
-
-    Raises:
-        OSError: the socket cannot be made.
+    handlers: of each verb; called with the request, they return the reply, or a function that has it later, or raise
+    ControlError.
     """
 
     def __init__(self, path: Path, handlers: dict[str, Callable[[Reply], Reply | Answer]]) -> None:
-        self._handlers = handlers
-        self._path = path
+        self._path, self._handlers = path, handlers
         self._connections: list[_Connection] = []
         path.unlink(missing_ok=True)
         self._listener = socket.socket(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from math import isfinite
@@ -10,7 +11,7 @@ from types import TracebackType
 from typing import Any
 
 from rich.box import HEAVY_HEAD, Box
-from rich.console import Console, ConsoleOptions, Group, RenderableType, RenderResult
+from rich.console import Console, ConsoleOptions, Group, JustifyMethod, RenderableType, RenderResult
 from rich.live import Live
 from rich.measure import Measurement
 from rich.table import Table
@@ -93,25 +94,20 @@ class LiveTable:
         table = first_that_fits(tables, console, options)
         if table is not None:
             return table
-        lines = (
-            Text.assemble(
-                f"{row['joint']}: {_with_unit(row['torque [Nm]'])}", row["status"], self._touched(row)
-            )
-            for row in self._rows
-        )
-        return Group(self._title, *lines)
+        return Group(self._title, *map(self._short, self._rows))
 
-    def _touched(self, row: dict[str, str | Text]) -> str | Text:
-        shown = row[_CONTACT]
-        there = _CONTACT in self._columns and isinstance(shown, Text)
-        return Text.assemble(" contact ", shown) if there else ""
+    def _short(self, row: dict[str, str | Text]) -> Text:
+        """Return a joint as one line."""
+        torque, contact = row["torque [Nm]"], row[_CONTACT]
+        line = Text.assemble(f"{row['joint']}: ", "" if torque == "-" else f"{torque} Nm ", row["status"])
+        there = _CONTACT in self._columns and isinstance(contact, Text)
+        return Text.assemble(line, " contact ", contact) if there else line
 
     def _table(self, names: list[str], box: Box | None) -> Table:
         table = Table(title=self._title, title_justify="left", box=box, pad_edge=box is not None)
         for name in names:
-            table.add_column(
-                name, justify="right" if "[Nm]" in name else "left", min_width=_COLUMNS[name], no_wrap=True
-            )
+            side: JustifyMethod = "right" if "[Nm]" in name else "left"
+            table.add_column(name, justify=side, min_width=_COLUMNS[name], no_wrap=True)
         for row in self._rows:
             table.add_row(*(row[name] for name in names))
         return table
@@ -161,24 +157,12 @@ def _plain(joint: JointView) -> str:
     return f"{name} {number(joint.torque_nm)} +- {number(joint.sigma_nm)} Nm{touched}"
 
 
-def _with_unit(torque: str | Text) -> str:
-    return "" if str(torque) == "-" else f"{torque} Nm "
-
-
 _TABLE_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
 
 
 class Display:
-    """Use it as a context manager; `turn` whenever there is time.
-
-    Args:
-        reader: of the loop's snapshot.
-        bitrate: of the bus [bit/s].
-        title: of the table.
-        log: takes the lines.
-        contacts: they are watched.
-    """
+    """Use it as a context manager; `turn` whenever there is time. bitrate [bit/s]; contacts: they are watched."""
 
     def __init__(
         self, reader: SnapshotReader, bitrate: int, title: str, log: OperatorLog, *, contacts: bool = False
@@ -224,30 +208,26 @@ _LOST = 0.05
 
 @dataclass(frozen=True)
 class Summary:
-    """Final figures of one run.
-
-    Attributes:
-        view: last reading of the snapshot.
-        work_us, late_us: p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us].
-        refused: real-time settings that the kernel did not grant.
-        recording: the recorder's account; None where nothing was recorded.
-        error: the failure that ended the run, if any.
-        inputs: late, lost, duplicate and rejected frames of each PDO by its name.
-        conditions: those that were present at any time; `first_s` counts from the begin of the run.
-        stolen_s: processor time that a hypervisor took (`daemon/loop/realtime.py`).
-        contacts: they were watched.
-    """
+    """Final figures of one run."""
 
     view: View
+    """Last reading of the snapshot."""
     work_us: Sequence[float]
     late_us: Sequence[float]
+    """p50, p99 and maximum of the work per cycle and of the SYNC's lateness [us]."""
     refused: Sequence[str] = ()
+    """Real-time settings that the kernel did not grant."""
     recording: dict[str, Any] | None = None
+    """The recorder's account; None where nothing was recorded."""
     error: str | None = None
     inputs: dict[str, dict[str, int]] = field(default_factory=dict)
+    """Late, lost, duplicate and rejected frames of each PDO by its name."""
     conditions: Sequence[Occurrences] = ()
+    """Those that were present at any time; `first_s` counts from the begin of the run."""
     stolen_s: float = 0.0
+    """Processor time that a hypervisor took."""
     contacts: bool = False
+    """They were watched."""
 
     @property
     def exit_status(self) -> int:
@@ -259,6 +239,9 @@ class Summary:
     def content(self) -> dict[str, Any]:
         """Return the summary as plain data for JSON."""
         view, counters = self.view, self.view.counters
+        deviations = Counter(
+            {each.subject: each.times for each in self.conditions if each.name == "deviation"}
+        )
 
         def by_joint(values: Iterable[Any]) -> dict[str, Any]:
             return {f"joint_{n}": value for n, value in enumerate(values, start=1)}
@@ -274,7 +257,7 @@ class Summary:
             "age_ms": by_joint(finite(each.age_ms) for each in view.joints),
             "zeros": by_joint(each.content() for each in view.zeros),
             "contacts": counters["contacts"] if self.contacts else None,
-            "deviations": by_joint(self._deviations(n) for n in range(1, len(view.joints) + 1)),
+            "deviations": by_joint(deviations[f"joint {n}"] for n in range(1, len(view.joints) + 1)),
             "conditions": [
                 each._asdict() | {"total_s": round(each.total_s, 3), "first_s": round(each.first_s, 3)}
                 for each in self.conditions
@@ -286,13 +269,6 @@ class Summary:
             "recording": self.recording,
             "error": self.error,
         }
-
-    def _deviations(self, joint: int) -> int:
-        return sum(
-            each.times
-            for each in self.conditions
-            if (each.name, each.subject) == ("deviation", f"joint {joint}")
-        )
 
     def _timing(self) -> list[str]:
         counters = self.view.counters
@@ -306,9 +282,8 @@ class Summary:
         if missed > _LOST * (cycles + missed):
             why = " (jtqd was not granted all that it asked for)" if self.refused else ""
             share = 100.0 * missed / (cycles + missed)
-            lines.append(
-                f"real time     not kept: {share:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
-            )
+            text = f"not kept: {share:.0f} % of the slots missed{why}; jtq doctor looks at the machine"
+            lines.append(f"real time     {text}")
         if self.stolen_s > 0.0:
             lines.append(f"processors    {self.stolen_s:.2f} s stolen by the hypervisor")
         return lines
@@ -328,15 +303,14 @@ class Summary:
     def text(self) -> str:
         """Return the summary as text."""
         view, counters, lines = self.view, self.view.counters, self._timing()
-        for n, (rmse, now, joint) in enumerate(
-            zip(view.rmse_nm, view.rmse_now_nm, view.joints, strict=False)
-        ):
+        errors = zip(view.rmse_nm, view.rmse_now_nm, view.joints, strict=False)
+        for n, (rmse, now, joint) in enumerate(errors, start=1):
             shown = "no reference"
             if isfinite(rmse):
                 age = joint.age_ms
                 older = f", both {age:.2f} ms old ({now:.3f} Nm against it now)" if age > 0.0 else " now"
                 shown = f"{rmse:.3f} Nm against the sensor in motion{older}"
-            lines.append(f"RMSE joint {n + 1}  {shown}")
+            lines.append(f"RMSE joint {n}  {shown}")
         zeros = enumerate(view.zeros, start=1)
         lines += [f"zeros joint {joint} {each.text}" for joint, each in zeros if each.tracked]
         if self.contacts:
@@ -377,15 +351,7 @@ def summary_of(
     stolen_s: float,
     contacts: bool = False,
 ) -> Summary:
-    """Return the summary of a finished run.
-
-    Args:
-        reader: snapshot of its loop.
-        result: last answer of the loop.
-        refused, recording, stolen_s, contacts: as in `Summary`.
-        history: conditions that were present at any time.
-        began_s: begin of the run (CLOCK_MONOTONIC).
-    """
+    """Return the summary of a run from the snapshot and last answer of its loop; began_s: CLOCK_MONOTONIC."""
     return Summary(
         view=reader.read(),
         work_us=reader.work_us(0.5, 0.99, 1.0),

@@ -10,8 +10,8 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import hypot, inf, isfinite
-from typing import NamedTuple
 
+from jtqd.daemon.bus.service import node_subjects
 from jtqd.daemon.config import Config
 from jtqd.daemon.core.input_pdos import input_pdos, joint_temperatures, names_of_inputs, sensor_index
 from jtqd.daemon.shared.conditions import (
@@ -34,7 +34,6 @@ from jtqd.daemon.shared.reasons import (
 )
 from jtqd.daemon.shared.snapshot import InputView, JointView, View
 from jtqd.drivers import nmt
-from jtqd.drivers.emcy import PDO_LONG, PDO_SHORT, PDO_TIMEOUT
 from jtqd.estimator import status as st
 from jtqd.estimator.status import Zeros
 
@@ -54,34 +53,14 @@ _COUNTED = {counter: row for counter, row in SHOWN_BY_COUNTERS.items() if counte
 """An interface that is down is observed by `jtqd.daemon.bus.service`, which knows more of it."""
 
 
-def joint_subjects(config: Config) -> tuple[Subject, ...]:
-    """Return the joints, joint 1 first."""
-    return tuple(
-        Subject(f"joint {joint.number}", joint.node_id, joints=1 << n)
-        for n, joint in enumerate(config.joints)
-    )
-
-
-def node_subjects(config: Config) -> dict[int, Subject]:
-    """Return every node of the configuration, by its node-ID."""
-    nodes = {
-        joint.node_id: Subject(f"node {joint.node_id}", joint.node_id, 1 << n, joint.node_id)
-        for n, joint in enumerate(config.joints)
-    }
-    if config.sensor is not None:
-        number = config.sensor.node_id
-        nodes[number] = Subject(f"node {number}", number, 0, number)
-    return nodes
-
-
 # Deviation ----------------------------------------------------------------------------------------------------------------
 
 
 class Deviation:
-    """Detects an estimate that stays further from the torque sensor than its sigma allows.
+    """Detects an estimate that stays further from the torque sensor of the same age than its sigma allows.
 
     It begins after DEVIATION_S beyond DEVIATION_SIGMAS and ends after as long within NEAR_SIGMAS: friction at a reversal is
-    over sooner. Both are of one age (`JointView.reference_nm`).
+    over sooner.
     """
 
     def __init__(self) -> None:
@@ -92,7 +71,7 @@ class Deviation:
     def update(self, seen: JointView, now_s: float, sensor_zero_nm: float = 0.0) -> bool:
         """Take a reading; True while the estimate is too far. A reading without a number is passed over.
 
-        sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
+        sensor_zero_nm: standard deviation of the sensor's offset, which adds to sigma.
         """
         difference = abs(seen.torque_nm - seen.reference_nm)
         if seen.status not in st.PUBLISHED or not isfinite(difference) or not seen.sigma_nm > 0.0:
@@ -112,70 +91,39 @@ class Deviation:
 # Deadline and length of each input PDO ------------------------------------------------------------------------------------
 
 
-class PdoChange(NamedTuple):
-    """An error (EMCY code) of a PDO has begun (`present`) or ended."""
-
-    code: int
-    pdo: Subject
-    present: bool
-
-
-class _PdoState:
-    def __init__(self) -> None:
-        self.missed = -1  # nothing has been read yet
-        self.in_a_row = 0
-        self.short = self.long = 0
-        self.timed_out = False
-        self.until = {PDO_SHORT: 0.0, PDO_LONG: 0.0}
-        self.present = {PDO_SHORT: False, PDO_LONG: False}
-
-
 class PdoWatch:
-    """Detects errors 8250h, 8210h and 8220h of each input PDO from the loop's counts.
+    """Errors 8250h, 8210h and 8220h of each input PDO from the loop's counts, as conditions.
 
-    The loop decides per cycle; this reports what lasts. A PDO has timed out when it brought no valid input for
-    `TIMEOUT_CYCLES` cycles in a row, and is back with the next valid one. A frame of a wrong length is never used: a short
-    one cannot be, and of a longer one CiA 301 allows to take the first bytes, but a node that sends another length than
-    was configured has lost its mapping, and then the first bytes are not what we think they are.
+    A PDO has timed out when it brought no valid input for `TIMEOUT_CYCLES` cycles in a row, and is back with the next valid
+    one. A frame of a wrong length is never used: CiA 301 allows to take the first bytes of a longer one, but a node that
+    sends another length than was configured has lost its mapping.
 
-    Args:
-        pdos: in the order of the snapshot's inputs; their `node` is the producer.
+    pdos: in the order of the snapshot's inputs; their `node` is the producer.
     """
 
-    def __init__(self, pdos: Sequence[Subject]) -> None:
-        self._pdos = [(pdo, _PdoState()) for pdo in pdos]
+    def __init__(self, pdos: Sequence[Subject], conditions: Conditions) -> None:
+        self._pdos, self._conditions = pdos, conditions
+        self._last: dict[str, InputView] = {}
+        self._until_s: dict[tuple[str, str], float] = {}
 
-    def changes(self, inputs: Sequence[InputView], absent: Collection[int], now_s: float) -> list[PdoChange]:
+    def observe(self, inputs: Sequence[InputView], absent: Collection[int], now_s: float) -> None:
         """Take a reading; PDOs of `absent` nodes (optional ones) do not time out."""
-        found: list[PdoChange] = []
-        for (pdo, state), seen in zip(self._pdos, inputs, strict=False):
+        for pdo, seen in zip(self._pdos, inputs, strict=False):
+            last = self._last.get(pdo.name, InputView(*(0,) * 12)._replace(missed=seen.missed))
+            self._last[pdo.name] = seen
+            lost, expected = seen.missed - last.missed, pdo.node not in absent
+            timed_out = expected and seen.in_a_row >= TIMEOUT_CYCLES
             # A loss between two readings, over by now, counts too, with what the last reading saw of it.
-            missed = 0 if state.missed < 0 else seen.missed - state.missed
-            if missed:
-                missed += state.in_a_row
-            state.missed, state.in_a_row = seen.missed, seen.in_a_row
-            expected = pdo.node not in absent
-            timed_out = seen.in_a_row >= TIMEOUT_CYCLES and expected
-            if timed_out != state.timed_out:
-                found.append(PdoChange(PDO_TIMEOUT, pdo, timed_out))
-            elif not timed_out and missed - seen.in_a_row >= TIMEOUT_CYCLES and expected:
-                found += [PdoChange(PDO_TIMEOUT, pdo, True), PdoChange(PDO_TIMEOUT, pdo, False)]
-            state.timed_out = timed_out
-            for code, count, before in (
-                (PDO_SHORT, seen.short, state.short),
-                (PDO_LONG, seen.long, state.long),
+            over = lost and not timed_out and lost + last.in_a_row - seen.in_a_row >= TIMEOUT_CYCLES
+            for present in (True, False) if expected and over else (timed_out,):
+                self._conditions.update("pdo_timeout", pdo, present, now_s, str(TIMEOUT_CYCLES))
+            for name, count, before in (
+                ("pdo_short", seen.short, last.short),
+                ("pdo_long", seen.long, last.long),
             ):
                 if count != before:
-                    state.until[code] = now_s + LENGTH_S
-                present = now_s < state.until[code]
-                if present != state.present[code]:
-                    found.append(PdoChange(code, pdo, present))
-                    state.present[code] = present
-            state.short, state.long = seen.short, seen.long
-        return found
-
-
-_PDO_CONDITIONS = {PDO_TIMEOUT: "pdo_timeout", PDO_SHORT: "pdo_short", PDO_LONG: "pdo_long"}
+                    self._until_s[name, pdo.name] = now_s + LENGTH_S
+                self._conditions.update(name, pdo, now_s < self._until_s.get((name, pdo.name), -inf), now_s)
 
 
 def pdo_subjects(config: Config) -> list[Subject]:
@@ -191,7 +139,7 @@ def pdo_subjects(config: Config) -> list[Subject]:
 
 @dataclass
 class _Joint:
-    """One joint's PDOs by name, and the counters when it was last well."""
+    """One joint: its PDOs by name, limits, and what was last seen of it."""
 
     subject: Subject
     number: int
@@ -200,7 +148,10 @@ class _Joint:
     sensor: str | None
     sensor_node: int | None
     temperature: str | None
+    network_limit_nm: float | None
+    sensor_zero_nm: float
     well: dict[str, int] = field(default_factory=dict)
+    """Counters when it last had inputs."""
     faults: int = 0
     latched: int = 0
     jumps: int = 0
@@ -208,80 +159,58 @@ class _Joint:
 
 
 class Health:
-    """Call `observe` with each reading of the snapshot.
-
-    Args:
-        config: in force.
-        conditions: the set to be kept up to date.
-    """
+    """Keeps the conditions up to date: call `observe` with each reading of the snapshot."""
 
     def __init__(self, config: Config, conditions: Conditions) -> None:
         self._conditions = conditions
         names = [pdo.name for pdo in input_pdos(config)]
         temperatures = {each.node_id: each.name for each in joint_temperatures(config)}
-        self._joints: list[_Joint] = []
-        for n, (joint, subject) in enumerate(zip(config.joints, joint_subjects(config), strict=True)):
-            sensor = sensor_index(config, joint.sensor_channel)
+        limit = config.estimator.network_limit
+        self._joints = []
+        for n, joint in enumerate(config.joints):
+            sensor, rated_nm = sensor_index(config, joint.sensor_channel), joint.joint.rated_torque_nm
             self._joints.append(
                 _Joint(
-                    subject,
-                    n + 1,
-                    joint.node_id,
-                    names_of_inputs(config, n),
-                    None if sensor is None else names[sensor],
-                    None if sensor is None or config.sensor is None else config.sensor.node_id,
-                    temperatures.get(joint.node_id),
+                    subject=Subject(f"joint {joint.number}", joint.node_id, joints=1 << n),
+                    number=n + 1,
+                    node=joint.node_id,
+                    names=names_of_inputs(config, n),
+                    sensor=None if sensor is None else names[sensor],
+                    sensor_node=config.sensor.node_id if sensor is not None and config.sensor else None,
+                    temperature=temperatures.get(joint.node_id),
+                    network_limit_nm=None if joint.network is None else limit * rated_nm,
+                    sensor_zero_nm=config.estimator.sensor_zero_nm(rated_nm),
                 )
             )
         self._nodes = node_subjects(config)
-        self._pdos = PdoWatch(pdo_subjects(config))
+        self._pdos = PdoWatch(pdo_subjects(config), conditions)
         self._counters: dict[str, tuple[int, float]] = {}
         self._cycle, self._advanced_s = -1, -inf
-        limit = config.estimator.network_limit
-        self._network_limits_nm = [
-            None if joint.network is None else limit * joint.joint.rated_torque_nm for joint in config.joints
-        ]
-        self._sensor_zeros_nm = [
-            config.estimator.sensor_zero_nm(joint.joint.rated_torque_nm) for joint in config.joints
-        ]
 
     def observe(
         self, view: View, now_s: float, *, absent: Collection[int] = (), cycles_lost: int = 0
     ) -> None:
         """Update the conditions from a reading.
 
-        Args:
-            view: the reading.
-            now_s: CLOCK_MONOTONIC.
-            absent: optional nodes that are not there; their PDOs are not missed.
-            cycles_lost: cycles that the recorder has lost so far.
+        absent: optional nodes that are not there, whose PDOs are not missed; cycles_lost: by the recorder so far.
         """
         advanced = view.cycle != self._cycle
         if advanced:
             self._cycle, self._advanced_s = view.cycle, now_s
         stopped = now_s - self._advanced_s > _STOPPED_S
-        self._conditions.update(
-            "loop_stopped",
-            THE_LOOP,
-            stopped,
-            now_s,
-            f"{_STOPPED_S:g} s",
-            since_s=self._advanced_s if stopped else now_s,
-        )
-        for change in self._pdos.changes(view.inputs, absent, now_s):
-            name = _PDO_CONDITIONS[change.code]
-            self._conditions.update(name, change.pdo, change.present, now_s, str(TIMEOUT_CYCLES))
+        since_s = self._advanced_s if stopped else now_s
+        text = f"{_STOPPED_S:g} s"
+        self._conditions.update("loop_stopped", THE_LOOP, stopped, now_s, text, since_s=since_s)
+        self._pdos.observe(view.inputs, absent, now_s)
         for counter, (name, subject) in _COUNTED.items():
             self._observe_counter(name, subject, view.counters[counter], now_s)
         self._observe_counter("cycles_lost", THE_RECORDER, cycles_lost, now_s, str(cycles_lost))
-        limits = zip(self._joints, view.joints, self._network_limits_nm, self._sensor_zeros_nm, strict=True)
-        for joint, seen, limit_nm, zero_nm in limits:
+        for joint, seen, zeros in zip(self._joints, view.joints, view.zeros[: len(view.joints)], strict=True):
             self._observe_inputs(joint, seen, view, now_s)
-            zeros = view.zeros[joint.number - 1]
-            self._observe_status(joint, seen, limit_nm, zeros, now_s)
+            self._observe_status(joint, seen, zeros, now_s)
             self._observe_zeros(joint, zeros, now_s)
             if advanced:
-                far = joint.deviation.update(seen, now_s, zero_nm)
+                far = joint.deviation.update(seen, now_s, joint.sensor_zero_nm)
                 text = f"{seen.torque_nm:.2f} Nm against {seen.reference_nm:.2f} Nm, sigma {seen.sigma_nm:.2f} Nm"
                 if far != self._conditions.is_present("deviation", joint.subject.name):
                     self._conditions.update("deviation", joint.subject, far, now_s, text)
@@ -317,9 +246,7 @@ class Health:
             text = f"from {1e6 * zeros.link_used_rad:+.0f} µrad"
             self._conditions.update("zero_jumped", subject, jumped, now_s, text)
 
-    def _observe_status(
-        self, joint: _Joint, seen: JointView, limit_nm: float | None, zeros: Zeros, now_s: float
-    ) -> None:
+    def _observe_status(self, joint: _Joint, seen: JointView, zeros: Zeros, now_s: float) -> None:
         conditions, subject = self._conditions, joint.subject
         present = seen.input_flags >> 8 | seen.latched
         faults = fault_meanings(present, names=True)
@@ -332,7 +259,7 @@ class Health:
         drive = partial(drive_reason, seen)
         conditions.update("drive_fault", subject, seen.status == st.DRIVE_FAULT, now_s, drive)
         conditions.update("drive_off", subject, seen.status == st.OFF, now_s, drive)
-        why = partial(degraded_reason, seen, limit_nm, zeros)
+        why = partial(degraded_reason, seen, joint.network_limit_nm, zeros)
         conditions.update("degraded", subject, seen.status == st.DEGRADED, now_s, why)
 
     def _observe_counter(
@@ -350,9 +277,8 @@ class Health:
         conditions = self._conditions
         conditions.update("node_absent", subject, node in absent, now_s)
         unready = "" if node in absent else unready_reason(node, view)
-        conditions.update(
-            "node_unconfigured", subject, bool(unready), now_s, unready.removeprefix(f"node {node} ")
-        )
+        text = unready.removeprefix(f"node {node} ")
+        conditions.update("node_unconfigured", subject, bool(unready), now_s, text)
         state = view.node_states[node]
         idle = not unready and state in nmt.NOT_OPERATIONAL
         conditions.update("node_not_operational", subject, idle, now_s, nmt.STATES.get(state, ""))

@@ -20,8 +20,8 @@ from types import FrameType
 from typing import Any
 
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, bus_load_of, gear_ratio_error, own_eds
-from jtqd.daemon.bus.service import BusService, nodes_of, service_filters
-from jtqd.daemon.config import Config, JointConfig, Ros2Settings, as_booted
+from jtqd.daemon.bus.service import BusService, nodes_of, sdo_timeouts_s, service_filters
+from jtqd.daemon.config import Config, Ros2Settings, as_booted
 from jtqd.daemon.core.input_pdos import input_pdos, names_of_inputs, sensor_index
 from jtqd.daemon.live import Address, LiveView
 from jtqd.daemon.loop.realtime import stolen_s
@@ -79,10 +79,8 @@ def checked_load(config: Config) -> BusLoad:
 def log_directory(record: str | None) -> Path | None:
     """Return the log directory of the option `--record`, created if missing; None: no recording.
 
-    A disk that is full, read-only or not permitted may change later: the recorder reports it and waits.
-
-    Raises:
-        SupervisorError: the path cannot be a directory.
+    A disk that is full, read-only or not permitted may change later: the recorder reports it and waits. Raises
+    SupervisorError for a path that cannot be a directory.
     """
     if record == "none":
         return None
@@ -94,9 +92,8 @@ def log_directory(record: str | None) -> Path | None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
-        raise SupervisorError(
-            f"--record {record}: found a file there, expected a directory for logs"
-        ) from None
+        text = f"--record {record}: found a file there, expected a directory for logs"
+        raise SupervisorError(text) from None
     except FileNotFoundError:  # an existing parent without room for one: /proc, a broken link
         raise SupervisorError(f"--record {record}: the directory cannot be created") from None
     except OSError:
@@ -137,33 +134,18 @@ def boot_nodes(config: Config, bus: str, child: Child, stopped: Stopped) -> dict
     The child sends jtqd's heartbeat until its input ends.
     """
     child.send(boot_request(config, bus).as_json())
-    waits_ms = [joint.sdo_timeout_ms for joint in config.joints]
-    if config.sensor is not None:
-        waits_ms.append(config.sensor.sdo_timeout_ms)
-    slowest_s = _BOOT_REQUESTS * 1e-3 * sum(waits_ms)
+    slowest_s = _BOOT_REQUESTS * sum(sdo_timeouts_s(config).values())
     report = wait_for(child, stopped, _WARM_UP_TIMEOUT_S + slowest_s)
-    if report is None:
-        return None
-    if not report["ok"]:
+    if report is not None and not report["ok"]:
         raise SupervisorError(report["error"]["message"])
     return report
-
-
-def check_gears(config: Config, report: dict[str, Any]) -> str | None:
-    """Return what is wrong with a gear ratio that a device reports; None: nothing."""
-    for number, booted in report["nodes"].items():
-        wrong = gear_ratio_error(config, int(number), booted.get("gear_ratio"))
-        if wrong is not None:
-            return wrong
-    return None
 
 
 def wait_for(child: Child, stopped: Stopped, longest_s: float = _WARM_UP_TIMEOUT_S) -> dict[str, Any] | None:
     """Return the child's next answer; None after a stop order.
 
-    Raises:
-        ChildError: it ended, or kept silent for too long.
-        SupervisorError: it reports that it has failed; ConfigurationRefused where a file is the reason.
+    Raises ChildError where it ended or kept silent for too long, SupervisorError where it reports that it has failed
+    (ConfigurationRefused where a file is the reason).
     """
     deadline = time.monotonic() + longest_s
     while not stopped():
@@ -178,15 +160,6 @@ def wait_for(child: Child, stopped: Stopped, longest_s: float = _WARM_UP_TIMEOUT
             raise failure(str(answer["failed"]))
         return None if stopped() else answer
     return None
-
-
-def put_back(config: Config, send: Callable[[bytes], bool]) -> None:
-    """Reset the started nodes to pre-operational, after the end of SYNC or a failed start."""
-    for node in nodes_of(config):
-        try:
-            send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
-        except BusError:
-            return
 
 
 def about(config: Config, *, bus: str, instance: str, log_directory: Path | None) -> About:
@@ -206,9 +179,7 @@ def about(config: Config, *, bus: str, instance: str, log_directory: Path | None
         period_us=config.period_ns // 1000,
         deadline_us=config.input_deadline_ns / 1000,
         heartbeat_ms=config.heartbeat_ms,
-        joints=tuple(
-            _about_joint(config, number, joint, names) for number, joint in enumerate(config.joints)
-        ),
+        joints=tuple(_about_joint(config, number, names) for number in range(len(config.joints))),
         sensor_node=config.sensor.node_id if config.sensor else None,
         inputs=names,
         log_directory=str(log_directory.resolve()) if log_directory else None,
@@ -218,7 +189,8 @@ def about(config: Config, *, bus: str, instance: str, log_directory: Path | None
     )
 
 
-def _about_joint(config: Config, number: int, joint: JointConfig, names: tuple[str, ...]) -> AboutJoint:
+def _about_joint(config: Config, number: int, names: tuple[str, ...]) -> AboutJoint:
+    joint = config.joints[number]
     sensor = sensor_index(config, joint.sensor_channel)
     rated = joint.joint.rated_torque_nm
     return AboutJoint(
@@ -243,41 +215,16 @@ _ON_HANGUP = (
 _STOLEN_PERIOD_S = 1.0
 
 
-class StolenTime:
-    """Stolen processor time, read once a second: the condition, and the sum since the start."""
-
-    def __init__(self, conditions: Conditions) -> None:
-        self._conditions = conditions
-        self._first_s = self._last_s = stolen_s()
-        self._due_s = 0.0
-
-    def observe(self, now_s: float) -> None:
-        """Read the stolen time when it is due (CLOCK_MONOTONIC)."""
-        if now_s < self._due_s:
-            return
-        self._due_s = now_s + _STOLEN_PERIOD_S
-        before, self._last_s = self._last_s, stolen_s()
-        self._conditions.update("stolen_time", THE_MACHINE, self._last_s > before, now_s)
-
-    def total_s(self) -> float:
-        """Return the stolen time since the start [s]."""
-        return stolen_s() - self._first_s
-
-
 class Supervisor:
-    """One run of the daemon.
+    """One run of the daemon. Raises SupervisorError, ConfigError where it cannot start.
 
     Args:
-        config: what was read from `config_path`.
+        config, config_path: what was read, and from which file; None for the one that ships.
         bus: SocketCAN interface, "unix:PATH" or "sim".
-        config_path: the file, None for the one that ships.
         record: directory for logs, "none", or None for the default.
         duration_s: end by itself after this time, None to run until stopped.
         live: where to serve viewers, None for no live view.
         ros2: publish for ROS 2.
-
-    Raises:
-        SupervisorError, ConfigError: it cannot start.
     """
 
     def __init__(  # noqa: PLR0917 - the command line's options
@@ -291,13 +238,10 @@ class Supervisor:
         *,
         ros2: bool = False,
     ) -> None:
-        self._config = config
-        self._config_path = config_path
-        self._duration_s = duration_s
-        self._stop = self._hung_up = False
+        self._config, self._config_path, self._duration_s = config, config_path, duration_s
+        self._stop = self._hung_up = self._bus_gone = False
         signal.signal(signal.SIGTERM, self._on_signal)
         signal.signal(signal.SIGINT, self._on_signal)
-        self._bus_gone = False
         self._send: Callable[[bytes], bool] | None = None
         """Set as long as nodes that we have started are on the bus."""
         self._load = checked_load(config)
@@ -337,11 +281,7 @@ class Supervisor:
         self._stop = True
 
     def run(self) -> Summary | None:
-        """Run to the end. None when it was stopped before the loop ran.
-
-        Raises:
-            SupervisorError, BusError: it could not start.
-        """
+        """Run to the end. None when it was stopped before the loop ran. Raises SupervisorError, BusError."""
         try:
             return self._run()
         except ChildError as error:
@@ -375,9 +315,10 @@ class Supervisor:
         if report is None:
             return None
         self._send = socket.send  # from here on the nodes are ours to put back
-        wrong = check_gears(self._config, report)
-        if wrong is not None:
-            raise SupervisorError(wrong)
+        for number, booted in report["nodes"].items():
+            wrong = gear_ratio_error(self._config, int(number), booted.get("gear_ratio"))
+            if wrong is not None:
+                raise SupervisorError(wrong)
         self._take_layout(report)
         ready = wait_for(loop, self._stopped)
         if ready is None:
@@ -391,9 +332,8 @@ class Supervisor:
         boot.end_of_input()
         for line in running["refused"]:
             self._log(f"not granted: {line}", Priority.WARNING)
-        if running["refused"]:
-            text = "; ".join(running["refused"])
-            self._conditions.update("not_granted", THE_MACHINE, True, time.monotonic(), text)
+        text = "; ".join(running["refused"])
+        self._conditions.update("not_granted", THE_MACHINE, bool(text), time.monotonic(), text)
         reader = SnapshotReader(self._snapshot, supervisor=True)
         self._log_event.notices = Notices(self._directory / NOTICES)
         self._record(report)
@@ -414,9 +354,11 @@ class Supervisor:
         self._bus_service.begin(time.monotonic())
         self._report = report
         self._service.open(reader)
-        began_s, self._stolen = time.monotonic(), StolenTime(self._conditions)
+        began_s = time.monotonic()
+        first_s = self._stolen_s = stolen_s()
+        self._stolen_due_s = 0.0
         result = self._watch(loop, reader, bench)
-        stolen = self._stolen.total_s()
+        stolen = stolen_s() - first_s
         self._leave()
         failed = result.get("error") or result.get("failed")
         if failed:
@@ -453,16 +395,9 @@ class Supervisor:
         if self._log_directory is None:
             return
         request = recording_request(
-            self._config,
-            report,
-            runtime=self._directory,
-            directory=self._log_directory,
-            bus=self._instance,
+            self._config, report, runtime=self._directory, directory=self._log_directory, bus=self._instance
         )
-        if again:
-            self._recorder.renew(request)
-        else:
-            self._recorder.start(request)
+        (self._recorder.renew if again else self._recorder.start)(request)
 
     def _child(self, module: str, arguments: list[str], name: str) -> Child:
         child = Child(module, arguments, name=name)
@@ -499,10 +434,8 @@ class Supervisor:
                     final = loop.poll_answer()
                     return final or {"error": f"the loop ended with exit status {loop.process.returncode}"}
                 if bench is not None and not bench.alive():
-                    self._log(
-                        f"the emulated bench ended with exit status {bench.process.returncode}",
-                        Priority.ERROR,
-                    )
+                    text = f"the emulated bench ended with exit status {bench.process.returncode}"
+                    self._log(text, Priority.ERROR)
                     bench = None
                 if self._stop and not stopping:
                     stopping = time.monotonic()
@@ -521,14 +454,21 @@ class Supervisor:
                 node.recorder_lost = self._recorder.lost
                 reader.note_alive()
                 view, now = reader.read(), time.monotonic()
-                self._health.observe(
-                    view, now, absent=self._bus_service.returning.absent, cycles_lost=node.recorder_lost
-                )
-                self._stolen.observe(now)
+                absent = self._bus_service.returning.absent
+                self._health.observe(view, now, absent=absent, cycles_lost=node.recorder_lost)
+                self._observe_stolen(now)
                 self._serve(view, now)
                 self._report_conditions(now)
                 self._service.serve(view, node.recorder_lost)
                 display.turn(now)
+
+    def _observe_stolen(self, now: float) -> None:
+        """Read once a second whether the hypervisor takes processor time."""
+        if now < self._stolen_due_s:
+            return
+        self._stolen_due_s = now + _STOLEN_PERIOD_S
+        before, self._stolen_s = self._stolen_s, stolen_s()
+        self._conditions.update("stolen_time", THE_MACHINE, self._stolen_s > before, now)
 
     def _report_conditions(self, now: float) -> None:
         """Log the lines that are due and keep `conditions.json` up to date."""
@@ -561,8 +501,10 @@ class Supervisor:
     # End -----------------------------------------------------------------------------------------------------------------
 
     def _leave(self) -> None:
-        """Reset the started nodes to pre-operational after the end of SYNC."""
+        """Reset the started nodes to pre-operational, after the end of SYNC or a failed start."""
         send, self._send = self._send, None
         if send is None:
             return
-        put_back(self._config, send)
+        with suppress(BusError):
+            for node in nodes_of(self._config):
+                send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))

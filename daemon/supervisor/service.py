@@ -13,13 +13,13 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import CATALOGUE, Condition, Conditions
 from jtqd.daemon.shared.counters import RECORDER_LOST, TABLE
 from jtqd.daemon.shared.events import OperatorLog, Priority
 from jtqd.daemon.shared.processes import Notifier
+from jtqd.daemon.shared.runtime_dir import write_whole
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.daemon.supervisor.control import FILE, Answer, ControlError, ControlServer, Reply
 from jtqd.estimator import status as st
@@ -41,11 +41,7 @@ _OF_ZEROS = (
 
 
 def metrics_text(
-    view: View,
-    reader: SnapshotReader,
-    bus: str,
-    recorder_lost: int,
-    conditions: Sequence[Condition] = (),
+    view: View, reader: SnapshotReader, bus: str, recorder_lost: int, conditions: Sequence[Condition] = ()
 ) -> str:
     """Return the text of the metrics file; the label `bus` distinguishes daemons."""
     label = bus.replace("\\", "\\\\").replace('"', '\\"').replace("\n", " ")
@@ -78,18 +74,6 @@ def metrics_text(
     return "\n".join(lines) + "\n"
 
 
-def write_metrics(path: Path, text: str) -> None:
-    """Replace the file atomically. Raises OSError."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        temporary.chmod(0o644)
-        temporary.replace(path)
-    except OSError:
-        temporary.unlink(missing_ok=True)
-        raise
-
-
 def _number(value: float) -> str:
     if math.isnan(value):
         return "NaN"
@@ -108,13 +92,8 @@ others switch it on, and perhaps only when we are ready."""
 class Service:
     """Services of one run: systemd, orders, metrics.
 
-    Args:
-        config: in force.
-        directory: runtime directory.
-        bus: name for the metrics.
-        log: of the operator.
-        save: has the flight recording written; False where there is no recorder.
-        conditions: for the metrics.
+    directory: runtime directory; bus: name for the metrics; save: has the flight recording written, False where there is no
+    recorder.
     """
 
     def __init__(
@@ -127,9 +106,8 @@ class Service:
         save: Callable[[], bool],
         conditions: Conditions,
     ) -> None:
-        self._config, self._bus, self._log = config, bus, log
-        self._conditions = conditions
-        self._directory, self._save = directory, save
+        self._config, self._directory, self._bus, self._log = config, directory, bus, log
+        self._save, self._conditions = save, conditions
         self._notifier = Notifier()
         self._control: ControlServer | None = None
         self._reader: SnapshotReader | None = None
@@ -210,12 +188,9 @@ class Service:
 
     def _estimating(self, view: View) -> bool:
         """Return whether the loop publishes and every mandatory joint has inputs and a settled estimator."""
-        if not view.counters["published"]:
-            return False
-        mandatory = (joint.mandatory for joint in self._config.joints)
-        return not any(
-            must and joint.status in _NOT_READY for must, joint in zip(mandatory, view.joints, strict=True)
-        )
+        joints = zip(self._config.joints, view.joints, strict=True)
+        waits = any(configured.mandatory and joint.status in _NOT_READY for configured, joint in joints)
+        return view.counters["published"] > 0 and not waits
 
     def _write_metrics(self, view: View, recorder_lost: int) -> None:
         assert self._config.metrics_file is not None
@@ -223,19 +198,15 @@ class Service:
         path = self._directory / self._config.metrics_file  # an absolute one stays what it is
         try:
             present = self._conditions.present()
-            write_metrics(path, metrics_text(view, self._reader, self._bus, recorder_lost, present))
+            write_whole(path, metrics_text(view, self._reader, self._bus, recorder_lost, present), 0o644)
         except OSError as error:
             self._log(f"metrics: {path}: {error.strerror}", Priority.WARNING, "metrics")
 
 
 def _status(view: View) -> str:
     joints = "; ".join(
-        f"joint {number}: {st.NAMES[joint.status]}" + _torque(joint)
+        f"joint {number}: {st.NAMES[joint.status]}"
+        + ("" if math.isnan(joint.torque_nm) else f" {joint.torque_nm:+.2f} Nm")
         for number, joint in enumerate(view.joints, start=1)
     )
-    counters = view.counters
-    return f"{joints}; {counters['cycles']} cycles, {counters['missed']} missed"
-
-
-def _torque(joint: Any) -> str:
-    return "" if joint.torque_nm != joint.torque_nm else f" {joint.torque_nm:+.2f} Nm"
+    return f"{joints}; {view.counters['cycles']} cycles, {view.counters['missed']} missed"

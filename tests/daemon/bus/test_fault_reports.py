@@ -10,17 +10,13 @@ import pytest
 from jtqd.daemon.bus.own_node import OwnErrors, OwnNode
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared import faults
-from jtqd.daemon.shared.conditions import Subject
-from jtqd.daemon.shared.snapshot import InputView, JointView, Snapshot, SnapshotReader, View
-from jtqd.daemon.supervisor.health import TIMEOUT_CYCLES, PdoChange, PdoWatch
+from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader, View
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.status import INVALID
 from tests.daemon.snapshots import EstimateWriter
 from tests.daemon.supervisor.watch_views import WELL, Observer, view
 from tests.paths import JTQD_EDS
 
-PDO = Subject("181h drive 1 TPDO1", 0x181, 1, node=1)
-SEEN = InputView(*(0,) * 12)
 JUMP, TORSION = faults.BITS["motor_jump"], faults.BITS["torsion"]
 
 
@@ -123,16 +119,6 @@ def test_faults_and_latches_are_emcy_with_the_drives_node(
 @pytest.fixture
 def errors(node: tuple[ObjectStore, Snapshot, SnapshotReader]) -> OwnErrors:
     return OwnErrors(node[0])
-
-
-def test_the_twentieth_cycle_is_the_deadline_and_absent_nodes_have_none() -> None:
-    watch = PdoWatch([PDO])
-    watch.changes([SEEN], (), 0.0)
-    row = SEEN._replace(missed=TIMEOUT_CYCLES, in_a_row=TIMEOUT_CYCLES)
-    assert watch.changes([row], (), 0.1) == [PdoChange(0x8250, PDO, True)]
-    watch = PdoWatch([PDO])
-    watch.changes([SEEN], {1}, 0.0)
-    assert watch.changes([row._replace(in_a_row=0)], {1}, 0.1) == []
 
 
 def test_a_counters_error_lasts_a_second_and_a_latch_alone_is_a_fault_too(errors: OwnErrors) -> None:

@@ -3,10 +3,11 @@
 import fcntl
 import os
 import threading
+from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.shared.runtime_dir import claim, instance_name, remove
+from jtqd.daemon.shared.runtime_dir import claim, instance_name, remove, write_whole
 
 
 @pytest.fixture(autouse=True)
@@ -140,3 +141,16 @@ def test_who_comes_while_left_overs_are_taken_away_waits_a_moment(root):
     timer.join()
     assert found == directory
     os.close(held)
+
+
+def test_a_file_is_replaced_at_once_and_nothing_is_left(tmp_path: Path) -> None:
+    path = tmp_path / "out" / "metrics.prom"
+    path.parent.mkdir()
+    write_whole(path, "old\n")
+    with open(path) as reader:
+        write_whole(path, "new\n", 0o644)
+        assert reader.read() == "old\n", "who has it open keeps the old one whole"
+    assert (path.read_text(), path.stat().st_mode & 0o777) == ("new\n", 0o644)
+    assert list(path.parent.iterdir()) == [path]
+    with pytest.raises(OSError, match="No such file"):
+        write_whole(tmp_path / "gone" / "metrics.prom", "new\n")

@@ -3,9 +3,9 @@
 import pytest
 
 from jtqd.daemon.config import load_config
-from jtqd.daemon.shared.conditions import Subject
+from jtqd.daemon.shared.conditions import Change, Conditions, Subject
 from jtqd.daemon.shared.snapshot import InputView
-from jtqd.daemon.supervisor.health import LENGTH_S, TIMEOUT_CYCLES, PdoChange, PdoWatch
+from jtqd.daemon.supervisor.health import LENGTH_S, TIMEOUT_CYCLES, PdoWatch
 from jtqd.estimator.status import OFF, STALE
 from jtqd.models.files import shipped
 from tests.daemon.supervisor.watch_views import NAN, WELL, Observer, view
@@ -211,57 +211,79 @@ def test_readings_far_apart_or_of_one_cycle_are_no_duration():
 
 PDO = Subject("181h drive 1 TPDO1", 0x181, 1, node=1)
 SENSOR = Subject("183h sensor 3 channel 1", 0x183, node=3)
-SEEN = InputView(*(0,) * 12)
+N = TIMEOUT_CYCLES
+BEGUN, ENDED, BOTH = "8250h", "8250h ended", "8250h,8250h ended"
 
 
-def test_8250h_per_pdo_comes_after_the_deadline_and_goes_with_the_next_valid_one() -> None:
-    watch = PdoWatch([PDO, SENSOR])
-
-    def events(missed: int, row: int) -> list[PdoChange]:
-        seen = SEEN._replace(missed=missed, in_a_row=row)
-        return watch.changes([seen, SEEN], (), 0.0)
-
-    assert events(19, 19) == []
-    assert events(25, 25) == [PdoChange(0x8250, PDO, True)]
-    assert events(200, 200) == []
-    assert events(200, 0) == [PdoChange(0x8250, PDO, False)]
-    assert events(200 + TIMEOUT_CYCLES, 0) == [PdoChange(0x8250, PDO, True), PdoChange(0x8250, PDO, False)], (
-        "a loss that was over before anybody looked is told too"
-    )
-
-
-def test_8250h_of_a_loss_that_two_readings_share() -> None:
-    watch = PdoWatch([PDO])
-    watch.changes([SEEN], (), 0.0)
-    assert watch.changes([SEEN._replace(missed=15, in_a_row=15)], (), 0.05) == []
-    both = [PdoChange(0x8250, PDO, True), PdoChange(0x8250, PDO, False)]
-    assert watch.changes([SEEN._replace(missed=15 + TIMEOUT_CYCLES - 15, in_a_row=0)], (), 0.1) == both
-    assert watch.changes([SEEN._replace(missed=TIMEOUT_CYCLES, in_a_row=0)], (), 0.15) == []
-    assert watch.changes([SEEN._replace(missed=TIMEOUT_CYCLES + 5, in_a_row=0)], (), 0.2) == [], (
-        "another loss"
-    )
-
-
-def test_8250h_of_a_loss_that_is_over_while_a_short_one_goes_on() -> None:
-    watch = PdoWatch([PDO])
-    watch.changes([SEEN], (), 0.0)
-    both = [PdoChange(0x8250, PDO, True), PdoChange(0x8250, PDO, False)]
-    assert watch.changes([SEEN._replace(missed=TIMEOUT_CYCLES + 3, in_a_row=3)], (), 0.05) == both
-    assert watch.changes([SEEN._replace(missed=TIMEOUT_CYCLES + 19, in_a_row=19)], (), 0.1) == [], "not yet"
+@pytest.mark.parametrize(
+    "readings",
+    [  # time, missed, in a row, short, long, changes
+        pytest.param(
+            [(0.0, 0, 0, 0, 0, ""), (0.1, N, N, 0, 0, BEGUN)], id="the twentieth cycle is the deadline"
+        ),
+        pytest.param(
+            [
+                (0.0, 19, 19, 0, 0, ""),
+                (0.0, 25, 25, 0, 0, BEGUN),
+                (0.0, 200, 200, 0, 0, ""),
+                (0.0, 200, 0, 0, 0, ENDED),
+                (0.0, 200 + N, 0, 0, 0, BOTH),
+            ],
+            id="it ends with the next valid one; a loss over before anybody looked counts too",
+        ),
+        pytest.param(
+            [
+                (0.0, 0, 0, 0, 0, ""),
+                (0.05, 15, 15, 0, 0, ""),
+                (0.1, N, 0, 0, 0, BOTH),
+                (0.15, N, 0, 0, 0, ""),
+                (0.2, N + 5, 0, 0, 0, ""),
+            ],
+            id="a loss that two readings share",
+        ),
+        pytest.param(
+            [(0.0, 0, 0, 0, 0, ""), (0.05, N + 3, 3, 0, 0, BOTH), (0.1, N + 19, 19, 0, 0, "")],
+            id="a loss that is over while a short one goes on",
+        ),
+        pytest.param(
+            [
+                (0.0, 0, 0, 0, 0, ""),
+                (1.0, 0, 0, 1, 0, "8210h"),
+                (1.5, 0, 0, 1, 3, "8220h"),
+                (1.0 + LENGTH_S, 0, 0, 1, 3, "8210h ended"),
+                (1.5 + LENGTH_S, 0, 0, 1, 3, "8220h ended"),
+            ],
+            id="wrong lengths last as long as they come",
+        ),
+    ],
+)
+def test_errors_of_a_pdo(readings: list[tuple[float, int, int, int, int, str]]) -> None:
+    watch, changes = pdo_watch(PDO, SENSOR)
+    for now_s, missed, in_a_row, short, long, expected in readings:
+        seen = InputView(0, 0, 0, 0, 0, 0, 0, 0, missed, in_a_row, short, long)
+        watch.observe([seen, InputView(*(0,) * 12)], (), now_s)
+        assert ",".join(changes) == expected, now_s
+        changes.clear()
 
 
 def test_a_pdo_of_an_absent_optional_node_is_not_missed() -> None:
-    watch = PdoWatch([PDO, SENSOR])
-    gone = SEEN._replace(missed=500, in_a_row=500)
-    assert watch.changes([SEEN, gone], {3}, 0.0) == []
-    assert watch.changes([SEEN, gone], (), 0.0) == [PdoChange(0x8250, SENSOR, True)]
+    watch, changes = pdo_watch(SENSOR)
+    gone = InputView(0, 0, 0, 0, 0, 0, 0, 0, 500, 500, 0, 0)
+    watch.observe([gone._replace(missed=0, in_a_row=0)], {3}, 0.0)
+    watch.observe([gone._replace(in_a_row=0)], {3}, 0.0)
+    watch.observe([gone], {3}, 0.0)
+    assert changes == []
+    watch.observe([gone], (), 0.0)
+    assert changes == [BEGUN]
 
 
-def test_8210h_and_8220h_last_as_long_as_wrong_lengths_come() -> None:
-    watch = PdoWatch([PDO])
-    watch.changes([SEEN], (), 0.0)
-    short, both = SEEN._replace(short=1), SEEN._replace(short=1, long=3)
-    assert watch.changes([short], (), 1.0) == [PdoChange(0x8210, PDO, True)]
-    assert watch.changes([both], (), 1.5) == [PdoChange(0x8220, PDO, True)]
-    assert watch.changes([both], (), 1.0 + LENGTH_S) == [PdoChange(0x8210, PDO, False)]
-    assert watch.changes([both], (), 1.5 + LENGTH_S) == [PdoChange(0x8220, PDO, False)]
+def pdo_watch(*pdos: Subject) -> tuple[PdoWatch, list[str]]:
+    """A watch of PDOs, and the EMCY codes of what it changes."""
+    conditions, changes = Conditions(), []
+
+    def changed(change: Change) -> None:
+        assert change.definition.emcy is not None
+        changes.append(f"{change.definition.emcy.code:04X}h" + ("" if change.present else " ended"))
+
+    conditions.subscribe(changed)
+    return PdoWatch(pdos, conditions), changes

@@ -9,7 +9,7 @@ from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.conditions import WARNING, Condition
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.daemon.supervisor.service import metrics_text, write_metrics
+from jtqd.daemon.supervisor.service import metrics_text
 from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import shipped
 from tests.daemon.loop.cycle_helpers import inputs, make, turn
@@ -42,19 +42,6 @@ def test_every_counter_and_both_joints_in_the_format_of_prometheus(tmp_path: Pat
 
 def test_a_bus_may_have_any_name(tmp_path: Path) -> None:
     assert 'bus="unix-\\"a\\\\b"' in text_of(tmp_path, 'unix-"a\\b')
-
-
-def test_the_file_is_replaced_at_once_and_nothing_is_left(tmp_path: Path) -> None:
-    path = tmp_path / "out" / "metrics.prom"
-    path.parent.mkdir()
-    write_metrics(path, "old\n")
-    with open(path) as reader:
-        write_metrics(path, "new\n")
-        assert reader.read() == "old\n", "who has it open keeps the old one whole"
-    assert path.read_text() == "new\n"
-    assert list(path.parent.iterdir()) == [path]
-    with pytest.raises(OSError, match="No such file"):
-        write_metrics(tmp_path / "gone" / "metrics.prom", "new\n")
 
 
 def test_it_is_off_unless_configured(tmp_path: Path) -> None:
