@@ -5,7 +5,7 @@ from libc.stdint cimport int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 
 from jtqd.daemon.core.intake cimport MOST_INPUTS, Intake
 from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
-from jtqd.daemon.core.record cimport MOST_JOINTS, CycleFrames, RecordRing
+from jtqd.daemon.core.record cimport MOST_JOINTS, RecordRing
 from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
 from jtqd.drivers.frame_socket cimport Frame, FrameSocket
 from jtqd.estimator.sample cimport Learned
@@ -79,14 +79,13 @@ cdef class Cycle:
     cdef readonly tuple joints
     cdef NetworkBudget budget
     cdef WakeUp wake_up
-    cdef CycleFrames frames
     cdef SnapshotWriter writer
     cdef ContactWatch contacts  # None: they are not watched
     cdef bint watches
     cdef int count  # of joints
     cdef PyObject *at[MOST_JOINTS]  # `joints`, which keeps them
     cdef JointState *states[MOST_JOINTS]  # theirs
-    cdef RecordRing records
+    cdef RecordRing ring
     cdef Clock clock
     cdef FrameSocket bus
     cdef int counter_overflow

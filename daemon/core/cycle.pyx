@@ -19,7 +19,7 @@ from typing import Final
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, NOT_HEARD, Input, Intake
 from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
-from jtqd.daemon.core.record cimport CycleFrames, Header, JointBlock, RecordRing
+from jtqd.daemon.core.record cimport Header, JointBlock, RecordRing
 from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
 from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
@@ -241,7 +241,7 @@ cdef class SnapshotWriter:
         """Write what the estimator of joint `number`, from 0 on, has learned, and its state; between `begin` and `end`."""
         cdef LearnedBlock *block = &(<LearnedBlock *> &self.learned[0])[number]
         cdef size_t size = 0
-        cdef const void *state = joint.learned(&block.zeros, &size)
+        cdef const void *state = joint.core.learned(&block.zeros, &size)
         block.size = 0
         if state != NULL and size <= sizeof(block.state):
             block.size = size
@@ -386,8 +386,7 @@ cdef class Cycle:
             joint = self.joints[n]
             self.at[n], self.states[n] = <PyObject *> joint, &joint.now
         self.clock, self.bus = clock, socket_of(socket)
-        self.records, self.frames = RecordRing(ring, self.count), CycleFrames(self.count)
-        self.frames.begin(self.records.slot())
+        self.ring = RecordRing(ring, self.count)
         self.budget, self.wake_up = NetworkBudget(self.count), WakeUp(wait_ns, deadline_ns)
         self.writer = SnapshotWriter(snapshot, intake, self.bus)
         self.counter_overflow, self.heartbeat_cycles = counter_overflow, heartbeat_cycles
@@ -442,13 +441,13 @@ cdef class Cycle:
         cdef Frame sync
         cdef int64_t before_ns, realtime_ns, at_ns
         cdef int count, n
-        self.frames.begin(self.records.slot())
+        self.ring.begin()
         self.flags, self.next_flags = self.next_flags, 0
         for n in range(4):
             self.counted[n] = intake.counters[COUNTED[n]]
         count = self.drain()
         if count:
-            self.frames.keep(self.bus.frames_c, self.bus.stamps_c, count)
+            self.ring.keep(self.bus.frames_c, self.bus.stamps_c, count)
         self.counter = self.counter % (self.counter_overflow or LAST_NUMBER) + 1
         intake.begin(self.counter)
         before_ns = self.clock.monotonic()
@@ -476,7 +475,7 @@ cdef class Cycle:
             if count:
                 for n in range(count):
                     intake.take_frame(&self.bus.frames_c[n], self.bus.stamps_c[n], self.bus.own_c[n])
-                self.frames.keep(self.bus.frames_c, self.bus.stamps_c, count)
+                self.ring.keep(self.bus.frames_c, self.bus.stamps_c, count)
                 if intake.missing == 0:
                     break
             left_ns = deadline_ns - self.clock.monotonic()
@@ -521,10 +520,11 @@ cdef class Cycle:
             if self.clock.monotonic() < self.grid.end_ns():
                 self.flags |= BEFORE_NEXT_SYNC
         self.sent_ns = self.clock.monotonic()
+        at_ns = self.sent_ns + self.realtime_offset_ns
         for n in range(self.estimates):
-            self.frames.keep_one(&self.estimate_frames[n], self.sent_ns + self.realtime_offset_ns)
+            self.ring.keep(&self.estimate_frames[n], &at_ns, 1)
         for n in range(self.contact_pdos):
-            self.frames.keep_one(&self.contact_frames[n], self.sent_ns + self.realtime_offset_ns)
+            self.ring.keep(&self.contact_frames[n], &at_ns, 1)
         if self.index >= self.heartbeat_due:
             self.heartbeat_due = self.index + self.heartbeat_cycles
             self.send(&self.heartbeat_frame)
@@ -534,10 +534,10 @@ cdef class Cycle:
         cdef Intake intake = self.intake
         cdef int n
         cdef int64_t work_ns = self.clock.monotonic() - self.work_start_ns, missed = self.grid.missed
-        self.frames.record.header[0] = Header(
+        self.ring.record.header[0] = Header(
             self.index, self.sync_ns, self.sync_realtime_ns,
             self.flags, min(work_ns, MOST_WORK_NS), min(self.late_ns, MOST_LATE_NS), missed,
-            self.counter, self.frames.count, min(self.frames.left_out, BYTE),
+            self.counter, self.ring.count, min(self.ring.left_out, BYTE),
             min(intake.counters[COUNTED[0]] - self.counted[0], BYTE),
             min(intake.counters[COUNTED[1]] - self.counted[1], BYTE),
             min(intake.counters[COUNTED[2]] - self.counted[2], BYTE),
@@ -545,10 +545,10 @@ cdef class Cycle:
             0,
         )
         for n in range(self.count):
-            self.frames.record.joints[n] = self.states[n].sample
+            self.ring.record.joints[n] = self.states[n].sample
             self.writer.status_cycles[CODES * n + self.states[n].status] += 1
-        self.frames.record.tail[0] = self.index
-        self.records.commit()
+        self.ring.record.tail[0] = self.index
+        self.ring.commit()
         self.writer.count(self.flags, work_ns, self.late_ns, missed)
         if self.index % SNAPSHOT_EVERY == 0:
             self.write_snapshot()
@@ -566,7 +566,7 @@ cdef class Cycle:
             frame = &self.bus.frames_c[n]
             state = intake.input_with(frame.id)
             if intake.temperature_with(frame.id) != NULL or (state != NULL and state.age_ns):
-                self.frames.keep_for_next(frame, self.bus.stamps_c[n])
+                self.ring.keep_for_next(frame, self.bus.stamps_c[n])
         if not intake.gap_wanted:
             return False
         intake.pass_slot()

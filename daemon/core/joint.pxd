@@ -7,7 +7,7 @@ from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.estimator.contact cimport ContactLaw, ContactState
-from jtqd.estimator.sample cimport Estimator, Learned
+from jtqd.estimator.sample cimport Estimator
 
 cdef enum:
     MOST_TPDOS = 4  # of a drive
@@ -57,7 +57,6 @@ cdef class JointCycle:
     cdef int set_scale(self, inputs) except -1
     cpdef void observe(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
     cdef void estimate(self, int64_t sync_ns, bint starting, bint network_wanted, int flags) noexcept nogil
-    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil
     cdef void miss(self, int flags) noexcept nogil
     cdef int reference(self) noexcept nogil
     cdef double since_last(self, int64_t sync_ns) noexcept nogil

@@ -39,7 +39,7 @@ from jtqd.estimator.contact cimport (
     fill_contact,
     restart_contact,
 )
-from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
+from jtqd.estimator.sample cimport Estimator, Sample, Values
 from jtqd.estimator.sample import PythonEstimator
 
 STAMP_ACCURACY_NS: Final = 5_000
@@ -232,7 +232,7 @@ cdef class JointCycle:
         if not has_torque(status):
             e.torque_nm = e.sigma_nm = NAN
         elif status != STANDSTILL and not isnan(record.reference_nm):
-            self.rules.tally.error(e.torque_nm - record.reference_nm, e.torque_nm - record.sensor_torque_nm)
+            self.rules.error(e.torque_nm - record.reference_nm, e.torque_nm - record.sensor_torque_nm)
         record.current_a, record.motor_position_rad = sample.current_a, sample.motor_position_rad
         record.link_position_rad = sample.link_position_rad if self.link_count != NULL else NAN
         record.motor_velocity_rad_s = sample.motor_velocity_rad_s
@@ -245,10 +245,6 @@ cdef class JointCycle:
         record.statusword, record.input_flags = statusword, flags
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched
-
-    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
-        """As `Estimator.learned`, of the estimator in force."""
-        return self.core.learned(out, size)
 
     cdef void miss(self, int flags) noexcept nogil:
         """Handle a missing input: the observer keeps its state (the next dt is longer), nothing is published."""

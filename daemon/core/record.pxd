@@ -35,6 +35,11 @@ cdef struct Record:  # one record in the ring's memory
     int64_t *stamps_ns
     uint64_t *tail
 
+cdef struct KeptFrames:  # of slots without a record
+    int64_t count
+    Frame frames[MOST_FRAMES]
+    int64_t stamps_ns[MOST_FRAMES]
+
 cdef class RecordRing:
     cdef object memory
     cdef uint64_t[::1] head
@@ -42,20 +47,10 @@ cdef class RecordRing:
     cdef uint64_t *written
     cdef uint64_t slots
     cdef Layout layout
-    cdef Record slot(self) noexcept nogil
-    cdef void commit(self) noexcept nogil
-
-cdef struct KeptFrames:  # of slots without a record
-    int64_t count
-    Frame frames[MOST_FRAMES]
-    int64_t stamps_ns[MOST_FRAMES]
-
-cdef class CycleFrames:
-    cdef Layout layout
     cdef Record record
-    cdef readonly int count, left_out
+    cdef int count, left_out
     cdef KeptFrames kept
-    cdef void begin(self, Record record) noexcept nogil
+    cdef void begin(self) noexcept nogil
+    cdef void commit(self) noexcept nogil
     cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil
     cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil
-    cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil

@@ -9,7 +9,6 @@ from libc.string cimport memcpy
 
 import sys
 
-from jtqd.estimator.block cimport copied
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.shared import cycle_record as cr
 
@@ -43,59 +42,44 @@ def _check_layout():
 _check_layout()
 
 
-cdef Layout _layout(int joints) except *:
-    """Return the layout for a number of joints; raises ValueError for any but 1..4."""
-    found = cr.layout_of(joints)
-    return Layout(joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.tail_offset, found.size)
-
-
 cdef class RecordRing:
-    """The ring's memory (`jtqd.daemon.shared.cycle_record.Ring`) for records of this number of joints."""
+    """The record of the current cycle in the ring's memory (`jtqd.daemon.shared.cycle_record.Ring`), and its frames.
+
+    Frames are copied unchanged: `count` are stored in the record, `left_out` found no room.
+    """
 
     def __init__(self, ring, int joints=2):
         cdef Py_ssize_t word = cr.COUNT_WORD
+        found = cr.layout_of(joints)
+        self.layout = Layout(
+            joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.tail_offset, found.size
+        )
         self.memory = ring
         self.head, self.records, self.slots = ring.words, ring.records, ring.size
         self.written = &self.head[word]
-        self.layout = _layout(joints)
         if <uint64_t> self.records.shape[0] != self.slots * self.layout.size:
             raise ValueError(f"found a ring of {self.records.shape[0]} bytes for {self.slots} cycles of {joints} joints")
+        self.begin()
 
-    cdef Record slot(self) noexcept nogil:
-        """Return the memory of the record that the next `commit` publishes."""
+    cdef void begin(self) noexcept nogil:
+        """Begin the record that the next `commit` publishes."""
         cdef uint8_t *start = &self.records[(self.written[0] % self.slots) * self.layout.size]
-        return Record(
+        cdef int stored = min(self.kept.count, self.layout.frame_capacity)
+        self.record = Record(
             <Header *> start,
             <JointBlock *> (start + sizeof(Header)),
             <Frame *> (start + self.layout.frames_offset),
             <int64_t *> (start + self.layout.stamps_offset),
             <uint64_t *> (start + self.layout.tail_offset),
         )
-
-    cdef void commit(self) noexcept nogil:
-        """Publish the record: one 8-byte store, after all others."""
-        publish(self.written, self.written[0] + 1)
-
-
-cdef class CycleFrames:
-    """Frames of a cycle, copied unchanged into its record; `count` are stored in it, `left_out` found no room."""
-
-    def __init__(self, int joints=2):
-        self.layout = _layout(joints)
-
-    @property
-    def slot(self):
-        """The record of the current cycle as it is now."""
-        return copied(self.record.header, self.layout.size)
-
-    cdef void begin(self, Record record) noexcept nogil:
-        """Store the next frames in this record."""
-        cdef int stored = min(self.kept.count, self.layout.frame_capacity)
-        self.record = record
         self.count = self.left_out = 0
         self.keep(self.kept.frames, self.kept.stamps_ns, stored)
         self.left_out = self.kept.count - stored
         self.kept.count = 0
+
+    cdef void commit(self) noexcept nogil:
+        """Publish the record: one 8-byte store, after all others."""
+        publish(self.written, self.written[0] + 1)
 
     cdef void keep_for_next(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
         """Keep a frame of a slot without a record for the next record."""
@@ -105,13 +89,9 @@ cdef class CycleFrames:
         self.kept.count += 1
 
     cdef void keep(self, const Frame *frames, const int64_t *stamps_ns, int count) noexcept nogil:
-        """Copy `count` received frames; `stamps_ns` are CLOCK_REALTIME."""
+        """Copy `count` frames; `stamps_ns` are CLOCK_REALTIME, of our own when they were handed to the socket."""
         cdef int stored = min(count, self.layout.frame_capacity - self.count)
         memcpy(&self.record.frames[self.count], frames, stored * sizeof(Frame))
         memcpy(&self.record.stamps_ns[self.count], stamps_ns, stored * sizeof(int64_t))
         self.count += stored
         self.left_out += count - stored
-
-    cdef void keep_one(self, const Frame *frame, int64_t stamp_ns) noexcept nogil:
-        """Copy one frame; of our own, `stamp_ns` (CLOCK_REALTIME) is when it was handed to the socket."""
-        self.keep(frame, &stamp_ns, 1)

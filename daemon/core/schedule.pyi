@@ -23,8 +23,7 @@ class Grid:
 
 class WakeUp:
     def __init__(self, wait_ns: int, deadline_ns: int) -> None: ...
-    @property
-    def wait_ns(self) -> int: ...
+    wait_ns: Final[int]
     def follow(self, last_delay_ns: int) -> None: ...
 
 class NetworkBudget:

@@ -26,16 +26,10 @@ cdef class JointStatus:
     cdef void rise(self, int status) noexcept nogil
     cdef int64_t cycles(self, int status) noexcept nogil
 
-cdef class JointTally:
+cdef class JointRules:
     cdef uint64_t[::1] counters
     cdef double[::1] errors
     cdef int number
-    cdef int faults(self, StatusState *state) noexcept nogil
-    cdef void network(self, const Values *estimate, bint wanted, double limit_nm) noexcept nogil
-    cdef void error(self, double aligned_nm, double now_nm) noexcept nogil
-
-cdef class JointRules:
-    cdef JointTally tally
     cdef JointStatus status
     cdef Plausibility plausibility
     cdef bint is_checked, with_network
@@ -50,4 +44,6 @@ cdef class JointRules:
     ) noexcept nogil
     cdef int stale(self, int *flags) noexcept nogil
     cdef int fault_flags(self) noexcept nogil
+    cdef void count_network(self, const Values *estimate, bint wanted) noexcept nogil
+    cdef void error(self, double aligned_nm, double now_nm) noexcept nogil
     cdef int faults_of(self, const Values *estimate, double reference_nm, bint network_wanted) noexcept nogil

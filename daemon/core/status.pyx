@@ -2,8 +2,8 @@
 
     estimate and inputs  ->  faults of this cycle  ->  status with hysteresis and latches  ->  status and flags
 
-`JointSafety` holds limits and checks, `JointStatus` the hysteresis, `JointTally` counts, and `JointRules` applies the rules
-of docs/safety.md to one cycle after the other: a number leaves only through `JointRules.judge`. What it needs beside the
+`JointSafety` holds limits and checks, `JointStatus` the hysteresis, and `JointRules` applies the rules of docs/safety.md to
+one cycle after the other and counts: a number leaves only through `JointRules.judge`. What it needs beside the
 estimate comes from the log again: the inputs, `cr.FLAG_WITHDRAWN` (`late`), `cr.FLAG_RESET` (`reset_latch`),
 `FLAG_NETWORK_SKIPPED`. So a replay gives the same.
 
@@ -200,54 +200,6 @@ if faults.COUNTED != tuple([1 << _bit for _bit in range(LOW_BYTE)]):
     raise ImportError("the faults that are counted are not those of the low byte")
 
 
-cdef class JointTally:
-    """Counts of joint `number` (from 0 on): why its network was dropped, its faults, its squared errors against the sensor.
-
-    tally: where it counts: `counters` and `errors` of a `Snapshot`, or arrays of their layout.
-    """
-
-    def __init__(self, int number, tally):
-        self.counters, self.errors = tally.counters, tally.errors
-        self.number = number
-        if self.counters.shape[0] != len(COUNTERS) or self.errors.shape[0] < 3 * number + 3:
-            raise ValueError("not the counters and errors of a snapshot")
-
-    cdef int faults(self, StatusState *state) noexcept nogil:
-        """Count the faults that are new in this cycle; return the flags that explain the missing torque."""
-        cdef int flags, bit
-        if state.news:
-            for bit in range(LOW_BYTE):
-                if state.news >> bit & 1:
-                    self.counters[COUNTER_OF[bit]] += 1
-            state.news = 0
-        flags = (state.reasons & 0xFF) << 8
-        if state.latched:
-            self.counters[LATCHES] += state.latches
-            state.latches = 0
-            flags |= FLAG_LATCHED | (state.latched & 0xFF) << 8
-        return flags
-
-    cdef void network(self, const Values *estimate, bint wanted, double limit_nm) noexcept nogil:
-        """Count a cycle in which the network is not fully used (status 3), or gave no torque."""
-        cdef double network_nm = estimate.network_nm
-        if estimate.status == DEGRADED:
-            self.counters[FALLBACKS] += 1
-        if not wanted:
-            self.counters[NETWORK_NO_TIME] += 1
-        elif network_nm - network_nm != 0.0:
-            self.counters[NETWORK_NOT_FINITE] += 1
-        elif fabs(network_nm - estimate.physics_nm) > limit_nm:
-            self.counters[NETWORK_FAR] += 1
-        else:
-            self.counters[NETWORK_OUTSIDE] += 1
-
-    cdef void error(self, double aligned_nm, double now_nm) noexcept nogil:
-        """Add the error of a published estimate against the sensor of its age, and against the sensor now."""
-        self.errors[3 * self.number] += aligned_nm * aligned_nm
-        self.errors[3 * self.number + 1] += now_nm * now_nm
-        self.errors[3 * self.number + 2] += 1.0
-
-
 # Limits and checks of a joint ------------------------------------------------------------------------------------------
 
 TORQUE_RANGE_NM: Final = 327.67
@@ -315,11 +267,14 @@ cdef int _forced_status(int statusword) noexcept nogil:
 cdef class JointRules:
     """The rules for joint `number` (from 0 on), one cycle after the other.
 
-    tally: where it counts; safety: limits and checks (`JointSafety`); with_network: the estimator uses one.
+    tally: where it counts why its network was dropped, its faults, and its squared errors against the sensor: `counters` and
+    `errors` of a `Snapshot`, or arrays of their layout; safety: limits and checks; with_network: the estimator uses one.
     """
 
     def __init__(self, int number, tally, safety, bint with_network):
-        self.tally = JointTally(number, tally)
+        self.counters, self.errors, self.number = tally.counters, tally.errors, number
+        if self.counters.shape[0] != len(COUNTERS) or self.errors.shape[0] < 3 * number + 3:
+            raise ValueError("not the counters and errors of a snapshot")
         restart_reference(&self.seen)
         self.status = JointStatus(safety.settings)
         self.with_network = with_network
@@ -376,12 +331,6 @@ cdef class JointRules:
         flags[0] |= self.fault_flags()
         return status
 
-    cdef int fault_flags(self) noexcept nogil:
-        """Bits of `input_flags` for the reason that there is no torque."""
-        if self.status.now.reasons or self.status.now.latched:
-            return self.tally.faults(&self.status.now)
-        return 0
-
     cdef int faults_of(self, const Values *estimate, double reference_nm, bint network_wanted) noexcept nogil:
         """Return the faults of numbers that the estimator marked as good."""
         cdef double torque = estimate.torque_nm, sigma = estimate.sigma_nm, network = estimate.network_nm
@@ -391,7 +340,7 @@ cdef class JointRules:
         if not (-limit <= torque <= limit and is_sigma):  # so that NaN fails too
             found = FAULT_OUT_OF_RANGE if torque - torque == 0.0 and is_sigma else FAULT_NOT_FINITE
         if self.with_network and (estimate.status == DEGRADED or network - network != 0.0):
-            self.tally.network(estimate, network_wanted, self.network_limit_nm)
+            self.count_network(estimate, network_wanted)
         if self.deviation_cycles:
             if fabs(torque - reference_nm) <= self.deviation_sigmas * sqrt(sigma * sigma + self.sensor_variance):
                 self.deviates = 0
@@ -400,3 +349,41 @@ cdef class JointRules:
             if self.deviates >= self.deviation_cycles:
                 found |= FAULT_DEVIATION
         return found
+
+    cdef int fault_flags(self) noexcept nogil:
+        """Count the faults that are new in this cycle; return the bits of `input_flags` that explain the missing torque."""
+        cdef StatusState *state = &self.status.now
+        cdef int flags, bit
+        if not (state.reasons or state.latched):
+            return 0
+        if state.news:
+            for bit in range(LOW_BYTE):
+                if state.news >> bit & 1:
+                    self.counters[COUNTER_OF[bit]] += 1
+            state.news = 0
+        flags = (state.reasons & 0xFF) << 8
+        if state.latched:
+            self.counters[LATCHES] += state.latches
+            state.latches = 0
+            flags |= FLAG_LATCHED | (state.latched & 0xFF) << 8
+        return flags
+
+    cdef void count_network(self, const Values *estimate, bint wanted) noexcept nogil:
+        """Count a cycle in which the network is not fully used (status 3), or gave no torque."""
+        cdef double network_nm = estimate.network_nm
+        if estimate.status == DEGRADED:
+            self.counters[FALLBACKS] += 1
+        if not wanted:
+            self.counters[NETWORK_NO_TIME] += 1
+        elif network_nm - network_nm != 0.0:
+            self.counters[NETWORK_NOT_FINITE] += 1
+        elif fabs(network_nm - estimate.physics_nm) > self.network_limit_nm:
+            self.counters[NETWORK_FAR] += 1
+        else:
+            self.counters[NETWORK_OUTSIDE] += 1
+
+    cdef void error(self, double aligned_nm, double now_nm) noexcept nogil:
+        """Add the error of a published estimate against the sensor of its age, and against the sensor now."""
+        self.errors[3 * self.number] += aligned_nm * aligned_nm
+        self.errors[3 * self.number + 1] += now_nm * now_nm
+        self.errors[3 * self.number + 2] += 1.0

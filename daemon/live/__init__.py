@@ -63,12 +63,7 @@ def address(text: str) -> Address:
 
 
 class LiveView(SideProcess):
-    """Live view of one run of jtqd; its failures do not affect the loop.
-
-    Args:
-        start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
-        address: where it listens.
-    """
+    """Live view of one run of jtqd, listening at `address`; its failures do not affect the loop."""
 
     def __init__(self, start_child: StartChild, address: Address) -> None:
         super().__init__(start_child, "jtqd.daemon.live.process", "live view", "listening")
@@ -82,5 +77,4 @@ class LiveView(SideProcess):
         reach = (
             f"the live view accepts connections from every host that can reach {where.host}; it is read-only"
         )
-        request = loop_request(config, runtime, bus) | {"host": where.host, "port": where.port}
-        self.begin(request, "" if where.loopback else reach)
+        self.begin(loop_request(config, runtime, bus) | where._asdict(), "" if where.loopback else reach)

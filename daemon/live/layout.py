@@ -26,9 +26,7 @@ The layout works for a recorded file and for the live view of `jtqd --live`."""
 def layout(follow_s: float | None = None, joints: int = 2) -> dict[str, Any]:
     """Return the shipped layout: panels by identifier, user scripts and their arrangement.
 
-    Args:
-        follow_s: plots show this many seconds up to the newest message; None: the whole recording.
-        joints: number of them, 1 to 4.
+    follow_s: plots show this many seconds up to the newest message; None: the whole recording.
     """
     content: dict[str, Any] = json.loads((_LAYOUTS / f"{joints}.json").read_text(encoding="utf-8"))
     for name, panel in content["configById"].items():
@@ -50,14 +48,9 @@ def parser() -> argparse.ArgumentParser:
     result.add_argument(
         "--follow", type=seconds, metavar="S", help="plots show the last S seconds (default: everything)"
     )
-    result.add_argument(
-        "--joints",
-        type=int,
-        choices=range(1, MOST_JOINTS + 1),
-        default=2,
-        metavar="N",
-        help="joints of the bus, 1 to 4 (default: 2)",
-    )
+    counts = range(1, MOST_JOINTS + 1)
+    text = "joints of the bus, 1 to 4 (default: 2)"
+    result.add_argument("--joints", type=int, choices=counts, default=2, metavar="N", help=text)
     return result
 
 

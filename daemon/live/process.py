@@ -1,10 +1,8 @@
 """The live view's process: `python -m jtqd.daemon.live.process REQUEST` reads the loop's shared memory and serves viewers.
 
 It sends one set of the cycle's messages per 20 ms, with the log's bytes; a change of status and a missed slot are seen in
-every cycle and sent as events, so that nothing that lasts less than 20 ms stays unseen.
-
-It maps ring, snapshot and notices read-only, and nothing that a viewer sends goes anywhere: the server has no capability
-(no publishing, no parameters, no services). A viewer that is too slow loses its oldest messages, not others theirs.
+every cycle and sent as events. It maps ring, snapshot and notices read-only, and nothing that a viewer sends goes anywhere.
+A viewer that is too slow loses its oldest messages, not others theirs.
 
 REQUEST is the JSON of `recording.launch.loop_request` with "host" and "port". The answer is {"listening": URL} or {"failed":
 why} (`shared.processes`).
@@ -58,14 +56,9 @@ class Message(NamedTuple):
 
 
 class LiveStream:
-    """Thins out the cycles of one run.
+    """Thins out the cycles of one run; `events` makes messages of what happens.
 
-    Args:
-        names: of the joints.
-        gear_ratios: motor revolutions per joint revolution; None where not known.
-
-    Attributes:
-        events: makes messages of what happens.
+    gear_ratios: motor revolutions per joint revolution; None where not known.
     """
 
     def __init__(self, names: Sequence[str], gear_ratios: Sequence[float | None]) -> None:
@@ -96,9 +89,8 @@ class LiveStream:
             if slot == self._slot:
                 continue
             self._slot = slot
-            block = self._cycles.block(
-                record, index, realtime, flags=flags, sync_counter=counter, frames=count
-            )
+            counts = {"flags": flags, "sync_counter": counter, "frames": count}
+            block = self._cycles.block(record, index, realtime, **counts)
             for topic, payload in self._cycles.payloads(block):
                 self.add(topic, realtime, payload)
             self.add(messages.JOINT_STATES.number, realtime, self._overview.payload(record, realtime))
@@ -109,12 +101,9 @@ class LiveStream:
 
 # ---- gateway ----
 #
-# Handshakes of viewers, old and new: a TCP gateway before the websocket server of foxglove-sdk.
-#
-# The server knows the subprotocol foxglove.sdk.v1 alone and refuses others with a text about headers. Older viewers ask for
-# foxglove.websocket.v1, which has the same messages (Lichtblick's pull request 819 takes both alike): its name is exchanged
-# in the handshake, and what follows passes unchanged.
-# A client that asks for neither, such as a browser, gets an answer with the protocols to use.
+# A TCP gateway before the websocket server of foxglove-sdk, which knows the subprotocol foxglove.sdk.v1 alone. Older viewers
+# ask for foxglove.websocket.v1, which has the same messages (Lichtblick's pull request 819): its name is exchanged in the
+# handshake, and what follows passes unchanged. A client that asks for neither gets an answer with the protocols to use.
 
 PROTOCOL, OLDER = "foxglove.sdk.v1", "foxglove.websocket.v1"
 _HEADER = re.compile(rb"^(sec-websocket-protocol: *)([^\r\n]*)", re.IGNORECASE | re.MULTILINE)
@@ -130,9 +119,8 @@ _HELP = (
 
 def asked(request: bytes) -> list[str]:
     """Return the subprotocols that a handshake offers."""
-    return [
-        each.strip() for _, value in _HEADER.findall(request) for each in value.decode("latin-1").split(",")
-    ]
+    values = (value.decode("latin-1") for _, value in _HEADER.findall(request))
+    return [each.strip() for value in values for each in value.split(",")]
 
 
 def renamed(handshake: bytes, name: str) -> bytes:
@@ -149,20 +137,15 @@ def refusal() -> bytes:
 
 
 class Gateway:
-    """Listens at `address` and passes connections on to the server at `inner`, in a thread of its own.
-
-    Raises:
-        OSError: it cannot listen there.
-    """
+    """Listens at `address` (raises OSError) and passes connections on to the server at `inner`, in a thread of its own."""
 
     def __init__(self, address: Address, inner: Address) -> None:
         self._inner = inner
         self._loop = asyncio.new_event_loop()
         self._tasks: set[asyncio.Task[None]] = set()
         try:
-            self._server = self._loop.run_until_complete(
-                asyncio.start_server(self._serve, address.host, address.port, limit=_LONGEST_HANDSHAKE)
-            )
+            listening = asyncio.start_server(self._serve, *address, limit=_LONGEST_HANDSHAKE)
+            self._server = self._loop.run_until_complete(listening)
         except BaseException:
             self._loop.close()
             raise
@@ -203,9 +186,7 @@ class Gateway:
             writer.write(refusal())
             await writer.drain()
             return
-        inside, outside = await asyncio.open_connection(
-            self._inner.host, self._inner.port, limit=_LONGEST_HANDSHAKE
-        )
+        inside, outside = await asyncio.open_connection(*self._inner, limit=_LONGEST_HANDSHAKE)
         try:
             outside.write(renamed(request, PROTOCOL))
             answer = await asyncio.wait_for(inside.readuntil(_END), _HANDSHAKE_S)
@@ -237,15 +218,9 @@ _BACKLOG = 512
 
 
 class LiveServer:
-    """Serves one channel per topic of the log, with the log's schema.
+    """Serves one channel per topic of the log, with the log's schema; `name` is what viewers show.
 
-    Args:
-        name: what viewers show.
-        address: where it listens.
-        joints: number of them.
-
-    Raises:
-        RuntimeError, OSError: it cannot listen there.
+    Raises RuntimeError, OSError where it cannot listen at `address`.
     """
 
     def __init__(self, name: str, address: Address, joints: int = 2) -> None:
@@ -255,9 +230,7 @@ class LiveServer:
             topic.number: foxglove.Channel(
                 topic.name,
                 message_encoding="cdr",
-                schema=foxglove.Schema(
-                    name=topic.schema, encoding="ros2msg", data=texts[topic.schema].encode()
-                ),
+                schema=foxglove.Schema(topic.schema, "ros2msg", texts[topic.schema].encode()),
                 context=context,
             )
             for topic in messages.topics_of(joints)
@@ -310,14 +283,7 @@ _POLL_S = 0.02
 
 
 class Source:
-    """What the daemon leaves in shared memory, as messages.
-
-    Args:
-        request: of the process.
-
-    Raises:
-        RingError, SnapshotError: it is not there.
-    """
+    """What the daemon leaves in shared memory, as messages. Raises RingError, SnapshotError where it is not there."""
 
     def __init__(self, request: dict[str, Any]) -> None:
         self._loop = LoopReader(request)
@@ -339,13 +305,8 @@ class Source:
         stream, now_ns = self._stream, time.time_ns()
         made = stream.take(self._loop.ring.read().records)
         for notice in () if self._notices is None else self._notices.read()[0]:
-            stream.events.note(
-                messages.NOTICE,
-                notice.text,
-                level=notice.level,
-                time_ns=notice.realtime_ns,
-                count=notice.node,
-            )
+            what, level, at_ns = notice.text, notice.level, notice.realtime_ns
+            stream.events.note(messages.NOTICE, what, level=level, time_ns=at_ns, count=notice.node)
         found = self._loop.diagnosis(time.monotonic_ns(), now_ns)
         if found is not None:
             view, statuses = found

@@ -33,11 +33,7 @@ def needed(machine: str) -> str:
 
 
 def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:
-    """Return the DDS domain: as configured, else by the environment (ROS_DOMAIN_ID), else 0.
-
-    Raises:
-        ConfigError: ROS_DOMAIN_ID is no domain.
-    """
+    """Return the DDS domain: as configured, else by the environment (ROS_DOMAIN_ID), else 0. Raises ConfigError."""
     text = environment.get(_VARIABLE, "")
     if configured is not None or not text:
         return configured or 0
@@ -47,15 +43,7 @@ def domain_id(configured: int | None, environment: Mapping[str, str]) -> int:
 
 
 class Ros2Publisher(SideProcess):
-    """ROS 2 publisher of one run of jtqd; its failures do not affect the loop.
-
-    Args:
-        start_child: (module, arguments, name) -> child; the supervisor ends what it has started.
-        settings: section `ros2` of the configuration.
-
-    Raises:
-        ConfigError: ROS_DOMAIN_ID is no domain.
-    """
+    """ROS 2 publisher of one run of jtqd; its failures do not affect the loop. Raises ConfigError (ROS_DOMAIN_ID)."""
 
     def __init__(self, start_child: StartChild, settings: Ros2Settings) -> None:
         super().__init__(start_child, "jtqd.daemon.ros2.process", "ROS 2 publisher", "publishing")

@@ -132,12 +132,7 @@ def header(time_ns: int) -> Header:
 
 
 class JointMessages:
-    """Messages of the newest cycle.
-
-    Args:
-        names: of the joints, joint 1 first.
-        gear_ratios: motor revolutions per joint revolution.
-    """
+    """Messages of the newest cycle; gear_ratios: motor revolutions per joint revolution."""
 
     def __init__(self, names: Sequence[str], gear_ratios: Sequence[float]) -> None:
         self._names, self._ratios = [*names], [*gear_ratios]
@@ -162,29 +157,24 @@ class JointMessages:
             header=header(cycle.header_of(self._last).sync_realtime_ns),
             name=self._names,
             position=[joint.link_position_rad for joint in joints],
-            velocity=[
-                joint.motor_velocity_rad_s / ratio for joint, ratio in zip(joints, self._ratios, strict=True)
-            ],
+            velocity=[each.motor_velocity_rad_s / g for each, g in zip(joints, self._ratios, strict=True)],
             effort=[_number(joint.torque_nm, joint.status) for joint in joints],
         )
 
     def torque_state(self, now_ns: int, *, stalled: bool = False) -> JointTorqueState | None:
-        """Return the torque state of the newest cycle; None before the first.
+        """Return the torque state of the newest cycle at now_ns (CLOCK_MONOTONIC); None before the first.
 
-        Args:
-            now_ns: CLOCK_MONOTONIC.
-            stalled: the loop stands still: nothing of that cycle is true any more.
+        stalled: the loop stands still: nothing of that cycle is true any more.
         """
         if self._last is None:
             return None
         of, joints = cycle.header_of(self._last), self._joints(self._last)
         statuses = [st.STALE if stalled else joint.status for joint in joints]
-        torque = [_number(joint.torque_nm, s) for joint, s in zip(joints, statuses, strict=True)]
-        sigma = [_number(joint.sigma_nm, s) for joint, s in zip(joints, statuses, strict=True)]
-        reach = [
-            s if status == st.STANDSTILL else INTERVAL_SIGMAS * s
-            for s, status in zip(sigma, statuses, strict=True)
-        ]
+        pairs = list(zip(joints, statuses, strict=True))
+        torque = [_number(joint.torque_nm, status) for joint, status in pairs]
+        sigma = [_number(joint.sigma_nm, status) for joint, status in pairs]
+        widths = (1.0 if status == st.STANDSTILL else INTERVAL_SIGMAS for status in statuses)
+        reach = [width * value for width, value in zip(widths, sigma, strict=True)]
         withheld, self._withheld = self._withheld, [0] * len(joints)
         return JointTorqueState(
             header=header(of.sync_realtime_ns),
@@ -214,32 +204,20 @@ def _number(value: float, status: int) -> float:
 def diagnostic_array(
     time_ns: int, bus: str, statuses: Sequence[Status], view: View, age_s: float
 ) -> DiagnosticArray:
-    """Return the statuses of /diagnostics, the bus in their names, and with the faults and the age of each joint.
+    """Return the `statuses` of /diagnostics, made of `view`, with the faults and the age of each joint.
 
-    Args:
-        time_ns: CLOCK_REALTIME.
-        bus: aggregators tell statuses apart by their names alone.
-        statuses: of the log's /diagnostics.
-        view: that they were made of.
-        age_s: of its newest cycle [s].
+    time_ns: CLOCK_REALTIME; bus: stands in their names, by which alone aggregators tell them apart; age_s: of the newest
+    cycle.
     """
     joints = {f"jtqd: joint {number}": joint for number, joint in enumerate(view.joints, start=1)}
-    return DiagnosticArray(
-        header=header(time_ns),
-        status=[
-            DiagnosticStatus(
-                level=status.level,
-                name=status.name.replace("jtqd:", f"jtqd {bus}:", 1),
-                message=status.text,
-                hardware_id=status.hardware_id,
-                values=[
-                    KeyValue(key=key, value=f"{value:.6g}" if isinstance(value, float) else str(value))
-                    for key, value in (dict(status.values) | _faults(joints.get(status.name), age_s)).items()
-                ],
-            )
-            for status in statuses
-        ],
-    )
+    shown = []
+    for status in statuses:
+        values = dict(status.values) | _faults(joints.get(status.name), age_s)
+        texts = {k: f"{v:.6g}" if isinstance(v, float) else str(v) for k, v in values.items()}
+        name = status.name.replace("jtqd:", f"jtqd {bus}:", 1)
+        rows = [KeyValue(key=key, value=text) for key, text in texts.items()]
+        shown.append(DiagnosticStatus(status.level, name, status.text, status.hardware_id, rows))
+    return DiagnosticArray(header=header(time_ns), status=shown)
 
 
 def _faults(joint: JointView | None, age_s: float) -> dict[str, float | str]:

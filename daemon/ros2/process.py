@@ -79,14 +79,10 @@ _ANNOUNCED_S = 2.0
 def domain_xml(interface: str, addresses: Sequence[str]) -> str:
     """Return Cyclone DDS's configuration for one network interface. CYCLONEDDS_URI, meant for other programs, is not read.
 
-    Each participant of a machine has a number of its own, and so ports of its own (`auto`), as in ROS 2, so that others find
-    it without multicast; 32 is rmw_cyclonedds's limit. On loopback this is how nodes are found that use other interfaces,
-    as they do in ROS 2 by default: announcements to this machine's own addresses never leave it. Cyclone DDS 11.0 ignores
-    announcements to 127.0.0.1 where it does not use that interface itself (its pull request 2457).
-
-    Args:
-        interface: its name.
-        addresses: of this machine's interfaces (IPv4).
+    Each participant of a machine has a number, and so ports, of its own (`auto`), as in ROS 2, so that others find it
+    without multicast; 32 is rmw_cyclonedds's limit. On loopback nodes that use other interfaces are found by announcements
+    to this machine's own `addresses` (IPv4), which never leave it: Cyclone DDS 11.0 ignores announcements to 127.0.0.1
+    where it does not use that interface itself (its pull request 2457).
     """
     discovery = (
         "<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>"
@@ -103,15 +99,7 @@ def domain_xml(interface: str, addresses: Sequence[str]) -> str:
 
 
 class Writers:
-    """One DDS writer per topic.
-
-    Args:
-        domain_id: DDS domain.
-        interface: network interface.
-
-    Raises:
-        DDSException: it cannot take part in that domain.
-    """
+    """One DDS writer per topic. Raises DDSException where it cannot take part in that domain."""
 
     def __init__(self, domain_id: int, interface: str) -> None:
         self._domain = Domain(domain_id, domain_xml(interface, own_addresses()))
@@ -143,14 +131,7 @@ def qos_of(kind: type[Message]) -> Qos:
 
 
 class Source:
-    """What the daemon leaves in shared memory, as messages.
-
-    Args:
-        request: of the process.
-
-    Raises:
-        RingError, SnapshotError: it is not there.
-    """
+    """What the daemon leaves in shared memory, as messages. Raises RingError, SnapshotError where it is not there."""
 
     def __init__(self, request: dict[str, Any]) -> None:
         self._bus = request["bus"]
@@ -159,12 +140,7 @@ class Source:
         self._newest_ns: int | None = None
 
     def read(self, now_ns: int, realtime_ns: int) -> Iterator[Message]:
-        """Return the messages that are due.
-
-        Args:
-            now_ns: CLOCK_MONOTONIC.
-            realtime_ns: CLOCK_REALTIME.
-        """
+        """Return the messages that are due at now_ns (CLOCK_MONOTONIC), which is realtime_ns (CLOCK_REALTIME)."""
         ring = self._loop.ring
         records = ring.read(ring.backlog).records
         self._joints.take(records)
