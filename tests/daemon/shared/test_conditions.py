@@ -3,6 +3,8 @@
 import re
 from itertools import pairwise
 
+import pytest
+
 from jtqd.daemon.shared.conditions import (
     CATALOGUE,
     Conditions,
@@ -19,10 +21,11 @@ PAGE = ROOT / "docs" / "deployment.md"
 KNOWN_CODES = {
     value for name, value in vars(emcy).items() if name.isupper() and isinstance(value, int) and value > 0xFF
 }
+FIRST = ((1.125, "lost: asked at 1.125"), (1.625, "back after 0.5 s"))
 STEP = 1.0 / 16.0  # exact in binary; two of them are longer than what counts as a flicker
 
 
-def told(*spans: tuple[float, float], until: float) -> list[tuple[float, str]]:
+def lines_of(*spans: tuple[float, float], until: float) -> list[tuple[float, str]]:
     """What is logged, and when, of something that is lost from .. to; the cause is the time it is asked for."""
     conditions, lines = Conditions(), []
     for n in range(round(until / STEP) + 1):
@@ -36,48 +39,51 @@ def told(*spans: tuple[float, float], until: float) -> list[tuple[float, str]]:
     return [(now, line.removeprefix("joint 1: inputs ")) for now, line in lines]
 
 
-def test_nothing_lost_nothing_said():
-    assert told(until=10) == []
+@pytest.mark.parametrize(
+    ("spans", "expected"),
+    [
+        pytest.param([], [], id="nothing"),
+        pytest.param(
+            [(1.0, 3.25)], [(1.125, "lost: asked at 1.125"), (3.375, "back after 2.2 s")], id="one line each"
+        ),
+        pytest.param([(1.0 + 0.25 * n, 1.125 + 0.25 * n) for n in range(20)], [], id="flickers"),
+        pytest.param(
+            [(1.0, 2.0), (2.0625, 3.0)],
+            [(1.125, "lost: asked at 1.125"), (3.125, "back after 2.0 s")],
+            id="a flicker of the end",
+        ),
+        pytest.param(
+            [(1.0, 1.5), (2.0, 2.5)],
+            [*FIRST, (6.125, "back after 0.5 s (inputs lost: asked at 2.125)")],
+            id="too soon for a line: with its end and cause",
+        ),
+        pytest.param(
+            [(1.0, 1.5), (2.0, 9.0)],
+            [*FIRST, (6.125, "lost: asked at 2.125"), (9.125, "back after 7.0 s")],
+            id="too soon, and lasts: as soon as allowed",
+        ),
+        pytest.param(
+            [(1.0, 1.5), (2.0, 2.5), (3.0, 3.5), (7.0, 7.5)],
+            [
+                *FIRST,
+                (6.125, "back after 1.0 s, 2 times (inputs lost: asked at 3.125)"),
+                (11.125, "back after 0.5 s (inputs lost: asked at 7.125)"),
+            ],
+            id="two losses are two and the next line waits for its time",
+        ),
+    ],
+)
+def test_lines_of_a_loss(spans: list[tuple[float, float]], expected: list[tuple[float, str]]) -> None:
+    assert lines_of(*spans, until=20) == expected
 
 
-def test_a_loss_and_its_end_are_one_line_each_at_once():
-    assert told((1.0, 3.25), until=10) == [(1.125, "lost: asked at 1.125"), (3.375, "back after 2.2 s")]
-
-
-def test_what_does_not_last_is_not_told():
-    assert told(*((1.0 + 0.25 * n, 1.125 + 0.25 * n) for n in range(20)), until=10) == []
-    assert told((1.0, 2.0), (2.0625, 3.0), until=10) == [
-        (1.125, "lost: asked at 1.125"),
-        (3.125, "back after 2.0 s"),
-    ]
-
-
-def test_a_flapping_contact_is_two_lines_in_five_seconds_and_nothing_is_left_out():
-    lines = told(*((1.0 + 0.5 * n, 1.25 + 0.5 * n) for n in range(40)), until=30)
+def test_a_flapping_contact_is_two_lines_in_five_seconds_and_each_loss_is_counted() -> None:
+    lines = lines_of(*((1.0 + 0.5 * n, 1.25 + 0.5 * n) for n in range(40)), until=30)
     assert lines[:2] == [(1.125, "lost: asked at 1.125"), (1.375, "back after 0.2 s")]
     assert all(later - earlier >= 5.0 for earlier, later in pairwise(at for at, _ in lines[::2]))
     assert len(lines) <= 2 * 5
     ends = [line for _, line in lines if line.startswith("back")]
     assert sum(int(line.split(", ")[1].split()[0]) if "times" in line else 1 for line in ends) == 40
-
-
-def test_a_loss_that_was_too_soon_to_be_told_is_told_with_its_end_and_cause():
-    assert told((1.0, 1.5), (2.0, 2.5), until=10)[2:] == [
-        (6.125, "back after 0.5 s (inputs lost: asked at 2.125)")
-    ]
-
-
-def test_a_loss_too_soon_that_lasts_is_told_as_soon_as_allowed():
-    assert told((1.0, 1.5), (2.0, 9.0), until=10)[2:] == [
-        (6.125, "lost: asked at 2.125"),
-        (9.125, "back after 7.0 s"),
-    ]
-
-
-def test_two_losses_are_two_and_the_next_line_waits_for_its_time():
-    lines = told((1.0, 1.5), (2.0, 2.5), (3.0, 3.5), (7.0, 7.5), until=20)
-    assert lines[2] == (6.125, "back after 1.0 s, 2 times (inputs lost: asked at 3.125)")
-    assert lines[3] == (11.125, "back after 0.5 s (inputs lost: asked at 7.125)")
 
 
 def test_what_waits_for_the_operator_is_said_again_while_it_lasts():
@@ -115,25 +121,22 @@ def test_the_catalogue_is_complete_and_consistent():
         assert definition.ended or not definition.logged or definition.name == "node_changed"
 
 
-def test_a_condition_that_is_superseded_has_no_line_at_its_end():
+def test_a_condition_that_supersedes_another_has_the_only_line() -> None:
     conditions, bus = Conditions(), Subject("bus")
-    conditions.update("bus_passive", bus, True, 1.0, "error active")
-    assert [line.text for line in conditions.lines(1.0)] == ["bus: error passive, previously error active"]
-    conditions.update("bus_passive", bus, False, 2.0, superseded=True)
-    conditions.update("bus_off", bus, True, 2.0, "error passive")
-    assert [line.text for line in conditions.lines(2.0)] == ["bus: bus-off, previously error passive"]
-    conditions.update("bus_off", bus, False, 3.5)
-    assert [line.text for line in conditions.lines(3.5)] == ["bus: error active after 1.5 s"]
 
+    def lines(name: str, now_s: float, previous: str = "", *, superseded: bool = False) -> list[str]:
+        conditions.update(name, bus, bool(previous), now_s, previous, superseded=superseded)
+        return [line.text for line in conditions.lines(now_s)]
 
-def test_a_condition_that_supersedes_another_one_has_its_own_end():
-    """One change ends the one and begins the other; both updates say `superseded`."""
-    conditions, bus = Conditions(), Subject("bus")
-    conditions.update("bus_passive", bus, False, 1.0, superseded=True)
-    conditions.update("bus_down", bus, True, 1.0, "error active", superseded=True)
-    assert [line.text for line in conditions.lines(1.0)] == ["bus: interface down, previously error active"]
-    conditions.update("bus_down", bus, False, 2.0)
-    assert [line.text for line in conditions.lines(2.0)] == ["bus: error active after 1.0 s"]
+    assert lines("bus_passive", 1.0, "error active") == ["bus: error passive, previously error active"]
+    assert lines("bus_passive", 2.0, superseded=True) == []
+    assert lines("bus_off", 2.0, "error passive") == ["bus: bus-off, previously error passive"]
+    assert lines("bus_off", 3.5) == ["bus: error active after 1.5 s"]
+    assert lines("bus_warning", 4.0, superseded=True) == [], "that was not present"
+    assert lines("bus_down", 4.0, "error active", superseded=True) == [
+        "bus: interface down, previously error active"
+    ]
+    assert lines("bus_down", 5.0) == ["bus: error active after 1.0 s"]
 
 
 def test_history_counts_and_adds_up():

@@ -1,19 +1,25 @@
 """Conditions from readings of the snapshot: lost inputs with their cause, deviations from the sensor, deadlines of PDOs."""
 
+from pathlib import Path
+from typing import Any
+
 import pytest
 
 from jtqd.daemon.config import load_config
 from jtqd.daemon.shared.conditions import Change, Conditions, Subject
-from jtqd.daemon.shared.snapshot import InputView
+from jtqd.daemon.shared.snapshot import InputView, JointView, View
 from jtqd.daemon.supervisor.health import LENGTH_S, TIMEOUT_CYCLES, PdoWatch
 from jtqd.estimator.status import OFF, STALE
 from jtqd.models.files import shipped
 from tests.daemon.supervisor.watch_views import NAN, WELL, Observer, view
 
-STALE_NO_MOTION = WELL._replace(torque_nm=NAN, status=STALE, input_flags=1 | 4)
+LOST = WELL._replace(torque_nm=NAN, status=STALE, input_flags=1 | 4)
+"""TPDO2 is missing."""
+COLD = ["joint 1: temperature lost: 381h drive 1 TPDO3 not received for 2 s, or reported as not measured"]
+FAR = "joint 2: the estimate has been more than 3 sigma away from the torque sensor for 1 s: "
 
 
-def told(lost, before=None, seconds=0.5):
+def lines_of(lost: View, before: View | None = None, seconds: float = 0.5) -> list[str]:
     """Lines of a loss that follows healthy readings."""
     watch = Observer()
     lines = watch.lines(before or view(0), 0.0)
@@ -22,7 +28,7 @@ def told(lost, before=None, seconds=0.5):
     return [line for line in lines if not line.startswith("bus: ")]
 
 
-def test_a_recorder_that_loses_cycles_is_told_while_it_runs():
+def test_a_recorder_that_loses_cycles_is_reported_while_it_runs() -> None:
     watch = Observer()
     watch.lines(view(0), 0.0)
     assert watch.lines(view(8), 1.0, cycles_lost=31) == ["recorder: cycles are lost: 31 are not in the log"]
@@ -30,19 +36,19 @@ def test_a_recorder_that_loses_cycles_is_told_while_it_runs():
     assert watch.lines(view(24), 30.0, cycles_lost=90) == ["recorder: no further cycles lost after 29.0 s"]
 
 
-def test_healthy_and_switched_off_joints_are_no_news():
-    assert told(view(8, two=WELL._replace(status=OFF, torque_nm=NAN)), seconds=10) == []
+def test_healthy_and_switched_off_joints_are_no_news() -> None:
+    assert lines_of(view(8, two=WELL._replace(status=OFF, torque_nm=NAN)), seconds=10) == []
+
+
+IN_TIME = "281h drive 1 TPDO2 not received in time"
 
 
 @pytest.mark.parametrize(
     ("options", "cause"),
     [
-        ({}, "281h drive 1 TPDO2 not received in time"),
-        ({"late_frames": 9}, "281h drive 1 TPDO2 not received in time (late frames on the bus)"),
-        (
-            {"rejected_frames": 9},
-            "281h drive 1 TPDO2 not received in time (frames of a wrong format on the bus)",
-        ),
+        ({}, IN_TIME),
+        ({"late_frames": 9}, f"{IN_TIME} (late frames on the bus)"),
+        ({"rejected_frames": 9}, f"{IN_TIME} (frames of a wrong format on the bus)"),
         ({"foreign_sync": 1}, "another SYNC producer is on the bus"),
         ({"sync_errors": 1}, "the own SYNC waits in the transmit queue"),
         ({"bus_errors": 1, "late_frames": 3}, "the bus is down"),
@@ -51,162 +57,132 @@ def test_healthy_and_switched_off_joints_are_no_news():
         ({"unconfigured": (1,), "states": {1: 127}}, "node 1 has restarted and is not configured yet"),
         ({"unconfigured": (1,), "states": {1: 0}}, "node 1 is absent"),
         ({"unconfigured": (1,), "states": {1: 5}}, "node 1 has a changed configuration"),
-        ({"unconfigured": (2, 3)}, "281h drive 1 TPDO2 not received in time"),
+        ({"unconfigured": (2, 3)}, IN_TIME),
     ],
 )
-def test_joint_and_likeliest_cause_are_named(options, cause):
-    assert told(view(8, STALE_NO_MOTION, **options)) == [f"joint 1: inputs lost: {cause}"]
-
-
-def test_counters_that_rose_before_the_loss_are_no_cause():
-    before = view(0, foreign_sync=5, late_frames=7)
-    lost = view(8, STALE_NO_MOTION, foreign_sync=5, late_frames=7)
-    assert told(lost, before) == ["joint 1: inputs lost: 281h drive 1 TPDO2 not received in time"]
-
-
-def test_every_missing_pdo_is_named_and_a_late_estimate_is_not_blamed_on_them():
-    nothing = STALE_NO_MOTION._replace(input_flags=4)
-    both = "182h drive 2 TPDO1 and 282h drive 2 TPDO2 not received in time"
-    assert told(view(8, two=nothing)) == [f"joint 2: inputs lost: {both}"]
-    late = STALE_NO_MOTION._replace(input_flags=7)
-    assert told(view(8, two=late)) == ["joint 2: inputs lost: the estimate is not ready before the next SYNC"]
-
-
-def test_inputs_that_are_missing_from_the_first_cycle_on_are_told():
-    assert told(view(8, STALE_NO_MOTION), before=view(0, STALE_NO_MOTION)) != []
+def test_the_likeliest_cause_of_lost_inputs(options: dict[str, Any], cause: str) -> None:
+    assert lines_of(view(8, LOST, **options)) == [f"joint 1: inputs lost: {cause}"]
 
 
 @pytest.mark.parametrize(
-    ("flags", "status", "cause"),
+    ("before", "flags", "counters", "cause"),
     [
-        (3, 0, "not received in time"),
-        (7, 1, "reports not valid"),
-        (7, 2, "reports positive overload"),
-        (7, 5, "reports not valid, negative overload"),
+        (WELL, 5, {"foreign_sync": 5, "late_frames": 7}, "282h drive 2 TPDO2 not received in time"),
+        (WELL, 4, {}, "182h drive 2 TPDO1 and 282h drive 2 TPDO2 not received in time"),
+        (WELL, 7, {}, "the estimate is not ready before the next SYNC"),
+        (LOST, 5, {}, "282h drive 2 TPDO2 not received in time"),
+    ],
+    ids=["counters that rose before", "every missing PDO", "a late estimate", "from the first cycle on"],
+)
+def test_what_is_missing(before: JointView, flags: int, counters: dict[str, int], cause: str) -> None:
+    lost = view(8, two=LOST._replace(input_flags=flags), **counters)
+    assert lines_of(lost, view(0, two=before, **counters)) == [f"joint 2: inputs lost: {cause}"]
+
+
+@pytest.mark.parametrize(
+    ("flags", "status", "options", "cause"),
+    [
+        (3, 0, {}, "183h sensor 3 channel 1 not received in time"),
+        (7, 1, {}, "183h sensor 3 channel 1 reports not valid"),
+        (7, 2, {}, "183h sensor 3 channel 1 reports positive overload"),
+        (7, 5, {}, "183h sensor 3 channel 1 reports not valid, negative overload"),
+        (3, 0, {"unconfigured": (3,), "states": {3: 0}}, "node 3 is absent"),
     ],
 )
-def test_the_sensor_has_its_own_line(flags, status, cause):
+def test_the_sensor_has_its_own_line(flags: int, status: int, options: dict[str, Any], cause: str) -> None:
     joint = WELL._replace(sensor_nm=NAN, sensor_status=status, input_flags=flags)
-    assert told(view(8, joint)) == [f"joint 1: torque sensor lost: 183h sensor 3 channel 1 {cause}"]
+    assert lines_of(view(8, joint, **options)) == [f"joint 1: torque sensor lost: {cause}"]
 
 
-def warmth(known, *, seconds, start_s=100.0):
-    """Lines while joint 1's temperature is known or not (one flag per 50 ms); the loop has run for `start_s`."""
-    watch = Observer()
-    lines = []
-    for n in range(round(seconds / 0.05)):
-        joint = WELL if known(0.05 * n) else WELL._replace(input_flags=7)
+@pytest.mark.parametrize(
+    ("lost_s", "start_s", "expected"),
+    [
+        ((1.0, 3.0), 100.0, [*COLD, "joint 1: temperature back after 2.0 s"]),
+        ((0.0, 1.5), 0.0, []),  # it cannot be there yet
+        ((0.0, 9.0), 0.0, COLD),
+    ],
+)
+def test_a_lost_temperature(lost_s: tuple[float, float], start_s: float, expected: list[str]) -> None:
+    watch, lines = Observer(), []
+    for n in range(80):
+        lost = lost_s[0] <= 0.05 * n < lost_s[1]
+        joint = WELL._replace(input_flags=7) if lost else WELL
         lines += watch.lines(view(round(1000 * (start_s + 0.05 * n)), joint), 0.05 * n)
-    return lines
+    assert lines == expected
 
 
-def test_a_temperature_that_is_lost_and_comes_back_has_its_own_lines():
-    lines = warmth(lambda t: not 1.0 <= t < 3.0, seconds=5.0)
-    assert lines == [
-        "joint 1: temperature lost: 381h drive 1 TPDO3 not received for 2 s, or reported as not measured",
-        "joint 1: temperature back after 2.0 s",
-    ]
-
-
-def test_a_temperature_is_not_missed_before_it_can_be_there():
-    assert warmth(lambda t: t > 1.5, seconds=4.0, start_s=0.0) == []
-    assert len(warmth(lambda t: False, seconds=4.0, start_s=0.0)) == 1
-
-
-def test_joints_without_a_temperature_are_not_told_of(tmp_path):
+def test_joints_without_a_temperature_have_no_line(tmp_path: Path) -> None:
     text = shipped("bench.yaml").read_text().replace("temperature: true", "temperature: false")
-    path = shipped("bench.yaml").parent
     config = tmp_path / "c.yaml"
-    config.write_text(text.replace("file: ", f"file: {path}/"))
+    config.write_text(text.replace("file: ", f"file: {shipped('bench.yaml').parent}/"))
     watch = Observer(load_config(config))
     cold = WELL._replace(input_flags=7)
     assert not any(watch.lines(view(100_000 + 50 * n, cold, cold), 0.05 * n) for n in range(200))
 
 
-def test_the_end_is_told():
-    watch = Observer()
-    lines = []
+def test_the_end_of_a_loss() -> None:
+    watch, lines = Observer(), []
     for n in range(100):
-        lost = 20 <= n < 60
-        lines += watch.lines(view(8 * n, STALE_NO_MOTION if lost else WELL), 0.05 * n)
+        lines += watch.lines(view(8 * n, LOST if 20 <= n < 60 else WELL), 0.05 * n)
     assert lines[1:] == ["joint 1: inputs back after 2.0 s"]
 
 
-def test_an_absent_sensor_is_named_by_its_node():
-    gone = WELL._replace(sensor_nm=NAN, input_flags=3)
-    lines = told(view(8, one=gone, two=gone, unconfigured=(3,), states={3: 0}))
-    assert lines == [f"joint {number}: torque sensor lost: node 3 is absent" for number in (1, 2)]
+# Deviation from the sensor
 
 
-def watched(sigmas, period=0.05):
-    """Readings of joint 2 so many sigmas above the sensor (None: no estimate); when it began, and its text."""
-    watch, when = Observer(), []
+def begins(sigmas: list[float | None], period_s: float = 0.05) -> list[int]:
+    """Readings of joint 2 so many sigmas above the sensor (None: no estimate); at which of them a deviation begins."""
+    watch, found = Observer(), []
     for n, distance in enumerate(sigmas):
         joint = WELL._replace(torque_nm=10.0 + 0.5 * (distance or 0.0), sigma_nm=0.5)
         if distance is None:
             joint = WELL._replace(torque_nm=NAN, sigma_nm=NAN, status=STALE)
-        before = far(watch)
-        watch.lines(view(8 * n, two=joint), n * period)
-        if far(watch) and not before:
-            when.append((n, far(watch)[0].line))
+        before = watch.conditions.is_present("deviation", "joint 2")
+        lines = watch.lines(view(8 * n, two=joint), n * period_s)
+        if watch.conditions.is_present("deviation", "joint 2") and not before:
+            found.append(n)
+            assert n > 30 or lines[-1].startswith(FAR), lines
     (times,) = [each.times for each in watch.conditions.history(0.0) if each.name == "deviation"] or [0]
-    assert times == len(when)
-    return when
+    assert times == len(found)
+    return found
 
 
-def far(watch):
-    return [each for each in watch.conditions.present() if each.name == "deviation"]
+@pytest.mark.parametrize(
+    ("sigmas", "expected"),
+    [
+        ([0.0] * 10 + [4.0] * 30, [10 + 20]),
+        ([0.0] * 200, []),
+        ([2.9] * 200, []),
+        ([-2.9] * 200, []),
+        ([-4.0] * 40, [20]),
+        (([4.0] * 20 + [1.0]) * 20, []),  # not for a second
+        ([4.0] * 21, [20]),
+        ([4.0] * 500, [20]),
+        (([4.0] * 25 + [2.5] * 25) * 10, [20]),  # never within 2 sigma
+        (([4.0] * 25 + [1.0] * 15) * 10, [20]),  # within 2 sigma, but not for a second
+        (([4.0] * 25 + [1.0] * 25) * 10, [50 * n + 20 for n in range(10)]),
+        (([4.0] * 15 + [None] * 11) * 20, []),  # half a second without a number
+        (([4.0] * 9 + [None]) * 4, [20]),  # a moment without a number is passed over
+        ([4.0] * 25 + [None] * 100 + [4.0] * 25, [20]),  # the episode has not ended
+    ],
+)
+def test_a_deviation_lasts_a_second_and_is_one_episode(
+    sigmas: list[float | None], expected: list[int]
+) -> None:
+    assert begins(sigmas) == expected
 
 
-def test_the_line_names_joint_and_numbers():
-    ((at, line),) = watched([0.0] * 10 + [4.0] * 30)
-    assert at == 10 + 20
-    assert line == (
-        "joint 2: the estimate has been more than 3 sigma away from the torque sensor for 1 s: "
-        "12.00 Nm against 10.00 Nm, sigma 0.50 Nm"
-    )
+def test_readings_far_apart_or_of_one_cycle_are_no_duration() -> None:
+    assert begins([4.0] * 40, period_s=0.6) == []
+    far = WELL._replace(torque_nm=20.0)
+    for joint, step in ((far, 0), (far._replace(sensor_nm=NAN, reference_nm=NAN), 8)):
+        watch = Observer()
+        for n in range(100):
+            watch.lines(view(8 + step * n, joint), 0.05 * n)
+        assert ("deviation", "joint 1") not in watch.present()
 
 
-@pytest.mark.parametrize("distance", [0.0, 2.9, -2.9])
-def test_within_three_sigma_is_as_it_should_be(distance):
-    assert watched([distance] * 200) == []
-
-
-def test_below_counts_as_above():
-    assert len(watched([-4.0] * 40)) == 1
-
-
-def test_a_second_is_the_least():
-    assert watched(([4.0] * 20 + [1.0]) * 20) == []
-    assert len(watched([4.0] * 21)) == 1
-
-
-def test_one_warning_per_episode_and_the_edge_is_one_episode():
-    assert len(watched([4.0] * 500)) == 1
-    assert len(watched(([4.0] * 25 + [2.5] * 25) * 10)) == 1  # never within 2 sigma
-    assert len(watched(([4.0] * 25 + [1.0] * 15) * 10)) == 1  # within 2 sigma, but not for a second
-    assert len(watched(([4.0] * 25 + [1.0] * 25) * 10)) == 10
-
-
-def test_what_is_not_known_is_neither_far_nor_near():
-    assert watched(([4.0] * 15 + [None] * 11) * 20) == [], "half a second without a number: it begins anew"
-    ((at, _),) = watched(([4.0] * 9 + [None]) * 4)
-    assert at == 20, "a moment without a number is passed over"
-    assert len(watched([4.0] * 25 + [None] * 100 + [4.0] * 25)) == 1, "the episode has not ended"
-    watch = Observer()
-    blind = WELL._replace(torque_nm=90.0, sensor_nm=NAN, reference_nm=NAN)
-    for n in range(100):
-        watch.lines(view(8 * n, blind), 0.05 * n)
-    assert far(watch) == []
-
-
-def test_readings_far_apart_or_of_one_cycle_are_no_duration():
-    assert watched([4.0] * 40, period=0.6) == []
-    watch = Observer()
-    reading = view(8, WELL._replace(torque_nm=20.0))
-    for n in range(100):
-        watch.lines(reading, 0.05 * n)
-    assert far(watch) == []
+# Errors of a PDO
 
 
 PDO = Subject("181h drive 1 TPDO1", 0x181, 1, node=1)
