@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint format clean
+.PHONY: help setup demo hidden-effect docs dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -22,12 +22,12 @@ demo: $(VENV)/.installed ## 20 s of jtqd on the emulated bench
 hidden-effect: $(VENV)/.installed-analysis ## hide an effect in the emulated bench and find it, without a bus: hidden/
 	$(BIN)/python -m examples.hidden_effect --effect torque_constant --bus none --out hidden --picture hidden/before_after.png
 
-test: lint ## everything but the tests marked campaign
+test: style ## everything but the tests marked campaign
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	@# Before the guest looks at this tree: what is written below it while it runs, it sees in part.
 	$(BIN)/python -m compileall -q daemon drivers estimator models sim_can sysid tests tools validation
 	@status=0; \
-	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-here test-guest test-hidden || status=$$?; \
+	$(MAKE) --no-print-directory -k -j2 --output-sync=target test-here test-guest test-hidden types || status=$$?; \
 	$(MAKE) --no-print-directory test-native || status=$$?; \
 	exit $$status
 
@@ -59,9 +59,13 @@ test-all: lint ## everything
 test-sanitized: $(VENV)/.installed-test ## compiled code with bounds checks, AddressSanitizer and UBSan, a million frames
 	$(BIN)/python -m tests.slow.sanitized
 
-lint: $(VENV)/.installed-test ## ruff and mypy
+lint: style types ## ruff and mypy
+
+style: $(VENV)/.installed-test
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
+
+types: $(VENV)/.installed-test
 	$(BIN)/mypy
 
 format: $(VENV)/.installed-dev ## rewrite the sources in the project's style
