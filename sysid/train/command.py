@@ -7,25 +7,24 @@ import hashlib
 import json
 import platform
 import sys
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jtqd.estimator.command_line import check_installed, count, make_directory, natural
+from jtqd.estimator.command_line import check_installed, command_parser, count, make_directory, natural
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint
-from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
-from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, joint_number, only
-from jtqd.sysid.runs.run_file import RunError, RunFile
-from jtqd.sysid.train.network import TrainedNetwork, paper_block, split_by_sample, train_paper
+from jtqd.sysid.runs.run_file import RunFile
+from jtqd.sysid.train.network import Schedule, TrainedNetwork, paper_block, split_by_sample, train_paper
 from jtqd.sysid.train.ours import Gate, judge, train_fused
 
 _WHAT = {
@@ -40,59 +39,50 @@ def write_card(
     path: Path, joint: Joint, kind: str, result: TrainedNetwork, digest: str, *, gate: Gate | None = None
 ) -> None:
     """Write path.md and path.png beside the ONNX file `path`."""
-    picture = path.with_suffix(".png")
+    picture, trained, metadata = path.with_suffix(".png"), result.trained, result.metadata
     _draw(picture, joint, kind, result)
-    trained = result.trained
     shape = "-".join(str(len(b)) for _, b in trained.weights)
-    inputs = len(trained.input_mean)
+    share = metadata.get("share", 1.0)
+    means = np.mean(list(result.held_out.values()), axis=0)
     lines = [
         f"# {path.name}",
         "",
         _WHAT[kind],
         "",
         f"- Joint: {joint.name}. File: sha256 {digest}",
-        f"- Layers: {inputs}-{shape}, float64, normalisation folded into the weights",
+        f"- Layers: {len(trained.input_mean)}-{shape}, float64, normalisation folded into the weights",
         f"- Trained: {len(trained.losses)} iterations, last loss {trained.losses[-1]:.4f} Nm^2; Python "
         f"{platform.python_version()}, one thread, so that the same runs and seed give the same file",
-        f"- Data: {len(result.metadata['runs'])} runs, digest {result.metadata['data_sha256']}",
-        *_share(result),
-        *([f"- Gate: {gate.text}"] if gate else []),
+        f"- Data: {len(metadata['runs'])} runs, digest {metadata['data_sha256']}",
+    ]
+    if share < 1.0:
+        lines.append(f"- Share of the correction that improves held-out runs and worsens none: {share:.2f}")
+    if gate is not None:
+        lines.append(f"- Gate: {gate.text}")
+    lines += [
         "",
         "## On runs it was not trained on",
         "",
         "| run | network, MSE Nm^2 | physics without network, MSE Nm^2 |",
         "|---|---|---|",
         *(f"| {name} | {net:.3f} | {physics:.3f} |" for name, (net, physics) in result.held_out.items()),
-        f"| mean | {_mean(result, 0):.3f} | {_mean(result, 1):.3f} |",
+        f"| mean | {means[0]:.3f} | {means[1]:.3f} |",
         "",
         f"![loss curve and scores]({picture.name})",
         "",
         "## Training envelope",
         "",
-        *_envelope(result),
+        *_envelope(metadata),
         "",
         "## Files of the data",
         "",
-        *(f"- {name} {sha}" for name, sha in result.metadata["runs"].items()),
+        *(f"- {name} {sha}" for name, sha in metadata["runs"].items()),
         "",
     ]
     path.with_suffix(".md").write_text("\n".join(lines), encoding="utf-8")
 
 
-def _share(result: TrainedNetwork) -> list[str]:
-    """A line where only part of the correction is used, because all of it would harm runs it was not trained on."""
-    share = float(result.metadata.get("share", 1.0))
-    if share >= 1.0:
-        return []
-    return [f"- Share of the correction that improves held-out runs and worsens none: {share:.2f}"]
-
-
-def _mean(result: TrainedNetwork, which: int) -> float:
-    return float(np.mean([score[which] for score in result.held_out.values()]))
-
-
-def _envelope(result: TrainedNetwork) -> list[str]:
-    metadata = result.metadata
+def _envelope(metadata: Mapping[str, Any]) -> list[str]:
     if "envelope" not in metadata:
         rows = zip(metadata["features"], metadata["envelope_low"], metadata["envelope_high"], strict=True)
         return [
@@ -173,7 +163,7 @@ def main(argv: list[str]) -> int:
             joint.name: _train_joint(joint, number, runs, options)
             for joint, number in zip(joints, numbers, strict=True)
         }
-    except (ConfigError, RunError, RunTableError, LossFitError, TorsionError, ValueError, OSError) as error:
+    except (ValueError, OSError) as error:
         print(f"jtq train: {error}", file=sys.stderr)
         return 1
     if options.json:
@@ -183,11 +173,8 @@ def main(argv: list[str]) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq train`."""
-    parser = argparse.ArgumentParser(
-        prog="jtq train",
-        description="Train one network per joint on recorded runs, with a split by run.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "jtq train", "Train one network per joint on recorded runs, with a split by run.", _EXAMPLES
     )
     add_runs(parser)
     parser.add_argument(
@@ -229,11 +216,12 @@ def parser() -> argparse.ArgumentParser:
 def _train_joint(
     joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace
 ) -> dict[str, Any]:
+    ours = options.network == "ours"
     iterations = options.iterations or _ITERATIONS[options.network]
-    claimed = None
     hashes = {run.name: run.sha256 for run in runs}
+    report = partial(print, file=sys.stderr if options.json else sys.stdout)
 
-    def say(n: int, loss: float) -> None:
+    def advance(n: int, loss: float) -> None:
         if (n + 1) % 100 == 0:
             print(f"{joint.name}: iteration {n + 1} of {iterations}, mse {loss:.4f} Nm^2", file=sys.stderr)
 
@@ -242,65 +230,43 @@ def _train_joint(
             f"{joint.name}: the runs have one encoder of this joint, expected both: "
             "jtqd uses no network without a link position"
         )
-    settings = {"iterations": iterations, "seed": options.seed, "progress": say}
-    if options.network == "ours":
-        result = train_fused(signals_of_runs(runs, number, joint), joint, hashes, **settings)
-        name = f"{joint.name}.fused"
+    schedule, claimed, gate = Schedule(iterations, options.seed, advance), None, None
+    if ours:
+        result = train_fused(signals_of_runs(runs, number, joint), joint, hashes, schedule)
+        gate = judge(result.held_out.values(), result.metadata["share"])
     else:
         blocks = [
             paper_block(run.name, joint, run.table.time_s, run.table.joint(number, joint.gear_ratio))
             for run in progress(runs, f"observing {joint.name}")
         ]
-        result = train_paper(blocks, joint, hashes, **settings)
-        name = joint.name
-        if options.show_leakage:
-            claimed = split_by_sample(blocks, **settings)
-    path = options.out / f"{name}.onnx"
-    gate = judge(result.held_out.values(), result.metadata["share"]) if options.network == "ours" else None
+        result = train_paper(blocks, joint, hashes, schedule)
+        claimed = split_by_sample(blocks, schedule) if options.show_leakage else None
+    count, share = len(result.held_out), result.metadata.get("share", 1.0)
+    network, physics = (sum(each) / count for each in zip(*result.held_out.values(), strict=True))
+    path = options.out / f"{joint.name}{'.fused' if ours else ''}.onnx"
+    digest = None
     if gate is not None and not gate.passed:
         left = f"; {path} is of an earlier training" if path.exists() else ""
-        print(
-            f"{joint.name}: no network is written: {gate.text}; jtqd runs on physics alone{left}",
-            file=sys.stderr if options.json else sys.stdout,
+        report(f"{joint.name}: no network is written: {gate.text}; jtqd runs on physics alone{left}")
+    else:
+        path.write_bytes(result.data)
+        digest = hashlib.sha256(result.data).hexdigest()
+        write_card(path, joint, options.network, result, digest, gate=gate)
+        report(
+            f"{path}  sha256 {digest}\n  on {count} held-out runs: MSE {network:.3f} Nm^2, "
+            f"the physics without network {physics:.3f} Nm^2"
         )
-        return {"path": None, "sha256": None, **_scores(result, claimed), "gate": gate.to_mapping()}
-    path.write_bytes(result.data)
-    digest = hashlib.sha256(result.data).hexdigest()
-    write_card(path, joint, options.network, result, digest, gate=gate)
-    network, physics = (_mean_of(result, k) for k in (0, 1))
-    print(
-        f"{path}  sha256 {digest}\n  on {len(result.held_out)} held-out runs: MSE {network:.3f} Nm^2, "
-        f"the physics without network {physics:.3f} Nm^2",
-        file=sys.stderr if options.json else sys.stdout,
-    )
-    share = result.metadata.get("share", 1.0)
-    if share < 1.0:
-        print(
-            f"  share of its correction that improves them and worsens none: {share:.2f}",
-            file=sys.stderr if options.json else sys.stdout,
-        )
-    if claimed is not None:
-        print(
-            f"  split by sample, the same data gives an MSE of {claimed:.3f} Nm^2",
-            file=sys.stderr if options.json else sys.stdout,
-        )
+        if share < 1.0:
+            report(f"  share of its correction that improves them and worsens none: {share:.2f}")
+        if claimed is not None:
+            report(f"  split by sample, the same data gives an MSE of {claimed:.3f} Nm^2")
     return {
-        "path": str(path),
+        "path": None if digest is None else str(path),
         "sha256": digest,
-        **_scores(result, claimed),
+        "split_by_sample_mse_nm2": claimed,
+        "network_mse_nm2": network,
+        "physics_mse_nm2": physics,
+        "share": share,
+        "runs": count,
         "gate": None if gate is None else gate.to_mapping(),
     }
-
-
-def _scores(result: TrainedNetwork, claimed: float | None) -> dict[str, Any]:
-    return {
-        "split_by_sample_mse_nm2": claimed,
-        "network_mse_nm2": _mean_of(result, 0),
-        "physics_mse_nm2": _mean_of(result, 1),
-        "share": result.metadata.get("share", 1.0),
-        "runs": len(result.held_out),
-    }
-
-
-def _mean_of(result: TrainedNetwork, which: int) -> float:
-    return sum(score[which] for score in result.held_out.values()) / max(len(result.held_out), 1)

@@ -12,7 +12,7 @@ A network is accepted by its gain on held-out runs, with a share of its correcti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -22,7 +22,6 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import FusedEstimator, quadrants
 from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, Torsion
 from jtqd.estimator.network import FUSED_FEATURES
-from jtqd.estimator.onnx_graph import perceptron_content
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.text import counted
 from jtqd.estimator.uncertainty import Fusion, network_shares
@@ -32,15 +31,12 @@ from jtqd.sysid.fit.losses import fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion, torsion_torque
 from jtqd.sysid.train.network import (
-    IR_VERSION,
-    OPSET,
+    Schedule,
     Trained,
     TrainedNetwork,
-    digest_of,
-    folded_layers,
-    hidden_output,
-    serialised,
-    thinned,
+    export_network,
+    network_output,
+    origin,
     train,
 )
 
@@ -55,11 +51,13 @@ class Gate:
     """Scores of a network on held-out runs, and whether it is accepted.
 
     Attributes:
+        gain: part of the error of physics that the network takes off; below 0: it adds to it.
         network_rmse_nm, physics_rmse_nm: over all runs, each of the same weight.
         runs, worse: how many there were, and how many were worse with it.
-        share: of its correction that the network is written with, 0 to 1.
+        share: of its correction that the network is written with; 0 is no network, and is never accepted.
     """
 
+    gain: float
     network_rmse_nm: float
     physics_rmse_nm: float
     runs: int
@@ -67,103 +65,43 @@ class Gate:
     share: float = 1.0
 
     @property
-    def gain(self) -> float:
-        """Return the part of the error of physics that the network takes off; below 0: it adds to it."""
-        return 1.0 - self.network_rmse_nm / self.physics_rmse_nm if self.physics_rmse_nm > 0.0 else 0.0
-
-    @property
-    def passed(self) -> bool:
-        """Return whether it may be used: not with the share 0, which is no network, however the runs were judged."""
-        return self._earned and self.share > 0.0
-
-    @property
     def _earned(self) -> bool:
         return self.gain >= LEAST_GAIN and self.worse <= MOST_WORSE * self.runs
 
     @property
+    def passed(self) -> bool:
+        """Return whether it may be used."""
+        return self._earned and self.share > 0.0
+
+    @property
     def text(self) -> str:
         """Return the verdict with its numbers, and what is expected."""
+        harm = self._earned and not self.passed
         return (
             f"on {self.runs} held-out runs it takes {100 * self.gain:.1f} % off the error of physics "
             f"(RMSE {self.physics_rmse_nm:.3f} -> {self.network_rmse_nm:.3f} Nm; "
             f"expected at least {100 * LEAST_GAIN:.0f} %) "
             f"and is worse in {self.worse} (expected at most {100 * MOST_WORSE:.0f} %)"
-            + (
-                "; but no share of it is without harm to all of them"
-                if self._earned and not self.passed
-                else ""
-            )
+            + ("; but no share of it is without harm to all of them" if harm else "")
         )
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values for JSON and for the metadata of a network."""
-        return {
-            "passed": self.passed,
-            "gain": self.gain,
-            "network_rmse_nm": self.network_rmse_nm,
-            "physics_rmse_nm": self.physics_rmse_nm,
-            "runs": self.runs,
-            "worse": self.worse,
-        }
+        return {"passed": self.passed} | {key: each for key, each in vars(self).items() if key != "share"}
 
 
 def judge(scores: Collection[tuple[float, float]], share: float = 1.0) -> Gate:
-    """Return the verdict on the MSE [Nm²] of each run left out: (with the network, physics alone).
+    """Return the verdict on the MSE [Nm²] of each held-out run: (with the network, physics alone).
 
-    share: of its correction that the network is to be written with; a run is judged with one that it had no say in. A
-    network that changes nothing takes nothing off, and is worse nowhere. Raises ValueError without a run.
+    share: of its correction that the network is to be written with; a run is judged with one that it had no say in.
+    Raises ValueError without a run.
     """
     if not scores:
         raise ValueError("found no held-out run, expected at least one")
     table = np.array(list(scores), np.float64)
     network, physics = np.sqrt(table.mean(axis=0)).tolist()
-    return Gate(network, physics, len(table), int((table[:, 0] > table[:, 1]).sum()), share)
-
-
-def gated_output(trained: Trained, core: FloatArray, waves: FloatArray) -> FloatArray:
-    """Return the output [n] for core inputs [n, k] and waves [n, m]: what the exported graph must equal."""
-    gains = hidden_output(trained.weights, trained.input_mean, trained.input_std, core)
-    result: FloatArray = trained.output_std * (gains * waves).sum(axis=1)
-    return result
-
-
-def export_gated(trained: Trained, waves: int, metadata: Mapping[str, Any]) -> bytes:
-    """Return the ONNX file; its input x is core inputs and waves side by side, [N, k + waves]."""
-    from onnx import TensorProto, helper, numpy_helper
-
-    layers = folded_layers(
-        trained.weights, trained.input_mean, trained.input_std, 0.0, trained.output_std, last_is_one=False
-    )
-    core = len(trained.input_mean)
-    first, bias = layers[0]
-    layers[0] = (
-        np.vstack((first, np.zeros((waves, first.shape[1])))),
-        bias,
-    )  # the waves do not enter the gains
-    constants = {"pick": np.vstack((np.zeros((core, waves)), np.eye(waves))), "sum": np.ones((waves, 1))}
-    nodes, name = [], "x"
-    for n, (w, b) in enumerate(layers):
-        constants[f"W{n}"], constants[f"b{n}"] = w, b
-        nodes.append(helper.make_node("Gemm", [name, f"W{n}", f"b{n}"], [f"g{n}"]))
-        name = f"g{n}"
-        if n < len(layers) - 1:
-            nodes.append(helper.make_node("Tanh", [name], [f"h{n}"]))
-            name = f"h{n}"
-    nodes += [
-        helper.make_node("MatMul", ["x", "pick"], ["waves"]),
-        helper.make_node("Mul", [name, "waves"], ["parts"]),
-        helper.make_node("MatMul", ["parts", "sum"], ["torque_nm"]),
-    ]
-    graph = helper.make_graph(
-        nodes,
-        "ripple_correction",
-        [helper.make_tensor_value_info("x", TensorProto.DOUBLE, ["N", core + waves])],
-        [helper.make_tensor_value_info("torque_nm", TensorProto.DOUBLE, ["N", 1])],
-        [numpy_helper.from_array(np.asarray(value, np.float64), key) for key, value in constants.items()],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jtqd")
-    model.ir_version = IR_VERSION
-    return serialised(model, metadata, perceptron_content(layers, range(core, core + waves)))
+    gain = 1.0 - network / physics if physics > 0.0 else 0.0
+    return Gate(gain, network, physics, len(table), int((table[:, 0] > table[:, 1]).sum()), share)
 
 
 _SETTINGS: Final = EstimatorSettings(method="fused", track_zeros=False)
@@ -201,11 +139,8 @@ class Seen:
 def train_fused(
     runs: Sequence[RunSignals],
     joint: Joint,
-    hashes: dict[str, str],
-    *,
-    iterations: int,
-    seed: int,
-    progress: Callable[[int, float], None],
+    hashes: Mapping[str, str],
+    schedule: Schedule,
 ) -> TrainedNetwork:
     """Train our network of a joint that has section `fused` with torsion; at least 8 runs (ValueError)."""
     fused = joint.fused
@@ -221,20 +156,17 @@ def train_fused(
     fold_of: list[int] = []
     for fold, (known, judged) in enumerate(folds(runs)):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
-        trained = _train(
-            [Seen(run, joint, loss, torsion, fused.sigma) for run in known], iterations, seed, progress
-        )
+        trained = _train([Seen(run, joint, loss, torsion, fused.sigma) for run in known], schedule)
         for n in judged:
             one = Seen(runs[n], joint, loss, torsion, fused.sigma)
-            unseen.append((one, gated_output(trained, one.features[:, :_CORE], one.waves)))
+            unseen.append((one, network_output(trained, one.features[:, :_CORE], one.waves)))
             fold_of.append(fold)
     pairs = [(one.residual_nm, correction) for one, correction in unseen]
     share = safe_share(pairs)
     errors = [residual - share * correction for residual, correction in pairs]
     scores = {one.name: score for (one, _), score in zip(unseen, judged_scores(pairs, fold_of), strict=True)}
     blocks = [Seen(run, joint, fused.loss, fused.torsion, fused.sigma) for run in runs]
-    trained = _train(blocks, iterations, seed, progress)
-    trained = scaled(trained, share)
+    trained = scaled(_train(blocks, schedule), share)
     features = np.concatenate([block.features for block in blocks])
     low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)
     metadata = {
@@ -247,11 +179,9 @@ def train_fused(
         "gate": judge(scores.values(), share).to_mapping(),
         "input_low": low.tolist(),
         "input_high": high.tolist(),
-        "joint": joint.name,
-        "data_sha256": digest_of(hashes),
-        "runs": hashes,
+        **origin(joint, hashes),
     }
-    data = export_gated(trained, len(FUSED_FEATURES) - _CORE, metadata)
+    data = export_network(trained, metadata, len(FUSED_FEATURES) - _CORE)
     return TrainedNetwork(data, trained, metadata, scores)
 
 
@@ -287,10 +217,7 @@ def judged_scores(
         for fold in set(fold_of)
     }
     return [
-        (
-            float(np.mean((residual - shares[fold] * correction) ** 2)),
-            float(np.mean(residual**2)),
-        )
+        (float(np.mean((residual - shares[fold] * correction) ** 2)), float(np.mean(residual**2)))
         for (residual, correction), fold in zip(unseen, fold_of, strict=True)
     ]
 
@@ -305,18 +232,14 @@ def quick_part(residual_nm: FloatArray) -> FloatArray:
     return result
 
 
-def _train(
-    blocks: Sequence[Seen], iterations: int, seed: int, progress: Callable[[int, float], None]
-) -> Trained:
+def _train(blocks: Sequence[Seen], schedule: Schedule) -> Trained:
     return train(
-        thinned([block.features[:, :_CORE] for block in blocks]),
-        thinned([quick_part(block.residual_nm) for block in blocks]),
-        iterations=iterations,
-        seed=seed,
+        [block.features[:, :_CORE] for block in blocks],
+        [quick_part(block.residual_nm) for block in blocks],
+        schedule,
         hidden=HIDDEN,
-        waves=thinned([block.waves for block in blocks]),
+        waves=[block.waves for block in blocks],
         weight_decay=_WEIGHT_DECAY,
-        progress=progress,
     )
 
 

@@ -19,7 +19,7 @@ import yaml
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.network import FEATURES
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.train.network import Layer, export_network
+from jtqd.sysid.train.network import Layer, Trained, export_network
 from tests.benchmarks.traffic import SCALING, SENSOR_NM_PER_UNIT
 
 _HIDDEN = (20, 40, 10)
@@ -68,9 +68,8 @@ class SmallNetwork:
             "joint": joint,
             "data_sha256": "0" * 64,
         }
-        return export_network(
-            self.layers, self.input_mean, self.input_std, self.output_mean, self.output_std, metadata
-        )
+        network = Trained(self.layers, self.input_mean, self.input_std, self.output_mean, self.output_std)
+        return export_network(network, metadata)
 
 
 def small_network(number: int) -> SmallNetwork:

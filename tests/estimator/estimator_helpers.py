@@ -13,7 +13,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Efficiency, Joint, QuadrantPolynomial
 from jtqd.estimator.network import FEATURES
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.train.network import Layer, export_network, forward
+from jtqd.sysid.train.network import Layer, Trained, export_network, network_output
 
 SIZES = (6, 20, 40, 10, 1)
 LOW = (-6.0, -200.0, -250.0, -2.0, -2.5, -40.0)
@@ -43,12 +43,15 @@ class SmallNetwork:
     metadata: dict[str, Any]
 
     @property
+    def trained(self) -> Trained:
+        return Trained(self.layers, self.mean, self.std, self.output_mean, self.output_std)
+
+    @property
     def data(self) -> bytes:
-        args = (self.layers, self.mean, self.std, self.output_mean, self.output_std)
-        return export_network(*args, self.metadata)
+        return export_network(self.trained, self.metadata)
 
     def numpy(self, x: FloatArray) -> FloatArray:
-        return forward(self.layers, self.mean, self.std, self.output_mean, self.output_std, x)
+        return network_output(self.trained, x)
 
     def with_metadata(self, **changes: Any) -> SmallNetwork:
         kept = {key: value for key, value in (self.metadata | changes).items() if value is not ...}

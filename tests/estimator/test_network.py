@@ -24,7 +24,7 @@ from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork, native_of
 from jtqd.estimator.onnx_graph import PERCEPTRON, NetworkError
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.sysid.train.network import export_network
+from jtqd.sysid.train.network import Trained, export_network
 from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, joint1, motion, small_network
 from tests.estimator.fused_helpers import HIGH as FUSED_HIGH
 from tests.estimator.fused_helpers import LOW as FUSED_LOW
@@ -84,7 +84,7 @@ def test_a_network_by_hand() -> None:
     mean, std = np.zeros(6), np.ones(6)
     mean[0], std[0] = 1.0, 0.5
     layers = [(w0, np.array([1.0])), (np.array([[4.0]]), np.array([-1.0]))]
-    data = export_network(layers, mean, std, 5.0, 10.0, small_network().metadata)
+    data = export_network(Trained(layers, mean, std, 5.0, 10.0), small_network().metadata)
     expected = 5.0 + 10.0 * (4.0 * math.tanh(3.5) - 1.0)
     assert TorqueNetwork(data).run_one(2.0, 0.0, 0.0, 0.0, 0.0, 0.0) == pytest.approx(expected, abs=1e-12)
 
@@ -149,13 +149,10 @@ def test_weights_of_the_metadata_and_of_the_graph_are_those_that_onnx_runtime_ev
 
 
 def test_a_gated_network_of_the_trainer_is_read_from_either() -> None:
-    from jtqd.sysid.train.network import Trained
-    from jtqd.sysid.train.ours import export_gated
-
     rng = np.random.default_rng(9)
     weights = [(rng.normal(size=(3, 5)), rng.normal(size=5)), (rng.normal(size=(5, 4)), rng.normal(size=4))]
-    trained = Trained(weights, np.zeros(3), np.ones(3), 0.0, 1.0, [])
-    data = export_gated(trained, 4, fused_network().metadata)
+    trained = Trained(weights, np.zeros(3), np.ones(3), 0.0, 1.0)
+    data = export_network(trained, fused_network().metadata, 4)
     model = onnx.load_from_string(data)
     model.metadata_props.remove(entry(model, PERCEPTRON))
     one, other = FusedNetwork(data), FusedNetwork(model.SerializeToString())
@@ -510,7 +507,7 @@ def test_graphs_that_cannot_be_used(change: Change, words: str) -> None:
 
 def test_networks_of_another_width_or_type() -> None:
     meta = small_network().metadata
-    seven = export_network([(np.ones((7, 1)), np.zeros(1))], np.zeros(7), np.ones(7), 0.0, 1.0, meta)
+    seven = export_network(Trained([(np.ones((7, 1)), np.zeros(1))], np.zeros(7), np.ones(7), 0.0, 1.0), meta)
     assert "found input 'x' of shape ['N', 7], expected ['N', 6]" in refused(seven)
     assert "expected ['N', 7]" in refused(small_network().data, FusedNetwork)
     assert "expected ['N', 6]" in refused(fused_network().data)
@@ -597,4 +594,4 @@ def test_the_writer_refuses_what_does_not_fit() -> None:
         (ok, one, 0.0),
     ):
         with pytest.raises(ValueError, match="found"):
-            export_network(weights, zero, std, 0.0, output_std, {})
+            export_network(Trained(weights, zero, std, 0.0, output_std), {})

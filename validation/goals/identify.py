@@ -44,7 +44,7 @@ from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.planner.campaigns import Scale, make_plan, outside_runs
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Run
-from jtqd.sysid.train.network import paper_block, train_paper
+from jtqd.sysid.train.network import Schedule, paper_block, train_paper
 
 SIDES: Final = ("joint_1", "joint_2")
 Mapped = dict[str, Any]
@@ -422,9 +422,7 @@ def _with_others(
         paper_block(run.name, joint, run.table.time_s, run.columns(number, joint)) for run in excitation
     ]
     names = {run.name: hashlib.sha256(run.table.time_s.tobytes()).hexdigest() for run in excitation}
-    network = train_paper(
-        blocks, joint, names, iterations=iterations, seed=seed, progress=lambda n, loss: None
-    )
+    network = train_paper(blocks, joint, names, Schedule(iterations, seed))
     examples = [example(run, number, joint) for run in excitation]
     baselines = {name: fit_baseline(baseline, examples) for name, baseline in BASELINES.items()}
     return replace(one, joint=joint, network=network.data, baselines=baselines)

@@ -23,7 +23,7 @@ from jtqd.sysid.evaluate.command import main
 from jtqd.sysid.evaluate.inputs import Samples
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.tables import write_run
-from jtqd.sysid.train.network import export_network
+from jtqd.sysid.train.network import Trained, export_network
 from tests.estimator.estimator_helpers import small_network
 
 
@@ -98,7 +98,7 @@ def fused_network(joint: str, correction_nm: float = 0.0, **metadata: Any) -> by
     } | metadata
     layers = [(np.zeros((width, 2)), np.zeros(2)), (np.zeros((2, 1)), np.zeros(1))]
     kept = {key: value for key, value in content.items() if value is not None}
-    return export_network(layers, np.zeros(width), np.ones(width), correction_nm, 1.0, kept)
+    return export_network(Trained(layers, np.zeros(width), np.ones(width), correction_nm, 1.0), kept)
 
 
 def paper_network(joint: str, **metadata: Any) -> bytes:

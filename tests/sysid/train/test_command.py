@@ -107,7 +107,7 @@ def test_runs_of_one_name_in_two_folders_keep_their_own_hashes(run, tmp_path, mo
     """The network names every run that it was trained on: `jtq evaluate` refuses them by these hashes."""
     seen = {}
 
-    def trained(blocks, joint, hashes, **_):
+    def trained(blocks, joint, hashes, schedule):
         seen.update(hashes)
         raise ValueError("enough")
 

@@ -9,49 +9,29 @@ import pytest
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork
 from jtqd.sysid.train.network import (
     PaperBlock,
-    digest_of,
-    forward,
+    Schedule,
+    export_network,
+    network_output,
+    origin,
     split_by_sample,
     thinned,
     train,
     train_paper,
 )
-from jtqd.sysid.train.ours import (
-    export_gated,
-    gated_output,
-    quick_part,
-    safe_share,
-    scaled,
-    training_envelope,
-)
+from jtqd.sysid.train.ours import quick_part, safe_share, scaled, training_envelope
+
+JOINT = SimpleNamespace(name="joint1")
+ENVELOPE = {
+    "velocity_step_rad_s": 0.25,
+    "torque_step_nm": 3.0,
+    "known": [[1, 1, 1]] * 3,
+    "distance_nm": 2.0,
+    "temperature_c": None,
+}
 
 
-def silent(n, loss):
-    """No progress."""
-
-
-def fused_metadata():
-    """What a network of method `fused` must say about itself."""
-    envelope = {
-        "velocity_step_rad_s": 0.25,
-        "torque_step_nm": 3.0,
-        "known": [[1, 1, 1]] * 3,
-        "distance_nm": 2.0,
-        "temperature_c": None,
-    }
-    return {
-        "features": list(FUSED_FEATURES),
-        "envelope": envelope,
-        "sigma_scale": [1.0] * 4,
-        "input_low": [-1.0] * 7,
-        "input_high": [1.0] * 7,
-        "joint": "joint1",
-        "data_sha256": "00",
-    }
-
-
-def blocks_with_zeros(count=10, samples=400, zero_nm=1.0, seed=3):
-    """Runs whose torque is 2 i plus a zero of the run, and whose angle tells which run it is."""
+def blocks_with_zeros(count=10, samples=200, zero_nm=1.0, seed=3):
+    """Runs whose torque is 2 i plus an offset of the run, and whose angle shows which run it is."""
     rng = np.random.default_rng(seed)
     made = []
     for n in range(count):
@@ -66,56 +46,38 @@ def test_same_seed_same_weights_and_another_seed_others():
     rng = np.random.default_rng(1)
     x = rng.normal(size=(500, 3))
     y = np.sin(x[:, 0]) + x[:, 1]
-    one, two, other = (train(x, y, iterations=5, seed=s, hidden=(8,)) for s in (4, 4, 5))
-    for (w, b), (w2, b2) in zip(one.weights, two.weights, strict=True):
-        assert np.array_equal(w, w2)
-        assert np.array_equal(b, b2)
+    one, two, other = (train([x], [y], Schedule(5, seed), hidden=(8,)) for seed in (4, 4, 5))
+    assert all(np.array_equal(a, b) for a, b in zip(sum(one.weights, ()), sum(two.weights, ()), strict=True))
     assert not np.array_equal(one.weights[0][0], other.weights[0][0])
 
 
-def test_training_learns_and_tells_its_loss():
+def test_training_learns_and_reports_its_loss():
     rng = np.random.default_rng(2)
     x = rng.normal(size=(3000, 2))
     y = 3.0 + 2.0 * np.tanh(x[:, 0]) - x[:, 1]
     seen = []
-    trained = train(
-        x, y, iterations=300, seed=0, hidden=(12,), progress=lambda n, loss: seen.append((n, loss))
-    )
-    out = forward(
-        trained.weights, trained.input_mean, trained.input_std, trained.output_mean, trained.output_std, x
-    )
-    assert np.mean((out - y) ** 2) < 0.01 * np.var(y)
-    assert [n for n, _ in seen] == list(range(300))
-    assert [loss for _, loss in seen] == trained.losses
-    assert trained.losses[-1] == pytest.approx(np.mean((out - y) ** 2), rel=0.5)
+    trained = train([x], [y], Schedule(150, 0, lambda n, loss: seen.append((n, loss))), hidden=(12,))
+    error = np.mean((network_output(trained, x) - y) ** 2)
+    assert error < 0.01 * np.var(y)
+    assert seen == list(enumerate(trained.losses))
+    assert len(seen) == 150
+    assert trained.losses[-1] == pytest.approx(error, rel=0.5)
 
 
 def test_split_by_sample_claims_what_a_new_run_does_not_give():
-    blocks = blocks_with_zeros()
+    blocks, schedule = blocks_with_zeros(), Schedule(300, 0)
     runs = {block.name: hashlib.sha256(block.name.encode()).hexdigest() for block in blocks}
-    result = train_paper(
-        blocks, SimpleNamespace(name="joint1"), runs, iterations=700, seed=0, progress=silent
-    )
-    claimed = split_by_sample(blocks, iterations=700, seed=0, progress=silent)
-    honest = np.mean([network for network, _ in result.held_out.values()])
+    result = train_paper(blocks, JOINT, runs, schedule)
     assert set(result.held_out) == {"run4", "run9"}
-    assert claimed < 0.2
-    assert honest > 0.8
-    assert result.metadata["runs"] == runs
+    assert split_by_sample(blocks, schedule) < 0.2
+    assert np.mean([network for network, _ in result.held_out.values()]) > 0.8
     network = TorqueNetwork(result.data)
-    assert network.joint == "joint1"
-    assert network.data_sha256 == digest_of(runs)
+    assert result.metadata["runs"] == runs
+    assert (network.joint, network.data_sha256) == ("joint1", origin(JOINT, runs)["data_sha256"])
     x = np.concatenate([block.features for block in blocks])
-    t = result.trained
-    expected = forward(t.weights, t.input_mean, t.input_std, t.output_mean, t.output_std, x)
-    assert np.abs(network.run_many(x) - expected).max() < 1e-6
-
-
-def test_too_few_runs_are_refused():
+    assert np.abs(network.run_many(x) - network_output(result.trained, x)).max() < 1e-6
     with pytest.raises(ValueError, match="found 4 runs, expected at least 5"):
-        train_paper(
-            blocks_with_zeros(4), SimpleNamespace(name="joint1"), {}, iterations=1, seed=0, progress=silent
-        )
+        train_paper(blocks[:4], JOINT, {}, schedule)
 
 
 def test_thinning_keeps_every_kth_sample(monkeypatch):
@@ -151,11 +113,11 @@ def test_safe_share_is_the_best_over_all_runs_that_harms_none():
 def test_network_that_learned_nothing_has_no_share():
     """Noise; one run of many that would be harmed; a correction that is nothing at all."""
     rng = np.random.default_rng(7)
-    pairs = [(rng.normal(size=2000), rng.normal(size=2000)) for _ in range(3)]
-    assert safe_share(pairs) == 0.0
+    assert safe_share([(rng.normal(size=2000), rng.normal(size=2000)) for _ in range(3)]) == 0.0
     correction = rng.normal(size=2000)
-    assert safe_share([(correction, correction)] * 20) == 1.0
-    assert safe_share([(correction, correction)] * 20 + [(-0.1 * correction, correction)]) == 0.0
+    good = [(correction, correction)] * 20
+    assert safe_share(good) == 1.0
+    assert safe_share([*good, (-0.1 * correction, correction)]) == 0.0
     assert safe_share([(correction, np.zeros(2000))] * 3) == 0.0
 
 
@@ -176,16 +138,26 @@ def test_envelope_knows_visited_cells_and_holes_between_them():
 def test_gated_network_in_numpy_and_as_a_graph_agree_and_have_no_mean():
     rng = np.random.default_rng(8)
     core, angle = rng.normal(size=(3000, 3)), rng.uniform(0, 2 * np.pi, 3000)
-    waves = np.column_stack((np.cos(angle), np.sin(angle), np.cos(2 * angle), np.sin(2 * angle)))
-    target = 5.0 + (0.3 + 0.1 * core[:, 0]) * waves[:, 0]
-    trained = train(core, target - 5.0, iterations=200, seed=0, hidden=(8,), waves=waves)
-    out = gated_output(trained, core, waves)
-    assert np.std(out - (target - 5.0)) < 0.03
+
+    def waves(at):
+        return np.column_stack((np.cos(at), np.sin(at), np.cos(2 * at), np.sin(2 * at)))
+
+    target = (0.3 + 0.1 * core[:, 0]) * np.cos(angle)
+    trained = train([core], [target], Schedule(150, 0), hidden=(8,), waves=[waves(angle)])
+    out = network_output(trained, core, waves(angle))
+    assert np.std(out - target) < 0.03
     turn = np.linspace(0, 2 * np.pi, 360, endpoint=False)
-    around = np.column_stack((np.cos(turn), np.sin(turn), np.cos(2 * turn), np.sin(2 * turn)))
-    assert abs(gated_output(trained, np.tile(core[0], (360, 1)), around).mean()) < 1e-9
+    assert abs(network_output(trained, np.tile(core[0], (360, 1)), waves(turn)).mean()) < 1e-9
+    metadata = {
+        "features": list(FUSED_FEATURES),
+        "envelope": ENVELOPE,
+        "sigma_scale": [1.0] * 4,
+        "input_low": [-1.0] * 7,
+        "input_high": [1.0] * 7,
+        **origin(JOINT, {}),
+    }
     for share in (1.0, 0.3, 0.0):
-        data = export_gated(scaled(trained, share), 4, fused_metadata())
-        found = FusedNetwork(data).run_many(np.column_stack((core, waves)))
+        data = export_network(scaled(trained, share), metadata, 4)
+        found = FusedNetwork(data).run_many(np.column_stack((core, waves(angle))))
         assert np.abs(found - share * out).max() < 1e-6
     assert not found.any()  # exactly nothing: the estimate is then the physics to the last bit
