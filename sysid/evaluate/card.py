@@ -18,11 +18,11 @@ import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
@@ -83,6 +83,47 @@ class Bin:
         object.__setattr__(self, "known", self.runs >= ENOUGH_RUNS and self.seconds >= ENOUGH_S)
 
 
+class Axis(NamedTuple):
+    """What errors are sorted by: field of `Card`, value of samples [n], label of a picture, an edge and a bin in words."""
+
+    name: str
+    value: Callable[[Samples], FloatArray]
+    label: str
+    edge: Callable[[float], str]
+    place: Callable[[float, float], str]
+
+
+def load_name(low: float, high: float) -> str:
+    """Return a bin of load in words: "50 to 75 % of rated torque, load drives"."""
+    ends = sorted((abs(low), abs(high)))
+    return f"{100.0 * ends[0]:.0f} to {100.0 * ends[1]:.0f} % of rated torque, {'motor' if high > 0.0 else 'load'} drives"
+
+
+_ALONG: Final = "torque along the motion [% of rated]"
+SPEED: Final = Axis(
+    "speed",
+    lambda each: np.abs(each.velocity_rad_s),
+    "speed |v| [rad/s]",
+    "{:g}".format,
+    "{:g} to {:g} rad/s".format,
+)
+LOAD: Final = Axis(
+    "load",
+    lambda each: each.sensor_nm * np.sign(each.velocity_rad_s) / each.rated_nm,
+    f"{_ALONG}, negative: load drives",
+    lambda edge: f"{100.0 * edge:.0f}",
+    load_name,
+)
+TEMPERATURE: Final = Axis(
+    "temperature",
+    lambda each: each.temperature_c,
+    "temperature [°C]",
+    "{:g}".format,
+    "{:g} to {:g} °C".format,
+)
+AXES: Final = (SPEED, LOAD, TEMPERATURE)
+
+
 @dataclass(frozen=True)
 class Advice:
     """What to measure or do next, and why; `key` for programs."""
@@ -121,6 +162,11 @@ class Card:
     given: bool
     advice: tuple[Advice, ...] = ()
 
+    def bins(self, axis: Axis) -> tuple[Bin, ...]:
+        """Return the bins of one axis."""
+        found: tuple[Bin, ...] = getattr(self, axis.name)
+        return found
+
 
 def method_of(models: JointModels) -> str:
     """Return the best method that jtqd can run with these files: the last one of TITLES."""
@@ -141,13 +187,11 @@ def make_card(samples: Sequence[Samples], joint: Joint, method: str) -> Card | N
     means = np.array([float(np.mean(each.scored_error_nm(method))) for each in own])
     weights = np.array([np.count_nonzero(each.scored) for each in own], np.float64)
     limit, given = _speed_limit(own, joint)
-    speeds, loads, warmth = (
-        list(itertools.pairwise(edges))
-        for edges in (speed_edges(limit), load_edges(own), temperature_edges(own))
-    )
+    edges = speed_edges(limit), load_edges(own), temperature_edges(own)
+    places = {axis.name: list(itertools.pairwise(each)) for axis, each in zip(AXES, edges, strict=True)}
 
-    def bins(of: Sequence[Samples], take: Take, edges: Sequence[tuple[float, float]]) -> tuple[Bin, ...]:
-        return tuple(_bin(_within(of, take, each), method, each) for each in edges)
+    def bins(of: Sequence[Samples], axis: Axis) -> tuple[Bin, ...]:
+        return tuple(_bin(_within(of, axis, place), method, place) for place in places[axis.name])
 
     card = Card(
         number=own[0].number,
@@ -162,10 +206,10 @@ def make_card(samples: Sequence[Samples], joint: Joint, method: str) -> Card | N
         zeros=float(weights @ means**2 / weights.sum()) / overall.mse_nm2 if overall.mse_nm2 else 0.0,
         interval=interval,
         standstill=standstill(samples)[own[0].number],
-        speed=bins(own, _speed, speeds),
-        load=bins(own, _load, loads),
-        temperature=bins(own, _temperature, warmth),
-        cells=tuple(bins(_within(own, _load, heavy), _speed, speeds) for heavy in loads),
+        speed=bins(own, SPEED),
+        load=bins(own, LOAD),
+        temperature=bins(own, TEMPERATURE),
+        cells=tuple(bins(_within(own, LOAD, heavy), SPEED) for heavy in places["load"]),
         limit_rad_s=limit,
         given=given,
     )
@@ -180,7 +224,7 @@ def speed_edges(limit_rad_s: float) -> tuple[float, ...]:
 
 def load_edges(samples: Sequence[Samples]) -> tuple[float, ...]:
     """Return edges in parts of rated torque: -1 to 1, and as far beyond as runs reach (at most 2)."""
-    most = max(float(np.quantile(np.abs(_load(each)[each.scored]), 0.999)) for each in samples)
+    most = max(float(np.quantile(np.abs(LOAD.value(each)[each.scored]), 0.999)) for each in samples)
     steps = round(min(2.0, max(1.0, math.ceil(most / LOAD_STEP - 0.2) * LOAD_STEP)) / LOAD_STEP)
     return tuple(LOAD_STEP * k for k in range(-steps, steps + 1))
 
@@ -201,35 +245,14 @@ def _speed_limit(samples: Sequence[Samples], joint: Joint) -> tuple[float, bool]
     limits = joint.motion_limits
     if limits is not None and limits.velocity_rad_s < _UNLIMITED:
         return limits.velocity_rad_s, True
-    seen = max(float(np.quantile(_speed(each)[each.scored], 0.999)) for each in samples)
+    seen = max(float(np.quantile(SPEED.value(each)[each.scored], 0.999)) for each in samples)
     return float(f"{seen:.2g}"), False
 
 
-Take = Callable[[Samples], FloatArray]
-
-
-def _speed(each: Samples) -> FloatArray:
-    found: FloatArray = np.abs(each.velocity_rad_s)
-    return found
-
-
-def _load(each: Samples) -> FloatArray:
-    found: FloatArray = each.sensor_nm * np.sign(each.velocity_rad_s) / each.rated_nm
-    return found
-
-
-def _temperature(each: Samples) -> FloatArray:
-    return each.temperature_c
-
-
-def _within(samples: Sequence[Samples], take: Take, edges: tuple[float, float]) -> list[Samples]:
+def _within(samples: Sequence[Samples], axis: Axis, edges: tuple[float, float]) -> list[Samples]:
     """Return the samples, of which those in a bin are scored."""
     low, high = edges
-
-    def inside(value: FloatArray) -> BoolArray:
-        return (value >= low) & (value < high)
-
-    return [each.where(inside(take(each))) for each in samples]
+    return [each.where((low <= (value := axis.value(each))) & (value < high)) for each in samples]
 
 
 def _seconds(samples: Sequence[Samples]) -> float:
@@ -292,19 +315,16 @@ def _zeros(card: Card) -> str:
 def _place(card: Card) -> str:
     """Name the worst bin that is known and clearly above the whole."""
     found = [
-        (each.error.rmse_nm / card.error.rmse_nm, text)
-        for each, text in (
-            *((each, f"at {each.low:g} to {each.high:g} rad/s") for each in card.speed),
-            *((each, f"at {load_name(each.low, each.high)}") for each in card.load),
-            *((each, f"at {each.low:g} to {each.high:g} °C") for each in card.temperature),
-        )
+        (each.error.rmse_nm / card.error.rmse_nm, axis.place(each.low, each.high))
+        for axis in AXES
+        for each in card.bins(axis)
         if each.known and each.error is not None
     ]
-    ratio, text = max(found, default=(0.0, ""))
+    ratio, place = max(found, default=(0.0, ""))
     if ratio < PLACE:
         return ""
     return (
-        f"The error is {ratio:.1f} times the average {text}: jtq diagnose on these runs names the cause; more runs "
+        f"The error is {ratio:.1f} times the average at {place}: jtq diagnose on these runs names the cause; more runs "
         "there help the fit only when there were few."
     )
 
@@ -388,12 +408,6 @@ def _runs(card: Card) -> str:
     )
 
 
-def load_name(low: float, high: float) -> str:
-    """Return a bin of load in words: "50 to 75 % of rated torque, load drives"."""
-    ends = sorted((abs(low), abs(high)))
-    return f"{100.0 * ends[0]:.0f} to {100.0 * ends[1]:.0f} % of rated torque, {'motor' if high > 0.0 else 'load'} drives"
-
-
 def ranges(bins: Sequence[Bin]) -> list[tuple[float, float]]:
     """Return neighbouring bins as one range each."""
     found: list[tuple[float, float]] = []
@@ -406,8 +420,6 @@ def ranges(bins: Sequence[Bin]) -> list[tuple[float, float]]:
 
 
 # Page, values, text ------------------------------------------------------------------------------------------------------
-
-_TEMPLATE: Final = "card.html.j2"
 
 
 def card_html(
@@ -430,7 +442,7 @@ def card_html(
         "findings": [f"{each.kind}: {each.text}" for each in findings],
         "made": made,
     }
-    return page.render("jtqd.sysid.evaluate", _TEMPLATE, content)
+    return page.render("jtqd.sysid.evaluate", "card.html.j2", content)
 
 
 def card_mapping(cards: Sequence[Card], findings: Sequence[RunIssue]) -> dict[str, Any]:
@@ -446,26 +458,22 @@ def card_lines(card: Card) -> list[str]:
     lines += [
         f"  {title:<15}{value}{f' ({more})' if more else ''}".rstrip() for title, value, more in tiles(card)
     ]
-    for title, bins, name in (
-        ("speed", card.speed, lambda low, high: f"{low:g} to {high:g} rad/s"),
-        ("load", card.load, load_name),
-        ("temperature", card.temperature, lambda low, high: f"{low:g} to {high:g} degC"),
-    ):
+    for axis in AXES:
         rows = [
             [
-                name(each.low, each.high),
-                f"{each.error.rmse_nm:.3f}" if each.error is not None else "-",
-                f"{100.0 * each.interval.share:.0f} %" if each.interval is not None else "-",
+                axis.place(each.low, each.high).replace("°C", "degC"),
+                "-" if each.error is None else f"{each.error.rmse_nm:.3f}",
+                "-" if each.interval is None else f"{100.0 * each.interval.share:.0f} %",
                 str(each.runs),
                 f"{each.seconds:.0f}",
             ]
-            for each in bins
+            for each in card.bins(axis)
         ]
         if rows:
-            lines += ["", *indented_table([title, "RMSE [Nm]", "90 % interval", "runs", "seconds"], rows)]
-    advice = [each.text for each in card.advice] or [
-        "nothing: every speed, load and temperature was measured"
-    ]
+            header = [axis.name, "RMSE [Nm]", "90 % interval", "runs", "seconds"]
+            lines += ["", *indented_table(header, rows)]
+    nothing = "nothing: every speed, load and temperature was measured"
+    advice = [each.text for each in card.advice] or [nothing]
     return [*lines, "", "  what to measure next", *(f"  - {text}" for text in advice)]
 
 
@@ -485,12 +493,9 @@ def tiles(card: Card) -> list[tuple[str, str, str]]:
     if standing is not None:
         width = card.standstill.half_width_nm[card.method]
         rest = (f"holds {100.0 * standing.share:.0f} %", f"half width {width:.2g} Nm on average")
+    relative = f"{card.error.rmse_rated_percent:.2g} % of rated"
     return [
-        (
-            "RMSE",
-            f"{card.error.rmse_nm:.2g} Nm",
-            ", ".join(filter(None, (f"{card.error.rmse_rated_percent:.2g} % of rated", beside))),
-        ),
+        ("RMSE", f"{card.error.rmse_nm:.2g} Nm", ", ".join(filter(None, (relative, beside)))),
         ("95 % of errors", f"below {card.error.p95_nm:.2g} Nm", f"largest {card.error.max_nm:.2g} Nm"),
         (
             "90 % interval",
@@ -554,35 +559,23 @@ def _panels(figure: Any, card: Card) -> None:
     left, right = figure.subfigures(1, 2)
     upper_left, lower_left = left.subfigures(2, 1)
     upper_right, lower_right = right.subfigures(2, 1)
-    top = 1.12 * max(
-        (
-            value
-            for each in (*card.speed, *card.load, *card.temperature)
-            if each.error is not None
-            for value in (each.error.rmse_nm, *each.by_run_nm)
-        ),
-        default=1.0,
-    )
-    along = "torque along the motion [% of rated]"
-    _panel(upper_left, card.speed, top, "speed |v| [rad/s]", _plain_edge)
-    _panel(upper_right, card.load, top, f"{along}, negative: load drives", _percent_edge)
-    _panel(lower_left, card.temperature, top, "temperature [°C]", _plain_edge)
-    _map(lower_right, card, along)
+    sizes = [
+        value
+        for axis in AXES
+        for each in card.bins(axis)
+        if each.error is not None
+        for value in (each.error.rmse_nm, *each.by_run_nm)
+    ]
+    for axis, panel in zip(AXES, (upper_left, upper_right, lower_left), strict=True):
+        _panel(panel, axis, card.bins(axis), 1.12 * max(sizes, default=1.0))
+    _map(lower_right, card)
 
 
-def _plain_edge(edge: float) -> str:
-    return f"{edge:g}"
+def _edge_names(bins: Sequence[Bin], axis: Axis) -> list[str]:
+    return [axis.edge(edge) for edge in (*(each.low for each in bins), bins[-1].high)]
 
 
-def _percent_edge(edge: float) -> str:
-    return f"{100.0 * edge:.0f}"
-
-
-def _edge_names(bins: Sequence[Bin], name: Callable[[float], str]) -> list[str]:
-    return [name(edge) for edge in (*(each.low for each in bins), bins[-1].high)]
-
-
-def _panel(figure: Any, bins: Sequence[Bin], top: float, label: str, name: Callable[[float], str]) -> None:
+def _panel(figure: Any, of: Axis, bins: Sequence[Bin], top: float) -> None:
     """RMSE of each bin as a bar, of each run as a dot; below, the coverage of the interval."""
     upper, lower = figure.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
     for axis in (upper, lower):
@@ -612,18 +605,18 @@ def _panel(figure: Any, bins: Sequence[Bin], top: float, label: str, name: Calla
                 elinewidth=1.2,
             )
     if bins:
-        lower.set_xticks(range(len(bins) + 1), _edge_names(bins, name))
+        lower.set_xticks(range(len(bins) + 1), _edge_names(bins, of))
         lower.set_xlim(0, len(bins))
     lower.axhline(100.0 * NOMINAL, color=LIGHT["soft"], linewidth=0.8, linestyle="--")
     lower.set_ylim(0.0, 105.0)
     lower.set_yticks([0, 50, 90], ["0", "50", "90 %"])
     lower.set_ylabel("in 90 %\ninterval")
-    lower.set_xlabel(label)
+    lower.set_xlabel(of.label)
     upper.set_ylim(0.0, top)
     upper.set_ylabel("RMSE [Nm]")
 
 
-def _map(figure: Any, card: Card, label: str) -> None:
+def _map(figure: Any, card: Card) -> None:
     """RMSE of each combination of speed and load; pale where one run or less than a second is all there is."""
     axis = figure.subplots(1, 1)
     most = max(
@@ -650,8 +643,8 @@ def _map(figure: Any, card: Card, label: str) -> None:
             )
     axis.set_xlim(0, len(card.speed))
     axis.set_ylim(0, len(card.load))
-    axis.set_xticks(range(len(card.speed) + 1), _edge_names(card.speed, _plain_edge))
-    axis.set_yticks(range(len(card.load) + 1), _edge_names(card.load, _percent_edge))
+    axis.set_xticks(range(len(card.speed) + 1), _edge_names(card.speed, SPEED))
+    axis.set_yticks(range(len(card.load) + 1), _edge_names(card.load, LOAD))
     axis.grid(visible=False)
     axis.set_xlabel("speed |v| [rad/s]; in the cells: RMSE [Nm]")
-    axis.set_ylabel(label)
+    axis.set_ylabel(_ALONG)

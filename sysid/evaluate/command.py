@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from jtqd.estimator.command_line import check_installed, make_directory, write_whole
+from jtqd.estimator.command_line import check_installed, command_parser, make_directory, write_whole
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.sysid.evaluate.card import (
@@ -23,7 +23,7 @@ from jtqd.sysid.evaluate.card import (
     method_of,
     write_png,
 )
-from jtqd.sysid.evaluate.evaluation import evaluate, loop_time
+from jtqd.sysid.evaluate.evaluation import evaluate
 from jtqd.sysid.evaluate.inputs import Inputs, JointModels, load_models, read_inputs, take_samples
 from jtqd.sysid.evaluate.report import as_mapping, report_html, text_lines
 from jtqd.sysid.progress import progress
@@ -69,18 +69,15 @@ def main(argv: list[str]) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq evaluate`."""
-    parser = argparse.ArgumentParser(
-        prog=BY,
-        description="Compare all methods with the torque sensor on held-out runs (the paper's section IV).",
-        epilog=(
-            "examples:\n"
-            "  jtq evaluate campaigns/validate --models models --out report\n"
-            "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n"
-            "  jtq evaluate my_runs --models arm --card --out card\n\n"
-            "DIR/evaluation.html is the report, DIR/evaluation.json the same for programs. Exit status: 0 done; 1 failure,\n"
-            "or a training run of a model was given; 2 usage; 3 done, but a run was left out or there are findings."
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        BY,
+        "Compare all methods with the torque sensor on held-out runs (the paper's section IV).",
+        "examples:\n"
+        "  jtq evaluate campaigns/validate --models models --out report\n"
+        "  jtq evaluate campaigns/validate --models models --outside campaigns/outside --out report --json\n"
+        "  jtq evaluate my_runs --models arm --card --out card\n\n"
+        "DIR/evaluation.html is the report, DIR/evaluation.json the same for programs. Exit status: 0 done; 1 failure,\n"
+        "or a training run of a model was given; 2 usage; 3 done, but a run was left out or there are findings.",
     )
     add_runs(parser)
     parser.add_argument(
@@ -131,7 +128,7 @@ def _report(
             raise ConfigError(
                 f"--outside {beyond[run.sha256]}: found the same data as in {run.name}, expected other runs"
             )
-    result = evaluate(inputs.runs, outside.runs, models, progress, loop_time(inputs.runs, models))
+    result = evaluate(inputs.runs, outside.runs, models)
     findings = (*_unknown_training(models), *inputs.findings, *outside.findings, *result.findings)
     result = replace(result, findings=findings)
     mapping = as_mapping(result)

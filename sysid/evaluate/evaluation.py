@@ -8,10 +8,11 @@ sleeps between its cycles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter_ns
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,7 +21,15 @@ from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.text import counted
-from jtqd.sysid.evaluate.inputs import OURS, PAPERS, TITLES, EvaluatedRun, JointModels, Samples, take_samples
+from jtqd.sysid.evaluate.inputs import (
+    OURS,
+    PAPERS,
+    TITLES,
+    EvaluatedRun,
+    JointModels,
+    Samples,
+    take_samples,
+)
 from jtqd.sysid.evaluate.scores import (
     ALLOWED,
     LIMIT_NM,
@@ -45,12 +54,14 @@ from jtqd.sysid.evaluate.scores import (
     plateau_scores,
     plateaus_of,
     ratio,
+    shown,
     standstill,
     truth_tables,
     worst_plateau,
 )
 from jtqd.sysid.fit.efficiency import QUADRANT_TITLES
 from jtqd.sysid.fit.plateaus import Plateau
+from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.channels import RunIssue
 
 # Time of a step ----------------------------------------------------------------------------------------------------------
@@ -88,8 +99,19 @@ def loop_time(
     total = dict.fromkeys(TIMED, 0.0)
     for each in whole:
         rows = _rows(run, each)
-        for method, cost in _costs_us(each, rows, clock_ns).items():
-            total[method] += cost
+        took: dict[str, list[int]] = {method: [] for method in TIMED}
+        steps = {
+            method: make_estimator(each.joint, recommended(method), each.networks.get(method)).step
+            for method in TIMED
+        }
+        for begin in range(0, len(rows), _BLOCK):
+            for method, step in steps.items():
+                for row in rows[begin : begin + _BLOCK]:
+                    began = clock_ns()
+                    step(*row)
+                    took[method].append(clock_ns() - began)
+        for method, times in took.items():
+            total[method] += float(np.median(times)) * 1e-3
     return LoopTime(total, len(whole), len(rows), run.name)
 
 
@@ -104,36 +126,15 @@ def _rows(run: EvaluatedRun, models: JointModels) -> list[_Step]:
     at = slice(begin, begin + SAMPLES)
     names = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
     values = [np.asarray(getattr(columns, name))[at].tolist() for name in names]
-    warm = columns.temperature_c
-    known = np.full(len(time_s), np.nan) if warm is None else np.asarray(warm)
+    warm = np.full(len(time_s), np.nan) if columns.temperature_c is None else columns.temperature_c
     steps = np.diff(time_s)[begin - 1 : begin - 1 + SAMPLES].tolist()
-    return list(zip(steps, *values, known[at].tolist(), strict=True))
-
-
-def _costs_us(models: JointModels, rows: list[_Step], clock_ns: Callable[[], int]) -> dict[str, float]:
-    """Return the median cost of a step [us] by method."""
-    steps = {
-        method: make_estimator(models.joint, recommended(method), models.networks.get(method)).step
-        for method in TIMED
-    }
-    took: dict[str, list[int]] = {method: [] for method in TIMED}
-    for begin in range(0, len(rows), _BLOCK):
-        for method, step in steps.items():
-            times = took[method]
-            for row in rows[begin : begin + _BLOCK]:
-                began = clock_ns()
-                step(*row)
-                times.append(clock_ns() - began)
-    return {method: float(np.median(times)) * 1e-3 for method, times in took.items()}
+    return list(zip(steps, *values, warm[at].tolist(), strict=True))
 
 
 # Tables ------------------------------------------------------------------------------------------------------------------
 
 NO_VALUE_SHARE: Final = 0.01
 """Share of the moving samples without a value of a method from which on that is a finding."""
-
-T = TypeVar("T")
-Progress = Callable[[Sequence[T], str], Iterable[T]]
 
 
 @dataclass(frozen=True)
@@ -212,17 +213,13 @@ class _Estimated(NamedTuple):
 
     run: EvaluatedRun
     samples: tuple[Samples, ...]
-    plateaus: tuple[tuple[Plateau, ...], ...]
+    plateaus: tuple[list[Plateau], ...]
 
 
 def evaluate(
-    runs: Sequence[EvaluatedRun],
-    outside: Sequence[EvaluatedRun],
-    models: Sequence[JointModels],
-    progress: Progress[EvaluatedRun] = lambda items, text: items,
-    measured: LoopTime | None = None,
+    runs: Sequence[EvaluatedRun], outside: Sequence[EvaluatedRun], models: Sequence[JointModels]
 ) -> Evaluation:
-    """Score all methods on runs, and ours outside its envelope on the runs `outside`; measured: the cost of their steps.
+    """Score all methods on runs, and ours outside its envelope on the runs `outside`.
 
     Raises ConfigError when a joint and its networks do not fit, ValueError when no run has a sample to score.
     """
@@ -231,42 +228,39 @@ def evaluate(
     outer = _estimate(progress(outside, "estimating outside"), models, findings)
     if not estimated:
         raise ValueError("found no run with a moving sample that every method has a value for, expected one")
-    constant: list[_Estimated] = []
-    variable: list[_Estimated] = []
+    by_kind: dict[str, list[_Estimated]] = {"constant": [], "variable": [], "outside": outer}
     for each in estimated:
-        (constant if any(map(is_constant, each.plateaus, each.samples)) else variable).append(each)
+        kind = "constant" if any(map(is_constant, each.plateaus, each.samples)) else "variable"
+        by_kind[kind].append(each)
     scored: list[PlateauScore] = []
-    for each in constant:
+    for each in by_kind["constant"]:
         for plateaus, samples in zip(each.plateaus, each.samples, strict=True):
             found, lost = plateau_scores(plateaus, samples)
             scored += found
             findings += [RunIssue("plateau_lost", text) for text in lost]
     every = _samples(estimated)
-    parts = {"variable": _samples(variable), "constant": _samples(constant), "all": every}
+    parts = {kind: _samples(by_kind[kind]) for kind in ("variable", "constant")} | {"all": every}
     modes = {each.run.name: each.run.velocity_joint for each in estimated}
     tables = {kind: error_tables(parts[kind], modes) for kind in ("variable", "constant")}
     methods = [method for method in TITLES if any(method in each.methods for each in models)]
-    jumps = {method: largest_jump(every, method) for method in methods}
-    passages = {method: largest_jump(every, method, passage=True) for method in methods}
     intervals = {
         name: interval_tables([for_intervals(each) for each in part]) for name, part in parts.items()
     }
     tested = [each for each in parts["variable"] if modes.get(each.run) == each.number]
-    kinds = (("constant", constant), ("variable", variable), ("outside", outer))
     result = Evaluation(
         models=tuple(models),
-        runs=tuple(_record(each, kind, tables.get(kind)) for kind, part in kinds for each in part),
+        runs=tuple(_record(each, kind, tables.get(kind)) for kind, part in by_kind.items() for each in part),
         findings=tuple(findings),
         plateaus=tuple(scored),
         variable=tables["variable"],
         constant_tables=tables["constant"],
         intervals={name: table for name, table in intervals.items() if table is not None},
         standstill=standstill([for_intervals(each) for each in every]),
-        jumps={method: jump for method, jump in jumps.items() if jump is not None},
-        passages={method: jump for method, jump in passages.items() if jump is not None},
+        jumps={m: jump for m in methods if (jump := largest_jump(every, m))},
+        passages={m: jump for m in methods if (jump := largest_jump(every, m, passage=True))},
         outside=tuple(outside_scores(_samples(outer), _envelopes(models))),
         picture=median_run(tested or parts["variable"]),  # of the joint in velocity mode, as in the paper
-        loop_time=measured,
+        loop_time=loop_time(runs, models),
         truth=truth_tables(every),
     )
     return replace(result, targets=targets(result))
@@ -283,21 +277,27 @@ def _estimate(
                 continue
             columns = run.columns[each.number]
             one = take_samples(run.name, each, run.table.time_s, columns, run.truth.get(each.number))
-            if not one.scored.any():
-                findings.append(
-                    RunIssue("nothing_to_score", f"{run.name}: j{each.number}: {_why_nothing(one)}")
-                )
-                continue
             findings += _without_value(one)
-            samples.append(one)
-            plateaus.append(tuple(plateaus_of(run.name, run.table.time_s, columns, each.joint)))
+            if one.scored.any():
+                samples.append(one)
+                plateaus.append(plateaus_of(run.name, run.table.time_s, columns, each.joint))
         if samples:
             estimated.append(_Estimated(run, tuple(samples), tuple(plateaus)))
     return estimated
 
 
 def _without_value(samples: Samples) -> list[RunIssue]:
-    """Name methods that had no value where the joint moved: these samples are in no score."""
+    """Return why nothing is scored, or which methods had no value where the joint moved."""
+    where = f"{samples.run}: j{samples.number}"
+    if not samples.scored.any():
+        why = "found no sample at which every method has a value, expected most of them: not scored"
+        if samples.standing.any():
+            share = 100.0 * float(samples.standing.mean())
+            why = (
+                f"found standstill in {share:.0f} % of the samples and no moving sample with a value of every method: "
+                "not scored"
+            )
+        return [RunIssue("nothing_to_score", f"{where}: {why}")]
     moving = samples.scored | samples.missing
     share = float(np.count_nonzero(samples.missing)) / float(np.count_nonzero(moving))
     if share <= NO_VALUE_SHARE:
@@ -307,23 +307,11 @@ def _without_value(samples: Samples) -> list[RunIssue]:
         for method, value in samples.estimate_nm.items()
         if np.isnan(value[samples.missing]).mean() > NO_VALUE_SHARE
     ]
-    return [
-        RunIssue(
-            "no_value",
-            f"{samples.run}: j{samples.number}: found no value of {', '.join(names)} in {100.0 * share:.1f} % of the "
-            "moving samples: these samples are scored for no method",
-        )
-    ]
-
-
-def _why_nothing(samples: Samples) -> str:
-    if samples.standing.any():
-        share = 100.0 * float(samples.standing.mean())
-        return (
-            f"found standstill in {share:.0f} % of the samples and no moving sample with a value of every method: "
-            "not scored"
-        )
-    return "found no sample at which every method has a value, expected most of them: not scored"
+    text = (
+        f"{where}: found no value of {', '.join(names)} in {100.0 * share:.1f} % of the moving samples: these samples are "
+        "scored for no method"
+    )
+    return [RunIssue("no_value", text)]
 
 
 def _samples(estimated: Iterable[_Estimated]) -> list[Samples]:
@@ -366,33 +354,8 @@ _SAME: Final = 1e-9
 """Relative difference of two mean squares that is rounding: a network that is faded out leaves the physics as it is."""
 _NO_WORSE: Final = 1.001
 """Ratio of two RMSE that still counts as no worse: at the rim of the envelope a share of the network is active."""
-
-
-def targets(result: Evaluation) -> tuple[Target, ...]:
-    """Return the targets, each with the paper's figure and ours."""
-    variable = result.variable
-    return (
-        _tob(variable.tested),
-        _tob_to_paper(variable),
-        _ours_to_paper(variable),
-        _every_run(result.run_scores),
-        _back_drive(result.plateaus),
-        _coverage(result.intervals.get("variable"), result.intervals.get("all")),
-        *_outside(result.outside),
-        _jump(OURS, "ours", result.jumps.get(OURS), result.passages.get(OURS)),
-        _jump(PAPERS, "the paper's chain", result.jumps.get(PAPERS), result.passages.get(PAPERS)),
-        _loop_time(result.loop_time),
-    )
-
-
-def worse_runs(runs: Mapping[tuple[str, int], Row]) -> list[tuple[str, int, float, float]]:
-    """Return (run, joint, MSE of ours, MSE of the physics) of runs in which ours is worse than its physics [Nm^2]."""
-    both = [(*key, mse(one, OURS), mse(one, "physics")) for key, one in runs.items()]
-    return [
-        (run, number, ours, physics)
-        for run, number, ours, physics in both
-        if ours is not None and physics is not None and ours > physics * (1.0 + _SAME)
-    ]
+_UNKNOWN: Final = "not known"
+_NOT_EVALUATED: Final = "not evaluated (--outside)"
 
 
 def mse(one: Row, method: str) -> float | None:
@@ -405,151 +368,177 @@ def mse_ratio(one: Row, a: str, b: str) -> float | None:
     return ratio(mse(one, a), mse(one, b))
 
 
-def _tob(tested: Row) -> Target:
+Pair = tuple[str, int, float, float]
+"""Run, joint, MSE of ours, MSE of its physics [Nm^2]."""
+
+
+def against_physics(runs: Mapping[tuple[str, int], Row]) -> tuple[list[Pair], list[Pair]]:
+    """Return the runs that have ours and its physics, and those of them in which ours is worse."""
+    pairs = [
+        (*key, one[OURS].mse_nm2, one["physics"].mse_nm2)
+        for key, one in runs.items()
+        if {OURS, "physics"} <= set(one)
+    ]
+    return pairs, [each for each in pairs if each[2] > each[3] * (1.0 + _SAME)]
+
+
+def targets(result: Evaluation) -> tuple[Target, ...]:
+    """Return the targets, each with the paper's figure and ours."""
+    return (
+        *_error_targets(result),
+        _back_drive(result.plateaus),
+        _coverage(result.intervals),
+        *_outside(result.outside),
+        _jump(result, OURS, "ours", LIMIT_NM),
+        _jump(result, PAPERS, "the paper's chain"),
+        _extra_time(result.loop_time),
+    )
+
+
+def _target(  # noqa: PLR0917
+    key: str,
+    figure: str,
+    found: float | tuple[float, ...] | str | None,
+    form: str,
+    limits: tuple[float, float] | None = None,
+    goal: str = "-",
+    *,
+    paper: str = "-",
+    details: Iterable[str] = (),
+) -> Target:
+    """Return a row: `form` of what was found (a text: why it is unknown), reached where all lies within the limits."""
+    ours, reached = str(found or _UNKNOWN), None
+    if found is not None and not isinstance(found, str):
+        values = found if isinstance(found, tuple) else (found,)
+        ours = form.format(*values)
+        reached = None if limits is None else all(limits[0] <= value <= limits[1] for value in values)
+    return Target(key, figure, paper, goal, ours, reached, tuple(details))
+
+
+def _up_to(limit: float) -> tuple[float, float]:
+    return -math.inf, limit
+
+
+def _error_targets(e: Evaluation) -> Iterator[Target]:
+    tested, both = e.variable.tested, e.variable.both
     low, high = TOB_RANGE_NM2
-    found = mse(tested, "tob")
-    return Target(
+    yield _target(
         "tob_mse",
         "MSE of the classical TOB, velocity mode",
-        f"{PAPER_MSE_NM2['tob']:g} Nm²",
+        mse(tested, "tob"),
+        "{:.2f} Nm²",
+        TOB_RANGE_NM2,
         f"{low:g} to {high:g} Nm²",
-        _number(found, ".2f", " Nm²"),
-        None if found is None else low <= found <= high,
-        ("property of the bench, not of the estimate",),
+        paper=f"{PAPER_MSE_NM2['tob']:g} Nm²",
+        details=["property of the bench, not of the estimate"],
     )
-
-
-def _tob_to_paper(tables: ErrorTables) -> Target:
-    tested, both = (mse_ratio(one, "tob", PAPERS) for one in (tables.tested, tables.both))
-    return Target(
+    alike = shown(mse_ratio(both, "tob", PAPERS), ".1f", _UNKNOWN)
+    yield _target(
         "tob_to_paper",
         "MSE ratio TOB : paper's chain, velocity mode",
-        f"{PAPER_MSE_NM2['tob'] / PAPER_MSE_NM2['network']:.0f}",
-        "-",
-        _number(tested, ".1f"),
-        None,
-        (f"all joints: {_number(both, '.1f')}; it mostly rewards a baseline without load friction",),
+        mse_ratio(tested, "tob", PAPERS),
+        "{:.1f}",
+        paper=f"{PAPER_MSE_NM2['tob'] / PAPER_MSE_NM2['network']:.0f}",
+        details=[f"all joints: {alike}; it mostly rewards a baseline without load friction"],
     )
-
-
-def _ours_to_paper(tables: ErrorTables) -> Target:
-    tested, both = (mse_ratio(one, OURS, PAPERS) for one in (tables.tested, tables.both))
-    largest = max((value for value in (tested, both) if value is not None), default=None)
-    return Target(
+    ratios = [mse_ratio(one, OURS, PAPERS) for one in (tested, both)]
+    one, all_ = (shown(each, ".3f", _UNKNOWN) for each in ratios)
+    yield _target(
         "ours_to_paper",
         "MSE ratio ours : paper's chain",
-        "-",
+        max((each for each in ratios if each is not None), default=None),
+        "{:.3f}",
+        _up_to(OURS_TO_PAPER),
         f"at most {OURS_TO_PAPER:g}",
-        _number(largest, ".3f"),
-        None if largest is None else largest <= OURS_TO_PAPER,
-        (
-            f"joint in velocity mode {_number(tested, '.3f')}, all joints {_number(both, '.3f')}; the larger one counts",
-        ),
+        details=[f"joint in velocity mode {one}, all joints {all_}; the larger one counts"],
     )
-
-
-def _every_run(runs: Mapping[tuple[str, int], Row]) -> Target:
-    pairs = [
-        (one[OURS].mse_nm2, one["physics"].mse_nm2) for one in runs.values() if {OURS, "physics"} <= set(one)
-    ]
-    worse = worse_runs(runs)
+    pairs, worse = against_physics(e.run_scores)
     # a network of share 0 is no network: that ours is not worse then means nothing
-    distinct = any(ours != physics for ours, physics in pairs)
-    text = "not known"
-    if pairs:
-        text = f"{len(worse)} of {len(pairs)}" if distinct else "none: they are one number"
-    return Target(
+    distinct = any(ours != physics for _, _, ours, physics in pairs)
+    yield _target(
         "every_run",
         "runs in which ours is worse than its physics",
-        "-",
+        len(worse) if distinct else "none: they are one number" if pairs else None,
+        f"{{}} of {len(pairs)}",
+        (0, 0),
         "none" if distinct else "-",
-        text,
-        not worse if distinct else None,
-        tuple(
-            f"{run} j{number}: {ours:.4f} against {physics:.4f} Nm²" for run, number, ours, physics in worse
-        ),
+        details=[f"{run} j{n}: {ours:.4f} against {physics:.4f} Nm²" for run, n, ours, physics in worse],
     )
 
 
 def _back_drive(plateaus: Sequence[PlateauScore]) -> Target:
     hard = hardest_plateaus(plateaus)
-    ours = worst_plateau(hard, OURS, "rated_percent")
-    tob = worst_plateau(hard, "tob", "percent")
-    details = [f"{counted(len(hard), 'plateau')} at 2.4 to 2.6 rad/s and 25 to 35 Nm, back-driven"]
-    if tob is not None:
-        details.append(f"classical TOB {tob[0]:.1f} % of the torque, {_place(tob[1])}")
-    if ours is not None:
-        details.append(f"ours worst in {_place(ours[1])}")
-    return Target(
+    ours, tob = worst_plateau(hard, OURS, "rated_percent"), worst_plateau(hard, "tob", "percent")
+
+    def place(plateau: PlateauScore) -> str:
+        at = f"{plateau.velocity_rad_s:.2f} rad/s and {plateau.torque_nm:.1f} Nm"
+        return f"{plateau.run} j{plateau.number} at {at}"
+
+    return _target(
         "back_drive",
         "worst error at 2.5 rad/s, 30 Nm, back drive",
-        f"{PAPER_WORST_PERCENT:g} % of torque (TOB)",
+        ours and ours[0],
+        "{:.2f} % of rated",
+        _up_to(BACK_DRIVE_PERCENT),
         f"at most {BACK_DRIVE_PERCENT:g} % of rated",
-        _number(None if ours is None else ours[0], ".2f", " % of rated"),
-        None if ours is None else ours[0] <= BACK_DRIVE_PERCENT,
-        tuple(details),
+        paper=f"{PAPER_WORST_PERCENT:g} % of torque (TOB)",
+        details=[
+            f"{counted(len(hard), 'plateau')} at 2.4 to 2.6 rad/s and 25 to 35 Nm, back-driven",
+            *([f"classical TOB {tob[0]:.1f} % of the torque, {place(tob[1])}"] if tob else []),
+            *([f"ours worst in {place(ours[1])}"] if ours else []),
+        ],
     )
 
 
-def _coverage(variable: IntervalTables | None, every: IntervalTables | None) -> Target:
+def _coverage(intervals: Mapping[str, IntervalTables]) -> Target:
     low, high = (100.0 * share for share in ALLOWED)
-    rows = {} if variable is None else variable.quadrants
-    cells = {
-        f"j{number} {QUADRANT_TITLES[name]}": one for number, row in rows.items() for name, one in row.items()
-    }
+    rows = intervals["variable"].quadrants if "variable" in intervals else {}
+    cells = {f"j{n} {QUADRANT_TITLES[name]}": one for n, row in rows.items() for name, one in row.items()}
     shares = [100.0 * one.share for one in cells.values()]
     details = [f"{where}: {one}" for where, one in cells.items() if not low <= 100.0 * one.share <= high]
-    if every is not None:
-        details.append(
-            f"runs at variable velocity; with those at constant velocity {100.0 * every.overall.share:.1f} % overall"
-        )
-    return Target(
+    if "all" in intervals:
+        share = 100.0 * intervals["all"].overall.share
+        details.append(f"runs at variable velocity; with those at constant velocity {share:.1f} % overall")
+    return _target(
         "coverage",
         "90 % interval of ours, joints and quadrants",
-        "-",
+        (min(shares), max(shares)) if shares else None,
+        "{:.1f} to {:.1f} %",
+        (low, high),
         f"covers {low:g} to {high:g} %",
-        f"{min(shares):.1f} to {max(shares):.1f} %" if shares else "not known",
-        all(low <= share <= high for share in shares) if shares else None,
-        tuple(details),
+        details=details,
     )
 
 
-def _outside(found: Sequence[Outside]) -> tuple[Target, Target]:
+def _outside(found: Sequence[Outside]) -> Iterator[Target]:
     ratios = [each.ours.rmse_nm / each.physics.rmse_nm for each in found if each.physics is not None]
-    flagged = min((each.flagged for each in found), default=None)
-    text = "no network: ours is its physics" if found else "not evaluated (--outside)"
-    details = [
-        f"j{each.number}: {each.ours.rmse_nm:.3f} "
-        + ("" if each.physics is None else f"against {each.physics.rmse_nm:.3f} ")
-        + f"Nm, {each.samples} samples outside"
-        for each in found
-    ]
-    return (
-        Target(
-            "outside_rmse",
-            "RMSE ours : physics, outside the envelope",
-            "-",
-            f"at most {_NO_WORSE:g}",
-            f"{max(ratios):.4f}" if ratios else text,
-            max(ratios) <= _NO_WORSE if ratios else None,
-            tuple(details),
-        ),
-        Target(
-            "outside_flagged",
-            "flagged degraded outside the envelope of network or fit",
-            "-",
-            "-",
-            "not evaluated (--outside)" if flagged is None else f"{100.0 * flagged:.2f} %",
-            None,
-            (
-                "by definition: 'python -m validation goals' counts flags outside of what a campaign has driven",
-            ),
-        ),
+    yield _target(
+        "outside_rmse",
+        "RMSE ours : physics, outside the envelope",
+        max(ratios) if ratios else "no network: ours is its physics" if found else _NOT_EVALUATED,
+        "{:.4f}",
+        _up_to(_NO_WORSE),
+        f"at most {_NO_WORSE:g}",
+        details=[
+            f"j{each.number}: {each.ours.rmse_nm:.3f} "
+            + ("" if each.physics is None else f"against {each.physics.rmse_nm:.3f} ")
+            + f"Nm, {each.samples} samples outside"
+            for each in found
+        ],
+    )
+    yield _target(
+        "outside_flagged",
+        "flagged degraded outside the envelope of network or fit",
+        100.0 * min(each.flagged for each in found) if found else _NOT_EVALUATED,
+        "{:.2f} %",
+        details=[
+            "by definition: 'python -m validation goals' counts flags outside of what a campaign has driven"
+        ],
     )
 
 
-def _jump(method: str, name: str, at: Jump | None, passage: Jump | None) -> Target:
-    details = []
+def _jump(e: Evaluation, method: str, name: str, limit_nm: float | None = None) -> Target:
+    at, passage, details = e.jumps.get(method), e.passages.get(method), []
     if at is not None:
         details += [
             f"at {at.of} in {at.run} j{at.number}, {at.time_s:.2f} s; median {at.median_nm:.2f} Nm of {at.crossings} "
@@ -557,22 +546,20 @@ def _jump(method: str, name: str, at: Jump | None, passage: Jump | None) -> Targ
             f"of as many windows anywhere in motion one exceeds {at.elsewhere_nm:.2f} Nm",
         ]
     if passage is not None:
-        details.append(
-            f"over whole passages, standstill included: {passage.nm:.2f} Nm ({passage.run} j{passage.number})"
-        )
-    return Target(
+        where = f"{passage.run} j{passage.number}"
+        details.append(f"over whole passages, standstill included: {passage.nm:.2f} Nm ({where})")
+    return _target(
         f"jump_{method}",
         f"jump at a change of quadrant, {name}",
-        "-",
-        f"at most {LIMIT_NM:g} Nm" if method == OURS else "-",
-        _number(None if at is None else at.nm, ".2f", " Nm"),
-        None if at is None or method != OURS else at.nm <= LIMIT_NM,
-        tuple(details),
+        None if at is None else at.nm,
+        "{:.2f} Nm",
+        None if limit_nm is None else _up_to(limit_nm),
+        "-" if limit_nm is None else f"at most {limit_nm:g} Nm",
+        details=details,
     )
 
 
-def _loop_time(found: LoopTime | None) -> Target:
-    extra = None if found is None else found.extra_us(PAPERS)
+def _extra_time(found: LoopTime | None) -> Target:
     details = ["'python -m tests.benchmarks stages' measures it in the whole loop"]
     if found is not None:
         costs = ", ".join(f"{TITLES[method]} {cost:.1f}" for method, cost in found.step_us.items())
@@ -581,20 +568,12 @@ def _loop_time(found: LoopTime | None) -> Target:
             f"steps on this machine, {found.joints} joints together, median of {found.samples} samples of {found.run}: "
             f"{costs} us; over the classical TOB {found.extra_us('tob'):.1f} us",
         )
-    return Target(
+    return _target(
         "loop_time",
         "extra time of ours in the loop, over the paper's",
-        "-",
+        "not measured" if found is None else found.extra_us(PAPERS),
+        "{:.1f} us",
+        _up_to(EXTRA_US),
         f"at most {EXTRA_US:g} us, median",
-        "not measured" if extra is None else f"{extra:.1f} us",
-        None if extra is None else extra <= EXTRA_US,
-        tuple(details),
+        details=details,
     )
-
-
-def _place(plateau: PlateauScore) -> str:
-    return f"{plateau.run} j{plateau.number} at {plateau.velocity_rad_s:.2f} rad/s and {plateau.torque_nm:.1f} Nm"
-
-
-def _number(value: float | None, form: str, unit: str = "") -> str:
-    return "not known" if value is None else format(value, form) + unit

@@ -16,7 +16,7 @@ from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.estimator.text import counted, table_lines
 from jtqd.estimator.uncertainty import GAUSS
-from jtqd.sysid.evaluate.evaluation import Evaluation, Target, mse, mse_ratio, worse_runs
+from jtqd.sysid.evaluate.evaluation import Evaluation, against_physics, mse, mse_ratio
 from jtqd.sysid.evaluate.inputs import OURS, PAPERS, TITLES, JointModels, Samples
 from jtqd.sysid.evaluate.scores import (
     LEVELS,
@@ -36,6 +36,7 @@ from jtqd.sysid.evaluate.scores import (
     common_methods,
     hardest_plateaus,
     ratio,
+    shown,
     speed_groups,
     worst_plateau,
 )
@@ -52,6 +53,10 @@ SCHEMA: Final = "jtq.evaluation/1"
 def as_mapping(result: Evaluation) -> dict[str, Any]:
     """Return dicts, lists, texts and finite numbers, None where there is none; joints are keys as text."""
     variable = result.variable
+    tables = {
+        kind: {name: value for name, value in vars(each).items() if name != "runs"}
+        for kind, each in (("variable", variable), ("constant", result.constant_tables))
+    }
     mapping: dict[str, Any] = plain_values(
         {
             "schema": SCHEMA,
@@ -61,15 +66,15 @@ def as_mapping(result: Evaluation) -> dict[str, Any]:
             "findings": [item._asdict() for item in result.findings],
             "figures_to_reach": result.targets,
             "constant": _constant(result),
-            "variable": _tables(variable)
+            "variable": tables["variable"]
             | {
                 "paper_mse_nm2": PAPER_MSE_NM2,
                 "ratios": {"tested": _ratios(variable.tested), "both": _ratios(variable.both)},
             },
-            "constant_runs": _tables(result.constant_tables),
+            "constant_runs": tables["constant"],
             "worse_than_physics": [
                 {"run": run, "number": number, "ours_mse_nm2": ours, "physics_mse_nm2": physics}
-                for run, number, ours, physics in worse_runs(result.run_scores)
+                for run, number, ours, physics in against_physics(result.run_scores)[1]
             ],
             "intervals": result.intervals,
             "standstill": result.standstill,
@@ -96,17 +101,9 @@ def _model(each: JointModels) -> dict[str, Any]:
     }
 
 
-def _tables(tables: ErrorTables) -> dict[str, Any]:
-    return {name: value for name, value in vars(tables).items() if name != "runs"}
-
-
 def _ratios(one: Row) -> dict[str, float | None]:
-    return {
-        "tob_to_paper": mse_ratio(one, "tob", PAPERS),
-        "efficiency_to_paper": mse_ratio(one, "efficiency", PAPERS),
-        "ours_to_paper": mse_ratio(one, OURS, PAPERS),
-        "ours_to_physics": mse_ratio(one, OURS, "physics"),
-    }
+    names = {"tob": "tob", "efficiency": "efficiency", PAPERS: "paper", "physics": "physics", OURS: "ours"}
+    return {f"{names[a]}_to_{names[b]}": mse_ratio(one, a, b) for a, b in _PAIRS}
 
 
 def _constant(result: Evaluation) -> dict[str, Any]:
@@ -132,19 +129,15 @@ def _constant(result: Evaluation) -> dict[str, Any]:
 
 def _group(group: list[PlateauScore], methods: Iterable[str]) -> dict[str, Any]:
     torques = [abs(each.torque_nm) for each in group]
-    worst = {
-        key: {method: worst_plateau(group, method, key) for method in methods}
-        for key in ("percent", "rated_percent")
-    }
-    return {
+    found: dict[str, Any] = {
         "plateaus": len(group),
         "least_torque_nm": min(torques, default=None),
         "most_torque_nm": max(torques, default=None),
-        **{
-            f"worst_{key}": {method: found and found[0] for method, found in by_method.items()}
-            for key, by_method in worst.items()
-        },
     }
+    for key in ("percent", "rated_percent"):
+        worst = {method: worst_plateau(group, method, key) for method in methods}
+        found[f"worst_{key}"] = {method: each and each[0] for method, each in worst.items()}
+    return found
 
 
 # Text --------------------------------------------------------------------------------------------------------------------
@@ -182,8 +175,12 @@ def text_lines(result: Evaluation, mapping: Mapping[str, Any]) -> list[str]:
         "",
         *_text_truth(result),
         "D. targets",
-        *_targets(result.targets),
     ]
+    rows = [[each.figure, each.paper, each.goal, each.ours, _MARKS[each.reached]] for each in result.targets]
+    lines += indented_table(["figure", "paper", "target", "ours", "met"], rows)
+    for each in result.targets:
+        if each.reached is False and each.details:
+            lines += [f"  {each.figure}:", *(f"    {line}" for line in each.details)]
     if result.findings:
         lines += ["", "findings", *(f"  {item.kind}: {item.text}" for item in result.findings)]
     return lines
@@ -206,24 +203,26 @@ def _runs(result: Evaluation) -> list[str]:
 
 
 def _text_constant(mapping: Mapping[str, Any]) -> list[str]:
-    speeds = mapping["constant"]["speeds"]
+    methods, speeds = list(mapping["methods"]), mapping["constant"]["speeds"]
     if not speeds:
         return ["  no run at constant velocity"]
-    methods = list(mapping["methods"])
-    rows = []
-    for each in speeds:
-        errors = [
-            f"{_cell(each['worst_percent'][m], '.1f')} ({_cell(each['worst_rated_percent'][m], '.2f')})"
-            for m in methods
+    rows = [
+        [
+            f"j{each['number']} {each['drive']} {each['velocity_rad_s']:g} rad/s",
+            str(each["plateaus"]),
+            f"{each['least_torque_nm']:.1f} to {each['most_torque_nm']:.1f} Nm",
+            *(
+                f"{shown(each['worst_percent'][m], '.1f')} ({shown(each['worst_rated_percent'][m])})"
+                for m in methods
+            ),
         ]
-        load = f"{each['least_torque_nm']:.1f} to {each['most_torque_nm']:.1f} Nm"
-        place = f"j{each['number']} {each['drive']} {each['velocity_rad_s']:g} rad/s"
-        rows.append([place, str(each["plateaus"]), load, *errors])
+        for each in speeds
+    ]
     lines = indented_table(["", "plateaus", "load", *(_SHORT[m] for m in methods)], rows)
     hard = mapping["constant"]["hardest"]
     for number, group in hard["joints"].items():
         if group["plateaus"]:
-            worst = ", ".join(f"{_SHORT[m]} {_cell(group['worst_percent'][m], '.1f')} %" for m in methods)
+            worst = ", ".join(f"{_SHORT[m]} {shown(group['worst_percent'][m], '.1f')} %" for m in methods)
             paper = f"(paper: TOB {hard['paper_percent']:g} %)"
             lines.append(f"  2.5 rad/s and about 30 Nm, back drive, j{number}: {worst} {paper}")
     return lines
@@ -238,10 +237,10 @@ def _variable(result: Evaluation) -> list[str]:
         f"  ratios, {name}: " + ", ".join(_ratio(row, a, b) for a, b in _PAIRS) for name, row in named.items()
     ]
     named |= {f"j{number}": row for number, row in tables.joints.items()}
-    rows = [["paper, tested joint", "", *(_cell(PAPER_MSE_NM2.get(m), ".2f") for m in methods)]]
+    rows = [["paper, tested joint", "", *(shown(PAPER_MSE_NM2.get(m), ".2f") for m in methods)]]
     for name, row in named.items():
         samples = str(next(iter(row.values())).samples) if row else "0"
-        rows.append([name, samples, *(_cell(mse(row, m), ".3f") for m in methods)])
+        rows.append([name, samples, *(shown(mse(row, m), ".3f") for m in methods)])
     return indented_table(["", "samples", *(_SHORT[m] for m in methods)], rows) + ratios
 
 
@@ -250,7 +249,7 @@ def _ratio(row: Row, a: str, b: str) -> str:
     paper = ratio(PAPER_MSE_NM2.get(a), PAPER_MSE_NM2.get(b))
     beside = "" if paper is None else f" (paper {paper:.1f})"
     form = ".3f" if a == OURS else ".1f"
-    return f"{_SHORT[a]} : {_SHORT[b]} {_cell(mse_ratio(row, a, b), form)}{beside}"
+    return f"{_SHORT[a]} : {_SHORT[b]} {shown(mse_ratio(row, a, b), form)}{beside}"
 
 
 def _text_intervals(result: Evaluation) -> list[str]:
@@ -275,7 +274,7 @@ def _text_truth(result: Evaluation) -> list[str]:
     rows = [
         [
             f"j{number} {text}",
-            *(_cell(row[m].rmse_rated_percent if m in row else None, ".2f") for m in result.methods),
+            *(shown(row[m].rmse_rated_percent if m in row else None, ".2f") for m in result.methods),
         ]
         for text, part in (("now", truth.now), ("aligned", truth.aligned))
         for number, row in part.items()
@@ -311,54 +310,26 @@ def _coverages(tables: IntervalTables, number: int) -> list[str]:
     return ["-" if one is None else str(one).replace(" %", "") for one in cells]
 
 
-def _targets(targets: Sequence[Target]) -> list[str]:
-    """Return the table, and under it the details of targets that are not reached."""
-    rows = [[each.figure, each.paper, each.goal, each.ours, _MARKS[each.reached]] for each in targets]
-    lines = indented_table(["figure", "paper", "target", "ours", "met"], rows)
-    for each in targets:
-        if each.reached is False and each.details:
-            lines += [f"  {each.figure}:", *(f"    {line}" for line in each.details)]
-    return lines
-
-
-def _cell(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)
-
-
 # Page --------------------------------------------------------------------------------------------------------------------
-
-TEMPLATE: Final = "report.html.j2"
 
 
 def report_html(result: Evaluation, mapping: Mapping[str, Any], made: str) -> str:
     """Return the page; mapping: `as_mapping(result)`, made: when and by what, one line. Needs jinja2 and matplotlib."""
     states = [each.reached for each in result.targets if each.goal != "-"]
+    counts = {"reached": states.count(True), "missed": states.count(False), "unknown": states.count(None)}
     content = {
         "e": mapping,
         "made": made,
         "quadrants": QUADRANTS,
         "pictures": pictures(result),
-        "verdict": {
-            "reached": states.count(True),
-            "missed": states.count(False),
-            "unknown": states.count(None),
-        },
+        "verdict": counts,
     }
-    filters = {
-        "number": _shown,
-        "percent": _percent,
+    filters: dict[str, Callable[..., Any]] = {
+        "number": partial(shown, missing=DASH),
+        "percent": lambda share, form=".1f": shown(None if share is None else 100.0 * share, form, DASH),
         "quadrant": lambda name: QUADRANT_TITLES[name].replace("w", "ω", 1),
     }
-    return page.render("jtqd.sysid.evaluate", TEMPLATE, content, filters)
-
-
-def _shown(value: float | None, form: str = ".2f") -> str:
-    """Return a number, a dash where there is none."""
-    return DASH if value is None else format(value, form)
-
-
-def _percent(share: float | None, form: str = ".1f") -> str:
-    return _shown(None if share is None else 100.0 * share, form)
+    return page.render("jtqd.sysid.evaluate", "report.html.j2", content, filters)
 
 
 def pictures(result: Evaluation) -> dict[str, Any]:
@@ -407,6 +378,11 @@ STYLES: Final = {
 WIDTH_IN: Final = 6.4
 
 
+def _look(method: str) -> dict[str, Any]:
+    colour, line, marker = STYLES[method]
+    return {"color": colour, "linestyle": line, "marker": marker, "markersize": 4.5}
+
+
 def _new_figure(rows: int, height: float, **options: Any) -> tuple[Any, Any]:
     """Return figure and axes [rows] of the report's width."""
     from matplotlib import pyplot as plt
@@ -427,16 +403,18 @@ def _plain_log(axis: Any, set_scale: Any) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _legend_above(figure: Any, *axes: Any) -> None:
-    """One legend above the figure, as many columns as fit."""
+def _finished(figure: Any, *axes: Any) -> Any:
+    """Return the figure with plain axes and one legend above, as many columns as fit."""
     handles, labels = [], []
     for axis in axes:
+        plain(axis)
         more, names = axis.get_legend_handles_labels()
         handles += more
         labels += names
     figure.legend(
         handles, labels, loc="outside upper left", ncols=min(len(labels), 3), fontsize=8.5, frameon=False
     )
+    return figure
 
 
 def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> Any | None:
@@ -454,35 +432,29 @@ def constant_figure(plateaus: Sequence[PlateauScore], drive: str) -> Any | None:
         x, torque, color=SENSOR, marker="_", markersize=11, linestyle="none", label="torque sensor", zorder=4
     )
     for method in [m for m in TITLES if all(m in each.errors_nm for each in own)]:
-        style = STYLES[method]
-        look = {"color": style.colour, "marker": style.marker, "markersize": 4.5, "linewidth": 1.1}
+        look = _look(method)
         error = np.array([each.errors_nm[method] * np.sign(each.torque_nm) for each in own])
-        upper.plot(x, torque + error, linestyle="none", label=TITLES[method], **look)
+        upper.plot(x, torque + error, label=TITLES[method], linewidth=1.1, **look | {"linestyle": "none"})
         percent = np.array([each.percent[method] for each in own], np.float64)  # None: NaN
-        lower.plot(x, percent, linestyle=style.line, **look)
+        lower.plot(x, percent, linewidth=1.1, **look)
     speeds = [round(abs(each.velocity_rad_s), 1) for each in own]
     starts = [k for k in range(len(own)) if k == 0 or speeds[k] != speeds[k - 1]]
-    for axis in (upper, lower):
-        plain(axis)
-        for k in starts[1:]:
-            axis.axvline(k - 0.5, color=LIGHT["soft"], linewidth=0.8)
+    below = {
+        "transform": lower.get_xaxis_transform(),
+        "ha": "center",
+        "va": "top",
+        "fontsize": 9,
+    }
     for k, end in zip(starts, [*starts[1:], len(own)], strict=True):
-        lower.text(
-            (k + end - 1) / 2,
-            -0.06,
-            f"{speeds[k]:g} rad/s",
-            transform=lower.get_xaxis_transform(),
-            ha="center",
-            va="top",
-            fontsize=9,
-        )
+        lower.text((k + end - 1) / 2, -0.06, f"{speeds[k]:g} rad/s", **below)
     lower.set_xticks([])
     upper.set_ylabel("|torque| [Nm]")
     lower.set_ylabel("error [% of torque]")
     for axis in (upper, lower):
         axis.set_ylim(bottom=0.0)
-    _legend_above(figure, upper)
-    return figure
+        for k in starts[1:]:
+            axis.axvline(k - 0.5, color=LIGHT["soft"], linewidth=0.8)
+    return _finished(figure, upper, lower)
 
 
 def run_figure(samples: Samples) -> Any:
@@ -490,7 +462,6 @@ def run_figure(samples: Samples) -> Any:
     figure, (upper, lower) = _new_figure(2, 5.2, sharex=True)
     time = samples.time_s
     for axis in (upper, lower):
-        plain(axis)
         shade(axis, time, samples.standing, STANDING, "standstill" if axis is upper else None)
     upper.plot(*thinned(time, samples.sensor_nm), color=SENSOR, linewidth=2.0, label="torque sensor")
     for method in common_methods([samples]):
@@ -508,8 +479,7 @@ def run_figure(samples: Samples) -> Any:
     lower.set_ylabel("error [Nm]")
     lower.set_xlabel("time [s]")
     upper.set_xlim(time[0], time[-1])
-    _legend_above(figure, upper, lower)
-    return figure
+    return _finished(figure, upper, lower)
 
 
 def paper_figure(tables: ErrorTables) -> Any | None:
@@ -538,9 +508,7 @@ def paper_figure(tables: ErrorTables) -> Any | None:
     axis.set_yticks(y, [TITLES[method] for method in methods])
     axis.set_ylim(-0.6, len(methods) - 0.4)
     axis.set_xlabel("mean square error [Nm²]")
-    plain(axis)
-    _legend_above(figure, axis)
-    return figure
+    return _finished(figure, axis)
 
 
 def runs_figure(tables: ErrorTables, number: int) -> Any | None:
@@ -554,9 +522,7 @@ def runs_figure(tables: ErrorTables, number: int) -> Any | None:
     figure, axis = _rows_figure(x, runs, lambda score: score.mse_nm2, "MSE [Nm²]", 0.8)
     axis.set_xlabel(f"runs, by the MSE of {TITLES[reference]}")
     axis.set_xticks(x if len(runs) <= 30 else [])
-    plain(axis)
-    _legend_above(figure, axis)
-    return figure
+    return _finished(figure, axis)
 
 
 def velocities_figure(tables: ErrorTables, number: int) -> Any | None:
@@ -565,17 +531,10 @@ def velocities_figure(tables: ErrorTables, number: int) -> Any | None:
     names = [name for k in range(len(VELOCITY_EDGES_RAD_S) - 1) if rows.get(name := bin_name(k))]
     if not names:
         return None
-    figure, axis = _rows_figure(
-        names,
-        [rows[name] for name in names],
-        lambda score: score.rmse_rated_percent,
-        "RMSE [% of rated]",
-        1.2,
-    )
+    bins = [rows[name] for name in names]
+    figure, axis = _rows_figure(names, bins, lambda score: score.rmse_rated_percent, "RMSE [% of rated]", 1.2)
     axis.set_xlabel("|velocity| [rad/s]")
-    plain(axis)
-    _legend_above(figure, axis)
-    return figure
+    return _finished(figure, axis)
 
 
 def _rows_figure(
@@ -584,17 +543,8 @@ def _rows_figure(
     """Return figure and axis with a value of every method that all rows have, over x."""
     figure, (axis,) = _new_figure(1, 2.9)
     for method in [m for m in TITLES if all(m in row for row in rows)]:
-        style = STYLES[method]
-        axis.plot(
-            x,
-            [value(row[method]) for row in rows],
-            color=style.colour,
-            marker=style.marker,
-            markersize=4.5,
-            linestyle=style.line,
-            linewidth=linewidth,
-            label=TITLES[method],
-        )
+        values = [value(row[method]) for row in rows]
+        axis.plot(x, values, label=TITLES[method], linewidth=linewidth, **_look(method))
     _plain_log(axis.yaxis, axis.set_yscale)
     axis.set_ylabel(label)
     return figure, axis

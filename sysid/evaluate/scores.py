@@ -136,6 +136,11 @@ def ratio(a: float | None, b: float | None) -> float | None:
     return None if a is None or b is None or b == 0.0 else a / b
 
 
+def shown(value: float | None, form: str = ".2f", missing: str = "-") -> str:
+    """Return a number as text, `missing` where there is none."""
+    return missing if value is None else format(value, form)
+
+
 @dataclass(frozen=True)
 class ErrorTables:
     """Scores by method. joints, quadrants, velocities: by joint number (and name). runs: by (run, joint number).

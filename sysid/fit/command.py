@@ -8,13 +8,13 @@ import difflib
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.command_line import check_installed, check_output
+from jtqd.estimator.command_line import check_installed, check_output, command_parser
 from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Joint
@@ -39,14 +39,12 @@ from jtqd.sysid.fit.losses import PER_K_PRIOR
 from jtqd.sysid.fit.plateaus import PlateauRules, fit_no_load, mean_temperature, no_load, plateaus_of
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
 from jtqd.sysid.report.page import check_picture
-from jtqd.sysid.runs.channels import RunIssue
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, runs_of_joint
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
 
-@dataclass(frozen=True)
-class Outcome:
+class Outcome(NamedTuple):
     """What one kind of fit gives: text and JSON for standard output, lines for standard error, the joint to write.
 
     status: exit status; other than 0, nothing is written.
@@ -112,15 +110,12 @@ def main(argv: list[str]) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq fit`, a subcommand for each kind."""
-    parser = argparse.ArgumentParser(
-        prog="jtq fit",
-        description="Fit one section of a joint file to measured runs and write a new joint file.",
-        epilog=(
-            "examples:\n"
-            "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
-            "  jtq fit KIND --help"
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+    parser = command_parser(
+        "jtq fit",
+        "Fit one section of a joint file to measured runs and write a new joint file.",
+        "examples:\n"
+        "  jtq fit efficiency campaigns/efficiency --joint joint1.yaml --out joint1.fitted.yaml --plot fig6.png\n"
+        "  jtq fit KIND --help",
     )
     kinds = parser.add_subparsers(dest="kind", metavar="KIND")
     for name, kind in KINDS.items():
@@ -172,28 +167,20 @@ def _positive(text: str) -> float:
 
 
 def _fitted(
-    joint: Joint,
-    section: str,
-    runs: Sequence[RunFile],
-    options: argparse.Namespace,
-    *,
-    temperature_c: float,
-    notes: Mapping[str, Any],
+    joint: Joint, section: str, runs: Sequence[RunFile], by: str, temperature_c: float, **notes: Any
 ) -> Joint:
     """Return the joint with today's date, the command and the hashes of the runs in the provenance of a section."""
+    hashes = {run.name: run.sha256 for run in runs}
+    today = dt.datetime.now().astimezone().date().isoformat()
     return with_fit(
         joint,
         section,
-        by=f"jtq fit {options.kind}",
-        runs={run.name: run.sha256 for run in runs},
-        date=dt.datetime.now().astimezone().date().isoformat(),
+        by=f"jtq fit {by}",
+        runs=hashes,
+        date=today,
         temperature_c=temperature_c,
         notes=notes,
     )
-
-
-def _count(findings: Sequence[RunIssue]) -> str:
-    return counted(len(findings), "finding")
 
 
 # Efficiency --------------------------------------------------------------------------------------------
@@ -224,10 +211,24 @@ def _fit_efficiency(joint: Joint, number: int, runs: list[RunFile], options: arg
     result = _efficiency_result(joint, number, runs, options)
     fit = result.fits[0] if result.fits else None
     written = None
-    if fit is not None and (not fit.refused or options.allow_missing):
-        written = _with_efficiency(joint, fit, result, runs, options)
-        result = replace(result, findings=tuple(written_findings(written, result.points, fit)))
     log = []
+    if fit is not None and (not fit.refused or options.allow_missing):
+        try:
+            efficiency = fit.efficiency(joint.efficiency if options.allow_missing else None)
+        except ValueError as error:
+            raise ConfigError(f"{options.joint}: {error}") from None
+        kept = {"kept_from_joint_file": list(fit.refused)} if fit.refused else {}
+        written = _fitted(
+            replace(joint, efficiency=efficiency),
+            "efficiency",
+            runs,
+            "efficiency",
+            result.temperature_c,
+            weighted=fit.weighted,
+            plateaus=len(result.points),
+            **kept,
+        )
+        result = replace(result, findings=tuple(written_findings(written, result.points, fit)))
     if fit is not None and options.plot is not None:
         title = f"{joint.name}: measured efficiency and Eq. (8), convention {fit.convention}"
         try:
@@ -238,7 +239,7 @@ def _fit_efficiency(joint: Joint, number: int, runs: list[RunFile], options: arg
     nothing = f"nothing was written to {options.out}" if options.out is not None else "not fitted"
     status = 0
     if result.findings:
-        log.append(f"{_count(result.findings)}, {nothing}")
+        log.append(f"{counted(len(result.findings), 'finding')}, {nothing}")
         status = 3
     elif fit is not None and written is None:
         log += [
@@ -277,24 +278,6 @@ def _efficiency_result(
     )
 
 
-def _with_efficiency(
-    joint: Joint,
-    fit: EfficiencyFit,
-    result: EfficiencyResult,
-    runs: list[RunFile],
-    options: argparse.Namespace,
-) -> Joint:
-    try:
-        efficiency = fit.efficiency(joint.efficiency if options.allow_missing else None)
-    except ValueError as error:
-        raise ConfigError(f"{options.joint}: {error}") from None
-    notes: dict[str, object] = {"weighted": fit.weighted, "plateaus": len(result.points)}
-    if fit.refused:
-        notes["kept_from_joint_file"] = list(fit.refused)
-    new = replace(joint, efficiency=efficiency)
-    return _fitted(new, "efficiency", runs, options, temperature_c=result.temperature_c, notes=notes)
-
-
 # Friction ----------------------------------------------------------------------------------------------
 
 
@@ -302,7 +285,7 @@ def _fit_friction(joint: Joint, number: int, runs: list[RunFile], options: argpa
     found = channel_findings(runs, number, joint)
     if found:
         lines = [f"{item.kind}: {item.text}" for item in found]
-        return Outcome(lines, log=[f"{_count(found)}, not fitted"], status=3)
+        return Outcome(lines, log=[f"{counted(len(found), 'finding')}, not fitted"], status=3)
     plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
     chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
     fit = fit_no_load(chosen, joint)
@@ -316,14 +299,8 @@ def _fit_friction(joint: Joint, number: int, runs: list[RunFile], options: argpa
         "warnings": fit.warnings,
         "plateaus": chosen,
     }
-    new = _fitted(
-        replace(joint, friction=fit.friction),
-        "friction",
-        runs,
-        options,
-        temperature_c=mean_temperature(chosen),
-        notes={"plateaus": fit.plateaus},
-    )
+    new = replace(joint, friction=fit.friction)
+    new = _fitted(new, "friction", runs, "friction", mean_temperature(chosen), plateaus=fit.plateaus)
     lines = [f"{joint.name} (j{number}): friction at no load", *fit.lines()]
     return Outcome(lines, plain_values(mapping), joint=new)
 
@@ -347,45 +324,33 @@ def _fit_losses(joint: Joint, number: int, runs: list[RunFile], options: argpars
     signals = signals_of_runs(runs, number, joint)
     if not two and len(runs) <= MOST_RUNS:
         few = fit_few_runs(signals, joint)
-        notes = {
-            "unseen_rmse_nm": round(few.held_out_nm, 4),
-            "few_runs": few.lines(),
-            "rotor_inertia_kgm2": "fitted, too",
+        lines, log = _few_lines(few), [ONE_ENCODER, FEW_RUNS]
+        new, unseen, sigma_per_k, samples = few.joint, [few.held_out_nm], PER_K_PRIOR[1], few.samples
+        notes: dict[str, Any] = {"few_runs": few.lines(), "rotor_inertia_kgm2": "fitted, too"}
+        more = {
+            "effective_samples": few.effective,
+            "terms": [asdict(term) for term in few.terms],
+            "rotor_inertia_kgm2": new.rotor_inertia_kgm2,
         }
-        temperature_c = few.fused.loss.temperature_c
-        new = _fitted(few.joint, "fused", runs, options, temperature_c=temperature_c, notes=notes)
-        return Outcome(_few_lines(few), _few_mapping(few), [ONE_ENCODER, FEW_RUNS], new)
-    fit = fit_fused(signals, joint, two_encoders=two)
-    new = _fitted(
-        replace(joint, fused=fit.fused),
-        "fused",
-        runs,
-        options,
-        temperature_c=fit.fused.loss.temperature_c,
-        notes={"unseen_rmse_nm": round(_held_out_rmse(fit), 4)},
-    )
+    else:
+        fit = fit_fused(signals, joint, two_encoders=two)
+        lines, log = _fused_lines(joint, fit), [] if two else [ONE_ENCODER]
+        new, unseen = replace(joint, fused=fit.fused), list(fit.held_out_rmse_nm)
+        sigma_per_k, samples = fit.loss.viscous_per_k_sigma, fit.loss.samples
+        notes, more = {}, {}
+    assert new.fused is not None
     mapping = {
         "schema": "jtq.fit_losses/1",
-        "unseen_rmse_nm": list(fit.held_out_rmse_nm),
-        "samples": fit.loss.samples,
-        "viscous_per_k_sigma": fit.loss.viscous_per_k_sigma,
-        "fused": fit.fused.to_mapping(),
+        "unseen_rmse_nm": unseen,
+        "samples": samples,
+        "viscous_per_k_sigma": sigma_per_k,
+        **more,
+        "fused": new.fused.to_mapping(),
     }
-    return Outcome(_fused_lines(joint, fit), mapping, [] if two else [ONE_ENCODER], new)
-
-
-def _few_mapping(fit: FewRunsFit) -> dict[str, object]:
-    """Return the mapping of a fit of many runs, and the fitted quantities."""
-    return {
-        "schema": "jtq.fit_losses/1",
-        "unseen_rmse_nm": [fit.held_out_nm],
-        "samples": fit.samples,
-        "viscous_per_k_sigma": PER_K_PRIOR[1],
-        "effective_samples": fit.effective,
-        "terms": [asdict(term) for term in fit.terms],
-        "rotor_inertia_kgm2": fit.joint.rotor_inertia_kgm2,
-        "fused": fit.fused.to_mapping(),
-    }
+    notes = {"unseen_rmse_nm": round(_together(unseen), 4), **notes}
+    return Outcome(
+        lines, mapping, log, _fitted(new, "fused", runs, "losses", new.fused.loss.temperature_c, **notes)
+    )
 
 
 def _few_lines(fit: FewRunsFit) -> list[str]:
@@ -399,12 +364,12 @@ def _few_lines(fit: FewRunsFit) -> list[str]:
     ]
 
 
-def _held_out_rmse(fit: FusedFit) -> float:
-    return float(np.sqrt(np.mean(np.square(fit.held_out_rmse_nm))))
+def _together(rmse_nm: Sequence[float]) -> float:
+    return float(np.sqrt(np.mean(np.square(rmse_nm))))
 
 
 def _fused_lines(joint: Joint, fit: FusedFit) -> list[str]:
-    fused, rmse = fit.fused, _held_out_rmse(fit)
+    fused, rmse = fit.fused, _together(fit.held_out_rmse_nm)
     sigma, torsion, loss = fused.sigma, fused.torsion, fused.loss
     lines = [
         f"{joint.name}: physics on held-out runs: RMSE {rmse:.3f} Nm "

@@ -170,12 +170,17 @@ def fit_efficiency(
         raise ValueError(f"convention: found {convention!r}, expected one of {', '.join(CONVENTIONS)}")
     fits, refused = {}, {}
     for name in QUADRANTS:
-        own = [point for point in points if point.quadrant == name]
+        own = in_quadrant(points, name)
         try:
             fits[name] = _fit_quadrant(own, convention, joint, weighted)
         except ValueError as error:
             refused[name] = f"{name}: {error}"
     return EfficiencyFit(convention, weighted, fits, refused)
+
+
+def in_quadrant(points: Iterable[EtaPoint], name: str) -> list[EtaPoint]:
+    """Return the points of one quadrant."""
+    return [point for point in points if point.quadrant == name]
 
 
 def distinct_points(points: Sequence[EtaPoint]) -> int:
@@ -287,33 +292,25 @@ def efficiency_findings(points: Sequence[EtaPoint], joint: Joint) -> list[RunIss
     ]
     if against:
         return [_against_current(against, points)]
-    kinds = {driving: [p for p in points if p.driving is driving] for driving in (True, False)}
-    gaining = {
-        driving: [p for p in own if p.loss_nm < -_reach(p.loss_se, offset_nm)]
-        for driving, own in kinds.items()
-    }
+    kinds = [[p for p in points if p.driving is driving] for driving in (True, False)]
+    gaining = [[p for p in own if p.loss_nm < -_reach(p.loss_se, offset_nm)] for own in kinds]
     # More than half of both: then it is not a scale, which moves eta of both kinds the same way.
-    mirrored = all(2 * len(gaining[driving]) > len(own) for driving, own in kinds.items())
+    mirrored = all(2 * len(gain) > len(own) for gain, own in zip(gaining, kinds, strict=True))
     found = []
-    if gaining[True]:
-        worst = max(gaining[True], key=lambda p: p.ratio)
-        cause = _MIRRORED if mirrored else _SCALE.format("small", 100.0 * (worst.ratio - 1.0), "much")
-        expected = "at most 1 when driving"
-        found.append(
-            _finding("eta_above_1_driving", gaining[True], kinds[True], worst, expected=expected, cause=cause)
-        )
-    if gaining[False]:
-        worst = min(gaining[False], key=lambda p: p.ratio)
-        cause = _MIRRORED if mirrored else _SCALE.format("large", 100.0 * (1.0 / worst.ratio - 1.0), "little")
-        expected = "at least 1 when back-driven"
-        found.append(
-            _finding(
-                "eta_below_1_back_driven", gaining[False], kinds[False], worst, expected=expected, cause=cause
-            )
-        )
+    for own, gain, (kind, expected, size, reading, sign) in zip(kinds, gaining, _GAINING, strict=True):
+        if gain:
+            worst = max(gain, key=lambda p: sign * p.ratio)
+            excess = 100.0 * (worst.ratio**sign - 1.0)
+            cause = _MIRRORED if mirrored else _SCALE.format(size, excess, reading)
+            found.append(_finding(kind, gain, own, worst, expected=expected, cause=cause))
     return found
 
 
+_GAINING: Final = (
+    ("eta_above_1_driving", "at most 1 when driving", "small", "much", 1),
+    ("eta_below_1_back_driven", "at least 1 when back-driven", "large", "little", -1),
+)
+"""Plateaus that gain energy: kind of the finding, expected, size of G Kt, reading of the torque, sign of the excess."""
 _MIRRORED: Final = (
     "swapped sign of the velocity (or of current and torque together), or torque and motor torque exchanged, as eta in "
     "the wrong convention would be"
@@ -426,7 +423,7 @@ def difference_from_table(
     points: Sequence[EtaPoint], name: str, polynomial: QuadrantPolynomial
 ) -> FloatArray:
     """Fitted minus Table I's eta (joint over motor) at the measured points of one quadrant, [n]."""
-    own = [point for point in points if point.quadrant == name]
+    own = in_quadrant(points, name)
     paper: QuadrantPolynomial = getattr(TABLE_I, name)
     pairs = zip(*(column.tolist() for column in operating_points(own)), strict=True)
     return np.array([polynomial.value(i, v) - paper.value(i, v) for i, v in pairs])
@@ -434,9 +431,9 @@ def difference_from_table(
 
 def report_lines(result: EfficiencyResult) -> list[str]:
     """Return the report, ready to print."""
+    warm = "" if math.isnan(result.temperature_c) else f", {result.temperature_c:.1f} degC on average"
     lines = [
-        f"{result.joint} (j{result.number}): {len(result.points)} plateaus in {len(result.runs)} runs"
-        + ("" if math.isnan(result.temperature_c) else f", {result.temperature_c:.1f} degC on average"),
+        f"{result.joint} (j{result.number}): {len(result.points)} plateaus in {len(result.runs)} runs{warm}",
         "",
         "measured eta (lowest to highest, with the largest standard error)",
         *_indented(_measured_lines(result)),
@@ -451,7 +448,11 @@ def report_lines(result: EfficiencyResult) -> list[str]:
             "",
             f"left out, {len(result.left_out)} plateaus with |i| < {result.current_min_a:.2f} A "
             "(the motor does not overcome its own friction, so eta is undefined):",
-            *_indented(map(_place, result.left_out)),
+            *(
+                f"  {p.run} {p.start_s:.2f} to {p.end_s:.2f} s: i = {p.current.value:.3f} A, "
+                f"v = {p.velocity.value:.3f} rad/s, tau_j = {p.torque.value:.2f} Nm"
+                for p in result.left_out
+            ),
         ]
     if result.findings:
         lines += ["", "findings:", *(f"  {item.kind}: {item.text}" for item in result.findings)]
@@ -463,64 +464,56 @@ def _indented(lines: Iterable[str]) -> list[str]:
 
 
 def _measured_lines(result: EfficiencyResult) -> list[str]:
-    rows = []
+    rows = [["quadrant", "plateaus", "tau_j/(G Kt i)", "G Kt i/tau_j"]]
     for name in QUADRANTS:
-        own = [point for point in result.points if point.quadrant == name]
-        cells = []
-        for convention in CONVENTIONS:
-            etas = [point.eta(convention) for point in own]
-            errors = [point.eta_se(convention) for point in own]
-            cells.append(f"{min(etas):.3f} to {max(etas):.3f} +- {max(errors):.3f}" if own else "none")
+        own = in_quadrant(result.points, name)
+        cells = ["none", "none"]
+        if own:
+            cells = [
+                f"{min(p.eta(c) for p in own):.3f} to {max(p.eta(c) for p in own):.3f} "
+                f"+- {max(p.eta_se(c) for p in own):.3f}"
+                for c in CONVENTIONS
+            ]
         rows.append([QUADRANT_TITLES[name], str(len(own)), *cells])
-    return table_lines([["quadrant", "plateaus", "tau_j/(G Kt i)", "G Kt i/tau_j"], *rows])
+    return table_lines(rows)
 
 
 def _summary_lines(fit: EfficiencyFit) -> list[str]:
     """Return one line per quadrant, with the paper's RMSE where the convention is Table I's."""
-    like_paper = fit.convention == TABLE_I.convention
-    rows = [
-        [
-            QUADRANT_TITLES[name],
-            str(quadrant.plateaus),
-            str(quadrant.distinct),
-            f"{quadrant.rmse:.4f}",
-            *([f"{getattr(TABLE_I, name).rmse:.4f}"] if like_paper else []),
-            f"{quadrant.rmse_nm:.3f}",
-            f"{quadrant.condition:.0f}",
-        ]
-        for name, quadrant in fit.quadrants.items()
-    ]
-    paper = ["paper"] if like_paper else []
-    header = ["quadrant", "plateaus", "distinct", "RMSE", *paper, "RMSE Nm", "condition"]
-    return table_lines([header, *rows]) + list(fit.refused.values())
+    paper = fit.convention == TABLE_I.convention
+    rows = [["quadrant", "plateaus", "distinct", "RMSE", *["paper"] * paper, "RMSE Nm", "condition"]]
+    for name, quadrant in fit.quadrants.items():
+        rmse = [quadrant.rmse, *[getattr(TABLE_I, name).rmse] * paper]
+        rows.append(
+            [
+                QUADRANT_TITLES[name],
+                *map(str, (quadrant.plateaus, quadrant.distinct)),
+                *(f"{each:.4f}" for each in rmse),
+                f"{quadrant.rmse_nm:.3f}",
+                f"{quadrant.condition:.0f}",
+            ]
+        )
+    return table_lines(rows) + list(fit.refused.values())
 
 
 def _coefficient_lines(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> list[str]:
     """Coefficients with standard errors, beside Table I where the convention is the table's."""
-    like_paper = fit.convention == TABLE_I.convention
+    paper = fit.convention == TABLE_I.convention
     lines = []
     for name, quadrant in fit.quadrants.items():
-        rows = []
+        rows = [["", "fitted", "std err", *["Table I", "difference"] * paper]]
         for key in COEFFICIENTS:
-            value, paper = getattr(quadrant.polynomial, key), getattr(getattr(TABLE_I, name), key)
-            beside = [f"{paper:.4f}", f"{value - paper:.4f}"] if like_paper else []
-            rows.append([key, f"{value:.4f}", f"{quadrant.errors[key]:.4f}", *beside])
-        header = ["", "fitted", "std err", *(["Table I", "difference"] if like_paper else [])]
-        lines += [QUADRANT_TITLES[name], *_indented(table_lines([header, *rows]))]
-        if like_paper:
+            value, table = getattr(quadrant.polynomial, key), getattr(getattr(TABLE_I, name), key)
+            cells = [value, quadrant.errors[key], *[table, value - table] * paper]
+            rows.append([key, *(f"{cell:.4f}" for cell in cells)])
+        lines += [QUADRANT_TITLES[name], *_indented(table_lines(rows))]
+        if paper:
             off = difference_from_table(points, name, quadrant.polynomial)
             lines.append(
                 f"  eta against Table I at these points: {float(np.sqrt(np.mean(off**2))):.4f} RMS, "
                 f"{float(np.max(np.abs(off))):.4f} at most"
             )
     return lines
-
-
-def _place(plateau: Plateau) -> str:
-    return (
-        f"{plateau.run} {plateau.start_s:.2f} to {plateau.end_s:.2f} s: i = {plateau.current.value:.3f} A, "
-        f"v = {plateau.velocity.value:.3f} rad/s, tau_j = {plateau.torque.value:.2f} Nm"
-    )
 
 
 def as_mapping(result: EfficiencyResult) -> dict[str, Any]:
@@ -589,7 +582,7 @@ def fit_figure(points: Sequence[EtaPoint], fit: EfficiencyFit, title: str) -> An
     )
     figure, axes = plt.subplots(2, 2, figsize=(12.0, 8.4), layout="constrained")
     for letter, name, axis in zip("abcd", QUADRANTS, axes.flat, strict=True):
-        own = [point for point in points if point.quadrant == name]
+        own = in_quadrant(points, name)
         _panel(axis, own, fit, name, lambda speed: colours(norm(speed)))
         axis.set_title(f"({letter}) {_panel_title(fit, name, len(own))}", fontsize=10, loc="left")
         plain(axis)
@@ -614,9 +607,8 @@ def _panel(axis: Any, points: Sequence[EtaPoint], fit: EfficiencyFit, name: str,
         axis.set(xticks=[], yticks=[])
         return
     speeds = _groups([abs(point.plateau.velocity.value) for point in points])
-    chosen = speeds
-    if len(speeds) > MOST_CURVES:
-        chosen = [speeds[k] for k in np.linspace(0, len(speeds) - 1, MOST_CURVES).round().astype(int)]
+    drawn = np.linspace(0, len(speeds) - 1, min(MOST_CURVES, len(speeds))).round().astype(int)
+    chosen = {speeds[k] for k in drawn}
     for speed in speeds:
         own = [p for p in points if abs(abs(p.plateau.velocity.value) - speed) <= SAME_VELOCITY_RAD_S]
         current = np.array([p.plateau.current.value for p in own])

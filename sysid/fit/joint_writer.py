@@ -1,23 +1,22 @@
 """Write joint files: every section the joint has, and the runs from which each fitted section comes.
 
-A file is put in place only after it has been read back as the same joint.
+A file is put in place only where its text reads back as the same joint.
 """
 
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 import yaml
 
+from jtqd.estimator.command_line import write_whole
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
-from jtqd.models.files import load_joint
+from jtqd.models.files import parse_yaml
 
 _UNITS: Final = (
     "SI units. Friction, stiffness, damping and link inertia are joint side; torque constant and rotor inertia are "
@@ -40,11 +39,10 @@ class _Dumper(yaml.SafeDumper):
         super().increase_indent(flow, False)
 
 
+_MAP, _SEQUENCE = "tag:yaml.org,2002:map", "tag:yaml.org,2002:seq"
+_Dumper.add_representer(_Row, lambda dumper, row: dumper.represent_mapping(_MAP, row, flow_style=True))
 _Dumper.add_representer(
-    _Row, lambda dumper, value: dumper.represent_mapping("tag:yaml.org,2002:map", value, flow_style=True)
-)
-_Dumper.add_representer(
-    _Numbers, lambda dumper, value: dumper.represent_sequence("tag:yaml.org,2002:seq", value, flow_style=True)
+    _Numbers, lambda dumper, row: dumper.represent_sequence(_SEQUENCE, row, flow_style=True)
 )
 
 
@@ -92,18 +90,13 @@ def write_joint(path: Path | str, joint: Joint, title: str) -> None:
     Raises:
         ConfigError: it cannot be written, or what was written does not read back as this joint.
     """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.part")
+    path, data = Path(path), joint_text(joint, title).encode()
+    if Joint.from_mapping(parse_yaml(data, str(path)), str(path)) != joint:
+        raise ConfigError(f"{path}: the written file reads back differently from the joint {joint.name}")
     try:
-        temporary.write_text(joint_text(joint, title), encoding="utf-8")
-        if load_joint(temporary) != joint:
-            raise ConfigError(f"{path}: the written file reads back differently from the joint {joint.name}")
-        os.replace(temporary, path)
+        write_whole(path, data)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror or error}") from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
 
 
 def _short(value: Any) -> Any:

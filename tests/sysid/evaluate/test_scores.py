@@ -12,7 +12,7 @@ import pytest
 from jtqd.estimator.joint import QUADRANTS, Envelope
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
-from jtqd.sysid.evaluate.evaluation import worse_runs
+from jtqd.sysid.evaluate.evaluation import against_physics
 from jtqd.sysid.evaluate.inputs import Samples, by_data
 from jtqd.sysid.evaluate.scores import (
     LEVELS,
@@ -159,7 +159,7 @@ def test_runs_in_which_ours_is_worse_than_its_physics_are_found_and_no_others() 
         return samples({"physics": np.full(9, physics), "fused": np.full(9, ours)}, run=run)
 
     tables = error_tables([one("better", 0.1, 0.2), one("same", 0.3, 0.3), one("worse", 0.3, 0.2999)], {})
-    assert [found[:2] for found in worse_runs(tables.runs)] == [("worse", 1)]
+    assert [found[:2] for found in against_physics(tables.runs)[1]] == [("worse", 1)]
 
 
 # Constant velocity ---------------------------------------------------------------------------------------

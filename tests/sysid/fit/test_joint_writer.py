@@ -6,7 +6,6 @@ import datetime as dt
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -143,10 +142,8 @@ def test_the_old_file_stays_when_writing_fails(tmp_path: Path, monkeypatch: pyte
     path = tmp_path / "j.yaml"
     path.write_text("old")
 
-    def other(_: Any) -> Joint:
-        return replace(joint1(), gear_ratio=50.0)
-
-    monkeypatch.setattr(joint_writer, "load_joint", other)
+    other = replace(joint1(), gear_ratio=50.0).to_mapping()
+    monkeypatch.setattr(joint_writer, "parse_yaml", lambda data, name: other)
     with pytest.raises(ConfigError, match="reads back differently from the joint joint1"):
         write_joint(path, joint1(), "t")
     assert path.read_text() == "old"
