@@ -11,16 +11,16 @@ import json
 import re
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from jtqd.daemon.bus.boot import bus_load_of
 from jtqd.daemon.cli.proposal import (
     OPTIONS,
-    ConfigProposal,
     JointProposal,
     MissingValueError,
     UsageError,
@@ -31,18 +31,16 @@ from jtqd.daemon.cli.proposal import (
     family_of,
     joint_text,
     merged,
-    propose_joint,
     sensor_problems,
     surveyed,
 )
 from jtqd.daemon.config import MAX_NODE_ID, load_config
-from jtqd.daemon.profiles import Family
 from jtqd.daemon.profiles import names as profile_names
 from jtqd.drivers.bus_load import LIMIT, BusLoadError
 from jtqd.drivers.frame_socket import BusError
 from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
-from jtqd.estimator.command_line import command_parser
+from jtqd.estimator.command_line import command_parser, count
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.text import counted
 
@@ -59,80 +57,6 @@ Nothing is written to a device. A bus with SYNC is refused: its master reads by 
 
 exit status: 0 the files are there and jtqd can use them, 1 failure, 2 usage or something missing,
 3 the files are there, and the devices lack what this version of jtqd needs"""
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq init`."""
-    made = command_parser(
-        "jtq init",
-        "Write a first configuration and joint files that run at once, and list the guesses in them.",
-        _EXAMPLES,
-    )
-    made.add_argument("--bus", metavar="BUS", help="look at the devices on this bus: can0, or unix:PATH")
-    made.add_argument(
-        "--from-eds",
-        type=Path,
-        action="append",
-        metavar="FILE",
-        help="EDS of the drives (one for all, or one for each)",
-    )
-    made.add_argument(
-        "--node",
-        type=node_id,
-        action="append",
-        metavar="N",
-        help=f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus; with EDS "
-        "files alone 1, 2 as a guess)",
-    )
-    made.add_argument(
-        "--sensor", type=_sensor, metavar="N|none", help="node-ID of the torque sensor (default: as found)"
-    )
-    made.add_argument(
-        "--sensor-joint",
-        type=int,
-        action="append",
-        metavar="J",
-        help="joint whose torque the sensor measures (default: all)",
-    )
-    add_values(made, action="append")
-    made.add_argument(
-        "--bitrate", type=_count, default=1_000_000, metavar="B", help="of the bus [bit/s] (default 1000000)"
-    )
-    made.add_argument(
-        "--name",
-        type=_name,
-        default="jtqd",
-        help="of the configuration: NAME.yaml (default jtqd; can0 for jtqd@can0)",
-    )
-    made.add_argument(
-        "--profile",
-        choices=[*profile_names(), "none"],
-        help="profile of the drives' family (default: by their vendor-ID; docs/bus.md)",
-    )
-    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
-    made.add_argument("--force", action="store_true", help="replace files that are there")
-    made.add_argument("--no-questions", action="store_true", help="ask nothing, also on a terminal")
-    made.add_argument("--json", action="store_true", help="print as JSON; asks nothing")
-    return made
-
-
-def add_values(made: argparse.ArgumentParser, *, action: str = "store", of_joint: bool = True) -> None:
-    """Add the options for values that a drive does not have (`Wanted`); of_joint: also those of the joint file."""
-    for name, kind, unit, text in (
-        ("gear_ratio", _positive, "G", "motor revolutions per joint revolution"),
-        ("rated_torque_nm", _positive, "NM", "rated torque of the joint [Nm]"),
-        ("torque_constant_nm_per_a", _positive, "KT", "of the motor [Nm/A]"),
-        ("rated_current_a", _positive, "A", "of the motor [A], for 6075h"),
-        ("encoder_counts", _count, "N", "counts per revolution of the motor, all edges"),
-        ("link_encoder_counts", _count, "N", "counts per revolution of the joint, at the link"),
-    ):
-        if of_joint or name not in {"rated_torque_nm", "torque_constant_nm_per_a"}:
-            made.add_argument(OPTIONS[name], dest=name, type=kind, action=action, metavar=unit, help=text)
-    made.add_argument(
-        "--one-encoder",
-        action="store_true",
-        help="the joints have no link encoder (default: as the drives have 60E4h:1)",
-    )
 
 
 def node_id(text: str) -> int:
@@ -161,25 +85,62 @@ def _positive(text: str) -> float:
     raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
 
 
-def _count(text: str) -> int:
-    if not text.isdecimal() or not 1 <= int(text) < 2**31:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number above 0")
-    return int(text)
+_VALUES: Mapping[str, tuple[Callable[[str], float], str, str]] = {
+    "gear_ratio": (_positive, "G", "motor revolutions per joint revolution"),
+    "rated_torque_nm": (_positive, "NM", "rated torque of the joint [Nm]"),
+    "torque_constant_nm_per_a": (_positive, "KT", "of the motor [Nm/A]"),
+    "rated_current_a": (_positive, "A", "of the motor [A], for 6075h"),
+    "encoder_counts": (count, "N", "counts per revolution of the motor, all edges"),
+    "link_encoder_counts": (count, "N", "counts per revolution of the joint, at the link"),
+}
+"""Field of `Wanted` -> type, metavar and help of its option."""
+_OF_JOINT_FILE = ("rated_torque_nm", "torque_constant_nm_per_a")
 
 
-@dataclass(frozen=True)
-class Found:
-    """Devices: node-IDs of the drives in the order of the joints, surveys and profiles by node-ID, the sensor's node-ID.
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq init`."""
+    made = command_parser(
+        "jtq init",
+        "Write a first configuration and joint files that run at once, and list the guesses in them.",
+        _EXAMPLES,
+    )
+    add = made.add_argument
+    add("--bus", metavar="BUS", help="look at the devices on this bus: can0, or unix:PATH")
+    eds = "EDS of the drives (one for all, or one for each)"
+    add("--from-eds", type=Path, action="append", metavar="FILE", help=eds)
+    node = (
+        f"node-ID of a drive; again for the next joint, at most {MAX_JOINTS} (default: drives on the bus; with EDS files "
+        "alone 1, 2 as a guess)"
+    )
+    add("--node", type=node_id, action="append", metavar="N", help=node)
+    add("--sensor", type=_sensor, metavar="N|none", help="node-ID of the torque sensor (default: as found)")
+    of_sensor = "joint whose torque the sensor measures (default: all)"
+    add("--sensor-joint", type=int, action="append", metavar="J", help=of_sensor)
+    add_values(made, action="append")
+    bitrate = "of the bus [bit/s] (default 1000000)"
+    add("--bitrate", type=count, default=1_000_000, metavar="B", help=bitrate)
+    add(
+        "--name",
+        type=_name,
+        default="jtqd",
+        help="of the configuration: NAME.yaml (default jtqd; can0 for jtqd@can0)",
+    )
+    profile = "profile of the drives' family (default: by their vendor-ID; docs/bus.md)"
+    add("--profile", choices=[*profile_names(), "none"], help=profile)
+    add("--out", type=Path, required=True, metavar="DIR", help="directory for the files")
+    add("--force", action="store_true", help="replace files that are there")
+    add("--no-questions", action="store_true", help="ask nothing, also on a terminal")
+    add("--json", action="store_true", help="print as JSON; asks nothing")
+    return made
 
-    guessed: the node-IDs are a guess, as an EDS is all that is known.
-    """
 
-    nodes: list[int]
-    surveys: dict[int, Survey]
-    sensor: int | None
-    notes: list[str]
-    families: dict[int, Family | None] = field(default_factory=dict)
-    guessed: bool = False
+def add_values(made: argparse.ArgumentParser, *, action: str = "store", of_joint: bool = True) -> None:
+    """Add the options for values that a drive does not have (`Wanted`); of_joint: also those of the joint file."""
+    for name, (kind, metavar, text) in _VALUES.items():
+        if of_joint or name not in _OF_JOINT_FILE:
+            made.add_argument(OPTIONS[name], dest=name, type=kind, action=action, metavar=metavar, help=text)
+    encoders = "the joints have no link encoder (default: as the drives have 60E4h:1)"
+    made.add_argument("--one-encoder", action="store_true", help=encoders)
 
 
 def main(argv: list[str]) -> int:
@@ -196,38 +157,43 @@ def main(argv: list[str]) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    _refuse_existing(options)
-    found = _found(options)
+    for name in (f"{options.name}.yaml", *(f"joint_{number}.yaml" for number in range(1, MAX_JOINTS + 1))):
+        if not options.force and (options.out / name).exists():
+            raise UsageError(f"{options.out / name}: exists; --force replaces it")
+    found = _devices(options)
     joints = _joints(options, found)
-    files, period_us = _write(options.out, options.name, _config(options, found, joints))
-    problems = [each for joint in joints for each in joint.problems]
-    if found.sensor is not None:
-        problems += sensor_problems(found.sensor, found.surveys.get(found.sensor))
+    sensor = None if found.sensor is None else found.surveys.get(found.sensor)
+    text = partial(
+        config_text,
+        joints,
+        bus=options.bus or "a bus that was not surveyed",
+        bitrate=options.bitrate,
+        sensor_node=found.sensor,
+        sensor=sensor,
+        measured=_measured(options, found),
+    )
+    files, period_us = _write(options, joints, text)
     report = {
         "files": [str(each) for each in files],
         "period_us": period_us,
-        "notes": [*found.notes, *_notes(joints)],
+        "notes": [*found.notes, *(note for joint in joints for note in _notes(joint))],
         "guesses": [each for joint in joints for each in joint.guesses],
-        "problems": problems,
+        "problems": [*(each for joint in joints for each in joint.problems), *sensor_problems(sensor)],
         "next": f"jtqd --bus {options.bus or 'can0'} --config {files[-1]} --record logs",
     }
     print(json.dumps(report) if options.json else _text(report))
-    return 3 if problems else 0
+    return 3 if report["problems"] else 0
 
 
-def _notes(joints: list[JointProposal]) -> list[str]:
+def _notes(joint: JointProposal) -> list[str]:
     """Return one line for each quantity and TPDO that differs from jtqd's own."""
-    notes = [
-        f"joint {joint.number}: objects.{name}: {each.text} ({each.why})"
-        for joint in joints
-        for name, each in joint.objects.items()
-    ]
-    return notes + [
-        f"joint {joint.number}: tpdos: {counted(len(joint.kept.tpdos), 'TPDO')} of the drive ({joint.kept.why}); "
-        "without this section jtqd maps its own, where the drive lets it"
-        for joint in joints
-        if joint.kept.tpdos
-    ]
+    notes = [f"objects.{name}: {each.text} ({each.origin})" for name, each in joint.objects.items()]
+    if joint.kept.tpdos:
+        notes.append(
+            f"tpdos: {counted(len(joint.kept.tpdos), 'TPDO')} of the drive ({joint.kept.why}); "
+            "without this section jtqd maps its own, where the drive lets it"
+        )
+    return [f"joint {joint.number}: {note}" for note in notes]
 
 
 def _text(report: dict[str, Any]) -> str:
@@ -241,16 +207,20 @@ def _text(report: dict[str, Any]) -> str:
     return "\n".join([*lines, f"next: {report['next']}"])
 
 
-def _refuse_existing(options: argparse.Namespace) -> None:
-    for name in (f"{options.name}.yaml", *(f"joint_{number}.yaml" for number in range(1, MAX_JOINTS + 1))):
-        if not options.force and (options.out / name).exists():
-            raise UsageError(f"{options.out / name}: exists; --force replaces it")
-
-
 # ---- devices ----
 
 
-def _found(options: argparse.Namespace) -> Found:
+class _Devices(NamedTuple):
+    """Node-IDs of the drives in the order of the joints (guessed: an EDS is all that is known), of the sensor; surveys."""
+
+    nodes: list[int]
+    sensor: int | None
+    surveys: dict[int, Survey]
+    notes: list[str]
+    guessed: bool
+
+
+def _devices(options: argparse.Namespace) -> _Devices:
     """Return the devices by options, bus and EDS. Raises UsageError, BusError, EdsError."""
     nodes: list[int] = options.node or []
     if len(set(nodes)) != len(nodes):
@@ -261,10 +231,9 @@ def _found(options: argparse.Namespace) -> Found:
     if options.bus is not None:
         surveys = _on_the_bus(options.bus, nodes, sensor, options.profile)
         drives = [node for node, each in surveys.items() if each.profile == DRIVE]
-        sensors = [node for node, each in surveys.items() if each.profile == SENSOR]
         notes += [f"node {node}: {description(each)}" for node, each in surveys.items()]
-        if sensor is None and sensors:
-            sensor = sensors[0]
+        if sensor is None:
+            sensor = next((node for node, each in surveys.items() if each.profile == SENSOR), None)
         if not nodes:
             nodes = drives[:MAX_JOINTS]
             notes += [f"node {node}: left out, give --node to choose" for node in drives[MAX_JOINTS:]]
@@ -285,14 +254,16 @@ def _found(options: argparse.Namespace) -> Found:
             notes.append(f"node {node}: {description(eds)}")
     if sensor and options.bus is not None and sensor not in surveys:
         raise UsageError(f"--sensor: node {sensor} does not answer on {options.bus}{_others(surveys)}")
-    _refuse_other_kinds(nodes, sensor, surveys)
-    families = {node: family_of(surveys.get(node), options.profile) for node in nodes}
-    notes += [f"node {node}: profile {each.name} ({each.title})" for node, each in families.items() if each]
-    return Found(nodes, surveys, sensor or None, notes, families, guessed)
+    _check_profiles(nodes, sensor, surveys)
+    notes += [
+        f"node {node}: profile {family.name} ({family.title})"
+        for node in nodes
+        if (family := family_of(surveys.get(node), options.profile))
+    ]
+    return _Devices(nodes, sensor or None, surveys, notes, guessed)
 
 
-def _refuse_other_kinds(nodes: Sequence[int], sensor: int | None, surveys: Mapping[int, Survey]) -> None:
-    """Raise UsageError for a joint's node that is no drive, and a sensor that is none."""
+def _check_profiles(nodes: Sequence[int], sensor: int | None, surveys: Mapping[int, Survey]) -> None:
     for node in nodes:
         if node in surveys and surveys[node].profile != DRIVE:
             raise UsageError(f"node {node} is no CiA 402 drive: {description(surveys[node])}")
@@ -314,6 +285,19 @@ def _others(surveys: dict[int, Survey]) -> str:
     return f"; there are {', '.join(f'{node} ({each.title})' for node, each in surveys.items())}"
 
 
+def _measured(options: argparse.Namespace, found: _Devices) -> list[int]:
+    """Return the joints whose torque the sensor measures. Raises UsageError."""
+    numbers = list(range(1, len(found.nodes) + 1))
+    if options.sensor_joint is None:
+        return numbers if found.sensor is not None else []
+    if found.sensor is None:
+        raise UsageError("--sensor-joint: there is no sensor")
+    measured: list[int] = options.sensor_joint
+    if not set(measured) <= set(numbers):
+        raise UsageError(f"--sensor-joint: found {measured}, expected among {numbers}")
+    return measured
+
+
 # ---- joints ----
 
 
@@ -328,36 +312,30 @@ def _each(option: str, values: list[Any] | None, count: int) -> list[Any]:
     return values * count if len(values) == 1 else values
 
 
-def _joints(options: argparse.Namespace, found: Found) -> list[JointProposal]:
+def _joints(options: argparse.Namespace, found: _Devices) -> list[JointProposal]:
+    """Return the proposals; on a terminal, ask for missing values. Raises UsageError, MissingValueError."""
     count = len(found.nodes)
     columns = {field: _each(option, getattr(options, field), count) for field, option in OPTIONS.items()}
     ask = sys.stdin.isatty() and not options.no_questions and not options.json
-    joints = []
-    for position, node in enumerate(found.nodes):
-        values = {name: column[position] for name, column in columns.items()}
+    joints: list[JointProposal] = []
+    for n, node in enumerate(found.nodes):
+        survey = found.surveys.get(node)
+        family = family_of(survey, options.profile)
+        values = {name: column[n] for name, column in columns.items()}
         wanted = Wanted(**values, one_encoder=options.one_encoder)
-        joint = _joint((position + 1, node), found.surveys.get(node), wanted, ask, found.families.get(node))
-        joints.append(replace(joint, node_guessed=found.guessed))
+        while len(joints) == n:
+            try:
+                joints.append(JointProposal(n + 1, node, survey, wanted, family, node_guessed=found.guessed))
+            except MissingValueError as error:
+                if not ask or not error.field:
+                    raise
+                answer: Any = _answer(error.why, error.field)
+                wanted = replace(wanted, **{error.field: answer})
     return joints
 
 
-def _joint(
-    joint: tuple[int, int], survey: Survey | None, wanted: Wanted, ask: bool, family: Family | None
-) -> JointProposal:
-    """Return the proposal of a joint (number, node); on a terminal, ask for missing values."""
-    while True:
-        try:
-            return propose_joint(*joint, survey, wanted, family)
-        except MissingValueError as error:
-            if not ask or not error.field:
-                raise
-            answer: Any = _answer(error.why, error.field)
-            wanted = replace(wanted, **{error.field: answer})
-
-
-def _answer(why: str, field: str) -> float | int:
+def _answer(why: str, field: str) -> float:
     """Ask until a number comes. Raises UsageError at the end of input."""
-    kind = _count if field.endswith("counts") else _positive
     print(why, file=sys.stderr)
     while True:
         question = OPTIONS[field].removeprefix("--").replace("-", " ")
@@ -366,7 +344,7 @@ def _answer(why: str, field: str) -> float | int:
         if not line:
             raise UsageError(f"no answer: give {OPTIONS[field]}")
         try:
-            return kind(line.strip())
+            return _VALUES[field][0](line.strip())
         except argparse.ArgumentTypeError as error:
             print(error, file=sys.stderr)
 
@@ -374,40 +352,23 @@ def _answer(why: str, field: str) -> float | int:
 # ---- files ----
 
 
-def _config(options: argparse.Namespace, found: Found, joints: list[JointProposal]) -> ConfigProposal:
-    numbers = [joint.number for joint in joints]
-    measured = options.sensor_joint if options.sensor_joint is not None else numbers
-    if found.sensor is None:
-        if options.sensor_joint is not None:
-            raise UsageError("--sensor-joint: there is no sensor")
-        measured = []
-    if not set(measured) <= set(numbers):
-        raise UsageError(f"--sensor-joint: found {measured}, expected among {numbers}")
-    return ConfigProposal(
-        bus=options.bus or "a bus that was not surveyed",
-        bitrate=options.bitrate,
-        period_us=_PERIODS_US[0],
-        joints=joints,
-        sensor=None if found.sensor is None else found.surveys.get(found.sensor),
-        sensor_node=found.sensor,
-        joints_of_sensor=measured,
-    )
-
-
-def _write(directory: Path, name: str, config: ConfigProposal) -> tuple[list[Path], int]:
+def _write(
+    options: argparse.Namespace, joints: Sequence[JointProposal], text: Callable[..., str]
+) -> tuple[list[Path], int]:
     """Write the files with the shortest period whose bus load fits; returns paths and period [us].
 
-    They are written to a temporary directory first: files that jtqd refuses replace nothing.
-    Raises ConfigError, BusLoadError.
+    text: of the configuration, by `period_us`. Files are written to a temporary directory first: those that jtqd refuses
+    replace nothing. Raises ConfigError, BusLoadError.
     """
+    directory: Path = options.out
     directory.mkdir(parents=True, exist_ok=True)
-    names = [*(f"joint_{joint.number}.yaml" for joint in config.joints), f"{name}.yaml"]
+    names = [*(f"joint_{joint.number}.yaml" for joint in joints), f"{options.name}.yaml"]
     with tempfile.TemporaryDirectory(dir=directory, prefix=".jtq-init-") as temporary:
         files = [Path(temporary, each) for each in names]
-        for path, joint in zip(files, config.joints, strict=False):
+        for path, joint in zip(files, joints, strict=False):
             path.write_text(joint_text(joint), encoding="utf-8")
         try:
-            period_us = _fitting_period_us(files[-1], config)
+            period_us = _fitting_period_us(files[-1], options.bitrate, text)
         except ConfigError as error:
             raise ConfigError(str(error).replace(temporary, str(directory))) from None
         for path in files:
@@ -415,10 +376,9 @@ def _write(directory: Path, name: str, config: ConfigProposal) -> tuple[list[Pat
     return [directory / each for each in names], period_us
 
 
-def _fitting_period_us(path: Path, config: ConfigProposal) -> int:
-    """Write the configuration with the shortest period whose bus load fits. Raises ConfigError, BusLoadError."""
+def _fitting_period_us(path: Path, bitrate: int, text: Callable[..., str]) -> int:
     for period_us in _PERIODS_US:
-        path.write_text(config_text(replace(config, period_us=period_us)), encoding="utf-8")
+        path.write_text(text(period_us=period_us), encoding="utf-8")
         if bus_load_of(load_config(path)).worst <= LIMIT:
             return period_us
-    raise ConfigError(f"{path}: at {config.bitrate} bit/s not even 100 Hz fit the bus")
+    raise ConfigError(f"{path}: at {bitrate} bit/s not even 100 Hz fit the bus")

@@ -16,6 +16,7 @@ from typing import Any
 from jtqd.daemon.cli.init import MAX_JOINTS, add_values, node_id
 from jtqd.daemon.cli.proposal import (
     OPTIONS,
+    JointProposal,
     MissingValueError,
     UsageError,
     Wanted,
@@ -24,7 +25,6 @@ from jtqd.daemon.cli.proposal import (
     eds_survey,
     family_of,
     merged,
-    propose_joint,
     sensor_lines,
     sensor_problems,
     surveyed,
@@ -47,6 +47,23 @@ _EXAMPLES = """examples:
   jtq probe --bus can0 --node 6 --joint 2 --gear-ratio 101 --section >> arm/jtqd.yaml
 
 exit status: 0 jtqd can use it, 1 failure or no answer, 2 usage, 3 it lacks what this version of jtqd needs"""
+NOTHING = Wanted()
+"""No option was given."""
+_ANY = Wanted(1.0, 1.0, 1.0, 1.0, 1, 1)
+"""Values that do not matter where only the objects of the drive are judged."""
+_CODES = {0x1018: 8, 0x6041: 4, 0x60A8: 8, 0x60A9: 8, 0x6131: 8}
+"""Objects whose values are codes (identity, statusword, units), with their hexadecimal digits."""
+_NAMES: dict[Key, str] = {
+    **{key: name for key, (name, _) in (EVERY_SCALING_OBJECT | SENSOR_SCALING_OBJECTS).items()},
+    **{key: name for name, key in IDENTITY.items()},
+    **{
+        (each.index, each.subindex): each.name.replace("_", " ")
+        for pdo in (*drive_layout(1), sensor_tpdo1(1))
+        for each in pdo.objects
+    },
+    TORQUE: "torque",
+}
+"""Names of the objects that are read."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -56,27 +73,17 @@ def parser() -> argparse.ArgumentParser:
         "Read a device on the bus, and print its section of the configuration. Nothing is written to it.",
         _EXAMPLES,
     )
-    made.add_argument("--bus", required=True, help="can0, or unix:PATH")
-    made.add_argument("--node", type=node_id, metavar="N", help="node-ID (default: list the nodes)")
-    made.add_argument(
-        "--eds", type=Path, metavar="FILE", help="its EDS, which has the objects that can be mapped"
-    )
-    made.add_argument(
-        "--profile",
-        choices=[*profile_names(), "none"],
-        help="profile of its family (default: by its vendor-ID; docs/bus.md)",
-    )
-    made.add_argument(
-        "--joint",
-        type=int,
-        choices=range(1, MAX_JOINTS + 1),
-        default=1,
-        metavar="J",
-        help="number of the joint in the section (default 1)",
-    )
+    add = made.add_argument
+    add("--bus", required=True, help="can0, or unix:PATH")
+    add("--node", type=node_id, metavar="N", help="node-ID (default: list the nodes)")
+    add("--eds", type=Path, metavar="FILE", help="its EDS, which has the objects that can be mapped")
+    profile = "profile of its family (default: by its vendor-ID; docs/bus.md)"
+    add("--profile", choices=[*profile_names(), "none"], help=profile)
+    joint = "number of the joint in the section (default 1)"
+    add("--joint", type=int, choices=range(1, MAX_JOINTS + 1), default=1, metavar="J", help=joint)
     add_values(made, of_joint=False)
-    made.add_argument("--section", action="store_true", help="print the section of the configuration alone")
-    made.add_argument("--json", action="store_true", help="print as JSON")
+    add("--section", action="store_true", help="print the section of the configuration alone")
+    add("--json", action="store_true", help="print as JSON")
     return made
 
 
@@ -100,15 +107,14 @@ def main(argv: list[str]) -> int:
 
 def _list(options: argparse.Namespace, bus: BusSurvey) -> int:
     found: list[Survey] = []
-    silent: list[str] = []
+    silent = False
     for node in bus.nodes():
         try:
             if (each := bus.read(node)) is not None:
                 found.append(each)
         except SurveyError as error:
-            silent.append(str(error))
-    for line in silent:
-        print(f"jtq probe: {line}", file=sys.stderr)
+            print(f"jtq probe: {error}", file=sys.stderr)
+            silent = True
     if options.json:
         print(json.dumps([content(each, [])["device"] for each in found]))
     else:
@@ -124,14 +130,17 @@ def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
         found = merged(eds_survey(options.eds, options.node, options.profile), found, options.eds)
     family = family_of(found, options.profile)
     problems = problems_of(found, family)
-    wanted = Wanted(
-        **{field: getattr(options, field, None) for field in OPTIONS},
-        one_encoder=options.one_encoder,
-    )
+    values = {field: getattr(options, field, None) for field in OPTIONS}
+    wanted = Wanted(**values, one_encoder=options.one_encoder)
     if options.json:
         print(json.dumps(content(found, problems, family)))
     elif options.section:
-        print("\n".join(_alone(found, wanted, family, options.joint)))
+        if found.profile not in (DRIVE, SENSOR):
+            raise UsageError(f"node {found.node} is neither a drive (402) nor a sensor (404)")
+        try:
+            print("\n".join(section(found, family, wanted, options.joint)))
+        except MissingValueError as error:
+            raise UsageError(str(error)) from None
         for problem in problems:
             print(f"jtq probe: {problem}", file=sys.stderr)
     else:
@@ -139,36 +148,17 @@ def _one(options: argparse.Namespace, bus: BusSurvey) -> int:
     return 3 if problems else 0
 
 
-def _alone(survey: Survey, wanted: Wanted, family: Family | None, joint: int) -> list[str]:
-    """Return the section as lines of a file. Raises UsageError where a value is missing that an option gives."""
-    if survey.profile not in (DRIVE, SENSOR):
-        raise UsageError(f"node {survey.node} is neither a drive (402) nor a sensor (404)")
-    try:
-        return section(survey, family, wanted, joint)
-    except MissingValueError as error:
-        raise UsageError(str(error)) from None
-
-
 def problems_of(survey: Survey, family: Family | None = None) -> list[str]:
     """Return why this version of jtqd does not work with a device."""
-    if survey.profile == DRIVE:
-        try:
-            found = propose_joint(1, survey.node, survey, _ANY, family).problems
-            units = unit_problems(survey.node, survey) if family is None else []
-            return list(dict.fromkeys((*found, *units)))
-        except MissingValueError as error:
-            return [str(error)]
     if survey.profile == SENSOR:
-        return sensor_problems(survey.node, survey)
-    return [f"node {survey.node}: {description(survey)}: neither a drive (402) nor a sensor (404)"]
-
-
-NOTHING = Wanted()
-"""No option was given."""
-_CODES = {0x1018: 8, 0x6041: 4, 0x60A8: 8, 0x60A9: 8, 0x6131: 8}
-"""Objects whose values are codes (identity, statusword, units), with their hexadecimal digits."""
-_ANY = Wanted(1.0, 1.0, 1.0, 1.0, 1, 1)
-"""Values that do not matter where only the objects of the drive are judged."""
+        return sensor_problems(survey)
+    if survey.profile != DRIVE:
+        return [f"node {survey.node}: {description(survey)}: neither a drive (402) nor a sensor (404)"]
+    try:
+        found = JointProposal(1, survey.node, survey, _ANY, family).problems
+        return list(dict.fromkeys((*found, *(unit_problems(survey) if family is None else ()))))
+    except MissingValueError as error:
+        return [str(error)]
 
 
 def section(
@@ -178,57 +168,32 @@ def section(
     if survey.profile == SENSOR:
         return sensor_lines(survey.node, survey)
     known = replace(wanted, rated_torque_nm=1.0, torque_constant_nm_per_a=1.0)  # of the joint file alone
-    return drive_lines(propose_joint(joint, survey.node, survey, known, family))
+    return drive_lines(JointProposal(joint, survey.node, survey, known, family))
 
 
 def content(survey: Survey, problems: list[str], family: Family | None = None) -> dict[str, Any]:
     """Return everything for a program."""
+    identity = {name: survey.numbers.get(key) for name, key in IDENTITY.items()}
+    tpdos = [
+        {
+            "number": each.number,
+            "cob_id": f"{each.cob_id:X}h",
+            "on": each.on,
+            "type": each.transmission_type,
+            "objects": list(each.objects),
+        }
+        for each in survey.tpdos
+    ]
     return {
         "schema": "jtq.probe/1",
-        "device": {
-            "node": survey.node,
-            "profile": survey.profile,
-            **survey.texts,
-            **{name: survey.numbers.get(key) for name, key in IDENTITY.items()},
-        },
+        "device": {"node": survey.node, "profile": survey.profile, **survey.texts, **identity},
         "objects": {label(*key): value for key, value in sorted(survey.numbers.items())},
         "missing": [label(*key) for key in sorted(survey.missing)],
         "unmappable": [label(*key) for key in sorted(survey.unmappable)],
-        "tpdos": [
-            {
-                "number": each.number,
-                "cob_id": f"{each.cob_id:X}h",
-                "on": each.on,
-                "type": each.transmission_type,
-                "objects": list(each.objects),
-            }
-            for each in survey.tpdos
-        ],
+        "tpdos": tpdos,
         "problems": problems,
         "family": None if family is None else family.name,
     }
-
-
-_NAMES: dict[Key, str] = {
-    **{key: name for key, (name, _) in (EVERY_SCALING_OBJECT | SENSOR_SCALING_OBJECTS).items()},
-    **{key: name for name, key in IDENTITY.items()},
-    **{
-        (each.index, each.subindex): each.name.replace("_", " ")
-        for pdo in (*drive_layout(1), sensor_tpdo1(1))
-        for each in pdo.objects
-    },
-    TORQUE: "torque",
-}
-"""Names of the objects that are read."""
-
-
-def _object(key: Key, value: str) -> str:
-    return f"  {label(*key):<8} {value:<12} {_NAMES.get(key, '')}".rstrip()
-
-
-def _value(key: Key, value: int) -> str:
-    """Return a number; a code in hexadecimal."""
-    return f"{value:0{_CODES[key[0]]}X}h" if key[0] in _CODES else str(value)
 
 
 def text(
@@ -242,20 +207,20 @@ def text(
     lines = [f"node {survey.node}: {description(survey)}"]
     if family is not None:
         lines.append(f"profile {family.name}: {family.title} (docs/bus.md)")
-    lines += [_object(key, _value(key, value)) for key, value in sorted(survey.numbers.items())]
-    lines += [_object(key, "not there") for key in sorted(survey.missing)]
+    for key, value in (*sorted(survey.numbers.items()), *((each, None) for each in sorted(survey.missing))):
+        shown = f"{value:0{_CODES[key[0]]}X}h" if value is not None and key[0] in _CODES else value
+        shown = "not there" if value is None else shown
+        lines.append(f"  {label(*key):<8} {shown!s:<12} {_NAMES.get(key, '')}".rstrip())
     lines.append("TPDOs as they are now (jtqd writes its own mapping at its start, where the drive lets it)")
     for each in survey.tpdos:
         kind = f"type {each.transmission_type}" if each.on else "off"
         lines.append(f"  {each.number}  {each.cob_id:X}h  {kind:<8}  {', '.join(each.objects) or 'nothing'}")
     if survey.profile in (DRIVE, SENSOR):
         try:
-            lines += [
-                "section of the configuration",
-                *(f"  {line}" for line in section(survey, family, wanted, joint)),
-            ]
+            own = section(survey, family, wanted, joint)
+            lines += ["section of the configuration", *(f"  {line}" for line in own)]
         except MissingValueError as error:
-            lines += [f"no section of the configuration yet: {error}"]
+            lines.append(f"no section of the configuration yet: {error}")
     if problems:
         lines += ["jtqd does not work with it yet:", *(f"  {line}" for line in problems)]
     return "\n".join(lines)

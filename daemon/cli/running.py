@@ -6,9 +6,9 @@ import json
 import os
 import time
 from collections import deque
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -128,27 +128,12 @@ def _subdirectories(root: Path) -> list[Path]:
 
 
 @dataclass(frozen=True)
-class CurrentLog:
-    """Account of the recorder; the file that is being written with its size, and the disk [bytes]."""
-
-    account: Account
-    path: Path | None = None
-    size: int | None = None
-    disk_free: int | None = None
-    disk_size: int | None = None
-
-
-_Quantiles = tuple[float, float, float]
-_NO_QUANTILES: _Quantiles = (float("nan"),) * 3
-
-
-@dataclass(frozen=True)
 class Reading:
     """State of a daemon at one moment; `view` and what follows only once its loop has begun.
 
     why: why it does not run; earlier: the reading before this one; work, late: histograms; work_us, late_us: their
-    quantiles 0.5, 0.99 and 1; notices: last ones about the bus; conditions: present ones, the worst first; bus: content of
-    `bus.json`, empty where it cannot be read.
+    quantiles 0.5, 0.99 and 1; recorder: see `_recorder`; notices: last ones about the bus; conditions: present ones, the
+    worst first; bus: content of `bus.json`, empty where it cannot be read.
     """
 
     daemon: Daemon
@@ -158,9 +143,9 @@ class Reading:
     earlier: View | None = None
     work: tuple[int, ...] = ()
     late: tuple[int, ...] = ()
-    work_us: _Quantiles = _NO_QUANTILES
-    late_us: _Quantiles = _NO_QUANTILES
-    log: CurrentLog | None = None
+    work_us: Sequence[float] = ()
+    late_us: Sequence[float] = ()
+    recorder: dict[str, Any] | None = None
     notices: tuple[Notice, ...] = ()
     conditions: tuple[Condition, ...] = ()
     bus: Mapping[str, Any] = field(default_factory=dict)
@@ -184,20 +169,21 @@ class Watch:
         assert self._reader is not None
         earlier, self._earlier = self._earlier or view, view
         state, why = _state(view)
+        reader, directory = self._reader, self.daemon.directory
         return Reading(
             self.daemon,
             state,
             why,
             view,
             earlier,
-            self._reader.work_bins(),
-            self._reader.late_bins(),
-            _three(self._reader.work_us(0.5, 0.99, 1.0)),
-            _three(self._reader.late_us(0.5, 0.99, 1.0)),
-            _log(self.daemon),
+            reader.work_bins(),
+            reader.late_bins(),
+            reader.work_us(0.5, 0.99, 1.0),
+            reader.late_us(0.5, 0.99, 1.0),
+            _recorder(self.daemon),
             self._read_notices(),
-            tuple(read_conditions(self.daemon.directory)),
-            _bus(self.daemon.directory),
+            tuple(read_conditions(directory)),
+            _bus(directory),
         )
 
     def _read_notices(self) -> tuple[Notice, ...]:
@@ -227,10 +213,6 @@ def _bus(directory: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _three(values: list[float]) -> _Quantiles:
-    return values[0], values[1], values[2]
-
-
 def _state(view: View) -> tuple[str, str]:
     age_s = time.monotonic() - view.sync_monotonic_ns * 1e-9
     if age_s <= max(STILL_S, 50 * view.period_s):
@@ -242,19 +224,31 @@ def _state(view: View) -> tuple[str, str]:
     return STILL, f"the loop (process {view.pid}) is {_PROCESS.get(code, code)}: no cycle for {age_s:.1f} s"
 
 
-def _log(daemon: Daemon) -> CurrentLog | None:
+def _recorder(daemon: Daemon) -> dict[str, Any] | None:
+    """Return the account of the recorder, the file that is being written with its size, and the disk [bytes].
+
+    None: it does not record; a value that is not known is None.
+    """
     about = daemon.about
     if about.log_directory is None:
         return None
     directory = Path(about.log_directory)
-    log = CurrentLog(read_account(daemon.directory / "recorded") or Account())
+    account = read_account(daemon.directory / "recorded") or Account()
+    path = length = free = total = None
     with suppress(OSError):  # a file that has just been renamed, or a closed directory
         active = directory.glob(f"{about.log_prefix}*.mcap.active")
         newest = max(active, key=lambda each: each.stat().st_mtime_ns, default=None)
         if newest is not None:
-            log = replace(log, path=newest, size=newest.stat().st_size)
+            path, length = str(newest), newest.stat().st_size
     with suppress(OSError):
         disk = os.statvfs(directory)
         free, total = disk.f_bavail * disk.f_frsize, disk.f_blocks * disk.f_frsize
-        log = replace(log, disk_free=free, disk_size=total)
-    return log
+    return {
+        "path": path,
+        "bytes": length,
+        "written": account.written,
+        "lost": account.lost,
+        "let_go": account.let_go,
+        "disk_free": free,
+        "disk_size": total,
+    }

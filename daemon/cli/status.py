@@ -11,7 +11,7 @@ import termios
 import time
 import tty
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from math import isfinite, log1p, nan
 from typing import Any, Final
@@ -25,7 +25,6 @@ from rich.text import Text
 
 from jtqd.daemon.cli.running import (
     RUNNING,
-    CurrentLog,
     Daemon,
     NoDaemonError,
     Reading,
@@ -34,9 +33,9 @@ from jtqd.daemon.cli.running import (
     find_daemons,
     on_bus,
 )
-from jtqd.daemon.shared.conditions import SEVERITIES, Condition
+from jtqd.daemon.shared.conditions import SEVERITIES
 from jtqd.daemon.shared.counters import Shown, shown_in
-from jtqd.daemon.shared.events import ERROR, WARNING, Notice
+from jtqd.daemon.shared.events import ERROR, WARNING
 from jtqd.daemon.shared.reasons import contact_line, contact_of, drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
@@ -46,57 +45,85 @@ from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import NOTHING, counted, duration, finite, number, percent, size
 
-HEAD: Final = "bold"
-HEADING: Final = 9
+SCHEMA: Final = "jtq.status/1"
+_EXAMPLES: Final = """examples:
+  jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
+  jtq status --bus can0          of the daemon on can0
+  jtq status --once              one text output, also for a file or a mail
+  jtq status --json | jq '.joints[].torque_nm'
+
+exit status: 0 running, 1 no daemon runs (or none that you may read), 2 usage, 3 stalled or still starting
+you may read your own daemons and those of your groups (usermod -a -G jtqd YOU)"""
+_FAULTS: Final = shown_in(Shown.STATUS)
+"""Counters shown when they are not zero."""
+_LAST_NOTICES: Final = 4
+_PERIOD_S: Final = 0.2
+_PLAIN_PERIOD_S: Final = 1.0
+_BETWEEN_S: Final = 0.3
+"""Between the two readings of one view: bus load and reasons need what has changed."""
+WINDOW_S: Final = 10.0
+"""Of the sparklines and maxima of a live view: its counters are those since the start of the daemon."""
+_HEAD: Final = "bold"
+_HEADING: Final = 9
 """Width of the headings of lines."""
 _FOOT_LINES: Final = 2
 _BLOCKS: Final = "▁▂▃▄▅▆▇█"
+_BAD: Final = "bold red"
+_QUANTITIES: Final = {
+    "torque": ("torque_nm", "Nm", 2),
+    "sigma": ("sigma_nm", "Nm", 2),
+    "sensor": ("reference_nm", "Nm", 2),
+    "age": ("age_ms", "ms", 2),
+    "current": ("current_a", "A", 2),
+    "motor": ("motor_velocity_rad_s", "rad/s", 1),
+    "temp.": ("temperature_c", "°C", 1),
+}
+"""Column of the joints -> its key in `content`, unit, decimals."""
+
+
+# ---- terminal ----
 
 
 class Columns:
     """A table that drops columns, in the order of `dispensable`, where the terminal is too narrow for all.
 
-    Nothing is cut, and a line below names the columns that are not shown.
+    Nothing is cut, and a line below names the columns that are not shown. left: number of columns aligned to the left.
     """
 
-    def __init__(self, headings: dict[str, str], dispensable: tuple[str, ...] = ()) -> None:
-        self._headings = headings
-        self._dispensable = dispensable
-        self._rows: list[dict[str, str | Text]] = []
+    def __init__(self, headings: Sequence[str], left: int, dispensable: tuple[str, ...]) -> None:
+        self._headings, self._left, self._dispensable = headings, left, dispensable
+        self._rows: list[Sequence[str | Text]] = []
 
     def add(self, *cells: str | Text) -> None:
         """Add a row, one cell per heading."""
-        self._rows.append(dict(zip(self._headings, cells, strict=True)))
+        self._rows.append(cells)
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Render for the width of the terminal (called by rich)."""
-        tables = [
-            self._table([name for name in self._headings if name not in self._dispensable[:dropped]])
-            for dropped in range(len(self._dispensable) + 1)
-        ]
+        tables = [self._table(self._dispensable[:n]) for n in range(len(self._dispensable) + 1)]
         shown = first_that_fits(tables, console, options) or tables[-1]
         yield shown
         if dropped := self._dispensable[: tables.index(shown)]:
             names = [name for name in self._headings if name in dropped]
             yield Text(f"no room for: {', '.join(names)}", style="dim")
 
-    def _table(self, names: list[str]) -> Table:
+    def _table(self, dropped: Sequence[str]) -> Table:
         table = Table(
-            box=None, pad_edge=False, padding=(0, 2, 0, 0), collapse_padding=True, header_style=HEAD
+            box=None, pad_edge=False, padding=(0, 2, 0, 0), collapse_padding=True, header_style=_HEAD
         )
-        for name in names:
-            right = self._headings[name] == "right"
-            table.add_column(name, justify="right" if right else "left", no_wrap=True)
+        shown = [n for n, name in enumerate(self._headings) if name not in dropped]
+        for n in shown:
+            table.add_column(self._headings[n], justify="left" if n < self._left else "right", no_wrap=True)
         for row in self._rows:
-            table.add_row(*(row[name] for name in names))
+            table.add_row(*(row[n] for n in shown))
         return table
 
 
-def line(heading: str, text: str | Text) -> RenderableType:
+def _line(heading: str, text: str | Text, style: str = "") -> RenderableType:
     """Return a heading of fixed width and text that wraps beside it."""
     grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=HEADING, no_wrap=True, style=HEAD)
-    grid.add_column(overflow="fold")
+    grid.add_column(width=_HEADING, no_wrap=True, style=_HEAD)
+    grid.add_column(overflow="fold", style=style)
     grid.add_row(heading, text)
     return grid
 
@@ -176,26 +203,6 @@ def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
     return f"{first * bin_us:.0f} {blocks} {high:.0f} us{more}"
 
 
-SCHEMA: Final = "jtq.status/1"
-_FAULTS: Final = shown_in(Shown.STATUS)
-"""Counters shown when they are not zero."""
-_LAST_NOTICES: Final = 4
-_EXAMPLES: Final = """examples:
-  jtq status                     live view of the daemon on this machine; Ctrl-C ends the view
-  jtq status --bus can0          of the daemon on can0
-  jtq status --once              one text output, also for a file or a mail
-  jtq status --json | jq '.joints[].torque_nm'
-
-exit status: 0 running, 1 no daemon runs (or none that you may read), 2 usage, 3 stalled or still starting
-you may read your own daemons and those of your groups (usermod -a -G jtqd YOU)"""
-_PERIOD_S: Final = 0.2
-_PLAIN_PERIOD_S: Final = 1.0
-_BETWEEN_S: Final = 0.3
-"""Between the two readings of one view: bus load and reasons need what has changed."""
-WINDOW_S: Final = 10.0
-"""Of the sparklines and maxima of a live view: its counters are those since the start of the daemon."""
-
-
 # ---- last seconds of a live view ----
 
 
@@ -248,260 +255,16 @@ class Recent:
         return (grown[-1] + 1) * bin_us if grown else None
 
 
-# ---- view ----
+# ---- content ----
 
 
-class StatusView:
-    """Rich view of one reading; recent: the last seconds of a live view."""
-
-    def __init__(self, reading: Reading, recent: Recent | None = None) -> None:
-        self._reading, self._recent = reading, recent
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Render for the width of the terminal (called by rich)."""
-        reading, width = self._reading, options.max_width
-        yield _title(reading)
-        if reading.state != RUNNING:
-            yield Text(f"NOT RUNNING: {reading.why}" if reading.view else reading.why, style="bold red")
-        if reading.view is None or reading.earlier is None:
-            return
-        about, view = reading.daemon.about, reading.view
-        still = reading.state != RUNNING
-        yield ""
-        yield _joints(about, view, still=still)
-        if not still:
-            yield from _reasons(about, view, reading.earlier)
-            for joint, zeros in zip(about.joints, view.zeros, strict=False):
-                if zeros.tracked:
-                    style = "" if zeros.plausible else "yellow"
-                    yield line(f"zeros {joint.number}", Text(zeros.text, style=style))
-            yield from _contacts(about, view, self._recent)
-            if self._recent is not None:
-                yield from _last_seconds(self._recent, len(about.joints), width)
-        yield ""
-        yield _inputs(about, view)
-        yield ""
-        yield _loop(reading, view, width)
-        load = percent(bus_load(reading.earlier, view, about.bitrate))
-        worst = percent(view.worst_load)
-        yield line("bus load", f"{load} now, with worst-case stuff bits; {worst} by configuration")
-        yield from _bus_state(reading)
-        faults = [
-            f"{name.replace('_', ' ')} {view.counters[name]}" for name in _FAULTS if view.counters[name]
-        ]
-        if faults:
-            yield line("counted", ", ".join(faults))
-        yield ""
-        yield _nodes(about, view)
-        yield ""
-        yield from _log(reading.log)
-        yield from _conditions(reading.conditions)
-        yield from _notices(reading.notices)
-
-
-def _status_name(status: int) -> str:
-    return NAMES.get(status, str(status))
-
-
-def _title(reading: Reading) -> Text:
-    about, view = reading.daemon.about, reading.view
-    text = Text(f"jtqd on {about.instance}", style=HEAD)
-    text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
-    if view is not None:
-        text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
-    text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
-    text.overflow = "fold"
-    return text
-
-
-def _quantity(value: float, unit: str, decimals: int = 2) -> str:
-    return f"{number(value, decimals)} {unit}" if isfinite(value) else NOTHING
-
-
-def _joints(about: About, view: View, *, still: bool) -> Columns:
-    headings = {"joint": "left", "status": "left"} | dict.fromkeys(
-        ("torque", "sigma", "sensor", "age", "current", "motor", "temp.", "with a torque"), "right"
-    )
-    table = Columns(headings, ("age", "with a torque", "motor", "temp.", "current", "sensor", "sigma"))
-    for n, (joint, seen) in enumerate(zip(about.joints, view.joints, strict=True)):
-        known = seen.status in PUBLISHED and not still
-        measured, cycles = view.measured[n], view.status_cycles[n]
-        name = _status_name(seen.status)
-        table.add(
-            f"{joint.number} {joint.name}",
-            Text(name, style="dim" if still else COLOURS.get(name, "bold red")),
-            _quantity(seen.torque_nm if known else nan, "Nm"),
-            _quantity(seen.sigma_nm if known else nan, "Nm"),
-            _quantity(seen.reference_nm, "Nm"),
-            _quantity(seen.age_ms if known else nan, "ms"),
-            _quantity(measured.current_a, "A"),
-            _quantity(measured.motor_velocity_rad_s, "rad/s", 1),
-            _quantity(measured.temperature_c, "°C", 1),
-            percent(sum(cycles[code] for code in PUBLISHED) / max(1, sum(cycles))),
-        )
-    return table
-
-
-def _reasons(about: About, view: View, earlier: View) -> Iterator[Text]:
-    """Return one line per joint, so that the view keeps its height."""
-    for joint, seen, since in zip(about.joints, view.joints, view.status_since, strict=True):
-        why = joint_reason(about, joint.number, view, earlier)
-        name = _status_name(seen.status)
-        lasting = duration((view.cycle - since) * view.period_s)
-        yield Text.assemble(
-            f"joint {joint.number} ",
-            (f"{name} for {lasting}", COLOURS.get(name, "bold red")),
-            f": {why}" if why else "",
-        )
-
-
-def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
-    """Return a line per joint that is watched, and their number: a short contact falls between two readings."""
-    watched = [
-        (joint, seen)
-        for joint, seen in zip(about.joints, view.joints, strict=False)
-        if joint.contact_threshold_nm is not None
-    ]
-    for joint, seen in watched:
-        contact, threshold_nm = contact_of(seen), joint.contact_threshold_nm or nan
-        style = "bold red" if contact else "yellow" if contact is None else ""
-        yield line(f"contact {joint.number}", Text(contact_line(seen, threshold_nm), style=style))
-    if watched:
-        text = Text(f"{view.counters['contacts'] or 'none'} since the start")
-        if recent is not None:
-            style = "bold red" if recent.contacts else ""
-            text.append(f", {recent.contacts} in the last {recent.seconds:.0f} s", style=style)
-        yield line("contacts", text)
-
-
-def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
-    """Return the torque of each joint as a sparkline, and the slowest cycle, of the last seconds."""
-    columns = min(50, max(10, width - 40))
-    for joint in range(joints):
-        torques = recent.torques(joint)
-        known = [each for each in torques if isfinite(each)]
-        extent = f"{min(known):.2f} to {max(known):.2f} Nm" if known else "no torque"
-        yield line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
-    work = recent.largest_us(WORK_BIN_NS / 1000, late=False)
-    late = recent.largest_us(LATE_BIN_NS / 1000, late=True)
-    if work is not None and late is not None:
-        text = f"work at most {work:.0f} us, SYNC late by at most {late:.0f} us"
-        yield line(f"last {recent.seconds:.0f} s", text)
-
-
-def _inputs(about: About, view: View) -> Columns:
-    headings = {"input": "left"} | dict.fromkeys(
-        ("age", "after SYNC", "usual", "missed", "late", "lost", "twice", "wrong"), "right"
-    )
-    table = Columns(headings, ("wrong", "twice", "usual", "lost", "late"))
-    for name, each in zip(about.inputs, view.inputs, strict=False):
-        age_s = (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else nan
-        old = not age_s <= 2 * 8 * view.period_s  # read every 8th cycle
-        band = f"{each.low_ns / 1000:.0f}..{each.high_ns / 1000:.0f} us"
-        table.add(
-            name,
-            Text("never" if not each.used_ns else duration(age_s), style="bold red" if old else ""),
-            after_sync(each.delay_ns) if each.used_ns else NOTHING,
-            band if each.low_ns <= each.high_ns else NOTHING,
-            *map(str, (each.missed, each.late, each.lost, each.duplicates, each.rejected)),
-        )
-    return table
-
-
-def after_sync(delay_ns: int) -> str:
-    """Return the arrival of an input after its SYNC; the age of an acyclic input, which arrived before it.
-
-    >>> after_sync(426_000), after_sync(-4_803_000)
-    ('426 us', '4803 us old')
-    """
-    return f"{delay_ns / 1000:.0f} us" if delay_ns >= 0 else f"{-delay_ns / 1000:.0f} us old"
-
-
-def _loop(reading: Reading, view: View, width: int) -> RenderableType:
-    grid = Table.grid(padding=(0, 1))
-    grid.add_column(width=HEADING, no_wrap=True, style=HEAD)
-    grid.add_column()
-    columns = min(60, max(10, width - 66))
-    for name, values, bins, bin_ns in (
-        ("work", reading.work_us, reading.work, WORK_BIN_NS),
-        ("lateness", reading.late_us, reading.late, LATE_BIN_NS),
-    ):
-        p50, p99, largest = (number(each, 0) for each in values)
-        text = f"p50 {p50}  p99 {p99}  max {largest} us"
-        grid.add_row(name, Text.assemble(text.ljust(31), (histogram(bins, bin_ns / 1000, columns), "cyan")))
-    cycles, missed = view.counters["cycles"], view.counters["missed"]
-    incomplete = cycles - view.counters["complete"]
-    shown = Text(f"{missed} of {max(1, cycles + missed)} cycles", style="yellow" if missed else "")
-    shown.append(f", an input missing in {incomplete}", style="yellow" if incomplete else "default")
-    grid.add_row("missed", shown)
-    return grid
-
-
-def _bus_state(reading: Reading) -> Iterator[RenderableType]:
-    """Return state and error frames of the CAN controller, where they are known."""
-    state, counts = reading.bus.get("state"), reading.bus.get("counts", {})
-    if state is not None:
-        names = ("protocol_errors", "no_acknowledge", "overruns", "bus_offs")
-        errors = sum(counts.get(name, 0) for name in names)
-        yield line("bus state", f"{state}, {counted(errors, 'error frame')}")
-
-
-def _nodes(about: About, view: View) -> Columns:
-    table = Columns({"node": "left", "what": "left", "state": "left", "heartbeat": "right"}, ("what",))
-    for node, what in sorted(about.nodes.items()):
-        heard = view.node_heard_ns[node]
-        state = Text(nmt.STATES.get(view.node_states[node], "?") if heard else "no heartbeat yet")
-        if silent_s(view, node, about.heartbeat_ms) is not None:
-            state = Text(f"silent, last {state.plain}", style="bold red")
-        elif node in view.unconfigured:
-            state = Text("restarted, not configured yet", style="bold red")
-        elif heard and view.node_states[node] != nmt.OPERATIONAL:
-            state.stylize("yellow")
-        age = duration(max(0, view.sync_realtime_ns - heard) * 1e-9) + " ago" if heard else NOTHING
-        table.add(f"{node:02X}h", what, state, age)
-    return table
-
-
-def _log(log: CurrentLog | None) -> Iterator[RenderableType]:
-    if log is None:
-        yield line("recorder", "no recording")
-        return
-    account = log.account
-    lost = Text(f"{account.lost} lost", style="bold red" if account.lost else "")
-    discarded = f", {account.let_go} discarded (flight recorder)" if account.let_go else ""
-    written = f"{counted(account.written, 'cycle')} written, "
-    yield line("recorder", Text.assemble(written, lost, f"{discarded}, {size(log.size)} in this file"))
-    yield line("", str(log.path) if log.path else "no file is being written")
-    yield line("disk", f"{size(log.disk_free)} free of {size(log.disk_size)}")
-
-
-def _style_of(level: int) -> str:
-    return "bold red" if level >= ERROR else "yellow" if level >= WARNING else ""
-
-
-def _conditions(conditions: Sequence[Condition]) -> Iterator[RenderableType]:
-    """Return the present conditions and their durations."""
-    if conditions:
-        yield ""
-    now_ns = time.monotonic_ns()
-    for each in conditions:
-        text = f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})"
-        yield line(SEVERITIES[each.severity], Text(text, style=_style_of(each.severity)))
-
-
-def _notices(notices: Sequence[Notice]) -> Iterator[RenderableType]:
-    if notices:
-        yield ""
-    for each in notices[-_LAST_NOTICES:]:
-        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
-        yield line(when, Text(each.text, style=_style_of(each.level)))
-
-
-# ---- JSON ----
+def _ago_s(now_ns: int, then_ns: int) -> float | None:
+    """Return the age of a stamp; None for one that has never been set."""
+    return (now_ns - then_ns) * 1e-9 if then_ns else None
 
 
 def content(reading: Reading) -> dict[str, Any]:
-    """Return everything that the view shows as plain data; null for unknown numbers."""
+    """Return the state as plain data, as `--json` prints it; null for unknown numbers."""
     about, view = reading.daemon.about, reading.view
     result: dict[str, Any] = {
         "schema": SCHEMA,
@@ -518,40 +281,57 @@ def content(reading: Reading) -> dict[str, Any]:
     if view is None or reading.earlier is None:
         return result
     now_ns = time.monotonic_ns()
+    inputs = [
+        {
+            "name": name,
+            "age_s": _ago_s(view.sync_monotonic_ns, each.used_ns),
+            "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
+            "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
+            "missed": each.missed,
+            "late": each.late,
+            "lost": each.lost,
+            "duplicates": each.duplicates,
+            "rejected": each.rejected,
+        }
+        for name, each in zip(about.inputs, view.inputs, strict=False)
+    ]
+    nodes = [
+        {
+            "node": node,
+            "what": what,
+            "state": nmt.STATES.get(view.node_states[node]) if view.node_heard_ns[node] else None,
+            "heartbeat_age_s": _ago_s(view.sync_realtime_ns, view.node_heard_ns[node]),
+            "configured": node not in view.unconfigured,
+        }
+        for node, what in sorted(about.nodes.items())
+    ]
+    notices = [{**each._asdict(), "node": each.node or None} for each in reading.notices]
+    for each in notices:
+        del each["number"]
+    conditions = [
+        {
+            "name": each.name,
+            "subject": each.subject,
+            "severity": SEVERITIES[each.severity],
+            "text": each.text,
+            "for_s": (now_ns - each.since_ns) * 1e-9,
+        }
+        for each in reading.conditions
+    ]
+    load = finite(bus_load(reading.earlier, view, about.bitrate))
     return result | {
         "cycle": view.cycle,
         "joints": [_joint_content(reading, view, reading.earlier, n) for n in range(len(view.joints))],
-        "inputs": _inputs_content(about, view),
-        "work_us": _quantiles(reading.work_us),
-        "late_us": _quantiles(reading.late_us),
-        "bus_load": {
-            "now": finite(bus_load(reading.earlier, view, about.bitrate)),
-            "worst_case": view.worst_load,
-        },
+        "inputs": inputs,
+        "work_us": dict(zip(("p50", "p99", "max"), map(finite, reading.work_us), strict=True)),
+        "late_us": dict(zip(("p50", "p99", "max"), map(finite, reading.late_us), strict=True)),
+        "bus_load": {"now": load, "worst_case": view.worst_load},
         "bus_state": dict(reading.bus),
         "counters": view.counters,
-        "nodes": _nodes_content(about, view),
-        "notices": [
-            {
-                "realtime_ns": each.realtime_ns,
-                "level": each.level,
-                "node": each.node or None,
-                "topic": each.topic,
-                "text": each.text,
-            }
-            for each in reading.notices
-        ],
-        "conditions": [
-            {
-                "name": each.name,
-                "subject": each.subject,
-                "severity": SEVERITIES[each.severity],
-                "text": each.text,
-                "for_s": (now_ns - each.since_ns) * 1e-9,
-            }
-            for each in reading.conditions
-        ],
-        "recorder": reading.log and _log_content(reading.log),
+        "nodes": nodes,
+        "notices": notices,
+        "conditions": conditions,
+        "recorder": reading.recorder,
     }
 
 
@@ -559,11 +339,10 @@ def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[
     about, seen, measured = reading.daemon.about, view.joints[n], view.measured[n]
     running = reading.state == RUNNING
     known = seen.status in PUBLISHED and running
-    cycles = enumerate(view.status_cycles[n])
     return {
         "joint": n + 1,
         "name": about.joints[n].name,
-        "status": _status_name(seen.status),
+        "status": NAMES.get(seen.status, str(seen.status)),
         "reason": joint_reason(about, n + 1, view, earlier) or None,
         "since_s": (view.cycle - view.status_since[n]) * view.period_s,
         "torque_nm": finite(seen.torque_nm if known else nan),
@@ -584,54 +363,225 @@ def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[
         "motor_velocity_rad_s": finite(measured.motor_velocity_rad_s),
         "temperature_c": finite(measured.temperature_c),
         "drive": drive_state(seen.statusword),
-        "cycles": {_status_name(code): count for code, count in cycles if count},
+        "cycles": {NAMES.get(code, str(code)): k for code, k in enumerate(view.status_cycles[n]) if k},
     }
 
 
-def _inputs_content(about: About, view: View) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": name,
-            "age_s": (view.sync_monotonic_ns - each.used_ns) * 1e-9 if each.used_ns else None,
-            "after_sync_us": each.delay_ns / 1000 if each.used_ns else None,
-            "usual_us": [each.low_ns / 1000, each.high_ns / 1000] if each.low_ns <= each.high_ns else None,
-            "late": each.late,
-            "lost": each.lost,
-            "duplicates": each.duplicates,
-            "rejected": each.rejected,
-        }
-        for name, each in zip(about.inputs, view.inputs, strict=False)
-    ]
+# ---- view ----
 
 
-def _nodes_content(about: About, view: View) -> list[dict[str, Any]]:
-    heard = view.node_heard_ns
-    return [
-        {
-            "node": node,
-            "what": what,
-            "state": nmt.STATES.get(view.node_states[node]) if heard[node] else None,
-            "heartbeat_age_s": (view.sync_realtime_ns - heard[node]) * 1e-9 if heard[node] else None,
-            "configured": node not in view.unconfigured,
-        }
-        for node, what in sorted(about.nodes.items())
-    ]
+class StatusView:
+    """Rich view of one reading; recent: the last seconds of a live view."""
+
+    def __init__(self, reading: Reading, recent: Recent | None = None) -> None:
+        self._reading, self._recent = reading, recent
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render for the width of the terminal (called by rich)."""
+        reading, width = self._reading, options.max_width
+        about, view, data = reading.daemon.about, reading.view, content(reading)
+        yield _title(about, view)
+        still = reading.state != RUNNING
+        if still:
+            yield Text(f"NOT RUNNING: {reading.why}" if view else reading.why, style=_BAD)
+        if view is None:
+            return
+        yield ""
+        yield _joints(data["joints"], still=still)
+        if not still:
+            yield from _reasons(data["joints"])
+            for joint, zeros in zip(about.joints, view.zeros, strict=False):
+                if zeros.tracked:
+                    yield _line(f"zeros {joint.number}", zeros.text, "" if zeros.plausible else "yellow")
+            yield from _contacts(about, view, self._recent)
+            if self._recent is not None:
+                yield from _last_seconds(self._recent, len(about.joints), width)
+        yield ""
+        yield _inputs(data["inputs"], view.period_s)
+        yield ""
+        yield from _loop(reading, view.counters, width)
+        yield from _bus(data, view.counters)
+        yield ""
+        yield _nodes(data["nodes"], about, view)
+        yield ""
+        yield from _recorder(data["recorder"])
+        yield from _conditions(reading)
+        yield from _notices(reading)
 
 
-def _log_content(log: CurrentLog) -> dict[str, Any]:
-    return {
-        "path": str(log.path) if log.path else None,
-        "bytes": log.size,
-        "written": log.account.written,
-        "lost": log.account.lost,
-        "let_go": log.account.let_go,
-        "disk_free": log.disk_free,
-        "disk_size": log.disk_size,
-    }
+def _title(about: About, view: View | None) -> Text:
+    text = Text(f"jtqd on {about.instance}", style=_HEAD, overflow="fold")
+    text.append(f"  node {about.node:02X}h  {about.method}  pid {about.pid}", style="")
+    if view is not None:
+        text.append(f"  cycle {view.cycle}  up {duration(view.cycle * view.period_s)}", style="")
+    text.append(f"\n{about.configuration}  {about.configuration_sha256[:8]}", style="dim")
+    return text
 
 
-def _quantiles(values: tuple[float, float, float]) -> dict[str, float | None]:
-    return dict(zip(("p50", "p99", "max"), map(finite, values), strict=True))
+def _joints(joints: Sequence[Mapping[str, Any]], *, still: bool) -> Columns:
+    dispensable = ("age", "with a torque", "motor", "temp.", "current", "sensor", "sigma")
+    table = Columns(("joint", "status", *_QUANTITIES, "with a torque"), 2, dispensable)
+    for each in joints:
+        values = each if each["torque_nm"] is not None else {**each, "age_ms": None}
+        published = sum(each["cycles"].get(NAMES[code], 0) for code in PUBLISHED)
+        table.add(
+            f"{each['joint']} {each['name']}",
+            Text(each["status"], style="dim" if still else COLOURS.get(each["status"], _BAD)),
+            *(
+                NOTHING if values[key] is None else f"{number(values[key], decimals)} {unit}"
+                for key, unit, decimals in _QUANTITIES.values()
+            ),
+            percent(published / max(1, sum(each["cycles"].values()))),
+        )
+    return table
+
+
+def _reasons(joints: Sequence[Mapping[str, Any]]) -> Iterator[Text]:
+    """Return one line per joint, so that the view keeps its height."""
+    for each in joints:
+        status, why = each["status"], each["reason"]
+        yield Text.assemble(
+            f"joint {each['joint']} ",
+            (f"{status} for {duration(each['since_s'])}", COLOURS.get(status, _BAD)),
+            f": {why}" if why else "",
+        )
+
+
+def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
+    """Return a line per joint that is watched, and their number: a short contact falls between two readings."""
+    watched = False
+    for joint, seen in zip(about.joints, view.joints, strict=False):
+        if joint.contact_threshold_nm is not None:
+            watched, contact = True, contact_of(seen)
+            style = _BAD if contact else "yellow" if contact is None else ""
+            yield _line(f"contact {joint.number}", contact_line(seen, joint.contact_threshold_nm), style)
+    if watched:
+        text = Text(f"{view.counters['contacts'] or 'none'} since the start")
+        if recent is not None:
+            style = _BAD if recent.contacts else ""
+            text.append(f", {recent.contacts} in the last {recent.seconds:.0f} s", style=style)
+        yield _line("contacts", text)
+
+
+def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
+    """Return the torque of each joint as a sparkline, and the slowest cycle, of the last seconds."""
+    columns = min(50, max(10, width - 40))
+    for joint in range(joints):
+        torques = recent.torques(joint)
+        known = [each for each in torques if isfinite(each)]
+        extent = f"{min(known):.2f} to {max(known):.2f} Nm" if known else "no torque"
+        yield _line(f"torque {joint + 1}", Text.assemble((sparkline(torques, columns), "cyan"), f" {extent}"))
+    work = recent.largest_us(WORK_BIN_NS / 1000, late=False)
+    late = recent.largest_us(LATE_BIN_NS / 1000, late=True)
+    if work is not None and late is not None:
+        text = f"work at most {work:.0f} us, SYNC late by at most {late:.0f} us"
+        yield _line(f"last {recent.seconds:.0f} s", text)
+
+
+def _inputs(inputs: Sequence[Mapping[str, Any]], period_s: float) -> Columns:
+    headings = ("input", "age", "after SYNC", "usual", "missed", "late", "lost", "twice", "wrong")
+    table = Columns(headings, 1, ("wrong", "twice", "usual", "lost", "late"))
+    for each in inputs:
+        age_s, usual = each["age_s"], each["usual_us"]
+        old = age_s is None or age_s > 2 * 8 * period_s  # read every 8th cycle
+        table.add(
+            each["name"],
+            Text("never" if age_s is None else duration(age_s), style=_BAD if old else ""),
+            NOTHING if age_s is None else after_sync(each["after_sync_us"]),
+            f"{usual[0]:.0f}..{usual[1]:.0f} us" if usual else NOTHING,
+            *(str(each[key]) for key in ("missed", "late", "lost", "duplicates", "rejected")),
+        )
+    return table
+
+
+def after_sync(delay_us: float) -> str:
+    """Return the arrival of an input after its SYNC; the age of an acyclic input, which arrived before it.
+
+    >>> after_sync(426.0), after_sync(-4803.0)
+    ('426 us', '4803 us old')
+    """
+    return f"{delay_us:.0f} us" if delay_us >= 0 else f"{-delay_us:.0f} us old"
+
+
+def _loop(reading: Reading, counters: Mapping[str, int], width: int) -> Iterator[RenderableType]:
+    columns = min(60, max(10, width - 66))
+    for name, values, bins, bin_ns in (
+        ("work", reading.work_us, reading.work, WORK_BIN_NS),
+        ("lateness", reading.late_us, reading.late, LATE_BIN_NS),
+    ):
+        p50, p99, largest = (number(each, 0) for each in values)
+        text = f"p50 {p50}  p99 {p99}  max {largest} us"
+        yield _line(name, Text.assemble(text.ljust(31), (histogram(bins, bin_ns / 1000, columns), "cyan")))
+    cycles, missed = counters["cycles"], counters["missed"]
+    incomplete = cycles - counters["complete"]
+    shown = Text(f"{missed} of {max(1, cycles + missed)} cycles", style="yellow" if missed else "")
+    shown.append(f", an input missing in {incomplete}", style="yellow" if incomplete else "default")
+    yield _line("missed", shown)
+
+
+def _bus(data: Mapping[str, Any], counters: Mapping[str, int]) -> Iterator[RenderableType]:
+    """Return load, state and error frames of the bus, where they are known, and the counters of faults."""
+    load, state = data["bus_load"], data["bus_state"]
+    now = percent(nan if load["now"] is None else load["now"])
+    worst = percent(load["worst_case"])
+    yield _line("bus load", f"{now} now, with worst-case stuff bits; {worst} by configuration")
+    if state.get("state") is not None:
+        names = ("protocol_errors", "no_acknowledge", "overruns", "bus_offs")
+        errors = sum(state.get("counts", {}).get(name, 0) for name in names)
+        yield _line("bus state", f"{state['state']}, {counted(errors, 'error frame')}")
+    faults = [f"{name.replace('_', ' ')} {counters[name]}" for name in _FAULTS if counters[name]]
+    if faults:
+        yield _line("counted", ", ".join(faults))
+
+
+def _nodes(nodes: Sequence[Mapping[str, Any]], about: About, view: View) -> Columns:
+    table = Columns(("node", "what", "state", "heartbeat"), 3, ("what",))
+    for each in nodes:
+        age_s, name = each["heartbeat_age_s"], each["state"] or "?"
+        state = Text("no heartbeat yet" if age_s is None else name)
+        if silent_s(view, each["node"], about.heartbeat_ms) is not None:
+            state = Text(f"silent, last {name}", style=_BAD)
+        elif not each["configured"]:
+            state = Text("restarted, not configured yet", style=_BAD)
+        elif age_s is not None and name != nmt.STATES[nmt.OPERATIONAL]:
+            state.stylize("yellow")
+        heard = NOTHING if age_s is None else f"{duration(max(0.0, age_s))} ago"
+        table.add(f"{each['node']:02X}h", each["what"], state, heard)
+    return table
+
+
+def _recorder(log: Mapping[str, Any] | None) -> Iterator[RenderableType]:
+    if log is None:
+        yield _line("recorder", "no recording")
+        return
+    lost = (f"{log['lost']} lost", _BAD if log["lost"] else "")
+    discarded = f", {log['let_go']} discarded (flight recorder)" if log["let_go"] else ""
+    written = f"{counted(log['written'], 'cycle')} written, "
+    yield _line("recorder", Text.assemble(written, lost, f"{discarded}, {size(log['bytes'])} in this file"))
+    yield _line("", log["path"] or "no file is being written")
+    yield _line("disk", f"{size(log['disk_free'])} free of {size(log['disk_size'])}")
+
+
+def _style_of(level: int) -> str:
+    return _BAD if level >= ERROR else "yellow" if level >= WARNING else ""
+
+
+def _conditions(reading: Reading) -> Iterator[RenderableType]:
+    """Return the present conditions and their durations."""
+    if reading.conditions:
+        yield ""
+    now_ns = time.monotonic_ns()
+    for each in reading.conditions:
+        text = f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})"
+        yield _line(SEVERITIES[each.severity], text, _style_of(each.severity))
+
+
+def _notices(reading: Reading) -> Iterator[RenderableType]:
+    if reading.notices:
+        yield ""
+    for each in reading.notices[-_LAST_NOTICES:]:
+        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
+        yield _line(when, each.text, _style_of(each.level))
 
 
 # ---- command ----
@@ -644,9 +594,8 @@ def parser() -> argparse.ArgumentParser:
         "Show the state of a running jtqd: torque, status with its reason, inputs, timing, bus, nodes, log.",
         _EXAMPLES,
     )
-    result.add_argument(
-        "--bus", help="bus of the daemon: can0, unix:PATH or sim (default: the only running one)"
-    )
+    bus = "bus of the daemon: can0, unix:PATH or sim (default: the only running one)"
+    result.add_argument("--bus", help=bus)
     result.add_argument("--once", action="store_true", help="print once, then end")
     result.add_argument("--json", action="store_true", help="print once as JSON, then end")
     return result
@@ -702,11 +651,10 @@ def _live(console: Console, daemon: Daemon) -> int:
 
 def _remember(recent: Recent, reading: Reading) -> None:
     view = reading.view
-    if view is None or reading.state != RUNNING:
-        return
-    torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
-    moment = Moment(time.monotonic(), torques, reading.work, reading.late, view.counters["contacts"])
-    recent.add(moment)
+    if view is not None and reading.state == RUNNING:
+        torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
+        contacts = view.counters["contacts"]
+        recent.add(Moment(time.monotonic(), torques, reading.work, reading.late, contacts))
 
 
 def _lines(daemon: Daemon) -> int:

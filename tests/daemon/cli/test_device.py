@@ -19,10 +19,10 @@ import yaml
 from jtqd.daemon.bus.boot import boot_request
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.proposal import (
+    JointProposal,
     Wanted,
     drive_lines,
     kept_tpdos,
-    propose_joint,
     reported_units,
     unit_problems,
 )
@@ -64,7 +64,7 @@ def drive(numbers: dict[tuple[int, int], int] | None = None, tpdos: tuple[Tpdo, 
 
 def entries(numbers: dict[tuple[int, int], int], gear: float = 100.0) -> dict[str, Any]:
     found = reported_units(drive(numbers), gear, QUANTITIES, ())
-    return {name: each.keys for name, each in found.items()}
+    return {name: each.value for name, each in found.items()}
 
 
 # Units --------------------------------------------------------------------------------------------------------------
@@ -115,7 +115,7 @@ def test_the_unit_is_right_whatever_gear_the_drive_counts_with(
     }
     survey = drive(numbers)
     wanted = Wanted(gear_ratio=gear, rated_torque_nm=30.0, torque_constant_nm_per_a=0.1)
-    section = yaml.safe_load("\n".join(drive_lines(propose_joint(1, 5, survey, wanted))))["joint_1"]
+    section = yaml.safe_load("\n".join(drive_lines(JointProposal(1, 5, survey, wanted))))["joint_1"]
     given = {(int(name[:4], 16), int(name[6:])): value for name, value in section.get("given", {}).items()}
     objects = CIA_402
     for name, keys in section["objects"].items():
@@ -129,7 +129,7 @@ def test_the_unit_is_right_whatever_gear_the_drive_counts_with(
 
 def test_what_is_not_sure_is_a_guess() -> None:
     survey = drive({(0x60A8, 0): MILLIDEGREE})
-    joint = propose_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, torque_constant_nm_per_a=0.1))
+    joint = JointProposal(1, 5, survey, Wanted(rated_torque_nm=30.0, torque_constant_nm_per_a=0.1))
     guesses = [each for each in joint.guesses if "objects" in each]
     assert [each.split(": ")[1].split(" = ")[0] for each in guesses] == ["link_position", "motor_velocity"]
     assert "no 60A9h: 606Ch taken for 60A8h per second" in guesses[1]
@@ -143,18 +143,18 @@ def test_increments_per_second_are_those_of_the_option() -> None:
         "no section of the configuration yet: node 5: 608Fh:1 is not known: give --encoder-counts"
         in probe.text(survey, [])
     )
-    joint = propose_joint(1, 5, survey, Wanted(rated_torque_nm=30.0, encoder_counts=4096))
-    assert {name: each.keys for name, each in joint.objects.items()} == {"motor_velocity": {"by": "608Fh"}}
-    assert joint.objects["motor_velocity"].why == "60A9h:0 is 0x00B50300, by the bus"
+    joint = JointProposal(1, 5, survey, Wanted(rated_torque_nm=30.0, encoder_counts=4096))
+    assert {name: each.value for name, each in joint.objects.items()} == {"motor_velocity": {"by": "608Fh"}}
+    assert joint.objects["motor_velocity"].origin == "60A9h:0 is 0x00B50300, by the bus"
     assert (0x6090, 1) not in joint.given
 
 
 def test_counts_by_an_option_go_before_what_the_drive_tells() -> None:
     survey = drive({(0x60A8, 0): MILLIDEGREE, (0x60A9, 0): 0xFD41_0300})
     wanted = Wanted(rated_torque_nm=30.0, encoder_counts=4096, link_encoder_counts=8192)
-    joint = propose_joint(1, 5, survey, wanted)
+    joint = JointProposal(1, 5, survey, wanted)
     assert joint.objects == {}
-    assert {key: value.number for key, value in joint.given.items()}[0x608F, 1] == 4096
+    assert {key: value.value for key, value in joint.given.items()}[0x608F, 1] == 4096
 
 
 @pytest.mark.parametrize(
@@ -166,11 +166,11 @@ def test_counts_by_an_option_go_before_what_the_drive_tells() -> None:
 )
 def test_a_unit_that_is_no_angle_is_reported(numbers: dict[tuple[int, int], int], text: str) -> None:
     survey = drive(numbers)
-    (problem,) = unit_problems(5, survey)
+    (problem,) = unit_problems(survey)
     assert problem.startswith(f"node 5 (drive): {text}")
     assert "found 0x0001" in problem
     assert probe.problems_of(survey) == [problem]
-    assert propose_joint(1, 5, survey, Wanted(rated_torque_nm=30.0)).problems == (problem,)
+    assert JointProposal(1, 5, survey, Wanted(rated_torque_nm=30.0)).problems == [problem]
 
 
 # TPDOs --------------------------------------------------------------------------------------------------------------
@@ -225,7 +225,7 @@ def test_a_mapping_that_an_eds_says_is_fixed_is_kept_or_refused() -> None:
 @pytest.mark.parametrize(("timer_ms", "age"), [(0, 100), (30, 45), (5000, 1000)])
 def test_a_type_that_cannot_be_written_needs_an_age(timer_ms: int, age: int) -> None:
     itself = {"mapping_fixed": True, "type_fixed": True, "transmission_type": 255, "timer_ms": timer_ms}
-    joint = propose_joint(1, 5, drive(tpdos=tuple(replace(each, **itself) for each in MAKERS)), Wanted())
+    joint = JointProposal(1, 5, drive(tpdos=tuple(replace(each, **itself) for each in MAKERS)), Wanted())
     section = yaml.safe_load("\n".join(drive_lines(joint)))["joint_1"]
     assert section["max_age_ms"] == age
     assert {each["type"] for each in section["tpdos"]} == {255}

@@ -12,14 +12,13 @@ import yaml
 
 from jtqd.daemon.cli import init, probe
 from jtqd.daemon.cli.proposal import (
-    ConfigProposal,
+    JointProposal,
     MissingValueError,
     Wanted,
     config_text,
     drive_lines,
     joint_text,
     plain,
-    propose_joint,
 )
 from jtqd.daemon.config import load_config
 from jtqd.drivers.drive import DriveProfile, drive_scaling
@@ -48,16 +47,16 @@ def drive(values=None, without=()):
 
 
 def numbers(values):
-    return {name: value.number for name, value in values.items()}
+    return {name: value.value for name, value in values.items()}
 
 
 def test_values_of_the_drive_are_used_and_none_is_given():
-    joint = propose_joint(1, NODE, drive({(0x6075, 0): 8000, (0x6076, 0): 500}), Wanted())
+    joint = JointProposal(1, NODE, drive({(0x6075, 0): 8000, (0x6076, 0): 500}), Wanted())
     values = numbers(joint.values)
     assert values["gear_ratio"] == 100.0
     assert values["torque_constant_nm_per_a"] == pytest.approx(0.5 / 8.0, rel=0.01)
     assert values["rated_torque_nm"] == pytest.approx(0.7 * 100 * 0.5)
-    assert (joint.given, joint.problems, joint.values["gear_ratio"].guess) == ({}, (), False)
+    assert (joint.given, joint.problems, joint.values["gear_ratio"].verify) == ({}, [], "")
     assert len(joint.guesses) == 8
 
 
@@ -73,9 +72,9 @@ def test_values_of_the_drive_are_used_and_none_is_given():
     ids=["an option replaces the drive's value", "one that agrees gives nothing"],
 )
 def test_options(wanted, given):
-    joint = propose_joint(1, NODE, drive({(0x6075, 0): 8000}), wanted)
+    joint = JointProposal(1, NODE, drive({(0x6075, 0): 8000}), wanted)
     assert numbers(joint.given) == given
-    assert joint.values["gear_ratio"].number == wanted.gear_ratio
+    assert joint.values["gear_ratio"].value == wanted.gear_ratio
     assert all("the drive has " in each.origin for each in joint.given.values())
 
 
@@ -91,12 +90,12 @@ def test_options(wanted, given):
 )
 def test_a_value_that_cannot_be_guessed_is_asked_for_by_its_option(without, wanted, option):
     with pytest.raises(MissingValueError, match=f"give {option}"):
-        propose_joint(1, NODE, drive(without=without), wanted)
+        JointProposal(1, NODE, drive(without=without), wanted)
 
 
 def test_a_gear_of_one_to_one_is_not_believed():
     with pytest.raises(MissingValueError, match="1:1"):
-        propose_joint(1, NODE, drive({(0x6091, 1): 1}), Wanted())
+        JointProposal(1, NODE, drive({(0x6091, 1): 1}), Wanted())
 
 
 def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
@@ -104,8 +103,8 @@ def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
     turns = [(index, sub) for index in (0x608F, 0x6090, 0x6091) for sub in (1, 2)]
     missing = [*turns, (0x60E6, 1), (0x60EB, 1)]
     found = drive({(0x6075, 0): 8000}, without=missing)
-    joint = propose_joint(1, NODE, found, GIVEN)
-    given = {key: round(value.number) for key, value in joint.given.items()}
+    joint = JointProposal(1, NODE, found, GIVEN)
+    given = {key: round(value.value) for key, value in joint.given.items()}
     assert set(missing) == set(given)
     scaling, gear = drive_scaling(DriveProfile(NODE, given=given), found.numbers)
     assert gear == 101.0
@@ -124,7 +123,7 @@ def test_a_drive_without_scaling_is_scaled_by_options_as_the_boot_does():
     ],
 )
 def test_problems_of_a_drive(values, without, wanted, problem):
-    found = propose_joint(1, NODE, drive(values, without), wanted).problems
+    found = JointProposal(1, NODE, drive(values, without), wanted).problems
     assert len(found) == (problem is not None)
     assert all(each.endswith(problem) for each in found)
 
@@ -151,8 +150,8 @@ CURRENT = ((0x6078, 0), (0x6075, 0))
 def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objects, why, tmp_path):
     """And no scaling of what it does not tell; jtqd reads the section, and its boot takes the drive as it is."""
     found = drive({(0x6075, 0): 8000, (0x6076, 0): 500}, without)
-    joint = propose_joint(1, NODE, found, wanted)
-    assert joint.problems == ()
+    joint = JointProposal(1, NODE, found, wanted)
+    assert joint.problems == []
     assert joint.given == {}
     text = "\n".join(drive_lines(joint))
     assert yaml.safe_load(text)["joint_1"]["objects"] == objects
@@ -162,7 +161,7 @@ def test_a_drive_that_tells_less_gets_objects_that_say_so(without, wanted, objec
     )
     (tmp_path / "joint_1.yaml").write_text(joint_text(joint))
     config = tmp_path / "c.yaml"
-    config.write_text(config_text(ConfigProposal("can0", 1_000_000, 1000, [joint], None, None)))
+    config.write_text(config_text([joint], bus="can0", bitrate=1_000_000, period_us=1000))
     joint = load_config(config).joints[0]
     profile = DriveProfile(NODE, objects=joint.objects, torque_constant_nm_per_a=0.05)
     scaling, _ = drive_scaling(profile, found.numbers)
