@@ -30,9 +30,8 @@ def parser() -> argparse.ArgumentParser:
         "Compute the worst-case bus load of a configuration: all PDOs, with the maximum number of stuff bits.",
         _EXAMPLES,
     )
-    result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
-    )
+    shipped = "configuration (default: the shipped bench)"
+    result.add_argument("--config", type=Path, metavar="FILE", help=shipped)
     result.add_argument("--json", action="store_true", help="print as JSON")
     return result
 
@@ -46,25 +45,20 @@ def main(argv: list[str]) -> int:
         print(f"jtq bus-load: {error}", file=sys.stderr)
         return 1
     load = bus_load_of(config)
-    fits = load.worst <= LIMIT
+    rows, fits = load.table(), load.worst <= LIMIT
     if arguments.json:
-        content = {
-            "worst": load.worst,
-            "unstuffed": load.unstuffed,
-            "limit": LIMIT,
-            "fits": fits,
-            "rows": load.table(),
-        }
-        print(json.dumps(content))
-    else:
-        print(f"{'COB-ID':<7} {'bytes':>5} {'per cycle':>9} {'worst bits':>10} {'share':>7}  who")
-        for row in load.table():
-            print(
-                f"{row['cob_id']:<7} {row['bytes']:>5} {row['per_cycle']:>9.3g} {row['worst_bits']:>10.1f} "
-                f"{row['share']:>7.2%}  {row['who']}"
-            )
         print(
-            f"worst case {load.worst:.1%}, without stuff bits {load.unstuffed:.1%}, limit {LIMIT:.0%}", end=""
+            json.dumps(
+                {"worst": load.worst, "unstuffed": load.unstuffed, "limit": LIMIT, "fits": fits, "rows": rows}
+            )
         )
-        print("" if fits else ": does not fit")
+        return 0 if fits else 1
+    print(f"{'COB-ID':<7} {'bytes':>5} {'per cycle':>9} {'worst bits':>10} {'share':>7}  who")
+    for row in rows:
+        print(
+            f"{row['cob_id']:<7} {row['bytes']:>5} {row['per_cycle']:>9.3g} {row['worst_bits']:>10.1f} "
+            f"{row['share']:>7.2%}  {row['who']}"
+        )
+    bounds = f"worst case {load.worst:.1%}, without stuff bits {load.unstuffed:.1%}, limit {LIMIT:.0%}"
+    print(bounds if fits else f"{bounds}: does not fit")
     return 0 if fits else 1

@@ -66,20 +66,14 @@ def parser() -> argparse.ArgumentParser:
         "Measure a bus and the timing of this machine: GOOD, WARN or FAIL for each item, with a remedy.",
         _EXAMPLES,
     )
-    result.add_argument(
-        "seconds", type=seconds, nargs="?", default=10.0, metavar="S", help="seconds to measure (default: 10)"
-    )
-    result.add_argument(
-        "--bus", default="can0", help="SocketCAN interface, unix:PATH, or sim (default: can0)"
-    )
-    result.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="configuration of the bus (default: that of the running jtqd, else the shipped bench)",
-    )
-    result.add_argument("--drive-sync", action="store_true", help="boot the nodes and send SYNC")
-    result.add_argument("--json", action="store_true", help="print as JSON")
+    add = result.add_argument
+    text = "seconds to measure (default: 10)"
+    add("seconds", type=seconds, nargs="?", default=10.0, metavar="S", help=text)
+    add("--bus", default="can0", help="SocketCAN interface, unix:PATH, or sim (default: can0)")
+    text = "configuration of the bus (default: that of the running jtqd, else the shipped bench)"
+    add("--config", type=Path, metavar="FILE", help=text)
+    add("--drive-sync", action="store_true", help="boot the nodes and send SYNC")
+    add("--json", action="store_true", help="print as JSON")
     return result
 
 
@@ -130,20 +124,22 @@ def _open(bus: str, *, receive_own: bool = False) -> FrameSocket:
 
 
 def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Iterator[CheckResult]:
-    """Listen without sending."""
+    """Listen without sending; beside a running jtqd its timing is judged, else that of this process."""
     traffic, socket = Traffic(config), _open(bus)
-    reader = _reader(daemon)
-    refused = [] if reader else _become_real_time(config)
-    _progress(
-        f"listening on {bus} for {for_s:g} s"
-        + (f" beside jtqd, process {daemon.about.pid}" if daemon else "")
-    )
-    before = (reader.late_bins(), reader.read()) if reader else None
-    timing = listen(socket, traffic, for_s, config.period_ns, timed=reader is None)
-    if reader is not None and before is not None:
-        yield check_loop_timing(before[0], reader.late_bins(), before[1], reader.read())
-    elif timing is not None:
+    if daemon is None:
+        refused = _become_real_time(config)
+        _progress(f"listening on {bus} for {for_s:g} s")
+        timing = listen(socket, traffic, for_s, config.period_ns)
         yield from check_own_timing(timing, config.period_ns, refused, driven=False)
+    else:
+        try:
+            reader = SnapshotReader(daemon.directory / "snapshot")
+        except SnapshotError as error:
+            raise CheckError(f"jtqd on {daemon.about.instance} is still starting ({error})") from None
+        _progress(f"listening on {bus} for {for_s:g} s beside jtqd, process {daemon.about.pid}")
+        bins, view = reader.late_bins(), reader.read()
+        listen(socket, traffic, for_s, 10 * config.period_ns)
+        yield check_loop_timing(bins, reader.late_bins(), view, reader.read())
     yield from _check_traffic(traffic, config, bus, socket)
     if daemon is not None:
         yield from check_conditions(read_conditions(daemon.directory))
@@ -179,15 +175,6 @@ def _drive(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> Ite
 
 def _check_traffic(traffic: Traffic, config: Config, bus: str, socket: FrameSocket) -> Iterator[CheckResult]:
     return check_bus(traffic, config, lost=socket.rx_dropped, error_frames=not bus.startswith("unix:"))
-
-
-def _reader(daemon: Daemon | None) -> SnapshotReader | None:
-    if daemon is None:
-        return None
-    try:
-        return SnapshotReader(daemon.directory / "snapshot")
-    except SnapshotError as error:
-        raise CheckError(f"jtqd on {daemon.about.instance} is still starting ({error})") from None
 
 
 def _become_real_time(config: Config) -> list[str]:

@@ -150,44 +150,45 @@ def check_bus(
         yield CheckResult("this check", WARN, text, hint)
 
 
-def _quantiles(times: TimeHistogram) -> str:
-    return f"p50 {times.quantile_us(0.5):.0f}, p99 {times.quantile_us(0.99):.0f}, max {times.quantile_us(1.0):.0f} us"
-
-
 def _sync(traffic: Traffic, config: Config) -> CheckResult:
     if traffic.syncs < 2:
         hint = "start jtqd, or let this check boot the nodes and send SYNC: --drive-sync"
         return CheckResult("SYNC", FAIL, "none on the bus", hint)
     period_us, jitter = config.period_ns / 1000, traffic.sync_jitter
-    text = (
-        f"{traffic.sync_rate:.1f} per s, expected {1e6 / period_us:.0f}; off the period: {_quantiles(jitter)}"
-    )
-    too_many = traffic.cycles - traffic.slots
-    if traffic.counter_jumps or too_many > (1 - SUCCESS_GOOD) * traffic.cycles:
-        text += f"; {counted(traffic.counter_jumps, 'jump')} of its counter"
-        hint = "possibly a second SYNC producer, or a restarted one (candump can0,080:7FF)"
-        return CheckResult("SYNC", FAIL, text, hint)
-    if too_many < 0:
-        level = FAIL if -too_many > (1 - SUCCESS_GOOD) * traffic.slots else WARN
+    text = f"{traffic.sync_rate:.1f} per s, expected {1e6 / period_us:.0f}; off the period: {jitter}"
+    too_many, jumps = traffic.cycles - traffic.slots, traffic.counter_jumps
+    second = jumps or too_many > (1 - SUCCESS_GOOD) * traffic.cycles
+    many = -too_many > (1 - SUCCESS_GOOD) * traffic.slots
+    if second:
+        text += f"; {counted(jumps, 'jump')} of its counter"
+    elif too_many < 0:
         text += f"; {-too_many} of {traffic.slots} slots without one"
-        return CheckResult("SYNC", level, text, "the sender missed slots: check its timing and `jtq doctor`")
-    late = jitter.quantile_us(0.99) > JITTER_WARN * period_us
-    hint = "the sender wakes up late: `jtq doctor` shows the missing real-time settings"
-    return judge("SYNC", text, (late, WARN, hint))
+    return judge(
+        "SYNC",
+        text,
+        (second, FAIL, "possibly a second SYNC producer, or a restarted one (candump can0,080:7FF)"),
+        (too_many < 0, FAIL if many else WARN, "the sender missed slots: check its timing and `jtq doctor`"),
+        (
+            jitter.quantile_us(0.99) > JITTER_WARN * period_us,
+            WARN,
+            "the sender wakes up late: `jtq doctor` shows the missing real-time settings",
+        ),
+    )
 
 
 def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
-    if not traffic.cycles:
+    cycles, name = traffic.cycles, pdo.name
+    if not cycles:
         if pdo.frames:
-            return CheckResult(pdo.name, WARN, f"{pdo.frames} without any SYNC")
-        return CheckResult(pdo.name, SKIP, "no SYNC on the bus")
+            return CheckResult(name, WARN, f"{pdo.frames} without any SYNC")
+        return CheckResult(name, SKIP, "no SYNC on the bus")
+    hint = "check that the node is on the bus and operational"
     if pdo.age_ns:
-        return _acyclic(pdo, traffic)
+        return _acyclic(pdo, traffic) if pdo.delays.count else CheckResult(name, FAIL, "none", hint)
     if not pdo.delays.count:
         length = f", {pdo.wrong_length} of a wrong length" if pdo.wrong_length else ""
-        hint = "check that the node is on the bus and operational, and that its TPDO has transmission type 1 (SYNC)"
-        return CheckResult(pdo.name, FAIL, f"none{length}", hint)
-    text = f"{pdo.counted / traffic.cycles:.4g} per SYNC, expected 1; after SYNC: {_quantiles(pdo.delays)}"
+        hint += ", and that its TPDO has transmission type 1 (SYNC)"
+        return CheckResult(name, FAIL, f"none{length}", hint)
     faults = {
         "missing": pdo.missing,
         "late": pdo.late,
@@ -195,26 +196,39 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
         "wrong length": pdo.wrong_length,
     }
     found = ", ".join(f"{kind} {count}" for kind, count in faults.items() if count)
-    text += f"; {found} of {traffic.cycles} cycles" if found else ""
-    bad = (pdo.missing + pdo.late + pdo.twice) / traffic.cycles
-    if not pdo.missing + pdo.twice + pdo.wrong_length and bad <= 1 - SUCCESS_GOOD:
-        return CheckResult(pdo.name, GOOD, text)  # a few late frames are within the success rate
+    bad = (pdo.missing + pdo.late + pdo.twice) / cycles
+    only_late = not pdo.missing + pdo.twice + pdo.wrong_length
     level = FAIL if bad > 1 - SUCCESS_FAIL or pdo.wrong_length else WARN
-    return CheckResult(pdo.name, level, text, _hint(pdo, config))
+    mapping = f"its mapping differs from the configuration ({pdo.length} bytes): jtqd configures it when it boots the node"
+    deadline = (
+        f"after the deadline of {config.input_deadline_ns / 1000:.0f} us: less load (`jtq bus-load`), or a higher priority "
+        "(lower COB-ID)"
+    )
+    return judge(
+        name,
+        f"{pdo.counted / cycles:.4g} per SYNC, expected 1; after SYNC: {pdo.delays}"
+        + (f"; {found} of {cycles} cycles" if found else ""),
+        (only_late and bad <= 1 - SUCCESS_GOOD, GOOD, ""),  # a few late frames are within the success rate
+        (pdo.wrong_length, level, mapping),
+        (
+            pdo.twice,
+            level,
+            "two nodes with one node-ID, or an event-driven TPDO: transmission type must be 1",
+        ),
+        (pdo.late > pdo.missing, level, deadline),
+        (True, level, "frames are lost: check error frames, termination and the interface's txqueuelen"),
+    )
 
 
 def _acyclic(pdo: PdoCount, traffic: Traffic) -> CheckResult:
     """Judge a PDO of transmission type 0, 254 or 255 by its age at SYNC: it belongs to no cycle."""
-    if not pdo.delays.count:
-        return CheckResult(pdo.name, FAIL, "none", "check that the node is on the bus and operational")
-    per_s = pdo.counted / max(traffic.cycles, 1) * traffic.sync_rate
-    limit = f"{pdo.age_ns / 1e6:g} ms"
-    text = f"{per_s:.4g} per s, sent by the drive itself; age at SYNC: {_quantiles(pdo.delays)}"
+    cycles, limit = traffic.cycles, f"{pdo.age_ns / 1e6:g} ms"
+    text = f"{pdo.counted / cycles * traffic.sync_rate:.4g} per s, sent by the drive itself; age at SYNC: {pdo.delays}"
     if not pdo.missing and not pdo.wrong_length:
         return CheckResult(pdo.name, GOOD, f"{text}, at most {limit}")
-    length = f"; wrong length {pdo.wrong_length}" * bool(pdo.wrong_length)
-    text += f", older than {limit} in {pdo.missing} of {traffic.cycles} cycles{length}"
-    level = FAIL if pdo.missing / traffic.cycles > 1 - SUCCESS_FAIL or pdo.wrong_length else WARN
+    text += f", older than {limit} in {pdo.missing} of {cycles} cycles"
+    text += f"; wrong length {pdo.wrong_length}" if pdo.wrong_length else ""
+    level = FAIL if pdo.missing / cycles > 1 - SUCCESS_FAIL or pdo.wrong_length else WARN
     hint = (
         "joint_N.max_age_ms is below the longest time between two frames: its event timer (180xh:5) must be shorter, or "
         "max_age_ms longer"
@@ -222,21 +236,8 @@ def _acyclic(pdo: PdoCount, traffic: Traffic) -> CheckResult:
     return CheckResult(pdo.name, level, text, hint)
 
 
-def _hint(pdo: PdoCount, config: Config) -> str:
-    if pdo.wrong_length:
-        return f"its mapping differs from the configuration ({pdo.length} bytes): jtqd configures it when it boots the node"
-    if pdo.twice:
-        return "two nodes with one node-ID, or an event-driven TPDO: transmission type must be 1"
-    if pdo.late > pdo.missing:
-        return (
-            f"after the deadline of {config.input_deadline_ns / 1000:.0f} us: less load (`jtq bus-load`), or a "
-            "higher priority (lower COB-ID)"
-        )
-    return "frames are lost: check error frames, termination and the interface's txqueuelen"
-
-
 def _estimate(traffic: Traffic, config: Config, cob_id: int) -> CheckResult:
-    pdo = traffic.estimates[cob_id]
+    pdo, cycles = traffic.estimates[cob_id], max(1, traffic.cycles)
     if not pdo.frames:
         return CheckResult(pdo.name, SKIP, "no jtqd on the bus")
     shares, shown = [], []
@@ -245,9 +246,9 @@ def _estimate(traffic: Traffic, config: Config, cob_id: int) -> CheckResult:
         others = [(n, code) for code, n in count.items() if code not in PUBLISHED]
         most = f" ({NAMES.get(max(others)[1], '?')} {max(others)[0]})" if others else ""
         shown.append(f"joint {number} {percent(shares[-1])}{most}")
-    text = f"{pdo.counted / max(1, traffic.cycles):.4g} per SYNC; with a torque: {', '.join(shown)}"
+    text = f"{pdo.counted / cycles:.4g} per SYNC; with a torque: {', '.join(shown)}"
     late = pdo.delays.quantile_us(0.99) > config.period_ns / 1000
-    if pdo.missing > (1 - SUCCESS_GOOD) * max(1, traffic.cycles) or late:
+    if pdo.missing > (1 - SUCCESS_GOOD) * cycles or late:
         missing = f"{text}; missing in {pdo.missing} of {traffic.cycles} cycles"
         return CheckResult(pdo.name, WARN, missing, "see `jtq status`")
     hint = "`jtq status` gives the reason for the missing torque"
@@ -356,7 +357,7 @@ def check_own_timing(
     yield _timing("timer wake-up", timing.lateness, timing.missed, period_ns, how)
     if not driven:
         return
-    text = f"from send to echo: {_quantiles(timing.echo)}"
+    text = f"from send to echo: {timing.echo}"
     lost = timing.lateness.count - timing.echo.count
     if timing.unsent:
         text += f"; {timing.unsent} not sent"
@@ -408,7 +409,7 @@ def _timing(item: str, times: TimeHistogram, missed: int, period_ns: int, how: s
     bad = not times.count or missed > MISSED_FAIL * slots or p99_us > LATE_FAIL * period_us
     return judge(
         item,
-        f"{how}: late {_quantiles(times)}; {missed} of {slots} slots missed",
+        f"{how}: late {times}; {missed} of {slots} slots missed",
         (bad, FAIL, _TIMING_HINT),
         (missed or p99_us > LATE_WARN * period_us, WARN, _TIMING_HINT),
     )

@@ -35,13 +35,8 @@ def parser() -> argparse.ArgumentParser:
         _EXAMPLES,
     )
     result.add_argument("shell", choices=SHELLS, help="shell that the script is for")
-    result.add_argument(
-        "program",
-        nargs="?",
-        choices=("jtq", "jtqd"),
-        default="jtq",
-        help="program to complete (default: jtq)",
-    )
+    program = "program to complete (default: jtq)"
+    result.add_argument("program", nargs="?", choices=("jtq", "jtqd"), default="jtq", help=program)
     return result
 
 

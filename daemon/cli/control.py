@@ -42,22 +42,21 @@ def parser() -> argparse.ArgumentParser:
 def main(argv: list[str]) -> int:
     """Send the order and print the reply; returns the exit status."""
     arguments = parser().parse_args(argv)
+    bus = ""
     try:
         daemon = choose_daemon(arguments.bus)
+        bus = daemon.about.bus
         reply = ask(daemon.directory / FILE, {"verb": arguments.verb}, _TIMEOUT_S)
     except (FileNotFoundError, ConnectionRefusedError):
         reply = {"ok": False, "error": "jtqd accepts no orders now: it is starting or ending"}
-        daemon = None
     except TimeoutError:
         reply = {"ok": False, "error": "jtqd did not answer in time"}
-        daemon = None
     except (NoDaemonError, OSError, ValueError) as error:
         reply = {"ok": False, "error": getattr(error, "strerror", None) or str(error)}
-        daemon = None
     if arguments.json:
         print(json.dumps(reply))
-    elif reply["ok"] and daemon is not None:
-        print(_DONE[arguments.verb].format(**{"bus": daemon.about.bus} | reply))
+    elif reply["ok"]:
+        print(_DONE[arguments.verb].format(**{"bus": bus} | reply))
     if not reply["ok"]:
         print(f"jtq control: {arguments.verb}: {reply['error']}", file=sys.stderr)
     return 0 if reply["ok"] else 1

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import gzip
-import hashlib
 import json
 import os
 import platform
@@ -17,11 +16,13 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Any
+
+from packaging.requirements import Requirement
 
 from jtqd import __version__
 from jtqd.daemon.bus.boot import bus_load_of
@@ -38,6 +39,14 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.onnx_graph import NetworkError
 from jtqd.estimator.text import percent, size
 
+SCHEMA = "jtq.doctor/1"
+_EXAMPLES = """examples:
+  jtq doctor                                          all CAN interfaces of this machine, the shipped configuration
+  jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
+  sudo -u jtqd jtq doctor --bus can0                  as jtqd's user: the rights of the caller are checked
+  jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
+
+exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
 _CAP_IPC_LOCK, _CAP_SYS_NICE = 14, 23
 _LOCKED_BYTES = 256 << 20
 """Memory of the loop at its start, with a margin."""
@@ -51,17 +60,67 @@ _QUEUE = 100
 _BUS_STATE_COUNTS = ("error_warning", "error_passive", "bus_off")
 _DROP_COUNTS = ("rx_dropped", "tx_dropped", "rx_over_errors", "tx_errors", "rx_errors")
 _UNITS = (
-    "/etc/systemd/system",
-    "/run/systemd/system",
-    "/usr/local/lib/systemd/system",
-    "/usr/lib/systemd/system",
-    "/lib/systemd/system",
+    *("/etc/systemd/system", "/run/systemd/system", "/usr/local/lib/systemd/system"),
+    *("/usr/lib/systemd/system", "/lib/systemd/system"),
 )
 _UNIT = "jtqd@.service"
+_USUAL_LOGS = Path("/var/log/jtqd")
 _LOG_FREE = 10 << 30
 """A working day of recording."""
 _SHM_FREE = 64 << 20
 _BYTES_AN_HOUR = 1_100_000_000
+
+
+def parser() -> argparse.ArgumentParser:
+    """Return the arguments of `jtq doctor`."""
+    result = command_parser(
+        "jtq doctor",
+        "Examine whether this machine is suitable for jtqd: GOOD, WARN or FAIL for each item, with a remedy. "
+        "Nothing is changed.",
+        _EXAMPLES,
+    )
+    add = result.add_argument
+    add("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
+    add("--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)")
+    add("--record", type=Path, metavar="DIR", help="directory of the logs (default: that of jtqd)")
+    add("--json", action="store_true", help="print as JSON")
+    return result
+
+
+def main(argv: list[str]) -> int:
+    """Examine and report; return the exit status."""
+    arguments = parser().parse_args(argv)
+    results = list(_examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
+    return report(results, SCHEMA if arguments.json else None, bus=arguments.bus)
+
+
+def _examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
+    """Run every check. An unreadable configuration is one failure; the shipped one is used instead."""
+    broken = ""
+    try:
+        config = load_config(path)
+    except ConfigError as error:
+        broken, config = str(error), load_config(None)
+    needs_can = bus is None or not (bus == "sim" or bus.startswith("unix:"))
+    yield from check_kernel(config.realtime, can=needs_can)
+    yield from check_can(bus, config)
+    if broken:
+        yield CheckResult("configuration", FAIL, broken, "jtqd will not start with it")
+    else:
+        yield from _files(config)
+    yield from check_directories(log, places())
+    yield _packages()
+    yield _unit()
+    yield from _remains(log, find_daemons())
+
+
+def _log_directory() -> Path | None:
+    """Return the directory that jtqd would write to, as far as it does not depend on the working directory."""
+    named = os.environ.get("LOGS_DIRECTORY", "").split(":")[0]
+    return Path(named) if named else _USUAL_LOGS if _USUAL_LOGS.exists() else None
+
+
+# ---- kernel and rights ----
 
 
 def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
@@ -70,10 +129,9 @@ def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
     yield _timers()
     yield _clocksource()
     yield _can_sockets(required=can)
-    yield _priority(wanted)
-    yield _throttling(wanted)
-    yield _memory(wanted)
-    yield _cpu(wanted)
+    checks: tuple[Callable[[Realtime], CheckResult], ...] = (_priority, _throttling, _memory, _cpu)
+    for check in checks:
+        yield check(wanted)
     yield _governor()
 
 
@@ -95,17 +153,12 @@ def _kernel() -> CheckResult:
     return CheckResult("kernel", WARN, f"{text}, {kind}", hint)
 
 
-def _build_options() -> dict[str, str]:
-    """Return the build options of the running kernel, e.g. {"CONFIG_HZ": "250"}; empty if not published."""
-    text = _read(f"/boot/config-{platform.release()}")
-    with suppress(OSError, EOFError), gzip.open("/proc/config.gz", "rt") as file:
-        text = file.read()
-    return dict(re.findall(r"^(CONFIG_\w+)=(.*)$", text, re.MULTILINE))
-
-
 def _timers() -> CheckResult:
-    hz = _build_options().get("CONFIG_HZ")
-    shown = f"HZ {hz}" if hz else "HZ unknown (the kernel does not publish its configuration)"
+    options = _read(f"/boot/config-{platform.release()}")
+    with suppress(OSError, EOFError), gzip.open("/proc/config.gz", "rt") as file:
+        options = file.read()
+    hz = re.search(r"^CONFIG_HZ=(.*)$", options, re.MULTILINE)
+    shown = f"HZ {hz[1]}" if hz else "HZ unknown (the kernel does not publish its configuration)"
     resolution = time.clock_getres(time.CLOCK_MONOTONIC)
     if resolution <= 1e-6:
         return CheckResult("timers", GOOD, f"high resolution ({resolution * 1e9:.0f} ns), {shown}")
@@ -204,34 +257,32 @@ def _cpu(wanted: Realtime) -> CheckResult:
         text = f"any of {len(os.sched_getaffinity(0))}" + (f"; isolated: {isolated}" if isolated else "")
         hint = f"realtime: {{cpu: {min(_cpus(isolated))}}} would use the isolated one" if isolated else ""
         return judge("CPU", text, (hint, WARN, hint))
+    text = f"{wanted.cpu} by the configuration"
     if wanted.cpu not in _cpus(_read(_SYS / "cpu/online")):
-        return CheckResult("CPU", FAIL, f"{wanted.cpu} by the configuration: does not exist", "realtime.cpu")
+        return CheckResult("CPU", FAIL, f"{text}: does not exist", "realtime.cpu")
     if wanted.cpu in _cpus(isolated):
         return CheckResult("CPU", GOOD, f"{wanted.cpu}, isolated")
-    text = f"{wanted.cpu} by the configuration, shared with other processes (isolated: {isolated or 'none'})"
+    text += f", shared with other processes (isolated: {isolated or 'none'})"
     return CheckResult("CPU", WARN, text, f"isolcpus={wanted.cpu} on the kernel command line reserves it")
 
 
 def _governor() -> CheckResult:
     governors = {_read(path) for path in _SYS.glob("cpu/cpu[0-9]*/cpufreq/scaling_governor")} - {""}
-    text = (
-        f"governor {', '.join(sorted(governors))}" if governors else "the kernel does not scale the frequency"
-    )
+    text = f"governor {', '.join(sorted(governors))}"
     hint = "cpupower frequency-set -g performance: a slow clock makes a cycle long"
-    return judge("cpufreq", text, (governors - {"performance"}, WARN, hint))
+    return judge(
+        "cpufreq",
+        text if governors else "the kernel does not scale the frequency",
+        (governors - {"performance"}, WARN, hint),
+    )
 
 
 # ---- CAN interfaces ----
 
 
-def interfaces() -> list[str]:
-    """Return the names of the CAN interfaces of this machine."""
-    return sorted(path.parent.name for path in _NET.glob("*/type") if _read(path) == _ARPHRD_CAN)
-
-
 def check_can(bus: str | None, config: Config) -> Iterator[CheckResult]:
     """Check the bus; None: all CAN interfaces."""
-    here = interfaces()
+    here = sorted(path.parent.name for path in _NET.glob("*/type") if _read(path) == _ARPHRD_CAN)
     if bus is None:
         if not here:
             hint = "connect one; `ip link add dev vcan0 type vcan` for a test"
@@ -272,9 +323,9 @@ def link_of(name: str) -> dict[str, Any]:
 def _interface(name: str, config: Config) -> Iterator[CheckResult]:
     link = link_of(name)
     info = link.get("linkinfo", {})
-    kind = info.get("info_kind", "CAN")
+    kind, bitrate = info.get("info_kind", "CAN"), config.bitrate
     up = int(_read(_NET / name / "flags") or "0", 16) & 1
-    down = f"ip link set {name} up type can bitrate {config.bitrate} restart-ms 100"
+    down = f"ip link set {name} up type can bitrate {bitrate} restart-ms 100"
     yield judge(name, f"up, {kind}" if up else "down", (not up, FAIL, down))
     queue = int(_read(_NET / name / "tx_queue_len") or "0")
     short = f"ip link set {name} txqueuelen 1000: a short queue loses frames when the bus is busy"
@@ -285,8 +336,7 @@ def _interface(name: str, config: Config) -> Iterator[CheckResult]:
     elif kind == "vcan":
         yield CheckResult(f"{name} wire", SKIP, "virtual: no bit rate, no arbitration, no errors")
     else:
-        yield _wire(name, info.get("info_data", {}), config)
-        yield _state(name, info)
+        yield from _controller(name, info.get("info_data", {}), info.get("info_xstats", {}), bitrate)
     counts = {each: int(_read(_NET / name / "statistics" / each) or "0") for each in _DROP_COUNTS}
     if any(counts.values()):
         text = ", ".join(f"{each} {count}" for each, count in counts.items() if count)
@@ -294,27 +344,24 @@ def _interface(name: str, config: Config) -> Iterator[CheckResult]:
         yield CheckResult(f"{name} drops", WARN, f"{text} since the interface exists", hint)
 
 
-def _wire(name: str, data: dict[str, Any], config: Config) -> CheckResult:
+def _controller(
+    name: str, data: dict[str, Any], counts: dict[str, int], wanted: int
+) -> Iterator[CheckResult]:
+    """Check bit rate, restart and error state; data, counts: of `ip`; wanted: bit rate of the configuration."""
     bitrate, restart = data.get("bittiming", {}).get("bitrate", 0), data.get("restart_ms", 0)
-    wrong = f"the configuration has {config.bitrate}: ip link set {name} type can bitrate {config.bitrate}"
+    wrong = f"the configuration has {wanted}: ip link set {name} type can bitrate {wanted}"
     stays_off = f"ip link set {name} type can restart-ms 100: otherwise it stays off after a bus-off"
-    return judge(
-        f"{name} wire",
-        f"{bitrate} bit/s, restart-ms {restart}",
-        (bitrate != config.bitrate, FAIL, wrong),
-        (not restart, WARN, stays_off),
-    )
-
-
-def _state(name: str, info: dict[str, Any]) -> CheckResult:
-    data, counts = info.get("info_data", {}), info.get("info_xstats", {})
+    text = f"{bitrate} bit/s, restart-ms {restart}"
+    yield judge(f"{name} wire", text, (bitrate != wanted, FAIL, wrong), (not restart, WARN, stays_off))
     state, errors = str(data.get("state", "unknown")), data.get("berr_counter", {})
-    seen = [f"{each.replace('_', ' ')} {counts[each]}" for each in _BUS_STATE_COUNTS if counts.get(each)]
+    seen = ", ".join(
+        f"{each.replace('_', ' ')} {counts[each]}" for each in _BUS_STATE_COUNTS if counts.get(each)
+    )
     text = f"{state}, error counters tx {errors.get('tx', '?')} rx {errors.get('rx', '?')}"
     dead = "check wiring, termination, bit rate, and that another node is powered"
-    return judge(
+    yield judge(
         f"{name} state",
-        "; ".join((text, *([", ".join(seen)] if seen else []))),
+        f"{text}; {seen}" if seen else text,
         (state in ("BUS-OFF", "ERROR-PASSIVE"), FAIL, dead),
         (state != "ERROR-ACTIVE" or seen, WARN, "errors occurred: check wiring, termination, sample point"),
     )
@@ -323,7 +370,7 @@ def _state(name: str, info: dict[str, Any]) -> CheckResult:
 # ---- files, directories, packages ----
 
 
-def check_files(config: Config) -> Iterator[CheckResult]:
+def _files(config: Config) -> Iterator[CheckResult]:
     """Check the files that a configuration names, by their use; the configuration itself is read already."""
     method, load = config.estimator.method, bus_load_of(config)
     yield CheckResult("configuration", GOOD, f"{config.path}, sha256 {config.sha256[:12]}, method {method}")
@@ -339,10 +386,9 @@ def check_files(config: Config) -> Iterator[CheckResult]:
         except (ConfigError, NetworkError) as error:
             yield CheckResult(item, FAIL, str(error), "jtqd will not start with it")
             continue
-        digest = hashlib.sha256(joint.joint_path.read_bytes()).hexdigest()
         network = f"{joint.network.path.name} {joint.network.sha256[:12]}" if joint.network else "no network"
-        text = f"{joint.joint.name}: {joint.joint_path.name} {digest[:12]}, {network}: loads and runs"
-        yield CheckResult(item, GOOD, text)
+        file = f"{joint.joint_path.name} {joint.joint_sha256[:12]}"
+        yield CheckResult(item, GOOD, f"{joint.joint.name}: {file}, {network}: loads and runs")
 
 
 def check_directories(log: Path | None, roots: list[Path]) -> Iterator[CheckResult]:
@@ -367,50 +413,29 @@ def _directory(item: str, path: Path, wanted: int, use: str) -> CheckResult:
     return judge(item, text, (free < wanted, WARN, hint))
 
 
-def check_packages() -> Iterator[CheckResult]:
+def _packages() -> CheckResult:
     """Compare installed versions with the requirements of jtqd's package."""
     try:
-        wanted = [each for each in requires("jtqd") or () if "extra ==" not in each]
+        wanted = [Requirement(each) for each in requires("jtqd") or ()]
     except PackageNotFoundError:
         text = "jtqd is not installed as a package: its requirements are unknown"
-        yield CheckResult("packages", WARN, text, "pip install .")
-        return
-    versions, wrong = [], []
-    for line in wanted:
-        name, limits = requirement(line)
-        version = installed(name)
-        versions.append(f"{name} {version}")
-        if version is None:
-            wrong.append(f"{name} is missing")
-        elif not all(fits(version, *limit) for limit in limits):
-            wrong.append(f"{name} {version}, expected {line.removeprefix(name)}")
-    text = "; ".join(wrong) or f"jtqd {__version__}, {', '.join(versions)}"
-    yield judge("packages", text, (wrong, FAIL, "pip install --upgrade jtqd, in its own environment"))
-
-
-def requirement(line: str) -> tuple[str, list[tuple[str, str]]]:
-    """Split a requirement into name and limits: "mcap>=1.3,<2" is ("mcap", [(">=", "1.3"), ("<", "2")])."""
-    name = re.split(r"[^A-Za-z0-9_.-]", line, maxsplit=1)[0]
-    return name, re.findall(r"(>=|<=|==|<|>)\s*([0-9][0-9A-Za-z.]*)", line.partition(";")[0])
-
-
-def fits(version: str, operator: str, limit: str) -> bool:
-    """Compare the numbers of two versions; the first part that is not a number ends them."""
-    have, want = _numbers(version), _numbers(limit)
-    length = max(len(have), len(want))
-    have, want = have + (0,) * (length - len(have)), want + (0,) * (length - len(want))
-    return {">=": have >= want, "<=": have <= want, "==": have == want, "<": have < want, ">": have > want}[
-        operator
+        return CheckResult("packages", WARN, text, "pip install .")
+    found = {
+        each.name: installed(each.name) for each in wanted if each.marker is None or each.marker.evaluate()
+    }
+    wrong = [
+        f"{each.name} is missing"
+        if found[each.name] is None
+        else f"{each.name} {found[each.name]}, expected {each.specifier}"
+        for each in wanted
+        if each.name in found and not each.specifier.contains(found[each.name] or "0", prereleases=True)
     ]
+    versions = ", ".join(f"{name} {version}" for name, version in found.items())
+    hint = "pip install --upgrade jtqd, in its own environment"
+    return judge("packages", "; ".join(wrong) or f"jtqd {__version__}, {versions}", (wrong, FAIL, hint))
 
 
-def _numbers(version: str) -> tuple[int, ...]:
-    match = re.match(r"\d+(?:\.\d+)*", version)
-    return tuple(map(int, match[0].split("."))) if match else ()
-
-
-def check_unit() -> CheckResult:
-    """Check the systemd unit."""
+def _unit() -> CheckResult:
     if not Path("/run/systemd/system").exists():
         return CheckResult("systemd unit", SKIP, "systemd does not run here")
     path = next((path for each in _UNITS if (path := Path(each, _UNIT)).exists()), None)
@@ -418,7 +443,7 @@ def check_unit() -> CheckResult:
     return judge("systemd unit", str(path or "not installed"), (path is None, WARN, hint))
 
 
-def check_remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
+def _remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
     """Check for unfinished logs and runtime directories of killed daemons."""
     running = [each.about for each in search.daemons]
     text = ", ".join(f"{each.instance} (process {each.pid})" for each in running) or "none"
@@ -430,7 +455,7 @@ def check_remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResul
         str(path)
         for directory in sorted(directories)
         for path in sorted(directory.glob("*.mcap.active"))
-        if not (growing and path.name.startswith(growing))
+        if not path.name.startswith(growing or "\n")
     ]
     text = ", ".join(files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")
     yield judge("unfinished logs", text or "none", (files, WARN, "of a crash: jtq recover FILE"))
@@ -438,66 +463,3 @@ def check_remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResul
         text = ", ".join(map(str, search.abandoned))
         hint = "runtime directories; removed by the next start, or remove them manually"
         yield CheckResult("killed daemons", WARN, text, hint)
-
-
-SCHEMA = "jtq.doctor/1"
-_EXAMPLES = """examples:
-  jtq doctor                                          all CAN interfaces of this machine, the shipped configuration
-  jtq doctor --bus can0 --config /etc/jtqd/can0.yaml
-  sudo -u jtqd jtq doctor --bus can0                  as jtqd's user: the rights of the caller are checked
-  jtq doctor --json | jq '.items[] | select(.level == "FAIL")'
-
-exit status: 0 all good, 3 warnings, 1 failures, 2 usage"""
-_USUAL_LOGS = Path("/var/log/jtqd")
-
-
-def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq doctor`."""
-    result = command_parser(
-        "jtq doctor",
-        "Examine whether this machine is suitable for jtqd: GOOD, WARN or FAIL for each item, with a remedy. "
-        "Nothing is changed.",
-        _EXAMPLES,
-    )
-    result.add_argument("--bus", help="interface, unix:PATH or sim (default: every CAN interface)")
-    result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
-    )
-    result.add_argument(
-        "--record", type=Path, metavar="DIR", help="directory of the logs (default: that of jtqd)"
-    )
-    result.add_argument("--json", action="store_true", help="print as JSON")
-    return result
-
-
-def main(argv: list[str]) -> int:
-    """Examine and report; return the exit status."""
-    arguments = parser().parse_args(argv)
-    results = list(_examine(arguments.bus, arguments.config, arguments.record or _log_directory()))
-    return report(results, SCHEMA if arguments.json else None, bus=arguments.bus)
-
-
-def _examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[CheckResult]:
-    """Run every check. An unreadable configuration is one failure; the shipped one is used instead."""
-    broken = ""
-    try:
-        config = load_config(path)
-    except ConfigError as error:
-        broken, config = str(error), load_config(None)
-    needs_can = bus is None or not (bus == "sim" or bus.startswith("unix:"))
-    yield from check_kernel(config.realtime, can=needs_can)
-    yield from check_can(bus, config)
-    if broken:
-        yield CheckResult("configuration", FAIL, broken, "jtqd will not start with it")
-    else:
-        yield from check_files(config)
-    yield from check_directories(log, places())
-    yield from check_packages()
-    yield check_unit()
-    yield from check_remains(log, find_daemons())
-
-
-def _log_directory() -> Path | None:
-    """Return the directory that jtqd would write to, as far as it does not depend on the working directory."""
-    named = os.environ.get("LOGS_DIRECTORY", "").split(":")[0]
-    return Path(named) if named else _USUAL_LOGS if _USUAL_LOGS.exists() else None

@@ -36,67 +36,67 @@ from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID
 
 _BIN_NS = 2_000
-_BINS = 5_000
-
-
-class TimeHistogram:
-    """Histogram of times in ns for hours of them: bins of 2 us up to 10 ms, exact maximum; below zero counts as zero."""
-
-    __slots__ = ("_bins", "count", "largest_ns")
-
-    def __init__(self) -> None:
-        self._bins = [0] * _BINS
-        self.count = 0
-        self.largest_ns = 0
-
-    def add(self, ns: int, count: int = 1) -> None:
-        """Count a value so many times."""
-        if count:
-            self.count += count
-            self.largest_ns = max(self.largest_ns, ns)
-            self._bins[min(max(ns, 0) // _BIN_NS, _BINS - 1)] += count
-
-    def quantile_us(self, share: float) -> float:
-        """Return the upper edge of this quantile's bin [us], at most the maximum; NaN without data."""
-        target, seen = share * self.count, 0
-        for n, count in enumerate(self._bins):
-            seen += count
-            if count and seen >= target:
-                edge_ns = self.largest_ns if n == _BINS - 1 else (n + 1) * _BIN_NS
-                return min(edge_ns, max(self.largest_ns, 0)) / 1000.0
-        return float("nan")
-
-
 _SERVICES = (0x000, 0x100, 0x7E4, 0x7E5)
 """NMT, TIME, LSS: belong to no node."""
 _LATE = 1000
 """Added to the frames of a cycle for each that is late: more than a cycle has room for."""
 
 
+class TimeHistogram:
+    """Histogram of times in ns: bins of 2 us, exact maximum; below zero counts as zero."""
+
+    def __init__(self) -> None:
+        self._bins: Counter[int] = Counter()
+        self.count = self.largest_ns = 0
+
+    def add(self, ns: int, count: int = 1) -> None:
+        """Count a value so many times."""
+        if count:
+            self.count += count
+            self.largest_ns = max(self.largest_ns, ns)
+            self._bins[max(ns, 0) // _BIN_NS] += count
+
+    def quantile_us(self, share: float) -> float:
+        """Return the upper edge of this quantile's bin [us], at most the maximum; NaN without data."""
+        seen = 0
+        for n in sorted(self._bins):
+            seen += self._bins[n]
+            if seen >= share * self.count:
+                return min((n + 1) * _BIN_NS, self.largest_ns) / 1000.0
+        return float("nan")
+
+    def __str__(self) -> str:
+        """Return median, 99th percentile and maximum."""
+        p50, p99, largest = (self.quantile_us(share) for share in (0.5, 0.99, 1.0))
+        return f"p50 {p50:.0f}, p99 {p99:.0f}, max {largest:.0f} us"
+
+
 @dataclass
 class PdoCount:
-    """One PDO: sent at each SYNC, or by its node itself."""
+    """One PDO: sent at each SYNC, or by its node itself.
+
+    Attributes:
+        is_input: jtqd waits for it in each cycle.
+        frames, counted: received, in whole cycles; in_cycle: in this cycle.
+        missing, late: cycles without it, cycles in which it arrived after the deadline.
+        delays: arrival after SYNC; of an acyclic PDO its age at SYNC.
+        age_ns: longest age at which a frame of an acyclic PDO counts; 0: it is sent at each SYNC.
+        last_ns: stamp of its last frame, where it is acyclic.
+    """
 
     name: str
     length: int
     is_input: bool = True
-    """jtqd waits for it in each cycle."""
+    age_ns: int = 0
     frames: int = 0
     in_cycle: int = 0
     counted: int = 0
-    """Frames in whole cycles."""
     missing: int = 0
-    """Cycles without it."""
     late: int = 0
-    """Cycles in which it arrived after the deadline."""
     twice: int = 0
     wrong_length: int = 0
     delays: TimeHistogram = field(default_factory=TimeHistogram)
-    """Arrival after SYNC; of an acyclic PDO its age at SYNC."""
-    age_ns: int = 0
-    """Longest age at which a frame of an acyclic PDO counts; 0: it is sent at each SYNC."""
     last_ns: int = 0
-    """Stamp of its last frame."""
 
 
 @dataclass
@@ -116,14 +116,11 @@ class NodeCount:
 class Traffic:
     """Counts of one bus.
 
-    Args:
-        config: configuration of the bus.
-
     Attributes:
-        inputs: the input PDOs by COB-ID.
-        estimates: jtqd's own PDOs by COB-ID, one for two joints.
+        inputs, estimates: the input PDOs and jtqd's own PDOs (one for two joints), by COB-ID.
         statuses: of each joint, how often each status was published.
         nodes: by node-ID, jtqd's own included.
+        sync_jitter: distance of two SYNCs from the period, absolute.
         foreign: frames by identifier that no configured node sends.
         errors: error messages of the driver, by class bit.
     """
@@ -138,22 +135,18 @@ class Traffic:
             pdo.cob_id: PdoCount(f"{pdo.cob_id:03X}h jtqd estimate", pdo.length, is_input=False)
             for pdo in estimate_tpdos(len(config.joints), config.node_id)
         }
-        names = {joint.node_id: f"drive {joint.node_id}" for joint in config.joints}
+        self._pdos = self.inputs | self.estimates
+        self.nodes = {joint.node_id: NodeCount(f"drive {joint.node_id}") for joint in config.joints}
         if config.sensor is not None:
-            names[config.sensor.node_id] = f"sensor {config.sensor.node_id}"
-        self.nodes = {node: NodeCount(name) for node, name in names.items()}
+            self.nodes[config.sensor.node_id] = NodeCount(f"sensor {config.sensor.node_id}")
         self.nodes[config.node_id] = NodeCount("jtqd")
         known = {row.cob_id for row in bus_load_of(config).rows}
         services = {base + node for node in self.nodes for base in (EMCY_BASE, RESPONSE_ID, REQUEST_ID)}
         self._known = known | services | {*_SERVICES, SYNC_COB_ID}
-        self.frames = self.bits = 0
-        self.first_ns = self.last_ns = 0
-        self.cycles = self.complete = 0
-        self.syncs = self.counter_jumps = 0
-        self.sync_jitter = TimeHistogram()
-        """Distance of two SYNCs from the period, absolute."""
-        self._first_sync_ns = self._sync_ns = 0
+        self.frames = self.bits = self.cycles = self.complete = self.syncs = self.counter_jumps = 0
+        self.first_ns = self.last_ns = self._first_sync_ns = self._sync_ns = 0
         self._counter: int | None = None
+        self.sync_jitter = TimeHistogram()
         self.foreign: Counter[int] = Counter()
         self.errors: Counter[int] = Counter()
         self.statuses: tuple[Counter[int], ...] = tuple(Counter() for _ in config.joints)
@@ -190,17 +183,14 @@ class Traffic:
         self.bits += stuffed_bits(can_id, data)
         self.first_ns = self.first_ns or stamp_ns
         self.last_ns = stamp_ns
-        pdo = self.inputs.get(can_id)
-        if pdo is not None:
-            self._input(pdo, data, stamp_ns)
-        elif can_id == SYNC_COB_ID:
-            self._sync(data, stamp_ns)
-        elif can_id in self.estimates:
-            self._input(self.estimates[can_id], data, stamp_ns)
-            if len(data) == 8:
+        if can_id in self._pdos:
+            self._pdo(self._pdos[can_id], data, stamp_ns)
+            if can_id in self.estimates and len(data) == 8:
                 codes = estimate_pdo.decode(data).status
                 for count, status in zip(self.statuses_in(can_id).values(), codes, strict=False):
                     count[status] += 1
+        elif can_id == SYNC_COB_ID:
+            self._sync(data, stamp_ns)
         elif can_id not in self._known:
             self.foreign[can_id] += 1
         else:
@@ -212,17 +202,15 @@ class Traffic:
             if node.last_ns:
                 node.longest_gap_ns = max(node.longest_gap_ns, now_ns - node.last_ns)
 
-    def _input(self, pdo: PdoCount, data: bytes, stamp_ns: int) -> None:
+    def _pdo(self, pdo: PdoCount, data: bytes, stamp_ns: int) -> None:
         pdo.frames += 1
         if len(data) != pdo.length:
             pdo.wrong_length += 1
             return
         if pdo.age_ns:
             pdo.last_ns = stamp_ns
-        if not self._sync_ns:
-            return
-        pdo.in_cycle += 1
-        if pdo.age_ns:
+        pdo.in_cycle += self._sync_ns > 0
+        if pdo.age_ns or not self._sync_ns:
             return
         delay_ns = stamp_ns - self._sync_ns
         pdo.delays.add(delay_ns)
@@ -235,11 +223,10 @@ class Traffic:
         if self._sync_ns:
             self._close()
             self.sync_jitter.add(abs(stamp_ns - self._sync_ns - self._period_ns))
-        for pdo in (*self.inputs.values(), *self.estimates.values()):
+        for pdo in self._pdos.values():
             pdo.in_cycle = 0
         counter = data[0] if data else None
-        if None not in (counter, self._counter):
-            assert self._counter is not None
+        if counter is not None and self._counter is not None:
             self.counter_jumps += counter != self._counter % self._overflow + 1
         self._counter = counter
         self._first_sync_ns = self._first_sync_ns or stamp_ns
@@ -248,16 +235,13 @@ class Traffic:
     def _close(self) -> None:
         self.cycles += 1
         complete = True
-        for pdo in self.inputs.values():
+        for pdo in self._pdos.values():
             if pdo.age_ns:
                 complete &= self._fresh(pdo)
             elif pdo.in_cycle != 1:
-                complete = False
+                complete &= not pdo.is_input
                 pdo.missing += pdo.in_cycle == 0
                 pdo.twice += pdo.in_cycle % _LATE > 1
-        for pdo in self.estimates.values():
-            pdo.missing += pdo.in_cycle == 0
-        for pdo in (*self.inputs.values(), *self.estimates.values()):
             pdo.counted += pdo.in_cycle % _LATE
         self.complete += complete
 
@@ -305,23 +289,13 @@ class Timing:
     """SYNCs that a full queue, or a bus that is down, refused."""
 
 
-def listen(
-    socket: FrameSocket, traffic: Traffic, seconds: float, period_ns: int, *, timed: bool
-) -> Timing | None:
-    """Count everything on the bus for `seconds`. Raises BusError.
-
-    Args:
-        socket: without filters.
-        traffic: counts the frames.
-        seconds: how long.
-        period_ns: time grid of the wake-ups.
-        timed: measure the wake-ups; without, there are a tenth as many.
-    """
+def listen(socket: FrameSocket, traffic: Traffic, seconds: float, every_ns: int) -> Timing:
+    """Count everything on the bus for `seconds`, waking up in a grid of `every_ns`. Raises BusError."""
     timing = Timing()
-    for _ in _slots(seconds, period_ns if timed else 10 * period_ns, timing):
+    for _ in _slots(seconds, every_ns, timing):
         _take(socket, traffic)
     traffic.end(time.time_ns())
-    return timing if timed else None
+    return timing
 
 
 def drive(socket: FrameSocket, traffic: Traffic, seconds: float, config: Config) -> Timing:
