@@ -2,15 +2,16 @@
 
     YAML -> values of profiles added -> sections (types, units, ranges) -> joint files, networks -> `Config`
 
-Each section is a dataclass, its keys the fields. Unknown keys and wrong values are errors of one line that name the file, the
-key, what was found and what was expected.
+Each section is a dataclass, its keys the fields. Unknown keys and wrong values are errors of one line that name the file,
+the key, what was found and what was expected.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -508,12 +509,8 @@ class ConfigFile:
     contact: ContactSettings | None = None
 
     def __post_init__(self) -> None:
-        self._check_numbers()
-        self._check_inputs()
-        self._check_channels()
-        self._check_node_ids()
-        self._check_names()
-        self._check_contact()
+        for key, found, expected in chain(self._wrong_numbers(), self._wrong_nodes(), self._wrong_features()):
+            raise FieldError("configuration", key, found, expected)
 
     @property
     def joints(self) -> tuple[JointSection, ...]:
@@ -531,70 +528,59 @@ class ConfigFile:
         """Time after SYNC at which missing inputs count as missing."""
         return 0.85 * self.sync.period_us if self.inputs.deadline_us is None else self.inputs.deadline_us
 
-    def _check_numbers(self) -> None:
-        """Joints are numbered without a gap: the numbers are those of the estimate PDOs and of the log's topics."""
+    def _wrong_numbers(self) -> Iterator[tuple[str, object, str]]:
+        """Yield key, value and expectation of each mistake; the others of this name as well.
+
+        Joints are numbered without a gap: the numbers are those of the estimate PDOs and of the log's topics.
+        """
         for number in range(1, len(self.joints) + 1):
             if getattr(self, f"joint_{number}") is None:
-                expected = f"joint_1 to joint_{len(self.joints)} without a gap"
-                raise FieldError("configuration", f"joint_{number}", "none", expected)
-
-    def _check_inputs(self) -> None:
+                yield f"joint_{number}", "none", f"joint_1 to joint_{len(self.joints)} without a gap"
         period_us = self.sync.period_us
         for key, value, low, high in (
             ("wait_us", self.wait_us, 50, period_us),
             ("deadline_us", self.deadline_us, self.wait_us, 0.95 * period_us),
         ):
             if not low <= value <= high:
-                raise FieldError(
-                    "configuration", f"inputs.{key}", value, range_text("a number in us", low, high, None)
-                )
+                yield f"inputs.{key}", value, range_text("a number in us", low, high, None)
 
-    def _check_channels(self) -> None:
+    def _wrong_nodes(self) -> Iterator[tuple[str, object, str]]:
         channels = [] if self.sensor is None else list(range(1, self.sensor.channels + 1))
+        nodes = {}
         for number, joint in enumerate(self.joints, start=1):
-            channel = joint.sensor_channel
-            if channel is not None and channel not in channels:
-                expected = (
-                    f"one of the sensor's channels {channels}" if channels else "no channel without a sensor"
-                )
-                raise FieldError("configuration", f"joint_{number}.sensor_channel", channel, expected)
-
-    def _check_names(self) -> None:
-        """Names of ROS 2 belong to joints of the file and are unique."""
-        if self.ros2 is None:
-            return
-        sections = [f"joint_{number}" for number in range(1, len(self.joints) + 1)]
-        for section in self.ros2.names:
-            if section not in sections:
-                expected = "one of " + ", ".join(sections)
-                raise FieldError("configuration", f"ros2.names.{section}", Verbatim("that joint"), expected)
-        names = self.ros2.names_of(len(sections))
-        for n, name in enumerate(names):
-            if name in names[:n]:
-                raise FieldError("configuration", f"ros2.names.{sections[n]}", name, "a name of its own")
-
-    def _check_contact(self) -> None:
-        if self.contact is None:
-            return
-        if not METHODS[self.estimator.method].with_torsion:
-            expected = "fused, because section contact needs its torsion"
-            raise FieldError("configuration", "estimator.method", self.estimator.method, expected)
-        if self.sync.period_us > LONGEST_CONTACT_PERIOD_US:
-            expected = f"at most {LONGEST_CONTACT_PERIOD_US} us with section contact: a slower cycle sees no contact in time"
-            raise FieldError("configuration", "sync.period_us", self.sync.period_us, expected)
-        if self.contact.opposed and len(self.joints) % 2:
-            expected = f"false with {len(self.joints)} joints: opposed are joints 1 and 2, 3 and 4"
-            raise FieldError("configuration", "contact.opposed", True, expected)
-
-    def _check_node_ids(self) -> None:
-        users = {self.node_id: "node_id"}
-        nodes = {f"joint_{number}.node": joint.node for number, joint in enumerate(self.joints, start=1)}
+            nodes[f"joint_{number}.node"] = joint.node
+            if joint.sensor_channel not in (None, *channels):
+                of_sensor = f"one of the sensor's channels {channels}"
+                expected = of_sensor if channels else "no channel without a sensor"
+                yield f"joint_{number}.sensor_channel", joint.sensor_channel, expected
         if self.sensor is not None:
             nodes["sensor.node"] = self.sensor.node
+        users = {self.node_id: "node_id"}
         for key, node in nodes.items():
             if node in users:
-                raise FieldError("configuration", key, node, f"a node-ID not used by {users[node]}")
+                yield key, node, f"a node-ID not used by {users[node]}"
             users[node] = key
+
+    def _wrong_features(self) -> Iterator[tuple[str, object, str]]:
+        if self.ros2 is not None:
+            sections = [f"joint_{number}" for number in range(1, len(self.joints) + 1)]
+            for section in self.ros2.names:
+                if section not in sections:
+                    yield f"ros2.names.{section}", Verbatim("that joint"), "one of " + ", ".join(sections)
+            names = self.ros2.names_of(len(sections))
+            for n, name in enumerate(names):
+                if name in names[:n]:
+                    yield f"ros2.names.{sections[n]}", name, "a name of its own"
+        if self.contact is not None:
+            method, period_us, count = self.estimator.method, self.sync.period_us, len(self.joints)
+            if not METHODS[method].with_torsion:
+                yield "estimator.method", method, "fused, because section contact needs its torsion"
+            if period_us > LONGEST_CONTACT_PERIOD_US:
+                bound = f"at most {LONGEST_CONTACT_PERIOD_US} us with section contact"
+                yield "sync.period_us", period_us, f"{bound}: a slower cycle sees no contact in time"
+            if self.contact.opposed and count % 2:
+                expected = f"false with {count} joints: opposed are joints 1 and 2, 3 and 4"
+                yield "contact.opposed", True, expected
 
 
 DEFAULT_CONFIG: Final = "bench.yaml"
