@@ -35,10 +35,7 @@ GROUPS = {
             "jtqd.daemon.logs.export",
             "write a log as CSV, Parquet or candump lines, or the bus as a DBC",
         ),
-        "recover": (
-            "jtqd.daemon.logs.recover",
-            "repair unfinished or damaged logs",
-        ),
+        "recover": ("jtqd.daemon.logs.recover", "repair unfinished or damaged logs"),
         "replay": ("jtqd.daemon.replay.command", "run the estimator again over a log, and compare"),
         "batch": ("jtqd.sysid.batch.command", "diagnose or replay many logs, here or on a dask cluster"),
     },
@@ -59,10 +56,7 @@ GROUPS = {
             "find the cause of the simulation error on runs, and extend the joint file",
         ),
         "score": ("jtqd.sysid.score", "print the error of a joint file on runs, before and after"),
-        "export-model": (
-            "jtqd.sysid.simulators",
-            "write a joint file for other simulators: MJCF, URDF",
-        ),
+        "export-model": ("jtqd.sysid.simulators", "write a joint file for other simulators: MJCF, URDF"),
     },
     "shell: this terminal": {
         "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish"),

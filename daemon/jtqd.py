@@ -39,37 +39,19 @@ def parser() -> argparse.ArgumentParser:
         "Estimate the torque of one to four harmonic-drive joints, as a CANopen master, without torque sensor.",
         _EXAMPLES,
     )
-    result.add_argument(
-        "--bus", required=True, help="SocketCAN interface, unix:PATH, or sim for the emulated bench"
-    )
-    result.add_argument(
-        "--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)"
-    )
-    result.add_argument(
-        "--record",
-        metavar="DIR",
-        help="directory of the MCAP logs, or none (default: $LOGS_DIRECTORY or ./logs)",
-    )
-    result.add_argument(
-        "--duration", type=seconds, metavar="S", help="end after S seconds (default: run until stopped)"
-    )
-    result.add_argument(
-        "--live",
-        type=address,
-        nargs="?",
-        const=Address(),
-        metavar="HOST:PORT",
-        help="serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)",
-    )
-    result.add_argument(
-        "--ros2",
-        action="store_true",
-        help="publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) states otherwise (extra: ros2)",
-    )
-    result.add_argument("--json", action="store_true", help="print the final summary as JSON")
-    result.add_argument(
-        "--version", action="version", help="print the version", version=f"jtqd {__version__}"
-    )
+    add = result.add_argument
+    add("--bus", required=True, help="SocketCAN interface, unix:PATH, or sim for the emulated bench")
+    add("--config", type=Path, metavar="FILE", help="configuration (default: the shipped bench)")
+    text = "directory of the MCAP logs, or none (default: $LOGS_DIRECTORY or ./logs)"
+    add("--record", metavar="DIR", help=text)
+    text = "end after S seconds (default: run until stopped)"
+    add("--duration", type=seconds, metavar="S", help=text)
+    text = "serve Foxglove or Lichtblick, read-only, 50 Hz (default: 127.0.0.1:8765; extra: live)"
+    add("--live", type=address, nargs="?", const=Address(), metavar="HOST:PORT", help=text)
+    text = "publish for ROS 2, 100 Hz, on loopback unless the configuration (ros2) states otherwise (extra: ros2)"
+    add("--ros2", action="store_true", help=text)
+    add("--json", action="store_true", help="print the final summary as JSON")
+    add("--version", action="version", help="print the version", version=f"jtqd {__version__}")
     return result
 
 

@@ -47,15 +47,9 @@ SLOTS = 8
 
 
 class Duties:
-    """Duties in the pauses of the loop: the watchdog, and requests of the supervisor.
+    """Duties in the pauses of the loop, after every `SLOTS` cycles: the watchdog, and requests of the supervisor.
 
     The watchdog is fed only while the supervisor runs as well: a stopped one serves no node, no request and no log.
-
-    Call it in the pause after every `SLOTS` cycles. It costs one look at shared memory and now and then a datagram.
-
-    Args:
-        cycle: the loop's.
-        watchdog: to be fed.
     """
 
     def __init__(self, cycle: Cycle, watchdog: LoopWatchdog) -> None:
@@ -66,8 +60,7 @@ class Duties:
 
     def __call__(self) -> None:
         """Run the duties after some cycles."""
-        index = self._cycle.index
-        orders = self._orders
+        index, orders = self._cycle.index, self._orders
         if orders[4] != self._sign:
             self._sign, self._sign_at = orders[4], index
         if index - self._sign_at <= self._patience:
@@ -112,10 +105,8 @@ def check_networks(config: Config) -> list[RuntimeCheck | str | None]:
     """Have ONNX Runtime check the networks of a start in a process of its own, which has ended before the loop begins.
 
     A graph of ours then runs natively on the bytes that were checked (their SHA-256 is part of the check). The loop loads
-    ONNX Runtime (40 MB, and a library that may fail with a file it was not made for) only for other graphs.
-
-    Returns:
-        Per joint the check of its network, or why the network is refused; None: it has none.
+    ONNX Runtime (40 MB, and a library that may fail with a file it was not made for) only for other graphs. Returns per
+    joint the check of its network, or why the network is refused; None: it has none.
     """
     networks = [joint.network for joint in config.joints]
     if not any(networks):
@@ -131,7 +122,6 @@ def check_networks(config: Config) -> list[RuntimeCheck | str | None]:
 
 
 def _check_of(child: Child, path: str) -> RuntimeCheck | str:
-    """Return the child's next answer."""
     try:
         answer = child.answer(_CHECK_S)
     except ChildError as error:
@@ -145,10 +135,9 @@ def build_estimator(
     check: RuntimeCheck | str | None = None,
     notes: list[str] | None = None,
 ) -> AnyEstimator:
-    """Build the estimator of one joint as configured; raises ConfigError or NetworkError.
+    """Build the estimator of one joint; notes takes lines for the operator. Raises ConfigError, NetworkError.
 
     check: of its network by `check_networks`, or why it is refused; None: ONNX Runtime checks it in this process.
-    notes: takes lines for the operator.
     """
     method, network = config.estimator.method, None
     try:
@@ -193,14 +182,7 @@ def run(
     *,
     slots: int = SLOTS,
 ) -> None:
-    """Cycle until `stop()` or `end_ns`.
-
-    Args:
-        cycle, grid: state of the loop; the first cycle is that of the grid's slot.
-        stop: asked before a cycle.
-        end_ns: no cycle begins from here on (CLOCK_MONOTONIC); None: without end.
-        duties: called in the pause after every `slots` slots.
-    """
+    """Cycle from the grid's slot until `stop()` or `end_ns` (CLOCK_MONOTONIC), with `duties` in the pause after `slots` slots."""
     passed = False
     while not stop():
         outcome = cycle.go_on(1 if passed or duties is None else slots, end_ns or 0)
@@ -261,10 +243,7 @@ def build_cycle(
 def build_estimators(
     request: dict[str, Any], notes: list[str] | None = None
 ) -> tuple[Config, list[AnyEstimator]]:
-    """Load the configuration and warm up the estimators of all joints; raises ConfigError or NetworkError.
-
-    notes: as in `build_estimator`.
-    """
+    """Load the configuration and warm up the estimators of all joints. Raises ConfigError, NetworkError."""
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:
         raise ConfigError(f"{config.path}: it or one of its joint files was changed during reading")

@@ -15,16 +15,11 @@ _PR_SET_TIMERSLACK = 29
 
 
 def prepare(priority: int, cpu: int | None, lock_memory: bool) -> list[str]:
-    """Request the real-time settings of this process; return the refused ones.
+    """Request the real-time settings of this process; return one line for each that the system did not grant.
 
-    Args:
-        priority: SCHED_FIFO priority, 0 leaves the default scheduling class.
-        cpu: CPU to stay on, None for any.
-        lock_memory: lock every page once it has been touched. Not the untouched ones: the runtime libraries reserve far
-            more than they use, and the warm-up touches what a cycle needs.
-
-    Returns:
-        One line for each thing that the system did not grant.
+    priority: of SCHED_FIFO, 0 leaves the default scheduling class. cpu: to stay on, None for any. lock_memory: lock every
+    page once it has been touched; the runtime libraries reserve far more than they use, and the warm-up touches what a
+    cycle needs.
     """
     refused = []
     libc = ctypes.CDLL(None, use_errno=True)
