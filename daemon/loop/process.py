@@ -182,7 +182,7 @@ def run(
     *,
     slots: int = SLOTS,
 ) -> None:
-    """Cycle from the grid's slot until `stop()` or `end_ns` (CLOCK_MONOTONIC), with `duties` in the pause after `slots` slots."""
+    """Cycle until `stop()` or `end_ns` (CLOCK_MONOTONIC); `duties` come in the pause after every `slots` slots."""
     passed = False
     while not stop():
         outcome = cycle.go_on(1 if passed or duties is None else slots, end_ns or 0)
