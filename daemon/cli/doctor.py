@@ -420,16 +420,16 @@ def _packages() -> CheckResult:
     except PackageNotFoundError:
         text = "jtqd is not installed as a package: its requirements are unknown"
         return CheckResult("packages", WARN, text, "pip install .")
-    found = {
-        each.name: installed(each.name) for each in wanted if each.marker is None or each.marker.evaluate()
-    }
-    wrong = [
-        f"{each.name} is missing"
-        if found[each.name] is None
-        else f"{each.name} {found[each.name]}, expected {each.specifier}"
-        for each in wanted
-        if each.name in found and not each.specifier.contains(found[each.name] or "0", prereleases=True)
-    ]
+    found: dict[str, str | None] = {}
+    wrong = []
+    for each in wanted:
+        if each.marker is not None and not each.marker.evaluate({"extra": ""}):
+            continue
+        version = found[each.name] = installed(each.name)
+        if version is None:
+            wrong.append(f"{each.name} is missing")
+        elif not each.specifier.contains(version, prereleases=True):
+            wrong.append(f"{each.name} {version}, expected {each.specifier}")
     versions = ", ".join(f"{name} {version}" for name, version in found.items())
     hint = "pip install --upgrade jtqd, in its own environment"
     return judge("packages", "; ".join(wrong) or f"jtqd {__version__}, {versions}", (wrong, FAIL, hint))

@@ -1,4 +1,4 @@
-"""`jtq check`: counting and judging of traffic that is known frame by frame, and the command on a real hub."""
+"""`jtq check`: results and their report, judging of traffic that is known frame by frame, and the command on a real hub."""
 
 import json
 import os
@@ -24,7 +24,9 @@ from jtqd.daemon.cli.checks import (
     check_conditions,
     check_own_timing,
     check_stolen_time,
+    report,
     show,
+    worst,
 )
 from jtqd.daemon.cli.traffic import TimeHistogram, Timing, Traffic, identifier_text
 from jtqd.daemon.config import Config, load_config
@@ -32,6 +34,7 @@ from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.events import ERROR, WARNING
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, stuffed_bits
+from jtqd.estimator.text import duration, number, percent, size
 from tests.drivers.hub_helpers import until_it_listens
 from tests.shipped_bench import shipped_bench
 
@@ -386,3 +389,47 @@ def test_conditions_of_the_daemon_are_results() -> None:
         ("bus off", FAIL, "jtqd reports: bus: bus-off"),
         ("sensor lost", WARN, "jtqd reports: joint 1: no torque sensor"),
     ]
+
+
+NAN = float("nan")
+
+
+def test_the_result_is_the_worst_level() -> None:
+    items = {level: CheckResult("x", level, "") for level in (GOOD, WARN, FAIL, SKIP)}
+    assert worst([items[GOOD], items[SKIP]]) == GOOD
+    assert worst([items[GOOD], items[WARN]]) == WARN
+    assert worst([items[WARN], items[FAIL]]) == FAIL
+
+
+def test_the_report_is_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+    results = [
+        CheckResult("one", GOOD, "fine"),
+        CheckResult("two", WARN, "first", "do this"),
+        CheckResult("three", WARN, "second", "do this"),
+    ]
+    assert report(results, None) == 3
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines[:3]] == [
+        ["GOOD", "one", "fine"],
+        ["WARN", "two", "first"],
+        ["WARN", "three", "second"],
+    ]
+    assert lines[3].strip() == "> do this", "one hint for both"
+    assert lines[4] == "WARN: 1 good, 2 warnings, 0 failures"
+    assert report(results[:1], "jtq.x/1", bus="can0") == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "schema": "jtq.x/1",
+        "result": "GOOD",
+        "bus": "can0",
+        "items": [{"item": "one", "level": "GOOD", "text": "fine", "hint": ""}],
+    }
+
+
+def test_numbers_for_people() -> None:
+    assert [duration(each) for each in (0.0451, 2.34, 59.94, 59.96, 751.2, 11_100.0, 187_300.0, NAN)] == [
+        *("45 ms", "2.3 s", "59.9 s", "1 min 00 s", "12 min 31 s", "3 h 05 min", "2 d 04 h", "-"),
+    ]
+    assert [size(each) for each in (0, 999, 1000, 123_456, 1_230_000_000, None)] == [
+        *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-"),
+    ]
+    assert (number(-1.005), number(NAN), percent(0.8476), percent(NAN)) == ("-1.00", "-", "84.8 %", "-")

@@ -1,14 +1,17 @@
-"""Stages of a cycle against a scripted socket: what goes out is what came in, scaled, dated and in time."""
+"""Stages of a cycle against a scripted socket: what goes out is what came in, scaled, dated and in time. The grid."""
 
+import gc
 import itertools
 import math
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from jtqd.daemon.core.estimate_pdo import decode
-from jtqd.daemon.core.schedule import WakeUp
+from jtqd.daemon.core.schedule import Grid, WakeUp
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.status import VALID, Estimate
@@ -243,3 +246,59 @@ def test_log_and_bus_agree_on_a_torque_that_does_not_fit_the_field(tmp_path: Pat
     joint = cr.joint_of(reader.read().records[-1], 1)
     assert joint.status == 15
     assert math.isnan(joint.torque_nm)
+
+
+MS = 1_000_000
+
+
+def test_on_time_cycles_stay_on_the_grid() -> None:
+    grid = Grid(10 * MS, MS)
+    for n in range(1, 5):
+        assert grid.advance(10 * MS + (n - 1) * MS + 300_000) == 0
+        assert grid.slot_ns == (10 + n) * MS
+    assert grid.missed == 0
+
+
+def test_a_stall_is_skipped_counted_and_not_made_up() -> None:
+    grid = Grid(0, MS)
+    assert grid.advance(200 * MS + 100_000) == 199
+    assert grid.slot_ns == 200 * MS  # 0.1 ms ago: can still be begun
+    assert grid.missed == 199
+    assert grid.advance(200 * MS + 200_000) == 0
+    assert grid.slot_ns == 201 * MS
+
+
+def test_half_a_period_decides() -> None:
+    late = Grid(0, MS)
+    assert late.advance(MS + MS // 2) == 0
+    assert late.slot_ns == MS
+    too_late = Grid(0, MS)
+    assert too_late.advance(MS + MS // 2 + 1) == 1
+    assert too_late.slot_ns == 2 * MS
+    assert not too_late.too_late(2 * MS + MS // 2)
+    assert too_late.too_late(2 * MS + MS // 2 + 1)
+
+
+HEALTHY, LOST, STRANGE = inputs(), inputs()[1:], [*inputs(), inputs()[0]]
+
+
+def test_no_cycle_leaves_anything_to_a_collector(tmp_path: Path) -> None:
+    """Whole ones, ones without an input, ones with a frame twice."""
+    cycle, _, _ = make(tmp_path, lambda n: (HEALTHY, LOST, STRANGE)[n % 3])
+    turn(cycle, 100)
+    gc.collect()
+    gc.disable()
+    try:
+        turn(cycle, 300)
+        assert gc.collect() == 0
+    finally:
+        gc.enable()
+
+
+def test_the_collector_is_off_once_the_loop_is_ready() -> None:
+    code = (
+        "import gc; from jtqd.daemon.loop import realtime; realtime.freeze(); "
+        "print(gc.isenabled(), gc.get_freeze_count() > 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["False", "True"]

@@ -1,15 +1,16 @@
-"""Which frame belongs to which cycle: each scenario states what is sent and what must be believed."""
+"""Inputs of a cycle: what is used is of its own cycle, of a configured node, and of the right length."""
 
 import random
 import struct
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from jtqd.daemon.core.cycle import frame_counts
 from jtqd.daemon.core.input_pdos import InputPdo
 from jtqd.daemon.core.intake import Intake
-from tests.daemon.snapshots import counted
+from tests.daemon.snapshots import IntakeSeen, counted
 
 PAIR = struct.Struct("<ii")
 TPDO1 = InputPdo(0x181, 8, PAIR, 1, "181h drive 1 TPDO1")
@@ -361,3 +362,98 @@ class Timeline:
         self.wrong += sum(intake.fresh(n) and intake.values(n)[0] != self.syncs for n in (0, 1))
         self.syncs += 1
         return complete
+
+
+DRIVE_1 = InputPdo(0x181, 8, PAIR, 1, "181h drive 1 TPDO1")
+DRIVE_2 = InputPdo(0x182, 8, PAIR, 2, "182h drive 2 TPDO1")
+SENSOR = InputPdo(0x183, 5, struct.Struct("<iB"), 3, "183h sensor 3 channel 1")
+
+
+class Nodes:
+    """One cycle after the other, each with the frames that answer its SYNC."""
+
+    def __init__(self, directory: Path) -> None:
+        self.intake = Intake([DRIVE_1, DRIVE_2, SENSOR])
+        self.seen = IntakeSeen(directory, self.intake)
+        self.sync_ns, self.counter = 0, 0
+
+    def cycle(self, *frames: bytes) -> tuple[bool, bool]:
+        """(nobody is waited for any more, every input is valid)."""
+        self.sync_ns += 1_000_000
+        self.counter = self.counter % 240 + 1
+        batch = [struct.pack("<IB3xB7x", 0x080, 1, self.counter), *frames]
+        stamps = [self.sync_ns + 100_000 * n for n in range(len(batch))]
+        self.intake.begin(self.counter)
+        done = self.intake.take(
+            bytearray(b"".join(batch)), stamps, [True] + [False] * len(frames), len(batch)
+        )
+        return done, self.intake.close()
+
+
+DRIVES = (frame(0x181), frame(0x182))
+
+
+@pytest.fixture
+def nodes(tmp_path: Path) -> Nodes:
+    return Nodes(tmp_path)
+
+
+def test_an_absent_optional_node_is_not_waited_for_and_not_missed(nodes: Nodes) -> None:
+    nodes.intake.leave_out(3)
+    for _ in range(50):
+        assert nodes.cycle(*DRIVES) == (True, True)
+    assert counted(nodes.intake)["stale_inputs"] == 0
+    assert nodes.intake.unconfigured == {3}
+    assert not nodes.intake.fresh(2)
+    assert nodes.seen.view().inputs[2].in_a_row == 50, "but known to be missing"
+
+
+def test_its_frames_before_its_configuration_are_not_used_and_leave_no_debt(nodes: Nodes) -> None:
+    nodes.intake.leave_out(3)
+    for _ in range(5):
+        nodes.cycle(*DRIVES, frame(0x183, length=5))
+        assert not nodes.intake.fresh(2)
+    nodes.intake.configured(3)
+    assert nodes.cycle(*DRIVES) == (False, False), "now it is waited for"
+    nodes.intake.configured(3)
+    assert nodes.cycle(*DRIVES, frame(0x183, length=5)) == (True, True)
+    assert nodes.intake.fresh(2)
+    assert counted(nodes.intake)["stale_inputs"] == 1
+
+
+def test_a_node_that_restarts_is_missed_but_nobody_waits_for_it(nodes: Nodes) -> None:
+    everything = (*DRIVES, frame(0x183, length=5))
+    assert nodes.cycle(*everything) == (True, True)
+    nodes.cycle(*everything, frame(0x701, bytes(1)))  # boot-up message of drive 1
+    assert nodes.intake.unconfigured == {1}
+    assert nodes.cycle(frame(0x182), frame(0x183, length=5)) == (True, False)
+    assert (nodes.intake.fresh(0), nodes.intake.fresh(1)) == (False, True)
+    assert nodes.cycle(*everything) == (True, False), "its default mapping may have the same length"
+    assert not nodes.intake.fresh(0)
+    nodes.intake.configured(1)
+    assert nodes.cycle(*everything) == (True, True)
+
+
+def test_lengths_and_cycles_without_an_input_are_counted_per_pdo(nodes: Nodes) -> None:
+    nodes.cycle(*DRIVES, frame(0x183, length=5))
+    for length in (0, 1, 7):
+        nodes.cycle(frame(0x181, length=length), frame(0x182), frame(0x183, length=8))
+    one, two, sensor = nodes.seen.view().inputs
+    assert (one.short, one.long, one.missed, one.in_a_row) == (3, 0, 3, 3)
+    assert (two.short, two.long, two.missed) == (0, 0, 0)
+    assert (sensor.short, sensor.long, sensor.rejected) == (0, 3, 3)
+    assert counted(nodes.intake)["rejected_frames"] == 6
+    for _ in range(30):
+        nodes.cycle(*DRIVES, frame(0x183, length=5))
+    one = nodes.seen.view().inputs[0]
+    assert one.in_a_row == 0
+    assert one.missed >= 3
+
+
+@pytest.mark.parametrize("state", [1, 2, 3, 6, 0x80, 0x85, 0xFF])
+def test_a_heartbeat_with_an_impossible_state_is_none(nodes: Nodes, state: int) -> None:
+    nodes.cycle(*DRIVES, frame(0x183, length=5), frame(0x701, b"\x05"))
+    nodes.cycle(*DRIVES, frame(0x183, length=5), frame(0x701, bytes([state])))
+    assert nodes.seen.view().node_states[1] == 5
+    assert counted(nodes.intake)["rejected_frames"] == 1
+    assert nodes.intake.unconfigured == frozenset()

@@ -1,4 +1,4 @@
-"""ONNX Runtime checks networks in a process of its own: the same refusals, the same bytes, and no runtime in the loop."""
+"""Which estimator the loop builds by configuration, how ONNX Runtime checks its network, and one line for each refusal."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import onnx
 import pytest
@@ -13,11 +14,128 @@ from onnx import helper
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.loop import process
-from jtqd.daemon.loop.process import build_estimator, build_estimators, check_networks
+from jtqd.daemon.loop.process import build_estimator, build_estimators, check_networks, loop_filters, warm_up
+from jtqd.drivers.bus_socket import CanFilter
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
 from tests.estimator.estimator_helpers import small_network
-from tests.estimator.fused_configuration import configured, networks
+from tests.estimator.fused_configuration import configured, joint_of, networks
+from tests.estimator.fused_helpers import fused_network
+
+JOINTS = (1, 2)
+
+
+def the_papers() -> dict[int, bytes]:
+    return {number: small_network().with_metadata(joint=f"joint{number}").data for number in JOINTS}
+
+
+def test_method_fused_uses_its_networks(tmp_path: Path) -> None:
+    config = load_config(configured(tmp_path, "fused", networks()))
+    estimators = [build_estimator(config, joint) for joint in config.joints]
+    warm_up(estimators)
+    for number, estimator in zip(JOINTS, estimators, strict=True):
+        assert isinstance(estimator, FusedEstimator)
+        assert estimator.joint == joint_of(number)
+        found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n - 1e-3, 25.0) for n in range(50)][-1]
+        assert found.status == 2
+        assert found.torque_nm != found.physics_nm
+
+
+def test_method_fused_without_networks_is_its_physics(tmp_path: Path) -> None:
+    config = load_config(configured(tmp_path, "fused", {1: networks()[1]}))
+    assert [joint.network is None for joint in config.joints] == [False, True]
+    estimator = build_estimator(config, config.joints[1])
+    found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0) for n in range(50)][-1]
+    assert (found.status, found.torque_nm) == (2, found.physics_nm)
+
+
+def notes(config: Config) -> list[str]:
+    found: list[str] = []
+    for joint in config.joints:
+        build_estimator(config, joint, None, found)
+    return found
+
+
+def test_a_joint_that_is_its_physics_alone_is_told(tmp_path: Path) -> None:
+    assert notes(load_config(None)) == [f"joint {number}: no network, physics only" for number in JOINTS]
+    nothing = {number: fused_network(joint=f"joint{number}", noise=0.0).data for number in JOINTS}
+    expected = (
+        "joint {0}: no network, physics only (n{0}.onnx has the share 0: envelope and calibration only)"
+    )
+    assert notes(load_config(configured(tmp_path, "fused", nothing))) == [expected.format(n) for n in JOINTS]
+    half = load_config(configured(tmp_path, "fused", {1: networks()[1]}))
+    assert notes(half) == ["joint 2: no network, physics only"]
+
+
+@pytest.mark.parametrize("method", ["tob", "efficiency", "network"])
+def test_methods_that_are_no_correction_of_it_say_nothing(tmp_path: Path, method: str) -> None:
+    assert notes(load_config(configured(tmp_path, method, the_papers()))) == []
+
+
+@pytest.mark.parametrize("method", ["tob", "efficiency"])
+def test_other_methods_leave_a_network_alone(tmp_path: Path, method: str) -> None:
+    config = load_config(configured(tmp_path, method, networks()))
+    assert [joint.network for joint in config.joints] == [None, None]
+    assert isinstance(build_estimator(config, config.joints[0]), JointEstimator)
+
+
+def test_method_network_still_needs_one(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"joint_2\.network.*missing.*estimator\.method is network"):
+        load_config(configured(tmp_path, "network", {1: the_papers()[1]}))
+    config = load_config(configured(tmp_path, "network", the_papers()))
+    assert isinstance(build_estimator(config, config.joints[1]), JointEstimator)
+
+
+def test_a_joint_without_section_fused_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(configured(tmp_path, "fused", networks(), without_fused=(2,)))
+    assert str(caught.value) == (
+        f"{tmp_path}/j2.yaml: key 'fused': missing, expected because estimator.method is fused"
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "kind", "found"),
+    [
+        ("fused", the_papers, "found input 'x' of shape ['N', 6], expected ['N', 7]"),
+        ("network", networks, "found input 'x' of shape ['N', 7], expected ['N', 6]"),
+    ],
+)
+def test_a_network_of_another_method_is_named(tmp_path: Path, method: str, kind: Any, found: str) -> None:
+    config = load_config(configured(tmp_path, method, kind()))
+    with pytest.raises(NetworkError) as caught:
+        build_estimator(config, config.joints[1])
+    assert str(caught.value) == (
+        f"{tmp_path}/n2.onnx: {found} ({tmp_path}/c.yaml: 'joint_2', estimator.method is {method})"
+    )
+
+
+@pytest.mark.parametrize("method", ["fused", "network"])
+def test_a_network_of_another_joint_is_named(tmp_path: Path, method: str) -> None:
+    second = (networks() if method == "fused" else the_papers())[2]
+    config = load_config(configured(tmp_path, method, {1: second, 2: second}))
+    with pytest.raises(ConfigError) as caught:
+        build_estimator(config, config.joints[0])
+    message = str(caught.value)
+    assert "joint joint1: found a network of joint 'joint2', expected one of 'joint1'" in message
+    assert message.endswith(f"({tmp_path}/c.yaml: 'joint_1', estimator.method is {method})")
+    assert "\n" not in message
+
+
+def received(filters: list[CanFilter], can_id: int) -> bool:
+    return any((can_id & each.mask) == (each.can_id & each.mask) for each in filters)
+
+
+@pytest.mark.parametrize("temperature", [True, False])
+def test_the_loop_hears_what_its_configuration_needs_and_nothing_else(
+    tmp_path: Path, temperature: bool
+) -> None:
+    filters = loop_filters(load_config(configured(tmp_path, "tob", {}, temperature=temperature)))
+    wanted = {0x080, 0x181, 0x281, 0x182, 0x282, 0x183, 0x701, 0x702, 0x703}
+    wanted |= {0x381, 0x382} if temperature else set()
+    assert {can_id for can_id in range(0x800) if received(filters, can_id)} == wanted
+
 
 PROGRAM = """
 import json, sys
