@@ -25,8 +25,8 @@ from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_NETWORK_SKIPPED, F
 from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.daemon.supervisor.process import wait_for
-from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.bus_socket import exact
+from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator.status import PUBLISHED, STALE
