@@ -1,9 +1,8 @@
-"""The bench of a campaign: jtqd's configuration as the commander takes it, the load of the bus, the motion.
+"""The bench of a campaign: jtqd's configuration as the commander takes it, the load of the bus, the motion, and processes.
 
-Processes of a campaign: jtqd for every run, the emulated bench, and the campaign itself in the bench kernel (exact time).
-
-In exact time the clock waits for the processes (docs/testing.md): the same jtqd, commander and emulated drives on SocketCAN
-miss no cycle, however busy the machine is.
+jtqd is a process of its own for every run, and so is the emulated bench. In exact time the whole campaign runs in the bench
+kernel, whose clock waits for the processes (docs/testing.md): the same jtqd, commander and emulated drives on SocketCAN miss
+no cycle, however busy the machine is.
 """
 
 from __future__ import annotations
@@ -57,11 +56,7 @@ _COMMANDER_PRIORITY: Final = 30
 
 @dataclass(frozen=True)
 class BenchConfig:
-    """jtqd's configuration of the bench.
-
-    Attributes:
-        joints: parameters of joints 1, 2, ... drives: their drives. sensor: None without one.
-    """
+    """jtqd's configuration of the bench: parameters and drives of joints 1, 2, ..., and the sensor, if there is one."""
 
     config: Config
     joints: tuple[Joint, ...]
@@ -72,9 +67,8 @@ class BenchConfig:
     def load(cls, path: Path | None) -> BenchConfig:
         """Read a configuration of jtqd (None: the one that ships).
 
-        Raises:
-            ConfigError: naming file, key, found and expected; also for a period of SYNC that is no whole milliseconds up to
-                10, and for drives whose velocity, current or state are not in the objects that command them (CiA 402).
+        Raises ConfigError, also for a period of SYNC that is no whole milliseconds up to 10, and for drives whose velocity,
+        current or state are not in the objects that command them (CiA 402).
         """
         config = load_config(path)
         with in_file(str(config.path)):
@@ -108,22 +102,14 @@ class BenchConfig:
         """Period of SYNC."""
         return 1e-9 * self.config.period_ns
 
-    @property
-    def estimate_cob_id(self) -> int:
-        """COB-ID of the estimate PDO that jtqd publishes."""
-        return 0x180 + self.config.node_id
-
     def measured(self, number: int) -> bool:
         """Return whether a channel of the torque sensor belongs to the joint."""
         return self.sensor is not None and self.channels[number - 1] is not None
 
     def check_temperature(self, limit_c: float) -> None:
-        """Refuse a limit of the temperature where jtqd does not receive that of a joint.
+        """Refuse a limit of the temperature where jtqd does not receive that of a joint. Raises ConfigError.
 
         The commander cannot switch TPDO3 on: jtqd would take the drive for a changed one and drop its inputs.
-
-        Raises:
-            ConfigError: naming file, joint and what to do.
         """
         for number, joint in enumerate(self.config.joints, 1):
             if joint.temperature is None and math.isfinite(limit_c):
@@ -158,10 +144,8 @@ class BenchConfig:
     def load_with_commander(self) -> BusLoad:
         """Return the load of the bus during a campaign: jtqd's configuration, the commander's heartbeat and set-points.
 
-        Set-points go to the drives in turn, so that a cycle holds one RPDO.
-
-        Raises:
-            ConfigError: above 95 % in the worst case, or two users of one COB-ID.
+        Set-points go to the drives in turn, one RPDO in a cycle. Raises ConfigError above 95 % in the worst case, or for two
+        users of one COB-ID.
         """
         config = self.config
         share = 1.0 / len(self.nodes)
@@ -206,28 +190,30 @@ def _drive(joint: JointConfig) -> DriveProfile:
     """
     objects = joint.objects
 
-    def refuse(key: str, found: object, expected: str) -> NoReturn:
-        raise FieldError(f"joint_{joint.number}", key, found, expected)
+    def refuse(key: str, found: str, expected: str) -> NoReturn:
+        raise FieldError(f"joint_{joint.number}", key, Verbatim(found), expected)
 
     if joint.max_age_ms:
-        age = Verbatim(f"{joint.max_age_ms:g}")
-        refuse("max_age_ms", age, "none for a campaign: a motion needs every value at each SYNC")
+        refuse(
+            "max_age_ms",
+            f"{joint.max_age_ms:g}",
+            "none for a campaign: a motion needs every value at each SYNC",
+        )
     if objects.motor_velocity is None:
         expected = "606Ch for a campaign: it counts as 60FFh does, by which the drive is commanded"
-        refuse("objects.motor_velocity", Verbatim("false"), expected)
+        refuse("objects.motor_velocity", "false", expected)
     for name, each, indices in (
         ("motor_velocity", objects.motor_velocity, (0x606C,)),
         ("current", objects.current, (0x6078, 0x6077)),
     ):
         if each.index not in indices or each.sign != 1:
-            found = Verbatim(f"{label(each.index, each.subindex)}, sign {each.sign}")
             wanted = " or ".join(f"{index:04X}h" for index in indices)
             expected = f"{wanted} with sign 1 for a campaign: the drive is commanded in its units"
-            refuse(f"objects.{name}", found, expected)
+            refuse(f"objects.{name}", f"{label(each.index, each.subindex)}, sign {each.sign}", expected)
     if objects.statusword != CIA_402.statusword:
-        refuse("objects.statusword", Verbatim("another one"), "6041h for a campaign")
+        refuse("objects.statusword", "another one", "6041h for a campaign")
     if joint.temperature not in (None, Temperature()):
-        refuse("objects.temperature", Verbatim("another one"), "3001h for a campaign")
+        refuse("objects.temperature", "another one", "3001h for a campaign")
     return DriveProfile(
         joint.node_id,
         Identity(**asdict(joint.identity)),
@@ -300,6 +286,8 @@ def _real_time() -> Iterator[None]:
             os.sched_setscheduler(0, before, priority)
 
 
+# Processes ------------------------------------------------------------------------------------------------------
+
 EXACT_TIME: Final = "exact"
 """As `--bus`: the emulated bench in exact time."""
 EXACT_TIME_BUS: Final = "sim:vcan0"
@@ -369,20 +357,16 @@ def _end(process: subprocess.Popen[bytes]) -> int:
 def _wait_for(
     process: subprocess.Popen[bytes], seen: Callable[[], bool], messages: Path, name: str, late: str
 ) -> None:
-    """Wait until `seen()`, which blocks for a moment itself.
-
-    Raises ProcessError where the process ends, or is `late` after READY_S.
-    """
+    """Wait until `seen()`, which blocks for a moment; ProcessError where the process ends, or is `late` after READY_S."""
     deadline = time.monotonic() + READY_S
     while not seen():
         if process.poll() is not None:
-            raise ProcessError(f"{name} ended with exit status {process.returncode}: {last_line(messages)}")
+            raise ProcessError(f"{name} ended with exit status {process.returncode}: {_last_line(messages)}")
         if time.monotonic() > deadline:
             raise ProcessError(f"{name}{late} within {READY_S:g} s")
 
 
-def last_line(path: Path) -> str:
-    """Return the last line that a process wrote to a file."""
+def _last_line(path: Path) -> str:
     try:
         lines = path.read_text(errors="replace").strip().splitlines()
     except OSError:
@@ -394,13 +378,9 @@ def last_line(path: Path) -> str:
 def emulated_bench(
     bus: str, folder: Path, plant: Path, seed: int, drives: int, *, sensor: bool
 ) -> Iterator[None]:
-    """Run the emulated bench as a process, at rest until it is commanded.
+    """Run the emulated bench as a process, at rest until it is commanded; a unix bus is made if there is none.
 
-    Args:
-        bus: where it is put; a unix bus is made if there is none. folder: for its messages. seed: of its noise and days.
-        drives, sensor: what is on it; drives 1 and 2, and 3 and 4, are coupled.
-
-    Raises ProcessError when it does not start.
+    folder: for its messages. seed: of its noise and days. drives: 1 and 2, and 3 and 4, are coupled. Raises ProcessError.
     """
     arguments = ["--bus", bus, "--profile", "rest", "--seed", str(seed), "--plant", str(plant)]
     arguments += ["--drives", str(drives), *([] if sensor else ["--no-sensor"])]
@@ -421,30 +401,18 @@ def emulated_bench(
 
 
 class Jtqd:
-    """jtqd during one run: a context manager that waits for its first estimate, and ends it in order.
+    """jtqd during one run of duration_s: a context manager that waits for its first estimate, and ends it in order.
 
-    Args:
-        bus, config: as for jtqd. folder: of the run; its log goes to folder/log, its messages to folder/jtqd.log.
-        duration_s: of the motion.
-        estimate_cob_id: of the PDO that jtqd publishes.
-        stop_asked: asked while waiting.
+    Its log goes to folder/log, its messages to folder/jtqd.log. stop_asked: asked while waiting.
     """
 
-    def __init__(
-        self,
-        bus: str,
-        config: Path | None,
-        folder: Path,
-        duration_s: float,
-        *,
-        estimate_cob_id: int,
-        stop_asked: StopAsked,
-    ) -> None:
+    def __init__(self, bench: Bench, folder: Path, duration_s: float, stop_asked: StopAsked) -> None:
         self.messages: Final = folder / "jtqd.log"
-        self._bus, self._cob_id, self._stop_asked = bus, estimate_cob_id, stop_asked
-        self._arguments = ["--bus", bus, "--record", str(folder / "log"), "--json"]
+        self._bus, self._stop_asked = bench.bus, stop_asked
+        self._cob_id = 0x180 + bench.config.config.node_id  # of the estimate PDO
+        self._arguments = ["--bus", bench.bus, "--record", str(folder / "log"), "--json"]
         self._arguments += ["--duration", f"{duration_s + _MARGIN_S:.1f}"]
-        self._arguments += [] if config is None else ["--config", str(config)]
+        self._arguments += [] if bench.config_path is None else ["--config", str(bench.config_path)]
         self._output = folder / "jtqd.json"
         self._status = 0
 
@@ -479,15 +447,14 @@ class Jtqd:
     def log(self) -> tuple[tuple[Path, ...], dict[str, Any]]:
         """Return parts of the log in their order, and the summary, after the end.
 
-        Raises:
-            ProcessError: it ended by a failure, or recorded nothing.
+        Raises ProcessError where it ended by a failure, or recorded nothing.
         """
         if self._status not in (0, 3):  # 3: done, with cycles missing in the log
-            raise ProcessError(f"jtqd ended with exit status {self._status}: {last_line(self.messages)}")
+            raise ProcessError(f"jtqd ended with exit status {self._status}: {_last_line(self.messages)}")
         try:
             summary = json.loads(self._output.read_text())
         except ValueError:
-            raise ProcessError(f"jtqd ended without a summary: {last_line(self.messages)}") from None
+            raise ProcessError(f"jtqd ended without a summary: {_last_line(self.messages)}") from None
         recording = summary.get("recording") or {}
         if not recording.get("path"):
             raise ProcessError(f"jtqd recorded nothing: {recording.get('error') or 'no reason given'}")
@@ -510,9 +477,7 @@ def exact_time_ready() -> bool:
 def run_in_exact_time(argv: Sequence[str], out: Path) -> int:
     """Run `jtq campaign` with these arguments in the bench kernel; return its exit status.
 
-    Raises:
-        ExactTimeError: the kernel cannot be built or booted.
-        ProcessError: a signal ended it.
+    Raises ExactTimeError where the kernel cannot be built or booted, ProcessError where a signal ended it.
     """
     command = [sys.executable, "-P", "-m", "jtqd.daemon.jtq", "campaign", *argv, "--bus", EXACT_TIME_BUS]
     sys.stdout.flush()

@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.drivers.bus_load import LIMIT, BusLoad
-from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.command_line import command_parser, count, natural, seconds
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted, table_lines
@@ -93,12 +93,11 @@ _EXAMPLES: Final = """examples:
 
 def parser() -> argparse.ArgumentParser:
     """Return the options; `_usage_error` checks their combination."""
-    made = argparse.ArgumentParser(
-        prog="jtq campaign",
-        description="Drive the joints of a bus through a campaign of runs, record and check each; continue an interrupted\n"
+    made = command_parser(
+        "jtq campaign",
+        "Drive the joints of a bus through a campaign of runs, record and check each; continue an interrupted\n"
         "campaign. Joints on a towing bench drive each other, any other joint is moved alone while the rest is held.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add = made.add_argument
     add("plan", metavar="PLAN", help="efficiency, excitation, validate, or a plan file (jtq.plan/1)")
@@ -197,8 +196,7 @@ def recipe(options: argparse.Namespace, joints: Sequence[Joint]) -> dict[str, An
     }
 
 
-def scale_of(options: argparse.Namespace) -> Scale:
-    """Return the size of a named campaign."""
+def _scale_of(options: argparse.Namespace) -> Scale:
     scale = {name: getattr(options, name) for name in _SCALING}
     return Scale(**scale, limits=replace(DEFAULT_LIMITS, **dict(options.limit)))
 
@@ -211,7 +209,7 @@ def wanted_plan(
 ) -> Plan:
     """Read or make the plan; `joints`, `units` are those of the bench. Raises ConfigError."""
     if options.plan in KINDS:
-        return make_plan_of(options.plan, units, joints, scale_of(options), on_progress)
+        return make_plan_of(options.plan, units, joints, _scale_of(options), on_progress)
     plan = load_plan(Path(options.plan))
     plan = replace(plan, limits=replace(plan.limits, **dict(options.limit)))
     try:
@@ -232,14 +230,16 @@ def _bench_of(options: argparse.Namespace) -> tuple[BenchConfig, tuple[Unit, ...
     for number, given in options.limits:
         if number is not None and number > len(joints):
             raise ConfigError(f"--limits {number}: found no joint {number} in {config.path}")
-        for place in range(len(joints)) if number is None else (number - 1,):
-            joints[place] = with_limits(joints[place], given)
+        joints = [with_limits(x, given) if number in (None, n) else x for n, x in enumerate(joints, 1)]
     units = units_of(config.channels, config.sensor is not None, options.towing)
     return replace(config, joints=tuple(joints)), units
 
 
+# Types of the options, which raise argparse.ArgumentTypeError
+
+
 def _motion_limits(text: str) -> tuple[int | None, dict[str, Any]]:
-    """[N:]NAME=VALUE,... Raises argparse.ArgumentTypeError."""
+    """[N:]NAME=VALUE,..."""
     head, colon, rest = text.partition(":")
     number = int(head) if colon and head.isdecimal() else None
     if number == 0:
@@ -251,7 +251,7 @@ def _motion_limits(text: str) -> tuple[int | None, dict[str, Any]]:
 
 
 def _pair(text: str) -> Pair:
-    """A,B. Raises argparse.ArgumentTypeError."""
+    """A,B"""
     one, _, two = text.partition(",")
     if not (one.isdecimal() and two.isdecimal()) or int(one) == int(two):
         raise argparse.ArgumentTypeError(f"found {text!r}, expected two joints like 1,2")
@@ -259,7 +259,7 @@ def _pair(text: str) -> Pair:
 
 
 def _limit(text: str) -> tuple[str, float]:
-    """NAME=VALUE. Raises argparse.ArgumentTypeError."""
+    """NAME=VALUE"""
     name, _, value = text.partition("=")
     if name not in LIMIT_NAMES:
         raise argparse.ArgumentTypeError(f"found {name!r}, expected one of {', '.join(LIMIT_NAMES)}")
@@ -375,32 +375,33 @@ def main(argv: list[str]) -> int:
     return 1
 
 
+def _checked(plan: Plan, options: argparse.Namespace, config: BenchConfig) -> dict[str, Setpoints]:
+    """Return the set-points of a plan that can be driven. Raises ConfigError."""
+    try:
+        setpoints = check_plan(plan)
+    except ConfigError as error:
+        raise ConfigError(f"{options.plan}: {error}") from None
+    config.check_temperature(plan.limits.temperature_c)
+    return setpoints
+
+
 def _make_plan(options: argparse.Namespace, config: BenchConfig, units: Sequence[Unit]) -> Plan:
     """Return the plan; a search of trajectories shows its progress."""
     if options.plan != "excitation":
         return wanted_plan(options, config.joints, units)
-    total = sum(len(unit.joints) == 2 for unit in units) * scale_of(options).motions_tried
+    total = sum(len(unit.joints) == 2 for unit in units) * _scale_of(options).motions_tried
     if total > _LONG_SEARCH and not sys.stderr.isatty():
         print("jtq campaign: designing trajectories", file=sys.stderr, flush=True)
     with bar("designing trajectories", total) as advance:
         return wanted_plan(options, config.joints, units, advance)
 
 
-def _check_plan(plan: Plan, options: argparse.Namespace) -> dict[str, Setpoints]:
-    try:
-        return check_plan(plan)
-    except ConfigError as error:
-        raise ConfigError(f"{options.plan}: {error}") from None
-
-
 def _dry_run(options: argparse.Namespace) -> int:
     config, units = _bench_of(options)
     load = config.load_with_commander()
     plan = _make_plan(options, config, units)
-    setpoints = _check_plan(plan, options)
-    config.check_temperature(plan.limits.temperature_c)
-    notes = plan_notes(options, units, plan)
-    content = dry_run_content(plan, setpoints, load, notes)
+    setpoints = _checked(plan, options, config)
+    content = dry_run_content(plan, setpoints, load, plan_notes(options, units, plan))
     print(json.dumps(content) if options.json else dry_run_text(content, plan.limits, load))
     return 0
 
@@ -418,8 +419,7 @@ def _campaign(options: argparse.Namespace, argv: Sequence[str], *, exact_too: bo
     directory = CampaignDirectory(options.out)
     try:
         plan = directory.same_recipe(made_from) or _make_plan(options, config, units)
-        setpoints = _check_plan(plan, options)
-        config.check_temperature(plan.limits.temperature_c)
+        setpoints = _checked(plan, options, config)
         directory.begin(plan, made_from)
         for line in plan_notes(options, units, plan):
             print(f"jtq campaign: {line}", file=sys.stderr)

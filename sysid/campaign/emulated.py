@@ -69,12 +69,8 @@ def emulated_with_truth(bench: AnyPlant, seed: int, day: int, run: Run) -> Emula
 
 def _sampled(values: FloatArray) -> TimeFunction:
     """Return the command of a drive as a function of time, one value per millisecond."""
-    each = values.tolist()
-
-    def at(time_s: float) -> float:
-        return float(each[round(_HZ * time_s)])
-
-    return at
+    each: list[float] = values.tolist()
+    return lambda time_s: each[round(_HZ * time_s)]
 
 
 def _write_run_files(out: Path, plant: Path, seed: int, numbered: tuple[int, Run]) -> str:
@@ -92,34 +88,21 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m jtqd.sysid.campaign.emulated", description=__doc__, epilog=_EXAMPLE
     )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="output directory; created or continued"
-    )
-    parser.add_argument(
-        "--kind", choices=KINDS, default="validate", help="kind of campaign (default validate)"
-    )
-    parser.add_argument("--plant", type=Path, default=shipped(PLANT), help=f"bench (default {PLANT})")
-    parser.add_argument("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
-    parser.add_argument("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 12)")
-    parser.add_argument("--hold", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
-    parser.add_argument(
-        "--evaluations", type=count, metavar="N", help="of each search of an excitation (default 1000)"
-    )
-    parser.add_argument("--quick", action="store_true", help="a small campaign of the kind")
-    parser.add_argument("--seed", type=natural, default=0, help="of trajectories and days (default 0)")
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="output directory; created or continued")
+    add("--kind", choices=KINDS, default="validate", help="kind of campaign (default validate)")
+    add("--plant", type=Path, default=shipped(PLANT), help=f"bench (default {PLANT})")
+    add("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
+    add("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 12)")
+    add("--hold", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
+    add("--evaluations", type=count, metavar="N", help="of each search of an excitation (default 1000)")
+    add("--quick", action="store_true", help="a small campaign of the kind")
+    add("--seed", type=natural, default=0, help="of trajectories and days (default 0)")
     options = parser.parse_args(arguments)
+    size = (options.runs, options.seconds, options.hold, options.seed, options.evaluations, options.quick)
     joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
-    scale = Scale(
-        options.runs,
-        options.seconds,
-        options.hold,
-        options.seed,
-        options.evaluations,
-        options.quick,
-        joints=joints,
-    )
     try:
-        plan = make_plan(options.kind, scale)
+        plan = make_plan(options.kind, Scale(*size, joints=joints))
         load_any_plant(options.plant)
         _claim(options.out, plan, options.plant, options.seed)
         _emulate(options.out, plan, options.plant, options.seed)

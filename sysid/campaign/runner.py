@@ -1,14 +1,9 @@
 """Runs of a campaign: each that is not done is driven, recorded, checked and kept; the outcome is reported.
 
-One attempt starts jtqd, plays the motion, ends jtqd, and turns its log into a run table (`recorded`). An attempt that fails
-for want of time is repeated. Where the run can be cut, its partial runs are driven one by one (NAME~1, NAME~2, ...) and stay
-separate tables, because the joints stood elsewhere in between.
-
-The run table of a motion that was driven: short gaps of lost cycles are interpolated, and faults of the run are found.
-
-Faults are missing cycles, broken channels, wrong wiring, and a motion that did not take place. No model is judged here.
-
-Progress of a campaign on standard error: a bar with the remaining time on a terminal, else a line per run.
+One attempt starts jtqd, plays the motion, ends jtqd, and turns its log into a run table. Short gaps of lost cycles are
+interpolated, and faults of the run are found: missing cycles, broken channels, wrong wiring, a motion that did not take
+place. No model is judged. An attempt that fails for want of time is repeated. Where the run can be cut, its partial runs are
+driven one by one (NAME~1, NAME~2, ...) and stay separate tables, because the joints stood elsewhere in between.
 """
 
 from __future__ import annotations
@@ -42,6 +37,8 @@ from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.logs import LoggedRun, log_to_run
 from jtqd.sysid.runs.tables import write_run
 
+# The run table of a motion --------------------------------------------------------------------------------------
+
 LONGEST_INTERPOLATED_S: Final = 0.0505
 """50 periods of 1 ms; the trajectories' harmonics lie below 1 Hz."""
 _INTERPOLATED_SHARE: Final = 0.005
@@ -58,12 +55,6 @@ _FOLLOW_CURRENT: Final = (0.1, 0.05)
 _OPPOSITE_TOLERANCE: Final = 0.02
 _LEAST_MOTION_RAD: Final = 1.0
 """Of a link, for its motion to be compared with the other one's."""
-
-
-def gaps_of(time_s: FloatArray, longest_gap_s: float) -> list[list[float]]:
-    """Return start and end [s] of each step that is longer than longest_gap_s."""
-    places = np.flatnonzero(np.diff(time_s) > longest_gap_s)
-    return [[round(float(time_s[place]), 6), round(float(time_s[place + 1]), 6)] for place in places]
 
 
 def interpolate_gaps(
@@ -111,56 +102,45 @@ def unusable(logged: LoggedRun, setpoints: Setpoints, longest_gap_s: float) -> s
 def findings(
     logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint], *, measured: Collection[int]
 ) -> tuple[str, ...]:
-    """Return the faults of a run, a line each.
+    """Return the faults of a run, a line each; its first row belongs to the first set-point.
 
-    Args:
-        logged: its first row belongs to the first set-point. joints: of jtqd's configuration, 1, 2, ...
-        measured: numbers of the joints of the run that have a channel of the torque sensor.
+    joints: of jtqd's configuration, 1, 2, ...; measured: numbers of those with a channel of the torque sensor.
     """
     by_number = {number: joints[number - 1] for number in setpoints.joints}
-    return (
-        *_lost(logged),
-        *_no_sensor(logged, measured),
-        *(issue.text for issue in check_run(logged.table, by_number).refused),
-        *_followed(logged, setpoints, joints),
-        *(() if setpoints.current_joint is None else _opposite(logged, setpoints.joints, joints)),
-    )
-
-
-def _lost(logged: LoggedRun) -> Iterator[str]:
+    lines = []
     if logged.lost_share > _LOST_SHARE:
         by = ", ".join(f"{name} {count}" for name, count in logged.incomplete_by.items() if count)
-        yield (
+        lines.append(
             f"{LOST_FINDING} found {logged.lost_share:.1%} missing ({logged.missed} without a cycle, "
             f"{logged.incomplete} incomplete{': ' + by if by else ''}), expected at most {_LOST_SHARE:.0%}"
         )
+    lines += [
+        f"j{number}.torque_nm: found no value in the whole run, expected the sensor's: dead channel"
+        for number, columns in logged.table.joints.items()
+        if columns.torque_nm is None and number in measured
+    ]
+    lines += [issue.text for issue in check_run(logged.table, by_number).refused]
+    lines += _followed(logged.table, setpoints, joints)
+    if setpoints.current_joint is not None:
+        lines += _opposite(logged.table, setpoints.joints, joints)
+    return tuple(lines)
 
 
-def _no_sensor(logged: LoggedRun, measured: Collection[int]) -> Iterator[str]:
-    for number, columns in logged.table.joints.items():
-        if columns.torque_nm is None and number in measured:
-            yield f"j{number}.torque_nm: found no value in the whole run, expected the sensor's: dead channel"
-
-
-def _followed(logged: LoggedRun, setpoints: Setpoints, joints: Sequence[Joint]) -> Iterator[str]:
+def _followed(table: RunTable, setpoints: Setpoints, joints: Sequence[Joint]) -> Iterator[str]:
     """Compare the velocity joint with its velocity, the other one with its current, at the time of each row."""
-    table = logged.table
     place = np.minimum(np.round(table.time_s / PERIOD_S).astype(np.intp), len(setpoints) - 1)
     mover, driver = setpoints.velocity_joint, setpoints.current_joint
     velocity = table.joints[mover].motor_velocity_rad_s
     assert velocity is not None  # log_to_run was asked for all columns
-    yield from _follows(
-        velocity / joints[mover - 1].gear_ratio,
-        setpoints.velocity_rad_s[place],
-        _FOLLOW_VELOCITY,
-        f"j{mover}.motor_velocity_rad_s: through the gear",
-        "rad/s",
-    )
+    what = f"j{mover}.motor_velocity_rad_s: through the gear"
+    wanted = setpoints.velocity_rad_s[place]
+    yield from _follows(velocity / joints[mover - 1].gear_ratio, wanted, _FOLLOW_VELOCITY, what, "rad/s")
     if driver is not None:
         current = table.joints[driver].current_a
         assert current is not None
-        wanted = setpoints.current_a[place]
-        yield from _follows(current, wanted, _FOLLOW_CURRENT, f"j{driver}.current_a:", "A")
+        yield from _follows(
+            current, setpoints.current_a[place], _FOLLOW_CURRENT, f"j{driver}.current_a:", "A"
+        )
 
 
 def _follows(
@@ -176,11 +156,9 @@ def _follows(
         )
 
 
-def _opposite(logged: LoggedRun, pair: tuple[int, ...], joints: Sequence[Joint]) -> Iterator[str]:
+def _opposite(table: RunTable, pair: tuple[int, ...], joints: Sequence[Joint]) -> Iterator[str]:
     """Compare the links, which are one body and turn oppositely; a joint with one encoder through its gear."""
-    one, two = (
-        logged.table.joint(number, joints[number - 1].gear_ratio).link_position_rad for number in pair
-    )
+    one, two = (table.joint(number, joints[number - 1].gear_ratio).link_position_rad for number in pair)
     assert one is not None
     assert two is not None
     if max(float(np.ptp(one)), float(np.ptp(two))) < _LEAST_MOTION_RAD:
@@ -189,10 +167,124 @@ def _opposite(logged: LoggedRun, pair: tuple[int, ...], joints: Sequence[Joint])
     variance = float(dx @ dx)
     slope = float(dx @ (two - two.mean())) / variance if variance else np.inf
     if abs(slope + 1.0) > _OPPOSITE_TOLERANCE:
-        link = logged.table.joints[pair[1]].link_position_rad is not None
+        link = table.joints[pair[1]].link_position_rad is not None
         name = "link_position_rad:" if link else "motor_position_rad: through the gear"
         yield f"j{pair[1]}.{name} found it turning {slope:.4g} times as far as j{pair[0]}'s, expected -1"
 
+
+# Attempts -------------------------------------------------------------------------------------------------------
+
+ATTEMPTS: Final = 3
+_BUS_WAS_LATE: Final = re.compile(
+    r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
+)
+_SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
+
+
+class Attempt(NamedTuple):
+    """How an attempt at a run ended.
+
+    again: a repetition may succeed, because the machine or the bus was late. begun: the joints were moved; otherwise the
+    bench itself is not ready. signalled: the operator ended it.
+    """
+
+    state: RunState
+    again: bool = False
+    begun: bool = True
+    signalled: bool = False
+
+
+def attempt(
+    run: Run, setpoints: Setpoints, bench: Bench, out: Path, *, motion: Play, stop_asked: StopAsked
+) -> Attempt:
+    """Play a run; leave table, marks and log in `out` where it is done, the log alone where it is not.
+
+    Raises Interrupted for a signal before the motion has begun, OSError where the files cannot be written.
+    """
+    if stop_asked():
+        raise Interrupted
+    folder = out / (run.name + PARTS)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir()
+    jtqd = Jtqd(bench, folder, setpoints.duration_s, stop_asked)
+    try:
+        try:
+            with jtqd:
+                result = motion(setpoints)
+            log, summary = jtqd.log()
+        except (ProcessError, MotionError) as error:
+            _keep([jtqd.messages], out, run.name, ".jtqd.log")
+            return Attempt(RunState(FAILED, str(error)), again=isinstance(error, MotionError), begun=False)
+        if result.status == "stopped":
+            _keep(log, out, run.name, ".stopped.mcap")
+            return stopped(result)
+        last = _recorded(run, setpoints, bench.config, log, out)
+        lost = int((summary.get("recording") or {}).get("lost", 0))
+        state = replace(last.state, played_s=result.played_s)
+        if lost and state.rows:
+            line = f"log: found {counted(lost, 'cycle')} lost by the recorder"
+            state = replace(state, findings=(line, *state.findings))
+        _keep(log, out, run.name, ".mcap" if state.status == DONE else ".failed.mcap")
+        return last._replace(state=state)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def stopped(result: MotionResult) -> Attempt:
+    """Return the attempt at a motion that was stopped before its end."""
+    signalled = bool(_SIGNALLED.search(result.reason))
+    again = not signalled and bool(_BUS_WAS_LATE.search(result.reason))
+    return Attempt(RunState(STOPPED, result.reason, played_s=result.played_s), again, signalled=signalled)
+
+
+def _recorded(run: Run, setpoints: Setpoints, config: BenchConfig, log: Sequence[Path], out: Path) -> Attempt:
+    """Write table and marks of a motion that was played to its end, if its log is usable."""
+    try:
+        logged = log_to_run(
+            log,
+            joints=run.joints,
+            all_needed=True,
+            nodes=config.nodes,
+            sensor=config.sensor is not None,
+            enabled=range(1, len(config.joints) + 1),
+            last_motion=run.current_joint is None,  # the approach of a joint that is moved alone is left out
+        )
+    except LogError as error:
+        return Attempt(RunState(FAILED, str(error)), again=True)
+    longest_gap_s = LONGEST_GAP * config.period_s
+    time_s = logged.table.time_s
+    gaps = [
+        [round(float(t), 6) for t in time_s[place : place + 2]]
+        for place in np.flatnonzero(np.diff(time_s) > longest_gap_s)
+    ]
+    logged, interpolated = interpolate_gaps(logged, longest_gap_s, config.period_s)
+    measured = [number for number in run.joints if config.measured(number)]
+    state = RunState(
+        FAILED,
+        unusable(logged, setpoints, longest_gap_s) or "",
+        rows=len(logged.table.time_s),
+        missed=logged.missed,
+        incomplete=logged.incomplete,
+        incomplete_by=dict(logged.incomplete_by),
+        findings=findings(logged, setpoints, config.joints, measured=measured),
+        interpolated=interpolated,
+    )
+    if state.reason:
+        return Attempt(state, again=True)
+    sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
+    marks = marks_of(run, setpoints) | ({"interpolated_s": gaps} if interpolated else {})
+    (out / f"{run.name}.json").write_text(json.dumps(marks, indent=1) + "\n")
+    return Attempt(replace(state, status=DONE, sha256=sha256))
+
+
+def _keep(paths: Iterable[Path], out: Path, run: str, ending: str) -> None:
+    """Move files out of the run's own directory: RUN.ENDING, RUN@2.ENDING, ... (no name has a @)."""
+    for number, file in enumerate(paths, start=1):
+        if file.exists():
+            os.replace(file, out / (run + ("" if number == 1 else f"@{number}") + ending))
+
+
+# Progress -------------------------------------------------------------------------------------------------------
 
 BETWEEN_RUNS_S: Final = 4.0
 """Assumed before the first run is measured: start of jtqd, set-up of the drives, run table."""
@@ -208,19 +300,13 @@ def clock_text(seconds: float) -> str:
 
 
 class Remaining:
-    """Remaining time of a campaign: motions to be played, and the measured time between them.
-
-    Args:
-        motions_s: lengths of all runs that are to be played.
-        now: clock in seconds.
-    """
+    """Remaining time of a campaign: motions to be played (their lengths [s]), and the measured time between them."""
 
     def __init__(self, motions_s: list[float], now: Callable[[], float] = time.monotonic) -> None:
         self.total_s: Final = sum(motions_s)
         self.played_s = 0.0
         """Motions of the runs that are over."""
-        self._left = len(motions_s)
-        self._over = 0
+        self._left, self._over = len(motions_s), 0
         self._now, self._began = now, now()
 
     def end(self, motion_s: float) -> None:
@@ -240,7 +326,7 @@ class Remaining:
 
 
 class Reporter:
-    """A context manager around the runs: the current one, and the outcome of each."""
+    """Progress on standard error around the runs: a bar with the remaining time on a terminal, else a line per run."""
 
     def __init__(self, motions_s: list[float], total: int, done: int, console: Console | None = None) -> None:
         self._console = console or Console(stderr=True)
@@ -287,10 +373,6 @@ class Reporter:
             refresh=True,
         )
 
-    def attempt_failed(self, name: str, reason: str, attempt: int) -> None:
-        """Report an attempt that is repeated."""
-        self.write_line(f"{name}: attempt {attempt}: {reason}; repeated")
-
     def end(self, name: str, motion_s: float, state: RunState) -> None:
         """Report a run that is over."""
         self._remaining.end(motion_s)
@@ -315,135 +397,16 @@ class Reporter:
             print(f"jtq campaign: {text}", file=sys.stderr, flush=True)
 
 
-ATTEMPTS: Final = 3
-_BUS_WAS_LATE: Final = re.compile(
-    r"SYNC missing|missing for \d+ cycles|no heartbeat for|no temperature for|late by|transmit queue"
-)
-_SIGNALLED: Final = re.compile(r"SIGINT|SIGTERM")
-
-
-class Attempt(NamedTuple):
-    """How an attempt at a run ended.
-
-    Attributes:
-        state: to be kept. again: a repetition may succeed, because the machine or the bus was late.
-        begun: the joints were moved; otherwise the bench itself is not ready. signalled: the operator ended it.
-    """
-
-    state: RunState
-    again: bool = False
-    begun: bool = True
-    signalled: bool = False
-
-
-def attempt(
-    run: Run, setpoints: Setpoints, bench: Bench, out: Path, *, motion: Play, stop_asked: StopAsked
-) -> Attempt:
-    """Play a run; leave table, marks and log in `out` where it is done, the log alone where it is not.
-
-    Raises:
-        Interrupted: a signal came before the motion had begun.
-        OSError: the files cannot be written.
-    """
-    if stop_asked():
-        raise Interrupted
-    folder = out / (run.name + PARTS)
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir()
-    jtqd = Jtqd(
-        bench.bus,
-        bench.config_path,
-        folder,
-        setpoints.duration_s,
-        estimate_cob_id=bench.config.estimate_cob_id,
-        stop_asked=stop_asked,
-    )
-    try:
-        try:
-            with jtqd:
-                result = motion(setpoints)
-            log, summary = jtqd.log()
-        except (ProcessError, MotionError) as error:
-            _keep([jtqd.messages], out, run.name, ".jtqd.log")
-            return Attempt(RunState(FAILED, str(error)), again=isinstance(error, MotionError), begun=False)
-        if result.status == "stopped":
-            _keep(log, out, run.name, ".stopped.mcap")
-            return stopped(result)
-        last = _recorded(run, setpoints, bench.config, log, out)
-        lost = int((summary.get("recording") or {}).get("lost", 0))
-        state = replace(last.state, played_s=result.played_s)
-        if lost and state.rows:
-            line = f"log: found {counted(lost, 'cycle')} lost by the recorder"
-            state = replace(state, findings=(line, *state.findings))
-        _keep(log, out, run.name, ".mcap" if state.status == DONE else ".failed.mcap")
-        return last._replace(state=state)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def stopped(result: MotionResult) -> Attempt:
-    """Return the attempt at a motion that was stopped before its end."""
-    signalled = bool(_SIGNALLED.search(result.reason))
-    return Attempt(
-        RunState(STOPPED, result.reason, played_s=result.played_s),
-        again=not signalled and bool(_BUS_WAS_LATE.search(result.reason)),
-        signalled=signalled,
-    )
-
-
-def _recorded(run: Run, setpoints: Setpoints, config: BenchConfig, log: Sequence[Path], out: Path) -> Attempt:
-    """Write table and marks of a motion that was played to its end, if its log is usable."""
-    try:
-        logged = log_to_run(
-            log,
-            joints=run.joints,
-            all_needed=True,
-            nodes=config.nodes,
-            sensor=config.sensor is not None,
-            enabled=range(1, len(config.joints) + 1),
-            last_motion=run.current_joint is None,  # the approach of a joint that is moved alone is left out
-        )
-    except LogError as error:
-        return Attempt(RunState(FAILED, str(error)), again=True)
-    longest_gap_s = LONGEST_GAP * config.period_s
-    gaps = gaps_of(logged.table.time_s, longest_gap_s)
-    logged, interpolated = interpolate_gaps(logged, longest_gap_s, config.period_s)
-    measured = [number for number in run.joints if config.measured(number)]
-    state = RunState(
-        FAILED,
-        unusable(logged, setpoints, longest_gap_s) or "",
-        rows=len(logged.table.time_s),
-        missed=logged.missed,
-        incomplete=logged.incomplete,
-        incomplete_by=dict(logged.incomplete_by),
-        findings=findings(logged, setpoints, config.joints, measured=measured),
-        interpolated=interpolated,
-    )
-    if state.reason:
-        return Attempt(state, again=True)
-    sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
-    marks = marks_of(run, setpoints) | ({"interpolated_s": gaps} if interpolated else {})
-    (out / f"{run.name}.json").write_text(json.dumps(marks, indent=1) + "\n")
-    return Attempt(replace(state, status=DONE, sha256=sha256))
-
-
-def _keep(paths: Iterable[Path], out: Path, run: str, ending: str) -> None:
-    """Move files out of the run's own directory: RUN.ENDING, RUN@2.ENDING, ... (no name has a @)."""
-    for number, file in enumerate(paths, start=1):
-        if file.exists():
-            os.replace(file, out / (run + ("" if number == 1 else f"@{number}") + ending))
-
+# The campaign ---------------------------------------------------------------------------------------------------
 
 AttemptRun = Callable[[Run, Setpoints], Attempt]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What was done of a campaign.
+    """What was done of a campaign: state of every run, and why it ended before the last one ("" when it did not).
 
-    Attributes:
-        runs: state of every run of the plan. ended: why it ended before the last run; "" when it did not.
-        late: it ended at the first run that was lost because this machine was late: the others are for exact time.
+    late: it ended at the first run that was lost because this machine was late: the others are for exact time.
     """
 
     runs: Mapping[str, RunState]
@@ -453,12 +416,8 @@ class Outcome:
     @property
     def short_of_time(self) -> bool:
         """Whether a run is not done because the bus or the machine was late."""
-        reasons = [state.reason for state in self.runs.values() if state.status in (STOPPED, FAILED)]
+        reasons = self._not_done().values()
         return any(_BUS_WAS_LATE.search(reason) or "found a gap of" in reason for reason in reasons)
-
-    def count(self, status: str) -> int:
-        """Return runs with this status."""
-        return sum(state.status == status for state in self.runs.values())
 
     @property
     def exit_status(self) -> int:
@@ -472,23 +431,22 @@ class Outcome:
         """Return the outcome for a program (jtq.campaign_outcome/1)."""
         return {
             "schema": "jtq.campaign_outcome/1",
-            "runs": {status: self.count(status) for status in STATUSES},
+            "runs": self._counts(),
             "rows": sum(state.rows for state in self.runs.values()),
             "missed_cycles": self._some("missed"),
             "incomplete_cycles": self._some("incomplete"),
             "interpolated_rows": self._some("interpolated"),
             "pieces": {name: s.pieces for name, s in self.runs.items() if s.pieces > 1},
             "findings": {name: list(lines) for name, lines in self._some("findings").items()},
-            "not_done": {name: s.reason for name, s in self.runs.items() if s.status in (STOPPED, FAILED)},
+            "not_done": self._not_done(),
             "ended": self.ended or None,
         }
 
     def text(self) -> str:
         """Return the outcome for people."""
-        counts = {status: self.count(status) for status in STATUSES}
         rows = sum(state.rows for state in self.runs.values())
         lines = [
-            f"runs      {', '.join(f'{number} {status}' for status, number in counts.items() if number)}",
+            f"runs      {', '.join(f'{number} {status}' for status, number in self._counts().items() if number)}",
             f"cycles    {counted(rows, 'row')}, {self._places('missed')}, {self._places('incomplete')}",
         ]
         if self._some("interpolated"):
@@ -502,6 +460,12 @@ class Outcome:
         if self.ended:
             lines.append(f"ended by  {self.ended}; the same command continues with the remaining runs")
         return "\n".join(lines)
+
+    def _counts(self) -> dict[str, int]:
+        return {each: sum(state.status == each for state in self.runs.values()) for each in STATUSES}
+
+    def _not_done(self) -> dict[str, str]:
+        return {name: s.reason for name, s in self.runs.items() if s.status in (STOPPED, FAILED)}
 
     def _some(self, field: str) -> dict[str, Any]:
         """Return a field of the states where it is not empty, by run."""
@@ -536,17 +500,17 @@ def go_through(
     for run in plan.runs:
         if directory.runs[run.name].status == DONE:
             continue
-        motion_s = setpoints[run.name].duration_s
+        points = setpoints[run.name]
         reporter.begin(run.name)
         try:
             if exact_next:
-                last, state = _attempt_on_time(run, setpoints[run.name], attempt_run)
+                last, state = _attempt_on_time(run, points, attempt_run)
             else:
-                last, state = _attempts(run, setpoints[run.name], reporter, attempt_run)
+                last, state = _attempts(run, points, reporter, attempt_run)
         except Interrupted:
             return Outcome(directory.runs, f"a signal, before {run.name} moved")
         directory.put(run.name, state)
-        reporter.end(run.name, motion_s, state)
+        reporter.end(run.name, points.duration_s, state)
         if last.signalled:
             return Outcome(directory.runs, f"{state.reason} during {run.name}")
         late = exact_next and last.again
@@ -570,32 +534,31 @@ def _attempts(
     run: Run, setpoints: Setpoints, reporter: Reporter, attempt_run: AttemptRun
 ) -> tuple[Attempt, RunState]:
     """Return the last attempt and the run's state."""
+    number = 0
+
+    def repeated(run: Run, setpoints: Setpoints, most: int) -> Attempt:
+        nonlocal number
+        for k in range(1, most + 1):
+            number += 1
+            last = attempt_run(run, setpoints)
+            if last.state.status == DONE or not last.again or k == most:
+                break
+            reporter.write_line(f"{run.name}: attempt {k}: {last.state.reason}; repeated")
+        return last
+
     parts = partial_runs(run)
-    number, last = _repeated(run, setpoints, reporter, attempt_run, ATTEMPTS if len(parts) == 1 else 1)
+    last = repeated(run, setpoints, ATTEMPTS if len(parts) == 1 else 1)
     state = last.state
     if len(parts) > 1 and last.again and last.begun and state.status != DONE:
         reporter.write_line(f"{run.name}: {state.reason}; repeated in {len(parts)} pieces")
         states = []
         for part in parts:
-            attempts, last = _repeated(part, expand(part), reporter, attempt_run, ATTEMPTS)
-            number += attempts
+            last = repeated(part, expand(part), ATTEMPTS)
             states.append(last.state)
             if last.state.status != DONE:
                 break
         state = _joined(parts, states)
     return last, replace(state, attempts=number)
-
-
-def _repeated(
-    run: Run, setpoints: Setpoints, reporter: Reporter, attempt_run: AttemptRun, most: int
-) -> tuple[int, Attempt]:
-    """Return the number of attempts, and the last of them."""
-    for number in range(1, most + 1):
-        last = attempt_run(run, setpoints)
-        if last.state.status == DONE or not last.again or number == most:
-            break
-        reporter.attempt_failed(run.name, last.state.reason, number)
-    return number, last
 
 
 def _joined(parts: Sequence[Run], states: Sequence[RunState]) -> RunState:
@@ -605,20 +568,15 @@ def _joined(parts: Sequence[Run], states: Sequence[RunState]) -> RunState:
     incomplete_by: Counter[str] = Counter()
     for state in states:
         incomplete_by.update(state.incomplete_by)
+    names = [part.name for part in parts[: len(states)]]
+    each = zip(names, states, strict=True)
+    sums = ("played_s", "rows", "missed", "incomplete", "interpolated")
     return RunState(
         status=last.status,
-        reason="" if done else f"{parts[len(states) - 1].name}: {last.reason}",
-        played_s=sum(state.played_s for state in states),
-        rows=sum(state.rows for state in states),
-        missed=sum(state.missed for state in states),
-        incomplete=sum(state.incomplete for state in states),
+        reason="" if done else f"{names[-1]}: {last.reason}",
         incomplete_by=dict(incomplete_by),
-        findings=tuple(
-            f"{part.name}: {finding}"
-            for part, state in zip(parts, states, strict=False)
-            for finding in state.findings
-        ),
+        findings=tuple(f"{name}: {finding}" for name, state in each for finding in state.findings),
         sha256=" ".join(state.sha256 for state in states) if done else "",
-        interpolated=sum(state.interpolated for state in states),
         pieces=len(parts) if done else 1,
+        **{field: sum(getattr(state, field) for state in states) for field in sums},
     )

@@ -41,13 +41,9 @@ class StateError(Exception):
 class RunState:
     """State of one run.
 
-    Attributes:
-        status: done; stopped (a limit, or the bus); failed (nothing usable was recorded); pending.
-        reason: one line for stopped and failed. attempts: number of attempts.
-        played_s: length of the set-points that were sent in the last attempt.
-        rows: of the run table. missed, incomplete: cycles that are no rows (see log_to_run).
-        interpolated: rows among `rows` that were interpolated. pieces: number of run tables, one for each partial run.
-        findings: faults of the table, a line each. sha256: of NAME.csv.gz.
+    status: done; stopped (a limit, or the bus); failed (nothing usable was recorded); pending. reason: of stopped, failed.
+    played_s: length of the set-points of the last attempt. rows: of the run table, `interpolated` of them interpolated.
+    missed, incomplete: cycles that are no rows. findings: faults of the table. sha256: of NAME.csv.gz. pieces: run tables.
     """
 
     status: Annotated[str, choice(STATUSES)] = PENDING
@@ -71,9 +67,7 @@ class RunState:
 class CampaignDirectory:
     """A campaign's directory, made if missing, locked for this process until `close`; its state is that of the last `put`.
 
-    Raises:
-        StateError: another campaign is running there, or campaign.json cannot be read.
-        OSError: it cannot be made or written.
+    Raises StateError where another campaign is running there, or campaign.json cannot be read; OSError.
     """
 
     def __init__(self, path: Path) -> None:
@@ -98,18 +92,13 @@ class CampaignDirectory:
             self.close()
             raise
 
-    @property
-    def begun(self) -> bool:
-        """Whether a campaign has been begun here."""
-        return bool(self.plan_sha256)
-
     def close(self) -> None:
         """Unlock the directory."""
         os.close(self._lock)
 
     def same_recipe(self, recipe: Mapping[str, Any]) -> Plan | None:
         """Return the plan of this directory if it was made from the same recipe; else None."""
-        if not self.begun or self.recipe != recipe:
+        if not self.plan_sha256 or self.recipe != recipe:
             return None
         try:
             plan = load_plan(self.path / PLAN_FILE)
@@ -122,12 +111,12 @@ class CampaignDirectory:
 
         Raises StateError for a directory of another plan.
         """
-        if self.begun and self.plan_sha256 != plan.sha256:
+        if self.plan_sha256 and self.plan_sha256 != plan.sha256:
             raise StateError(
                 f"{self.path}: found campaign '{self.name}' of another plan ({self.plan_sha256[:8]}), expected "
                 f"'{plan.name}' ({plan.sha256[:8]}): give another --out, or the same campaign with the same options"
             )
-        if not self.begun:
+        if not self.plan_sha256:
             foreign = [path.name for run in plan.runs for path in _files_of(self.path, run.name)]
             if foreign:
                 raise StateError(

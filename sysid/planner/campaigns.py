@@ -113,12 +113,8 @@ def unit_lines(units: Iterable[Unit], text_of: Callable[[Unit], str]) -> list[st
 
 
 def units_of(channels: Sequence[int | None], sensor: bool, towing: Iterable[Pair] = ()) -> tuple[Unit, ...]:
-    """Return the units of a bus in the order of their first joints.
-
-    channels: of the sensor, for joints 1, 2, ...; sensor: there is one. towing: pairs that the operator has coupled.
-
-    Raises:
-        ConfigError: a pair of joints that are not there, or of which one is in another pair.
+    """Return the units of a bus by their first joints; channels: of the sensor, for joints 1, 2, ...; towing: coupled
+    by the operator. Raises ConfigError for a pair of joints that are not there, or of which one is in another pair.
     """
     shared: dict[int, list[int]] = {}
     for number, channel in enumerate(channels, 1):
@@ -156,8 +152,7 @@ def _pairs(groups: Iterable[list[int]]) -> Iterator[Pair]:
 
 def check_joints(plan: Plan, units: Sequence[Unit]) -> None:
     """Refuse a plan that moves joints as they are not coupled, or takes the power from a bus with others to hold.
-
-    Raises ConfigError naming the run.
+    Raises ConfigError.
     """
     of = {number: unit for unit in units for number in unit.joints}
     for run in plan.runs:
@@ -213,10 +208,10 @@ def plateau_run(
     hold_s: float,
     travel_rad: float = math.inf,
 ) -> Run:
-    """Return one run: from rest over all points (velocity [rad/s], current [A]), each held for hold_s, back to rest.
+    """Return one run over all points (velocity [rad/s], current [A]), each held for hold_s.
 
-    Before a point that would take the joint further than travel_rad from where the run began (with room to stop in), it
-    turns back there without load.
+    Before a point that would take the joint further than travel_rad from the start (with room to stop in), it turns
+    back there without load.
     """
     return run_over(name, velocity_joint, _turned_back(points, hold_s, travel_rad), _ramp_s, _PLATEAU_EDGE_S)
 
@@ -257,8 +252,7 @@ def efficiency_runs(
 ) -> tuple[Run, ...]:
     """Section II: a run per velocity, direction and kind of drive, each over the currents (default: the paper's).
 
-    Slow and fast take turns, so that the joints' warming does not look like an effect of velocity; so do both
-    directions and both joints, so that the bench does not wander off.
+    Slow and fast, both directions and both joints take turns, so that warming does not look like an effect of velocity.
     """
     runs = []
     for velocity in slow_and_fast(velocities_rad_s):
@@ -319,13 +313,10 @@ def excitation_runs(
     joints: Joints = None,
     on_progress: OnTried | None = None,
 ) -> tuple[Run, ...]:
-    """Section III: `count` runs of two trajectories each with 2 s of rest between; run_s [s] is a run's length.
+    """Section III: `count` runs of run_s [s] with two trajectories each.
 
-    The first trajectory of a run uses all of the velocity, the second one is slow, medium or fast in turn; the velocity
-    joint alternates.
-
-    Raises:
-        ConfigError: runs too short for two trajectories.
+    The first one uses all of the velocity, the second one is slow, medium or fast in turn; the velocity joint
+    alternates. Raises ConfigError for runs that are too short.
     """
     duration_s = _trajectory_s(run_s, (2.0 * EDGE_S + BETWEEN_S), 2)
     # the second level changes after each pair of runs, so that either joint is the velocity joint at every level
@@ -354,9 +345,7 @@ def variable_runs(
     limits: Limits, count: int, run_s: float, *, seed: int, joints: Joints = None
 ) -> tuple[Run, ...]:
     """Section IV.B: `count` runs of one drawn trajectory each, for validation only; the velocity joint alternates.
-
-    Raises:
-        ConfigError: runs too short for a trajectory.
+    Raises ConfigError for runs that are too short.
     """
     drawn = seed_of("variable", FULL_RAD_S, seed)
     wanted = _design_limits(limits, FULL_RAD_S)
@@ -374,9 +363,7 @@ def outside_runs(
     velocity_rad_s: float = FULL_RAD_S,
 ) -> tuple[Run, ...]:
     """Return runs outside of every training range: `load` times the currents of other campaigns, or a higher velocity.
-
-    Raises:
-        ConfigError: runs too short for a trajectory.
+    Raises ConfigError for runs that are too short.
     """
     wanted = ExcitationLimits(
         velocity_rad_s=velocity_rad_s,
@@ -406,7 +393,7 @@ def _drawn_runs(
 
 
 def seed_of(purpose: str, level: float, seed: int) -> int:
-    """Return a seed of 32 bits for a purpose and level: no two of them share their random numbers, whatever `seed` is."""
+    """Return a seed of 32 bits: no two purposes or levels share their random numbers, whatever `seed` is."""
     digest = hashlib.sha256(f"{purpose}/{level!r}/{seed}".encode()).digest()
     return int.from_bytes(digest[:4], "big")
 
@@ -422,7 +409,6 @@ def _trajectory_s(run_s: float, rests_s: float, trajectories: int) -> float:
 
 
 def _design_limits(limits: Limits, peak_rad_s: float) -> ExcitationLimits:
-    """Well within the plan's limits, so that none of them ends a run."""
     return ExcitationLimits(
         velocity_rad_s=min(peak_rad_s, _LIMIT_SHARE * limits.velocity_rad_s),
         travel_rad=_LIMIT_SHARE * limits.travel_rad,
@@ -443,12 +429,10 @@ INERTIA_SHARE: Final = 0.25
 
 
 def range_of(number: int, joint: Joint, plan: Limits) -> MotionRange:
-    """Return what joint `number` may do alone; plan: limits of the campaign, of which temperature and current hold here too.
+    """Return what joint `number` may do alone; plan: limits of the campaign, for temperature and current.
 
-    The current is what the joint needs for the allowed torque, against its own losses.
-
-    Raises:
-        ConfigError: travel or velocity are not limited.
+    The current is what the joint needs for the allowed torque against its own losses. Raises ConfigError where travel
+    or velocity are not limited.
     """
     missing = missing_limits(joint, "travel_rad", "velocity_rad_s")
     if missing:
@@ -489,10 +473,8 @@ def allowed_torque(joint: Joint) -> float:
 
 
 def tightest(given: Limits, own: Limits) -> Limits:
-    """Return the tighter one of a plan's limits of a joint and those of its joint file, limit by limit.
-
-    Raises:
-        ConfigError: their travels have nothing in common.
+    """Return the tighter one of a plan's limits of a joint and those of its joint file, limit by limit. Raises
+    ConfigError where their travels have nothing in common.
     """
     low = max(given.position_rad[0], own.position_rad[0])
     high = min(given.position_rad[1], own.position_rad[1])
@@ -563,10 +545,10 @@ _SHORTEST_RAMP_S: Final = 0.3
 
 
 def joint_plateau_run(number: int, motion: MotionRange, name: str, shares: Sequence[float] = LADDER) -> Run:
-    """Return constant velocities (parts of the fastest) both ways: left, right, left and back.
+    """Return constant velocities (parts of the fastest) both ways: left, right, left and back, over as much of the
+    travel as a pass may take.
 
-    Each goes over as much of the travel as a pass may take. The ramps between two directions move the joint nowhere, and
-    those at the ends half of their time.
+    The ramps between two directions move the joint nowhere, those at the ends half of their time.
     """
     segments: list[Segment] = [Rest(EDGE_S, 0.0)]
     for share in shares:
@@ -599,9 +581,8 @@ def joint_excitation_runs(
     evaluations: int,
     ladder: Sequence[float] = LADDER,
 ) -> tuple[Run, ...]:
-    """Return the plateaus (`joint_plateau_run`) and `count` runs of run_s [s] with two trajectories each.
-
-    The first one uses all of the velocity, the second one a part of it (SECOND_LEVELS).
+    """Return the plateaus and `count` runs of run_s [s] with two trajectories each, the first at full velocity, the
+    second at a part of it (SECOND_LEVELS).
     """
     duration_s = round(0.5 * (run_s - 2.0 * EDGE_S - BETWEEN_S), 3)
     levels = [1.0] * count + [SECOND_LEVELS[k % len(SECOND_LEVELS)] for k in range(count)]
@@ -632,10 +613,8 @@ APPROACH_S: Final = 1.0
 
 
 def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) -> Setpoints:
-    """Return the motion of one joint, alone, from where it stands to another place, slowly; positions by its own encoder.
-
-    Raises:
-        MotionError: start or target are outside of its travel.
+    """Return the slow motion of one joint from where it stands to another place; positions by its own encoder. Raises
+    MotionError for start or target outside of its travel.
     """
     low, high = limits.position_rad
     for what, position in (("stands at", start_rad), ("shall go to", target_rad)):
@@ -668,14 +647,10 @@ _QUICK_CURRENTS: Final = (1.0, 2.5, 4.0)
 
 @dataclass(frozen=True)
 class Scale:
-    """Size of a campaign; None: as in the paper, or small with `quick`.
+    """Size of a campaign; None: as in the paper, or small with `quick` (every kind of run, few of each).
 
-    Attributes:
-        runs: number of Fourier runs. seconds: length of one. hold_s: of a point at constant velocity.
-        seed: of the trajectories. evaluations: of each search.
-        quick: a small campaign of the same kind: enough points for every fit, too few for a good one.
-        limits: of the plan; the Fourier runs stay well within them.
-        joints: of the bench, for the torque of a motion; None: those that ship.
+    runs, seconds: number and length of Fourier runs; hold_s: of a point at constant velocity; evaluations: of each
+    search; limits: of the plan, the Fourier runs stay well within them; joints: of the bench, None: those that ship.
     """
 
     runs: int | None = None
@@ -688,7 +663,7 @@ class Scale:
     joints: Joints = None
 
     def or_else(self, name: str, whole: Any, quick: Any) -> Any:
-        """Return the value of an option: as given, else by the size of the campaign."""
+        """Return an option as given, else by the size of the campaign."""
         given = getattr(self, name)
         return given if given is not None else quick if self.quick else whole
 
@@ -701,12 +676,8 @@ class Scale:
 
 
 def make_plan(kind: str, scale: Scale, on_progress: OnTried | None = None) -> Plan:
-    """Return the plan of one of KINDS for joints 1 and 2 on a towing bench.
-
-    on_progress: called with the number of motions tried, `scale.motions_tried` in all.
-
-    Raises:
-        ConfigError: a scale that leaves nothing to be driven.
+    """Return the plan of one of KINDS for joints 1 and 2 on a towing bench; on_progress: `scale.motions_tried` in all.
+    Raises ConfigError for a scale that leaves nothing to be driven.
     """
     limits, hold_s = scale.limits, scale.or_else("hold_s", HOLD_S, 1.0)
     count = scale.or_else("runs", RUNS, QUICK_RUNS)
@@ -739,9 +710,7 @@ def make_plan_of(
     on_progress: OnTried | None = None,
 ) -> Plan:
     """Return the plan of one of KINDS for all units of a bus that can be moved so; joints: files of joints 1, 2, ...
-
-    Raises:
-        ConfigError: nothing to be driven, or a joint that is moved alone without limits.
+    Raises ConfigError where there is nothing to be driven, or for a joint that is moved alone without limits.
     """
     able = [unit for unit in units if not unit.refusal(kind)]
     if not able:

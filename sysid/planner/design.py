@@ -52,12 +52,9 @@ LONGEST_S: Final = 600.0
 class ExcitationLimits:
     """Limits of a designed run; joint side, each > 0 (ConfigError otherwise).
 
-    Attributes:
-        velocity_rad_s, acceleration_rad_s2: peaks of the velocity joint.
-        travel_rad: largest distance from the start, either way.
-        current_a: peak of the driving joint's commanded current.
-        joint_current_a: peak of the current that the velocity joint needs, by the joint files.
-        torque_nm: peak of the torque between the joints, by the joint files.
+    velocity, acceleration: peaks of the velocity joint; travel_rad: from the start, either way; current_a: peak of the
+    driving joint's commanded current; joint_current_a: of the current that the velocity joint needs; torque_nm: between
+    the joints, both by the joint files.
     """
 
     velocity_rad_s: float = 3.0
@@ -116,9 +113,8 @@ class Bench:
 class Motion(NamedTuple):
     """Scaled candidates over the grid: every array [m, n].
 
-    velocity, acceleration of the velocity joint [rad/s, rad/s^2]; current of the driving joint [A]; torque between the
-    joints [Nm], positive along the positive current of either; `velocity_scale`, `current_scale` [m, 1]: factors of the
-    genome's amplitudes.
+    velocity, acceleration of the velocity joint; current of the driving joint; torque between the joints [Nm], positive
+    along the positive current of either; factors of the genome's amplitudes [m, 1].
     """
 
     velocity: FloatArray
@@ -130,10 +126,7 @@ class Motion(NamedTuple):
 
 
 class Candidates:
-    """Turns genomes into motions that keep the limits, on one time grid.
-
-    duration_s: length of a run; rate_hz: grid. The motion is linear in its amplitudes, so it is a product with matrices
-    that are computed once.
+    """Turns genomes into motions of duration_s on a grid of rate_hz that keep the limits, by products with matrices.
 
     Raises ConfigError for limits that leave no motion at all.
     """
@@ -220,7 +213,6 @@ class Candidates:
         return Motion(velocity, acceleration, current, torque, v_scale, i_scale)
 
     def _torque_range(self, velocity: FloatArray, acceleration: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the least and largest torque [Nm] by its own limit and that of the velocity joint's current."""
         low, high = self.bench.torque_range(self.limits.joint_current_a, velocity, acceleration)
         limit = self.limits.torque_nm
         return np.maximum(low, -limit), np.minimum(high, limit)
@@ -249,10 +241,10 @@ def unit_motions(
 
 
 def fundamentals(duration_s: float) -> tuple[float, float]:
-    """Return angular frequencies [rad/s] of velocity and current: whole periods of about 10 s, and over the golden ratio.
+    """Return angular frequencies [rad/s] of velocity and current: whole periods of about 10 s, and over the golden
+    ratio.
 
-    Fractions approach the golden ratio worst: harmonics of the two never stay in step, so that all four quadrants of
-    velocity and torque fill.
+    Harmonics of the two never stay in step, so that all four quadrants of velocity and torque fill.
     """
     velocity = 2.0 * math.pi * max(1.0, round(FUNDAMENTAL_HZ * duration_s)) / duration_s
     return velocity, velocity / GOLDEN
@@ -278,7 +270,6 @@ def _peak(values: FloatArray) -> FloatArray:
 
 
 def _between(low: FloatArray, value: FloatArray, high: FloatArray) -> NDArray[np.bool_]:
-    """Return whether a row lies within its range at every instant, [m] of arrays [m, n]."""
     return np.asarray(((low <= value) & (value <= high)).all(axis=1))
 
 
@@ -311,16 +302,15 @@ gets a bad log det in place of an infinite one; that of a useful run changes by 
 
 
 def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatArray:
-    """Return the 20 columns of the loss model [..., 20] at velocities [rad/s] and joint torques [Nm] of one shape [...].
+    """Return the 20 columns of the loss model [..., 20] at velocities [rad/s] and joint torques [Nm] of one shape
+    [...].
 
     Per direction of motion d and, in it, per quadrant q (driving or back-driven), with s = tanh(v/0.02):
 
         loss = s (c_d + f_d |v| + q_d v^2 + p_d exp(-(v/0.05)^2)) + s (k_dq |tau| + m_dq tau^2 + n_dq |tau| |v|)
 
-    The estimator's own loss (estimator/losses.pyx) is finer in the load: lines between nodes. The few coefficients of a
-    polynomial make a better design: they need the ends and the middle of every range. At the same instant the other joint
-    has (-v, tau), which only permutes columns and changes signs: one determinant serves both joints.
-
+    The few coefficients of a polynomial make a better design than the estimator's lines between nodes. At the same
+    instant the other joint has (-v, tau), which only permutes columns and changes signs: one determinant serves both.
     Order: direction positive, then negative; in each 4 columns of speed, 3 of load driving (tau v >= 0), 3 back-driven.
     """
     v, tau = velocity_rad_s, torque_nm
@@ -337,10 +327,10 @@ def loss_regressor(velocity_rad_s: FloatArray, torque_nm: FloatArray) -> FloatAr
 
 
 class Information:
-    """Information matrices with fixed scales: the mean square of each column over the box of velocity and torque.
+    """Information matrices, each column scaled by its mean square over the box of half widths velocity_rad_s,
+    torque_nm.
 
-    velocity_rad_s, torque_nm: half widths of the box. The scales shift every log det by the same amount and leave the
-    optimum unchanged; they make the numbers readable and the matrices well conditioned.
+    The scales shift every log det by the same amount and leave the optimum unchanged.
     """
 
     def __init__(self, velocity_rad_s: float, torque_nm: float) -> None:
@@ -389,14 +379,12 @@ class Found(NamedTuple):
 
 
 def minimise(criterion: Criterion, dimension: int, *, evaluations: int, rng: np.random.Generator) -> Found:
-    """Return the best genome of a search of at most `evaluations` (>= 1); the same generator state gives the same result.
+    """Return the best genome of a search of at most `evaluations` (>= 1); the same generator state gives the same
+    result.
 
-    Below two populations the genomes are drawn uniformly, POPULATION at most; beyond it they evolve (scipy's differential
-    evolution, whole generations of POPULATION), and the last tenth polishes the best of them.
-
-    Raises:
-        ValueError: evaluations below 1.
-        ConfigError: scipy is needed and not installed.
+    Below two populations the genomes are drawn uniformly, POPULATION at most; beyond it they evolve (differential
+    evolution, whole generations), and the last tenth polishes the best. Raises ConfigError where scipy is needed and
+    not installed.
     """
     if evaluations < 1:
         raise ValueError(f"found {evaluations} evaluations, expected at least 1")
@@ -502,10 +490,8 @@ def sequence(problems: Iterable[Problem], search: Search, *, seed: int) -> list[
 
 @dataclass(frozen=True)
 class Design:
-    """One trajectory of the excitation of two coupled joints.
-
-    information_log_det: of the scaled information of all trajectories so far; grows with every one. It compares designs for
-    the same limits; its zero has no meaning.
+    """One trajectory; information_log_det: of the scaled information of all so far, comparable for the same limits
+    only.
     """
 
     segment: Fourier
@@ -513,11 +499,7 @@ class Design:
 
 
 class CoupledJoints:
-    """Problem of one trajectory of two coupled joints, with the matrices that its evaluation needs.
-
-    Raises:
-        ConfigError: duration or harmonics out of range.
-    """
+    """Problem of one trajectory of two coupled joints. Raises ConfigError for duration or harmonics out of range."""
 
     def __init__(
         self,
@@ -568,21 +550,13 @@ def design(
     joints: tuple[Joint, Joint] | None = None,
     on_progress: Callable[[int], None] | None = None,
 ) -> tuple[Design, ...]:
-    """Return `count` trajectories of duration_s seconds, every one within the limits and with at least one limit reached.
+    """Return `count` trajectories of duration_s (1 to 600 s), each within the limits, with at least one limit reached.
 
-    Args:
-        limits: which no trajectory exceeds at any set-point of 1 kHz.
-        count: number of trajectories, >= 1. duration_s: length of each, 1 to 600 s. harmonics: of velocity and of current.
-        seed: the same arguments give the same trajectories.
-        evaluations: most motions that each search tries, >= 1; 1: the coefficients are drawn.
-        starts: independent searches for each trajectory, of which the best counts. None: 3, or 1 for so few evaluations
-            that nothing is searched.
-        joints: velocity joint and driving joint; None: the two that ship. They give the torque of a current and the
-            current of a motion.
-        on_progress: called after each batch with the number of motions tried since the last call.
+    The same arguments give the same trajectories. evaluations: most motions that each search tries; 1: the coefficients
+    are drawn. starts: searches per trajectory, of which the best counts; None: `starts_of`. joints: velocity joint and
+    driving joint; None: the two that ship. on_progress: called with the number of motions tried since the last call.
 
-    Raises:
-        ConfigError: an argument is out of range, or scipy is needed (more than one generation) and not installed.
+    Raises ConfigError for an argument out of range, or where scipy is needed and not installed.
     """
     starts = starts_of(evaluations) if starts is None else starts
     _check_range("count", count, 1, 1000)
@@ -703,7 +677,7 @@ def trajectories(
 ) -> list[Fourier]:
     """Return a trajectory for each level (peak as a part of the fastest velocity), the best one given those before it.
 
-    evaluations: of each search; 1: drawn, not optimised. Raises ConfigError for runs that are too short.
+    evaluations: of each search; 1: drawn. Raises ConfigError for runs that are too short.
     """
     if duration_s < SHORTEST_TRAJECTORY_S:
         raise ConfigError(

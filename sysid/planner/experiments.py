@@ -63,12 +63,11 @@ _OFF_S: Final = 2.5
 class PairRange:
     """What the runs of an experiment may use of two coupled joints.
 
-    A joint file gives the rated torque and no rated current. The current limit is the current for the rated torque against
-    the joint's own losses. The planned motion stays well below both, because the file may be wrong in the very value that
-    the experiment identifies.
+    The current limit is the current for the rated torque against the joint's own losses. The planned motion stays well
+    below both: the file may be wrong in the very value that the experiment identifies.
 
-    joints: of the bench; limits: of the plan but for travel, which each plan adds; velocity_rad_s: fastest plateau;
-    acceleration_rad_s2: steepest change of it; own_current_a: largest planned current of joint 1 and of joint 2.
+    limits: of the plan but for travel; velocity_rad_s: fastest plateau; acceleration_rad_s2: steepest change of it;
+    own_current_a: largest planned current of joint 1 and of joint 2.
     """
 
     joints: tuple[Joint, Joint]
@@ -78,10 +77,11 @@ class PairRange:
     own_current_a: tuple[float, float]
 
     def load_of(self, velocity_joint: int, velocity_rad_s: float | None = None) -> float:
-        """Return the largest current [A] of the other joint at any velocity up to this one (None: the fastest; 0: standing).
+        """Return the largest current [A] of the other joint at any velocity up to this one (None: the fastest; 0:
+        standing).
 
-        Torque and the velocity joint's own current stay within their bounds in both directions: driven back, the driving
-        joint's losses add to its torque. Standing, its torque is at most that of its current.
+        Torque and the velocity joint's own current stay within their bounds in both directions. Standing, its torque is
+        at most that of its current.
         """
         speed = self.velocity_rad_s if velocity_rad_s is None else velocity_rad_s
         mover, driver = self.joints[velocity_joint - 1], self.joints[2 - velocity_joint]
@@ -109,13 +109,10 @@ class PairRange:
 def pair_range_of(
     joints: Mapping[int, Joint], *, velocity_rad_s: float = VELOCITY_RAD_S, temperature: bool = True
 ) -> PairRange:
-    """Return what two coupled joints can do within the `motion_limits` of their files but for travel, which a coupling has
-    not; one joint alone is taken to face one like itself.
+    """Return what two coupled joints can do within the `motion_limits` of their files but for travel; one joint alone
+    is taken to face one like itself.
 
-    joints: by number, at least one; the first two count. temperature: whether the drives measure theirs (a plan with a
-    limit for it is refused otherwise).
-
-    Raises ValueError without a joint.
+    joints: by number, at least one (ValueError); the first two count. temperature: whether the drives measure theirs.
     """
     if not joints:
         raise ValueError("joints: found none, expected one or two")
@@ -450,11 +447,11 @@ def _joint_zero_reading(joint: JointRange, name: str) -> list[Motion]:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A kind of experiment. pair_text, joint_text: what is done and what that shows, of two joints on a bench and of one.
+    """A kind of experiment, of two joints on a bench and of one: what is done and what that shows, and its runs or
+    motions.
 
-    pair: runs of one velocity joint, named after a prefix; joint: motions, named after a prefix. Signs as in `campaigns`.
-    Every kind is done with either joint as the velocity joint, so that both joints drive and are driven, and there are
-    always runs to hold out.
+    Every kind is done with either joint as the velocity joint; there are always runs to hold out. Signs as in
+    `campaigns`.
     """
 
     pair_text: str

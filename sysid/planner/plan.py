@@ -1,15 +1,12 @@
-"""Plans of motions (schema jtq.plan/1): segments, runs, limits; to and from YAML, and as set-points at 1 kHz.
+"""Plans of motions (schema jtq.plan/1): Fourier series, segments, runs, limits; YAML, and set-points at 1 kHz.
 
 A plan gives the commands of two joints on a towing bench, or of one that is moved alone, segment by segment: plateaus,
 rests, rests without power, and Fourier trajectories. `expand` gives the set-points of a run, millisecond by millisecond;
 `check_run` and `check_plan` compare them with the plan's limits.
 
-Motions as finite Fourier series: Eq. (10) of the paper for a joint, and a windowed series for a current.
-
-A trajectory begins and ends at rest. Eq. (10) adds a polynomial of fifth order to the series of the velocity, which has
-enough coefficients for position, velocity and acceleration at both ends. For a current the same polynomial would cancel the
-offset: a constant is its own polynomial. The current is therefore multiplied by a smooth step up at its beginning and down
-at its end.
+A Fourier trajectory begins and ends at rest. Eq. (10) of the paper adds a polynomial of fifth order to the series of the
+velocity, enough for position, velocity and acceleration at both ends. For a current that polynomial would cancel the offset:
+the current is multiplied by a smooth step up at its beginning and down at its end instead.
 """
 
 from __future__ import annotations
@@ -59,6 +56,8 @@ from jtqd.sysid.motion.setpoints import (
     path,
 )
 
+# Fourier series -------------------------------------------------------------------------------------------------
+
 RAMP_SHARE: Final = 0.1
 """Part of a current series' duration in which it rises from zero, and in which it falls back to zero."""
 MAX_HARMONICS: Final = 50
@@ -81,8 +80,8 @@ Amplitudes = Annotated[tuple[float, ...], parsed(_amplitudes, _AMPLITUDES)]
 class Series:
     """Amplitudes a, b of sines and cosines of omega_rad_s [rad/s] and its multiples; length duration_s [s].
 
-    Raises FieldError (a ConfigError): a number that is not finite, omega or duration not positive, none or too many or
-    unequally many amplitudes.
+    Raises FieldError: a number that is not finite, omega or duration not positive, none, too many or unequally many
+    amplitudes.
     """
 
     omega_rad_s: Annotated[float, limits("rad/s", gt=0.0)]
@@ -100,11 +99,8 @@ class Series:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the series as it stands in a plan, in Python's own numbers; the duration belongs to the segment."""
-        return {
-            "omega_rad_s": float(self.omega_rad_s),
-            "a": [float(x) for x in self.a],
-            "b": [float(x) for x in self.b],
-        }
+        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "duration_s"}
+        return {k: list(map(float, v)) if isinstance(v, tuple) else float(v) for k, v in values.items()}
 
 
 class FourierTrajectory(Series):
@@ -176,16 +172,14 @@ class FourierSeries(Series):
             series = series + (a * np.cos(phase) + b * np.sin(phase))
         return np.asarray(series * smooth_step(x))
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the series as it stands in a plan."""
-        return super().to_mapping() | {"offset_a": float(self.offset_a)}
-
 
 def smooth_step(x: FloatArray) -> FloatArray:
     """10 x^3 - 15 x^4 + 6 x^5: from 0 to 1 over x in 0..1 with first and second derivative zero at both ends."""
     result: FloatArray = x * x * x * (10.0 + x * (-15.0 + 6.0 * x))
     return result
 
+
+# Segments -------------------------------------------------------------------------------------------------------
 
 SCHEMA: Final = "jtq.plan/1"
 DEFAULT_RAMP_S: Final = 0.5
@@ -194,35 +188,29 @@ LONGEST_S: Final = 3600.0
 SHORTEST_OFF_S: Final = 1.5
 """Of one segment without power: standing, switching off and on again take about half a second of it."""
 
-DEFAULT_LIMITS: Final = Limits(
-    current_a=10.0, velocity_rad_s=3.3, torque_nm=60.0, travel_rad=60.0, temperature_c=70.0
-)
-_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
-_RESERVED: Final = ("plan", "campaign")
-"""Names of the campaign's own files."""
+_Seconds = Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
 
 
-# Segments -------------------------------------------------------------------------------------------------------
+class _Held:
+    """Targets that are reached within ramp_s and held for hold_s [s]."""
 
-
-@dataclass(frozen=True)
-class Plateau:
-    """Both joints are taken to their targets within ramp_s and held there for hold_s.
-
-    Attributes:
-        velocity_rad_s: of the velocity joint, joint side, own frame. current_a: of the other joint, own frame.
-        hold_s, ramp_s: seconds.
-    """
-
-    velocity_rad_s: Annotated[float, limits("rad/s")]
-    current_a: Annotated[float, limits("A")]
-    hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
-    ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
+    hold_s: float
+    ramp_s = 0.0
 
     @property
     def duration_s(self) -> float:
         """Ramp and hold."""
         return self.ramp_s + self.hold_s
+
+
+@dataclass(frozen=True)
+class Plateau(_Held):
+    """Both joints at their targets: velocity of the velocity joint (joint side), current of the other; own frames."""
+
+    velocity_rad_s: Annotated[float, limits("rad/s")]
+    current_a: Annotated[float, limits("A")]
+    hold_s: _Seconds
+    ramp_s: _Seconds = DEFAULT_RAMP_S
 
     @property
     def moving(self) -> bool:
@@ -231,30 +219,20 @@ class Plateau:
 
 
 @dataclass(frozen=True)
-class Rest:
-    """Both targets are taken to zero within ramp_s and stay there for hold_s [s]."""
+class Rest(_Held):
+    """Both targets at zero."""
 
-    hold_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)]
-    ramp_s: Annotated[float, limits("s", ge=0.0, le=LONGEST_S)] = DEFAULT_RAMP_S
-
-    @property
-    def duration_s(self) -> float:
-        """Ramp and hold."""
-        return self.ramp_s + self.hold_s
+    hold_s: _Seconds
+    ramp_s: _Seconds = DEFAULT_RAMP_S
 
 
 @dataclass(frozen=True)
-class Off:
-    """Both joints stand and their drives are off for hold_s [s], switching off and on included: the current then reads the
-    offset of its sensor. Must begin at rest.
+class Off(_Held):
+    """Both joints stand and their drives are off, switching off and on included: the current then reads the offset of its
+    sensor. Must begin at rest.
     """
 
     hold_s: Annotated[float, limits("s", ge=SHORTEST_OFF_S, le=LONGEST_S)]
-
-    @property
-    def duration_s(self) -> float:
-        """From rest to rest."""
-        return self.hold_s
 
 
 @dataclass(frozen=True)
@@ -397,6 +375,11 @@ def trajectory_run(
     return Run(name, velocity_joint, tuple(segments), current_joint)
 
 
+_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+-]*")
+_RESERVED: Final = ("plan", "campaign")
+"""Names of the campaign's own files."""
+
+
 def _run_name(value: Any) -> str:
     if not isinstance(value, str) or not value.strip():
         raise FieldError("run", "", value, "a text")
@@ -405,13 +388,8 @@ def _run_name(value: Any) -> str:
     return value
 
 
-_RunName = Annotated[
-    str,
-    parsed(
-        _run_name,
-        "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'",
-    ),
-]
+_ALPHABET: Final = "letters, digits and . _ + -, beginning with a letter or digit, not 'plan' or 'campaign'"
+_RunName = Annotated[str, parsed(_run_name, _ALPHABET)]
 _Number = Annotated[int, limits(ge=1, le=MOST_JOINTS)]
 
 
@@ -453,11 +431,17 @@ def _run(mapping: Mapping[str, Any]) -> Run:
             segments.append(each)
     if isinstance(file, _AloneRun):
         return Run(file.name, file.joint, tuple(segments), None)
-    other = OTHER_ONE if file.current_joint is None else file.current_joint
-    return Run(file.name, file.velocity_joint, tuple(segments), other)
+    return Run(file.name, file.velocity_joint, tuple(segments), file.current_joint or OTHER_ONE)
 
 
 # Plans ----------------------------------------------------------------------------------------------------------
+
+DEFAULT_LIMITS: Final = Limits(
+    current_a=10.0, velocity_rad_s=3.3, torque_nm=60.0, travel_rad=60.0, temperature_c=70.0
+)
+_Ampere = Annotated[float, limits("A", gt=0.0)]
+_RadPerSecond = Annotated[float, limits("rad/s", gt=0.0)]
+_NewtonMetre = Annotated[float, limits("Nm", gt=0.0)]
 
 
 @dataclass(frozen=True)
@@ -480,7 +464,9 @@ class Plan:
         alone = [
             {
                 "joint": number,
-                **{name: getattr(each, name) for name in ("current_a", "velocity_rad_s", "torque_nm")},
+                "current_a": each.current_a,
+                "velocity_rad_s": each.velocity_rad_s,
+                "torque_nm": each.torque_nm,
                 "travel_rad": list(each.position_rad),
             }
             for number, each in sorted(self.alone.items())
@@ -526,11 +512,11 @@ def load_plan(path: Path) -> Plan:
 
 @dataclass(frozen=True)
 class _LimitsFile:
-    """`limits` of a plan; by default those of DEFAULT_LIMITS, temperature_c: null means no limit."""
+    """`limits` of a plan; temperature_c: null means no limit."""
 
-    current_a: Annotated[float, limits("A", gt=0.0)] = DEFAULT_LIMITS.current_a
-    velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)] = DEFAULT_LIMITS.velocity_rad_s
-    torque_nm: Annotated[float, limits("Nm", gt=0.0)] = DEFAULT_LIMITS.torque_nm
+    current_a: _Ampere = DEFAULT_LIMITS.current_a
+    velocity_rad_s: _RadPerSecond = DEFAULT_LIMITS.velocity_rad_s
+    torque_nm: _NewtonMetre = DEFAULT_LIMITS.torque_nm
     travel_rad: Annotated[float, limits("rad", gt=0.0)] = DEFAULT_LIMITS.travel_rad
     temperature_c: Annotated[float, limits("degC", gt=0.0)] | None = DEFAULT_LIMITS.temperature_c
 
@@ -540,9 +526,9 @@ class _AloneLimits:
     """`alone` of a plan; travel_rad by the joint's own encoder, the temperature's limit is the plan's."""
 
     joint: _Number
-    current_a: Annotated[float, limits("A", gt=0.0)]
-    velocity_rad_s: Annotated[float, limits("rad/s", gt=0.0)]
-    torque_nm: Annotated[float, limits("Nm", gt=0.0)]
+    current_a: _Ampere
+    velocity_rad_s: _RadPerSecond
+    torque_nm: _NewtonMetre
     travel_rad: Annotated[tuple[float, float], limits("rad")]
 
     def __post_init__(self) -> None:
@@ -571,15 +557,8 @@ class _PlanFile:
                 runs.append(run)
         celsius = math.inf if self.limits.temperature_c is None else self.limits.temperature_c
         alone = {
-            each.joint: Limits(
-                each.current_a,
-                each.velocity_rad_s,
-                each.torque_nm,
-                each.travel_rad[1] - each.travel_rad[0],
-                celsius,
-                each.travel_rad,
-            )
-            for each in self.alone
+            joint: Limits(current, velocity, torque, high - low, celsius, (low, high))
+            for joint, current, velocity, torque, (low, high) in (vars(each).values() for each in self.alone)
         }
         return Plan(self.name, Limits(**vars(self.limits) | {"temperature_c": celsius}), tuple(runs), alone)
 
@@ -633,14 +612,8 @@ def expand(run: Run) -> Setpoints:
             velocity, current = target
     if run.current_joint is None:
         marks = [replace(mark, current_a=None) for mark in marks]
-    return Setpoints(
-        run.velocity_joint,
-        np.concatenate(velocities),
-        np.concatenate(currents),
-        tuple(marks),
-        tuple(off),
-        run.current_joint,
-    )
+    series = np.concatenate(velocities), np.concatenate(currents)
+    return Setpoints(run.velocity_joint, *series, tuple(marks), tuple(off), run.current_joint)
 
 
 def samples(duration_s: float) -> int:
@@ -656,8 +629,7 @@ def travel_rad(setpoints: Setpoints) -> float:
 def check_run(run: Run, limits: Limits) -> Setpoints:
     """Return the set-points of a run that keeps the limits, does not jump, and ends at rest.
 
-    Raises:
-        ConfigError: naming the run, the quantity, when, what was found and the limit.
+    Raises ConfigError naming the run, the quantity, when, what was found and the limit.
     """
     last = run.segments[-1]
     if isinstance(last, Plateau) and last.moving:
@@ -712,15 +684,12 @@ def partial_runs(run: Run) -> tuple[Run, ...]:
     where it began. A run of one direction, which does not rest, is cut between its plateaus, each with the ramps of the
     run's own ends. A partial run never goes further from its start than the run does.
     """
-    if any(isinstance(each, Off) for each in run.segments):
-        return (run,)
     moving = [place for place, each in enumerate(run.segments) if not isinstance(each, Rest)]
-    if len(moving) < 2:
+    if len(moving) < 2 or any(isinstance(each, Off) for each in run.segments):
         return (run,)
-    found = _cut_at_plateaus(run, moving) or _cut_at_rests(run)
     parts = tuple(
         replace(run, name=f"{run.name}~{number}", segments=tuple(each))
-        for number, each in enumerate(found, 1)
+        for number, each in enumerate(_cut_at_plateaus(run, moving) or _cut_at_rests(run, moving[-1]), 1)
     )
     far = travel_rad(expand(run)) + BACK_RAD
     if len(parts) < 2 or any(travel_rad(expand(part)) > far for part in parts):
@@ -728,13 +697,12 @@ def partial_runs(run: Run) -> tuple[Run, ...]:
     return parts
 
 
-def _cut_at_rests(run: Run) -> list[list[Segment]]:
-    """Cut in the middle of each rest between two motions."""
+def _cut_at_rests(run: Run, last: int) -> list[list[Segment]]:
+    """Cut in the middle of each rest between two motions; last: place of the last motion."""
     parts: list[list[Segment]] = [[]]
     whole = path(expand(run))
     ends = np.cumsum([samples(each.duration_s) for each in run.segments])
     position = whole[np.minimum(ends, len(whole)) - 1]  # at the end of each segment
-    last = max(place for place, each in enumerate(run.segments) if not isinstance(each, Rest))
     moved = False
     for place, each in enumerate(run.segments):
         home = run.current_joint is not None or abs(position[place]) <= BACK_RAD
