@@ -37,11 +37,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import jtqd
-from jtqd.estimator.command_line import check_installed, count, make_directory, seconds
+from jtqd.estimator.command_line import check_installed, command_parser, count, make_directory, seconds
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.settings import METHODS
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.report.words import BADGES, effect_title, place
+from jtqd.sysid.progress import bar
 from jtqd.sysid.report import page
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import LOGS, TABLES
@@ -80,14 +81,10 @@ class Group:
 
 @dataclass(frozen=True)
 class Task:
-    """One command of jtq on one group.
+    """One command of jtq on one group: absolute paths of the logs, arguments besides these, --json and --out.
 
-    Attributes:
-        command: of jtq.
-        files: absolute paths of the logs.
-        arguments: of the command, besides the logs, --json and --out.
-        writes: the command takes --out DIR; what it writes there is part of the result.
-        timeout_s: longest duration; None: no limit.
+    writes: the command takes --out DIR; what it writes there is part of the result. timeout_s: longest duration; None: no
+    limit.
     """
 
     command: str
@@ -126,17 +123,8 @@ def find_groups(
 ) -> tuple[list[Group], list[Path]]:
     """Find the logs among and below `named`; return the groups by name, and the logs left out as still being written.
 
-    Of each directory the files of the first kind that it has are taken: a campaign's directory holds the log of every run
-    beside its table, and a run must not count twice.
-
-    Args:
-        named: files and directories.
-        by: one of `WAYS`: parts of one run, one directory, or one file make a group.
-        kinds: endings of file names, by kind.
-
-    Raises:
-        GroupError: a path does not exist, or no log is there.
-        OSError: a directory cannot be read.
+    Of each directory the files of the first kind (endings) that it has are taken: a campaign's directory holds log and
+    table of every run. by: one of `WAYS`. Raises GroupError where a path does not exist, or no log is there; OSError.
     """
     files: set[Path] = set()
     active: list[Path] = []
@@ -262,12 +250,8 @@ def _jtq(arguments: Sequence[str], timeout_s: float | None) -> tuple[int, bytes,
 def executor(scheduler: str | None, jobs: int | None) -> Iterator[tuple[Executor, str]]:
     """Yield the executor of the tasks and its description.
 
-    Args:
-        scheduler: address of a dask scheduler; None: this machine, a pool of threads that each wait for one process.
-        jobs: tasks at a time on this machine; None: one per usable processor.
-
-    Raises:
-        BatchError: dask is not installed, or no scheduler answers there.
+    scheduler: of dask; None: this machine, a pool of threads that each wait for one process, `jobs` at a time (None: one
+    per usable processor). Raises BatchError where dask is not installed, or no scheduler answers.
     """
     if scheduler is None:
         count = jobs or len(os.sched_getaffinity(0))
@@ -320,7 +304,7 @@ def store(out: Path, key: str, content: Mapping[str, Any], files: Mapping[str, b
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Put a file in place that is there whole or not at all; nothing is left of one that fails. Raises OSError."""
+    """Put a file in place that is there whole or not at all, also where two batches write it. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -343,18 +327,9 @@ def run_batch(
 ) -> list[Row]:
     """Run the command on every group whose result is not kept yet; return one row per group, in their order.
 
-    Args:
-        base: the task without files.
-        parameters: its arguments with files replaced by their hashes.
-        groups: of logs; those with the same content are worked on once.
-        out: directory of the results.
-        workers: run the tasks.
-        again: run finished groups again.
-        progress: called with each row when it is complete.
-
-    Raises:
-        BatchError: the executor takes or returns no more tasks.
-        OSError: a result cannot be kept.
+    base: the task without files. parameters: its arguments with files replaced by their hashes. Groups with the same
+    content are worked on once. again: finished ones too. Raises BatchError where the executor takes or returns no more
+    tasks, OSError.
     """
     tool = tool_version()
     rows: dict[str, Row] = {}
@@ -412,9 +387,8 @@ def run_batch(
 
 
 def _outcome(future: Future[Outcome], here: str) -> Outcome:
-    """Return what the task returned, or one line for what its worker raised; another tool than `here` is an error.
-
-    Raises BatchError when the scheduler is gone.
+    """Return what the task returned, or one line for what its worker raised; another tool than `here` is an error. Raises
+    BatchError when the scheduler is gone.
     """
     try:
         outcome = future.result()
@@ -447,8 +421,8 @@ GAP: Final = {
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one result: badge as (colour role, text), cells under `HEADINGS`, size of the gap [Nm], causes to count over all
-    groups, and the values for summary.json.
+    """Of one result: badge (colour role, text), cells under `HEADINGS`, size of the gap [Nm], causes, values for
+    summary.json.
     """
 
     badge: tuple[str, str]
@@ -492,14 +466,7 @@ def to_mapping(
 
 
 def render(command: str, rows: Sequence[Row], where: str, made: str) -> str:
-    """Return index.html, self-contained but for the links to the reports of the groups.
-
-    Args:
-        made: when, by what and with which options: the foot of the page.
-
-    Raises:
-        ImportError: jinja2 is not installed.
-    """
+    """Return index.html, self-contained but for the links to the groups' reports; made: the foot of the page."""
     every = [(row, figures_of(command, row)) for row in rows]
     largest = max((each.gap_nm or 0.0 for _, each in every if each is not None), default=0.0)
     lines = [_line(row, each, largest) for row, each in every]
@@ -660,9 +627,15 @@ def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, param
     """Run the batch and write the summary. Raises BatchError, OSError."""
     (options.out / "results").mkdir(parents=True, exist_ok=True)
     tool = tool_version()
-    with executor(options.scheduler, options.jobs) as (workers, where), _progress(len(groups)) as progress:
+    with executor(options.scheduler, options.jobs) as (workers, where), bar("groups", len(groups)) as advance:
+
+        def finished(row: Row) -> None:
+            advance(1)
+            if row.state == FAILED:
+                _error(_failure(row))
+
         rows = run_batch(
-            task, parameters, groups, options.out, workers, again=options.again, progress=progress
+            task, parameters, groups, options.out, workers, again=options.again, progress=finished
         )
     mapping = to_mapping(task.command, parameters, tool, rows, where)
     text = json.dumps(mapping, indent=1, allow_nan=False)
@@ -689,24 +662,6 @@ def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, param
 def _failure(row: Row) -> str:
     """Return group and error of a row; a file that is its own group is named once."""
     return f"{row.group.name}: {row.error.removeprefix(f'{Path(row.group.name).name}: ')}"
-
-
-@contextmanager
-def _progress(groups: int) -> Iterator[Callable[[Row], None]]:
-    """Show a bar on a terminal, and a line for each group that failed. Yields what is to be called with each row."""
-    from rich.console import Console
-    from rich.progress import Progress
-
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as bar:
-        task = bar.add_task("groups", total=groups)
-
-        def finished(row: Row) -> None:
-            bar.advance(task)
-            if row.state == FAILED:
-                _error(_failure(row))
-
-        yield finished
 
 
 def _diagnose(options: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, Any]]:
@@ -750,12 +705,8 @@ def _hash(path: Path) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """Arguments of `jtq batch`."""
-    result = argparse.ArgumentParser(
-        prog=BY,
-        description="Run one command over many logs, on this machine or on a dask cluster, and summarise the results.",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    about = "Run one command over many logs, on this machine or on a dask cluster, and summarise the results."
+    result = command_parser(BY, about, _EXAMPLES)
     commands = result.add_subparsers(dest="command", required=True, metavar="diagnose|replay")
     diagnose = _common(
         commands, DIAGNOSE, "diagnose the simulation error of a joint file on each group of runs"
@@ -791,23 +742,15 @@ def _common(commands: Any, name: str, text: str) -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument("logs", nargs="+", type=Path, metavar="LOGS", help="logs, or directories of them")
-    made.add_argument("--out", type=Path, required=True, metavar="DIR", help="results; created if missing")
-    made.add_argument(
-        "--group-by",
-        choices=WAYS,
-        help=f"logs of one task: the parts of one run, a directory, a file (default: {_GROUP_BY[name]})",
-    )
-    made.add_argument(
-        "--scheduler",
-        type=_scheduler,
-        metavar="tcp://HOST:PORT",
-        help="dask scheduler (default: this machine; extra: cluster)",
-    )
-    made.add_argument(
-        "--jobs", type=count, metavar="N", help="tasks at a time on this machine (default: CPUs)"
-    )
-    made.add_argument("--timeout", type=seconds, metavar="S", help="time limit of a group [s]")
-    made.add_argument("--again", action="store_true", help="run finished groups again")
-    made.add_argument("--json", action="store_true", help="print summary.json")
+    add = made.add_argument
+    add("logs", nargs="+", type=Path, metavar="LOGS", help="logs, or directories of them")
+    add("--out", type=Path, required=True, metavar="DIR", help="results; created if missing")
+    ways = f"logs of one task: the parts of one run, a directory, a file (default: {_GROUP_BY[name]})"
+    add("--group-by", choices=WAYS, help=ways)
+    where = "dask scheduler (default: this machine; extra: cluster)"
+    add("--scheduler", type=_scheduler, metavar="tcp://HOST:PORT", help=where)
+    add("--jobs", type=count, metavar="N", help="tasks at a time on this machine (default: CPUs)")
+    add("--timeout", type=seconds, metavar="S", help="time limit of a group [s]")
+    add("--again", action="store_true", help="run finished groups again")
+    add("--json", action="store_true", help="print summary.json")
     return made

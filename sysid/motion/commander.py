@@ -196,12 +196,8 @@ class PowerOff:
         on           6040h 6, 7, 15 to both as at the start, targets zero, until both are in operation enabled
 
     Limits and supervision go on meanwhile, but that both drives must be in operation enabled. A joint that turns although
-    nothing drives it ends the motion.
-
-    Attributes:
-        index: set-point in force; all of them are zero.
-        over: both drives are in operation enabled again, and the window has ended.
-        violation: why it cannot go on.
+    nothing drives it ends the motion. index: set-point in force, zero; over: both drives are enabled again, and the window
+    has ended; violation: why it cannot go on.
     """
 
     def __init__(  # noqa: PLR0917
@@ -306,11 +302,9 @@ LARGEST_ADVANCE: Final = 4
 
 
 class Pace:
-    """When a set-point is due: SYNC sets the pace, our own clock once SYNC is lost.
+    """When a set-point is due: SYNC sets the pace, our own clock once SYNC is lost (`synced`).
 
-    Attributes:
-        synced: SYNC runs.
-        pending: the newest SYNC has not had its set-point.
+    pending: the newest SYNC has not had its set-point.
     """
 
     def __init__(self, timing: Timing, now_ns: int) -> None:
@@ -392,16 +386,12 @@ Frame = tuple[int, bytes, int]
 
 
 class Commander:
-    """One motion of all drives of a bus, joints 1, 2, ..., which are set up already (`jtqd.sysid.motion.drives`).
+    """One motion of all drives of a bus, joints 1, 2, ..., which are set up already; those that the set-points do not name
+    are held.
 
-    Those that the set-points do not name are held.
-
-    Call `on_frames` with what has arrived, at best at `wake_ns`, and by `due_ns` at the latest; send what it returns.
-
-    Attributes:
-        phase: see the module's diagram.
-        refusal: why nothing has moved; None otherwise, and `result` holds once `over`.
-        out_of_place: position [rad] of a joint that was refused because of it; else None.
+    Call `on_frames` with what has arrived, at best at `wake_ns`, by `due_ns` at the latest; send what it returns. refusal:
+    why nothing has moved, None otherwise, and `result` holds once `over`. out_of_place: position [rad] of a joint that was
+    refused for it.
     """
 
     def __init__(

@@ -116,16 +116,10 @@ Sleep = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class DriveUnits:
-    """Identifiers of a drive and its factors to SI units, as read from it.
+    """A drive and its factors to SI units, as read from it.
 
-    Attributes:
-        node: node number.
-        mode: 9 (csv) or 10 (cst).
-        gear_ratio: 6091h.
-        scaling: factors of 6064h, 606Ch, 60E4h:1 and 6078h.
-        heartbeat_ms: 1017h.
-        temperature: True when TPDO3 (380h+n) brings the temperature in 0.1 °C.
-        objects: objects of its quantities. tpdos: those that carry them, as they are mapped in it.
+    mode: 9 (csv) or 10 (cst); gear_ratio: 6091h; scaling: of 6064h, 606Ch, 60E4h:1 and 6078h; heartbeat_ms: 1017h;
+    temperature: TPDO3 brings it in 0.1 °C; tpdos: those that carry `objects`.
     """
 
     node: int
@@ -142,10 +136,9 @@ class DriveUnits:
         return round(velocity_rad_s * self.gear_ratio / self.scaling.motor_rad_s_per_unit)
 
     def current_units(self, current_a: float) -> int:
-        """Return 6071h of a motor current.
+        """Return 6071h of a motor current, in 1/1000 of rated torque (6076h).
 
-        6071h is in 1/1000 of rated torque (6076h). The drive's own torque constant is 6076h / 6075h, so the torque of the
-        current i is i * 6076h / 6075h, and 6071h becomes 1000 i / 6075h: the rated torque cancels.
+        The drive's own torque constant is 6076h / 6075h, so 6071h becomes 1000 i / 6075h: the rated torque cancels.
         """
         return round(current_a / self.scaling.ampere_per_unit)
 
@@ -412,10 +405,7 @@ class BenchSetup:
         return units, sensor_units(SdoClient(self._socket, self._sensor.node_id), self._sensor)
 
     def release(self, *, beating: bool) -> str:
-        """Release all drives; return "", or the failures in one line.
-
-        beating: the drives watch our heartbeat, so it continues until they are released.
-        """
+        """Release all drives; return "", or the failures in one line. beating: the drives watch our heartbeat."""
         self._beating = beating
         problems = []
         for step in (Drive.quick_stop, Drive.release):
@@ -444,13 +434,11 @@ _COMMAND, _VELOCITY = drive_rpdo1(1).layout, drive_rpdo2(1).layout
 
 
 class Commands:
-    """RPDOs for drive `turn` (0, 1, ...); set-points are scaled to the drives' units once.
+    """RPDOs for drive `turn` (0, 1, ...); set-points are scaled to the drives' units once; a drive that is not moved is
+    held.
 
-    A drive that is not moved is held: velocity zero. Raises MotionError for set-points that 60FFh (32 bits) or 6071h
-    (16 bits) cannot hold, and for a joint without a drive.
-
-    Attributes:
-        order, round_cycles: see `sending_order`.
+    order, round_cycles: see `sending_order`. Raises MotionError for set-points that 60FFh (32 bits) or 6071h (16 bits)
+    cannot hold, and for a joint without a drive.
     """
 
     def __init__(self, setpoints: Setpoints, drives: Sequence[DriveUnits]) -> None:

@@ -58,9 +58,7 @@ class NodeInput:
 class DriveInput(NodeInput):
     """Values of one drive in SI units, joint side.
 
-    Attributes:
-        cycles: SYNCs seen when each of `units.tpdos` came last.
-        sdo_confirmed: it has confirmed a download of its controlword.
+    cycles: SYNCs seen when each of `units.tpdos` came last; sdo_confirmed: it has confirmed a download of its controlword.
     """
 
     def __init__(self, number: int, units: DriveUnits, inputs: Inputs) -> None:
@@ -126,7 +124,6 @@ class DriveInput(NodeInput):
             self.cycles[at] = self._inputs.cycle
 
     def _on_motor(self, counts: int) -> None:
-        """The counters roll over: differences are modulo 2^32."""
         self._motor_counts += _difference(counts - self._last.get("motor", counts))
         self._last["motor"] = counts
         self._set_travel()
@@ -191,10 +188,7 @@ class ChannelInput:
 class Inputs:
     """All frames that the commander receives but SYNC.
 
-    Attributes:
-        cycle: number of SYNCs so far, kept by the commander.
-        foreign: another node has sent the heartbeat of `own_node`.
-        handlers: by COB-ID.
+    cycle: number of SYNCs so far, kept by the commander; foreign: another node has sent our heartbeat; handlers: by COB-ID.
     """
 
     def __init__(self, drives: Sequence[DriveUnits], sensor: SensorUnits | None, own_node: int) -> None:

@@ -22,10 +22,7 @@ class MotionError(Exception):
 
 
 class OutOfPlaceError(MotionError):
-    """The motion was refused because a joint that is moved alone would leave its travel from where it stands.
-
-    position_rad: where it stands, by its own encoder.
-    """
+    """The motion was refused because a joint that is moved alone would leave its travel from where it stands [rad]."""
 
     def __init__(self, reason: str, position_rad: float) -> None:
         super().__init__(reason)
@@ -33,12 +30,9 @@ class OutOfPlaceError(MotionError):
 
 
 class MotionResult(NamedTuple):
-    """Result of a motion. All joints are disabled in either case, or `reason` reports what could not be confirmed.
+    """Result of a motion; all joints are disabled, or `reason` (joint, quantity, found, limit) has what is not confirmed.
 
-    Attributes:
-        status: "done", or "stopped" before its end.
-        reason: one line: joint, quantity, found, limit; "" when done.
-        played_s: length of the set-points that were sent.
+    status: "stopped" before its end; played_s: length of the set-points that were sent.
     """
 
     status: Literal["done", "stopped"]
@@ -47,11 +41,9 @@ class MotionResult(NamedTuple):
 
 
 class Violation(NamedTuple):
-    """Why the motion must end.
+    """Why the motion must end, in one line.
 
-    Attributes:
-        reason: one line: joint, quantity, found, limit.
-        hard: the joints cannot be led to a stop any more (drive or SYNC lost): each drive brakes by itself, now.
+    hard: the joints cannot be led to a stop any more (drive or SYNC lost): each drive brakes by itself, now.
     """
 
     reason: str
@@ -139,12 +131,8 @@ MOST_JOINTS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """An interval of a run by its kind.
-
-    Attributes:
-        kind: "plateau", "rest", "power_off" or "fourier".
-        start_s, end_s: from the first set-point, end not included.
-        velocity_rad_s, current_a: what is held; None where it varies.
+    """An interval of a run, end not included: "plateau", "rest", "power_off", "ramp" or "fourier"; what is held, None where
+    it varies.
     """
 
     kind: str
@@ -158,18 +146,13 @@ class Mark:
 class Setpoints:
     """Set-points of one run, `PERIOD_S` apart; number k belongs to time k * PERIOD_S.
 
-    Attributes:
-        velocity_joint: number of the joint in velocity mode (csv).
-        velocity_rad_s: [n] joint side, in the own frame of the velocity joint.
-        current_a: [n] motor current of the current joint, in its own frame.
-        marks: intervals of the run in order of time; for people and files, not for the motion.
-        off: (first, end) of set-points during which both drives have no power, in order, end not included.
-        current_joint: the joint in torque mode (cst) that tows the other one; None: there is none, the velocity joint is
-            moved alone and current_a is zero. Left out: the other one of joints 1 and 2.
+    velocity_rad_s [n]: of the velocity joint (csv), joint side; current_a [n]: of the current joint (cst), each in its own
+    frame. marks: for people and files. off: (first, end) of set-points without power, end not included. current_joint:
+    None: the velocity joint is moved alone and current_a is zero; left out: the other one of joints 1 and 2.
 
-    Raises ValueError with one line for joints that are no pair, arrays that are not one-dimensional, empty, of unequal
-    length, or not finite, marks that are not Mark, and times without power that overlap or have a target other than 0.
-    The arrays are copied and read-only.
+    Raises ValueError for joints that are no pair, arrays that are not one-dimensional, empty, of unequal length or not
+    finite, marks that are not Mark, and times without power that overlap or have a target. The arrays are copied and
+    read-only.
     """
 
     velocity_joint: int
@@ -250,13 +233,9 @@ STEEPEST_CURRENT_A_S: Final = 500.0
 class Limits:
     """Largest magnitudes, for all joints that are moved; ValueError for one that is not a positive number.
 
-    Attributes:
-        current_a: motor current.
-        velocity_rad_s: joint side (motor encoder through the gear).
-        torque_nm: at the sensor of these joints, where they have one.
-        travel_rad: joint side, from where the motion began, by either encoder.
-        temperature_c: of the joint; math.inf where the drives do not measure it.
-        position_rad: lowest and highest position of a joint that is moved alone, by its own encoder.
+    current_a: of the motor; velocity_rad_s: joint side; torque_nm: at the sensor of these joints; travel_rad: from where
+    the motion began, by either encoder; temperature_c: math.inf where the drives do not measure it; position_rad: range of
+    a joint that is moved alone, by its own encoder.
     """
 
     current_a: float
@@ -280,9 +259,8 @@ class Limits:
 
 
 class JointSample(NamedTuple):
-    """Measurement of one joint in one cycle: motor current, joint side velocity and travel, temperature, position.
-
-    `temperature_c` is nan as long as none has come; `position_rad` counts from the zero of the joint's own encoder.
+    """Measurement of one joint in one cycle; temperature nan as long as none has come; position from its own encoder's
+    zero.
     """
 
     current_a: float
@@ -307,12 +285,10 @@ HELD_RAD_S: Final = 0.3
 
 @dataclass(frozen=True, slots=True)
 class Surroundings:
-    """Joints and sensor channels of the bus that are not moved.
+    """What of the bus is not moved: largest current of each joint that is held (missing: as of those that are moved).
 
-    Attributes:
-        held_current_a: largest current of each joint that is held, by number; missing: as the joints that are moved.
-        channels: joints of each sensor channel for which the torque limit holds; None: all channels, and the joints of a
-            single one are 1 and 2.
+    channels: joints of each sensor channel for which the torque limit holds; None: all channels, and the joints of a single
+    one are 1 and 2.
     """
 
     held_current_a: Mapping[int, float] = field(default_factory=dict)
@@ -320,11 +296,7 @@ class Surroundings:
 
 
 class Monitor:
-    """Compares samples with the limits; it has no state.
-
-    Args:
-        limits: of the joints that are moved. moved: their numbers; all others are held.
-    """
+    """Compares samples with the limits of the joints that are moved (numbers `moved`); all others are held. No state."""
 
     __slots__ = ("_channels", "_limits", "_of", "_temperature")
 
@@ -386,11 +358,10 @@ class Monitor:
 
 
 def check_setpoints(setpoints: Setpoints, limits: Limits) -> None:
-    """Refuse a plan that exceeds the limits, or that jumps, before anything moves.
+    """Refuse a plan that exceeds the limits, or that jumps, before anything moves. Raises MotionError.
 
-    Travel is that of the velocity joint; the other one turns with it. The first set-point is compared with standstill.
-    The position of a joint that is moved alone is checked at the start (`out_of_range`). Raises MotionError naming joint,
-    quantity, time, found and limit.
+    Travel is that of the velocity joint. The first set-point is compared with standstill. The position of a joint that is
+    moved alone is checked at the start (`out_of_range`).
     """
     one, other = setpoints.velocity_joint, setpoints.current_joint
     _below(setpoints.velocity_rad_s, limits.velocity_rad_s, f"velocity of joint {one}", "rad/s")

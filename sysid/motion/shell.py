@@ -57,10 +57,9 @@ def play(
 ) -> MotionResult:
     """Move joints along `setpoints`, within `limits`, on a bus on which jtqd runs; all are disabled afterwards.
 
-    SIGINT and SIGTERM stop the joints, a second one makes them brake at once; the previous handlers are
-    restored when this returns. drives: joints 1, 2, ..; those that the set-points do not name are held. Without `sensor`
-    the torque is not supervised.
-    Raises MotionError (OutOfPlaceError), one line, when the motion was refused and nothing has moved.
+    SIGINT and SIGTERM stop the joints, a second one makes them brake at once. drives: joints 1, 2, ..; those that the
+    set-points do not name are held. Without `sensor` the torque is not supervised. Raises MotionError (OutOfPlaceError),
+    one line, when the motion was refused and nothing has moved.
     """
     timing = timing or Timing()
     check_setpoints(setpoints, limits)
@@ -131,10 +130,10 @@ def _loop(socket: FrameSocket, commander: Commander, taken: list[str], on_progre
 
 
 def _take(socket: FrameSocket) -> list[Frame]:
-    """Return all frames that have arrived, their stamps on CLOCK_MONOTONIC.
+    """Return all frames that have arrived, their stamps (CLOCK_REALTIME) on CLOCK_MONOTONIC.
 
-    The stamps are of CLOCK_REALTIME; a frame waits for a millisecond at most, so only a clock that is stepped within that
-    moment makes one wrong, and that looks like lateness.
+    A frame waits for a millisecond at most: only a clock that is stepped in that moment makes one wrong, which looks like
+    lateness.
     """
     frames: list[Frame] = []
     count = CAPACITY

@@ -121,8 +121,8 @@ _MOMENTS: Final = 6
 
 @dataclass(frozen=True)
 class Held:
-    """saturated, stuck: rows of one channel [n]; deviation [n]: of these rows from the straight line between the rows before
-    and after, in the unit of the channel, 0 elsewhere.
+    """Rows of one channel [n] that are saturated or stuck; deviation [n]: of these rows from the straight line between the
+    rows before and after, 0 elsewhere.
     """
 
     saturated: BoolArray

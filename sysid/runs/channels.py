@@ -72,10 +72,7 @@ MOTION: Final = ("motor_position_rad", "motor_velocity_rad_s", "link_position_ra
 
 
 class RunIssue(NamedTuple):
-    """Finding of a check of runs or joint file.
-
-    kind: a fixed name for programs, e.g. "torque_nm_stuck"; text: one line with what was found and what was expected.
-    """
+    """Finding of a check of runs or joint file: a fixed name for programs, and one line with what was found and expected."""
 
     kind: str
     text: str
@@ -85,7 +82,7 @@ class RunIssue(NamedTuple):
 class Channels:
     """Columns of one joint as recorded in one run, not derived (a derived position agrees with itself), and its joint file.
 
-    time_s [n]; where: run and joint in messages, e.g. "forward_1.csv.gz: j1". Columns that are absent are not checked.
+    where: run and joint in messages. Columns that are absent are not checked.
     """
 
     time_s: FloatArray

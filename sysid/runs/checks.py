@@ -80,12 +80,9 @@ def check_rate(time_s: FloatArray, where: str) -> list[RunIssue]:
 def on_even_steps(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
     """Return the run resampled to equal steps where its own are uneven, and a note of it.
 
-    Values between two rows lie on a cubic through both with the slopes of a parabola through three rows: linear
-    interpolation would put two steps into the acceleration at every lost cycle. A run whose steps are equal but for jitter
-    is returned unchanged if its stamps are right.
-
-    Stamps of a computer's clock, or rounded ones, jitter where the samples do not: a position over such stamps jumps by
-    speed times jitter. Stamps or equal steps with rows missing are taken, whichever leaves positions smoother.
+    Values between two rows lie on a cubic: linear interpolation would put two steps into the acceleration at every lost
+    cycle. Stamps of a computer's clock, or rounded ones, jitter where the samples do not: stamps or equal steps with rows
+    missing are taken, whichever leaves positions smoother.
     """
     steps = np.diff(table.time_s)
     median = float(np.median(steps))
@@ -123,8 +120,8 @@ def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
 def _equal_steps(time_s: FloatArray, step_s: float) -> tuple[FloatArray, float]:
     """Return times of the rows [n] that are whole steps apart, and the step that ends where the stamps do.
 
-    A row belongs to the next cycle, or to a later one where it and the following rows are late against the mean phase of the
-    rows before: jitter makes one row late, a lost row all that follow.
+    A row belongs to a later cycle where it and the following rows are late against the mean phase of the rows before:
+    jitter makes one row late, a lost row all that follow.
     """
     ahead = np.min(
         [np.append(time_s[k:], np.full(k, np.inf)) - k * step_s for k in range(_ROWS_AHEAD)], axis=0
@@ -252,11 +249,8 @@ _SPARE: Final = {
 
 @dataclass(frozen=True)
 class CheckedRun:
-    """Result of `check_run`.
-
-    Attributes:
-        table: columns that may be used; None: nothing.
-        refused: why joints (or the whole run) are left out. notes: what is suspicious about the rest.
+    """Columns that may be used (None: nothing), why joints or the whole run are left out, and what is suspicious about the
+    rest.
     """
 
     table: RunTable | None
@@ -266,11 +260,8 @@ class CheckedRun:
 
 @dataclass(frozen=True)
 class CheckedRuns:
-    """Result of `check_runs`.
-
-    Attributes:
-        runs: (name, table) with the columns that may be used.
-        notes, refused: as those of `CheckedRun`, one line each. lost: joints that are left out of every run.
+    """(name, table) of the runs with the columns that may be used, lines as of `CheckedRun`, and joints left out of every
+    run.
     """
 
     runs: tuple[tuple[str, RunTable], ...]
@@ -287,11 +278,11 @@ def check_run(
     thorough: bool = False,
     limits: Mapping[int, Limits] | None = None,
 ) -> CheckedRun:
-    """Check the joints of one run that have a joint file; `name` begins every line.
-
-    thorough: as a diagnosis needs it; only then are columns changed (rows with an outlier left out, positions that roll over
-    unwrapped, uneven steps resampled, faulty channels that are not needed left out). limits: where channels saturate in
+    """Check the joints of one run that have a joint file; `name` begins every line. limits: where channels saturate in
     other runs.
+
+    thorough: as a diagnosis needs it; only then are columns changed (rows with an outlier left out, positions that roll
+    over unwrapped, uneven steps resampled, faulty channels that are not needed left out).
     """
     if thorough:
         return _thorough(table, joints, name, limits or {})

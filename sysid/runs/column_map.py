@@ -120,9 +120,8 @@ class Expression:
 
 
 def parse(text: str, header: Sequence[str], target: str = "it") -> Expression:
-    """Return the expression that `text` is for a file with these columns; target: its use, in messages.
-
-    Raises ExpressionError.
+    """Return the expression that `text` is for a file with these columns; target: its use, in messages. Raises
+    ExpressionError.
     """
     if text in header:
         return Expression((text,), lambda cells: cells[text])
@@ -255,9 +254,7 @@ _SOURCE: Final = (
 
 @dataclass(frozen=True)
 class Column:
-    """value = scale * cell + offset, in the target's SI unit; name: a column or an expression. A negative scale flips the
-    sign.
-    """
+    """value = scale * cell + offset, in the target's SI unit; name: a column or an expression."""
 
     name: str
     scale: float = 1.0
@@ -266,10 +263,9 @@ class Column:
 
 @dataclass(frozen=True)
 class KnownLoad:
-    """Load of a joint without a torque sensor: a pendulum, or the torque that a model gives.
+    """Load of a joint without a torque sensor: the torque that a model gives (a column or an expression), or a pendulum:
 
-    torque_nm: a column or an expression [Nm], else None; mass [kg] at lever [m] from the axis, inertia about the axis
-    [kg m2], hangs_at: link position at rest [rad].
+    mass [kg] at lever [m] from the axis, inertia about the axis [kg m2], hangs_at: link position at rest [rad].
     """
 
     torque_nm: str | None = None
@@ -301,10 +297,7 @@ class VoltageDrive:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Where each target column comes from; known loads and voltage drives by joint; joint files named by `jN.joint_file`.
-
-    where: the map's file, for messages.
-    """
+    """Where each target column comes from; known loads, voltage drives and joint files by joint; `where`: the map's file."""
 
     columns: Mapping[str, Column]
     joint_files: Mapping[int, Path]
@@ -314,10 +307,7 @@ class ColumnMap:
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, object], where: str, folder: Path) -> ColumnMap:
-        """Check a column map read from YAML.
-
-        `TARGET: NAME` is short for `TARGET: {column: NAME, scale: 1.0, offset: 0.0}`. Raises ConfigError.
-        """
+        """Check a column map read from YAML; `TARGET: NAME` is short for `TARGET: {column: NAME}`. Raises ConfigError."""
         with in_file(where):
             values = read_values(_keys(), mapping)
             columns = {key: values[key] for key in targets() if key in values}
@@ -348,9 +338,8 @@ class ColumnMap:
         return found | {f"j{n}.drive": Column(x.voltage_v) for n, x in (self.drives or {}).items()}
 
     def parsed(self, header: list[str], file: str) -> dict[str, Expression]:
-        """Return the expression of every source for a file with these columns; `file` names it and its place.
-
-        Raises ExpressionError: file, key, what was found and what was expected.
+        """Return the expression of every source for a file with these columns; `file`: file and place in messages. Raises
+        ExpressionError.
         """
         found = {}
         for key, column in self.sources().items():
@@ -361,10 +350,7 @@ class ColumnMap:
         return found
 
     def completed(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return the targets [n] of one segment without gaps: torques of known loads and currents of voltage drives added.
-
-        values: every source's, by its key.
-        """
+        """Return the targets [n] of one segment without gaps, torques of known loads and currents of voltage drives too."""
         found = {key: value for key, value in values.items() if key in self.columns}
         time = found[TIME]
         for n, load in (self.loads or {}).items():
@@ -409,9 +395,9 @@ def targets() -> list[str]:
 def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return velocity and acceleration [n] of the cubic through a window of the position around each row, ends held.
 
-    The window is the shortest in which the position's noise (rounding included) is below _QUIET of the motion's largest
-    acceleration, WINDOW_S at most: a longer one rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964,
-    doi 10.1021/ac60214a047). Outlier samples are interpolated: each would be in the whole window.
+    The window is the shortest in which the position's noise is below _QUIET of the motion's largest acceleration, WINDOW_S
+    at most: a longer one rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964, doi
+    10.1021/ac60214a047). Outlier samples are interpolated.
     """
     outliers = outlier_rows(position, _OUTLIER_RAD)
     if outliers.any():

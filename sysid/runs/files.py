@@ -38,11 +38,8 @@ _PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.
 
 
 def run_paths(arguments: Sequence[Path]) -> list[Path]:
-    """Return the run files: a file is itself; a directory stands for its tables, or its logs where it has no table.
-
-    A campaign's directory holds the log of every run and its table: each run is read once.
-
-    Raises RunError for a path that does not exist, or a directory without a run.
+    """Return the run files: a file is itself; a directory stands for its tables, or its logs where it has no table. Raises
+    RunError.
     """
     paths: list[Path] = []
     for argument in arguments:
@@ -70,18 +67,14 @@ def read_runs(
     segments: bool = False,
     joints: Sequence[int] | None = None,
 ) -> list[RunFile]:
-    """Read all runs of files and directories (`run_paths`); a progress bar on a terminal.
+    """Read all runs of files and directories (`run_paths`), each with a name of its own; a progress bar on a terminal.
 
-    columns: a column map or its file. Names are unique: the file's, or its path where two files share a name.
-    segments: a recording with gaps gives one run for each segment between them, "a.csv (1 of 3)", not an error; rows with a
-    blank cell are gaps, and a table whose time starts again is several runs, "a.csv (run 1 of 2)"; the parts of one run of
-    jtqd are one recording. Segments shorter than SHORTEST_SEGMENT_S and rows written twice are left out, with a note.
-    joints: numbers of those wanted of a log, where a row needs the inputs of all of them; None: all. A table gives all.
+    segments: a recording with gaps gives one run for each segment between them, "a.csv (1 of 3)"; rows with a blank cell
+    are gaps; a table whose time starts again is several runs, "a.csv (run 1 of 2)"; the parts of one log are one recording.
+    Segments shorter than SHORTEST_SEGMENT_S and rows written twice are left out, with a note. joints: numbers of those
+    wanted of a log, where a row needs the inputs of all of them; None: all.
 
-    Raises:
-        RunError: as `read_run` and `run_paths`; for one run given twice (the same data, or a log and its table); with
-            `segments` where no segment is long enough.
-        ConfigError: the column map cannot be used.
+    Raises RunError, also for one run given twice (the same data, or a log and its table); ConfigError for the column map.
     """
     mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
     runs: list[RunFile] = []
@@ -122,15 +115,14 @@ def read_run(
 ) -> RunFile:
     """Read one run by the ending of its name; without a column map a table must use the run table's own column names.
 
-    columns: for tables; a log of jtqd has its own names. joints: of a log, as in `read_runs`. Raises RunError, also for a
-    recording with gaps.
+    joints: of a log, as in `read_runs`. Raises RunError, also for a recording with gaps.
     """
     [run] = runs_of(_content(Path(path), columns=columns, joints=joints), whole=True)
     return run
 
 
 def _recordings(paths: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Return the files of each recording: jtqd splits a long log into parts (docs/logs.md)."""
+    """Return the files of each recording: jtqd splits a long log into parts."""
     groups: dict[object, list[Path]] = {}
     for path in paths:
         run = _PART.fullmatch(path.name)

@@ -58,14 +58,9 @@ Flags = NDArray[np.bool_]
 class LoggedRun:
     """Run table of a log with an account of its cycles: rows + incomplete + missed are all slots of SYNC.
 
-    Attributes:
-        table: torque_nm is None where the log has no sensor value at all, temperature_c where the drive sent none,
-            link_position_rad for a joint with one encoder.
-        missed: slots without a cycle (missed by the loop, or skipped on purpose).
-        incomplete: cycles left out because an input was not fresh.
-        incomplete_by: the same by input, e.g. {"joint 2": 3, "sensor": 1}; a cycle may miss several.
-        longest_gap_s: longest time between two rows.
-        left_out: joints of the log that are not in the table, and why.
+    missed: slots without a cycle. incomplete: cycles left out because an input was not fresh, and by input, e.g. {"joint
+    2": 3, "sensor": 1}; a cycle may miss several. longest_gap_s: between two rows. left_out: joints of the log that are not
+    in the table, and why.
     """
 
     table: RunTable
@@ -92,26 +87,16 @@ def log_to_run(
     enabled: Sequence[int] = (),
     last_motion: bool = False,
 ) -> LoggedRun:
-    """Read joints of a log from the first to the last cycle in which all their drives are in "operation enabled".
+    """Read joints of a log (a file, the parts of one run, or their directory) from the first to the last cycle in which all
+    their drives are in "operation enabled"; a joint that is read alone has its own first and last cycle.
 
-    The commander sends its first set-point in the cycle after the first of these, and ends with a quick stop. A joint that
-    is read alone has its own first and last cycle.
+    joints: numbers; None: all. Those whose drive was never enabled, or that lack an input in the whole motion, are left out
+    and reported, as long as one remains; all_needed: refused instead. nodes: node-IDs of the drives, for their
+    temperatures; None: by the configuration attached to the log, else 1, 2, ... sensor: a row needs the sensor's value
+    where a joint has a channel of it. enabled: further joints whose drives must be enabled at both ends. last_motion: begin
+    after the last time without power.
 
-    Args:
-        log: MCAP of jtqd, or the parts of one run, or their directory.
-        joints: numbers; None: all. Those whose drive was never enabled, or that lack an input in the whole motion, are
-            left out and reported, as long as one remains.
-        all_needed: refuse the log instead of leaving joints out.
-        nodes: node-IDs of the drives in the order of the log's joints, for their temperatures; None: by the
-            configuration that is attached to the log, without one 1, 2, ...
-        sensor: a row needs the sensor's value, where a joint has a channel of it; False: the bench has none,
-            torque_nm is None.
-        enabled: further joints whose drives must be in "operation enabled" at both ends.
-        last_motion: begin after the last time without power, not at the first cycle with it.
-
-    Raises:
-        LogError: no such joint or cycle, an input that never came, or topics that do not belong together.
-        OSError: the file cannot be read.
+    Raises LogError: no such joint or cycle, an input that never came, or topics that do not belong together; OSError.
     """
     name = log if isinstance(log, Path) else log[0]  # names the run in messages
     there = _joints_of(log, name)
@@ -367,8 +352,8 @@ def _powered(statusword: NDArray[Any]) -> FloatArray | None:
 def _temperature(readings: Readings, span: slice) -> FloatArray | None:
     """Return the temperature [n] over the cycles of `span` [degC], held between two TPDO3; None without any.
 
-    Before the first frame of the span that frame's value holds: an earlier one was sent while the drive was off, and an
-    emulated day begins when the drives are enabled. Where the span has no frame, the last one before it counts.
+    Before the first frame of the span that frame's value holds: an earlier one was sent while the drive was off. Where the
+    span has no frame, the last one before it counts.
     """
     rows, values = readings
     if not len(rows):

@@ -25,9 +25,8 @@ class UsageError(ValueError):
 
 
 def joint_files(arguments: Sequence[str], columns: ColumnMap | None) -> dict[int, Path]:
-    """Return the joint files by number, or {ALL_JOINTS: file}; without arguments those of the column map.
-
-    Raises UsageError.
+    """Return the joint files by number, or {ALL_JOINTS: file}; without arguments those of the column map. Raises
+    UsageError.
     """
     if not arguments:
         if columns is not None and columns.joint_files:
@@ -70,10 +69,7 @@ def check_joint_files(files: Mapping[int, Path]) -> None:
 
 
 def joints_of(files: Mapping[int, Path], runs: Sequence[RunFile]) -> dict[int, Joint]:
-    """Load the joint files of the joints that the runs have.
-
-    Raises ConfigError for a file that cannot be used, or a joint that no run has.
-    """
+    """Load the joint files of the joints that the runs have. Raises ConfigError, also for a joint that no run has."""
     there = sorted({number for run in runs for number in run.table.joints})
     if ALL_JOINTS in files:
         joint = load_joint(files[ALL_JOINTS])
@@ -88,9 +84,8 @@ def joints_of(files: Mapping[int, Path], runs: Sequence[RunFile]) -> dict[int, J
 
 
 def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> int:
-    """Return the number of a joint: the option, else the number its name ends in, else the only one of the runs.
-
-    Raises ConfigError where none of these decides.
+    """Return the number of a joint: the option, else the one its name ends in, else the only one of the runs. Raises
+    ConfigError.
     """
     if option is not None:
         return option
@@ -107,10 +102,7 @@ def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> i
 
 
 def with_joint(runs: Sequence[RunFile], number: int) -> list[RunFile]:
-    """Return the runs that have columns of the joint; all of them where none has, so that the caller reports it.
-
-    A campaign of an arm moves one joint after the other: its directory holds runs of other joints too.
-    """
+    """Return the runs that have columns of the joint (a campaign of an arm has others too); all where none has."""
     found = [run for run in runs if number in run.table.joints]
     return found or list(runs)
 

@@ -26,14 +26,8 @@ class RunError(ValueError):
 
 @dataclass(frozen=True)
 class RunFile:
-    """A run as read.
-
-    Attributes:
-        name: for messages; unique among runs that were read together.
-        path, source: the file, and its kind: "csv", "parquet" or "mcap".
-        sha256: of the file on disk (hex).
-        table: its columns. The segments of one recording keep its time.
-        notes: what is suspicious about it, one line each.
+    """A run as read: name for messages, unique among the runs read together; file, its kind ("csv", "parquet", "mcap") and
+    SHA-256 (hex); columns (the segments of one recording keep its time); what is suspicious, one line each.
     """
 
     name: str
@@ -146,7 +140,7 @@ def runs_of(content: Content, *, whole: bool) -> list[RunFile]:
 
 def _without_repeated_rows(content: Content) -> Content:
     """Return the content without rows that were written twice in a row, and a note. Two rows that share only their stamp
-    stay, to be refused: one of their times is wrong.
+    stay, to be refused.
     """
     columns = np.array(list(content.values.values()))
     again = np.concatenate(([False], np.all(columns[:, 1:] == columns[:, :-1], axis=0)))
@@ -159,9 +153,8 @@ def _without_repeated_rows(content: Content) -> Content:
 
 
 def _with_spread_stamps(content: Content) -> Content:
-    """Return the content with rounded stamps that equal the one before spread between their neighbours, and a note.
-
-    It is unchanged where there are more rows than the time can hold.
+    """Return the content with rounded stamps that equal the one before spread between their neighbours, and a note;
+    unchanged where there are more rows than the time can hold.
     """
     time_s = content.values[TIME]
     steps = np.diff(time_s)

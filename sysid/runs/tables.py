@@ -188,9 +188,7 @@ def _text(path: Path, data: bytes) -> str:
 
 
 def _separator(text: str) -> str:
-    """Return the mark that gives the header and the row below it equally many cells, marks rare in names before the comma
-    ("Zeit, ms;Weg, mm"); else the first that the header has.
-    """
+    """Return the mark that gives the header and the row below it equally many cells, else the first that the header has."""
     header = text.lstrip().split("\n", 1)[0]
     for mark in "\t;,":
         try:
@@ -203,9 +201,7 @@ def _separator(text: str) -> str:
 
 
 def _without_cut_row(text: str, separator: str) -> tuple[str, tuple[str, ...]]:
-    """Return the text without a last row that has no line end and fewer cells than the row before (the recorder was ended
-    while it wrote), and a note.
-    """
+    """Return the text without a last row that has no line end and too few cells (the recorder was ended), and a note."""
     *before, row, last = ("", "", *text.rsplit("\n", 2))[-3:]
     if not last or last.count(separator) >= row.count(separator):
         return text, ()
@@ -223,8 +219,8 @@ def _rows(text: str, separator: str, path: Path) -> Iterator[tuple[int, list[str
 
 
 def _numbers(path: Path, name: str, values: Any, *, blanks: bool) -> FloatArray:
-    """Return one column as float64 [n]. Raises RunError with the first row that is text or infinite, or blank where blanks
-    are not allowed.
+    """Return one column as float64 [n]. Raises RunError with the first row that is text, infinite, or blank where not
+    allowed.
     """
     try:
         cells: FloatArray = np.asarray(values, np.float64)
@@ -253,17 +249,10 @@ _ROWS_AT_A_TIME: Final = 8192
 
 
 def write_run(path: Path | str, table: RunTable) -> str:
-    """Write `table` as .csv or .csv.gz, whole or not at all: an earlier file stays until the new one is complete.
+    """Write `table` as .csv or .csv.gz, whole or not at all; return the SHA-256 of the file (hex). Same table, same bytes.
 
-    Returns the SHA-256 of the file (hex), as `read_run` does. The same table gives the same bytes.
-
-    Columns: time_s, then those of each joint, in the order of the joints' numbers and of COLUMN_NAMES. Numbers are written
-    to 1e-10 of their unit, below the resolution of any encoder, current or torque channel: reading gives every value back to
-    5e-11 (values above 1e5 to 1e-15 of themselves).
-
-    Raises:
-        ValueError: the name ends in neither .csv nor .csv.gz.
-        OSError: it cannot be written.
+    Columns: time_s, then those of each joint, by number, in the order of COLUMN_NAMES. Numbers are written to 1e-10 of
+    their unit, below the resolution of any channel. Raises ValueError for another ending, OSError.
     """
     path = Path(path)
     if not path.name.endswith((".csv", ".csv.gz")):
