@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,7 +44,7 @@ def swing(phase: float, seconds: float = 6.0, rate_hz: float = 1000.0) -> RunTab
     )
 
 
-def test_a_true_file_has_no_error_and_a_wrong_one_what_is_wrong() -> None:
+def test_a_true_file_has_no_error_and_a_wrong_one_what_is_wrong():
     table = swing(0.3)
     right, wrong = (errors_on("r", table, 1, joint) for joint in (TRUE, WRONG))
     assert right.errors[MOTOR] < 0.01
@@ -58,7 +57,7 @@ def test_a_true_file_has_no_error_and_a_wrong_one_what_is_wrong() -> None:
     assert "simulation, torsion balance" not in right.errors  # one encoder
 
 
-def test_what_rounding_makes_of_the_acceleration_is_no_error() -> None:
+def test_what_rounding_makes_of_the_acceleration_is_no_error():
     """Positions of the motor in steps of 50 mrad at 100 Hz: a second difference of them is newton metres of noise."""
     table = swing(0.3, 12.0, 100.0)
     columns = table.joints[1]
@@ -75,9 +74,7 @@ def test_what_rounding_makes_of_the_acceleration_is_no_error() -> None:
     assert own != shared, "two files are judged by the same part of a run"
 
 
-def test_with_one_encoder_there_is_no_torsion_to_estimate_from(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_with_one_encoder_there_is_no_torsion_to_estimate_from(tmp_path, capsys):
     """Derived from the motor's, a link position makes a torsion of zero: method fused would be wrong by the whole torque."""
     path, run = tmp_path / "rig_joint1.yaml", tmp_path / "r.csv"
     write_joint(path, replace(TRUE, fused=fused_joint().fused), "test")
@@ -94,19 +91,19 @@ def test_with_one_encoder_there_is_no_torsion_to_estimate_from(
     assert "estimator fused, without network" in errors_on("r", swing(0.3), 1, rigid).errors
 
 
-def test_an_effect_of_the_file_is_part_of_its_simulation() -> None:
+def test_an_effect_of_the_file_is_part_of_its_simulation():
     mended = replace(WRONG, effects=(Effect("coulomb_friction", {"coulomb_nm": 1.2}),))
     assert errors_on("r", swing(0.3), 1, mended).errors[MOTOR] < 0.01
 
 
-def test_an_effect_that_no_value_stands_for_is_simulated_too() -> None:
+def test_an_effect_that_no_value_stands_for_is_simulated_too():
     """A ripple that the joint does not have is an error of its own size."""
     ripple = Effect("torque_ripple", {"amplitude_nm": 0.5, "order_per_motor_rev": 1.0, "phase_rad": 0.0})
     found = errors_on("r", swing(0.3), 1, replace(TRUE, effects=(ripple,)))
     assert found.errors[MOTOR] == pytest.approx(0.5 / math.sqrt(2.0), rel=0.15)
 
 
-def test_all_runs_together_are_weighted_by_their_samples() -> None:
+def test_all_runs_together_are_weighted_by_their_samples():
     short, long = swing(0.3, 3.0), swing(1.1, 9.0)
     scored = [[errors_on(name, table, 1, WRONG) for name, table in (("a", short), ("b", long))]]
     rows = [row for row in rows_of(scored) if row.what == MOTOR]
@@ -118,7 +115,7 @@ def test_all_runs_together_are_weighted_by_their_samples() -> None:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> Path:
+def files(tmp_path):
     write_joint(tmp_path / "wrong.yaml", WRONG, "wrong")
     write_joint(tmp_path / "true.yaml", TRUE, "true")
     for k in range(2):
@@ -126,7 +123,7 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_both_files_stand_in_one_table(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_both_files_stand_in_one_table(files, capsys):
     arguments = ["score", str(files / "wrong.yaml"), str(files / "r0.csv"), str(files / "r1.csv")]
     assert jtq([*arguments, "--after", str(files / "true.yaml")]) == 0
     lines = capsys.readouterr().out.splitlines()
@@ -142,7 +139,7 @@ def test_both_files_stand_in_one_table(files: Path, capsys: pytest.CaptureFixtur
     assert all(row["change"] is None and len(row["rmse"]) == 1 for row in made["rows"])
 
 
-def test_a_run_that_cannot_be_used_is_told(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_cannot_be_used_is_told(files, capsys):
     table = swing(0.2)
     columns = replace(table.joints[1], torque_nm=None)
     write_run(files / "blind.csv", RunTable(table.time_s, {1: columns}))
@@ -154,7 +151,7 @@ def test_a_run_that_cannot_be_used_is_told(files: Path, capsys: pytest.CaptureFi
     assert "found no run in which joint 1 can be scored" in capsys.readouterr().err
 
 
-def test_files_of_two_joints_are_refused(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_of_two_joints_are_refused(files, capsys):
     write_joint(files / "other.yaml", replace(TRUE, gear_ratio=100.0), "other")
     status = jtq(
         ["score", str(files / "true.yaml"), str(files / "r0.csv"), "--after", str(files / "other.yaml")]

@@ -284,21 +284,15 @@ def test_a_task_that_takes_too_long_is_a_failed_one(tmp_path):
 @pytest.mark.parametrize(
     ("command", "expected"),
     [
-        (
-            ["diagnose", "nowhere", "--joint", str(JOINT_FILE)],
-            (1, "nowhere: found no such file or directory"),
-        ),
+        (["diagnose", "nowhere", "--joint", str(JOINT_FILE)], (1, "nowhere: found no such file or directory")),
         (["diagnose", "logs"], (2, "--joint")),
         (["diagnose", "logs", "--joint", "x=a.yaml"], (2, "found joint 'x', expected a number from 1 to 7")),
         (["replay", "nothere.mcap"], (1, "nothere.mcap: found no such file or directory")),
         (["diagnose", "logs", "--joint", "none.yaml"], (1, "none.yaml: cannot be read: No such file")),
-        (
-            ["replay", "logs", "--out", "logs/a.mcap"],
-            (1, "--out logs/a.mcap: cannot be created: it is a file"),
-        ),
+        (["replay", "logs", "--out", "logs/a.mcap"], (1, "--out logs/a.mcap: cannot be created: it is a file")),
         (["replay", "logs", "--model", "none"], (1, "--model none: found no such directory")),
     ],
-)
+)  # fmt: skip
 def test_wrong_usage_is_one_line(tmp_path, monkeypatch, capsys, command, expected):
     monkeypatch.chdir(tmp_path)
     touch(tmp_path, "logs/a.mcap")

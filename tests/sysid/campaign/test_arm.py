@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -102,9 +102,7 @@ def test_runs_of_all_units_that_can_be_driven(  # noqa: PLR0917
         assert (printed.out, len(printed.err.splitlines())) == ("", 1)
 
 
-def test_a_joint_without_limits_is_not_moved_until_they_are_given(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_joint_without_limits_is_not_moved_until_they_are_given(tmp_path, capsys):
     file = str(config_file(tmp_path, [None, None], sensor=False, limits=False))
     arguments = ["excitation", "--quick", "--evaluations", "1", "--dry-run", "--config", file]
     assert main(arguments) == 1
@@ -151,9 +149,7 @@ ALONE = {
         (lambda r: r["segments"][0].update(hold_s=9.0), "travel of joint 1"),
     ],
 )
-def test_errors_in_a_plan_of_a_joint_alone(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], change: Callable[[Any], Any], words: str
-) -> None:
+def test_errors_in_a_plan_of_a_joint_alone(tmp_path, capsys, change, words):
     content = json.loads(json.dumps(ALONE))
     file = config_file(tmp_path, [None], sensor=False)
     plan = tmp_path / "p.yaml"
@@ -168,7 +164,7 @@ def test_errors_in_a_plan_of_a_joint_alone(
     assert "p.yaml" in line
 
 
-def test_a_run_of_a_joint_alone_holds_its_own_columns_and_is_checked(tmp_path: Path) -> None:
+def test_a_run_of_a_joint_alone_holds_its_own_columns_and_is_checked(tmp_path):
     """Joint 3 of a bus: a reader of joint 3 leaves the runs of joints 1 and 2 out."""
     plan = make_plan_of("validate", units_of([1, 1, 2], True), [JOINT] * 3, Scale(quick=True, runs=1))
     files: tuple[Joint, ...] = (JOINT, JOINT, JOINT)
@@ -187,9 +183,7 @@ def test_a_run_of_a_joint_alone_holds_its_own_columns_and_is_checked(tmp_path: P
     assert len(with_joint(runs, 4)) == 2, "no run has it: all of them are returned"
 
 
-def test_a_limit_of_the_temperature_needs_that_of_every_joint(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_limit_of_the_temperature_needs_that_of_every_joint(tmp_path, capsys):
     """jtqd leaves TPDO3 of the others off, and drops the inputs of a drive on which it is switched on."""
     file = config_file(tmp_path, [None, None], sensor=False)
     content = yaml.safe_load(file.read_text())
@@ -202,9 +196,7 @@ def test_a_limit_of_the_temperature_needs_that_of_every_joint(
     assert main([*arguments, "--limit", "temperature_c=none"]) == 0
 
 
-def test_a_joint_that_stands_elsewhere_is_brought_to_the_middle_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_joint_that_stands_elsewhere_is_brought_to_the_middle_first(tmp_path, monkeypatch):
     config = BenchConfig.load(config_file(tmp_path, [None, None, None], sensor=False, **TWO_MS))
     run = expand(Run("r", 3, (Rest(0.1), Plateau(0.5, 0.0, 0.2), Rest(0.5)), None))
     played: list[Setpoints] = []

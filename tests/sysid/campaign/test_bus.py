@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -46,7 +45,7 @@ PLAN = {
 
 
 @pytest.fixture
-def arguments(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+def arguments(tmp_path, monkeypatch):
     """A campaign of two runs in a directory of its own; nothing of it is left on the bus afterwards."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(PLAN))
@@ -112,9 +111,7 @@ def check_done(out: Path, status: int, content: dict[str, Any], runs: list[str])
     assert left == sorted([".lock", "campaign.json", "plan.yaml", *files])
 
 
-def test_ctrl_c_brings_both_joints_to_rest_and_the_same_command_goes_on(
-    arguments: list[str], tmp_path: Path
-) -> None:
+def test_ctrl_c_brings_both_joints_to_rest_and_the_same_command_goes_on(arguments, tmp_path):
     out = tmp_path / "out"
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(PLAN | {"runs": PLAN["runs"][1:]}))
     process = started(arguments)
@@ -139,7 +136,7 @@ def test_ctrl_c_brings_both_joints_to_rest_and_the_same_command_goes_on(
 
 
 @pytest.mark.campaign
-def test_a_campaign_that_was_killed_goes_on(arguments: list[str], tmp_path: Path) -> None:
+def test_a_campaign_that_was_killed_goes_on(arguments, tmp_path):
     """SIGKILL: nothing tidies up but the next call; what it had started ends by itself."""
     out = tmp_path / "out"
     process = started(arguments)
@@ -186,9 +183,7 @@ def check_tables(out: Path) -> None:
 
 
 @pytest.mark.campaign
-def test_a_limit_stops_the_joints_and_the_campaign_unless_keep_going(
-    arguments: list[str], tmp_path: Path
-) -> None:
+def test_a_limit_stops_the_joints_and_the_campaign_unless_keep_going(arguments, tmp_path):
     out = tmp_path / "out"
     status, content, errors = ended(started([*arguments, "--limit", "torque_nm=8", "--keep-going"]))
     assert status == 3, errors
@@ -201,9 +196,7 @@ def test_a_limit_stops_the_joints_and_the_campaign_unless_keep_going(
 
 
 @pytest.mark.campaign
-def test_a_joint_is_moved_alone_beside_a_towing_bench(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_joint_is_moved_alone_beside_a_towing_bench(tmp_path, monkeypatch):
     """Three joints at 500 Hz: joint 3 is brought to the middle of its travel, moved, and read; 1 and 2 are held."""
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     config: dict[str, Any] = {

@@ -35,16 +35,14 @@ SMALL = {
 
 
 @pytest.fixture
-def plan(tmp_path: Path) -> str:
+def plan(tmp_path):
     path = tmp_path / "small.yaml"
     path.write_text(yaml.safe_dump(SMALL))
     return str(path)
 
 
 @pytest.mark.parametrize("more", [[], ["--dry-run"], ["--bus", "sim", "--out", "x"]])
-def test_a_missing_plan_comes_before_a_missing_option(
-    more: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_plan_comes_before_a_missing_option(more, capsys):
     assert main(["nothere.yaml", *more]) == 1
     assert (
         capsys.readouterr().err == "jtq campaign: nothere.yaml: cannot be read: No such file or directory\n"
@@ -63,9 +61,7 @@ def test_a_missing_plan_comes_before_a_missing_option(
         (["efficiency", "--bus", "can0", "--out", "x", "--plant", "p"], ["--plant requires --bus sim"]),
     ],
 )
-def test_misuse_is_status_2_and_one_line(
-    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_misuse_is_status_2_and_one_line(arguments, words, capsys):
     assert main(arguments) == 2
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -83,9 +79,7 @@ def test_misuse_is_status_2_and_one_line(
         (["--limit", "current_a=none"], ["current_a=none"]),
     ],
 )
-def test_wrong_values_of_options(
-    option: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_wrong_values_of_options(option, words, capsys):
     with pytest.raises(SystemExit) as caught:
         main(["efficiency", "--dry-run", *option])
     assert caught.value.code == 2
@@ -94,7 +88,7 @@ def test_wrong_values_of_options(
         assert word in error
 
 
-def test_a_dry_run_prints_every_run_and_moves_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_prints_every_run_and_moves_nothing(capsys):
     assert main(["efficiency", "--dry-run"]) == 0
     captured = capsys.readouterr()
     assert captured.err == ""
@@ -107,7 +101,7 @@ def test_a_dry_run_prints_every_run_and_moves_nothing(capsys: pytest.CaptureFixt
     assert "93.4% in the worst case, 934 of 1000 bits" in lines[-1]
 
 
-def test_a_dry_run_as_json_adds_up(plan: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dry_run_as_json_adds_up(plan, capsys):
     assert main([plan, "--dry-run", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert [run["run"] for run in content["runs"]] == ["a", "b"]
@@ -139,9 +133,7 @@ def bench_config(folder: Path, **changes: object) -> Path:
         ({"joint_4": {"node": 5, "file": "none.yaml"}}, ["joint_3", "without a gap"]),
     ],
 )
-def test_a_bench_that_cannot_carry_it_is_refused(
-    tmp_path: Path, changes: dict[str, object], words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bench_that_cannot_carry_it_is_refused(tmp_path, changes, words, capsys):
     path = bench_config(tmp_path, **changes)
     assert main(["efficiency", "--dry-run", "--config", str(path)]) == 1
     captured = capsys.readouterr()
@@ -179,16 +171,14 @@ def drives_with(folder: Path, **section: object) -> Path:
         ),
     ],
 )  # fmt: skip
-def test_a_drive_that_would_be_moved_otherwise_than_planned_is_refused(
-    section: dict[str, object], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_that_would_be_moved_otherwise_than_planned_is_refused(section, words, tmp_path, capsys):
     assert main(["efficiency", "--dry-run", "--config", str(drives_with(tmp_path, **section))]) == 1
     error = capsys.readouterr().err
     assert words in error
     assert len(error.splitlines()) == 1
 
 
-def test_the_bus_load_of_a_campaign_is_that_of_the_layout(tmp_path: Path) -> None:
+def test_the_bus_load_of_a_campaign_is_that_of_the_layout(tmp_path):
     """Four bytes less of each drive, and torque instead of current, are no reason against it."""
     less = {"link_position": False, "current": {"index": 0x6077}}
     config = BenchConfig.load(drives_with(tmp_path, objects=less))
@@ -198,7 +188,7 @@ def test_the_bus_load_of_a_campaign_is_that_of_the_layout(tmp_path: Path) -> Non
     assert whole.worst - config.load_with_commander().worst == pytest.approx(0.08)
 
 
-def test_a_plan_beyond_its_limits_is_refused(plan: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_plan_beyond_its_limits_is_refused(plan, capsys):
     assert main([plan, "--dry-run", "--limit", "velocity_rad_s=0.4"]) == 1
     error = capsys.readouterr().err
     assert len(error.splitlines()) == 1
@@ -223,17 +213,13 @@ def done_directory(path: Path, arguments: list[str]) -> None:
     directory.close()
 
 
-def test_a_campaign_that_is_done_needs_no_bus(
-    plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_campaign_that_is_done_needs_no_bus(plan, tmp_path, capsys):
     done_directory(tmp_path / "out", [plan])
     assert main([plan, "--bus", "unix:/nonexistent/bus", "--out", str(tmp_path / "out"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["runs"]["done"] == 2
 
 
-def test_the_same_directory_takes_no_other_plan(
-    plan: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_same_directory_takes_no_other_plan(plan, tmp_path, capsys):
     out = tmp_path / "out"
     done_directory(out, ["validate", "--quick", "--seed", "3"])
     for other in (
@@ -250,9 +236,7 @@ def test_the_same_directory_takes_no_other_plan(
     assert main(same) == 0
 
 
-def test_a_plan_that_was_designed_once_is_not_designed_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_plan_that_was_designed_once_is_not_designed_again(tmp_path, monkeypatch, capsys):
     arguments = ["excitation", "--quick", "--evaluations", "1"]
     done_directory(tmp_path / "out", arguments)
 
@@ -265,9 +249,7 @@ def test_a_plan_that_was_designed_once_is_not_designed_again(
 
 
 @pytest.mark.parametrize("bus", ["can77", "unix:/nonexistent/bus"])
-def test_a_bus_that_is_not_there_ends_the_campaign_in_one_line(
-    plan: str, tmp_path: Path, bus: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bus_that_is_not_there_ends_the_campaign_in_one_line(plan, tmp_path, bus, capsys):
     assert main([plan, "--bus", bus, "--out", str(tmp_path / "out")]) == 1
     captured = capsys.readouterr()
     assert bus.removeprefix("unix:") in captured.out
@@ -276,9 +258,7 @@ def test_a_bus_that_is_not_there_ends_the_campaign_in_one_line(
     assert left == [".lock", "campaign.json", "plan.yaml"]
 
 
-def test_the_error_of_a_jtqd_that_does_not_start_is_passed_on(
-    plan: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_error_of_a_jtqd_that_does_not_start_is_passed_on(plan, tmp_path, monkeypatch, capsys):
     """A bench with nothing on it: jtqd's boot names the node that is missing, and the campaign passes it on."""
     (tmp_path / "run").mkdir()
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path / "run"))
@@ -296,7 +276,7 @@ def test_the_error_of_a_jtqd_that_does_not_start_is_passed_on(
         hub.wait(10)
 
 
-def test_help_has_an_example_and_jtq_knows_the_command() -> None:
+def test_help_has_an_example_and_jtq_knows_the_command():
     done = subprocess.run(
         [sys.executable, "-m", "jtqd.daemon.jtq", "campaign", "--help"],
         capture_output=True,

@@ -17,13 +17,13 @@ ARGUMENTS = ["--runs", "2", "--seconds", "4", "--hold", "0.3", "--seed", "5"]
 
 
 @pytest.fixture(scope="module")
-def directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def directory(tmp_path_factory):
     out: Path = tmp_path_factory.mktemp("runs") / "days"
     assert main([*ARGUMENTS, "--out", str(out)]) == 0
     return out
 
 
-def test_tables_and_marks_are_those_of_the_plan(directory: Path) -> None:
+def test_tables_and_marks_are_those_of_the_plan(directory):
     joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
     runs = make_plan("validate", Scale(2, 4.0, 0.3, 5, joints=joints)).runs
     assert {path.name for path in directory.iterdir()} == {
@@ -43,7 +43,7 @@ def test_tables_and_marks_are_those_of_the_plan(directory: Path) -> None:
     assert np.corrcoef(planned, driven)[0, 1] > 0.99
 
 
-def test_each_run_has_a_day_of_its_own() -> None:
+def test_each_run_has_a_day_of_its_own():
     joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
     run = make_plan("validate", Scale(1, 4.0, 0.3, 5, joints=joints)).runs[-1]
     bench = load_plant(shipped(PLANT))
@@ -56,9 +56,7 @@ def test_each_run_has_a_day_of_its_own() -> None:
     assert abs(rest[2] - rest[0]) > 0.01
 
 
-def test_what_was_interrupted_goes_on_and_nothing_else_is_written_over(
-    directory: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_was_interrupted_goes_on_and_nothing_else_is_written_over(directory, capsys):
     before = {path.name: path.read_bytes() for path in directory.iterdir()}
     (directory / "variable_02.json").unlink()  # interrupted before its end
     (directory / "variable_02.csv.gz").write_bytes(b"half")

@@ -34,14 +34,14 @@ PLAN = {
 
 
 @pytest.fixture
-def argv(tmp_path: Path) -> list[str]:
+def argv(tmp_path):
     path = tmp_path / "small.plan.yaml"
     path.write_text(yaml.safe_dump(PLAN))
     return [str(path), "--out", str(tmp_path / "out")]
 
 
 @pytest.fixture
-def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], Path]]:
+def sent(monkeypatch):
     """Calls of exact time, which ends with status 3."""
     found: list[tuple[list[str], Path]] = []
     monkeypatch.setattr(command, "run_in_exact_time", lambda argv, out: found.append((list(argv), out)) or 3)
@@ -49,16 +49,14 @@ def sent(monkeypatch: pytest.MonkeyPatch) -> list[tuple[list[str], Path]]:
     return found
 
 
-def test_bus_exact_goes_there_at_once(argv: list[str], sent: list[Any], tmp_path: Path) -> None:
+def test_bus_exact_goes_there_at_once(argv, sent, tmp_path):
     argv += ["--bus", "exact"]
     assert command.main(argv) == 3
     assert sent == [(argv, tmp_path / "out")]
     assert not (tmp_path / "out").exists(), "the directory belongs to the campaign inside"
 
 
-def test_inside_of_exact_time_the_bench_is_on_its_bus(
-    argv: list[str], sent: list[Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_inside_of_exact_time_the_bench_is_on_its_bus(argv, sent, monkeypatch):
     buses = []
     monkeypatch.setenv(guest.TIME_TRAVEL_MARK, "1")
     monkeypatch.setattr(
@@ -74,12 +72,8 @@ def test_inside_of_exact_time_the_bench_is_on_its_bus(
     [("sim", True, True), ("sim", False, False), ("sim:unix:/tmp/bus", True, False), ("can0", True, False)],
 )
 def test_runs_that_real_time_loses_go_on_in_exact_time_on_the_emulated_bench_alone(
-    argv: list[str],
-    sent: list[Any],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    case: tuple[str, bool, bool],
-) -> None:
+    argv, sent, monkeypatch, capsys, case
+):
     """Never from a real bench to an emulated one, and never from a given bus to another."""
     bus, ready, goes = case
     asked = []
@@ -101,9 +95,7 @@ def test_runs_that_real_time_loses_go_on_in_exact_time_on_the_emulated_bench_alo
     assert ("ended by" in captured.out) == (not goes)
 
 
-def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(
-    argv: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(argv, monkeypatch, capsys):
     asked = []
 
     def run(*_: object, exact_next: bool) -> Outcome:
@@ -122,7 +114,7 @@ def test_a_kernel_that_does_not_boot_leaves_real_time_with_its_repeats(
     assert "the guest ended without a result; in real time again" in capsys.readouterr().err
 
 
-def test_the_command_inside_is_the_same_on_another_bus(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_inside_is_the_same_on_another_bus(monkeypatch):
     ran: list[tuple[list[str], dict[str, Any]]] = []
 
     def run(words: list[str], **options: Any) -> SimpleNamespace:
@@ -147,9 +139,7 @@ def test_the_command_inside_is_the_same_on_another_bus(monkeypatch: pytest.Monke
         (KeyboardInterrupt(), "the same command continues"),
     ],
 )
-def test_a_missing_bench_kernel_is_one_line(
-    monkeypatch: pytest.MonkeyPatch, raised: BaseException, words: str
-) -> None:
+def test_a_missing_bench_kernel_is_one_line(monkeypatch, raised, words):
     def run(*_: object, **__: object) -> None:
         raise raised
 
@@ -160,22 +150,20 @@ def test_a_missing_bench_kernel_is_one_line(
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-def test_sigterm_ends_the_guest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sigterm_ends_the_guest(monkeypatch):
     monkeypatch.setattr(guest, "run", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
     with pytest.raises(ProcessError, match="ended by a signal"):
         bench.run_in_exact_time(["validate"], Path("there"))
 
 
-def test_a_broken_override_of_the_kernel_is_no_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_broken_override_of_the_kernel_is_no_kernel(monkeypatch):
     monkeypatch.setenv("JTQD_BENCH_KERNEL", "/nowhere")
     monkeypatch.delenv(guest.TIME_TRAVEL_MARK, raising=False)
     assert not bench.exact_time_ready()
 
 
 @pytest.mark.boots
-def test_a_run_in_exact_time_has_all_of_its_cycles(
-    argv: list[str], tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes]
-) -> None:
+def test_a_run_in_exact_time_has_all_of_its_cycles(argv, tmp_path, capfdbinary):
     assert command.main([*argv, "--bus", "exact", "--json"]) == 0
     outcome = json.loads(capfdbinary.readouterr().out)
     assert outcome["missed_cycles"] == outcome["incomplete_cycles"] == {}

@@ -111,19 +111,19 @@ def one_encoder_and_longer_travel(columns: dict[int, JointColumns]) -> None:
         (one_encoder_and_longer_travel, ["j2.motor_position_rad: through the gear", "-1.049 times"]),
     ],
 )
-def test_faults_of_a_run_are_found(change: Change, words: list[str]) -> None:
+def test_faults_of_a_run_are_found(change, words):
     lines = found(changed(change))
     assert all(len(line.splitlines()) == 1 for line in lines)
     assert any(all(word in line for word in words) for line in lines), lines
 
 
-def test_a_good_run_has_no_findings() -> None:
+def test_a_good_run_has_no_findings():
     assert found() == ()
     assert found(changed(one_encoder)) == ()
     assert found(changed(both("torque_nm", absent)), measured=()) == ()
 
 
-def test_missing_cycles_are_a_finding_above_one_percent() -> None:
+def test_missing_cycles_are_a_finding_above_one_percent():
     run = replace(logged(good_run()[0]), incomplete=10, incomplete_by={"joint 1": 10, "sensor": 0})
     assert found(replace(run, missed=20)) == ()
     (line,) = found(replace(run, missed=50))
@@ -131,7 +131,7 @@ def test_missing_cycles_are_a_finding_above_one_percent() -> None:
         assert word in line
 
 
-def test_lost_cycles_do_not_make_a_motion_look_wrong() -> None:
+def test_lost_cycles_do_not_make_a_motion_look_wrong():
     """Rows are compared with the set-point of their own time, not of their number."""
     keep = np.random.default_rng(1).random(len(good_run()[0].time_s)) > 0.3
     assert found(with_rows(keep)) == ()
@@ -145,7 +145,7 @@ def with_gaps(*gaps: tuple[int, int]) -> LoggedRun:
     return with_rows(keep)
 
 
-def test_a_gap_is_interpolated_and_counted() -> None:
+def test_a_gap_is_interpolated_and_counted():
     table, points, _ = good_run()
     whole, made = interpolate_gaps(with_gaps((1000, 15), (2000, 5)), GAP_S)
     assert made == 15, "readers accept a short gap"
@@ -158,13 +158,13 @@ def test_a_gap_is_interpolated_and_counted() -> None:
 
 
 @pytest.mark.parametrize("gaps", [((1000, 60),), ((1000, 45), (3000, 45)), ()], ids=["long", "many", "none"])
-def test_too_long_or_too_many_gaps_are_not_interpolated(gaps: tuple[tuple[int, int], ...]) -> None:
+def test_too_long_or_too_many_gaps_are_not_interpolated(gaps):
     run = with_gaps(*gaps)
     assert interpolate_gaps(run, GAP_S) == (run, 0)
     assert (unusable(run, good_run()[1], GAP_S) is None) == (not gaps)
 
 
-def test_a_log_with_a_gap_or_without_the_end_of_the_motion_is_not_kept() -> None:
+def test_a_log_with_a_gap_or_without_the_end_of_the_motion_is_not_kept():
     table, points, _ = good_run()
     good = logged(table)
     assert unusable(good, points, GAP_S) is None

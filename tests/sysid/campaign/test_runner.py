@@ -2,7 +2,6 @@
 
 import io
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -64,7 +63,7 @@ class Script:
 
 
 @pytest.fixture
-def directory(tmp_path: Path) -> Iterator[CampaignDirectory]:
+def directory(tmp_path):
     made = CampaignDirectory(tmp_path)
     made.begin(PLAN, {})
     yield made
@@ -94,13 +93,7 @@ def gone(directory: CampaignDirectory, script: Script, **options: bool) -> Outco
         ({"b": [Interrupted()]}, {"keep_going": True}, "ab", ([DONE, "pending", "pending"], 1)),
     ],
 )
-def test_attempts_and_outcome(
-    directory: CampaignDirectory,
-    attempts: dict[str, list[Attempt | BaseException]],
-    options: dict[str, bool],
-    asked: str,
-    expected: tuple[list[str], int],
-) -> None:
+def test_attempts_and_outcome(directory, attempts, options, asked, expected):
     statuses, status = expected
     script = Script(**attempts)
     outcome = gone(directory, script, **options)
@@ -131,12 +124,8 @@ OTHER_FINDING = Attempt(RunState(DONE, rows=1000, findings=("j1.torque_nm: found
     ],
 )
 def test_nothing_is_repeated_in_real_time_where_exact_time_can_be_had(
-    directory: CampaignDirectory,
-    attempts: dict[str, list[Attempt | BaseException]],
-    asked: str,
-    late: bool,
-    statuses: list[str],
-) -> None:
+    directory, attempts, asked, late, statuses
+):
     script = Script(**attempts)
     outcome = gone(directory, script, exact_next=True)
     assert "".join(script.asked) == asked
@@ -168,13 +157,7 @@ def fourier_run(name: str = "b", trajectories: int = 2) -> Run:
         ({"b": [LIMIT]}, ["b"], STOPPED, 1),
     ],
 )
-def test_a_lost_run_is_repeated_in_partial_runs(
-    tmp_path: Path,
-    attempts: dict[str, list[Attempt | BaseException]],
-    asked: list[str],
-    status: str,
-    pieces: int,
-) -> None:
+def test_a_lost_run_is_repeated_in_partial_runs(tmp_path, attempts, asked, status, pieces):
     plan = Plan("p", DEFAULT_LIMITS, (fourier_run(),))
     made = CampaignDirectory(tmp_path)
     made.begin(plan, {})
@@ -198,13 +181,13 @@ def test_a_lost_run_is_repeated_in_partial_runs(
         assert state.reason.startswith("b~1: ")
 
 
-def test_a_campaign_that_was_short_of_time() -> None:
+def test_a_campaign_that_was_short_of_time():
     assert Outcome({"a": LATE.state}).short_of_time
     assert Outcome({"a": RunState(FAILED, "b~1: found a gap of 30.0 ms in the log")}).short_of_time
     assert not Outcome({"a": LIMIT.state, "b": GOOD.state}).short_of_time
 
 
-def test_only_what_is_not_done_is_played_when_the_command_is_repeated(directory: CampaignDirectory) -> None:
+def test_only_what_is_not_done_is_played_when_the_command_is_repeated(directory):
     for ending in (".csv.gz", ".json", ".mcap"):
         (directory.path / f"a{ending}").write_text("x")
     assert gone(directory, Script(b=[LIMIT])).exit_status == 1
@@ -214,7 +197,7 @@ def test_only_what_is_not_done_is_played_when_the_command_is_repeated(directory:
     assert script.asked == ["b", "c"]
 
 
-def test_findings_make_the_exit_status_3(directory: CampaignDirectory) -> None:
+def test_findings_make_the_exit_status_3(directory):
     dead = Attempt(RunState(DONE, rows=9, missed=4, incomplete=2, findings=("j1.torque_nm: dead channel",)))
     outcome = gone(directory, Script(b=[dead]))
     assert outcome.exit_status == 3
@@ -256,7 +239,7 @@ def limit_reasons() -> list[str]:
     return [reason for reason in reasons if reason]
 
 
-def test_a_late_bus_is_tried_again_and_a_limit_never() -> None:
+def test_a_late_bus_is_tried_again_and_a_limit_never():
     for reason in late_reasons():
         assert stopped(MotionResult("stopped", reason, 1.0)).again, reason
     for reason in [*limit_reasons(), "joint 1: fault (statusword 0218h)", "SIGINT", "SIGTERM"]:
@@ -265,7 +248,7 @@ def test_a_late_bus_is_tried_again_and_a_limit_never() -> None:
     assert not stopped(MotionResult("stopped", limit_reasons()[0], 1.0)).signalled
 
 
-def test_remaining_time_is_motion_plus_the_measured_time_between() -> None:
+def test_remaining_time_is_motion_plus_the_measured_time_between():
     now = [100.0]
     remaining = Remaining([10.0, 20.0, 30.0], lambda: now[0])
     assert remaining.seconds() == pytest.approx(60.0 + 3 * BETWEEN_RUNS_S)
@@ -276,7 +259,7 @@ def test_remaining_time_is_motion_plus_the_measured_time_between() -> None:
         assert remaining.seconds() == pytest.approx(expected)
 
 
-def test_clock_text() -> None:
+def test_clock_text():
     assert [clock_text(s) for s in (0, 61.6, 3723, -5)] == ["0:00", "1:02", "1:02:03", "0:00"]
 
 
@@ -290,7 +273,7 @@ def reported(terminal: bool, state: RunState) -> str:
     return console.file.getvalue()
 
 
-def test_a_bar_on_a_terminal_and_lines_elsewhere(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_on_a_terminal_and_lines_elsewhere(capsys):
     bar = reported(True, RunState(DONE, rows=7))
     assert "1/1 one" in bar
     assert "left" in bar

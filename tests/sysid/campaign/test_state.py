@@ -30,7 +30,7 @@ def begun(path: Path, plan: Plan = PLAN) -> CampaignDirectory:
     return directory
 
 
-def test_a_new_directory_has_every_run_pending(tmp_path: Path) -> None:
+def test_a_new_directory_has_every_run_pending(tmp_path):
     directory = begun(tmp_path / "new" / "deep")
     assert [state.status for state in directory.runs.values()] == [PENDING] * 3
     assert json.loads((directory.path / "campaign.json").read_text())["plan_sha256"] == PLAN.sha256
@@ -39,7 +39,7 @@ def test_a_new_directory_has_every_run_pending(tmp_path: Path) -> None:
     directory.close()
 
 
-def test_done_runs_are_found_again_and_the_others_begin_again(tmp_path: Path) -> None:
+def test_done_runs_are_found_again_and_the_others_begin_again(tmp_path):
     directory = begun(tmp_path)
     files(tmp_path, "a", ".csv.gz", ".json", ".mcap")
     directory.put("a", DONE_STATE)
@@ -64,7 +64,7 @@ def test_done_runs_are_found_again_and_the_others_begin_again(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("missing", [".csv.gz", ".json", ".mcap"])
-def test_a_run_whose_files_have_gone_is_not_done(tmp_path: Path, missing: str) -> None:
+def test_a_run_whose_files_have_gone_is_not_done(tmp_path, missing):
     directory = begun(tmp_path)
     files(tmp_path, "a", ".csv.gz", ".json", ".mcap")
     directory.put("a", DONE_STATE)
@@ -76,7 +76,7 @@ def test_a_run_whose_files_have_gone_is_not_done(tmp_path: Path, missing: str) -
     again.close()
 
 
-def test_another_plan_is_refused_in_one_line_and_changes_nothing(tmp_path: Path) -> None:
+def test_another_plan_is_refused_in_one_line_and_changes_nothing(tmp_path):
     directory = begun(tmp_path)
     files(tmp_path, "a", ".csv.gz", ".json", ".mcap")
     directory.put("a", DONE_STATE)
@@ -91,7 +91,7 @@ def test_another_plan_is_refused_in_one_line_and_changes_nothing(tmp_path: Path)
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
 
 
-def test_two_campaigns_at_once_in_one_directory_are_refused(tmp_path: Path) -> None:
+def test_two_campaigns_at_once_in_one_directory_are_refused(tmp_path):
     directory = begun(tmp_path)
     with pytest.raises(StateError, match="another campaign is running"):
         begun(tmp_path)
@@ -99,7 +99,7 @@ def test_two_campaigns_at_once_in_one_directory_are_refused(tmp_path: Path) -> N
     begun(tmp_path).close()
 
 
-def test_foreign_files_are_refused(tmp_path: Path) -> None:
+def test_foreign_files_are_refused(tmp_path):
     files(tmp_path, "b", ".csv.gz")
     with pytest.raises(StateError, match=r"found b\.csv\.gz and no campaign\.json"):
         begun(tmp_path)
@@ -119,7 +119,7 @@ def test_foreign_files_are_refused(tmp_path: Path) -> None:
         ('{"schema": "jtq.campaign/1", "name": "p"}', "plan_sha256"),
     ],
 )
-def test_a_state_that_cannot_be_read_is_refused(tmp_path: Path, text: str, word: str) -> None:
+def test_a_state_that_cannot_be_read_is_refused(tmp_path, text, word):
     (tmp_path / "campaign.json").write_bytes(text.encode("latin-1"))
     with pytest.raises(StateError) as caught:
         CampaignDirectory(tmp_path)
@@ -130,7 +130,7 @@ def test_a_state_that_cannot_be_read_is_refused(tmp_path: Path, text: str, word:
     CampaignDirectory(tmp_path).close()  # the lock of the refused one is gone
 
 
-def test_a_plan_file_that_was_edited_is_not_the_one_that_was_begun(tmp_path: Path) -> None:
+def test_a_plan_file_that_was_edited_is_not_the_one_that_was_begun(tmp_path):
     begun(tmp_path).close()
     (tmp_path / "plan.yaml").write_text(OTHER.to_yaml())
     directory = CampaignDirectory(tmp_path)
@@ -140,9 +140,7 @@ def test_a_plan_file_that_was_edited_is_not_the_one_that_was_begun(tmp_path: Pat
     directory.close()
 
 
-def test_a_crash_between_two_states_leaves_the_old_one_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_crash_between_two_states_leaves_the_old_one_whole(tmp_path, monkeypatch):
     directory = begun(tmp_path)
     files(tmp_path, "a", ".csv.gz", ".json", ".mcap")
     directory.put("a", DONE_STATE)

@@ -1,7 +1,6 @@
 """The commander leads the emulated bench through a motion, in lock-step: its frames, and the motion of the joints."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -20,11 +19,11 @@ RPDOS = {0x201, 0x202, 0x301, 0x302}
 
 
 @pytest.fixture
-def lock() -> LockStep:
+def lock():
     return LockStep()
 
 
-def test_a_whole_motion_is_played_and_both_joints_are_disabled(lock: LockStep) -> None:
+def test_a_whole_motion_is_played_and_both_joints_are_disabled(lock):
     motion = lock.commander(plateau(1.0, 2.0))
     lock.run()
     assert motion.result == MotionResult("done", "", 1.0)
@@ -38,7 +37,7 @@ def test_a_whole_motion_is_played_and_both_joints_are_disabled(lock: LockStep) -
 
 @pytest.mark.parametrize("joint", [1, 2])
 @pytest.mark.parametrize("sign", [1, -1])
-def test_the_joints_do_what_was_planned(lock: LockStep, joint: int, sign: int) -> None:
+def test_the_joints_do_what_was_planned(lock, joint, sign):
     """On the plateau the true velocity is the planned one, and the other joint's true current is the planned one."""
     motion = lock.commander(plateau(sign * 1.2, 2.5, joint=joint))
     velocities, currents = [], []
@@ -77,9 +76,7 @@ def three_tpdos(node: int) -> DriveProfile:
 
 
 @pytest.mark.parametrize("made", [one_encoder_and_torque, three_tpdos])
-def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
-    made: Callable[[int], DriveProfile],
-) -> None:
+def test_drives_with_other_objects_and_layouts_are_moved_as_planned(made):
     lock = LockStep(profiles=(made(1), made(2)))
     motion = lock.commander(plateau(1.2, 2.5))
     seen = []
@@ -106,7 +103,7 @@ def test_drives_with_other_objects_and_layouts_are_moved_as_planned(
     assert motion.result.reason.startswith(text)
 
 
-def test_a_drive_that_sends_by_itself_is_not_moved() -> None:
+def test_a_drive_that_sends_by_itself_is_not_moved():
     acyclic = map_of(1, Tpdo(2, 0x281, (0x606C0020, 0x60780010, 0x60410010), 255), CIA_402)
     layout = (map_of(1, Tpdo(1, 0x181, (0x60640020, 0x60E40120)), CIA_402), acyclic)
     lock = LockStep(profiles=(DriveProfile(1, layout=layout, acyclic=True), DriveProfile(2)))
@@ -114,7 +111,7 @@ def test_a_drive_that_sends_by_itself_is_not_moved() -> None:
         lock.commander(plateau(1.0, 2.0))
 
 
-def test_each_drive_gets_every_second_setpoint_and_no_cycle_carries_two(lock: LockStep) -> None:
+def test_each_drive_gets_every_second_setpoint_and_no_cycle_carries_two(lock):
     plan = plateau(1.0, 2.0, hold_ms=100)
     motion = lock.commander(plan)
     lock.run(lambda: motion.phase is Phase.PLAYING)
@@ -137,7 +134,7 @@ def test_each_drive_gets_every_second_setpoint_and_no_cycle_carries_two(lock: Lo
         assert drive.store.number(0x1016, 2) == 0x21 << 16 | 300
 
 
-def test_the_start_word_by_word(lock: LockStep) -> None:
+def test_the_start_word_by_word(lock):
     """After boot-up and standstill: 6, 7, 15 to each drive, each when its statusword has confirmed the last one."""
     motion = lock.commander(plateau(1.0, 2.0))
     lock.run(lambda: motion.phase is Phase.PLAYING)
@@ -152,7 +149,7 @@ def test_the_start_word_by_word(lock: LockStep) -> None:
     assert first - lock.sent[0][0] >= 150, "standstill was watched before"
 
 
-def test_the_end_word_by_word(lock: LockStep) -> None:
+def test_the_end_word_by_word(lock):
     """Set-points to zero, quick stop, power off: nothing else, and the current joint never without its velocity joint."""
     motion = lock.commander(plateau(1.0, 2.0))
     lock.run()
@@ -163,7 +160,7 @@ def test_the_end_word_by_word(lock: LockStep) -> None:
     assert motion.over
 
 
-def test_joints_that_turn_are_not_enabled(lock: LockStep) -> None:
+def test_joints_that_turn_are_not_enabled(lock):
     """Joint 2 turns by hand: refused after 3 s, nothing was enabled."""
     motion = lock.commander(plateau(1.0, 2.0))
     lock.filter = turning(2, 0.05)
@@ -184,7 +181,7 @@ def test_joints_that_turn_are_not_enabled(lock: LockStep) -> None:
         (0x183, "sensor: no torque of channel 1"),
     ],
 )
-def test_nothing_is_begun_without_every_input(lock: LockStep, gone: int, line: str) -> None:
+def test_nothing_is_begun_without_every_input(lock, gone, line):
     motion = lock.commander(plateau(1.0, 2.0))
     lock.filter = without(gone)
     assert lock.run() == pytest.approx(3000, abs=5)
@@ -192,7 +189,7 @@ def test_nothing_is_begun_without_every_input(lock: LockStep, gone: int, line: s
     assert not [each for each in lock.sent if each[1] in RPDOS]
 
 
-def test_an_emcy_or_a_fault_that_is_there_already_refuses_the_start(lock: LockStep) -> None:
+def test_an_emcy_or_a_fault_that_is_there_already_refuses_the_start(lock):
     motion = lock.commander(plateau(1.0, 2.0))
     lock.with_extra(0x081, bytes.fromhex("1023020000000000"))
     lock.run()
@@ -205,7 +202,7 @@ def test_an_emcy_or_a_fault_that_is_there_already_refuses_the_start(lock: LockSt
 
 
 @pytest.mark.parametrize("content", [None, (-0x8000).to_bytes(2, "little", signed=True)])
-def test_a_temperature_limit_needs_a_temperature(lock: LockStep, content: bytes | None) -> None:
+def test_a_temperature_limit_needs_a_temperature(lock, content):
     """TPDO3 of drive 2 does not come, or is "not measured" (8000h)."""
     motion = lock.commander(plateau(1.0, 2.0), WARM)
     lock.filter = without(0x382) if content is None else changed(0x382, lambda _: content)
@@ -213,7 +210,7 @@ def test_a_temperature_limit_needs_a_temperature(lock: LockStep, content: bytes 
     assert motion.refusal == "joint 2: no temperature (382h), which is required by its limit"
 
 
-def test_a_drive_that_does_not_come_on_stops_the_other(lock: LockStep) -> None:
+def test_a_drive_that_does_not_come_on_stops_the_other(lock):
     """Drive 2 stays in "ready to switch on": nothing is played, both are off again."""
     motion = lock.commander(plateau(1.0, 2.0))
     machine = lock.bench.drives[1].machine
@@ -235,7 +232,7 @@ def test_a_drive_that_does_not_come_on_stops_the_other(lock: LockStep) -> None:
     assert lock.states == OFF
 
 
-def test_lost_cycles_make_the_motion_longer_and_never_jump(lock: LockStep) -> None:
+def test_lost_cycles_make_the_motion_longer_and_never_jump(lock):
     """Up to 12 SYNCs are missing now and then: the motion continues at most four set-points further."""
     ramp = plateau(1.5, 3.0, hold_ms=300)
     motion = lock.commander(ramp)
@@ -254,7 +251,7 @@ def test_lost_cycles_make_the_motion_longer_and_never_jump(lock: LockStep) -> No
     assert np.abs(np.diff(targets)).max() <= 8.01 * steepest * units
 
 
-def test_a_commander_that_is_held_up_briefly_sends_no_burst(lock: LockStep) -> None:
+def test_a_commander_that_is_held_up_briefly_sends_no_burst(lock):
     motion = lock.commander(plateau(1.0, 2.0))
     lock.play_until(300)
     lock.held_up(15)
@@ -265,7 +262,7 @@ def test_a_commander_that_is_held_up_briefly_sends_no_burst(lock: LockStep) -> N
     assert motion.result.status == "done"
 
 
-def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock: LockStep) -> None:
+def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock):
     """The motor's counter starts 0.2 rad of the motor below its upper end: 0.4 rad of the joint are 0.4 rad."""
     plant = lock.source.plant
     turns = (2**31 / 65536) * 2 * math.pi - 0.2
@@ -286,7 +283,7 @@ def test_the_travel_begins_where_the_motion_begins_and_counters_roll_over(lock: 
     assert motion.result.status == "done"
 
 
-def test_setpoints_beyond_the_range_of_an_rpdo_are_refused(lock: LockStep) -> None:
+def test_setpoints_beyond_the_range_of_an_rpdo_are_refused(lock):
     """300 A of an 8 A drive are 37500 in 1/1000 of rated torque; 16 bits end at 32767."""
     with pytest.raises(
         MotionError, match="plan: current of joint 2 is -37500 in units of the drive, limit 32767"
@@ -294,7 +291,7 @@ def test_setpoints_beyond_the_range_of_an_rpdo_are_refused(lock: LockStep) -> No
         lock.commander(plateau(1.0, -300.0))
 
 
-def test_setpoints_that_end_in_motion_are_led_to_rest(lock: LockStep) -> None:
+def test_setpoints_that_end_in_motion_are_led_to_rest(lock):
     whole = plateau(1.0, 2.0)
     cut = Setpoints(1, whole.velocity_rad_s[:500], whole.current_a[:500])
     motion = lock.commander(cut)

@@ -20,11 +20,11 @@ from tests.sysid.motion.lock_step import BenchAccess, LockStep
 
 
 @pytest.fixture
-def lock() -> LockStep:
+def lock():
     return LockStep()
 
 
-def test_states_of_all_statuswords() -> None:
+def test_states_of_all_statuswords():
     assert [state_of(word).value for word in cia402.STATUSWORDS] == list(cia402.NAMES)
     for word in range(0x10000):
         state = state_of(word)
@@ -34,7 +34,7 @@ def test_states_of_all_statuswords() -> None:
 
 
 @pytest.mark.parametrize("number", [cia402.SWITCH_ON_DISABLED, cia402.READY, cia402.SWITCHED_ON])
-def test_controlwords_lead_a_drive_to_operation_enabled(number: int) -> None:
+def test_controlwords_lead_a_drive_to_operation_enabled(number):
     machine = cia402.StateMachine()
     machine.state = number
     words = []
@@ -50,7 +50,7 @@ def test_controlwords_lead_a_drive_to_operation_enabled(number: int) -> None:
     assert state_of(machine.statusword) is State.SWITCH_ON_DISABLED
 
 
-def test_no_controlword_leads_out_of_a_fault_and_an_unknown_state_counts_as_powered() -> None:
+def test_no_controlword_leads_out_of_a_fault_and_an_unknown_state_counts_as_powered():
     stuck = (State.FAULT, State.FAULT_REACTION, State.QUICK_STOP, State.NOT_READY, State.UNKNOWN)
     assert [enabling_word(state) for state in stuck] == [None] * 5
     assert state_of(0x7FFF) is State.UNKNOWN
@@ -83,7 +83,7 @@ def configure(
     lock.drive(Bent(lock.access(1), answers), DriveProfile(1)).set_up(CSV, 300, temperature=temperature)
 
 
-def test_a_drive_is_configured_and_its_units_read(lock: LockStep) -> None:
+def test_a_drive_is_configured_and_its_units_read(lock):
     access = lock.access(2)
     access.write(0x6071, 0, b"\x10\x00")
     access.write(0x60FF, 0, b"\x10\x00\x00\x00")
@@ -100,7 +100,7 @@ def test_a_drive_is_configured_and_its_units_read(lock: LockStep) -> None:
     assert units.velocity_units(1.0) == 1043038, "100 turns of 65536 counts in 2 pi seconds"
 
 
-def test_the_units_of_the_sensor(lock: LockStep) -> None:
+def test_the_units_of_the_sensor(lock):
     units = sensor_units(lock.access(3), SensorProfile(3))
     assert (units.node, units.heartbeat_ms) == (3, 100)
     assert units.nm_per_unit == pytest.approx((0.001,))
@@ -126,20 +126,18 @@ def test_the_units_of_the_sensor(lock: LockStep) -> None:
         ({(0x1016, 2): SdoAbort(NO_SUBINDEX)}, "node 1: 1016h:2: write of 0x0021012C refused: sub-index does not exist"),
     ],
 )  # fmt: skip
-def test_a_drive_that_cannot_be_used_is_refused_in_one_line(
-    lock: LockStep, answers: dict[tuple[int, int], int | SdoAbort], line: str
-) -> None:
+def test_a_drive_that_cannot_be_used_is_refused_in_one_line(lock, answers, line):
     with pytest.raises(BootError) as refused:
         configure(lock, answers)
     assert str(refused.value).startswith(line)
     assert "\n" not in str(refused.value)
 
 
-def test_a_drive_without_temperature_may_be_used_when_none_is_limited(lock: LockStep) -> None:
+def test_a_drive_without_temperature_may_be_used_when_none_is_limited(lock):
     configure(lock, {(0x1802, 1): SdoAbort(NO_OBJECT)}, temperature=False)
 
 
-def test_a_fault_is_reset_and_returned(lock: LockStep) -> None:
+def test_a_fault_is_reset_and_returned(lock):
     machine = lock.bench.drives[0].machine
     drive = lock.drive(lock.access(1), DriveProfile(1))
     assert drive.reset_fault() is None
@@ -149,7 +147,7 @@ def test_a_fault_is_reset_and_returned(lock: LockStep) -> None:
     assert machine.state == cia402.SWITCH_ON_DISABLED
 
 
-def test_a_fault_that_stays_is_refused(lock: LockStep) -> None:
+def test_a_fault_that_stays_is_refused(lock):
     lock.bench.drives[0].machine.fault()
     with pytest.raises(BootError, match=r"node 1: fault 2310h cannot be reset: fault \(statusword 0218h\)"):
         lock.drive(
@@ -157,7 +155,7 @@ def test_a_fault_that_stays_is_refused(lock: LockStep) -> None:
         ).reset_fault()
 
 
-def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> None:
+def test_a_drive_that_runs_is_braked_before_its_power_goes(lock):
     """Enabled at 1 rad/s: quick stop first, and it stands when the power is off."""
     access = lock.access(1)
     drive = lock.drive(access, DriveProfile(1))
@@ -180,14 +178,14 @@ def test_a_drive_that_runs_is_braked_before_its_power_goes(lock: LockStep) -> No
     assert len(words) == 2, "a drive that is off is not commanded"
 
 
-def test_a_drive_that_stays_powered_is_refused(lock: LockStep) -> None:
+def test_a_drive_that_stays_powered_is_refused(lock):
     with pytest.raises(
         BootError, match=r"node 1: 6041h:0: expected disabled, found operation enabled \(statusword 1237h\)"
     ):
         lock.drive(Bent(lock.access(1), {(0x6041, 0): 0x1237}), DriveProfile(1)).switch_off()
 
 
-def test_after_the_motion_the_watch_ends_and_the_targets_are_zero(lock: LockStep) -> None:
+def test_after_the_motion_the_watch_ends_and_the_targets_are_zero(lock):
     access = lock.access(2)
     drive = lock.drive(access, DriveProfile(2))
     drive.set_up(CST, 300, temperature=False)

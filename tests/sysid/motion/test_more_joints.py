@@ -22,7 +22,6 @@ from jtqd.sysid.motion.setpoints import (
 from jtqd.sysid.planner.campaigns import approach
 from tests.sysid.motion.lock_step import (
     MS,
-    Filter,
     LockStep,
     changed,
     plateau,
@@ -54,9 +53,7 @@ def travels(lock: LockStep) -> list[float]:
         ((3, 4), 4, (2, 3, 0, 2, 3, 1), 3),
     ],
 )
-def test_one_drive_gets_a_setpoint_in_each_cycle(
-    moved: tuple[int, ...], drives: int, order: tuple[int, ...], cycles: int
-) -> None:
+def test_one_drive_gets_a_setpoint_in_each_cycle(moved, drives, order, cycles):
     assert sending_order(moved, drives) == (order, cycles)
 
 
@@ -71,7 +68,7 @@ def test_one_drive_gets_a_setpoint_in_each_cycle(
     ],
     ids=["one", "one at 500 Hz", "third of three", "pair beside a third", "second pair"],
 )
-def test_joints_are_moved_and_all_others_held(drives: int, period_ms: int, setpoints: Setpoints) -> None:
+def test_joints_are_moved_and_all_others_held(drives, period_ms, setpoints):
     lock = LockStep(drives=drives, period_ms=period_ms)
     lock.commander(setpoints, replace(ALONE, torque_nm=100.0))
     lock.run(lambda: lock.motion.phase is Phase.RAMPING)
@@ -106,7 +103,7 @@ def test_joints_are_moved_and_all_others_held(drives: int, period_ms: int, setpo
     ],
     ids=["fault of a held joint", "held joint turns", "held joint is silent", "fault of the moved one"],
 )
-def test_a_fault_of_any_drive_stops_all(faulty: int | Filter, reason: str) -> None:
+def test_a_fault_of_any_drive_stops_all(faulty, reason):
     lock = LockStep(drives=3, period_ms=2)
     lock.commander(alone(3, 1.0, hold_ms=1000), ALONE)
     lock.play_until(300)
@@ -123,7 +120,7 @@ def test_a_fault_of_any_drive_stops_all(faulty: int | Filter, reason: str) -> No
     assert (lock.now - began) / MS < 2000
 
 
-def test_a_joint_that_would_leave_its_travel_is_not_begun() -> None:
+def test_a_joint_that_would_leave_its_travel_is_not_begun():
     lock = LockStep(drives=1)
     lock.commander(alone(1, 1.0), replace(ALONE, position_rad=(-4.0, 0.2)))
     lock.run()
@@ -134,7 +131,7 @@ def test_a_joint_that_would_leave_its_travel_is_not_begun() -> None:
     assert lock.states == (cia402.SWITCH_ON_DISABLED,)
 
 
-def test_an_approach_ends_at_its_target_and_within_its_limits() -> None:
+def test_an_approach_ends_at_its_target_and_within_its_limits():
     for start, target in ((1.5, 0.0), (-1.9, 1.0), (0.3, 0.31)):
         there = approach(1, start, target, ALONE)
         check_setpoints(there, ALONE)
@@ -146,7 +143,7 @@ def test_an_approach_ends_at_its_target_and_within_its_limits() -> None:
             approach(1, start, target, ALONE)
 
 
-def test_the_travel_of_a_joint_that_is_moved_alone_is_supervised() -> None:
+def test_the_travel_of_a_joint_that_is_moved_alone_is_supervised():
     """The encoder is beyond the limit, although the plan is not."""
     lock = LockStep(drives=1)
     lock.commander(alone(1, 1.0, hold_ms=600), replace(ALONE, position_rad=(-1.0, 1.0)))
@@ -159,7 +156,7 @@ def test_the_travel_of_a_joint_that_is_moved_alone_is_supervised() -> None:
     assert "limits -1 to 1 rad" in lock.motion.result.reason
 
 
-def test_the_torque_of_another_joint_is_no_reason_to_stop() -> None:
+def test_the_torque_of_another_joint_is_no_reason_to_stop():
     """Joint 3 is measured by channel 2; channel 1 belongs to joints 1 and 2."""
     around = Surroundings({1: 9.0, 2: 9.0}, {2: (3,)})
     lock = LockStep(drives=3, period_ms=2)
@@ -173,7 +170,7 @@ def test_the_torque_of_another_joint_is_no_reason_to_stop() -> None:
     assert lock.motion.result.reason.startswith("joint 3: torque at the sensor")
 
 
-def test_a_moved_drive_interpolates_over_its_sending_period() -> None:
+def test_a_moved_drive_interpolates_over_its_sending_period():
     """60C2h of the moved drive is the time between two of its set-points."""
     lock = LockStep(drives=3, period_ms=2)
     lock.commander(alone(3, 1.0), ALONE)

@@ -55,7 +55,7 @@ def stopped(lock: LockStep, pattern: str) -> None:
     assert lock.states == BOTH_OFF
 
 
-def test_the_motion_continues_after_a_window_without_power_in_which_only_the_offset_is_read() -> None:
+def test_the_motion_continues_after_a_window_without_power_in_which_only_the_offset_is_read():
     lock = with_offset()
     motion = lock.commander(check_run(RUN, WIDE))
     rows = []
@@ -82,7 +82,7 @@ def test_the_motion_continues_after_a_window_without_power_in_which_only_the_off
     assert np.abs([v1[back], v2[back]]).max() < 0.02, "enabled again without a jump"
 
 
-def test_the_controlwords_of_switching_off_and_on_and_no_target_meanwhile() -> None:
+def test_the_controlwords_of_switching_off_and_on_and_no_target_meanwhile():
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.phase is Phase.POWERLESS)
@@ -99,7 +99,7 @@ def test_the_controlwords_of_switching_off_and_on_and_no_target_meanwhile() -> N
     assert lock.states == BOTH_ON
 
 
-def test_a_window_without_power_is_no_new_day_of_the_emulated_bench() -> None:
+def test_a_window_without_power_is_no_new_day_of_the_emulated_bench():
     lock = LockStep(load_plant(shipped("campaign_plant.yaml")))
     zeros = set()
     lock.commander(check_run(RUN, WIDE))
@@ -113,7 +113,7 @@ def test_a_window_without_power_is_no_new_day_of_the_emulated_bench() -> None:
     assert lock.source.day_number == 1, "the next run is"
 
 
-def test_a_signal_while_the_power_is_off_ends_the_motion_without_enabling_again() -> None:
+def test_a_signal_while_the_power_is_off_ends_the_motion_without_enabling_again():
     lock = LockStep()
     until_off(lock)
     lock.run_for(200)
@@ -132,7 +132,7 @@ def test_a_signal_while_the_power_is_off_ends_the_motion_without_enabling_again(
         (0x183, "400d030000", r"joints 1 and 2: torque at the sensor 200.00 Nm, .*"),
     ],
 )
-def test_limits_and_supervision_continue_without_power(can_id: int, data: str, pattern: str) -> None:
+def test_limits_and_supervision_continue_without_power(can_id, data, pattern):
     lock = LockStep()
     until_off(lock)
     lock.run_for(300)
@@ -140,7 +140,7 @@ def test_limits_and_supervision_continue_without_power(can_id: int, data: str, p
     stopped(lock, pattern)
 
 
-def test_a_joint_that_turns_without_power_ends_the_motion() -> None:
+def test_a_joint_that_turns_without_power_ends_the_motion():
     lock = LockStep()
     until_off(lock)
     lock.run_for(300)
@@ -156,7 +156,7 @@ def test_a_joint_that_turns_without_power_ends_the_motion() -> None:
     ],
     ids=["stays on", "stays off"],
 )
-def test_a_drive_that_does_not_obey_ends_the_motion(word: int, pattern: str) -> None:
+def test_a_drive_that_does_not_obey_ends_the_motion(word, pattern):
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.phase is Phase.POWERLESS)
@@ -172,7 +172,7 @@ def test_a_drive_that_does_not_obey_ends_the_motion(word: int, pattern: str) -> 
     assert lock.states == BOTH_OFF
 
 
-def test_the_power_does_not_go_while_a_joint_moves() -> None:
+def test_the_power_does_not_go_while_a_joint_moves():
     """Both drives stay enabled until both joints have stood for 150 ms, and are then off for half of the window."""
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
@@ -189,7 +189,7 @@ def test_the_power_does_not_go_while_a_joint_moves() -> None:
     assert off == pytest.approx(700, abs=60)
 
 
-def test_lost_cycles_do_not_skip_a_window_without_power() -> None:
+def test_lost_cycles_do_not_skip_a_window_without_power():
     lock = LockStep()
     lock.commander(check_run(RUN, WIDE))
     lock.run(lambda: lock.motion.played_s >= 0.899)
@@ -197,7 +197,7 @@ def test_lost_cycles_do_not_skip_a_window_without_power() -> None:
     lock.run(lambda: lock.states == BOTH_OFF, limit_ms=400)
 
 
-def test_segments_without_power() -> None:
+def test_segments_without_power():
     points = expand(RUN)
     assert points.off == ((900, 2400),)
     assert Mark("power_off", 0.9, 2.4) in points.marks
@@ -212,6 +212,6 @@ def test_segments_without_power() -> None:
         (((2, 4), (3, 5)), "off from 3 to 5, expected rising numbers up to 5"),
     ],
 )
-def test_setpoints_refuse_power_off_in_motion(off: tuple[tuple[int, int], ...], text: str) -> None:
+def test_setpoints_refuse_power_off_in_motion(off, text):
     with pytest.raises(ValueError, match=text):
         Setpoints(1, np.array([0.0, 0.01, 0.0, 0.0, 0.0]), np.zeros(5), (), off)

@@ -35,7 +35,7 @@ def sample(joint: int, **values: float) -> Sample:
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("joint", [1, 2])
 @pytest.mark.parametrize("field", FIELDS)
-def test_a_value_at_its_limit_passes_and_one_beyond_names_itself(field: str, joint: int, sign: int) -> None:
+def test_a_value_at_its_limit_passes_and_one_beyond_names_itself(field, joint, sign):
     name, limit, unit = FIELDS[field]
     monitor = Monitor(LIMITS)
     assert monitor.check(sample(joint, **{field: sign * limit})) is None
@@ -46,7 +46,7 @@ def test_a_value_at_its_limit_passes_and_one_beyond_names_itself(field: str, joi
 
 
 @pytest.mark.parametrize("joint", [1, 2])
-def test_temperature_has_one_side_and_may_be_unknown(joint: int) -> None:
+def test_temperature_has_one_side_and_may_be_unknown(joint):
     monitor = Monitor(LIMITS)
     assert monitor.check(sample(joint, temperature_c=70.0)) is None
     assert monitor.check(sample(joint, temperature_c=-40.0)) is None
@@ -56,7 +56,7 @@ def test_temperature_has_one_side_and_may_be_unknown(joint: int) -> None:
 
 
 @pytest.mark.parametrize("torque", [60.01, -60.01, math.nan])
-def test_torque_is_that_of_both_joints_with_one_sensor_and_of_one_with_two(torque: float) -> None:
+def test_torque_is_that_of_both_joints_with_one_sensor_and_of_one_with_two(torque):
     monitor = Monitor(LIMITS)
     assert monitor.check(Sample((STILL, STILL), (60.0,))) is None
     found = monitor.check(Sample((STILL, STILL), (torque,)))
@@ -67,7 +67,7 @@ def test_torque_is_that_of_both_joints_with_one_sensor_and_of_one_with_two(torqu
 
 @pytest.mark.parametrize("name", ["current_a", "velocity_rad_s", "torque_nm", "travel_rad", "temperature_c"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan, "9", True, None])
-def test_a_limit_is_a_positive_number(name: str, value: object) -> None:
+def test_a_limit_is_a_positive_number(name, value):
     values = {"current_a": 9.0, "velocity_rad_s": 3.3, "torque_nm": 60.0, "travel_rad": 50.0}
     with pytest.raises(ValueError, match=rf"limits\.{name}: found .* expected a positive number"):
         Limits(**{**values, name: value})  # type: ignore[arg-type]
@@ -84,7 +84,7 @@ def ramp(to: float, n: int) -> np.ndarray:
     return np.linspace(to / n, to, n)
 
 
-def test_a_plan_within_all_limits_passes() -> None:
+def test_a_plan_within_all_limits_passes():
     shape = np.concatenate([ramp(1.0, 300), np.ones(1000), 1.0 - ramp(1.0, 300)])
     check_setpoints(Setpoints(1, 3.3 * shape, -9.0 * shape), LIMITS)
 
@@ -96,30 +96,16 @@ LONG = np.r_[ramp(-2.0, 1000), np.full(25000, -2.0)]
 @pytest.mark.parametrize(
     ("velocity", "current", "line"),
     [
-        (
-            np.full(8, 0.06),
-            REST,
-            "velocity of joint 2 starts with a jump of 0.060 rad/s, limit 0.05 rad/s per ms",
-        ),
+        (np.full(8, 0.06), REST, "velocity of joint 2 starts with a jump of 0.060 rad/s, limit 0.05 rad/s per ms"),
         (REST, np.full(8, -0.6), "current of joint 1 starts with a jump of -0.600 A, limit 0.5 A per ms"),
-        (
-            np.r_[np.zeros(7), 1.0],
-            REST,
-            "velocity of joint 2 jumps at 0.007 s of 1.000 rad/s, limit 0.05 rad/s per ms",
-        ),
-        (
-            REST,
-            np.r_[np.zeros(5), 0.4, -0.4, 0.0],
-            "current of joint 1 jumps at 0.006 s of -0.800 A, limit 0.5 A per ms",
-        ),
+        (np.r_[np.zeros(7), 1.0], REST, "velocity of joint 2 jumps at 0.007 s of 1.000 rad/s, limit 0.05 rad/s per ms"),
+        (REST, np.r_[np.zeros(5), 0.4, -0.4, 0.0], "current of joint 1 jumps at 0.006 s of -0.800 A, limit 0.5 A per ms"),
         (ramp(3.4, 340), np.zeros(340), "velocity of joint 2 3.310 rad/s at 0.330 s, limit 3.3 rad/s"),
         (np.zeros(910), ramp(-9.1, 910), "current of joint 1 -9.010 A at 0.900 s, limit 9 A"),
         (LONG, np.zeros(26000), "travel of joint 2 -50.001 rad at 25.499 s, limit 50 rad"),
     ],
-)
-def test_a_plan_that_jumps_or_exceeds_a_limit_is_refused_before_anything_moves(
-    velocity: np.ndarray, current: np.ndarray, line: str
-) -> None:
+)  # fmt: skip
+def test_a_plan_that_jumps_or_exceeds_a_limit_is_refused_before_anything_moves(velocity, current, line):
     with pytest.raises(MotionError) as refused:
         check_setpoints(Setpoints(2, velocity, current), LIMITS)
     assert str(refused.value) == f"plan: {line}"
@@ -128,7 +114,7 @@ def test_a_plan_that_jumps_or_exceeds_a_limit_is_refused_before_anything_moves(
 # Set-points -------------------------------------------------------------------------------------------------
 
 
-def test_setpoints_are_copied_read_only_and_know_their_times() -> None:
+def test_setpoints_are_copied_read_only_and_know_their_times():
     velocity = np.linspace(0.0, 1.0, 5)
     mark = Mark("plateau", 0.0, 0.005, 1.0, 2.0)
     setpoints = Setpoints(2, velocity, [0, 1, 2, 1, 0], (mark,))  # type: ignore[arg-type]
@@ -155,7 +141,7 @@ def test_setpoints_are_copied_read_only_and_know_their_times() -> None:
         ((1, [0.0], [0.0], ("rest",)), "'rest' is no Mark"),
     ],
 )
-def test_setpoints_that_cannot_be_are_refused(arguments: tuple, message: str) -> None:
+def test_setpoints_that_cannot_be_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
         Setpoints(*arguments)
 
@@ -166,9 +152,7 @@ def test_setpoints_that_cannot_be_are_refused(arguments: tuple, message: str) ->
 @pytest.mark.parametrize(
     ("velocity", "current"), [(2.0, 4.0), (-3.3, 9.0), (0.5, -1.0), (0.0, -3.0), (0.0, 0.0)]
 )
-def test_the_stop_ramp_is_ten_rad_per_second_squared_and_a_tenth_of_a_second(
-    velocity: float, current: float
-) -> None:
+def test_the_stop_ramp_is_ten_rad_per_second_squared_and_a_tenth_of_a_second(velocity, current):
     ramp = StopRamp(velocity, current)
     assert ramp.at(0.0) == (velocity, current)
     assert ramp.duration_s == pytest.approx(max(abs(velocity) / 10.0, 0.1 if current else 0.0))
@@ -179,6 +163,6 @@ def test_the_stop_ramp_is_ten_rad_per_second_squared_and_a_tenth_of_a_second(
         assert i == pytest.approx(current * max(0.0, 1.0 - t / 0.1))
 
 
-def test_times_of_the_supervision_are_positive() -> None:
+def test_times_of_the_supervision_are_positive():
     with pytest.raises(ValueError, match="sync_lost_s is 0"):
         Timing(sync_lost_s=0)

@@ -45,7 +45,7 @@ def patient_config(directory: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+def bus(tmp_path_factory):
     """The bench and jtqd as processes of their own; jtqd publishes."""
     directory = tmp_path_factory.mktemp("motion")
     address = f"unix:{directory / 'bus'}"
@@ -103,7 +103,7 @@ class Listener:
         return [self._found.get() for _ in range(self._found.qsize())]
 
 
-def test_a_motion_is_played_and_leaves_both_drives_off_and_unwatched(bus: str) -> None:
+def test_a_motion_is_played_and_leaves_both_drives_off_and_unwatched(bus):
     """The drives may turn by themselves before (demo motion). What they measured follows the plan; then all is quiet."""
     listener = Listener(bus, 0x281, 0x301, 0x202, 0x081, 0x082)
     progress: list[tuple[float, float]] = []
@@ -129,7 +129,7 @@ def test_a_motion_is_played_and_leaves_both_drives_off_and_unwatched(bus: str) -
     assert states == {0x40}, "switch on disabled, and operational"
 
 
-def test_a_limit_stops_it_and_the_next_motion_begins(bus: str) -> None:
+def test_a_limit_stops_it_and_the_next_motion_begins(bus):
     slow = Limits(current_a=9.0, velocity_rad_s=3.3, torque_nm=8.0, travel_rad=60.0)
     result = play(bus, plateau(0.5, 3.0, hold_ms=2000), slow, timing=PATIENT)
     assert result.status == "stopped"
@@ -153,7 +153,7 @@ def replaced_handlers(handler: Callable[[int, object], None]) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_stops_it_and_the_handlers_are_back(bus: str, number: signal.Signals) -> None:
+def test_a_signal_stops_it_and_the_handlers_are_back(bus, number):
     caught: list[int] = []
 
     def before(
@@ -172,7 +172,7 @@ def test_a_signal_stops_it_and_the_handlers_are_back(bus: str, number: signal.Si
     assert 0.0 <= result.played_s < 6.0
 
 
-def test_what_cannot_be_begun_is_refused_in_one_line(bus: str) -> None:
+def test_what_cannot_be_begun_is_refused_in_one_line(bus):
     with pytest.raises(MotionError, match=r"plan: velocity of joint 1 3.303 rad/s at .* limit 3\.3 rad/s"):
         play(bus, plateau(4.5, 1.0, ramp_ms=600), LIMITS)
     with pytest.raises(MotionError, match="nocan7"):
@@ -181,7 +181,7 @@ def test_what_cannot_be_begun_is_refused_in_one_line(bus: str) -> None:
         play("unix:/nonexistent", plateau(1.0, 1.0), LIMITS)
 
 
-def test_a_second_commander_is_refused_before_it_touches_anything(bus: str) -> None:
+def test_a_second_commander_is_refused_before_it_touches_anything(bus):
     """Both in this process: the second one is refused while the first one plays on to its end."""
     results: list[object] = []
     first = threading.Thread(
@@ -196,7 +196,7 @@ def test_a_second_commander_is_refused_before_it_touches_anything(bus: str) -> N
     assert results == [("done", "", 2.1)]
 
 
-def test_a_progress_callback_that_raises_leaves_both_drives_off(bus: str) -> None:
+def test_a_progress_callback_that_raises_leaves_both_drives_off(bus):
     def broken(played_s: float, total_s: float) -> None:
         if played_s > 0.5:
             raise RuntimeError("screen on fire")
@@ -211,7 +211,7 @@ def test_a_progress_callback_that_raises_leaves_both_drives_off(bus: str) -> Non
     assert int.from_bytes(last[:4], "little", signed=True) == pytest.approx(0, abs=20000)
 
 
-def test_without_jtqd_there_is_no_sync_and_no_motion(tmp_path: Path) -> None:
+def test_without_jtqd_there_is_no_sync_and_no_motion(tmp_path):
     bench = subprocess.Popen(
         [sys.executable, "-m", "jtqd.sim_can", "--bus", f"unix:{tmp_path / 'bus'}"],
         stderr=subprocess.PIPE,

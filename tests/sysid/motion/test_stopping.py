@@ -67,7 +67,7 @@ def until_stop(lock: LockStep, limit_ms: int) -> int:
 
 
 @pytest.fixture
-def lock() -> LockStep:
+def lock():
     return LockStep()
 
 
@@ -115,7 +115,7 @@ def test_a_limit_stops_the_motion_when_the_true_value_reaches_it(  # noqa: PLR09
 
 
 @pytest.mark.parametrize("direction", [1, -1])
-def test_travel(lock: LockStep, direction: int) -> None:
+def test_travel(lock, direction):
     lock.commander(plateau(direction * SPEED, CURRENT, hold_ms=3000), replace(WIDE, travel_rad=1.2))
     until_stop(lock, 3000)
     plant = lock.source.plant
@@ -146,9 +146,7 @@ TEMPERATURE_FIELD = (0x380, "<h", 0)
         (TEMPERATURE_FIELD, 703, "temperature 70.3 °C, limit 70 °C"),
     ],
 )
-def test_one_sample_beyond_a_limit_names_its_joint(
-    lock: LockStep, joint: int, field: tuple[int, str, int], value: int, line: str
-) -> None:
+def test_one_sample_beyond_a_limit_names_its_joint(lock, joint, field, value, line):
     base, layout, place = field
     started(lock, WARM)
     pending = [True]
@@ -167,7 +165,7 @@ def test_one_sample_beyond_a_limit_names_its_joint(
 
 
 @pytest.mark.parametrize("encoder", ["motor", "link"])
-def test_a_dead_encoder_does_not_hide_the_travel(lock: LockStep, encoder: str) -> None:
+def test_a_dead_encoder_does_not_hide_the_travel(lock, encoder):
     """One encoder of each joint stays at its value; the other one still counts."""
     started(lock, replace(WIDE, travel_rad=2.0))
     frozen: dict[int, bytes] = {}
@@ -200,7 +198,7 @@ def test_a_dead_encoder_does_not_hide_the_travel(lock: LockStep, encoder: str) -
         (0x183, "sensor: torque of channel 1 missing for 6 cycles, limit 5"),
     ],
 )
-def test_a_pdo_that_is_missing_or_has_another_length(lock: LockStep, gone: int, line: str) -> None:
+def test_a_pdo_that_is_missing_or_has_another_length(lock, gone, line):
     started(lock)
     lock.filter = changed(gone, lambda data: data[:7]) if gone == 0x281 else without(gone)
     assert until_stop(lock, 100) == 6
@@ -208,7 +206,7 @@ def test_a_pdo_that_is_missing_or_has_another_length(lock: LockStep, gone: int, 
     assert lock.states == (cia402.SWITCH_ON_DISABLED, cia402.SWITCH_ON_DISABLED)
 
 
-def test_five_missing_pdos_are_no_reason(lock: LockStep) -> None:
+def test_five_missing_pdos_are_no_reason(lock):
     started(lock)
     lock.filter = without(0x282)
     lock.run_for(5)
@@ -218,7 +216,7 @@ def test_five_missing_pdos_are_no_reason(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("joint", [1, 2])
-def test_a_fault_of_one_drive_brakes_both(lock: LockStep, joint: int) -> None:
+def test_a_fault_of_one_drive_brakes_both(lock, joint):
     """Also that of the velocity joint: the other one's current must not accelerate the pair."""
     started(lock)
     lock.bench.drives[joint - 1].machine.fault()
@@ -231,7 +229,7 @@ def test_a_fault_of_one_drive_brakes_both(lock: LockStep, joint: int) -> None:
     assert not lock.setpoints_sent(lock.now // MS - 20)
 
 
-def test_a_drive_that_trips_on_current_names_its_fault(lock: LockStep) -> None:
+def test_a_drive_that_trips_on_current_names_its_fault(lock):
     """The true drive 2 measures 13 A for a moment: EMCY 2310h or its state, whichever comes first."""
     started(lock)
     drive = lock.bench.drives[1]
@@ -241,7 +239,7 @@ def test_a_drive_that_trips_on_current_names_its_fault(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("joint", [1, 2])
-def test_an_emcy(lock: LockStep, joint: int) -> None:
+def test_an_emcy(lock, joint):
     started(lock)
     lock.with_extra(0x080 + joint, bytes.fromhex("1042 08 0000000000"))
     assert until_stop(lock, 10) == 1
@@ -250,14 +248,14 @@ def test_an_emcy(lock: LockStep, joint: int) -> None:
 
 
 @pytest.mark.parametrize(("node", "name"), [(1, "joint 1"), (2, "joint 2"), (3, "sensor")])
-def test_a_node_whose_heartbeat_stops(lock: LockStep, node: int, name: str) -> None:
+def test_a_node_whose_heartbeat_stops(lock, node, name):
     started(lock)
     lock.filter = without(0x700 + node)
     assert 200 <= until_stop(lock, 1000) <= 302
     stopped_with(lock, rf"{name}: no heartbeat for 30\d ms, limit 300 ms")
 
 
-def test_a_sensor_that_is_not_valid(lock: LockStep) -> None:
+def test_a_sensor_that_is_not_valid(lock):
     started(lock)
     lock.source.channels[0].valid = False
     until_stop(lock, 10)
@@ -265,7 +263,7 @@ def test_a_sensor_that_is_not_valid(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("node", [1, 2])
-def test_a_node_that_receives_no_rpdo_is_stopped_by_sdo(lock: LockStep, node: int) -> None:
+def test_a_node_that_receives_no_rpdo_is_stopped_by_sdo(lock, node):
     """Pre-operational with its power on: an SDO brakes it 10 ms later."""
     started(lock)
     lock.to_bench(0, bytes([0x80, node]))
@@ -277,7 +275,7 @@ def test_a_node_that_receives_no_rpdo_is_stopped_by_sdo(lock: LockStep, node: in
     assert [data.hex() for _, _, data in by_sdo] == ["2b40600002000000"]
 
 
-def test_a_drive_that_obeys_nothing_gets_no_heartbeat_and_stops_by_itself(lock: LockStep) -> None:
+def test_a_drive_that_obeys_nothing_gets_no_heartbeat_and_stops_by_itself(lock):
     """Neither RPDO nor SDO reach drive 1: after 0.2 s our heartbeat ends, 0.3 s later it brakes with 8130h."""
     started(lock)
     reach = lock.bench.drives[0].on_frame
@@ -299,7 +297,7 @@ def test_a_drive_that_obeys_nothing_gets_no_heartbeat_and_stops_by_itself(lock: 
 # SYNC and time ----------------------------------------------------------------------------------------------
 
 
-def test_sync_that_stops(lock: LockStep) -> None:
+def test_sync_that_stops(lock):
     """After 20 ms both drives brake by themselves; only quick stop and power off are sent then."""
     started(lock)
     lock.sync_runs = False
@@ -312,7 +310,7 @@ def test_sync_that_stops(lock: LockStep) -> None:
     assert not lock.setpoints_sent(begin + 1)
 
 
-def test_sync_that_was_away_for_longer_than_allowed(lock: LockStep) -> None:
+def test_sync_that_was_away_for_longer_than_allowed(lock):
     """The commander did not look while SYNC was away, and still notices by the stamps."""
     started(lock)
     lock.sync_runs = False
@@ -325,14 +323,14 @@ def test_sync_that_was_away_for_longer_than_allowed(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("ms", [25, 200])
-def test_a_commander_that_was_held_up(lock: LockStep, ms: int) -> None:
+def test_a_commander_that_was_held_up(lock, ms):
     started(lock)
     lock.held_up(ms)
     lock.cycle()
     stopped_with(lock, f"commander: late by {ms + 0.7:.0f} ms, limit 20 ms")
 
 
-def test_a_limit_that_was_exceeded_while_the_commander_did_not_look_is_not_missed(lock: LockStep) -> None:
+def test_a_limit_that_was_exceeded_while_the_commander_did_not_look_is_not_missed(lock):
     """Three cycles come at once, the middle one with 9.6 A."""
     started(lock)
     cycle = iter(range(3))
@@ -343,7 +341,7 @@ def test_a_limit_that_was_exceeded_while_the_commander_did_not_look_is_not_misse
     stopped_with(lock, r"joint 2: current 9\.600 A, limit 9 A")
 
 
-def test_a_commander_that_dies_is_noticed_by_both_drives(lock: LockStep) -> None:
+def test_a_commander_that_dies_is_noticed_by_both_drives(lock):
     """1016h:2: 300 ms after its last heartbeat both drives brake with EMCY 8130h and keep the fault."""
     started(lock)
     last = max(ms for ms, can_id, _ in lock.sent if can_id == 0x721)
@@ -365,21 +363,21 @@ def test_a_commander_that_dies_is_noticed_by_both_drives(lock: LockStep) -> None
     assert lock.states == (cia402.FAULT, cia402.FAULT)
 
 
-def test_a_bus_that_takes_no_frames(lock: LockStep) -> None:
+def test_a_bus_that_takes_no_frames(lock):
     started(lock)
     for _ in range(5):
         lock.motion.frame_refused(True)
     stopped_with(lock, "bus: transmit queue full for 5 frames in a row", BRAKE_MS)
 
 
-def test_single_refused_frames_are_no_reason(lock: LockStep) -> None:
+def test_single_refused_frames_are_no_reason(lock):
     started(lock)
     for refused in (True, True, True, True, False) * 5:
         lock.motion.frame_refused(refused)
     assert lock.motion.phase is Phase.PLAYING
 
 
-def test_a_second_commander(lock: LockStep) -> None:
+def test_a_second_commander(lock):
     started(lock)
     lock.with_extra(0x721, b"\x05")
     lock.cycle()
@@ -390,7 +388,7 @@ def test_a_second_commander(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("joint", [1, 2])
-def test_a_signal_leads_both_joints_to_a_stop(lock: LockStep, joint: int) -> None:
+def test_a_signal_leads_both_joints_to_a_stop(lock, joint):
     started(lock, joint=joint)
     lock.motion.stop("SIGINT")
     velocities = []
@@ -402,7 +400,7 @@ def test_a_signal_leads_both_joints_to_a_stop(lock: LockStep, joint: int) -> Non
     assert lock.motion.result.played_s == pytest.approx(0.5)
 
 
-def test_asked_twice_they_brake_at_once_and_the_first_reason_stays(lock: LockStep) -> None:
+def test_asked_twice_they_brake_at_once_and_the_first_reason_stays(lock):
     started(lock)
     lock.motion.stop("SIGINT")
     lock.run_for(30)
@@ -413,7 +411,7 @@ def test_asked_twice_they_brake_at_once_and_the_first_reason_stays(lock: LockSte
     stopped_with(lock, "SIGINT", BRAKE_MS)
 
 
-def test_a_stop_while_stopping_for_a_limit_does_not_begin_the_ramp_again(lock: LockStep) -> None:
+def test_a_stop_while_stopping_for_a_limit_does_not_begin_the_ramp_again(lock):
     """The temperature stays beyond its limit all along the ramp: one ramp, one reason."""
     started(lock, WARM)
     lock.filter = changed(0x381, lambda _: struct.pack("<h", 800))
@@ -421,7 +419,7 @@ def test_a_stop_while_stopping_for_a_limit_does_not_begin_the_ramp_again(lock: L
     stopped_with(lock, re.escape("joint 1: temperature 80.0 °C, limit 70 °C"))
 
 
-def test_a_fault_on_the_ramp_goes_over_to_braking(lock: LockStep) -> None:
+def test_a_fault_on_the_ramp_goes_over_to_braking(lock):
     started(lock)
     lock.motion.stop("SIGINT")
     lock.run_for(30)
@@ -432,7 +430,7 @@ def test_a_fault_on_the_ramp_goes_over_to_braking(lock: LockStep) -> None:
 
 
 @pytest.mark.parametrize("phase", [Phase.WAITING, Phase.ENABLING])
-def test_a_signal_before_the_first_setpoint(lock: LockStep, phase: Phase) -> None:
+def test_a_signal_before_the_first_setpoint(lock, phase):
     motion = lock.commander(plateau(SPEED, CURRENT))
     lock.run(lambda: motion.phase is phase and lock.now > 1100 * MS)
     motion.stop("SIGINT")
@@ -442,7 +440,7 @@ def test_a_signal_before_the_first_setpoint(lock: LockStep, phase: Phase) -> Non
     assert lock.velocities == (0.0, 0.0)
 
 
-def test_an_exceeded_limit_before_the_start_refuses_it(lock: LockStep) -> None:
+def test_an_exceeded_limit_before_the_start_refuses_it(lock):
     motion = lock.commander(plateau(SPEED, CURRENT), WARM)
     lock.filter = changed(0x382, lambda _: struct.pack("<h", 701))
     lock.run()

@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -22,7 +21,7 @@ EXACT = bool(os.environ.get("JTQD_IN_BENCH_KERNEL"))
 
 
 @pytest.fixture
-def jtqd(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+def jtqd(tmp_path):
     """The bench and jtqd, which publishes."""
     bench = subprocess.Popen(
         [sys.executable, "-m", "jtqd.sim_can", "--bus", INTERFACE, "--seed", "1"],
@@ -68,7 +67,7 @@ class Dump:
 
 
 @pytest.mark.socketcan
-def test_a_motion_in_exact_time(tmp_path: Path, jtqd: subprocess.Popen[str]) -> None:
+def test_a_motion_in_exact_time(tmp_path, jtqd):
     dump = Dump(tmp_path / "dump.log")
     result = play(INTERFACE, plateau(1.0, 2.0, hold_ms=900), LIMITS)
     frames = dump.frames()
@@ -112,7 +111,7 @@ play({interface!r}, plateau(1.0, 2.0, hold_ms=60_000), Limits(9.0, 3.3, 100.0, 1
 
 @pytest.mark.socketcan
 @pytest.mark.usefixtures("jtqd")
-def test_a_commander_that_is_killed_is_noticed_by_both_drives(tmp_path: Path) -> None:
+def test_a_commander_that_is_killed_is_noticed_by_both_drives(tmp_path):
     """1016h:2: each drive sends EMCY 8130h and stands, 300 ms after the last heartbeat of node 21h."""
     root = ROOT
     commander = subprocess.Popen([sys.executable, "-c", PLAY.format(interface=INTERFACE)], cwd=root)

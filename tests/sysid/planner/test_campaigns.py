@@ -44,7 +44,7 @@ def points_of(run: Run) -> list[tuple[float, float]]:
     return [(s.velocity_rad_s, s.current_a) for s in run.segments if isinstance(s, Plateau)]
 
 
-def test_efficiency_has_every_point_of_section_ii_forward_and_back_in_both_directions() -> None:
+def test_efficiency_has_every_point_of_section_ii_forward_and_back_in_both_directions():
     runs = efficiency_runs()
     assert len(runs) == 32
     assert len({run.name for run in runs}) == 32
@@ -66,7 +66,7 @@ def test_efficiency_has_every_point_of_section_ii_forward_and_back_in_both_direc
         assert run.name.startswith("forward_1" if run.velocity_joint == 1 else "back_1")
 
 
-def test_section_iv_a_has_its_points_in_both_directions() -> None:
+def test_section_iv_a_has_its_points_in_both_directions():
     wanted = {0.5: (0.5, 1.5, 2.5), 1.5: (1.5, 2.5, 3.5), 2.5: (2.5, 3.5, 4.5)}
     found: dict[tuple[int, float], list[tuple[float, float]]] = {}
     for run in validation_runs():
@@ -79,13 +79,13 @@ def test_section_iv_a_has_its_points_in_both_directions() -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("quick", [False, True])
-def test_shipped_campaigns_keep_their_own_limits(kind: str, quick: bool) -> None:
+def test_shipped_campaigns_keep_their_own_limits(kind, quick):
     plan = make_plan(kind, Scale(quick=quick, evaluations=80))
     assert set(check_plan(plan)) == {run.name for run in plan.runs}
     assert make_plan(kind, Scale(quick=quick, evaluations=80)).sha256 == plan.sha256
 
 
-def test_the_named_quadrants_are_those_of_the_plant() -> None:
+def test_the_named_quadrants_are_those_of_the_plant():
     """forward_1: joint 1's current and velocity have the same sign, joint 2's opposite ones; back_1 the other way round.
 
     Asked of the plant with measured currents, so that neither the plan nor its comments decide.
@@ -116,13 +116,13 @@ def test_the_named_quadrants_are_those_of_the_plant() -> None:
         assert np.sign(turned[-1] - turned[0]) == (1.0 if "_p" in run.name else -1.0)
 
 
-def test_slow_and_fast_take_turns_and_none_is_lost() -> None:
+def test_slow_and_fast_take_turns_and_none_is_lost():
     order = slow_and_fast([0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0])
     assert order == [0.2, 3.0, 0.6, 2.6, 1.0, 2.2, 1.4, 1.8]
     assert slow_and_fast([3.0, 1.0, 2.0]) == [1.0, 3.0, 2.0]
 
 
-def test_excitation_alternates_and_covers_low_velocity_for_either_joint() -> None:
+def test_excitation_alternates_and_covers_low_velocity_for_either_joint():
     runs = excitation_runs(DEFAULT_LIMITS, 12, 24.0, seed=3, evaluations=1)
     assert [run.velocity_joint for run in runs] == [1, 2] * 6
     for run in runs:
@@ -146,7 +146,7 @@ def test_excitation_alternates_and_covers_low_velocity_for_either_joint() -> Non
                 assert np.mean((velocity * v_sign > 0.1) & (current * i_sign > 0.3)) > 0.08
 
 
-def test_no_trajectory_of_validation_is_one_of_training_whatever_the_seeds() -> None:
+def test_no_trajectory_of_validation_is_one_of_training_whatever_the_seeds():
     def series(runs: tuple[Run, ...]) -> set[tuple[float, ...]]:
         return {s.velocity.a for run in runs for s in run.segments if isinstance(s, Fourier)}
 
@@ -162,7 +162,7 @@ def test_no_trajectory_of_validation_is_one_of_training_whatever_the_seeds() -> 
     assert len(seeds) == 2000
 
 
-def test_scale_changes_what_it_names_and_nothing_else() -> None:
+def test_scale_changes_what_it_names_and_nothing_else():
     plan = make_plan("validate", Scale(runs=3, seconds=5.0, hold_s=0.5))
     fourier = [run for run in plan.runs if run.name.startswith("variable")]
     assert [run.duration_s for run in fourier] == pytest.approx([5.0] * 3)
@@ -174,14 +174,14 @@ def test_scale_changes_what_it_names_and_nothing_else() -> None:
     )
 
 
-def test_runs_too_short_for_their_trajectories_are_refused() -> None:
+def test_runs_too_short_for_their_trajectories_are_refused():
     with pytest.raises(ConfigError, match=r"--seconds: found 7, expected at least 8"):
         make_plan("excitation", Scale(seconds=7.0))
     with pytest.raises(ConfigError, match=r"--seconds: found 3, expected at least 4"):
         make_plan("validate", Scale(seconds=3.0))
 
 
-def test_a_run_of_one_direction_turns_back_before_it_goes_too_far() -> None:
+def test_a_run_of_one_direction_turns_back_before_it_goes_too_far():
     """Long holds in a short space: every point is still there, in its direction, and the limit is kept."""
     for travel in (7.0, 12.0, 25.0):
         for run in efficiency_runs((0.6, 2.2), hold_s=2.1, travel_rad=travel):
@@ -216,12 +216,7 @@ def test_a_run_of_one_direction_turns_back_before_it_goes_too_far() -> None:
         ([None] * 4, False, [(3, 4)], [((1,), False), ((2,), False), ((3, 4), False)]),
     ],
 )
-def test_joints_at_one_channel_or_given_by_towing_are_coupled(
-    channels: list[int | None],
-    sensor: bool,
-    towing: list[tuple[int, int]],
-    expected: list[tuple[tuple[int, ...], bool]],
-) -> None:
+def test_joints_at_one_channel_or_given_by_towing_are_coupled(channels, sensor, towing, expected):
     assert [(unit.joints, unit.measured) for unit in units_of(channels, sensor, towing)] == expected
 
 
@@ -233,14 +228,12 @@ def test_joints_at_one_channel_or_given_by_towing_are_coupled(
         ([None, None], [(1, 3)], "found joint 3, expected joints of the bus, 1 to 2"),
     ],
 )
-def test_wrong_couplings_are_refused(
-    channels: list[int | None], towing: list[tuple[int, int]], words: str
-) -> None:
+def test_wrong_couplings_are_refused(channels, towing, words):
     with pytest.raises(ConfigError, match=words):
         units_of(channels, True, towing)
 
 
-def test_runs_must_fit_the_coupling_of_the_joints() -> None:
+def test_runs_must_fit_the_coupling_of_the_joints():
     bench, arm = units_of([1, 1], True), units_of([None, None], False)
     pair = Plan("p", DEFAULT_LIMITS, (Run("r", 1, (Rest(1.0),)),))
     single = Plan("p", DEFAULT_LIMITS, (Run("r", 1, (Rest(1.0),), None),))

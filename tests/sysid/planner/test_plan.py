@@ -4,7 +4,6 @@ import copy
 import random
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -84,7 +83,7 @@ def run_of(*segments: Any) -> Run:
     return Run("r", 1, tuple(segments))
 
 
-def test_a_plan_is_the_same_after_yaml(tmp_path: Path) -> None:
+def test_a_plan_is_the_same_after_yaml(tmp_path):
     plan = Plan.from_mapping(PLAN, "p.yaml")
     assert plan.to_mapping() == PLAN
     path = tmp_path / "plan.yaml"
@@ -95,7 +94,7 @@ def test_a_plan_is_the_same_after_yaml(tmp_path: Path) -> None:
     assert plan.duration_s == pytest.approx(1.5 + 0.9 + 4.0 + 0.5 + 1.5 + 2.0)
 
 
-def test_every_number_of_a_plan_counts_for_its_hash() -> None:
+def test_every_number_of_a_plan_counts_for_its_hash():
     rng = random.Random(1)
     plan = Plan.from_mapping(PLAN, "p.yaml")
     seen = {plan.sha256}
@@ -142,7 +141,7 @@ def test_every_number_of_a_plan_counts_for_its_hash() -> None:
         (lambda p: p["runs"][0]["segments"][2].pop("duration_s"), ["duration_s", "missing"]),
     ],
 )
-def test_errors_in_a_plan_are_one_line(change: Callable[[dict[str, Any]], Any], words: list[str]) -> None:
+def test_errors_in_a_plan_are_one_line(change, words):
     with pytest.raises(ConfigError) as caught:
         Plan.from_mapping(changed(change), "my.plan.yaml")
     message = str(caught.value)
@@ -151,7 +150,7 @@ def test_errors_in_a_plan_are_one_line(change: Callable[[dict[str, Any]], Any], 
         assert word in message
 
 
-def test_limits_that_are_left_out_have_their_defaults_and_null_is_no_limit_of_temperature() -> None:
+def test_limits_that_are_left_out_have_their_defaults_and_null_is_no_limit_of_temperature():
     assert Plan.from_mapping(changed(lambda p: p.pop("limits")), "p").limits == DEFAULT_LIMITS
     some = Plan.from_mapping(changed(lambda p: p.update(limits={"torque_nm": 20.0})), "p").limits
     assert (some.torque_nm, some.current_a, some.temperature_c) == (20.0, DEFAULT_LIMITS.current_a, 70.0)
@@ -160,7 +159,7 @@ def test_limits_that_are_left_out_have_their_defaults_and_null_is_no_limit_of_te
     assert Plan.from_mapping(yaml.safe_load(plan.to_yaml()), "p") == plan
 
 
-def test_smooth_step_has_no_slope_and_no_curvature_at_its_ends() -> None:
+def test_smooth_step_has_no_slope_and_no_curvature_at_its_ends():
     h = 1e-4
     x = np.array([0.0, h, 2 * h, 0.5, 1.0 - 2 * h, 1.0 - h, 1.0])
     y = smooth_step(x)
@@ -173,7 +172,7 @@ def test_smooth_step_has_no_slope_and_no_curvature_at_its_ends() -> None:
     assert np.diff(fine).max() * 10000 == pytest.approx(1.875, rel=1e-6)
 
 
-def test_set_points_are_those_of_the_segments_at_the_times_of_the_marks() -> None:
+def test_set_points_are_those_of_the_segments_at_the_times_of_the_marks():
     points = expand(Plan.from_mapping(PLAN, "p").runs[0])
     assert len(points) == 6900
     assert (points.velocity_joint, points.current_joint) == (2, 1)
@@ -199,7 +198,7 @@ def test_set_points_are_those_of_the_segments_at_the_times_of_the_marks() -> Non
     assert np.array_equal(points.current_a[held], FourierSeries(1.1, (1.0,), (0.5,), 4.0, 0.5).value(t))
 
 
-def test_random_runs_never_jump_and_end_at_rest() -> None:
+def test_random_runs_never_jump_and_end_at_rest():
     """Velocity and acceleration are continuous over every segment: differences stay below what the ramps explain."""
     for seed in range(30):
         rng = random.Random(seed)
@@ -221,7 +220,7 @@ def test_random_runs_never_jump_and_end_at_rest() -> None:
             assert np.all(series[-200:] == 0.0), f"seed {seed}"
 
 
-def test_travel_is_the_largest_distance_and_directions_cancel() -> None:
+def test_travel_is_the_largest_distance_and_directions_cancel():
     out = Plateau(1.0, 0.0, 2.0, 0.5)
     back = Plateau(-1.0, 0.0, 2.0, 0.5)
     # ramp 0 -> 1 within 0.5 s covers 0.25 rad, then 2 rad
@@ -244,9 +243,7 @@ def test_travel_is_the_largest_distance_and_directions_cancel() -> None:
         ([Rest(0.0, 0.0)], ["no duration"]),
     ],
 )
-def test_a_run_beyond_its_limits_is_refused_before_anything_moves(
-    segments: list[Any], words: list[str]
-) -> None:
+def test_a_run_beyond_its_limits_is_refused_before_anything_moves(segments, words):
     limits = Limits(current_a=5.0, velocity_rad_s=3.0, torque_nm=50.0, travel_rad=10.0)
     with pytest.raises(ConfigError) as caught:
         check_run(run_of(*segments), limits)
@@ -254,13 +251,13 @@ def test_a_run_beyond_its_limits_is_refused_before_anything_moves(
         assert word in str(caught.value)
 
 
-def test_a_run_at_its_limits_is_allowed() -> None:
+def test_a_run_at_its_limits_is_allowed():
     limits = Limits(current_a=5.0, velocity_rad_s=3.0, torque_nm=50.0, travel_rad=10.0)
     plan = Plan("p", limits, (run_of(Plateau(3.0, -5.0, 1.0, 1.0), Rest(0.5)),))
     assert list(check_plan(plan)) == ["r"]
 
 
-def test_fourier_segments_carry_their_series_unchanged() -> None:
+def test_fourier_segments_carry_their_series_unchanged():
     segment = Plan.from_mapping(PLAN, "p").runs[0].segments[2]
     assert isinstance(segment, Fourier)
     assert segment.duration_s == 4.0
@@ -286,7 +283,7 @@ JOINT = replace(load_joint(shipped("joint1.yaml")), motion_limits=MotionLimits((
 RANGE = range_of(1, JOINT, DEFAULT_LIMITS)
 
 
-def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
+def test_a_run_of_trajectories_is_cut_where_it_rests():
     run = TWO_TRAJECTORIES
     one, two = partial_runs(run)
     assert (one.name, two.name) == ("r~1", "r~2")
@@ -299,7 +296,7 @@ def test_a_run_of_trajectories_is_cut_where_it_rests() -> None:
     assert all(part.velocity_rad_s[0] == part.velocity_rad_s[-1] == 0.0 for part in parts)
 
 
-def test_plateaus_of_both_directions_and_a_single_trajectory_are_not_cut() -> None:
+def test_plateaus_of_both_directions_and_a_single_trajectory_are_not_cut():
     for run in (
         plateau_run("r", 2, [(1.2, 1.0), (-1.2, 3.0)], 0.8),
         replace(TWO_TRAJECTORIES, segments=TWO_TRAJECTORIES.segments[:3]),
@@ -308,7 +305,7 @@ def test_plateaus_of_both_directions_and_a_single_trajectory_are_not_cut() -> No
         assert partial_runs(run) == (run,)
 
 
-def test_marks_of_a_run() -> None:
+def test_marks_of_a_run():
     run = Run("r", 2, (Plateau(1.0, 2.0, 0.5, 0.25), Rest(0.5)))
     plan = Plan("p", DEFAULT_LIMITS, (run,))
     marks = marks_of(run, check_plan(plan)["r"])
@@ -325,7 +322,7 @@ def test_marks_of_a_run() -> None:
     assert np.isclose(marks["segments"][-1]["end_s"], run.duration_s)
 
 
-def test_plateaus_of_a_joint_alone_are_cut_by_velocity() -> None:
+def test_plateaus_of_a_joint_alone_are_cut_by_velocity():
     run = alone_run(1, RANGE, "r", (0.1, 0.2, 0.5))
     parts = partial_runs(run)
     assert [part.name for part in parts] == ["r~1", "r~2", "r~3"]
@@ -335,7 +332,7 @@ def test_plateaus_of_a_joint_alone_are_cut_by_velocity() -> None:
         assert path(points)[-1] == pytest.approx(0.0, abs=2e-3)
 
 
-def test_a_run_of_one_direction_is_cut_by_plateau() -> None:
+def test_a_run_of_one_direction_is_cut_by_plateau():
     (run, *_) = efficiency_runs((1.4,), 2.1, (1.0, 2.5, 4.0))
     parts = partial_runs(run)
     assert len(parts) == 3

@@ -1,7 +1,6 @@
 """Runs of one joint that is moved alone: within its range, back to the start, and as informative as they can be."""
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,7 +33,7 @@ def arm_plan(kind: str = "excitation", **scale: Any) -> Plan:
 
 
 @pytest.mark.parametrize("kind", ["excitation", "validate"])
-def test_a_joint_alone_stays_in_its_range_and_comes_back(kind: str) -> None:
+def test_a_joint_alone_stays_in_its_range_and_comes_back(kind):
     plan = arm_plan(kind)
     for run, points in zip(plan.runs, check_plan(plan).values(), strict=True):
         assert (run.joints, run.current_joint) == ((1,), None)
@@ -52,7 +51,7 @@ def test_a_joint_alone_stays_in_its_range_and_comes_back(kind: str) -> None:
     assert arm_plan(kind, seed=1) != plan
 
 
-def test_plateaus_in_both_directions_at_every_velocity() -> None:
+def test_plateaus_in_both_directions_at_every_velocity():
     run = joint_plateau_run(1, RANGE, "r", (0.2, 0.5))
     held = sorted({each.velocity_rad_s for each in run.segments if isinstance(each, Plateau)})
     fastest = SHARE * LIMITS.velocity_rad_s
@@ -61,7 +60,7 @@ def test_plateaus_in_both_directions_at_every_velocity() -> None:
     assert len(alone.segments) == 2 + 5, "the fast one does not fit at this acceleration"
 
 
-def test_a_search_gives_more_information_than_one_draw() -> None:
+def test_a_search_gives_more_information_than_one_draw():
     """The velocities of a design cover more than those of a draw: it is the reason to search at all."""
 
     def information(evaluations: int) -> float:
@@ -73,7 +72,7 @@ def test_a_search_gives_more_information_than_one_draw() -> None:
     assert information(400) > information(1) + 1.0
 
 
-def test_a_plan_of_a_joint_alone_survives_a_file(tmp_path: Path) -> None:
+def test_a_plan_of_a_joint_alone_survives_a_file(tmp_path):
     plan = arm_plan()
     (tmp_path / "plan.yaml").write_text(plan.to_yaml())
     again = load_plan(tmp_path / "plan.yaml")
@@ -85,11 +84,11 @@ def test_a_plan_of_a_joint_alone_survives_a_file(tmp_path: Path) -> None:
     assert load_plan(tmp_path / "plan.yaml").runs == pair.runs
 
 
-def test_motion_limits_of_a_command_line() -> None:
+def test_motion_limits_of_a_command_line():
     assert parsed_limits("travel_rad=-1:1, torque_nm=5") == {"travel_rad": (-1.0, 1.0), "torque_nm": 5.0}
 
 
-def test_the_tighter_limit_holds() -> None:
+def test_the_tighter_limit_holds():
     given = replace(RANGE.limits, current_a=1.0, velocity_rad_s=9.0, position_rad=(-5.0, 1.0), travel_rad=6.0)
     both = tightest(given, RANGE.limits)
     assert (both.current_a, both.velocity_rad_s, both.position_rad) == (1.0, 1.5, (-1.0, 1.0))

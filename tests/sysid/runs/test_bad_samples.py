@@ -66,12 +66,12 @@ def clipped(table: RunTable, limit: float, span: slice = slice(None)) -> RunTabl
 
 
 @pytest.mark.parametrize("noise", [0.0, 1.0])
-def test_a_measured_channel_is_not_held(noise: float) -> None:
+def test_a_measured_channel_is_not_held(noise):
     assert held_in(run(noise)) == {}
 
 
 @pytest.mark.parametrize("name", ["current_a", "torque_nm"])
-def test_a_channel_without_its_own_noise_is_stuck_however_little_its_partner_moves(name: str) -> None:
+def test_a_channel_without_its_own_noise_is_stuck_however_little_its_partner_moves(name):
     """Sixty rows at the crest of the load, which hardly changes there."""
     held = held_in(frozen(run(swing=0.01), name, 3000, 3060))
     assert list(held) == [name]
@@ -80,7 +80,7 @@ def test_a_channel_without_its_own_noise_is_stuck_however_little_its_partner_mov
 
 
 @pytest.mark.parametrize("name", ["current_a", "torque_nm"])
-def test_a_channel_that_is_stuck_in_motion_stays_so_at_rest_and_at_rest_alone_none_is(name: str) -> None:
+def test_a_channel_that_is_stuck_in_motion_stays_so_at_rest_and_at_rest_alone_none_is(name):
     clean = run()
     there = frozen(clean, name, 3000, 3100)
     speed, values = column(clean, "motor_velocity_rad_s"), column(there, name)
@@ -95,7 +95,7 @@ def test_a_channel_that_is_stuck_in_motion_stays_so_at_rest_and_at_rest_alone_no
     assert not deviation[3100:].any()
 
 
-def test_a_current_without_noise_anywhere_or_without_power_is_not_stuck() -> None:
+def test_a_current_without_noise_anywhere_or_without_power_is_not_stuck():
     assert held_in(frozen(run(noise=0.0, swing=0.01), "current_a", 3000, 3060)) == {}
     noisy = run(swing=0.01)
     off = column(noisy, "current_a")
@@ -108,14 +108,14 @@ def test_a_current_without_noise_anywhere_or_without_power_is_not_stuck() -> Non
     assert held_in(having(noisy, current_a=off, enabled=enabled)) == {}
 
 
-def test_a_commanded_current_that_goes_to_a_level_and_on_is_measured() -> None:
+def test_a_commanded_current_that_goes_to_a_level_and_on_is_measured():
     """It repeats no number on its way, but it has no noise, and the load does not change meanwhile."""
     current = np.round(np.interp(T, [0.0, 3.0, 3.06, 8.0], [0.5, 2.15, 2.15, 4.867]), 4)
     assert held_in(having(run(swing=0.01), current_a=current)) == {}
 
 
 @pytest.mark.parametrize("span", [slice(None), slice(0, 1500)])
-def test_one_number_at_the_end_of_the_range_is_saturation_however_long_or_seldom(span: slice) -> None:
+def test_one_number_at_the_end_of_the_range_is_saturation_however_long_or_seldom(span):
     """Of the second, only one crest is clipped: half a second of one number, never again."""
     limit = 0.35003 * JOINT.rated_torque_nm  # between two steps of the channel
     there = clipped(run(), limit, span)
@@ -132,7 +132,7 @@ def test_one_number_at_the_end_of_the_range_is_saturation_however_long_or_seldom
     assert short[0].text.startswith(f"run1.csv: j1.torque_nm: found exactly {limit:.6g} Nm held for")
 
 
-def test_one_number_in_the_middle_of_the_range_is_stuck() -> None:
+def test_one_number_in_the_middle_of_the_range_is_stuck():
     there = frozen(run(), "torque_nm", 3500, 3900)
     held = held_in(there)["torque_nm"]
     assert held.stuck[3500:3900].all()
@@ -142,14 +142,14 @@ def test_one_number_in_the_middle_of_the_range_is_stuck() -> None:
     assert "from 3.5 s on" in issue.text
 
 
-def test_a_number_that_is_never_left_again_is_no_limit() -> None:
+def test_a_number_that_is_never_left_again_is_no_limit():
     top = int(np.argmax(column(run(), "torque_nm")[:6000]))
     held = held_in(frozen(run(), "torque_nm", top, len(T)))["torque_nm"]
     assert held.stuck[top:].all()
     assert not held.saturated.any()
 
 
-def test_a_limit_of_one_run_is_a_limit_of_all_runs_and_joints_at_the_sensor() -> None:
+def test_a_limit_of_one_run_is_a_limit_of_all_runs_and_joints_at_the_sensor():
     limit = 0.25003 * JOINT.rated_torque_nm  # between two steps of the channel
     often, seldom = clipped(run(), limit), clipped(run(), limit, slice(500, 503))
     limits = saturation_limits([often, RunTable(T, {2: seldom.joints[1]})], {1: JOINT, 2: JOINT})
@@ -159,7 +159,7 @@ def test_a_limit_of_one_run_is_a_limit_of_all_runs_and_joints_at_the_sensor() ->
     assert np.flatnonzero(rows).tolist() == [500, 501, 502]
 
 
-def test_a_run_that_is_held_for_the_most_part_is_refused() -> None:
+def test_a_run_that_is_held_for_the_most_part_is_refused():
     long, short = issues_of(frozen(run(), "torque_nm", 500, 500 + int((LONGEST_HELD + 0.05) * len(T))))
     assert [issue.kind for issue in long] == ["torque_nm_stuck"]
     assert not short
@@ -169,7 +169,7 @@ def test_a_run_that_is_held_for_the_most_part_is_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def measured() -> RunTable:
+def measured():
     return bench()
 
 
@@ -181,7 +181,7 @@ def with_outlier(table: RunTable, name: str, value: float) -> RunTable:
 
 @pytest.mark.parametrize("name", sorted(set(COLUMN_NAMES) - {"enabled", "link_velocity_rad_s"}))
 @pytest.mark.parametrize("value", [1e30, -1e6, 4e3])
-def test_a_row_with_an_outlier_is_left_out_with_a_note(measured: RunTable, name: str, value: float) -> None:
+def test_a_row_with_an_outlier_is_left_out_with_a_note(measured, name, value):
     kept, [note] = without_outliers(with_outlier(measured, name, value), JOINTS, "r.csv")
     assert f"j1.{name}: found 1 outlier sample, {value:.4g} at 7 s" in note.text
     assert np.array_equal(kept.time_s, np.delete(measured.time_s, 7000))
@@ -189,7 +189,7 @@ def test_a_row_with_an_outlier_is_left_out_with_a_note(measured: RunTable, name:
         assert np.array_equal(column(kept, each, number), np.delete(column(measured, each, number), 7000))
 
 
-def test_an_outlier_is_interpolated_as_a_lost_row(measured: RunTable) -> None:
+def test_an_outlier_is_interpolated_as_a_lost_row(measured):
     result = checked(with_outlier(measured, "torque_nm", 1e30))
     outlier, uneven = result.notes
     assert "1 outlier sample" in outlier
@@ -198,7 +198,7 @@ def test_an_outlier_is_interpolated_as_a_lost_row(measured: RunTable) -> None:
     assert column(result.runs[0][1], "torque_nm") == pytest.approx(column(measured, "torque_nm"), abs=2.0)
 
 
-def test_a_motion_that_a_joint_can_do_is_no_outlier(measured: RunTable) -> None:
+def test_a_motion_that_a_joint_can_do_is_no_outlier(measured):
     """A kick of twice the rating at the start, a blow, a channel that steps, one that is wrong for longer."""
     for rows, value in ((slice(1, 2), 80.0), (slice(7000, 7001), 18.0), (slice(7000, 8000), 1e3)):
         torque = column(measured, "torque_nm")

@@ -27,7 +27,6 @@ from tests.sysid.runs.random_motion import Excitation, random_current, random_ve
 from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     DEGREES,
-    Change,
     bench,
     changed,
     checked,
@@ -41,12 +40,12 @@ POINTS = [(v, i) for v in (0.4, 2.0, -1.0) for i in (0.0, 3.0, 5.0, -4.0)]
 
 
 @pytest.fixture(scope="module")
-def noisy() -> RunTable:
+def noisy():
     return plateau_run(load_plant(shipped("plant.yaml")), POINTS, hold_s=0.6)
 
 
 @pytest.fixture(scope="module")
-def ideal() -> RunTable:
+def ideal():
     """Without noise beyond rounding: constant values are normal here, and no sign of a stuck channel."""
     return plateau_run(plant_of_joint(JOINT), POINTS, hold_s=0.6)
 
@@ -60,13 +59,13 @@ def kinds(table: RunTable, joint: Joint = JOINT, number: int = 1, **changes: Flo
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_good_runs_have_no_finding(noisy: RunTable, ideal: RunTable, number: int) -> None:
+def test_good_runs_have_no_finding(noisy, ideal, number):
     assert kinds(noisy, number=number) == []
     assert kinds(ideal, number=number) == []
 
 
 @pytest.mark.parametrize("seed", [3, 4])
-def test_random_motion_through_all_quadrants_has_no_finding(seed: int) -> None:
+def test_random_motion_through_all_quadrants_has_no_finding(seed):
     rng = np.random.default_rng(seed)
     commands = (
         JointCommand.velocity(random_velocity(Excitation(), 12.0, rng)),
@@ -79,7 +78,7 @@ def test_random_motion_through_all_quadrants_has_no_finding(seed: int) -> None:
 
 
 @pytest.mark.parametrize("run", ["opti_traj_testing1", "RunTrajectory1"])
-def test_measured_runs_of_a_real_arm_have_no_finding(run: str) -> None:
+def test_measured_runs_of_a_real_arm_have_no_finding(run):
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     table = read_run(shipped(f"kinova_gen3/{run}.csv.gz"), columns).table
     for number, path in columns.joint_files.items():
@@ -87,7 +86,7 @@ def test_measured_runs_of_a_real_arm_have_no_finding(run: str) -> None:
         assert check_channels(Channels(table.time_s, table.joints[number], joint, "run")) == []
 
 
-def test_dead_channels(noisy: RunTable) -> None:
+def test_dead_channels(noisy):
     zero = np.zeros(len(noisy.time_s))
     assert kinds(noisy, torque_nm=zero)[0] == "torque_nm_dead"
     assert kinds(noisy, current_a=zero)[0] == "current_a_dead"
@@ -96,7 +95,7 @@ def test_dead_channels(noisy: RunTable) -> None:
 
 
 @pytest.mark.parametrize("span", [slice(1200, None), slice(1300, 2300)])
-def test_a_stuck_sensor(noisy: RunTable, span: slice) -> None:
+def test_a_stuck_sensor(noisy, span):
     """To the end of the run, or for a while in which the current changes."""
     torque = column(noisy, "torque_nm")
     torque[span] = torque[span.start]
@@ -106,38 +105,38 @@ def test_a_stuck_sensor(noisy: RunTable, span: slice) -> None:
     assert f"found exactly {torque[span.start]:g} Nm for" in issue.text
 
 
-def test_a_saturated_sensor(noisy: RunTable, ideal: RunTable) -> None:
+def test_a_saturated_sensor(noisy, ideal):
     for table in (noisy, ideal):
         torque = np.clip(column(table, "torque_nm"), -22.0, 22.0)
         assert kinds(table, torque_nm=torque) == ["torque_nm_saturated"]
 
 
-def test_a_stuck_current(noisy: RunTable) -> None:
+def test_a_stuck_current(noisy):
     current = column(noisy, "current_a")
     current[1100:] = current[1100]
     assert "current_a_stuck" in kinds(noisy, current_a=current)
 
 
-def test_stuck_positions(noisy: RunTable) -> None:
+def test_stuck_positions(noisy):
     motor, link = column(noisy, "motor_position_rad"), column(noisy, "link_position_rad")
     assert kinds(noisy, link_position_rad=np.full_like(link, 0.3)) == ["link_position_rad_stuck"]
     assert kinds(noisy, motor_position_rad=np.full_like(motor, 7.0))[0] == "motor_position_rad_stuck"
 
 
-def test_swapped_signs_are_distinguished(noisy: RunTable, ideal: RunTable) -> None:
+def test_swapped_signs_are_distinguished(noisy, ideal):
     for table in (noisy, ideal):
         for name in ("torque_nm", "current_a", "motor_velocity_rad_s", "link_position_rad"):
             assert kinds(table, **{name: -column(table, name)}) == [f"{name}_sign"], name
 
 
-def test_swapped_torque_and_current_are_distinguished_without_positions(noisy: RunTable) -> None:
+def test_swapped_torque_and_current_are_distinguished_without_positions(noisy):
     none = {"motor_position_rad": None, "link_position_rad": None}
     for name in ("torque_nm", "current_a"):
         assert kinds(noisy, **none, **{name: -column(noisy, name)}) == [f"{name}_sign"]
 
 
 @pytest.mark.parametrize("ratio", [50.0, 98.0, 102.0, 160.0])
-def test_wrong_gear_ratio(noisy: RunTable, ratio: float) -> None:
+def test_wrong_gear_ratio(noisy, ratio):
     assert kinds(noisy, replace(JOINT, gear_ratio=ratio)) == ["gear_ratio"]
     assert Channels(noisy.time_s, noisy.joints[1], JOINT, "r").gear_ratio == pytest.approx(100.0, rel=2e-3)
 
@@ -146,9 +145,7 @@ def test_wrong_gear_ratio(noisy: RunTable, ratio: float) -> None:
     ("swing_rad", "ratio", "found"),
     [(0.08, 100.0, []), (0.08, 110.0, ["gear_ratio"]), (0.5, 102.0, ["gear_ratio"])],
 )
-def test_in_a_small_swing_a_twisting_gear_is_no_wrong_gear_ratio(
-    swing_rad: float, ratio: float, found: list[str]
-) -> None:
+def test_in_a_small_swing_a_twisting_gear_is_no_wrong_gear_ratio(swing_rad, ratio, found):
     """The load of a swing is in phase with it: 0.8 mrad of twist in 80 mrad look like a ratio that is 2 % off."""
     time = 1e-3 * np.arange(20_000)
     link = 0.5 * swing_rad * np.sin(2.0 * np.pi * 0.7 * time)
@@ -157,13 +154,13 @@ def test_in_a_small_swing_a_twisting_gear_is_no_wrong_gear_ratio(
     assert kinds(RunTable(time, {1: run}), replace(JOINT, gear_ratio=ratio)) == found
 
 
-def test_a_velocity_of_the_joint_side_or_in_other_units(noisy: RunTable) -> None:
+def test_a_velocity_of_the_joint_side_or_in_other_units(noisy):
     velocity = column(noisy, "motor_velocity_rad_s")
     for scale in (0.01, 9.549, 0.5):
         assert kinds(noisy, motor_velocity_rad_s=scale * velocity) == ["motor_velocity_rad_s_scale"]
 
 
-def test_positions_that_roll_over_are_no_finding(noisy: RunTable) -> None:
+def test_positions_that_roll_over_are_no_finding(noisy):
     turn = 2.0 * np.pi
     wrapped = np.mod(column(noisy, "motor_position_rad"), 40.0 * turn)
     assert np.ptp(np.diff(wrapped)) > 100.0  # it does roll over
@@ -171,13 +168,13 @@ def test_positions_that_roll_over_are_no_finding(noisy: RunTable) -> None:
     assert kinds(noisy, motor_position_rad=wrapped, link_position_rad=link) == []
 
 
-def test_missing_channels_have_no_finding(noisy: RunTable) -> None:
+def test_missing_channels_have_no_finding(noisy):
     assert check_channels(Channels(noisy.time_s, JointColumns(), JOINT, "r")) == []
     only = JointColumns(current_a=noisy.joints[1].current_a, torque_nm=noisy.joints[1].torque_nm)
     assert check_channels(Channels(noisy.time_s, only, JOINT, "r")) == []
 
 
-def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal: RunTable) -> None:
+def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal):
     """Stiction: a constant torque in a standing joint while the current changes."""
     n = 2000
     time_s = 0.001 * np.arange(n)
@@ -193,7 +190,7 @@ def test_a_torque_held_by_stiction_at_standstill_is_not_stuck(ideal: RunTable) -
 
 
 @pytest.fixture(scope="module")
-def day() -> RunTable:
+def day():
     return bench()
 
 
@@ -206,11 +203,7 @@ def day() -> RunTable:
         (times("motor_velocity_rad_s", 65536 / (2 * math.pi)), "motor_velocity_rad_s", "counts per second"),
         (times("motor_position_rad", DEGREES), "motor_position_rad", "degrees suspected"),
         (times("motor_position_rad", 65536 / (2 * math.pi)), "motor_position_rad", "counts (65536"),
-        (
-            times("motor_position_rad motor_velocity_rad_s", DEGREES),
-            "motor_position_rad",
-            "degrees suspected",
-        ),
+        (times("motor_position_rad motor_velocity_rad_s", DEGREES), "motor_position_rad", "degrees suspected"),
         (times("motor_position_rad motor_velocity_rad_s", 0.01), "motor_position_rad", "joint side"),
         (times("link_position_rad", DEGREES), "link_position_rad", "degrees suspected"),
         (times("link_position_rad", 524288 / (2 * math.pi)), "link_position_rad", "counts (524288"),
@@ -220,10 +213,8 @@ def day() -> RunTable:
         (times("current_a", 1000.0), "current_a", "mA"),
         (times("current_a torque_nm", 1000.0), "j1", "mNm and mA"),
     ],
-)
-def test_other_units_by_size_and_the_other_joint_stays(
-    day: RunTable, change: Change, channel: str, unit: str
-) -> None:
+)  # fmt: skip
+def test_other_units_by_size_and_the_other_joint_stays(day, change, channel, unit):
     result = checked(changed(day, change))
     assert len(result.refused) == 1
     assert f"r.csv: j1.{channel}: " in result.refused[0] or channel == "j1"
@@ -233,7 +224,7 @@ def test_other_units_by_size_and_the_other_joint_stays(
     assert result.lost == (1,)
 
 
-def test_slow_motion_in_degrees_is_seen_by_the_spring() -> None:
+def test_slow_motion_in_degrees_is_seen_by_the_spring():
     """57 times 0.1 rad/s is a speed that joints have; the torsion against the sensor shows the unit."""
     table = emulate_run(load_plant(shipped("plant.yaml")), motion(0.12), 20.0, 6)
     assert checked(table).refused == ()
@@ -243,7 +234,7 @@ def test_slow_motion_in_degrees_is_seen_by_the_spring() -> None:
     assert "degrees suspected" in found[0]
 
 
-def test_one_encoder_in_degrees_is_seen_by_its_speed(day: RunTable) -> None:
+def test_one_encoder_in_degrees_is_seen_by_its_speed(day):
     table = changed(day, lambda c: replace(c, motor_position_rad=None, motor_velocity_rad_s=None))
     assert checked(table).refused == ()
     found = checked(changed(table, times("link_position_rad", DEGREES))).refused
@@ -291,7 +282,7 @@ def exchanged(table: RunTable, names: tuple[str, ...], a: int = 3, b: int = 4) -
     ],
     ids=["torque", "current", "all"],
 )
-def test_exchanged_columns(names: tuple[str, ...], expected: str) -> None:
+def test_exchanged_columns(names, expected):
     checked = check_runs([("good", exchanged(rich(5), names))], PAIR)
     assert checked.runs == ()
     (line,) = checked.refused
@@ -300,14 +291,14 @@ def test_exchanged_columns(names: tuple[str, ...], expected: str) -> None:
     assert checked.lost == (3, 4)
 
 
-def test_a_run_with_exchanged_columns_is_left_out_and_the_others_are_used() -> None:
+def test_a_run_with_exchanged_columns_is_left_out_and_the_others_are_used():
     bad = exchanged(rich(5), ("torque_nm",))
     checked = check_runs([("a", rich(7)), ("b", bad), ("c", rich(9))], PAIR)
     assert [name for name, _ in checked.runs] == ["a", "c"]
     assert [line.split(":")[0] for line in checked.refused] == ["b"]
 
 
-def test_a_wrong_joint_file_is_no_exchange() -> None:
+def test_a_wrong_joint_file_is_no_exchange():
     wrong = replace(ONE, torque_constant_nm_per_a=0.7 * ONE.torque_constant_nm_per_a, rotor_inertia_kgm2=1e-6)
     assert not [
         line for line in check_runs([("a", rich(5))], {3: wrong, 4: TWO}).refused if "swapped" in line
@@ -322,13 +313,13 @@ def kinova() -> tuple[list[tuple[str, RunTable]], dict[int, Joint]]:
     return [(run.name, run.table) for run in read], joints
 
 
-def test_columns_of_a_real_arm_are_where_they_belong() -> None:
+def test_columns_of_a_real_arm_are_where_they_belong():
     runs, joints = kinova()
     assert not [line for line in check_runs(runs, joints).refused if "swapped" in line]
 
 
 @pytest.mark.parametrize("names", [("torque_nm",), ("current_a",)])
-def test_exchanged_columns_of_a_real_arm(names: tuple[str, ...]) -> None:
+def test_exchanged_columns_of_a_real_arm(names):
     runs, joints = kinova()
     bad = [(name, exchanged(table, names)) for name, table in runs]
     refused = check_runs(bad, {3: joints[3], 4: joints[4]}).refused

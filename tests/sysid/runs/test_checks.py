@@ -15,7 +15,6 @@ from jtqd.sysid.runs.checks import check_runs
 from tests.sysid.runs.spoiled_runs import (
     ANGLES,
     JOINTS,
-    Change,
     bench,
     changed,
     checked,
@@ -28,12 +27,12 @@ from tests.sysid.runs.spoiled_runs import (
 
 
 @pytest.fixture(scope="module")
-def run() -> RunTable:
+def run():
     return bench()
 
 
 @pytest.mark.parametrize("seed", [11, 12])
-def test_good_runs_pass_unchanged(seed: int) -> None:
+def test_good_runs_pass_unchanged(seed):
     rng = np.random.default_rng(seed)
     benches = (
         (load_plant(shipped("campaign_plant.yaml")), JOINTS),
@@ -46,7 +45,7 @@ def test_good_runs_pass_unchanged(seed: int) -> None:
         assert result.runs[0][1] is table or np.array_equal(result.runs[0][1].time_s, table.time_s)
 
 
-def test_a_joint_file_that_is_wrong_by_a_half_is_left_to_the_diagnosis(run: RunTable) -> None:
+def test_a_joint_file_that_is_wrong_by_a_half_is_left_to_the_diagnosis(run):
     rng = np.random.default_rng(21)
     for key in (
         "torque_constant_nm_per_a",
@@ -73,19 +72,19 @@ def test_a_joint_file_that_is_wrong_by_a_half_is_left_to_the_diagnosis(run: RunT
         (lambda c: JointColumns(current_a=c.current_a, torque_nm=c.torque_nm), "no position and no velocity"),
     ],
 )
-def test_contradictions_leave_the_joint_out(run: RunTable, change: Change, expected: str) -> None:
+def test_contradictions_leave_the_joint_out(run, change, expected):
     result = checked(changed(run, change))
     assert any(expected in line for line in result.refused)
     assert list(result.runs[0][1].joints) == [2]
 
 
-def test_a_joint_in_the_others_frame_is_left_out(run: RunTable) -> None:
+def test_a_joint_in_the_others_frame_is_left_out(run):
     result = checked(changed(run, times(f"{ANGLES} current_a torque_nm", -1.0), 2))
     assert "frame of the other" in result.refused[0]
     assert list(result.runs[0][1].joints) == [1]
 
 
-def test_a_joint_file_of_another_joint(run: RunTable) -> None:
+def test_a_joint_file_of_another_joint(run):
     for change, expected in (
         ({"gear_ratio": 80.0}, "wrong gear ratio"),
         ({"torque_constant_nm_per_a": 0.0062}, "joint file of another joint"),
@@ -100,7 +99,7 @@ def held(run: RunTable, name: str, first: int, last: int) -> RunTable:
     return having(run, **{name: values})
 
 
-def test_stuck_channels_by_how_long(run: RunTable) -> None:
+def test_stuck_channels_by_how_long(run):
     current = column(run, "current_a")
     # where the motor's torque changes much: stuck, and not merely constant
     spread = [float(np.ptp(current[k : k + 300])) for k in range(2000, 15000, 100)]
@@ -113,7 +112,7 @@ def test_stuck_channels_by_how_long(run: RunTable) -> None:
 
 
 @pytest.mark.parametrize("name", ["link_position_rad", "motor_position_rad"])
-def test_a_stuck_encoder_is_not_used_and_the_joint_stays(run: RunTable, name: str) -> None:
+def test_a_stuck_encoder_is_not_used_and_the_joint_stays(run, name):
     result = checked(held(run, name, 0, len(run.time_s)))
     assert result.refused == ()
     assert f"j1.{name}" in result.notes[0]
@@ -122,7 +121,7 @@ def test_a_stuck_encoder_is_not_used_and_the_joint_stays(run: RunTable, name: st
     assert (getattr(joints[1], name) is None, getattr(joints[2], name) is None) == (True, False)
 
 
-def test_a_saturated_sensor_is_refused_when_it_is_so_most_of_the_time(run: RunTable) -> None:
+def test_a_saturated_sensor_is_refused_when_it_is_so_most_of_the_time(run):
     torque = column(run, "torque_nm")
     mostly, often, seldom = (
         checked(having(run, torque_nm=np.clip(torque, -limit, limit)))
@@ -133,7 +132,7 @@ def test_a_saturated_sensor_is_refused_when_it_is_so_most_of_the_time(run: RunTa
     assert any("j1.torque_nm" in note and "saturated or clipped channel" in note for note in often.notes)
 
 
-def test_spikes_are_counted_and_kept(run: RunTable) -> None:
+def test_spikes_are_counted_and_kept(run):
     spiky = column(run, "torque_nm")
     spiky[[3000, 7000, 7500, 16000]] += 25.0
     result = checked(having(run, torque_nm=spiky))
@@ -146,9 +145,7 @@ def test_spikes_are_counted_and_kept(run: RunTable) -> None:
     [(25.0, 28.7, "found a step of 3.7 degC at 0.3"), (298.1, 298.1, "kelvin"), (25.0, 26.0, "")],
     ids=["a step", "kelvin", "a coarse thermometer"],
 )
-def test_a_temperature_that_no_joint_has_is_not_used(
-    run: RunTable, before: float, after: float, expected: str
-) -> None:
+def test_a_temperature_that_no_joint_has_is_not_used(run, before, after, expected):
     result = checked(having(run, temperature_c=np.where(run.time_s < 0.3, before, after)))
     joints = result.runs[0][1].joints
     assert (joints[1].temperature_c is None) == bool(expected)
@@ -157,23 +154,23 @@ def test_a_temperature_that_no_joint_has_is_not_used(
 
 
 @pytest.mark.parametrize(("factor", "rate"), [(100, "10 Hz"), (25, "40 Hz")])
-def test_slow_recordings_are_refused(run: RunTable, factor: int, rate: str) -> None:
+def test_slow_recordings_are_refused(run, factor, rate):
     result = checked(each_column(run, lambda x: x[::factor]))
     assert rate in result.refused[0]
     assert (result.runs, result.lost) == ((), (1, 2))
 
 
-def test_time_in_milliseconds_is_suspected(run: RunTable) -> None:
+def test_time_in_milliseconds_is_suspected(run):
     assert "milliseconds" in checked(RunTable(run.time_s * 1000.0, run.joints)).refused[0]
 
 
 @pytest.mark.parametrize("count", [2, 10, 900])
-def test_a_run_that_is_too_short(run: RunTable, count: int) -> None:
+def test_a_run_that_is_too_short(run, count):
     [line] = checked(each_column(run, lambda x: x[:count])).refused
     assert line == f"r.csv: found {count} samples, {count * 1e-3:.3g} s, expected a run of at least 1 s"
 
 
-def test_every_run_is_judged_for_itself(run: RunTable) -> None:
+def test_every_run_is_judged_for_itself(run):
     bad = changed(run, times("torque_nm", 1000.0))
     result = check_runs([("a", run), ("b", bad), ("c", each_column(run, lambda x: x[::100]))], JOINTS)
     assert [(name, list(table.joints)) for name, table in result.runs] == [("a", [1, 2]), ("b", [2])]
@@ -181,7 +178,7 @@ def test_every_run_is_judged_for_itself(run: RunTable) -> None:
     assert [line[0] for line in result.refused] == ["b", "c"]
 
 
-def test_a_run_in_which_nothing_changes_is_not_used(run: RunTable) -> None:
+def test_a_run_in_which_nothing_changes_is_not_used(run):
     """As from a dead bus: position and current (of the duty) are one number, the torque of the load follows from them."""
     one = np.ones(len(run.time_s))
     dead = JointColumns(0.5 * one, 7.0 * one, torque_nm=column(run, "torque_nm"))
@@ -196,7 +193,7 @@ def test_a_run_in_which_nothing_changes_is_not_used(run: RunTable) -> None:
     assert (beside.refused, set(beside.notes)) == ((), set(result.refused))
 
 
-def test_channels_of_one_value(run: RunTable) -> None:
+def test_channels_of_one_value(run):
     one = np.ones(len(run.time_s))
     [line] = checked(having(run, torque_nm=7.5 * one)).refused
     assert line == (

@@ -61,7 +61,7 @@ def rig(path: Path) -> Path:
     )
 
 
-def test_a_known_load_is_the_torque_of_its_motion(tmp_path: Path) -> None:
+def test_a_known_load_is_the_torque_of_its_motion(tmp_path):
     run = read_run(rig(tmp_path / "a.csv"), made(j1__current_a="i", j1__load=LOAD))
     found = column(run.table, "torque_nm")
     inner = slice(10, -10)
@@ -71,12 +71,12 @@ def test_a_known_load_is_the_torque_of_its_motion(tmp_path: Path) -> None:
     assert "no effect of a torque sensor is looked for" in run.notes[0]
 
 
-def test_without_an_inertia_the_load_is_a_point_mass() -> None:
+def test_without_an_inertia_the_load_is_a_point_mass():
     load = made(j1__load={"mass_kg": 2.0, "lever_m": 0.5}).loads[1]  # type: ignore[index]
     assert load == KnownLoad(None, 2.0, 0.5, 0.5)
 
 
-def test_a_models_torque_is_a_known_load(tmp_path: Path) -> None:
+def test_a_models_torque_is_a_known_load(tmp_path):
     columns = made(j1__current_a="i", j1__load={"torque_nm": "gravity + rest"})
     assert columns.known_loads == (1,)
     found = read_run(rig(tmp_path / "a.csv"), columns).table.joints[1].torque_nm
@@ -84,7 +84,7 @@ def test_a_models_torque_is_a_known_load(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_speed", [True, False])
-def test_a_drive_that_gives_duty(tmp_path: Path, with_speed: bool) -> None:
+def test_a_drive_that_gives_duty(tmp_path, with_speed):
     path = rig(tmp_path / "a.csv")
     more: dict[str, object] = {"j1__motor_position_rad": f"{RATIO} * deg2rad(angle)"}
     if with_speed:
@@ -100,7 +100,7 @@ def test_a_drive_that_gives_duty(tmp_path: Path, with_speed: bool) -> None:
     assert "a wrong resistance shows as torque_constant" in run.notes[0]
 
 
-def test_the_window_follows_the_motion_and_not_the_noise() -> None:
+def test_the_window_follows_the_motion_and_not_the_noise():
     noisy = Q + np.random.default_rng(3).normal(0.0, 1e-4, len(T))
     velocity, acceleration = motion_of(T, noisy)
     inner = slice(10, -10)
@@ -123,25 +123,22 @@ DRIVE = {"voltage_v": "v", "resistance_ohm": 1.0, "back_emf_vs_per_rad": 0.1}
         ({"j1.load": LOAD, "j1.torque_nm": "i"}, "found it beside 'j1.torque_nm', expected one reference"),
         ({"j2.load": LOAD}, "found no 'j2.link_position_rad'"),
         ({"j1.load": 3}, "found 3, expected a mapping"),
-        (
-            {"j1.current_a": "i", "j1.drive": DRIVE},
-            "found it beside 'j1.current_a', expected one of them",
-        ),
+        ({"j1.current_a": "i", "j1.drive": DRIVE}, "found it beside 'j1.current_a', expected one of them"),
         ({"j1.drive": DRIVE}, "found neither 'j1.motor_velocity_rad_s' nor"),
         (
             {"j1.motor_position_rad": "p", "j1.drive": {"voltage_v": "v", "resistance_ohm": 0.0}},
             "key 'j1.drive.resistance_ohm': found 0.0",
         ),
     ],
-)
-def test_wrong_loads_and_drives_are_named(more: dict[str, object], expected: str) -> None:
+)  # fmt: skip
+def test_wrong_loads_and_drives_are_named(more, expected):
     with pytest.raises(ConfigError) as caught:
         ColumnMap.from_mapping(mapping() | more, "m.yaml", Path())
     assert expected in str(caught.value)
     assert "m.yaml" in str(caught.value)
 
 
-def test_a_wrong_expression_names_file_key_and_map(tmp_path: Path) -> None:
+def test_a_wrong_expression_names_file_key_and_map(tmp_path):
     path = rig(tmp_path / "a.csv")
     with pytest.raises(RunError) as caught:
         read_run(path, made(j1__current_a="i + bias"))
@@ -150,7 +147,7 @@ def test_a_wrong_expression_names_file_key_and_map(tmp_path: Path) -> None:
     )
 
 
-def test_an_outlier_of_a_position_is_not_in_the_torque_of_the_load(tmp_path: Path) -> None:
+def test_an_outlier_of_a_position_is_not_in_the_torque_of_the_load(tmp_path):
     outlier = np.sin(T)
     outlier[1000] = 1e6
     torques = []
@@ -163,7 +160,7 @@ def test_an_outlier_of_a_position_is_not_in_the_torque_of_the_load(tmp_path: Pat
     assert torques[1] == pytest.approx(torques[0], abs=0.1)
 
 
-def test_turns_in_a_gap_are_not_known(tmp_path: Path) -> None:
+def test_turns_in_a_gap_are_not_known(tmp_path):
     keep = ~((T > 2.0) & (T < 2.5))
     path = table(tmp_path / "a.csv", {"t": T[keep], "q": np.mod(9.0 * T[keep], 2.0 * np.pi), "i": Q[keep]})
     mapping = {"time_s": "t", "j1.current_a": "i", "j1.motor_position_rad": "unwrap(q, 2 * pi)"}
@@ -207,7 +204,7 @@ HEADER = tuple(CELLS)
         ("12", [12.0, 12.0, 12.0], ()),
     ],
 )
-def test_values_of_expressions(text: str, expected: list[float], names: tuple[str, ...]) -> None:
+def test_values_of_expressions(text, expected, names):
     found = parse(text, HEADER)
     assert found.names == names
     assert found.value(CELLS).tolist() == pytest.approx(expected)
@@ -241,7 +238,7 @@ def test_values_of_expressions(text: str, expected: list[float], names: tuple[st
         ("(" * 300 + "a" + ")" * 300, "expected"),
     ],
 )
-def test_other_expressions_are_refused_in_one_line(text: str, expected: str) -> None:
+def test_other_expressions_are_refused_in_one_line(text, expected):
     with pytest.raises(ExpressionError) as caught:
         parse(text, HEADER, "j1.torque_nm")
     assert expected in str(caught.value)
@@ -249,7 +246,7 @@ def test_other_expressions_are_refused_in_one_line(text: str, expected: str) -> 
 
 
 @given(st.text(alphabet="ab`()+-*/. 019,sincospi_[]'\"=<>!lambdexr", max_size=60))
-def test_any_text_is_an_expression_or_an_expression_error(text: str) -> None:
+def test_any_text_is_an_expression_or_an_expression_error(text):
     try:
         found = parse(text, HEADER)
     except ExpressionError:

@@ -3,7 +3,6 @@
 import hashlib
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,7 @@ def joints(n: int, **changes: float) -> tuple[Joint, Joint]:
     return one._replace(**changes), two  # type: ignore[arg-type]
 
 
-def test_every_column_is_the_log_s_and_time_is_that_of_sync(tmp_path: Path) -> None:
+def test_every_column_is_the_log_s_and_time_is_that_of_sync(tmp_path):
     cycles = regular(50, joints)
     cycles = [cycle._replace(time_ns=cycle.time_ns + 1000 * (cycle.index % 7)) for cycle in cycles]
     logged = log_to_run(write_log(tmp_path / "a.mcap", cycles))
@@ -44,7 +43,7 @@ def test_every_column_is_the_log_s_and_time_is_that_of_sync(tmp_path: Path) -> N
     assert (logged.missed, logged.incomplete, logged.lost_share) == (0, 0, 0.0)
 
 
-def test_a_run_of_several_parts_is_one_table(tmp_path: Path) -> None:
+def test_a_run_of_several_parts_is_one_table(tmp_path):
     """A run longer than recording.rotate_s; the recorder was killed as well: cycles 30 to 34 are in both parts."""
     cycles = regular(90, joints)
     whole = log_to_run(write_log(tmp_path / "a.mcap", cycles))
@@ -59,7 +58,7 @@ def test_a_run_of_several_parts_is_one_table(tmp_path: Path) -> None:
         assert columns[0].motor_position_rad.tolist() == columns[1].motor_position_rad.tolist()
 
 
-def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path: Path) -> None:
+def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path):
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
         # joint 1 is enabled from 10 to 79, joint 2 from 20 to 89: the run is 20 to 79
@@ -73,7 +72,7 @@ def test_only_cycles_in_which_both_drives_are_enabled_are_the_run(tmp_path: Path
     assert column(logged.table, "current_a")[0] == pytest.approx(2.0)
 
 
-def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_path: Path) -> None:
+def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_path):
     """Switch on disabled, ready and switched on carry no current; quick stop active (1217h) does."""
     words = {10: 0x1250, 11: 0x1231, 12: 0x1233, 13: 0x1217}
 
@@ -89,7 +88,7 @@ def test_the_column_enabled_is_there_where_the_power_was_off_within_the_run(tmp_
     assert (logged.missed, logged.incomplete) == (0, 0)
 
 
-def test_missing_inputs_and_cycles_are_left_out_and_counted_by_input(tmp_path: Path) -> None:
+def test_missing_inputs_and_cycles_are_left_out_and_counted_by_input(tmp_path):
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
         if n in (5, 6):
@@ -114,7 +113,7 @@ def test_missing_inputs_and_cycles_are_left_out_and_counted_by_input(tmp_path: P
             assert column is None or np.isfinite(column).all()
 
 
-def test_a_sensor_without_a_value_leaves_the_rest(tmp_path: Path) -> None:
+def test_a_sensor_without_a_value_leaves_the_rest(tmp_path):
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
         return one._replace(sensor_nm=NAN, input_flags=3), two._replace(sensor_nm=NAN, input_flags=3)
@@ -127,7 +126,7 @@ def test_a_sensor_without_a_value_leaves_the_rest(tmp_path: Path) -> None:
         assert logged.table.joints[1].current_a is not None
 
 
-def test_a_joint_without_a_channel_of_the_sensor_has_no_torque(tmp_path: Path) -> None:
+def test_a_joint_without_a_channel_of_the_sensor_has_no_torque(tmp_path):
     def wanted(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
         return one, two._replace(sensor_nm=NAN, input_flags=3)
@@ -138,7 +137,7 @@ def test_a_joint_without_a_channel_of_the_sensor_has_no_torque(tmp_path: Path) -
     assert len(table.time_s) == 30
 
 
-def test_temperature_holds_between_its_frames_and_before_the_first_one(tmp_path: Path) -> None:
+def test_temperature_holds_between_its_frames_and_before_the_first_one(tmp_path):
     cycles = regular(40, joints)
 
     def with_frames(at: int, *frames: tuple[int, bytes]) -> None:
@@ -163,9 +162,7 @@ def test_temperature_holds_between_its_frames_and_before_the_first_one(tmp_path:
     ],
     ids=["in several chunks of 0.5 s", "before the motion only", "before and in the motion"],
 )
-def test_a_temperature_belongs_to_its_cycle(
-    tmp_path: Path, rows: int, first: int, frames: dict[int, float], expected: list[float]
-) -> None:
+def test_a_temperature_belongs_to_its_cycle(tmp_path, rows, first, frames, expected):
     """One from before the motion counts only where the motion has none: an emulated day begins with the motion."""
 
     def wanted(n: int) -> tuple[Joint, Joint]:
@@ -179,7 +176,7 @@ def test_a_temperature_belongs_to_its_cycle(
     assert column(table, "temperature_c").tolist() == pytest.approx(expected)
 
 
-def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
+def test_logs_without_a_motion_are_refused_in_one_line(tmp_path):
     def off(n: int) -> tuple[Joint, Joint]:
         one, two = joints(n)
         return one, two._replace(statusword=OFF)
@@ -200,7 +197,7 @@ def test_logs_without_a_motion_are_refused_in_one_line(tmp_path: Path) -> None:
             assert word in str(caught.value)
 
 
-def test_a_joint_with_one_encoder_has_no_link_position_and_a_note(tmp_path: Path) -> None:
+def test_a_joint_with_one_encoder_has_no_link_position_and_a_note(tmp_path):
     """The cycles of the other joint, which has one, are complete only with it."""
 
     def wanted(n: int) -> tuple[Joint, Joint]:
@@ -233,7 +230,7 @@ def four(n: int) -> tuple[Joint, ...]:
     )
 
 
-def test_one_to_four_joints_and_the_reference_of_those_that_have_one(tmp_path: Path) -> None:
+def test_one_to_four_joints_and_the_reference_of_those_that_have_one(tmp_path):
     for count in (1, 3, 4):
         cycles = regular(50, lambda n, count=count: four(n)[:count])  # type: ignore[misc]
         logged = log_to_run(write_log(tmp_path / f"{count}.mcap", cycles, count))
@@ -245,7 +242,7 @@ def test_one_to_four_joints_and_the_reference_of_those_that_have_one(tmp_path: P
     assert column(logged.table, "torque_nm", 3).tolist() == [3.0 + n for n in range(50)]
 
 
-def test_one_joint_alone_has_its_own_cycles(tmp_path: Path) -> None:
+def test_one_joint_alone_has_its_own_cycles(tmp_path):
     """Joint 4 is enabled before the others and loses inputs at other times."""
 
     def wanted(n: int) -> tuple[Joint, ...]:
@@ -263,7 +260,7 @@ def test_one_joint_alone_has_its_own_cycles(tmp_path: Path) -> None:
     assert len(log_to_run(path, joints=[2, 3]).table.time_s) == 20
 
 
-def test_the_last_motion_of_a_joint_begins_when_all_drives_are_enabled(tmp_path: Path) -> None:
+def test_the_last_motion_of_a_joint_begins_when_all_drives_are_enabled(tmp_path):
     """Joint 3 was brought to its place from 5 to 14; then it moves from 20 on, and joint 1 is enabled at 25 only."""
 
     def wanted(n: int) -> tuple[Joint, ...]:
@@ -283,7 +280,7 @@ def test_the_last_motion_of_a_joint_begins_when_all_drives_are_enabled(tmp_path:
     assert (last.missed, last.incomplete) == (0, 0), "losses of joint 4 do not count"
 
 
-def test_a_joint_that_was_never_enabled_is_left_out_with_a_note(tmp_path: Path) -> None:
+def test_a_joint_that_was_never_enabled_is_left_out_with_a_note(tmp_path):
     def wanted(n: int) -> tuple[Joint, ...]:
         one, two, three, last = four(n)
         return one._replace(statusword=OFF), two._replace(current_a=NAN), three, last
@@ -305,7 +302,7 @@ def test_a_joint_that_was_never_enabled_is_left_out_with_a_note(tmp_path: Path) 
     assert list(log_to_run(path, joints=[3, 5]).table.joints) == [3]
 
 
-def test_the_temperature_of_a_joint_is_that_of_the_node_in_the_attached_configuration(tmp_path: Path) -> None:
+def test_the_temperature_of_a_joint_is_that_of_the_node_in_the_attached_configuration(tmp_path):
     cycles = regular(40, four)
     cycles[5] = cycles[5]._replace(frames=[temperature(1, 31.0), temperature(12, 35.5)])
     own = "objects: {temperature: {index: 0x2040, factor: 0.01}}"
@@ -318,7 +315,7 @@ def test_the_temperature_of_a_joint_is_that_of_the_node_in_the_attached_configur
     assert table.joints[1].temperature_c is table.joints[4].temperature_c is None
 
 
-def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
+def test_the_account_holds_for_any_losses(tmp_path):
     for seed in range(8):
         rng = np.random.default_rng(seed)
         lost = rng.random((200, 4)) < 0.05
@@ -345,7 +342,7 @@ def test_the_account_holds_for_any_losses(tmp_path: Path) -> None:
         assert replace(logged, incomplete=0).lost_share <= logged.lost_share
 
 
-def test_the_parts_of_a_run_are_one_recording(tmp_path: Path) -> None:
+def test_the_parts_of_a_run_are_one_recording(tmp_path):
     """In segments: two parts of one run and a log of another; the second part lacks its first 60 ms."""
     cycles = regular(4000, joints)
     parts = [tmp_path / f"b-20260101T000000Z-000{k}.mcap" for k in (1, 2)]

@@ -15,11 +15,11 @@ from tests.sysid.runs.spoiled_runs import JOINTS, bench, checked, column, each_c
 
 
 @pytest.fixture(scope="module")
-def run() -> RunTable:
+def run():
     return bench()
 
 
-def test_uneven_time_is_brought_to_equal_steps(run: RunTable) -> None:
+def test_uneven_time_is_brought_to_equal_steps(run):
     """Straight lines survive a linear interpolation exactly, sines to their curvature."""
     kept = np.sort(np.random.default_rng(31).choice(len(run.time_s), 17000, replace=False))
     table = each_column(run, lambda x: x[kept])
@@ -43,7 +43,7 @@ def swing(time_s: np.ndarray[tuple[int], np.dtype[np.float64]]) -> RunTable:
 
 
 @pytest.mark.parametrize("jitter", [1e-4, 4e-4])
-def test_jitter_of_the_samples_is_no_jitter_of_stamps(jitter: float) -> None:
+def test_jitter_of_the_samples_is_no_jitter_of_stamps(jitter):
     t = 1e-3 * np.arange(8000) + jitter * np.sin(np.arange(8000.0))
     table, notes = on_even_steps(swing(t), "r")
     if jitter < 2e-4:
@@ -55,7 +55,7 @@ def test_jitter_of_the_samples_is_no_jitter_of_stamps(jitter: float) -> None:
 @pytest.mark.parametrize(
     ("spread", "digits"), [(8e-5, 9), (4e-4, 9), (5e-4, 3)], ids=["small", "large", "ms"]
 )
-def test_stamps_that_jitter_where_the_samples_do_not_are_corrected(spread: float, digits: int) -> None:
+def test_stamps_that_jitter_where_the_samples_do_not_are_corrected(spread, digits):
     """A computer's stamps, or rounded to milliseconds: by them a motor at 160 rad/s would jump by 0.1 rad."""
     rng = np.random.default_rng(4)
     step = 1e-3 if spread < 1e-4 else 4e-3
@@ -73,7 +73,7 @@ def test_stamps_that_jitter_where_the_samples_do_not_are_corrected(spread: float
 
 
 @pytest.mark.parametrize("name", ["link_position_rad", "motor_position_rad"])
-def test_positions_that_roll_over_are_made_continuous(run: RunTable, name: str) -> None:
+def test_positions_that_roll_over_are_made_continuous(run, name):
     position = column(run, name)
     rolled = np.mod(position - np.mean(position), 2.0 * math.pi)
     table, notes = unwrapped(having(run, **{name: rolled}), "r")
@@ -84,7 +84,7 @@ def test_positions_that_roll_over_are_made_continuous(run: RunTable, name: str) 
 
 
 @pytest.mark.parametrize("speed", [40.0, 300.0])
-def test_a_fast_motor_rolls_over_in_many_rows(speed: float) -> None:
+def test_a_fast_motor_rolls_over_in_many_rows(speed):
     """At 250 Hz a motor at 300 rad/s has five rows to a turn: every fifth step is a jump."""
     t = 0.004 * np.arange(3000)
     position = speed * np.sin(t)
@@ -98,7 +98,7 @@ def test_a_fast_motor_rolls_over_in_many_rows(speed: float) -> None:
 
 
 @pytest.mark.parametrize("late", [-300, -40, 25, 60, 250])
-def test_skew_is_measured_against_current_and_motion(run: RunTable, late: int) -> None:
+def test_skew_is_measured_against_current_and_motion(run, late):
     """late rows of 1 ms; rolled around the ends, which are 1.5 % of the run."""
     table = having(run, torque_nm=np.roll(column(run, "torque_nm"), late))
     assert skew_s(table, 1, JOINTS[1]) == pytest.approx(late / 1000, abs=0.006)
@@ -107,14 +107,12 @@ def test_skew_is_measured_against_current_and_motion(run: RunTable, late: int) -
     assert bool(result.refused) == (abs(late) >= 100)
 
 
-def test_channels_in_step_have_no_skew(run: RunTable) -> None:
+def test_channels_in_step_have_no_skew(run):
     assert [skew_s(run, number, JOINTS[number]) for number in (1, 2)] == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(("least", "late_s"), [(0.02, 0.105), (0.031, None)])
-def test_a_shift_counts_where_it_halves_the_residual(
-    monkeypatch: pytest.MonkeyPatch, least: float, late_s: float | None
-) -> None:
+def test_a_shift_counts_where_it_halves_the_residual(monkeypatch, least, late_s):
     """0.051 in step and 0.031 after 0.105 s come from slow motions with stiction, whose channels are in step."""
     t = np.arange(0.0, 20.0, 1e-3)
     velocity = np.sin(t)
