@@ -1,7 +1,7 @@
 """The campaigns that ship, efficiency, excitation and validate, for the joints of a bus that are moved together or alone.
 
 Two joints that share a channel of the torque sensor are on a towing bench, and so are those that --towing names. Every other
-joint is moved alone (`single_joint`). Each unit has its runs one after the other.
+joint is moved alone. Each unit has its runs one after the other.
 
 Runs at constant velocity and load are those of section II of the paper (efficiency) and of its section IV.A (validation).
 Runs at varying velocity and load are Fourier trajectories (`design`). Those of `excitation_runs` are optimised for the
@@ -41,7 +41,6 @@ from jtqd.sysid.planner.plan import (
     BETWEEN_S,
     DEFAULT_LIMITS,
     EDGE_S,
-    Fourier,
     Off,
     Plan,
     Plateau,
@@ -66,14 +65,14 @@ class Unit:
     measured: bool
 
     @property
-    def name(self) -> str:
-        """Of its runs: "joint_3", "joints_3_4"."""
-        return f"joint{'s' if len(self.joints) > 1 else ''}_{'_'.join(map(str, self.joints))}"
-
-    @property
     def title(self) -> str:
         """For people: "joint 3", "joints 3 and 4"."""
         return f"joint{'s' if len(self.joints) > 1 else ''} {' and '.join(map(str, self.joints))}"
+
+    @property
+    def name(self) -> str:
+        """Of its runs: "joint_3", "joints_3_4"."""
+        return self.title.replace(" and ", "_").replace(" ", "_")
 
     def refusal(self, kind: str) -> str:
         """Return why a campaign of this kind has no runs of these joints; "" where it has."""
@@ -321,20 +320,22 @@ def excitation_runs(
     duration_s = _trajectory_s(run_s, (2.0 * EDGE_S + BETWEEN_S), 2)
     # the second level changes after each pair of runs, so that either joint is the velocity joint at every level
     levels = [FULL_RAD_S] * count + [_SECOND_LEVELS[k // 2 % len(_SECOND_LEVELS)] for k in range(count)]
-    fourier: dict[int, Fourier] = {}
-    for level in dict.fromkeys(levels):
-        places = [k for k, each in enumerate(levels) if each == level]
-        made = design(
-            _design_limits(limits, level),
-            count=len(places),
-            duration_s=duration_s,
-            harmonics=HARMONICS,
-            seed=seed_of("excitation", level, seed),
-            evaluations=evaluations,
-            joints=joints,
-            on_progress=on_progress,
+    of_level = {
+        level: iter(
+            design(
+                _design_limits(limits, level),
+                count=levels.count(level),
+                duration_s=duration_s,
+                harmonics=HARMONICS,
+                seed=seed_of("excitation", level, seed),
+                evaluations=evaluations,
+                joints=joints,
+                on_progress=on_progress,
+            )
         )
-        fourier.update(zip(places, (one.segment for one in made), strict=True))
+        for level in dict.fromkeys(levels)
+    }
+    fourier = [next(of_level[level]).segment for level in levels]
     return tuple(
         trajectory_run(f"excitation_{k + 1:02d}", 1 + k % 2, fourier[k], fourier[count + k])
         for k in range(count)
@@ -571,41 +572,6 @@ def joint_plateau_run(number: int, motion: MotionRange, name: str, shares: Seque
     return Run(name, number, tuple(segments), None)
 
 
-def joint_excitation_runs(
-    number: int,
-    motion: MotionRange,
-    count: int,
-    run_s: float,
-    *,
-    seed: int,
-    evaluations: int,
-    ladder: Sequence[float] = LADDER,
-) -> tuple[Run, ...]:
-    """Return the plateaus and `count` runs of run_s [s] with two trajectories each, the first at full velocity, the
-    second at a part of it (SECOND_LEVELS).
-    """
-    duration_s = round(0.5 * (run_s - 2.0 * EDGE_S - BETWEEN_S), 3)
-    levels = [1.0] * count + [SECOND_LEVELS[k % len(SECOND_LEVELS)] for k in range(count)]
-    made = trajectories(motion, levels, duration_s, seed=seed, evaluations=evaluations)
-    runs = [
-        trajectory_run(f"excitation_{k + 1:02d}", number, made[k], made[count + k], current_joint=None)
-        for k in range(count)
-    ]
-    return joint_plateau_run(number, motion, "plateaus", ladder), *runs
-
-
-def joint_variable_runs(
-    number: int, motion: MotionRange, count: int, run_s: float, *, seed: int
-) -> tuple[Run, ...]:
-    """Return `count` runs of one drawn trajectory each, for validation only."""
-    duration_s = round(run_s - 2.0 * EDGE_S, 3)
-    made = trajectories(motion, [1.0] * count, duration_s, seed=seed, evaluations=1)
-    return tuple(
-        trajectory_run(f"variable_{k:02d}", number, each, current_joint=None)
-        for k, each in enumerate(made, 1)
-    )
-
-
 APPROACH_SHARE: Final = 0.3
 """Largest velocity of an approach, as a part of its limit."""
 APPROACH_S: Final = 1.0
@@ -634,23 +600,25 @@ def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) ->
 # Campaigns ------------------------------------------------------------------------------------------------------
 
 KINDS: Final = ("efficiency", "excitation", "validate")
-RUNS: Final = 24
-QUICK_RUNS: Final = 4
-ALONE_RUNS: Final = 12
-QUICK_ALONE_RUNS: Final = 2
-"""Of a joint that is moved alone."""
-EVALUATIONS: Final = 1000
-QUICK_EVALUATIONS: Final = 160
+_SIZES: Final = {
+    "runs": (24, 4),
+    "alone runs": (12, 2),
+    "hold_s": (HOLD_S, 1.0),
+    "excitation seconds": (24.0, 10.0),
+    "validate seconds": (12.0, 6.0),
+    "evaluations": (1000, 160),
+}
+"""Of a campaign as in the paper, and of a quick one: every kind of run, few of each."""
 _QUICK_VELOCITIES: Final = (0.4, 1.4, 2.4)
 _QUICK_CURRENTS: Final = (1.0, 2.5, 4.0)
 
 
 @dataclass(frozen=True)
 class Scale:
-    """Size of a campaign; None: as in the paper, or small with `quick` (every kind of run, few of each).
+    """Size of a campaign; None: by _SIZES.
 
-    runs, seconds: number and length of Fourier runs; hold_s: of a point at constant velocity; evaluations: of each
-    search; limits: of the plan, the Fourier runs stay well within them; joints: of the bench, None: those that ship.
+    runs, seconds: number and length of Fourier runs; hold_s: of a point at constant velocity; evaluations: of each search;
+    limits: of the plan, the Fourier runs stay well within them; joints: of the bench, None: those that ship.
     """
 
     runs: int | None = None
@@ -662,43 +630,40 @@ class Scale:
     limits: Limits = DEFAULT_LIMITS
     joints: Joints = None
 
-    def or_else(self, name: str, whole: Any, quick: Any) -> Any:
-        """Return an option as given, else by the size of the campaign."""
+    def value(self, name: str, of: str = "") -> Any:
+        """Return an option as given, else by the size of the campaign; of: what it belongs to in _SIZES."""
         given = getattr(self, name)
-        return given if given is not None else quick if self.quick else whole
+        return _SIZES[f"{of} {name}".strip()][self.quick] if given is None else given
 
     @property
     def motions_tried(self) -> int:
         """Number of motions that an excitation campaign tries before it begins."""
-        evaluations: int = self.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS)
-        runs: int = self.or_else("runs", RUNS, QUICK_RUNS)
+        evaluations: int = self.value("evaluations")
+        runs: int = self.value("runs")
         return 2 * runs * starts_of(evaluations) * evaluations
 
 
 def make_plan(kind: str, scale: Scale, on_progress: OnTried | None = None) -> Plan:
     """Return the plan of one of KINDS for joints 1 and 2 on a towing bench; on_progress: `scale.motions_tried` in all.
+
     Raises ConfigError for a scale that leaves nothing to be driven.
     """
-    limits, hold_s = scale.limits, scale.or_else("hold_s", HOLD_S, 1.0)
-    count = scale.or_else("runs", RUNS, QUICK_RUNS)
+    limits, hold_s = scale.limits, scale.value("hold_s")
     if kind == "efficiency":
         velocities = _QUICK_VELOCITIES if scale.quick else VELOCITIES_RAD_S
         currents = _QUICK_CURRENTS if scale.quick else None
-        runs = efficiency_runs(velocities, hold_s, currents, limits.travel_rad)
-    elif kind == "excitation":
-        runs = excitation_runs(
-            limits,
-            count,
-            scale.or_else("seconds", 24.0, 10.0),
-            seed=scale.seed,
-            evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
-            joints=scale.joints,
-            on_progress=on_progress,
-        )
-    else:
-        seconds = scale.or_else("seconds", 12.0, 6.0)
-        drawn = variable_runs(limits, count, seconds, seed=scale.seed, joints=scale.joints)
-        runs = validation_runs(hold_s) + drawn
+        return Plan(kind, limits, efficiency_runs(velocities, hold_s, currents, limits.travel_rad))
+    size = limits, scale.value("runs"), scale.value("seconds", kind)
+    if kind == "validate":
+        drawn = variable_runs(*size, seed=scale.seed, joints=scale.joints)
+        return Plan(kind, limits, validation_runs(hold_s) + drawn)
+    runs = excitation_runs(
+        *size,
+        seed=scale.seed,
+        evaluations=scale.value("evaluations"),
+        joints=scale.joints,
+        on_progress=on_progress,
+    )
     return Plan(kind, limits, runs)
 
 
@@ -720,12 +685,11 @@ def make_plan_of(
     runs: list[Run] = []
     limits: dict[int, Limits] = {}
     for unit in able:
-        if len(unit.joints) == 2:
-            one, two = unit.joints
-            of_pair = replace(scale, joints=(joints[one - 1], joints[two - 1]))
+        number, *other = unit.joints
+        if other:
+            of_pair = replace(scale, joints=(joints[number - 1], joints[other[0] - 1]))
             runs += [_driven_by(run, unit) for run in make_plan(kind, of_pair, on_progress).runs]
             continue
-        [number] = unit.joints
         motion = range_of(number, joints[number - 1], scale.limits)
         limits[number] = motion.limits
         runs += [replace(run, name=f"{unit.name}_{run.name}") for run in _alone(kind, number, motion, scale)]
@@ -741,17 +705,23 @@ def _driven_by(run: Run, unit: Unit) -> Run:
 
 
 def _alone(kind: str, number: int, motion: MotionRange, scale: Scale) -> tuple[Run, ...]:
-    count: int = scale.or_else("runs", ALONE_RUNS, QUICK_ALONE_RUNS)
+    """Return the runs of a joint that is moved alone; two trajectories in each one of an excitation, one for validation."""
+    count: int = scale.value("runs", "alone")
+    run_s: float = scale.value("seconds", kind)
     seed = seed_of(f"alone/{kind}", float(number), scale.seed)
     if kind == "validate":
-        seconds = scale.or_else("seconds", 12.0, 6.0)
-        return joint_variable_runs(number, motion, count, seconds, seed=seed)
-    return joint_excitation_runs(
-        number,
-        motion,
-        count,
-        scale.or_else("seconds", 24.0, 10.0),
-        seed=seed,
-        evaluations=scale.or_else("evaluations", EVALUATIONS, QUICK_EVALUATIONS),
-        ladder=QUICK_LADDER if scale.quick else LADDER,
+        duration_s = round(run_s - 2.0 * EDGE_S, 3)
+        drawn = trajectories(motion, [1.0] * count, duration_s, seed=seed, evaluations=1)
+        return tuple(
+            trajectory_run(f"variable_{k:02d}", number, each, current_joint=None)
+            for k, each in enumerate(drawn, 1)
+        )
+    duration_s = round(0.5 * (run_s - 2.0 * EDGE_S - BETWEEN_S), 3)
+    levels = [1.0] * count + [SECOND_LEVELS[k % len(SECOND_LEVELS)] for k in range(count)]
+    evaluations = scale.value("evaluations")
+    made = trajectories(motion, levels, duration_s, seed=seed, evaluations=evaluations)
+    plateaus = joint_plateau_run(number, motion, "plateaus", QUICK_LADDER if scale.quick else LADDER)
+    pairs = enumerate(zip(made[:count], made[count:], strict=True), 1)
+    return plateaus, *(
+        trajectory_run(f"excitation_{k:02d}", number, *pair, current_joint=None) for k, pair in pairs
     )

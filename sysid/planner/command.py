@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.command_line import command_parser, count, natural, seconds
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
@@ -48,52 +48,31 @@ def _positive(text: str) -> float:
 
 def parser() -> argparse.ArgumentParser:
     """Options of `jtq excitation`."""
-    made = argparse.ArgumentParser(
-        prog="jtq excitation",
-        description="Design Fourier trajectories of velocity and driving current to identify the losses of a joint\n"
+    made = command_parser(
+        "jtq excitation",
+        "Design Fourier trajectories of velocity and driving current to identify the losses of a joint\n"
         "(D-optimality, differential evolution).",
-        epilog=_EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        _EXAMPLES,
     )
     add = made.add_argument
     add("--count", type=count, default=8, metavar="N", help="runs (default 8)")
     add("--duration", type=seconds, default=20.0, metavar="S", help="length of a run (default 20)")
     add("--harmonics", type=count, default=5, metavar="N", help="of each series (default 5)")
     add("--seed", type=natural, default=0, metavar="N", help="same seed, same runs (default 0)")
-    add(
-        "--evaluations",
-        type=count,
-        metavar="N",
-        default=EVALUATIONS,
-        help=f"motions evaluated by a search (default {EVALUATIONS})",
-    )
-    add(
-        "--starts",
-        type=count,
-        metavar="N",
-        help=f"searches per run, of which the best is used (default {STARTS})",
-    )
-    add(
-        "--joints",
-        type=Path,
-        nargs=2,
-        metavar="FILE",
-        help="joint files of velocity joint and driving joint (default: the shipped ones)",
-    )
+    tried = f"motions evaluated by a search (default {EVALUATIONS})"
+    add("--evaluations", type=count, metavar="N", default=EVALUATIONS, help=tried)
+    starts = f"searches per run, of which the best is used (default {STARTS})"
+    add("--starts", type=count, metavar="N", help=starts)
+    files = "joint files of velocity joint and driving joint (default: the shipped ones)"
+    add("--joints", type=Path, nargs=2, metavar="FILE", help=files)
     add("--velocity-joint", type=int, choices=(1, 2), default=1, help="joint in velocity mode (default 1)")
     add("--out", type=Path, metavar="FILE", help="write the runs as a plan (jtq.plan/1) to this file")
     add("--json", action="store_true", help="print the result as JSON")
     group = made.add_argument_group("limits that no run exceeds")
     for one in fields(ExcitationLimits):
         option, unit, text = LIMIT_OPTIONS[one.name]
-        group.add_argument(
-            option,
-            dest=one.name,
-            type=_positive,
-            default=one.default,
-            metavar="X",
-            help=f"{text} [{unit}] (default {one.default:g})",
-        )
+        text += f" [{unit}] (default {one.default:g})"
+        group.add_argument(option, dest=one.name, type=_positive, default=one.default, metavar="X", help=text)
     return made
 
 
@@ -106,10 +85,8 @@ def main(argv: list[str]) -> int:
         print(f"jtq excitation: {error}", file=sys.stderr)
         return 1
     except OSError as error:
-        print(
-            f"jtq excitation: {error.filename or options.out or 'output'}: {error.strerror or error}",
-            file=sys.stderr,
-        )
+        where = error.filename or options.out or "output"
+        print(f"jtq excitation: {where}: {error.strerror or error}", file=sys.stderr)
         return 1
     return 0
 
@@ -153,11 +130,7 @@ def _design(options: argparse.Namespace) -> None:
     peaks = [_peaks(one.segment, joints) for one in designs]
     if options.json:
         found = [
-            {
-                "segment": segment_mapping(one.segment),
-                "information_log_det": one.information_log_det,
-                "peaks": peak,
-            }
+            asdict(one) | {"segment": segment_mapping(one.segment), "peaks": peak}
             for one, peak in zip(designs, peaks, strict=True)
         ]
         print(json.dumps({"schema": "jtq.excitation/1", "limits": asdict(limits), "runs": found}))

@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from itertools import repeat
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,7 +146,7 @@ class Candidates:
         self.duration_s: Final = duration_s
         self.dimension: Final = 4 * harmonics + 1
         self.omega_velocity, self.omega_current = fundamentals(duration_s)
-        time_s = np.linspace(0.0, duration_s, round(duration_s * rate_hz) + 1)
+        time_s = _grid(duration_s, rate_hz)
         pair = 2 * harmonics
         self._position, self._velocity, self._acceleration = unit_motions(
             self.omega_velocity, harmonics, duration_s, time_s
@@ -225,6 +225,10 @@ class Candidates:
         i = tuple((float(motion.current_scale[0, 0]) * genome[2 * H :]).tolist())
         trajectory = FourierTrajectory(self.omega_velocity, v[:H], v[H:], self.duration_s)
         return Fourier(trajectory, self._series(i)), motion
+
+
+def _grid(duration_s: float, rate_hz: float) -> FloatArray:
+    return np.linspace(0.0, duration_s, round(duration_s * rate_hz) + 1)
 
 
 def unit_motions(
@@ -452,35 +456,25 @@ def _polished(criterion: Criterion, found: Found, evaluations: int) -> Found:
     return best
 
 
-class Problem(Protocol):
-    """What is searched for one trajectory."""
-
-    @property
-    def dimension(self) -> int:
-        """Length of a genome."""
-
-    def criterion(self, before: FloatArray) -> Criterion:
-        """Return -log det of the information so far [p, p] plus that of each candidate, as a function of genomes."""
-
-    def finish(self, genome: FloatArray, before: FloatArray) -> tuple[Fourier, FloatArray]:
-        """Return the segment of a genome [d], scaled on the grid of the set-points, and the information so far with it."""
-
-
-Search = Callable[[Criterion, int, np.random.Generator], Found]
-"""(criterion, dimension, generator) -> the best genome found."""
-
-
-def sequence(problems: Iterable[Problem], search: Search, *, seed: int) -> list[tuple[Fourier, FloatArray]]:
+def sequence(
+    problems: Iterable[CoupledJoints | SingleJoint], *, seed: int, evaluations: int, starts: int = 0
+) -> list[tuple[Fourier, FloatArray]]:
     """Return a trajectory for each problem, the best one given those before it, and the information up to it.
 
-    Trajectory k of a seed has its own random numbers, whatever their number.
+    Trajectory k of a seed has its own random numbers, whatever their number. starts: searches for each, of which the best
+    counts; 0: one, with the trajectory's own generator.
     """
     designed: list[tuple[Fourier, FloatArray]] = []
     information: FloatArray = np.zeros((1, 1))
     for k, problem in enumerate(problems):
         rng = np.random.default_rng([seed, k])
-        found = search(problem.criterion(information), problem.dimension, rng)
-        segment, information = problem.finish(found.genome, information)
+        criterion = problem.criterion(information)
+        found = [
+            minimise(criterion, problem.dimension, evaluations=evaluations, rng=each)
+            for each in (rng.spawn(starts) if starts else [rng])
+        ]
+        genome = min(found, key=lambda one: one.value).genome
+        segment, information = problem.finish(genome, information)
         designed.append((segment, information))
     return designed
 
@@ -562,16 +556,10 @@ def design(
     _check_range("count", count, 1, 1000)
     _check_range("evaluations", evaluations, 1, 10_000_000)
     _check_range("starts", starts, 1, 1000)
-
-    def search(criterion: Criterion, dimension: int, rng: np.random.Generator) -> Found:
-        generators = rng.spawn(starts)
-        found = [minimise(criterion, dimension, evaluations=evaluations, rng=each) for each in generators]
-        return min(found, key=lambda one: one.value)
-
     problem = CoupledJoints(
         limits, duration_s=duration_s, harmonics=harmonics, joints=joints, on_progress=on_progress
     )
-    designed = sequence(repeat(problem, count), search, seed=seed)
+    designed = sequence(repeat(problem, count), seed=seed, evaluations=evaluations, starts=starts)
     return tuple(Design(segment, float(log_det(information))) for segment, information in designed)
 
 
@@ -623,12 +611,7 @@ class SingleJoint:
         self._motion, self._level, self._duration_s = motion, level, duration_s
         self._omega = fundamentals(duration_s)[0]
         self._coarse, self._fine = (
-            unit_motions(
-                self._omega,
-                HARMONICS,
-                duration_s,
-                np.linspace(0.0, duration_s, round(duration_s * rate_hz) + 1),
-            )
+            unit_motions(self._omega, HARMONICS, duration_s, _grid(duration_s, rate_hz))
             for rate_hz in (SEARCH_RATE_HZ, FINAL_RATE_HZ)
         )
 
@@ -646,15 +629,9 @@ class SingleJoint:
         """Return the information [m, 6, 6] of motions [3, m, n], per sample."""
         q, w, a = motion
         fastest = self._motion.velocity_rad_s
-        terms = (
-            np.tanh(w / (_DIRECTION_SHARE * fastest)),
-            w / fastest,
-            a / self._motion.acceleration_rad_s2,
-            np.sin(q),
-            np.cos(q),
-            np.ones_like(q),
-        )
-        x = np.stack(terms, axis=2)
+        friction = np.tanh(w / (_DIRECTION_SHARE * fastest)), w / fastest
+        load = a / self._motion.acceleration_rad_s2, np.sin(q), np.cos(q), np.ones_like(q)
+        x = np.stack((*friction, *load), axis=2)
         found: FloatArray = np.swapaxes(x, 1, 2) @ x / q.shape[1]
         return found
 
@@ -684,26 +661,21 @@ def trajectories(
             f"--seconds: found trajectories of {duration_s:g} s, expected at least {SHORTEST_TRAJECTORY_S:g} s"
         )
     problems = (SingleJoint(motion, level, duration_s) for level in levels)
-    designed = sequence(
-        problems,
-        lambda criterion, size, rng: minimise(criterion, size, evaluations=evaluations, rng=rng),
-        seed=seed,
-    )
-    return [segment for segment, _ in designed]
+    return [segment for segment, _ in sequence(problems, seed=seed, evaluations=evaluations)]
 
 
 # Currents of a torque -------------------------------------------------------------------------------------------
 
-_STEPS: Final = 200
-_OVER: Final = 3.0
-"""Largest current tried, in torques over G Kt."""
+STEPS: Final = 200
+OVER: Final = 3.0
+"""Number of currents tried, and the largest of them in torques over G Kt."""
 
 
 def current_at(joint: Joint, torque_nm: float, velocity_rad_s: float) -> float:
     """Return the current [A] at which the joint, driving at this velocity, gives this torque."""
     loss = LossModel(joint)
-    highest = _OVER * torque_nm / loss.torque_per_ampere
-    currents = np.linspace(0.0, highest, _STEPS)
+    highest = OVER * torque_nm / loss.torque_per_ampere
+    currents = np.linspace(0.0, highest, STEPS)
     speeds = np.full_like(currents, velocity_rad_s)
     given = loss.torque_per_ampere * currents - loss.loss_many(currents, speeds)
     enough = np.flatnonzero(given >= torque_nm)

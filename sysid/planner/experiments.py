@@ -22,7 +22,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import LossModel
 from jtqd.sysid.motion.setpoints import Limits
 from jtqd.sysid.planner.campaigns import LADDER, STEEPEST, allowed_torque, seed_of
-from jtqd.sysid.planner.design import Bench, ExcitationLimits, current_at, design, rounded_down
+from jtqd.sysid.planner.design import OVER, STEPS, Bench, ExcitationLimits, current_at, design, rounded_down
 from jtqd.sysid.planner.plan import (
     EDGE_S,
     Fourier,
@@ -46,9 +46,6 @@ _TORQUE_SHARE: Final = 0.7
 _CURRENT_SHARE: Final = 0.85
 _INERTIA_SHARE: Final = 0.25
 """Part of the rated torque that accelerates both rotors."""
-_STEPS: Final = 200
-_OVER: Final = 3.0
-"""Largest current tried, in rated torques over G Kt."""
 _RAMP_S: Final = 0.4
 _GENTLE: Final = 0.5
 """Part of the acceleration for changes between plateaus, which give no information."""
@@ -87,14 +84,14 @@ class PairRange:
         mover, driver = self.joints[velocity_joint - 1], self.joints[2 - velocity_joint]
         bound = _TORQUE_SHARE * self.limits.torque_nm
         nm_per_a = LossModel(driver).torque_per_ampere
-        most = min(self.own_current_a[2 - velocity_joint], _OVER * bound / nm_per_a)
+        most = min(self.own_current_a[2 - velocity_joint], OVER * bound / nm_per_a)
         if speed == 0.0:
             return min(most, bound / nm_per_a)
         bench = Bench(mover, driver)
-        currents = np.linspace(0.0, most, _STEPS)
-        good = np.ones(_STEPS, bool)
+        currents = np.linspace(0.0, most, STEPS)
+        good = np.ones(STEPS, bool)
         for share in (-1.0, -0.1, 0.1, 1.0):
-            velocity, still = np.full(_STEPS, share * speed), np.zeros(_STEPS)
+            velocity, still = np.full(STEPS, share * speed), np.zeros(STEPS)
             low, high = bench.torque_range(self.own_current_a[velocity_joint - 1], velocity, still)
             torque = bench.torque(currents, velocity, still)
             good &= (np.abs(torque) <= bound) & (low <= torque) & (torque <= high)
