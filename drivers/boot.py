@@ -39,15 +39,22 @@ import msgspec
 from msgspec import Meta, Struct
 
 from jtqd.drivers import nmt
-from jtqd.drivers.boot_node import BootedNode, BootError, BusSettings, NodeBoot, Profile, reset_during_boot
+from jtqd.drivers.boot_node import (
+    BootedNode,
+    BootError,
+    BusSettings,
+    NodeBoot,
+    NodeId,
+    Profile,
+    reset_during_boot,
+)
 from jtqd.drivers.bus_socket import exact
 from jtqd.drivers.drive import BY_TORQUE, CIA_402, DriveObjects, DriveProfile, Temperature, map_of
 from jtqd.drivers.emcy import EMCY_BASE, HISTORY_INDEX, Emergency, name_of, parse, register_text
 from jtqd.drivers.frame import FRAME, FRAME_SIZE
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.drivers.object_dictionary import ANY_IDENTITY, Identity, entries_to_json, read_eds
-from jtqd.drivers.own_objects import JTQD_NODE
-from jtqd.drivers.pdo import SYNC_COB_ID, SYNC_LISTEN_S, Tpdo
+from jtqd.drivers.pdo import SYNC_LISTEN_S, Tpdo
 from jtqd.drivers.sdo import ANSWER_S, PATIENCE, RESPONSE_ID, Key, SdoAbort, SdoClient, SdoTimeout, parse_key
 from jtqd.drivers.sensor import SensorProfile
 
@@ -55,9 +62,7 @@ from jtqd.drivers.sensor import SensorProfile
 
 _OPTIONAL_TIMEOUT_S = 0.5
 """An optional node is not waited for any longer: it is booted again when it appears."""
-_NodeId = Annotated[int, Meta(ge=1, le=127)]
 _Word = Annotated[int, Meta(ge=0, le=0xFFFF_FFFF)]
-_Ms = Annotated[int, Meta(ge=1, le=0xFFFF)]
 
 
 class RequestError(ValueError):
@@ -73,11 +78,16 @@ class _Node(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True, tag_f
         mandatory: the boot fails without it.
     """
 
-    node: _NodeId
+    node: NodeId
     identity: Identity = ANY_IDENTITY
     given: dict[str, _Word] = {}
     sdo_timeout_ms: Annotated[int, Meta(ge=10, le=10_000)] | None = None
     mandatory: bool = True
+
+    @property
+    def given_values(self) -> dict[Key, int]:
+        """The values of `given` by index and sub-index. Raises ValueError."""
+        return {parse_key(key): value for key, value in self.given.items()}
 
 
 class DriveNode(_Node, frozen=True, kw_only=True, tag="drive"):
@@ -96,16 +106,9 @@ class DriveNode(_Node, frozen=True, kw_only=True, tag="drive"):
         if current.by == BY_TORQUE and not current.factor and self.torque_constant_nm_per_a <= 0.0:
             found = self.torque_constant_nm_per_a
             raise ValueError(f"torque_constant_nm_per_a: found {found}, expected a number above 0")
-        return DriveProfile(
-            self.node,
-            self.identity,
-            {parse_key(key): value for key, value in self.given.items()},
-            self.temperature,
-            self.objects,
-            tuple(map_of(self.node, each, self.objects) for each in self.tpdos),
-            self.torque_constant_nm_per_a,
-            self.acyclic,
-        )
+        maps = tuple(map_of(self.node, each, self.objects) for each in self.tpdos)
+        options = self.temperature, self.objects, maps, self.torque_constant_nm_per_a, self.acyclic
+        return DriveProfile(self.node, self.identity, self.given_values, *options)
 
 
 class SensorNode(_Node, frozen=True, kw_only=True, tag="sensor"):
@@ -117,45 +120,23 @@ class SensorNode(_Node, frozen=True, kw_only=True, tag="sensor"):
     @property
     def profile(self) -> SensorProfile:
         """The sensor as the boot configures it. Raises ValueError."""
-        given = {parse_key(key): value for key, value in self.given.items()}
         words = {int(word, 0): nm for word, nm in self.unit_words.items()}
-        return SensorProfile(self.node, self.identity, self.channels, given, words)
+        return SensorProfile(self.node, self.identity, self.channels, self.given_values, words)
 
 
-class Sync(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """SYNC of the bus.
-
-    Attributes:
-        counter_overflow: 1019h (0: SYNC without counter); None: left alone.
-        check_foreign: refuse a bus with another SYNC producer; off beside jtqd's own SYNC.
-    """
-
-    cob_id: Annotated[int, Meta(ge=1, le=0x7FF)] = SYNC_COB_ID
-    counter_overflow: Annotated[int, Meta(ge=0, le=240)] | None = None
-    check_foreign: bool = True
-
-
-class BootRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class BootRequest(BusSettings, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Which nodes to boot on which bus.
 
     Attributes:
         bus: CAN interface or unix:PATH.
-        master_timeout_ms: for so long a drive waits for jtqd's heartbeat (1016h:1).
-        heartbeat_ms: 1017h of all nodes, and period of jtqd's own heartbeat.
         answer_timeout_s: longest wait for the answer of a mandatory node.
-        error_behaviour: 1029h:1; None: left alone.
         reset: begin with NMT reset communication.
     """
 
     bus: Annotated[str, Meta(min_length=1)]
     nodes: Annotated[tuple[DriveNode | SensorNode, ...], Meta(min_length=1)]
-    master_node: _NodeId = JTQD_NODE
-    heartbeat_ms: _Ms = 100
-    master_timeout_ms: _Ms = 500
     answer_timeout_s: Annotated[float, Meta(gt=0.0, le=60.0)] = 0.5
-    error_behaviour: Annotated[int, Meta(ge=0, le=2)] | None = None
     reset: bool = True
-    sync: Sync = Sync()
 
     def __post_init__(self) -> None:
         numbers = [each.node for each in self.nodes]
@@ -177,30 +158,20 @@ class BootRequest(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
         """The nodes as the boot configures them, in its order."""
         return tuple(each.profile for each in self.nodes)
 
-    @property
-    def settings(self) -> BusSettings:
-        """What all nodes have in common."""
-        return BusSettings(
-            master_node=self.master_node,
-            master_timeout_ms=self.master_timeout_ms,
-            heartbeat_ms=self.heartbeat_ms,
-            sync_cob_id=self.sync.cob_id,
-            counter_overflow=self.sync.counter_overflow,
-            error_behaviour=self.error_behaviour,
-        )
+    def _node(self, node: int) -> DriveNode | SensorNode:
+        (found,) = (each for each in self.nodes if each.node == node)
+        return found
 
     def timeout_s(self, node: int) -> float:
         """Return how long a node may take for its first answer."""
-        (found,) = (each for each in self.nodes if each.node == node)
-        longest = (
-            self.answer_timeout_s if found.mandatory else min(_OPTIONAL_TIMEOUT_S, self.answer_timeout_s)
-        )
+        found, longest = self._node(node), self.answer_timeout_s
+        longest = longest if found.mandatory else min(_OPTIONAL_TIMEOUT_S, longest)
         return max(longest, (found.sdo_timeout_ms or 0) * 1e-3)
 
     def answer_s(self, node: int) -> float:
         """Return the silence of a node after which a request is repeated."""
-        (found,) = (each for each in self.nodes if each.node == node)
-        return ANSWER_S if found.sdo_timeout_ms is None else found.sdo_timeout_ms * 1e-3
+        timeout_ms = self._node(node).sdo_timeout_ms
+        return ANSWER_S if timeout_ms is None else timeout_ms * 1e-3
 
 
 def parse_request(raw: object) -> BootRequest:
@@ -267,17 +238,17 @@ class BootBus:
     """
 
     def __init__(self, request: BootRequest) -> None:
-        self._settings, self._first = request.settings, request.sync.check_foreign
+        self._settings, self._first = request, request.sync.check_foreign
         self.states: dict[int, int] = {}
         self.restarted: set[int] = set()
         self.boot_ups: Counter[int] = Counter()
         self.emergencies: dict[int, Emergency] = {}
         self._syncs = self._own_ids = 0
-        self._own_id = nmt.HEARTBEAT_BASE + request.settings.master_node
+        self._own_id = nmt.HEARTBEAT_BASE + request.master_node
         bases = RESPONSE_ID, nmt.HEARTBEAT_BASE, EMCY_BASE
         identifiers = [base + profile.node_id for profile in request.profiles for base in bases]
         if self._first:
-            identifiers += [request.settings.sync_cob_id, self._own_id]
+            identifiers += [request.sync.cob_id, self._own_id]
         self._socket = open_frame_socket(request.bus, [exact(each) for each in identifiers])
         self.frames = self._socket.frames
         self._since, self._beat_due = time.monotonic(), inf
@@ -332,7 +303,7 @@ class BootBus:
         elif can_id >= nmt.HEARTBEAT_BASE:
             if len(data) == 1:
                 self._on_heartbeat(can_id - nmt.HEARTBEAT_BASE, data[0])
-        elif can_id == self._settings.sync_cob_id:
+        elif can_id == self._settings.sync.cob_id:
             self._syncs += 1
         elif can_id < RESPONSE_ID:
             self.emergencies[can_id - EMCY_BASE] = parse(data)
@@ -373,7 +344,7 @@ class BootBus:
         self.run(self._since + SYNC_LISTEN_S - time.monotonic())
         if self._syncs:
             # it would make every input's cycle ambiguous
-            where = f"COB-ID {self._settings.sync_cob_id:03X}h"
+            where = f"COB-ID {self._settings.sync.cob_id:03X}h"
             detail = f"another SYNC producer is on the bus ({where}, {self._syncs} frames during boot)"
             raise BootError(None, where, expected="no SYNC", found=f"{self._syncs} frames", detail=detail)
         if self._own_ids:
@@ -395,7 +366,7 @@ def boot(request: BootRequest, bus: BootBus) -> BootReport:
     # Before anything is sent: a second daemon must not disturb the one that runs.
     bus.require_one_master()
     bus.begin_heartbeat()
-    wait_s = max(3 * request.settings.heartbeat_ms, 100) * 1e-3
+    wait_s = max(3 * request.heartbeat_ms, 100) * 1e-3
     booted: dict[int, BootedNode] = {}
     absent: dict[int, BootError] = {}
     mandatory = {each.node for each in request.nodes if each.mandatory}
@@ -456,15 +427,14 @@ def _configure(bus: BootBus, request: BootRequest, profile: Profile, *, ran: Col
     for attempt in range(1, _ATTEMPTS + 1):
         # A running node would refuse to be re-mapped, and a stopped one does not answer SDO.
         bus.command(nmt.ENTER_PRE_OPERATIONAL, node)
-        procedure = NodeBoot(sdo, profile, request.settings)
+        procedure = NodeBoot(sdo, profile, request)
         device_type = procedure.check_device_type()
         sdo.wait_longer(PATIENCE * answer_s)
         bus.forget(node)  # a boot-up message up to its first answer is its own start
         booted = procedure.run(device_type)
         if not (request.reset and node in bus.restarted and attempt < _ATTEMPTS):
             break
-        again = "it sent its boot-up message again during its configuration: configured once more"
-        notes.append(again)
+        notes.append("it sent its boot-up message again during its configuration: configured once more")
     return replace(booted, notes=(*notes, *booted.notes), boot_ups=bus.boot_ups[node])
 
 

@@ -15,7 +15,9 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from typing import Annotated
+
+from msgspec import Meta, Struct
 
 from jtqd.drivers.drive import (
     EVENT_MS,
@@ -28,6 +30,7 @@ from jtqd.drivers.drive import (
     select_tpdos,
     tpdos_as_json,
 )
+from jtqd.drivers.own_objects import JTQD_NODE
 from jtqd.drivers.pdo import (
     ACYCLIC,
     CAN_ID,
@@ -51,7 +54,6 @@ from jtqd.drivers.sdo import (
     SdoAbort,
     SdoAccess,
     SdoTimeout,
-    describe_abort,
     label,
 )
 from jtqd.drivers.sensor import OPERATING_MODE_OBJECT, SensorProfile, SensorScaling, sensor_scaling
@@ -123,12 +125,8 @@ class NodeObjects:
 
     def read(self, key: Key, letter: str = "") -> bytes | None:
         """Upload an object as bytes, which are not kept in `values`; None when the device does not have it."""
-        try:
-            return self._read(key, letter)
-        except SdoAbort as abort:
-            if abort.code in (NO_OBJECT, NO_SUBINDEX):
-                return None
-            raise self._refused(key, "read", abort, letter) from abort
+        found = self._upload(key, letter)
+        return None if isinstance(found, SdoAbort) else found
 
     def best_effort(self, key: Key) -> bytes | None:
         """Upload an object that nothing depends on; None where the device gives none, for whatever reason."""
@@ -137,18 +135,21 @@ class NodeObjects:
         except (SdoAbort, SdoTimeout):
             return None
 
+    def optional_number(self, key: Key, size: int, letter: str = "") -> int | None:
+        """Upload a number; None when the device does not have it."""
+        found = self._upload(key, letter)
+        return None if isinstance(found, SdoAbort) else self._keep(key, found, size)
+
     def number(self, key: Key, size: int, letter: str = "") -> int:
         """Upload a number that the device must have."""
-        try:
-            raw = self._read(key, letter)
-        except SdoAbort as abort:
-            raise self._refused(key, "read", abort, letter) from abort
-        return self._keep(key, raw, size)
+        found = self._upload(key, letter)
+        if isinstance(found, SdoAbort):
+            raise self._refused(key, "read", found, letter)
+        return self._keep(key, found, size)
 
-    def optional_number(self, key: Key, size: int) -> int | None:
-        """Upload a number; None when the device does not have it."""
-        raw = self.read(key)
-        return None if raw is None else self._keep(key, raw, size)
+    def _keep(self, key: Key, raw: bytes, size: int) -> int:
+        self.values[key] = value = int.from_bytes(raw[:size], "little")
+        return value
 
     def write(self, key: Key, value: int, size: int) -> None:
         """Download a number; a negative one as its two's complement."""
@@ -173,15 +174,16 @@ class NodeObjects:
         self.write(key, value, size)
         self.require(key, value, size, name)
 
-    def _read(self, key: Key, letter: str) -> bytes:
+    def _upload(self, key: Key, letter: str) -> bytes | SdoAbort:
+        """Return the object's bytes, or the abort of a device that does not have it."""
         try:
             return self.access.read(*key)
         except SdoTimeout as timeout:
             raise self._no_answer(key, timeout, letter) from timeout
-
-    def _keep(self, key: Key, raw: bytes, size: int) -> int:
-        self.values[key] = value = int.from_bytes(raw[:size], "little")
-        return value
+        except SdoAbort as abort:
+            if abort.code in (NO_OBJECT, NO_SUBINDEX):
+                return abort
+            raise self._refused(key, "read", abort, letter) from abort
 
     def _no_answer(self, key: Key, timeout: SdoTimeout, letter: str) -> BootError:
         where = label(*key)
@@ -190,10 +192,10 @@ class NodeObjects:
 
     def _refused(self, key: Key, what: str, abort: SdoAbort, letter: str) -> BootError:
         """`what` is "read" or "write of 0x60640020"."""
-        where, found = label(*key), describe_abort(abort.code)
-        detail = f"{where}: {what} refused: {found}"
+        where, found = label(*key), str(abort)
+        text = f"{where}: {what} refused: {found}"
         return BootError(
-            self.node, where, expected=f"{what} accepted", found=found, letter=letter, detail=detail
+            self.node, where, expected=f"{what} accepted", found=found, letter=letter, detail=text
         )
 
 
@@ -211,25 +213,39 @@ _ABORT_OPTION: Key = (0x6007, 0)
 _SYNC_PRODUCER = 1 << 30  # of 1005h
 
 
-@dataclass(frozen=True)
-class BusSettings:
+NodeId = Annotated[int, Meta(ge=1, le=127)]
+_Ms = Annotated[int, Meta(ge=1, le=0xFFFF)]
+
+
+class Sync(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """SYNC of the bus.
+
+    Attributes:
+        cob_id: 1005h must hold it.
+        counter_overflow: 1019h (0: SYNC without counter); None: left alone.
+        check_foreign: refuse a bus with another SYNC producer; off beside jtqd's own SYNC.
+    """
+
+    cob_id: Annotated[int, Meta(ge=1, le=0x7FF)] = SYNC_COB_ID
+    counter_overflow: Annotated[int, Meta(ge=0, le=240)] | None = None
+    check_foreign: bool = True
+
+
+class BusSettings(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Settings that are the same for all nodes.
 
     Attributes:
         master_node: node number of jtqd, whose heartbeat the drives watch for `master_timeout_ms` (1016h:1).
-        heartbeat_ms: 1017h.
-        sync_cob_id: 1005h must hold it.
-        counter_overflow: 1019h (0: SYNC without counter); None: left alone.
+        heartbeat_ms: 1017h of all nodes, and period of jtqd's own heartbeat.
         error_behaviour: 1029h:1, what a node does when it misses the master's heartbeat: 0 pre-operational, 1 nothing,
             2 stopped; None: left alone.
     """
 
-    master_node: int
-    master_timeout_ms: int = 500
-    heartbeat_ms: int = 100
-    sync_cob_id: int = SYNC_COB_ID
-    counter_overflow: int | None = None
-    error_behaviour: int | None = None
+    master_node: NodeId = JTQD_NODE
+    master_timeout_ms: _Ms = 500
+    heartbeat_ms: _Ms = 100
+    sync: Sync = Sync()
+    error_behaviour: Annotated[int, Meta(ge=0, le=2)] | None = None
 
 
 @dataclass(frozen=True)
@@ -261,33 +277,35 @@ class BootedNode:
 
     def as_json(self) -> dict[str, object]:
         """Return it for a report; `scaling` holds the fields of DriveScaling or SensorScaling."""
-        return {
-            "name": self.name,
-            "device_type": self.device_type,
-            "serial": self.serial,
-            "scaling": asdict(self.scaling),
-            "gear_ratio": self.gear_ratio,
-            "tpdos": tpdos_as_json(self.tpdos),
-            "configuration_sha256": self.configuration_sha256,
-            "signed": self.signed,
-            "watched": [list(each) for each in self.watched],
-            "notes": list(self.notes),
-            "boot_ups": self.boot_ups,
-        }
+        own = {name: value for name, value in vars(self).items() if name != "node_id"}
+        return {**own, "scaling": asdict(self.scaling), "tpdos": tpdos_as_json(self.tpdos)}
 
 
 # TPDOs
 
-_INHIBIT_TIME, _EVENT_TIMER = 3, 5
-"""Sub-indices of a PDO's communication parameter."""
+_Row = tuple[Key, int, int, str]
+"""An object of a TPDO: key, wanted value, size, name in words."""
 
 
-class _Change(NamedTuple):
-    """One write, and the value that the object had."""
+def _mapping_rows(pdo: PdoMap, transmission_type: int) -> list[_Row]:
+    """Return number of entries, entries and transmission type of a TPDO."""
+    communication, mapping = tpdo_parameters(pdo.number)
+    return [
+        ((mapping, 0), len(pdo.words), 1, "number of mapped objects"),
+        *(((mapping, entry), word, 4, "mapping entry") for entry, word in enumerate(pdo.words, 1)),
+        ((communication, 2), transmission_type, 1, "transmission type"),
+    ]
 
-    key: Key
-    before: int
-    size: int
+
+def _timer_rows(pdo: PdoMap) -> list[_Row]:
+    """Return inhibit time and event timer of the temperature's TPDO; the others have none."""
+    if not _is_temperature(pdo):
+        return []
+    communication = tpdo_parameters(pdo.number)[0]
+    return [
+        ((communication, 3), 10 * EVENT_MS, 2, "inhibit time in 100 us"),
+        ((communication, 5), EVENT_MS, 2, "event timer in ms"),
+    ]
 
 
 class TpdoSetup:
@@ -301,7 +319,7 @@ class TpdoSetup:
 
     def __init__(self, objects: NodeObjects, profile: Profile, notes: list[str]) -> None:
         self._objects, self._profile, self._notes = objects, profile, notes
-        self._changes: list[_Change] = []
+        self._changes: list[tuple[Key, int, int]] = []  # writes: key, value before, size
         self._written: dict[Key, int] = {}
 
     def run(self) -> tuple[PdoMap, ...]:
@@ -324,20 +342,25 @@ class TpdoSetup:
 
     def _as_wanted(self, pdo: PdoMap) -> bool:
         """Return whether a TPDO is valid and as wanted."""
-        objects, (communication, mapping) = self._objects, tpdo_parameters(pdo.number)
-        cob_id = objects.number((communication, 1), 4)
+        cob_id = self._objects.number((tpdo_parameters(pdo.number)[0], 1), 4)
+        count, *mapping = _mapping_rows(pdo, pdo.transmission_type)
         return (
-            objects.number((mapping, 0), 1) == len(pdo.words)
+            self._holds(count)
             and cob_id & ~NO_RTR == pdo.cob_id
-            and all(objects.number((mapping, n), 4) == word for n, word in enumerate(pdo.words, 1))
-            and objects.number((communication, 2), 1) == pdo.transmission_type
-            and (not _is_temperature(pdo) or self._timers_as_wanted(communication))
+            and all(self._holds(row) for row in mapping)
+            and self._timers_as_wanted(pdo)
         )
 
-    def _timers_as_wanted(self, communication: int) -> bool:
-        inhibit = self._objects.optional_number((communication, _INHIBIT_TIME), 2)
-        timer = self._objects.optional_number((communication, _EVENT_TIMER), 2)
-        return inhibit in (None, 10 * EVENT_MS) and timer == EVENT_MS
+    def _holds(self, row: _Row) -> bool:
+        key, value, size, _ = row
+        return self._objects.number(key, size) == value
+
+    def _timers_as_wanted(self, pdo: PdoMap) -> bool:
+        if not _is_temperature(pdo):
+            return True
+        (inhibit, due, _, _), (timer, period, _, _) = _timer_rows(pdo)
+        found = self._objects.optional_number(inhibit, 2)
+        return self._objects.optional_number(timer, 2) == period and found in (None, due)
 
     def _write(self, pdo: PdoMap) -> None:
         """Map a TPDO; `_as_wanted` has read its COB-ID."""
@@ -345,12 +368,14 @@ class TpdoSetup:
         cob_id = objects.values[communication, 1]
         self._change((communication, 1), cob_id | INVALID, 4)
         self._change((mapping, 0), 0, 1)
-        for entry, word in enumerate(pdo.words, 1):
-            self._change((mapping, entry), word, 4)
-        self._change((mapping, 0), len(pdo.words), 1)
-        self._change((communication, 2), pdo.transmission_type, 1)
-        if _is_temperature(pdo):
-            self._set_timers(communication)
+        count, *entries, kind = _mapping_rows(pdo, pdo.transmission_type)
+        for key, value, size, _ in (*entries, count, kind):
+            self._change(key, value, size)
+        for at, (key, value, size, name) in enumerate(_timer_rows(pdo)):
+            if at == 0 and objects.read(key) is None:
+                continue  # a node need not have an inhibit time; with one, a value that flickers does not fill the bus
+            self._change(key, value, size)
+            objects.require(key, value, size, name)
         # the device's own RTR bit is kept: some accept one value only
         valid = cob_id & NO_RTR | pdo.cob_id
         self._change((communication, 1), valid, 4)
@@ -362,20 +387,8 @@ class TpdoSetup:
 
     def _require_mapping(self, pdo: PdoMap, transmission_type: int) -> None:
         """Read mapping and transmission type back."""
-        communication, mapping = tpdo_parameters(pdo.number)
-        self._objects.require((mapping, 0), len(pdo.words), 1, "number of mapped objects")
-        for entry, word in enumerate(pdo.words, 1):
-            self._objects.require((mapping, entry), word, 4, "mapping entry")
-        self._objects.require((communication, 2), transmission_type, 1, "transmission type")
-
-    def _set_timers(self, communication: int) -> None:
-        """Set event timer, and inhibit time where the node has one: a value that flickers must not fill the bus."""
-        inhibit, timer = (communication, _INHIBIT_TIME), (communication, _EVENT_TIMER)
-        if self._objects.read(inhibit) is not None:
-            self._change(inhibit, 10 * EVENT_MS, 2)
-            self._objects.require(inhibit, 10 * EVENT_MS, 2, "inhibit time in 100 us")
-        self._change(timer, EVENT_MS, 2)
-        self._objects.require(timer, EVENT_MS, 2, "event timer in ms")
+        for row in _mapping_rows(pdo, transmission_type):
+            self._objects.require(*row)
 
     def _change(self, key: Key, value: int, size: int) -> None:
         """Write a number, and remember the one that it replaces."""
@@ -386,7 +399,7 @@ class TpdoSetup:
         self._objects.write(key, value, size)
         self._written[key] = value
         if before is not None:
-            self._changes.append(_Change(key, before, size))
+            self._changes.append((key, before, size))
 
     def _switch_off(self, number: int) -> None:
         key = (tpdo_parameters(number)[0], 1)
@@ -426,7 +439,7 @@ class TpdoSetup:
         """
         for change in reversed(self._changes):
             with suppress(BootError):
-                self._objects.write(change.key, change.before, change.size)
+                self._objects.write(*change)
         self._changes.clear()
         self._written.clear()
 
@@ -531,6 +544,7 @@ class NodeBoot:
 
     def run(self, device_type: int) -> BootedNode:
         """Do all steps between `check_device_type`, whose result it takes, and error control and NMT start."""
+        objects, profile = self._objects, self._profile
         serial = self.check_identity()
         self.check_temperature()
         tpdos = self.configure_pdos()
@@ -538,33 +552,20 @@ class NodeBoot:
         self.configure_heartbeat()
         self.configure_error_behaviour()
         scaling, gear_ratio = self.read_scaling()
-        watched = watched_objects(self._objects.values, self._profile.scaling_objects)
-        sha256 = configuration_sha256(self._objects.values)
+        watched = watched_objects(objects.values, profile.scaling_objects)
+        sha256 = configuration_sha256(objects.values)
         signed = self.sign(sha256)
-        name = self._objects.best_effort((0x1008, 0)) or b""
-        return BootedNode(
-            node_id=self._node,
-            name=printable(name),
-            device_type=device_type,
-            serial=serial,
-            scaling=scaling,
-            gear_ratio=gear_ratio,
-            tpdos=tpdos,
-            configuration_sha256=sha256,
-            signed=signed,
-            watched=watched,
-            notes=tuple(self._notes),
-        )
+        name = printable(objects.best_effort((0x1008, 0)) or b"")
+        ids, found = (self._node, name, device_type, serial), (scaling, gear_ratio, tpdos)
+        return BootedNode(*ids, *found, sha256, signed, watched, tuple(self._notes))
 
     def check_device_type(self) -> int:
         """Check 1000h, whose low word is the number of the device profile (402, 404), and return it."""
         found = self._objects.number((0x1000, 0), 4, letter="B")
         number = self._profile.profile_number
         if found & 0xFFFF != number:
-            expected = f"profile {number} (0x....{number:04X})"
-            raise mismatch(
-                self._node, (0x1000, 0), "device type", expected=expected, found=f"0x{found:08X}", letter="C"
-            )
+            expected, text = f"profile {number} (0x....{number:04X})", f"0x{found:08X}"
+            raise mismatch(self._node, (0x1000, 0), "device type", expected=expected, found=text, letter="C")
         return found
 
     def check_identity(self) -> int:
@@ -600,11 +601,9 @@ class NodeBoot:
         profile = self._profile
         wanted = profile.temperature if isinstance(profile, DriveProfile) else None
         if wanted is not None and self._objects.read(wanted.key) is None:
-            expected = "a value (required by the configuration)"
+            expected, found = "a value (required by the configuration)", "no such object"
             what = "joint temperature"
-            raise mismatch(
-                self._node, wanted.key, what, expected=expected, found="no such object", letter="J"
-            )
+            raise mismatch(self._node, wanted.key, what, expected=expected, found=found, letter="J")
 
     def configure_pdos(self) -> tuple[PdoMap, ...]:
         """Set up the TPDOs and return those that are used (`TpdoSetup`)."""
@@ -612,19 +611,18 @@ class NodeBoot:
 
     def configure_sync(self) -> None:
         """Check that 1005h is jtqd's SYNC; make 1019h tell whether it has a counter byte."""
-        wanted = self._settings.sync_cob_id
+        wanted = self._settings.sync.cob_id
         found = self._objects.optional_number((0x1005, 0), 4)
         if found is None:  # as some have it that list no 1005h
             self._notes.append(f"no 1005h: its SYNC is taken to be the default {wanted:03X}h")
             found = wanted
         if found & CAN_ID != wanted:
-            raise mismatch(
-                self._node, (0x1005, 0), "COB-ID SYNC", expected=f"{wanted:03X}h", found=f"0x{found:08X}"
-            )
+            expected, text = f"{wanted:03X}h", f"0x{found:08X}"
+            raise mismatch(self._node, (0x1005, 0), "COB-ID SYNC", expected=expected, found=text)
         if found & _SYNC_PRODUCER:
             self._objects.put((0x1005, 0), found & ~_SYNC_PRODUCER, 4, "COB-ID SYNC")
             self._notes.append("1005h: it was a SYNC producer, which jtqd is")
-        overflow, key = self._settings.counter_overflow, (0x1019, 0)
+        overflow, key = self._settings.sync.counter_overflow, (0x1019, 0)
         if overflow is None:
             return
         counts = self._objects.optional_number(key, 1)
@@ -648,9 +646,8 @@ class NodeBoot:
         if emcy is not None:
             cob_id, expected = int.from_bytes(emcy[:4], "little"), 0x080 + self._node
             if cob_id & (INVALID | CAN_ID) != expected:
-                self._notes.append(
-                    f"1014h COB-ID EMCY: expected {expected:03X}h, found 0x{cob_id:08X}: its EMCY messages are not read"
-                )
+                text = f"1014h COB-ID EMCY: expected {expected:03X}h, found 0x{cob_id:08X}"
+                self._notes.append(f"{text}: its EMCY messages are not read")
 
     def _try(self, key: Key, value: int, size: int, name: str) -> str:
         """Write and read back what a node can do without; return why it does, "" where it has it."""
@@ -676,9 +673,8 @@ class NodeBoot:
         if isinstance(self._profile, DriveProfile):
             option = self._objects.best_effort(_ABORT_OPTION)
             if option is not None and not any(option):
-                self._notes.append(
-                    "6007h abort connection option is 0: the drive does not stop when jtqd's heartbeat ends"
-                )
+                text = "6007h abort connection option is 0"
+                self._notes.append(f"{text}: the drive does not stop when jtqd's heartbeat ends")
 
     def sign(self, sha256: str) -> bool:
         """Write the signature to 1020h where the node has it; it holds until the configuration is changed (CiA 301)."""

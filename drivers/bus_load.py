@@ -42,11 +42,6 @@ class Row:
         """Bits per cycle with every possible stuff bit, intermission included."""
         return worst_case_bits(self.length) * self.per_cycle
 
-    @property
-    def unstuffed_bits(self) -> float:
-        """Bits per cycle without any stuff bit."""
-        return unstuffed_bits(self.length) * self.per_cycle
-
 
 @dataclass(frozen=True)
 class BusLoad:
@@ -69,7 +64,7 @@ class BusLoad:
     @property
     def unstuffed(self) -> float:
         """Share without stuff bits: the load is never below it."""
-        return sum(row.unstuffed_bits for row in self.rows) / self.capacity_bits
+        return sum(unstuffed_bits(row.length) * row.per_cycle for row in self.rows) / self.capacity_bits
 
     def table(self) -> list[dict[str, object]]:
         """Return the rows in the order of priority: cob_id, who, bytes, per_cycle, worst_bits, share (of a cycle)."""
@@ -86,25 +81,13 @@ class BusLoad:
         ]
 
 
-def sync_row(counter: bool) -> Row:
-    """Return the row of SYNC, with the counter byte of 1019h or without."""
-    return Row(SYNC_COB_ID, "SYNC", 1 if counter else 0)
-
-
 def pdo_row(who: str, pdo: PdoMap) -> Row:
     """Return the row of a synchronous PDO. Raises BusLoadError for an event-driven one, which has no bound."""
-    if not 1 <= pdo.transmission_type <= LAST_SYNC_TYPE:
-        raise BusLoadError(
-            f"PDO {pdo.cob_id:X}h of {who}: transmission type {pdo.transmission_type} is not bound to SYNC, "
-            "its load has no bound"
-        )
-    return Row(pdo.cob_id, who, pdo.length, 1.0 / pdo.transmission_type)
-
-
-def temperature_row(node: int, period_s: float = PERIOD_S) -> Row:
-    """Return the row of a drive's TPDO3: the boot's event timer and inhibit time let one come in EVENT_MS."""
-    pdo = drive_tpdo3(node)
-    return Row(pdo.cob_id, f"drive {node} TPDO3", pdo.length, period_s * 1e3 / EVENT_MS)
+    kind = pdo.transmission_type
+    if not 1 <= kind <= LAST_SYNC_TYPE:
+        where = f"PDO {pdo.cob_id:X}h of {who}"
+        raise BusLoadError(f"{where}: transmission type {kind} is not bound to SYNC, its load has no bound")
+    return Row(pdo.cob_id, who, pdo.length, 1.0 / kind)
 
 
 def heartbeat_row(who: str, node: int, heartbeat_ms: int, period_s: float = PERIOD_S) -> Row:
@@ -134,25 +117,22 @@ def configured_load(
     the contact PDOs.
     """
     layouts = drives if isinstance(drives, Mapping) else {node: drive_layout(node) for node in drives}
-    rows = [sync_row(sync_counter)]
-    for pdo, who in zip(estimate_tpdos(len(layouts), master), _ESTIMATES, strict=False):
-        rows.append(pdo_row(who, pdo))
+    own = dict(zip(_ESTIMATES, estimate_tpdos(len(layouts), master), strict=False))
     if contacts:
-        rows += [
-            pdo_row(who, pdo)
-            for pdo, who in zip(contact_tpdos(len(layouts), master), _CONTACTS, strict=False)
-        ]
+        own |= zip(_CONTACTS, contact_tpdos(len(layouts), master), strict=False)
+    rows = [Row(SYNC_COB_ID, "SYNC", 1 if sync_counter else 0)]
+    rows += [pdo_row(who, pdo) for who, pdo in own.items()]
     rows.append(heartbeat_row("jtqd", master, heartbeat_ms, period_s))
     for node, tpdos in layouts.items():
-        rows += [
+        for pdo in tpdos:
+            who = f"drive {node} TPDO{pdo.number}"
             # one that the drive sends by itself is counted once per SYNC: an inhibit time must keep it so
-            Row(pdo.cob_id, f"drive {node} TPDO{pdo.number}", pdo.length)
-            if pdo.transmission_type in ACYCLIC
-            else pdo_row(f"drive {node} TPDO{pdo.number}", pdo)
-            for pdo in tpdos
-        ]
+            acyclic = pdo.transmission_type in ACYCLIC
+            rows.append(Row(pdo.cob_id, who, pdo.length) if acyclic else pdo_row(who, pdo))
         rows.append(heartbeat_row(f"drive {node}", node, heartbeat_ms, period_s))
-    rows += [temperature_row(node, period_s) for node in temperatures]
+    for node in temperatures:  # the boot's event timer and inhibit time let one come in EVENT_MS
+        pdo = drive_tpdo3(node)
+        rows.append(Row(pdo.cob_id, f"drive {node} TPDO3", pdo.length, period_s * 1e3 / EVENT_MS))
     for node, channels in sensors.items():
         pdos = sensor_tpdo1(node), sensor_tpdo2(node)
         rows += [pdo_row(f"sensor {node} channel {channel}", pdos[channel - 1]) for channel in channels]

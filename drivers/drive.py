@@ -214,16 +214,9 @@ def scale_of(quantity: str, by: str) -> Scale:
 
 
 def si_per_unit(quantity: str, by: str, shaft: str, values: Values, torque_constant_nm_per_a: float) -> float:
-    """Return SI (rad, rad/s, A) per unit of a quantity.
+    """Return SI (rad, rad/s, A) per unit of a quantity; `quantity` and `by` as in SCALES, `shaft`: where it counts.
 
-    Args:
-        quantity, by: as in SCALES.
-        shaft: where 6092h, 60A8h and 60A9h count.
-        values: of the scaling objects.
-        torque_constant_nm_per_a: of the motor, for a current by its torque.
-
-    Raises:
-        ScalingError: a unit word is neither an angle nor a speed.
+    Raises ScalingError: a unit word is neither an angle nor a speed.
     """
     scale = scale_of(quantity, by)
     factor = scale.factor(values)
@@ -415,15 +408,8 @@ def _layout_error(objects: DriveObjects, missing: set[str], maps: Sequence[PdoMa
 
 def tpdos_as_json(maps: Iterable[PdoMap]) -> list[dict[str, Any]]:
     """Return the TPDOs for a request or a report."""
-    return [
-        {
-            "number": pdo.number,
-            "cob_id": pdo.cob_id,
-            "transmission_type": pdo.transmission_type,
-            "words": list(pdo.words),
-        }
-        for pdo in maps
-    ]
+    names = "number", "cob_id", "transmission_type"
+    return [{name: getattr(pdo, name) for name in names} | {"words": list(pdo.words)} for pdo in maps]
 
 
 def maps_of_json(node: int, tpdos: Iterable[Mapping[str, Any]], objects: DriveObjects) -> tuple[PdoMap, ...]:

@@ -40,22 +40,10 @@ from jtqd.drivers.sdo import (
 
 # Data types (CiA 301, 7.4.7)
 BOOLEAN, REAL32, VISIBLE_STRING, REAL64 = 0x01, 0x08, 0x09, 0x11
-_INTEGERS = {
-    BOOLEAN: "B",
-    0x02: "b",
-    0x03: "h",
-    0x04: "i",
-    0x05: "B",
-    0x06: "H",
-    0x07: "I",
-    0x15: "q",
-    0x1B: "Q",
-}
+_INTEGERS = {BOOLEAN: "B", 2: "b", 3: "h", 4: "i", 5: "B", 6: "H", 7: "I", 0x15: "q", 0x1B: "Q"}
 """Struct letters; a BOOLEAN takes a byte in an SDO."""
-_LAYOUTS = {
-    data_type: struct.Struct("<" + letter)
-    for data_type, letter in {**_INTEGERS, REAL32: "f", REAL64: "d"}.items()
-}
+_LETTERS = {**_INTEGERS, REAL32: "f", REAL64: "d"}
+_LAYOUTS = {data_type: struct.Struct("<" + letter) for data_type, letter in _LETTERS.items()}
 _SIGNED = frozenset({0x02, 0x03, 0x04, 0x15})
 _FIRST_REAL_INDEX = 0x1000  # below: dummy entries of [DummyUsage], which are types and not objects
 _LARGEST_EDS = 16_000_000
@@ -166,11 +154,10 @@ class ObjectStore:
     def write(self, index: int, subindex: int, data: bytes) -> None:
         """Store an SDO download after rights, length, limits and hook, which may refuse it too. Raises SdoAbort."""
         entry = self.check_write(index, subindex, len(data))
-        if entry.layout is not None and (entry.low is not None or entry.high is not None):
+        if entry.layout is not None:
             (value,) = entry.layout.unpack(data)
-            if (entry.low is not None and value < entry.low) or (
-                entry.high is not None and value > entry.high
-            ):
+            below = entry.low is not None and value < entry.low
+            if below or (entry.high is not None and value > entry.high):
                 raise SdoAbort(VALUE_RANGE)
         hook = self._on_write.get((index, subindex))
         if hook is not None:
@@ -217,11 +204,13 @@ class ObjectStore:
 
     def on_read(self, index: int, subindex: int, hook: ReadHook) -> None:
         """Call `hook()` for the value at each read: bytes, or a number that is packed to the object's type."""
-        self._on_read[self._key(index, subindex)] = hook
+        self.entry(index, subindex)
+        self._on_read[index, subindex] = hook
 
     def on_write(self, index: int, subindex: int, hook: WriteHook) -> None:
         """Call `hook(data)` before a download is stored; an SdoAbort from it refuses the value."""
-        self._on_write[self._key(index, subindex)] = hook
+        self.entry(index, subindex)
+        self._on_write[index, subindex] = hook
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Return whether the object exists."""
@@ -237,10 +226,6 @@ class ObjectStore:
         """Make the present value, such as a serial number, the power-on value."""
         entry = self.entry(index, subindex)
         self.entries[index, subindex] = replace(entry, default=self._values[index, subindex])
-
-    def _key(self, index: int, subindex: int) -> tuple[int, int]:
-        self.entry(index, subindex)
-        return index, subindex
 
     def _value(self, entry: Entry) -> bytes:
         hook = self._on_read.get((entry.index, entry.subindex))
@@ -271,13 +256,18 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     logger = logging.getLogger(parser.__name__)
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # an EdsError has the reason in one line
+    entries = []
     try:
-        return [_entry(variable) for variable in _variables(parser.import_eds(io.StringIO(text), node_id))]
+        for parsed in parser.import_eds(io.StringIO(text), node_id).values():
+            if parsed.index >= _FIRST_REAL_INDEX:
+                members = parsed.subindices.values() if hasattr(parsed, "subindices") else [parsed]
+                entries += [_entry(member) for member in members]
     except Exception as error:  # the parser has no exception class of its own
         reason = " ".join(str(error).split())[:200]
         raise EdsError(f"{name}: not a readable EDS: {type(error).__name__}: {reason}") from None
     finally:
         logger.setLevel(level)
+    return entries
 
 
 def _eds_text(eds: Path | str, name: str) -> str:
@@ -318,38 +308,25 @@ def entries_from_json(rows: Any) -> list[Entry]:
     return msgspec.convert(rows, list[Entry])
 
 
-def _variables(dictionary: Any) -> list[Any]:
-    """Return every variable of a parsed EDS: plain ones, and the members of arrays and records."""
-    variables: list[Any] = []
-    for parsed in dictionary.values():
-        if parsed.index < _FIRST_REAL_INDEX:
-            continue
-        variables.extend(parsed.subindices.values() if hasattr(parsed, "subindices") else [parsed])
-    return variables
-
-
 def _entry(variable: Any) -> Entry:
-    data_type = int(variable.data_type)
-    name = variable.name if variable.subindex == 0 else f"{variable.parent.name}: {variable.name}"
+    """Return one variable of a parsed EDS, or member of an array or record."""
+    data_type, default = int(variable.data_type), variable.default
+    layout = _LAYOUTS.get(data_type)
+    if layout is not None:
+        default = layout.pack(default if default is not None else 0)
+    elif not isinstance(default, bytes):
+        default = b"" if default is None else str(default).encode("ascii")
     return Entry(
         index=variable.index,
         subindex=variable.subindex,
-        name=name,
+        name=variable.name if variable.subindex == 0 else f"{variable.parent.name}: {variable.name}",
         data_type=data_type,
         access=variable.access_type,
         mappable=bool(variable.pdo_mappable),
         low=variable.min,
         high=variable.max,
-        default=_default_bytes(variable.default, _LAYOUTS.get(data_type)),
+        default=default,
     )
-
-
-def _default_bytes(default: Any, layout: struct.Struct | None) -> bytes:
-    if layout is not None:
-        return layout.pack(default if default is not None else 0)
-    if default is None:
-        return b""
-    return default if isinstance(default, bytes) else str(default).encode("ascii")
 
 
 # SDO server
@@ -435,7 +412,9 @@ class SdoServer:
         self._transfer = None
         expedited, sized = command & 2, command & 1
         if expedited:
-            length = 4 - (command >> 2 & 3) if sized else self._own_length(index, subindex)
+            # without a size so many of the four bytes count as the object's type has
+            own = self.store.entry(index, subindex).bits // 8 or 4
+            length = 4 - (command >> 2 & 3) if sized else min(4, own)
             self.store.write(index, subindex, field[:length])
         else:
             size = int.from_bytes(field, "little") if sized else None
@@ -444,10 +423,6 @@ class SdoServer:
                 raise SdoAbort(OUT_OF_MEMORY)
             self._transfer = _Transfer(index, subindex, False, bytearray(), size)
         return INITIATE.pack(0x60, index, subindex, 0)
-
-    def _own_length(self, index: int, subindex: int) -> int:
-        """Return how many of the four bytes count in an expedited download without size: by the object's type."""
-        return min(4, self.store.entry(index, subindex).bits // 8 or 4)
 
     def _download_segment(self, command: int, payload: bytes) -> bytes:
         transfer = self._running(command, upload=False)

@@ -5,6 +5,7 @@ Those of 2200h stand in `jtqd.daemon.shared.counters`.
 
 from jtqd.drivers.pdo import MappedObject, PdoMap
 
+_SEQUENCE = MappedObject(0x2103, 0, 8, False, "sequence")
 JTQD_NODE = 0x20
 COMMANDER_NODE = 0x21
 """Node that may command the drives beside jtqd; they watch its heartbeat by 1016h:2."""
@@ -80,10 +81,14 @@ def estimate_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
 
     2100h..2103h and 2105h of jtqd.eds and jtqd4.eds. The second half of an odd joint's PDO is that of no joint.
     """
-    return tuple(
-        _estimate_tpdo(pair, base + node)
-        for pair, base in zip(range((joints + 1) // 2), ESTIMATE_BASES, strict=False)
-    )
+    pdos = []
+    for base, status, pair in ((ESTIMATE_BASES[0], 0x2102, (1, 2)), (ESTIMATE_BASES[1], 0x2105, (3, 4))):
+        torques = [MappedObject(0x2100, joint, 16, True, f"torque_{joint}") for joint in pair]
+        sigmas = [MappedObject(0x2101, joint, 8, False, f"sigma_{joint}") for joint in pair]
+        pdos.append(
+            PdoMap(base + node, (*torques, *sigmas, MappedObject(status, 0, 8, False, "status"), _SEQUENCE))
+        )
+    return tuple(pdos[: (joints + 1) // 2])
 
 
 def contact_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
@@ -91,21 +96,8 @@ def contact_tpdos(joints: int, node: int = JTQD_NODE) -> tuple[PdoMap, ...]:
 
     2106h..2108h and 2103h of jtqd.eds and jtqd4.eds. Four bytes each: a bus of two joints with sensor has room for them.
     """
-    return tuple(
-        _contact_tpdo(pair, base + node)
-        for pair, base in zip(range((joints + 1) // 2), CONTACT_BASES, strict=False)
-    )
-
-
-def _contact_tpdo(pair: int, cob_id: int) -> PdoMap:
-    rates = [MappedObject(0x2106, n, 8, True, f"torque_rate_{n}") for n in (2 * pair + 1, 2 * pair + 2)]
-    contact = MappedObject((0x2107, 0x2108)[pair], 0, 8, False, "contact")
-    return PdoMap(cob_id, (*rates, contact, MappedObject(0x2103, 0, 8, False, "sequence")))
-
-
-def _estimate_tpdo(pair: int, cob_id: int) -> PdoMap:
-    numbers = (2 * pair + 1, 2 * pair + 2)
-    torques = [MappedObject(0x2100, joint, 16, True, f"torque_{joint}") for joint in numbers]
-    sigmas = [MappedObject(0x2101, joint, 8, False, f"sigma_{joint}") for joint in numbers]
-    status = MappedObject((0x2102, 0x2105)[pair], 0, 8, False, "status")
-    return PdoMap(cob_id, (*torques, *sigmas, status, MappedObject(0x2103, 0, 8, False, "sequence")))
+    pdos = []
+    for base, contact, pair in ((CONTACT_BASES[0], 0x2107, (1, 2)), (CONTACT_BASES[1], 0x2108, (3, 4))):
+        rates = [MappedObject(0x2106, joint, 8, True, f"torque_rate_{joint}") for joint in pair]
+        pdos.append(PdoMap(base + node, (*rates, MappedObject(contact, 0, 8, False, "contact"), _SEQUENCE)))
+    return tuple(pdos[: (joints + 1) // 2])

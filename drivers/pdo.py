@@ -218,20 +218,15 @@ class PdoParameters:
         self.tpdo_indices = _communication_indices(store, _TPDO)
         self.rpdo_indices = _communication_indices(store, _RPDO)
         for index in (*self.tpdo_indices, *self.rpdo_indices):
-            self._guard_communication(index)
-            self._guard_mapping(index)
+            self._guard(index)
 
     def tpdos(self) -> list[PdoMap]:
         """Return the TPDOs that exist and map something, in the order of their number."""
-        return self._active(self.tpdo_indices)
+        return [pdo for index in self.tpdo_indices if (pdo := self.active_map(index))]
 
     def rpdos(self) -> list[PdoMap]:
         """Return the RPDOs that exist and map something."""
-        return self._active(self.rpdo_indices)
-
-    def _active(self, indices: tuple[int, ...]) -> list[PdoMap]:
-        maps = (self.active_map(index) for index in indices)
-        return [pdo for pdo in maps if pdo is not None]
+        return [pdo for index in self.rpdo_indices if (pdo := self.active_map(index))]
 
     def active_map(self, communication_index: int) -> PdoMap | None:
         """Return the map of one PDO (1400h.., 1800h..); None when it is switched off or empty."""
@@ -241,25 +236,19 @@ class PdoParameters:
         count = store.number(mapping, 0)
         if cob_id & INVALID or count == 0:
             return None
-        mapped = tuple(self._mapped(store.number(mapping, entry)) for entry in range(1, count + 1))
-        return PdoMap(cob_id & CAN_ID, mapped, store.number(communication_index, 2))
+        mapped = []
+        for number in range(1, count + 1):
+            index, subindex, bits = split_word(store.number(mapping, number))
+            entry = store.entry(index, subindex)
+            mapped.append(MappedObject(index, subindex, bits, entry.signed, entry.name))
+        return PdoMap(cob_id & CAN_ID, tuple(mapped), store.number(communication_index, 2))
 
-    def _mapped(self, word: int) -> MappedObject:
-        index, subindex, bits = split_word(word)
-        entry = self._store.entry(index, subindex)
-        return MappedObject(index, subindex, bits, entry.signed, entry.name)
-
-    def _exists(self, communication_index: int) -> bool:
-        return not self._store.number(communication_index, 1) & INVALID
-
-    def _guard_communication(self, index: int) -> None:
+    def _guard(self, index: int) -> None:
         self._hook(index, 1, lambda value: self._check_cob_id(index, value))
         self._hook(index, 2, self._check_transmission)
         for subindex in (_INHIBIT_TIME, _SYNC_START):
             if self._store.has(index, subindex):
                 self._hook(index, subindex, lambda _value: self._require_destroyed(index))
-
-    def _guard_mapping(self, index: int) -> None:
         mapping = index + _MAPPING_OFFSET
         access = _TPDO_ACCESS if index >= _TPDO else _RPDO_ACCESS
         self._hook(mapping, 0, lambda count: self._check_count(index, count))
@@ -284,13 +273,11 @@ class PdoParameters:
             raise SdoAbort(VALUE_RANGE)  # bits 0..29 may not change while the PDO exists
 
     def _check_transmission(self, value: int) -> None:
-        if (
-            value > LAST_SYNC_TYPE and value not in EVENT_DRIVEN
-        ):  # 252, 253 are RTR-only, which is not offered
+        if value > LAST_SYNC_TYPE and value not in EVENT_DRIVEN:  # 252, 253: RTR-only, not offered
             raise SdoAbort(VALUE_RANGE)
 
     def _require_destroyed(self, index: int) -> None:
-        if self._exists(index):
+        if not self._store.number(index, 1) & INVALID:
             raise SdoAbort(DEVICE_STATE)
 
     def _check_count(self, index: int, count: int) -> None:

@@ -45,67 +45,52 @@ def parse_key(text: str) -> Key:
 TOGGLE_NOT_ALTERNATED = 0x0503_0000
 PROTOCOL_TIMED_OUT = 0x0504_0000
 UNKNOWN_COMMAND = 0x0504_0001
-BLOCK_SIZE = 0x0504_0002
-BLOCK_SEQUENCE = 0x0504_0003
-BLOCK_CRC = 0x0504_0004
 OUT_OF_MEMORY = 0x0504_0005
-UNSUPPORTED_ACCESS = 0x0601_0000
 READ_OF_WRITE_ONLY = 0x0601_0001
 WRITE_OF_READ_ONLY = 0x0601_0002
 NO_OBJECT = 0x0602_0000
 NOT_MAPPABLE = 0x0604_0041
 PDO_TOO_LONG = 0x0604_0042
-PARAMETER_INCOMPATIBLE = 0x0604_0043
-DEVICE_INCOMPATIBLE = 0x0604_0047
-HARDWARE_ERROR = 0x0606_0000
 LENGTH_MISMATCH = 0x0607_0010
 LENGTH_TOO_HIGH = 0x0607_0012
 LENGTH_TOO_LOW = 0x0607_0013
 NO_SUBINDEX = 0x0609_0011
 VALUE_RANGE = 0x0609_0030
-VALUE_TOO_HIGH = 0x0609_0031
-VALUE_TOO_LOW = 0x0609_0032
-MAXIMUM_BELOW_MINIMUM = 0x0609_0036
-NO_RESOURCE = 0x060A_0023
 GENERAL_ERROR = 0x0800_0000
-NOT_TRANSFERRED = 0x0800_0020
-LOCAL_CONTROL = 0x0800_0021
 DEVICE_STATE = 0x0800_0022
-NO_DICTIONARY = 0x0800_0023
-NO_DATA = 0x0800_0024
 
 _MEANING = {
     TOGGLE_NOT_ALTERNATED: "toggle bit not alternated",
     PROTOCOL_TIMED_OUT: "SDO protocol timed out",
     UNKNOWN_COMMAND: "unknown SDO command",
-    BLOCK_SIZE: "invalid block size",
-    BLOCK_SEQUENCE: "invalid sequence number",
-    BLOCK_CRC: "CRC error",
+    0x0504_0002: "invalid block size",
+    0x0504_0003: "invalid sequence number",
+    0x0504_0004: "CRC error",
     OUT_OF_MEMORY: "out of memory",
-    UNSUPPORTED_ACCESS: "unsupported access to an object",
+    0x0601_0000: "unsupported access to an object",
     READ_OF_WRITE_ONLY: "object is write only",
     WRITE_OF_READ_ONLY: "object is read only",
     NO_OBJECT: "object does not exist",
     NOT_MAPPABLE: "object cannot be mapped",
     PDO_TOO_LONG: "mapped objects exceed the PDO",
-    PARAMETER_INCOMPATIBLE: "parameters are incompatible with each other",
-    DEVICE_INCOMPATIBLE: "incompatible within the device",
-    HARDWARE_ERROR: "access failed due to a hardware error",
+    0x0604_0043: "parameters are incompatible with each other",
+    0x0604_0047: "incompatible within the device",
+    0x0606_0000: "access failed due to a hardware error",
     LENGTH_MISMATCH: "length does not match the data type",
     LENGTH_TOO_HIGH: "length too high for the data type",
     LENGTH_TOO_LOW: "length too low for the data type",
     NO_SUBINDEX: "sub-index does not exist",
     VALUE_RANGE: "value out of range",
-    VALUE_TOO_HIGH: "value too high",
-    VALUE_TOO_LOW: "value too low",
-    MAXIMUM_BELOW_MINIMUM: "maximum is below the minimum",
-    NO_RESOURCE: "resource not available: SDO connection",
+    0x0609_0031: "value too high",
+    0x0609_0032: "value too low",
+    0x0609_0036: "maximum is below the minimum",
+    0x060A_0023: "resource not available: SDO connection",
     GENERAL_ERROR: "general error",
-    NOT_TRANSFERRED: "cannot be transferred or stored",
-    LOCAL_CONTROL: "cannot be transferred or stored: the device is under local control",
+    0x0800_0020: "cannot be transferred or stored",
+    0x0800_0021: "cannot be transferred or stored: the device is under local control",
     DEVICE_STATE: "not in the present device state",
-    NO_DICTIONARY: "no object dictionary: it cannot be made, or is not there",
-    NO_DATA: "no data available",
+    0x0800_0023: "no object dictionary: it cannot be made, or is not there",
+    0x0800_0024: "no data available",
 }
 
 
@@ -276,8 +261,6 @@ class Exchange:
     answer and a repeated request would be taken for the next segment: each segment may take `timeout_s`.
 
     Args:
-        index, subindex, data: of the transfer.
-        now: time of its start.
         timeout_s: for an answer, and for all repetitions of the first request together.
         answer_s: silence after which the first request is repeated.
 
@@ -316,27 +299,29 @@ class Exchange:
         return self.value is not None or self.refusal is not None or self.timed_out
 
     @property
+    def request(self) -> bytes:
+        """The request to be sent now; after the constructor the first one."""
+        return self._transfer.request
+
+    @property
     def due(self) -> float:
         """When `tick` has something to do."""
         return min(self._repeat_at, self._deadline)
-
-    def begin(self) -> list[bytes]:
-        """Return the first request."""
-        return [self._transfer.request]
 
     def on_reply(self, reply: bytes, now: float) -> list[bytes]:
         """Take a frame of the server."""
         if self.ended:
             return []
         try:
-            if not self._transfer.answer(reply):
-                self.ignored += 1
-                return []
+            taken = self._transfer.answer(reply)
         except SdoAbort as abort:
             self.refusal = abort.code
             return []
         except TransferError as error:
             return [self._transfer.abort(error.code), *self._repeat(now)]
+        if not taken:
+            self.ignored += 1
+            return []
         if self._transfer.done:
             self.value = self._transfer.value
             return []
@@ -432,7 +417,7 @@ class SdoQueue:
         key, timeout_s, done = self._waiting.popleft()
         exchange = Exchange(*key, None, now=now, timeout_s=timeout_s, answer_s=self._answer_s)
         self._running = exchange, done
-        return exchange.begin()
+        return [exchange.request]
 
 
 # Blocking client
@@ -443,14 +428,9 @@ class Socket(Protocol):
 
     frames: bytearray
 
-    def send(self, frame16: bytes) -> bool:
-        """Send one frame."""
-
-    def wait(self, timeout_s: float | None) -> bool:
-        """Wait for frames."""
-
-    def receive(self) -> int:
-        """Take what has arrived."""
+    def send(self, frame16: bytes, /) -> bool: ...  # noqa: D102
+    def wait(self, timeout_s: float | None, /) -> bool: ...  # noqa: D102
+    def receive(self) -> int: ...  # noqa: D102
 
 
 class SdoTimeout(Exception):  # noqa: N818  (a state of the node)
@@ -498,7 +478,7 @@ class SdoClient:
         self._replies(0.0)  # to a request that was given up
         now, timeout_s = time.monotonic(), self._timeout_s
         exchange = Exchange(index, subindex, data, now=now, timeout_s=timeout_s, answer_s=self._answer_s)
-        self._send(exchange.begin())
+        self._send([exchange.request])
         while not exchange.ended:
             for reply in self._replies(max(exchange.due - time.monotonic(), 1e-4)):
                 self._send(exchange.on_reply(reply, time.monotonic()))

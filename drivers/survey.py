@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from jtqd.drivers.bus_socket import exact
-from jtqd.drivers.drive import DRIVE_SCALING_OBJECTS, OTHER_SCALING_OBJECTS, drive_tpdo1, drive_tpdo2
+from jtqd.drivers.drive import DRIVE_SCALING_OBJECTS, OTHER_SCALING_OBJECTS, drive_layout
 from jtqd.drivers.frame import FRAME, FRAME_SIZE, pack
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import VISIBLE_STRING, Entry, read_eds
@@ -42,9 +42,7 @@ IDENTITY: Mapping[str, Key] = {
 }
 RATED_CURRENT, RATED_TORQUE, TORQUE = (0x6075, 0), (0x6076, 0), (0x6077, 0)
 MAPPED: Mapping[int, tuple[Key, ...]] = {
-    DRIVE: tuple(
-        (each.index, each.subindex) for pdo in (drive_tpdo1(1), drive_tpdo2(1)) for each in pdo.objects
-    ),
+    DRIVE: tuple((each.index, each.subindex) for pdo in drive_layout(1) for each in pdo.objects),
     SENSOR: tuple((each.index, each.subindex) for each in sensor_tpdo1(1).objects),
 }
 """Objects that jtqd maps into TPDOs, by profile; of a sensor the first channel."""
@@ -102,11 +100,6 @@ class Survey:
     def scales_by(self, key: Key) -> bool:
         """Whether the device has the scaling object: with a value, or in its EDS, of which the value does not count."""
         return self.number(key) is not None or (self.defaults and key in self.numbers)
-
-
-def tpdos(access: SdoAccess) -> tuple[Tpdo, ...]:
-    """Read the TPDOs of the predefined connection set. Raises SurveyError."""
-    return _tpdos(lambda key: _number(access, key))
 
 
 def _tpdos(number_of: Callable[[Key], int | None]) -> tuple[Tpdo, ...]:
@@ -254,8 +247,9 @@ class BusSurvey:
 
     def tpdos(self, node: int) -> tuple[Tpdo, ...]:
         """Read the TPDOs of one node. Raises SurveyError."""
+        access = self._access(node)
         with _of(node):
-            return tpdos(self._access(node))
+            return _tpdos(lambda key: _number(access, key))
 
     def _answers(self, timeout_s: float) -> set[int]:
         return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}

@@ -16,7 +16,8 @@ from jtqd.daemon.shared.events import RateLimit
 from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import nmt
-from jtqd.drivers.boot import BootRequest, DriveNode, SensorNode, Sync
+from jtqd.drivers.boot import BootRequest, DriveNode, SensorNode
+from jtqd.drivers.boot_node import Sync
 from jtqd.drivers.bus_load import BusLoad, configured_load
 from jtqd.drivers.emcy import COMMUNICATION
 from jtqd.drivers.object_dictionary import Identity

@@ -161,7 +161,7 @@ def test_mapping_is_written_in_the_order_of_cia_301():
             written.append((index, subindex, int.from_bytes(data, "little")))
             node.store.write(index, subindex, data)
 
-    NodeBoot(Access(), DriveProfile(1, temperature=Temperature()), BusSettings(0x20)).configure_pdos()
+    NodeBoot(Access(), DriveProfile(1, temperature=Temperature()), BusSettings()).configure_pdos()
     assert written[:7] == [
         (0x1800, 1, 0xC0000181),
         (0x1A00, 0, 0),
@@ -813,7 +813,7 @@ def test_request_becomes_profiles():
         DriveProfile(2, Identity(serial=22)),
         SensorProfile(3),
     )
-    assert request.settings == BusSettings(0x20, heartbeat_ms=30, counter_overflow=240)
+    assert (request.heartbeat_ms, request.sync.counter_overflow) == (30, 240)
     assert parse_request(json.loads(json.dumps(request.as_json()))) == request
 
 

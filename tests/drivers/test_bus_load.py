@@ -10,8 +10,6 @@ from jtqd.drivers.bus_load import (
     configured_load,
     heartbeat_row,
     pdo_row,
-    sync_row,
-    temperature_row,
 )
 from jtqd.drivers.drive import drive_tpdo1
 from jtqd.drivers.own_objects import estimate_tpdos
@@ -38,7 +36,8 @@ def test_a_temperature_is_a_frame_of_75_bits_in_500_ms():
     assert load.worst - without.worst == pytest.approx(75 / 500 / 1000)
     (row,) = (row for row in load.rows if row not in without.rows)
     assert (row.cob_id, row.who, row.length, row.worst_bits * 500) == (0x382, "drive 2 TPDO3", 2, 75)
-    assert temperature_row(1, period_s=5e-3).per_cycle == 0.01
+    slow = configured_load((1, 2), {}, temperatures=(2,), period_s=5e-3)
+    assert slow.rows[-1].per_cycle == 0.01
 
 
 def test_second_channel_fits_and_two_rpdos_do_not():
@@ -81,10 +80,6 @@ def test_heartbeats_scale_with_their_time_and_the_period():
     assert heartbeat_row("x", 1, 100, period_s=2e-3).per_cycle == pytest.approx(0.02)
     with pytest.raises(BusLoadError):
         heartbeat_row("x", 1, 0)
-
-
-def test_sync_without_counter_is_shorter():
-    assert (sync_row(False).worst_bits, sync_row(True).worst_bits) == (55, 65)
 
 
 def test_table_is_in_the_order_of_priority_and_adds_up():

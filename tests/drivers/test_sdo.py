@@ -157,7 +157,6 @@ def test_a_refusal_is_the_servers():
 )
 def test_answers_to_something_else_are_ignored(reply):
     exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.5)
-    exchange.begin()
     assert exchange.on_reply(frame(reply), 0.01) == []
     assert not exchange.ended
     exchange.on_reply(frame("43 00 10 00 92 01 02 00"), 0.02)
@@ -167,7 +166,6 @@ def test_answers_to_something_else_are_ignored(reply):
 
 def test_a_toggle_error_ends_the_transfer_and_it_is_repeated():
     exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=0.5)
-    exchange.begin()
     assert exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.01) == [frame("60 00 00 00 00 00 00 00")]
     out = exchange.on_reply(frame("10 6a 6f 69 6e 74 20 64"), 0.02)  # toggle 1 where 0 is due
     assert out == [
@@ -181,9 +179,9 @@ def test_a_toggle_error_ends_the_transfer_and_it_is_repeated():
 def test_nothing_is_repeated_inside_a_segmented_transfer():
     """A slow device takes its time for each segment; a request sent twice would be answered twice."""
     exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=2.0, answer_s=0.1)
-    assert (
-        exchange.tick(0.11) == exchange.begin()
-    )  # the first request may be repeated: it restarts the transfer
+    assert exchange.tick(0.11) == [
+        exchange.request
+    ]  # the first request may be repeated: it restarts the transfer
     segment = [frame("60 00 00 00 00 00 00 00")]
     assert exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.5) == segment
     assert exchange.tick(2.4) == [], "nor is the transfer given up: each answer may take the timeout"
@@ -194,7 +192,6 @@ def test_nothing_is_repeated_inside_a_segmented_transfer():
 
 def test_a_node_that_falls_silent_between_two_segments_is_given_up():
     exchange = Exchange(0x1008, 0, None, now=0.0, timeout_s=0.5, answer_s=0.1)
-    exchange.begin()
     exchange.on_reply(frame("41 08 10 00 0b 00 00 00"), 0.1)
     assert exchange.tick(0.59) == []
     assert exchange.tick(0.61) == [frame("80 08 10 00 00 00 04 05")]
@@ -223,7 +220,7 @@ def test_a_size_that_is_not_kept_and_one_that_is_too_large():
 
 def test_silence_is_asked_again_and_then_given_up():
     exchange = Exchange(0x1000, 0, None, now=0.0, timeout_s=0.3, answer_s=0.1)
-    request = exchange.begin()
+    request = [exchange.request]
     assert exchange.tick(0.05) == []
     assert exchange.tick(0.11) == request
     assert exchange.tick(0.22) == request

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.drivers.boot_node import BusSettings, NodeBoot
+from jtqd.drivers.boot_node import BusSettings, NodeBoot, Sync
 from jtqd.drivers.drive import DriveProfile
 from jtqd.drivers.frame import FRAME
 from jtqd.drivers.sdo import SdoAccess, Transfer
@@ -116,7 +116,7 @@ class LockStep:
         self.deaf = False
         self.waiting: Frames = []
         self.bench.tick(self.now)
-        settings = BusSettings(0x20, counter_overflow=240)
+        settings = BusSettings(sync=Sync(counter_overflow=240))
         for profile_of in (*self.drives, self.sensor_profile):
             boot = NodeBoot(BenchAccess(self, profile_of.node_id), profile_of, settings)
             boot.run(boot.check_device_type())
