@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 from jtqd.drivers.bus_socket import exact
@@ -100,6 +101,11 @@ class Survey:
     def scales_by(self, key: Key) -> bool:
         """Whether the device has the scaling object: with a value, or in its EDS, of which the value does not count."""
         return self.number(key) is not None or (self.defaults and key in self.numbers)
+
+
+def tpdos(access: SdoAccess) -> tuple[Tpdo, ...]:
+    """Read the TPDOs of the predefined connection set. Raises SurveyError."""
+    return _tpdos(partial(_number, access))
 
 
 def _tpdos(number_of: Callable[[Key], int | None]) -> tuple[Tpdo, ...]:
@@ -247,9 +253,8 @@ class BusSurvey:
 
     def tpdos(self, node: int) -> tuple[Tpdo, ...]:
         """Read the TPDOs of one node. Raises SurveyError."""
-        access = self._access(node)
         with _of(node):
-            return _tpdos(lambda key: _number(access, key))
+            return tpdos(self._access(node))
 
     def _answers(self, timeout_s: float) -> set[int]:
         return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}
