@@ -21,7 +21,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -93,8 +93,7 @@ def write_secret(directory: Path, name: str) -> Path:
         effects = (secrets(joint)[name],) if number == SECRET_JOINT else ()
         file = f"joint{number}.yaml"
         write_joint(directory / file, replace(joint, effects=effects), "Joint of the secret bench.")
-        own = plant_of_joint(joint).joints[0].deviations
-        peak = {"torque_nm": own.stribeck_nm, "velocity_rad_s": own.stribeck_velocity_rad_s}
+        peak = asdict(plant_of_joint(joint).joints[0].deviations.stribeck)
         part: dict[str, Any] = mapping[f"joint_{number}"]
         mapping[f"joint_{number}"] = {
             "joint": file,

@@ -293,7 +293,7 @@ class EffectPlant(Plant):
         self.effects = (one, two)
         bends = (one.steepest_bend(), two.steepest_bend())
         for side, bend in zip(parameters.joints, bends, strict=True):
-            steepest = bend + side.joint.gear_ratio * side.deviations.kinematic_slope
+            steepest = bend + side.constants.error_slope
             if steepest > STEEPEST_KINEMATIC_ERROR:
                 raise ConfigError(
                     f"joint {side.joint.name}: effects: the kinematic error changes the gear's transmission by "

@@ -274,7 +274,7 @@ def joint_friction(side, table=None):
     joint, d = side.joint, side.deviations
     viscous = (d.viscous_scale - 1.0) * joint.friction.viscous_nms_per_rad
     table = loss_table(side) if table is None else table
-    return JointFriction(table, d.friction_scale, viscous, d.stribeck_nm, d.stribeck_velocity_rad_s)
+    return JointFriction(table, d.friction_scale, viscous, d.stribeck.torque_nm, d.stribeck.velocity_rad_s)
 
 
 # One joint in its own frame
@@ -427,18 +427,3 @@ cdef class Plant(TwoJoints):
     cpdef double sensor_torque(self) except? -1.0:
         cdef double one = self.torque(0), two = self.torque(1)  # τ1 - Jl1 dwl1/dt
         return one - self.link_inertia[0] / (self.link_inertia[0] + self.link_inertia[1]) * (one - two + self.external_nm)
-
-    def energy(self):
-        """Return kinetic and elastic energy and the ripple's potential, J. Without motor current it can only fall."""
-        cdef double total = 0.5 * (self.link_inertia[0] + self.link_inertia[1]) * self.link_velocity**2
-        cdef const Constants *c
-        cdef JointState s
-        for k in range(2):
-            c, s = &self.constants[k], self.state(k)
-            total += 0.5 * c.rotor_inertia * s.velocity**2 + 0.5 * c.stiffness * s.torsion**2
-            total += 0.5 * c.slip_nm / c.per_travel * s.slip**2
-            if c.ripple_order > 0.0:
-                total += (
-                    c.ripple_nm / (c.gear_ratio * c.ripple_order) * sin(c.ripple_order * s.angle + c.ripple_phase)
-                )
-        return total

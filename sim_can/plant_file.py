@@ -149,37 +149,6 @@ WARMING_K_PER_W: Final = 0.6
 """Warming of a joint that comes as a joint file with effects of the temperature: that of campaign_plant.yaml."""
 
 
-@dataclass(frozen=True)
-class Deviations:
-    """How the true joint differs from its file. The defaults are a joint that is exactly as its file states."""
-
-    friction_scale: float = 1.0
-    viscous_scale: float = 1.0  # of the file's viscous friction; the difference is added to the losses
-    torque_constant_scale: float = 1.0
-    stiffness_scale: float = 1.0
-    rotor_inertia_scale: float = 1.0
-    ripple_nm: float = 0.0  # joint side, A cos(order θm + phase) on the motor's load
-    ripple_order_per_motor_rev: float = 2.0
-    ripple_phase_rad: float = 0.0
-    stribeck_nm: float = 0.0
-    stribeck_velocity_rad_s: float = 0.05
-    kinematic_error_rad: float = 0.0  # joint side, torsion gains A sin(order θm + phase)
-    kinematic_error_order_per_motor_rev: float = 2.0
-    kinematic_error_phase_rad: float = 0.0
-    hysteresis_nm: float = 0.0  # one Maxwell-slip element beside the spring
-    hysteresis_travel_rad: float = 1.0e-4  # torsion over which it goes from 0 to hysteresis_nm
-
-    @property
-    def kinematic_slope(self) -> float:
-        """Largest |de/dθm| of the kinematic error, joint rad per motor rad."""
-        return self.kinematic_error_rad * self.kinematic_error_order_per_motor_rev
-
-    @property
-    def hysteresis_stiffness(self) -> float:
-        """Stiffness of the Maxwell-slip element while it sticks, Nm/rad."""
-        return self.hysteresis_nm / self.hysteresis_travel_rad
-
-
 _Amplitude = Annotated[float, limits("Nm", ge=0.0)]
 _Order = Annotated[float, limits("1/rev", ge=0.0)]
 _Phase = Annotated[float, limits("rad")]
@@ -188,64 +157,59 @@ _FrictionScale = Annotated[float, limits(ge=0.0, le=10.0)]
 
 
 @dataclass(frozen=True)
-class _Ripple:
+class Ripple:
+    """A cos(order θm + phase) on the motor's load, joint side."""
+
     amplitude_nm: _Amplitude
     order_per_motor_rev: _Order = 2.0
     phase_rad: _Phase = 0.0
 
 
 @dataclass(frozen=True)
-class _Stribeck:
+class Stribeck:
+    """Peak of the friction. Above 0.06 rad/s it would reach into Table I's range, which begins at 0.2 rad/s."""
+
     torque_nm: _Amplitude
-    # above 0.06 rad/s the peak would reach into Table I's range, which begins at 0.2 rad/s
     velocity_rad_s: Annotated[float, limits("rad/s", ge=0.002, le=0.06)] = 0.05
 
 
 @dataclass(frozen=True)
-class _KinematicError:
+class KinematicError:
+    """Torsion gains A sin(order θm + phase), joint side."""
+
     amplitude_rad: Annotated[float, limits("rad", ge=0.0, le=0.01)]
     order_per_motor_rev: _Order = 2.0
     phase_rad: _Phase = 0.0
 
+    @property
+    def slope(self) -> float:
+        """Largest |de/dθm|, joint rad per motor rad."""
+        return self.amplitude_rad * self.order_per_motor_rev
+
 
 @dataclass(frozen=True)
-class _Hysteresis:
+class Hysteresis:
+    """One Maxwell-slip element beside the spring; it goes from 0 to its torque over its travel."""
+
     torque_nm: _Amplitude
     travel_rad: Annotated[float, limits("rad", ge=1.0e-6, le=0.1)] = 1.0e-4
 
 
 @dataclass(frozen=True)
-class _DeviationsFile:
-    """`deviations` of a plant file, which keeps each deviation in a section of its own."""
+class Deviations:
+    """How the true joint differs from its file. The defaults are a joint that is exactly as its file states."""
 
     friction_scale: _FrictionScale = 1.0
-    viscous_scale: _FrictionScale = 1.0
+    viscous_scale: _FrictionScale = (
+        1.0  # of the file's viscous friction; the difference is added to the losses
+    )
     torque_constant_scale: _Scale = 1.0
     stiffness_scale: _Scale = 1.0
     rotor_inertia_scale: _Scale = 1.0
-    ripple: _Ripple = _Ripple(0.0)
-    stribeck: _Stribeck = _Stribeck(0.0)
-    kinematic_error: _KinematicError = _KinematicError(0.0)
-    hysteresis: _Hysteresis = _Hysteresis(0.0)
-
-    def deviations(self) -> Deviations:
-        return Deviations(
-            self.friction_scale,
-            self.viscous_scale,
-            self.torque_constant_scale,
-            self.stiffness_scale,
-            self.rotor_inertia_scale,
-            self.ripple.amplitude_nm,
-            self.ripple.order_per_motor_rev,
-            self.ripple.phase_rad,
-            self.stribeck.torque_nm,
-            self.stribeck.velocity_rad_s,
-            self.kinematic_error.amplitude_rad,
-            self.kinematic_error.order_per_motor_rev,
-            self.kinematic_error.phase_rad,
-            self.hysteresis.torque_nm,
-            self.hysteresis.travel_rad,
-        )
+    ripple: Ripple = Ripple(0.0)
+    stribeck: Stribeck = Stribeck(0.0)
+    kinematic_error: KinematicError = KinematicError(0.0)
+    hysteresis: Hysteresis = Hysteresis(0.0)
 
 
 @dataclass(frozen=True)
@@ -303,21 +267,22 @@ class JointPlant:
     def constants(self) -> JointConstants:
         """Return the constants of the inner loop; effects on torque constant and stiffness are losses and twists."""
         joint, d = self.true_joint, self.deviations
+        ripple, error = d.ripple, d.kinematic_error
         return JointConstants(
             joint.gear_ratio,
             joint.torque_constant_nm_per_a,
             joint.rotor_inertia_kgm2,
             joint.stiffness_nm_per_rad,
             joint.damping_nms_per_rad,
-            d.ripple_nm,
-            d.ripple_order_per_motor_rev,
-            d.ripple_phase_rad,
-            d.kinematic_error_rad,
-            d.kinematic_error_order_per_motor_rev,
-            d.kinematic_error_phase_rad,
-            joint.gear_ratio * d.kinematic_slope,
-            d.hysteresis_nm,
-            1.0 / d.hysteresis_travel_rad,
+            ripple.amplitude_nm,
+            ripple.order_per_motor_rev,
+            ripple.phase_rad,
+            error.amplitude_rad,
+            error.order_per_motor_rev,
+            error.phase_rad,
+            joint.gear_ratio * error.slope,
+            d.hysteresis.torque_nm,
+            1.0 / d.hysteresis.travel_rad,
         )
 
 
@@ -376,7 +341,7 @@ class _JointFile:
     """`joint_1`, `joint_2` of a plant file."""
 
     joint: Text
-    deviations: _DeviationsFile = _DeviationsFile()
+    deviations: Deviations = Deviations()
     drive: DriveParameters = USUAL_DRIVE
     measurement: Measurement = Measurement()
     thermal: Thermal = field(default_factory=Thermal)
@@ -394,12 +359,13 @@ class _PlantFile:
 
 def _joint_plant(key: str, file: _JointFile, joint_of: Callable[[str], Joint]) -> JointPlant:
     joint = joint_of(file.joint)
-    side = JointPlant(joint, file.deviations.deviations(), file.drive, file.measurement, file.thermal)
+    side = JointPlant(joint, file.deviations, file.drive, file.measurement, file.thermal)
     steepest = STEEPEST_KINEMATIC_ERROR / joint.gear_ratio
-    if side.deviations.kinematic_slope > steepest:
+    slope = side.deviations.kinematic_error.slope
+    if slope > steepest:
         expected = f"amplitude_rad times order_per_motor_rev <= {steepest:g}, half of 1/gear_ratio"
         with below(key):
-            raise FieldError("plant", "deviations.kinematic_error", side.deviations.kinematic_slope, expected)
+            raise FieldError("plant", "deviations.kinematic_error", slope, expected)
     return side
 
 
@@ -409,14 +375,14 @@ def plant_of_joint(joint: Joint) -> PlantParameters:
     They stay at 25 °C, but warm as the campaign's bench does where an effect depends on the temperature.
     """
     friction = joint.friction
-    stribeck = {}
+    stribeck = Stribeck(0.0)
     if friction.stribeck_nm > 0.0:
         velocity = max(friction.stribeck_velocity_rad_s, 0.002)
         if joint.efficiency is not None:
             velocity = min(velocity, 0.06)  # Table I holds from 0.2 rad/s on
-        stribeck = {"stribeck_nm": friction.stribeck_nm, "stribeck_velocity_rad_s": velocity}
+        stribeck = Stribeck(friction.stribeck_nm, velocity)
     thermal = Thermal(kelvin_per_w=WARMING_K_PER_W) if uses_temperature(joint) else Thermal()
-    side = JointPlant(joint, Deviations(**stribeck), thermal=thermal)
+    side = JointPlant(joint, Deviations(stribeck=stribeck), thermal=thermal)
     return PlantParameters((side, side))
 
 
@@ -437,7 +403,7 @@ def substep_limit(
     constants = [side.constants for side in sides]
     link = sum(side.true_joint.link_inertia_kgm2 for side in sides)
     stiffness = [
-        c.stiffness * factor + side.deviations.hysteresis_stiffness
+        c.stiffness * factor + side.deviations.hysteresis.torque_nm / side.deviations.hysteresis.travel_rad
         for c, side, factor in zip(constants, sides, stiffer, strict=True)
     ]
     squares = [2.0 * sum(stiffness) / link]

@@ -38,8 +38,8 @@ class BaseLoss:
             self._per_torque = table.per_torque_step
             self._per_velocity = table.per_velocity_step
             self._last = table.last_row
-            true = plant_of_joint(joint).joints[0].deviations
-            self._peak = true.stribeck_nm, true.stribeck_velocity_rad_s
+            peak = plant_of_joint(joint).joints[0].deviations.stribeck
+            self._peak = peak.torque_nm, peak.velocity_rad_s
 
     @property
     def depends_on_load(self) -> bool:

@@ -10,7 +10,7 @@ import pytest
 
 from examples.hidden_effect import NAMES, main, nominal_file, plans, secrets, write_secret
 from jtqd.models.files import load_joint
-from jtqd.sim_can.plant_file import load_plant
+from jtqd.sim_can.plant_file import Deviations, load_plant
 
 KEPT = 0.75
 """Part of the promised reduction that an estimate shows: it has errors of its own beside the simulation's."""
@@ -52,10 +52,8 @@ def test_the_secret_bench_has_the_effect_and_nothing_else(name: str, tmp_path: P
     assert [effect.name for effect in one.joint.effects] == [name]
     assert one.joint.effects[0] == secrets(nominal)[name]
     assert not two.joint.effects
-    assert one.deviations.stribeck_nm == nominal.friction.stribeck_nm
-    assert (
-        one.deviations.ripple_nm == one.deviations.hysteresis_nm == one.deviations.kinematic_error_rad == 0.0
-    )
+    assert one.deviations.stribeck.torque_nm == nominal.friction.stribeck_nm
+    assert one.deviations == Deviations(stribeck=one.deviations.stribeck)
     assert one.thermal.viscous_per_k == 0.0
 
 

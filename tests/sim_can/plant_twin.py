@@ -69,9 +69,9 @@ class TwinPlant:
         side, d = self.sides[k], self.sides[k].deviations
         force = d.friction_scale * self.tables[k].magnitude(torque, velocity)
         force += (d.viscous_scale - 1.0) * side.joint.friction.viscous_nms_per_rad * abs(velocity)
-        if d.stribeck_nm > 0.0 and abs(velocity) < 4.0 * d.stribeck_velocity_rad_s:
-            x = abs(velocity) * (1.0 / d.stribeck_velocity_rad_s)
-            force += d.stribeck_nm * math.exp(-x * x)
+        if d.stribeck.torque_nm > 0.0 and abs(velocity) < 4.0 * d.stribeck.velocity_rad_s:
+            x = abs(velocity) * (1.0 / d.stribeck.velocity_rad_s)
+            force += d.stribeck.torque_nm * math.exp(-x * x)
         return max(force, 0.0)
 
     def step(self):
@@ -94,10 +94,10 @@ class TwinPlant:
             side, d, g = self.sides[k], self.sides[k].deviations, 1.0 / self.sides[k].joint.gear_ratio
             per_motor = h / side.constants.rotor_inertia
             per_joint = per_motor * g
-            angle = d.ripple_order_per_motor_rev * self.motor_position[k] + d.ripple_phase_rad
+            angle = d.ripple.order_per_motor_rev * self.motor_position[k] + d.ripple.phase_rad
             w = self.motor_velocity[k] + (
                 per_motor * side.constants.torque_constant * currents[k]
-                - per_joint * (torques[k] + d.ripple_nm * math.cos(angle))
+                - per_joint * (torques[k] + d.ripple.amplitude_nm * math.cos(angle))
             )
             stop = per_joint * self.friction(k, torques[k], w * g)
             self.motor_velocity[k] = w - stop if w > stop else w + stop if w < -stop else 0.0

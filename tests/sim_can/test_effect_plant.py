@@ -13,18 +13,23 @@ from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.drives import demo_current, demo_velocity
 from jtqd.sim_can.effect_plant import EffectFriction, EffectPlant, JointEffects
+from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant import Plant, joint_friction
 from jtqd.sim_can.plant_file import (
     Day,
     Deviations,
+    Hysteresis,
     JointPlant,
+    KinematicError,
     PlantParameters,
+    Ripple,
+    Stribeck,
     Thermal,
     load_plant,
     plant_of_joint,
 )
 from jtqd.sim_can.plant_source import PlantSource
-from jtqd.sim_can.source import CURRENT, VELOCITY
+from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
 
 JOINT = load_joint(shipped("joint1.yaml"))
 G, KT, K = JOINT.gear_ratio, JOINT.torque_constant_nm_per_a, JOINT.stiffness_nm_per_rad
@@ -112,19 +117,19 @@ SAME = [
     ({"stiffness_scale": 1.2}, {"nonlinear_stiffness": {"stiffness_nm_per_rad": 1.2 * K}}),
     ({"rotor_inertia_scale": 1.3}, {"rotor_inertia": {"rotor_inertia_kgm2": 1.3 * JM}}),
     (
-        {"ripple_nm": 0.5, "ripple_order_per_motor_rev": 4.0, "ripple_phase_rad": 0.3},
+        {"ripple": Ripple(0.5, 4.0, 0.3)},
         {"torque_ripple": {"amplitude_nm": 0.5, "order_per_motor_rev": 4.0, "phase_rad": 0.3}},
     ),
     (
-        {"kinematic_error_rad": 3e-4, "kinematic_error_phase_rad": 0.9},
+        {"kinematic_error": KinematicError(3e-4, phase_rad=0.9)},
         {"kinematic_error": {"amplitude_rad": 3e-4, "order_per_motor_rev": 2.0, "phase_rad": 0.9}},
     ),
     (
-        {"hysteresis_nm": 2.0, "hysteresis_travel_rad": 2e-4},
+        {"hysteresis": Hysteresis(2.0, 2e-4)},
         {"hysteresis": {"torque_nm": 2.0, "travel_rad": 2e-4}},
     ),
     (
-        {"stribeck_nm": 1.7, "stribeck_velocity_rad_s": 0.05},
+        {"stribeck": Stribeck(1.7)},
         {"stribeck_friction": {"stribeck_nm": 2.5, "stribeck_velocity_rad_s": 0.05}},  # the file's 0.8 more
     ),
 ]
@@ -312,3 +317,88 @@ def test_a_joint_that_could_not_be_is_refused(effects, message):
 def test_the_plain_plant_refuses_what_it_has_no_equations_for():
     with pytest.raises(ValueError, match="found joints with effects"):
         Plant(plant_of_joint(with_effects(JOINT, {"torque_ripple": {"amplitude_nm": 0.2}})))
+
+
+# What instruments read
+
+
+def still(joint_1, joint_2=JOINT, seconds=0.2):
+    sides = (JointPlant(joint_1), JointPlant(joint_2))
+    return emulate_run(PlantParameters(sides), (JointCommand.off(), JointCommand.off()), seconds)
+
+
+def test_the_one_sensor_is_joint_ones():
+    """Joint 2's file speaks for it only where joint 1's says nothing about the sensor."""
+    a = with_effects(JOINT, {"sensor_offset": {"offset_nm": 1.0}})
+    b = with_effects(JOINT, {"sensor_offset": {"offset_nm": -2.0}})
+    ripple = with_effects(JOINT, {"torque_ripple": {"amplitude_nm": 0.1}})
+    for joints, expected in (((a, b), 1.0), ((ripple, b), -2.0), ((a, a), 1.0), ((a, JOINT), 1.0)):
+        run = still(*joints)
+        assert run.joints[1].torque_nm == pytest.approx(np.full(200, expected), abs=1e-3)
+        assert np.array_equal(run.joints[1].torque_nm, run.joints[2].torque_nm)
+
+
+def test_sensor_effects_add_up_in_the_reading():
+    """reading = (truth + offset) / (1 - (1 - 1/g)): gain and offset both speak of the reading."""
+    effects = {"sensor_gain": {"gain": 1.25}, "sensor_offset": {"offset_nm": 0.8}}
+    source = PlantSource(PlantParameters((JointPlant(with_effects(JOINT, effects)), JointPlant(JOINT))))
+    source.command(0, VELOCITY, 0.0)
+    source.command(1, CURRENT, 4.0)
+    for _ in range(300):
+        source.advance(0.001)
+    truth = source.plant.sensor_torque()
+    assert truth > 5.0
+    assert source.channels[0].torque_nm == pytest.approx(1.25 * (truth + 0.8), rel=1e-12)
+
+
+def test_an_eccentric_motor_encoder_is_the_motors():
+    effects = {"encoder_eccentricity": {"amplitude_rad": 0.02, "phase_rad": 0.4, "motor_side": 1.0}}
+    source = PlantSource(PlantParameters((JointPlant(JOINT), JointPlant(with_effects(JOINT, effects)))))
+    source.advance(0.0)
+    source.command(1, VELOCITY, 30.0)
+    for _ in range(300):
+        source.advance(0.001)
+        angle = source.plant.motor_position[1]
+        read = source.drives[1].motor_position_rad
+        assert read - angle == pytest.approx(0.02 * math.sin(angle + 0.4), abs=1e-4)
+        assert source.drives[1].link_position_rad == -source.plant.link_position
+    assert abs(source.plant.motor_position[1]) > 5.0
+
+
+def test_drift_begins_again_when_the_drives_are_enabled():
+    joint = with_effects(JOINT, {"sensor_drift": {"rate_nm_per_s": 1.0}})
+    source = PlantSource(plant_of_joint(joint))
+    for _ in range(300):
+        source.advance(0.001)
+    assert source.channels[0].torque_nm == pytest.approx(0.3, abs=1e-9)
+    source.command(0, VELOCITY, 0.0)
+    source.command(1, CURRENT, 0.0)
+    for _ in range(100):
+        source.advance(0.001)
+    assert source.channels[0].torque_nm == pytest.approx(0.1, abs=1e-6)
+    source.command(0, OFF, 0.0)
+    source.command(0, VELOCITY, 0.0)  # joint 2 stayed on: the same run
+    source.advance(0.001)
+    assert source.channels[0].torque_nm == pytest.approx(0.101, abs=1e-6)
+
+
+def test_hooks_see_each_joint_in_its_own_frame():
+    joint = with_effects(JOINT, {"unbalance": {"moment_nm": 0.5}})
+    plant = PlantSource(plant_of_joint(joint)).plant
+    plant.link_position, plant.link_velocity = 0.3, 0.7
+    plant.motor_position, plant.motor_velocity = [31.0, -29.0], [10.0, -20.0]
+    torques = plant.joint_torques()
+    for k, sign in ((0, 1.0), (1, -1.0)):
+        state = plant.effects[k].state
+        assert state.coupling_position_rad == 0.3
+        assert (state.link_position_rad, state.link_velocity_rad_s) == (sign * 0.3, sign * 0.7)
+        assert state.torsion_rad == pytest.approx(plant.motor_position[k] / 100.0 - sign * 0.3)
+        assert state.velocity_rad_s == pytest.approx(plant.motor_velocity[k] / 100.0)
+        assert (state.torque_nm, state.direction) == (torques[k], sign)
+
+
+def test_a_joint_file_with_an_effect_of_temperature_warms_up():
+    warm = {"temperature_dependent_friction": {"viscous_per_k": 0.03, "reference_c": 25.0}}
+    drift, cold = {"sensor_drift": {"per_k_nm": 0.01}}, {"torque_ripple": {"amplitude_nm": 0.2}}
+    sides = [plant_of_joint(with_effects(JOINT, effects)).joints[0] for effects in (warm, drift, cold)]
+    assert [side.thermal.kelvin_per_w for side in sides] == [0.6, 0.6, 0.0]

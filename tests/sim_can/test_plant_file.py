@@ -7,7 +7,14 @@ import yaml
 
 from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.plant_file import RunToRun, Thermal, load_plant, plant_from_mapping
+from jtqd.sim_can.plant_file import (
+    Hysteresis,
+    KinematicError,
+    RunToRun,
+    Thermal,
+    load_plant,
+    plant_from_mapping,
+)
 
 CAMPAIGN = "campaign_plant.yaml"
 
@@ -27,14 +34,12 @@ def test_campaign_plant_is_the_hard_bench():
     assert plant.profile == "demo"
     for side, phase in zip(plant.joints, (0.9, 2.3), strict=True):
         d = side.deviations
-        assert (d.ripple_nm, d.ripple_order_per_motor_rev) == (0.25, 2.0)
-        assert (d.kinematic_error_rad, d.kinematic_error_order_per_motor_rev) == (4e-5, 2.0)
-        assert d.kinematic_error_phase_rad == phase
-        assert (d.hysteresis_nm, d.hysteresis_travel_rad) == (0.4, 1e-4)
+        assert (d.ripple.amplitude_nm, d.ripple.order_per_motor_rev) == (0.25, 2.0)
+        assert d.kinematic_error == KinematicError(4e-5, 2.0, phase)
+        assert d.hysteresis == Hysteresis(0.4, 1e-4)
         assert side.thermal == Thermal(25.0, 0.025, 0.004, 0.6, 600.0)
     mild = load_plant(shipped("plant.yaml")).joints[0]
-    assert d.stribeck_nm == mild.deviations.stribeck_nm
-    assert d.stribeck_velocity_rad_s == mild.deviations.stribeck_velocity_rad_s
+    assert d.stribeck == mild.deviations.stribeck
 
 
 def test_new_sections_may_be_left_out():
@@ -47,7 +52,8 @@ def test_new_sections_may_be_left_out():
     plant = from_mapping(changed)
     assert plant.run_to_run == RunToRun() == RunToRun(0.0, 0.0, 0.0, 0.0)
     assert plant.joints[0].thermal == Thermal()
-    assert plant.joints[0].deviations.hysteresis_nm == plant.joints[1].deviations.kinematic_error_rad == 0.0
+    assert plant.joints[0].deviations.hysteresis.torque_nm == 0.0
+    assert plant.joints[1].deviations.kinematic_error.amplitude_rad == 0.0
 
 
 @pytest.mark.parametrize(
@@ -72,6 +78,17 @@ def test_new_sections_may_be_left_out():
             5e-3,  # 5e-3 * 2 = 0.01 = 1/G: the link would stand still while the motor turns
             "'joint_2.deviations.kinematic_error': found 0.01, expected amplitude_rad times",
         ),
+        (("joint_1", "deviation"), {}, "'joint_1.deviation': unknown key, did you mean 'deviations'"),
+        (("joint_1", "deviations", "friction_scale"), "x", "'joint_1.deviations.friction_scale': found 'x'"),
+        (("joint_1", "deviations", "stiffness_scale"), 0.0, "expected a number from 0.05 to 10"),
+        (("joint_2", "measurement", "motor_counts_per_rev"), 1.5, "motor_counts_per_rev': found 1.5"),
+        (("joint_2", "deviations", "ripple", "amplitude"), 1.0, "ripple.amplitude': unknown key"),
+        (("joint_1", "deviations", "stribeck", "velocity_rad_s"), 0.2, "from 0.002 to 0.06"),
+        (("sensor", "gain"), float("nan"), "'sensor.gain': found nan"),
+        (("profile",), "dance", "'profile': found 'dance'"),
+        (("substep_s",), 1.0, "'substep_s': found 1.0"),
+        (("extra",), 1, "'extra': unknown key"),
+        (("joint_2",), ..., "'joint_2': missing"),
     ],
 )
 def test_wrong_section_is_refused_by_name(path, value, message):
@@ -80,6 +97,8 @@ def test_wrong_section_is_refused_by_name(path, value, message):
     for key in path[:-1]:
         inner = inner[key]
     inner[path[-1]] = value
+    if value is ...:
+        del inner[path[-1]]
     with pytest.raises(ConfigError) as error:
         from_mapping(changed)
     assert message in str(error.value)

@@ -1,38 +1,21 @@
-"""Measurement, effects of the instruments, built-in motion, plant file and emulated runs."""
+"""Measurement, built-in motion and emulated runs."""
 
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import yaml
 
-from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.joint import Effect
-from jtqd.models.files import load_joint, shipped
+from jtqd.models.files import shipped
 from jtqd.sim_can.bench import measure
 from jtqd.sim_can.drives import PERIOD_S, demo_current, demo_velocity
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
-from jtqd.sim_can.plant_file import (
-    JointPlant,
-    PlantParameters,
-    load_plant,
-    plant_from_mapping,
-    plant_of_joint,
-)
+from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
-from jtqd.sim_can.source import CURRENT, OFF, VELOCITY
+from jtqd.sim_can.source import CURRENT, VELOCITY
 
 PLANT = load_plant(shipped("plant.yaml"))
 G = PLANT.joints[0].joint.gear_ratio
-
-
-def mapping():
-    return yaml.safe_load(shipped("plant.yaml").read_text())
-
-
-def from_mapping(changed):
-    return plant_from_mapping(changed, "plant.yaml", lambda name: load_joint(shipped(name)))
 
 
 def snapshot(source):
@@ -65,9 +48,8 @@ def test_noise_and_rounding_are_those_of_the_plant_file():
     for _ in range(4000):
         source.advance(0.001)
         one = source.drives[0]
-        rows.append(
-            (one.current_a, one.link_position_rad, source.channels[0].torque_nm, one.motor_position_rad)
-        )
+        torque = source.channels[0].torque_nm
+        rows.append((one.current_a, one.link_position_rad, torque, one.motor_position_rad))
     current, link, torque, motor = np.array(rows).T
     assert np.std(current) == pytest.approx(0.010, rel=0.05)
     assert np.std(link) == pytest.approx(6e-6, rel=0.05)
@@ -154,15 +136,9 @@ def test_demo_run_visits_all_quadrants_of_both_joints(demo):
     for joint in demo.joints.values():
         moving = np.abs(joint.motor_velocity_rad_s) > 0.2 * G
         loaded = np.abs(joint.current_a) > 0.5
-        for si in (1, -1):
-            for sw in (1, -1):
-                share = np.mean(
-                    moving
-                    & loaded
-                    & (np.sign(joint.current_a) == si)
-                    & (np.sign(joint.motor_velocity_rad_s) == sw)
-                )
-                assert share > 0.005, (si, sw)
+        signs = [np.sign(each) for each in (joint.current_a, joint.motor_velocity_rad_s)]
+        for si, sw in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+            assert np.mean(moving & loaded & (signs[0] == si) & (signs[1] == sw)) > 0.005, (si, sw)
 
 
 def test_emulated_run_holds_what_the_pdos_would_say(demo):
@@ -198,139 +174,7 @@ def test_emulated_run_refuses_a_senseless_duration(duration):
         emulate_run(PLANT, (JointCommand.off(), JointCommand.off()), duration)
 
 
-def test_shipped_plant_deviates_as_documented():
-    for side in PLANT.joints:
-        assert side.deviations.viscous_scale == 1.05
-        assert side.deviations.ripple_nm == 0.4
-        assert side.deviations.ripple_order_per_motor_rev == 2.0
-        assert side.deviations.stribeck_nm > 0
-    assert PLANT.sensor.noise_nm == 0.02
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "message"),
-    [
-        (("joint_1", "deviation"), {}, "'joint_1.deviation': unknown key, did you mean 'deviations'"),
-        (("joint_1", "deviations", "friction_scale"), "x", "'joint_1.deviations.friction_scale': found 'x'"),
-        (("joint_1", "deviations", "stiffness_scale"), 0.0, "expected a number from 0.05 to 10"),
-        (("joint_2", "measurement", "motor_counts_per_rev"), 1.5, "motor_counts_per_rev': found 1.5"),
-        (("joint_2", "deviations", "ripple", "amplitude"), 1.0, "ripple.amplitude': unknown key"),
-        (("joint_1", "deviations", "stribeck", "velocity_rad_s"), 0.2, "from 0.002 to 0.06"),
-        (("sensor", "gain"), float("nan"), "'sensor.gain': found nan"),
-        (("profile",), "dance", "'profile': found 'dance'"),
-        (("substep_s",), 1.0, "'substep_s': found 1.0"),
-        (("extra",), 1, "'extra': unknown key"),
-    ],
-)
-def test_wrong_plant_file_is_refused_by_name(path, value, message):
-    changed = mapping()
-    inner = changed
-    for key in path[:-1]:
-        inner = inner[key]
-    inner[path[-1]] = value
-    with pytest.raises(ConfigError) as error:
-        from_mapping(changed)
-    assert message in str(error.value)
-    assert "\n" not in str(error.value)
-
-
-def test_missing_joint_is_refused():
-    changed = mapping()
-    del changed["joint_2"]
-    with pytest.raises(ConfigError, match="'joint_2': missing"):
-        from_mapping(changed)
-
-
 def test_cost_is_measured():
     cost = measure(PLANT, cycles=200)
     assert 0 < cost.plant_step_us < cost.sync_us < 2000
     assert cost.substeps == 8
-
-
-JOINT = load_joint(shipped("joint1.yaml"))
-
-
-def with_effects(joint, effects):
-    return replace(joint, effects=tuple(Effect(name, values) for name, values in effects.items()))
-
-
-def still(joint_1, joint_2=JOINT, seconds=0.2):
-    sides = (JointPlant(joint_1), JointPlant(joint_2))
-    return emulate_run(PlantParameters(sides), (JointCommand.off(), JointCommand.off()), seconds)
-
-
-def test_the_one_sensor_is_joint_ones():
-    """Joint 2's file speaks for it only where joint 1's says nothing about the sensor."""
-    a = with_effects(JOINT, {"sensor_offset": {"offset_nm": 1.0}})
-    b = with_effects(JOINT, {"sensor_offset": {"offset_nm": -2.0}})
-    ripple = with_effects(JOINT, {"torque_ripple": {"amplitude_nm": 0.1}})
-    for joints, expected in (((a, b), 1.0), ((ripple, b), -2.0), ((a, a), 1.0), ((a, JOINT), 1.0)):
-        run = still(*joints)
-        assert run.joints[1].torque_nm == pytest.approx(np.full(200, expected), abs=1e-3)
-        assert np.array_equal(run.joints[1].torque_nm, run.joints[2].torque_nm)
-
-
-def test_sensor_effects_add_up_in_the_reading():
-    """reading = (truth + offset) / (1 - (1 - 1/g)): gain and offset both speak of the reading."""
-    effects = {"sensor_gain": {"gain": 1.25}, "sensor_offset": {"offset_nm": 0.8}}
-    source = PlantSource(PlantParameters((JointPlant(with_effects(JOINT, effects)), JointPlant(JOINT))))
-    source.command(0, VELOCITY, 0.0)
-    source.command(1, CURRENT, 4.0)
-    for _ in range(300):
-        source.advance(0.001)
-    truth = source.plant.sensor_torque()
-    assert truth > 5.0
-    assert source.channels[0].torque_nm == pytest.approx(1.25 * (truth + 0.8), rel=1e-12)
-
-
-def test_an_eccentric_motor_encoder_is_the_motors():
-    effects = {"encoder_eccentricity": {"amplitude_rad": 0.02, "phase_rad": 0.4, "motor_side": 1.0}}
-    source = PlantSource(PlantParameters((JointPlant(JOINT), JointPlant(with_effects(JOINT, effects)))))
-    source.advance(0.0)
-    source.command(1, VELOCITY, 30.0)
-    for _ in range(300):
-        source.advance(0.001)
-        angle = source.plant.motor_position[1]
-        read = source.drives[1].motor_position_rad
-        assert read - angle == pytest.approx(0.02 * math.sin(angle + 0.4), abs=1e-4)
-        assert source.drives[1].link_position_rad == -source.plant.link_position
-    assert abs(source.plant.motor_position[1]) > 5.0
-
-
-def test_drift_begins_anew_when_the_drives_are_enabled():
-    joint = with_effects(JOINT, {"sensor_drift": {"rate_nm_per_s": 1.0}})
-    source = PlantSource(plant_of_joint(joint))
-    for _ in range(300):
-        source.advance(0.001)
-    assert source.channels[0].torque_nm == pytest.approx(0.3, abs=1e-9)
-    source.command(0, VELOCITY, 0.0)
-    source.command(1, CURRENT, 0.0)
-    for _ in range(100):
-        source.advance(0.001)
-    assert source.channels[0].torque_nm == pytest.approx(0.1, abs=1e-6)
-    source.command(0, OFF, 0.0)
-    source.command(0, VELOCITY, 0.0)  # joint 2 stayed on: the same run
-    source.advance(0.001)
-    assert source.channels[0].torque_nm == pytest.approx(0.101, abs=1e-6)
-
-
-def test_hooks_see_each_joint_in_its_own_frame():
-    joint = with_effects(JOINT, {"unbalance": {"moment_nm": 0.5}})
-    plant = PlantSource(plant_of_joint(joint)).plant
-    plant.link_position, plant.link_velocity = 0.3, 0.7
-    plant.motor_position, plant.motor_velocity = [31.0, -29.0], [10.0, -20.0]
-    torques = plant.joint_torques()
-    for k, sign in ((0, 1.0), (1, -1.0)):
-        state = plant.effects[k].state
-        assert state.coupling_position_rad == 0.3
-        assert (state.link_position_rad, state.link_velocity_rad_s) == (sign * 0.3, sign * 0.7)
-        assert state.torsion_rad == pytest.approx(plant.motor_position[k] / 100.0 - sign * 0.3)
-        assert state.velocity_rad_s == pytest.approx(plant.motor_velocity[k] / 100.0)
-        assert (state.torque_nm, state.direction) == (torques[k], sign)
-
-
-def test_a_joint_file_with_an_effect_of_temperature_warms_up():
-    warm = {"temperature_dependent_friction": {"viscous_per_k": 0.03, "reference_c": 25.0}}
-    drift, cold = {"sensor_drift": {"per_k_nm": 0.01}}, {"torque_ripple": {"amplitude_nm": 0.2}}
-    sides = [plant_of_joint(with_effects(JOINT, effects)).joints[0] for effects in (warm, drift, cold)]
-    assert [side.thermal.kelvin_per_w for side in sides] == [0.6, 0.6, 0.0]
