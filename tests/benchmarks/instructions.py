@@ -13,6 +13,7 @@ import argparse
 import json
 import math
 import os
+import pickle
 import re
 import shutil
 import subprocess
@@ -23,18 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
-from jtqd.daemon.config import load_config
-from jtqd.daemon.loop import process as loop
-from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.drivers.frame_socket import open_frame_socket
-from jtqd.estimator import load_network, make_estimator, onnx_graph
-from jtqd.estimator.methods import AnyNetwork
+from jtqd.estimator import load_network, make_estimator
 from jtqd.estimator.settings import recommended
-from jtqd.estimator.status import PUBLISHED
 from jtqd.models.files import load_joint, shipped
-from tests.benchmarks.fixture import Fixture, small_network
-from tests.benchmarks.host import Cpus, traffic
-from tests.estimator.fused_configuration import network_of
 
 STORED = Path(__file__).with_name("instructions.json")
 SAMPLES = 2000
@@ -59,13 +51,25 @@ class BusyError(RuntimeError):
     """Too few cycles had a torque, in each of TRIES runs."""
 
 
-def work(method: str) -> None:
-    """Estimate a run: what is counted."""
+def prepared(method: str) -> bytes:
+    """Return the network of a method, of the paper's form and size or of ours, and ONNX Runtime's check of it, pickled."""
+    from tests.benchmarks.fixture import small_network
+    from tests.estimator.fused_configuration import network_of
+
+    if method not in ("network", "fused"):
+        return pickle.dumps(None)
+    data = small_network(1).onnx("joint1") if method == "network" else network_of(1)
+    return pickle.dumps((data, load_network(method, data).check))
+
+
+def work(method: str, prepared: Path) -> None:
+    """Estimate a run: what is counted. Few imports, and no ONNX Runtime: under valgrind they take minutes."""
     joint = load_joint(shipped("trained/joint1.yaml"))
     assert joint.fused is not None
     assert joint.fused.agreement is not None
-    with tempfile.TemporaryDirectory() as directory:
-        estimator = make_estimator(joint, recommended(method), _network(method, Path(directory)))
+    made = pickle.loads(prepared.read_bytes())
+    network = None if made is None else load_network(method, made[0], check=made[1])
+    estimator = make_estimator(joint, recommended(method), network)
     time = np.arange(SAMPLES) * 1e-3
     angle = np.sin(3.0 * time)
     run = estimator.run(
@@ -74,17 +78,18 @@ def work(method: str) -> None:
     assert np.isfinite(run.torque_nm[1:]).all()
 
 
-def _network(method: str, directory: Path) -> AnyNetwork | None:
-    """Return one of the paper's form and size, or of ours, whatever is shipped."""
-    if method not in ("network", "fused"):
-        return None
-    file = directory / "network.onnx"
-    file.write_bytes(small_network(1).onnx("joint1") if method == "network" else network_of(1))
-    return load_network(method, str(file))
-
-
 def cycles() -> None:
     """Go through the loop's own cycle on a unix bus, beside the bench's traffic: what is counted."""
+    from jtqd.daemon.config import load_config
+    from jtqd.daemon.loop import process as loop
+    from jtqd.daemon.shared.snapshot import SnapshotReader
+    from jtqd.drivers.frame_socket import open_frame_socket
+    from jtqd.estimator import onnx_graph
+    from jtqd.estimator.status import PUBLISHED
+    from tests.benchmarks.fixture import Fixture
+    from tests.benchmarks.host import Cpus, traffic
+
+    onnx_graph._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         original = shipped("bench.yaml")
@@ -121,11 +126,12 @@ def count(method: str) -> float:
     if shutil.which("valgrind") is None:
         raise RuntimeError("found no valgrind")
     with tempfile.TemporaryDirectory() as directory:
-        out = Path(directory) / "callgrind.out"
+        out, made = Path(directory) / "callgrind.out", Path(directory) / "network.pickle"
+        made.write_bytes(prepared(method))
         command = [
             *("valgrind", "--tool=callgrind", "--collect-atstart=no", *counted),
             *(f"--callgrind-out-file={out}", sys.executable, "-m", "tests.benchmarks.instructions"),
-            *("--work", method),
+            *("--work", method, str(made)),
         ]
         plain = "glibc.cpu.hwcaps=-AVX2,-AVX2_Usable,-FMA,-FMA_Usable,-FMA4"
         environment = {**os.environ, "GLIBC_TUNABLES": plain}
@@ -150,11 +156,11 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--store", metavar="WHY", help="store them, with this reason")
-    parser.add_argument("--work", choices=(*METHODS, CYCLE), help=argparse.SUPPRESS)
+    parser.add_argument("--work", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work:
-        onnx_graph._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
-        cycles() if options.work == CYCLE else work(options.work)
+        method, made = options.work
+        cycles() if method == CYCLE else work(method, Path(made))
         return 0
     counts = {method: round(count(method), 1) for method in (*METHODS, CYCLE)}
     stored = json.loads(STORED.read_text())["instructions"] if STORED.exists() else {}
