@@ -14,10 +14,10 @@ from tests.slow.fuzz.files import fuzz_files
 
 
 def test_every_kind_of_file() -> None:
-    reports = fuzz_files(seed=1, count=8)
+    reports = fuzz_files(seed=1, count=5)
     assert len(reports) == 14
     assert [line for report in reports for line in report.wrong] == []
-    assert sum(report.counts["refused"] for report in reports) > 4 * len(reports)
+    assert sum(report.counts["refused"] for report in reports) > 2 * len(reports)
 
 
 @pytest.mark.campaign

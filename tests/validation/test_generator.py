@@ -54,11 +54,25 @@ def library_cases() -> list[Case]:
     return quiet_set([*hidden, *EXTRA], SEED)
 
 
-def test_both_balances_close_when_nothing_is_hidden() -> None:
+UNLIKE = [name for name, entry in UNKNOWN.items() if not entry.resembling]
+
+
+@pytest.fixture(scope="module")
+def long_cases() -> list[Case]:
+    """Runs of 20 s, integrated side by side: nothing hidden, quiet; with noise; each unknown thing."""
     print(f"seed {SEED}")
-    case = draw(SEED, runs=3, quiet=True)
-    for columns in case.runs:
-        for number, joint in case.joints.items():
+    unknown = [Order(SEED + k, ((n, 1, UNKNOWN[n].high),), runs=4, quiet=True) for k, n in enumerate(UNLIKE)]
+    return draw_many([Order(SEED, quiet=True), Order(SEED, profile="slow", runs=2), *unknown])
+
+
+@pytest.fixture(scope="module")
+def plain(long_cases: list[Case]) -> Case:
+    return long_cases[0]
+
+
+def test_both_balances_close_when_nothing_is_hidden(plain: Case) -> None:
+    for columns in plain.runs[:3]:
+        for number, joint in plain.joints.items():
             s = signals(columns, number, joint)
             assert s.moving.mean() > 0.3
             assert rms(binned(s.motor_nm, s.moving)) < 0.02
@@ -66,8 +80,8 @@ def test_both_balances_close_when_nothing_is_hidden() -> None:
             assert rms(binned(s.torsion_nm, s.moving)) < 1e-3
 
 
-def test_noise_is_what_is_left_with_noise() -> None:
-    case = draw(SEED, profile="slow", runs=2)
+def test_noise_is_what_is_left_with_noise(long_cases: list[Case]) -> None:
+    case = long_cases[1]
     for columns in case.runs:
         for number, joint in case.joints.items():
             s = signals(columns, number, joint)
@@ -167,9 +181,8 @@ def test_energy_goes_into_friction_and_nowhere_else() -> None:
         assert work == pytest.approx(lost, rel=0.03, abs=0.2)
 
 
-def test_rests_are_standstill_with_zero_current() -> None:
-    case = draw(SEED, runs=2, duration_s=20.0, quiet=True)
-    for columns, motion in zip(case.runs, case.motions, strict=True):
+def test_rests_are_standstill_with_zero_current(plain: Case) -> None:
+    for columns, motion in zip(plain.runs, plain.motions, strict=True):
         off = ~motion.on
         settled = np.convolve(off, np.ones(300), "full")[: len(off)] > 299.5
         assert settled.sum() > 500
@@ -179,7 +192,7 @@ def test_rests_are_standstill_with_zero_current() -> None:
 
 
 def test_finer_steps_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    order = Order(SEED, (("hysteresis", 1, None),), profile="fourier", runs=2, duration_s=5.0, quiet=True)
+    order = Order(SEED, (("hysteresis", 1, None),), profile="fourier", runs=2, duration_s=3.0, quiet=True)
     coarse = draw_many([order])[0]
     monkeypatch.setattr(plant_module, "SUBSTEPS", 16)
     fine = draw_many([order])[0]
@@ -188,8 +201,8 @@ def test_finer_steps_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
         assert rms(a["j1.motor_position_rad"] - b["j1.motor_position_rad"]) < 0.02
 
 
-def test_profiles_cover_what_a_diagnosis_needs() -> None:
-    case = draw(SEED)
+def test_profiles_cover_what_a_diagnosis_needs(plain: Case) -> None:
+    case = plain
     travel = [np.ptp(c["j1.link_position_rad"]) for c in case.runs]
     assert sum(x > 2 * np.pi for x in travel) >= 1
     both = {(bool(a), bool(b)) for c in case.runs for a, b in _quadrants(signals(c, 1, case.joints[1]))}
@@ -225,20 +238,9 @@ def test_late_channel_is_the_channel_of_before() -> None:
         assert np.max(np.abs(late[20:-2] - np.sin(2 * np.pi * 5.0 * (t - delay))[20:-2])) < 1e-6
 
 
-UNLIKE = [name for name, entry in UNKNOWN.items() if not entry.resembling]
-
-
-@pytest.fixture(scope="module")
-def unknown_cases() -> list[Case]:
-    print(f"seed {SEED}")
-    return draw_many(
-        [Order(SEED + k, ((n, 1, UNKNOWN[n].high),), runs=4, quiet=True) for k, n in enumerate(UNLIKE)]
-    )
-
-
 @pytest.mark.parametrize("index", range(len(UNLIKE)))
-def test_unknown_thing_shows_at_its_place_and_little_elsewhere(unknown_cases: list[Case], index: int) -> None:
-    case = unknown_cases[index]
+def test_unknown_thing_shows_at_its_place_and_little_elsewhere(long_cases: list[Case], index: int) -> None:
+    case = long_cases[2 + index]
     (item,) = case.truth
     print(case.seed, item)
     assert item["name"] not in ENTRIES

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -205,14 +206,21 @@ def test_what_the_recorder_does_itself_is_no_wrong_name(
 # On the generator.
 
 
-def test_trials_print_their_table(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_trials_print_their_table(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Short runs, and a diagnosis that finds nothing: the row of what is hidden is missed, the other one reached."""
     file = tmp_path / "found.json"
-    few = "--trials 1 --seed 4 --kinds nothing --processes 1 --json"
-    status = main(["trials", *few.split(), str(file)])
+    draw = trials.draw_many
+    shorter = lambda orders: draw([replace(each, runs=1, duration_s=3.0) for each in orders])  # noqa: E731
+    monkeypatch.setattr(trials, "draw_many", shorter)
+    monkeypatch.setattr(trials, "diagnose", lambda runs, joints: Findings("no_gap", (), ("run1",), (1, 2)))
+    few = "--trials 1 --seed 4 --kinds nothing,unknown --processes 1 --json"
+    assert main(["trials", *few.split(), str(file)]) == MISSED
     result = json.loads(file.read_text())
     assert result["seeds"] == {"seed": 4}
-    assert result["values"]["outcomes"][0]["kind"] == "nothing"
-    assert (status == 0) == all(row["reached"] for row in result["values"]["figures"])
+    assert [each["kind"] for each in result["values"]["outcomes"]] == ["nothing", "unknown"]
+    assert [row["reached"] for row in result["values"]["figures"]] == [True, False]
     assert main(["trials", "--trials", "1", "--kinds", "everything"]) == USAGE
     assert "found --kinds 'everything'" in capsys.readouterr().err
 
