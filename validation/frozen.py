@@ -49,7 +49,6 @@ def called(*arguments: str, allowed: tuple[int, ...] = (0, 3), cwd: Path | None 
 
 
 def jtq(*arguments: str) -> str:
-    """Return what `jtq` prints."""
     return called("jtqd.daemon.jtq", *arguments)
 
 
@@ -118,7 +117,6 @@ def _trials(directory: Path) -> Iterator[Path]:
 
 
 def findings(out: Path) -> Iterator[str]:
-    """Diagnose three sets of two generators each."""
     with tempfile.TemporaryDirectory() as scratch:
         for folder in _trials(Path(scratch)):
             runs = sorted(str(path) for path in folder.glob("run*.csv"))
@@ -204,7 +202,6 @@ def wire(out: Path) -> Iterator[str]:
 
 
 def kinova(out: Path) -> Iterator[str]:
-    """Diagnose the seven joints of the measured arm."""
     with tempfile.TemporaryDirectory() as scratch:
         content = json.loads(called("examples.kinova_diagnosis", "--out", scratch, "--json"))
         for each in content["joints"]:
@@ -255,7 +252,6 @@ SECTIONS: Final[dict[str, Callable[[Path], Iterator[str]]]] = {
 
 
 def stored_sections() -> dict[str, list[str]]:
-    """Return the stored lines of each section."""
     sections: dict[str, list[str]] = {}
     for line in STORED.read_text(encoding="utf-8").splitlines() if STORED.exists() else ():
         if line.startswith("["):
@@ -266,7 +262,6 @@ def stored_sections() -> dict[str, list[str]]:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"of {', '.join(SECTIONS)}")
     parser.add_argument("--store", action="store_true", help="store the results as the reference")
     parser.add_argument("--out", type=Path, metavar="DIR", help="keep full dumps")

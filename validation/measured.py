@@ -25,8 +25,9 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
+from itertools import product
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,15 +200,23 @@ def _save(joint: Joint, path: Path) -> None:
     )
 
 
+class Line(NamedTuple):
+    """An estimate [n], its error, and its difference to the offline estimate where there is another one."""
+
+    label: str
+    time_s: Array
+    estimate_nm: Array
+    error_nm: Array
+    difference_nm: Array | None = None
+
+
 class Panel(NamedTuple):
-    """What is drawn of one run, arrays [n]: estimates with label, shaded times, and differences to the offline estimate."""
+    """What is drawn of one run: before and after the fit; the reference and shaded times are those of the last line."""
 
     title: str
-    time_s: Array
+    lines: Sequence[Line]
     reference_nm: Array
-    estimates: Sequence[tuple[Array, str]]
     shades: Sequence[tuple[NDArray[np.bool_], str, str]]
-    differences: Sequence[Array] = ()
 
 
 def draw(panels: Sequence[Panel], path: Path) -> None:
@@ -218,18 +227,20 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
     from jtqd.sysid.report import page as parts
 
     mpl.use("Agg")  # files only; a display is not needed
-    heights = (4, 3, 2) if panels[0].differences else (3, 2)
-    size = (6.2 * len(panels), 7.6 if panels[0].differences else 6.4)
+    differences = panels[0].lines[0].difference_nm is not None
+    heights = (4, 3, 2) if differences else (3, 2)
+    size = (6.2 * len(panels), 7.6 if differences else 6.4)
     figure, axes = plt.subplots(
         len(heights), len(panels), figsize=size, sharex="col", squeeze=False, height_ratios=heights
     )
     for column, panel in zip(axes.T, panels, strict=True):
-        for colour, (values, label) in zip((parts.BEFORE, parts.AFTER), panel.estimates, strict=True):
-            column[0].plot(panel.time_s, values, color=colour, linewidth=0.9, label=label)
-            column[1].plot(panel.time_s, values - panel.reference_nm, color=colour, linewidth=0.9)
-        for colour, difference in zip((parts.BEFORE, parts.AFTER), panel.differences, strict=False):
-            column[2].plot(panel.time_s, 1e3 * difference, color=colour, linewidth=0.6)
-        parts.sensor_line(column[0], panel.time_s, panel.reference_nm)
+        for colour, line in zip((parts.BEFORE, parts.AFTER), panel.lines, strict=True):
+            column[0].plot(line.time_s, line.estimate_nm, color=colour, linewidth=0.9, label=line.label)
+            column[1].plot(line.time_s, line.error_nm, color=colour, linewidth=0.9)
+            if line.difference_nm is not None:
+                column[2].plot(line.time_s, 1e3 * line.difference_nm, color=colour, linewidth=0.6)
+        time_s = panel.lines[-1].time_s
+        parts.sensor_line(column[0], time_s, panel.reference_nm)
         parts.room_for_legend(column[0], 0.45)
         column[0].set_title(panel.title, fontsize=10)
         column[1].axhline(0.0, color=parts.SENSOR, linewidth=0.8)
@@ -237,7 +248,7 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
         for axis in column:
             for where, colour, label in panel.shades:
                 named = label if axis is column[0] and where.any() else None
-                parts.shade(axis, panel.time_s, where, colour, named)
+                parts.shade(axis, time_s, where, colour, named)
             parts.plain(axis)
         parts.legend(column[0])
     labels = ("joint torque [Nm]", "estimate - sensor [Nm]", "published - offline [mNm]")
@@ -249,18 +260,15 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
 
 
 def panel(case: Case) -> Panel:
-    """Return what is drawn of a case."""
     from jtqd.sysid.report import page as parts
 
+    t, reference = case.time_s - case.time_s[0], case.reference_nm
     before = f"before: joint file as shipped, RMSE {case.before.rmse_nm:.2f} Nm"
     after = f"after: losses fitted on {case.fitted_on}, RMSE {case.after.rmse_nm:.2f} Nm"
-    return Panel(
-        f"joint {case.joint}, {case.run}",
-        case.time_s - case.time_s[0],
-        case.reference_nm,
-        ((case.before_nm, before), (case.after_nm, after)),
-        ((case.standstill, parts.STANDING, parts.STANDING_LABEL),),
-    )
+    estimates = ((before, case.before_nm), (after, case.after_nm))
+    lines = [Line(label, t, values, values - reference) for label, values in estimates]
+    shade = (case.standstill, parts.STANDING, parts.STANDING_LABEL)
+    return Panel(f"joint {case.joint}, {case.run}", lines, reference, [shade])
 
 
 def case_table(cases: Sequence[Case]) -> Table:
@@ -282,7 +290,6 @@ def case_table(cases: Sequence[Case]) -> Table:
 
 
 def rms(values: Array) -> float:
-    """Return the root mean square."""
     return float(np.sqrt(np.mean(values**2)))
 
 
@@ -294,13 +301,25 @@ def percent_of(error_nm: float, rated_nm: float) -> str:
 # On a bus.
 
 
+class Played(NamedTuple):
+    """A joint of a run as its configuration sees it."""
+
+    number: int
+    run: str
+    config: str
+    table: RunTable
+    joint: Joint
+    settings: EstimatorSettings
+
+
 @dataclass(frozen=True)
 class BusRun:
     """One joint in one played run under one configuration, row by row of the log [n] (one row per cycle).
 
-    `published_nm` is what stood in the estimate PDO, NaN where it has no torque. `reference_nm` is the
-    sensor as it came over the bus, filtered like the estimate; `offline_nm` the whole-run estimate from the
-    file at the row that was played, NaN after the run's end.
+    published_nm: of the estimate PDO, NaN where it has no torque. reference_nm: the sensor as it came over the bus, filtered
+    like the estimate. offline_nm: the whole-run estimate from the file at the row that was played, NaN after the run's end.
+    rows: of the run; missed: SYNC slots; incomplete: cycles with an input missing; scored: rows that have both estimates and
+    the sensor. replay_difference_nm: of the logged torque to a whole-run estimate of the logged inputs.
     """
 
     joint: int
@@ -312,31 +331,19 @@ class BusRun:
     reference_nm: Array
     offline_nm: Array
     status: NDArray[np.uint16]
-    rows: int  # rows of the run
-    missed: int  # SYNC slots missed while the run was played
-    incomplete: int  # cycles of the run that had an input missing
-    rmse_nm: float  # published against reference
-    offline_rmse_nm: float  # offline estimate of the same rows against the same reference
-    scored: int  # rows of both
-    offline_difference_nm: float  # largest |published - offline|
-    replay_difference_nm: float  # largest |logged - whole-run estimate of the logged inputs|
-    silent_after_end: bool  # no cycle after the run published a torque, and the last status is stale
-
-
-@dataclass(frozen=True)
-class Played:
-    """A joint of a run as its configuration sees it."""
-
-    number: int
-    run: str
-    config: str
-    table: RunTable
-    joint: Joint
-    settings: EstimatorSettings
+    rows: int
+    missed: int
+    incomplete: int
+    rmse_nm: float
+    offline_rmse_nm: float
+    scored: int
+    offline_difference_nm: float
+    replay_difference_nm: float
+    silent_after_end: bool
 
 
 def configured(config: Path) -> tuple[tuple[Joint, Joint], EstimatorSettings]:
-    """Joints and estimator of a configuration of jtqd. Raises ConfigError."""
+    """Return joints and estimator of a configuration of jtqd. Raises ConfigError."""
     mapping = load_yaml(config)
     one, two = (load_joint(config.parent / mapping[f"joint_{number}"]["file"]) for number in (1, 2))
     return (one, two), decode(EstimatorSettings, mapping["estimator"], str(config), "estimator")
@@ -347,9 +354,9 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
     state, frames = read_topic(log, f"/joint/{index + 1}/state"), read_topic(log, "/can/frames")
     if not np.array_equal(state["cycle"], frames["cycle"]):
         raise LogError(f"{log}: found cycles in one topic that are not in the other, expected the same")
-    time_s = sync_time(state["header"]["stamp"])
+    time_s, rows = sync_time(state["header"]["stamp"]), len(played.table.time_s)
     row = _played_row(time_s, played.table.time_s)
-    running = row < len(played.table.time_s)
+    running = row < rows
     published = published_torque(frames, index)
     reference = reference_torque(state, time_s, played.settings.bandwidth_rad_s)
     offline = np.full(len(time_s), np.nan)
@@ -358,7 +365,6 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
     if not used.any():
         raise LogError(f"{log}: found no cycle of {played.run} with estimate and sensor, expected them")
     complete = (state["input_flags"] & _ALL_INPUTS) == _ALL_INPUTS
-    after = ~running
     return BusRun(
         joint=played.number,
         run=played.run,
@@ -369,7 +375,7 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
         reference_nm=reference,
         offline_nm=offline,
         status=state["status"],
-        rows=len(played.table.time_s),
+        rows=rows,
         missed=int(state["cycle"][running][-1]) + 1 - int(running.sum()),
         incomplete=int(np.count_nonzero(running & ~complete)),
         rmse_nm=rms((published - reference)[used]),
@@ -377,52 +383,39 @@ def score_log(log: Path, index: int, played: Played) -> BusRun:
         scored=int(used.sum()),
         offline_difference_nm=float(np.max(np.abs(published - offline)[used])),
         replay_difference_nm=_replay(state, played),
-        silent_after_end=bool(np.isnan(published[after]).all() and state["status"][-1] == STALE),
+        silent_after_end=bool(np.isnan(published[~running]).all() and state["status"][-1] == STALE),
     )
 
 
 def _played_row(time_s: Array, run_s: Array) -> NDArray[np.intp]:
-    """Row of the run that a SYNC at time_s got: the nearest (jtqd.sim_can.play); len(run_s) after the end.
+    """Return the row of the run that a SYNC at time_s got: the nearest (jtqd.sim_can.play); len(run_s) after the end.
 
     As in the bench, a longer pause between two SYNCs than LONGEST_STEP_NS holds the run's time.
     """
-    steps = np.minimum(np.diff(time_s, prepend=time_s[0]), LONGEST_STEP_NS * 1e-9)
+    steps = np.minimum(np.diff(time_s, prepend=time_s[0]), 1e-9 * LONGEST_STEP_NS)
     middles = 0.5 * (run_s[1:] + run_s[:-1]) - run_s[0]
     end = run_s[-1] - run_s[0] + 0.5 * (run_s[-1] - run_s[-2])
     return np.searchsorted(np.append(middles, end), np.cumsum(steps), side="right")
 
 
 def _offline(played: Played) -> Array:
-    """Whole-run estimate from the file, as `offline` makes it; NaN where none would be published.
-
-    Without the temperature: the played drives send none.
-    """
-    table, joint = played.table, played.joint
-    dt_s, current, motor, velocity, link = table.estimator_inputs(played.number, joint.gear_ratio)
-    result = make_estimator(joint, played.settings).run(dt_s, current, motor, velocity, link)
+    """Return the whole-run estimate from the file, NaN where none would be published; the drives send no temperature."""
+    dt_s, current, motor, speed, link = played.table.estimator_inputs(played.number, played.joint.gear_ratio)
+    result = make_estimator(played.joint, played.settings).run(dt_s, current, motor, speed, link)
     return np.where(np.isin(result.status, _PUBLISHED), result.torque_nm, np.nan)
 
 
 def _replay(state: Records, played: Played) -> float:
-    """Return the largest difference between the logged torque and a whole-run estimate of the logged inputs [Nm]."""
+    names = ("dt_s", "current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
     fed = np.isfinite(state["dt_s"])
-    names = (
-        "dt_s",
-        "current_a",
-        "motor_position_rad",
-        "motor_velocity_rad_s",
-        "link_position_rad",
-        "temperature_c",
-    )
-    again = make_estimator(played.joint, played.settings).run(
-        *(np.asarray(state[name][fed]) for name in names)
-    )
+    inputs = (np.asarray(state[name][fed]) for name in (*names, "temperature_c"))
+    again = make_estimator(played.joint, played.settings).run(*inputs).torque_nm
     logged = state["torque_nm"][fed]
     # The loop keeps back the torque of its first cycles, and of those beside a missing input; there is none in the log.
-    expected = np.isfinite(again.torque_nm) & ~np.isin(state["status"][fed], (STARTING, STALE))
+    expected = np.isfinite(again) & ~np.isin(state["status"][fed], (STARTING, STALE))
     if not np.array_equal(np.isfinite(logged), expected):
         return float("inf")
-    return float(np.max(np.abs(logged - again.torque_nm)[expected], initial=0.0))
+    return float(np.max(np.abs(logged - again)[expected], initial=0.0))
 
 
 class PlayError(RuntimeError):
@@ -430,51 +423,10 @@ class PlayError(RuntimeError):
 
 
 def config_file(run: str, after: bool) -> Path:
-    """Configuration of jtqd for a played run: joint files as shipped, or fitted on the other run."""
+    """Return the configuration of jtqd for a played run: joint files as shipped, or fitted on the other run."""
     other = RUNS[1 - RUNS.index(run)]
-    return shipped(
-        f"kinova_gen3/jtqd_after.fitted_on_{other}.yaml" if after else "kinova_gen3/jtqd_before.yaml"
-    )
-
-
-@contextmanager
-def playing(bus: str, run: Path, log_path: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """`jtq sim --play` on the bus, ready; ended with the context. Its log goes to `log_path`. Raises PlayError."""
-    joints = ",".join(str(number) for number in JOINTS)
-    command = [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--play", str(run), "--joints", joints]
-    read_end, write_end = os.pipe()
-    with log_path.open("wb") as log, os.fdopen(read_end, "rb") as pipe:
-        process = subprocess.Popen(command, stderr=write_end, stdin=subprocess.DEVNULL)
-        os.close(write_end)
-        try:
-            for line in pipe:
-                log.write(line)
-                if line.startswith(b"bench ready"):
-                    break
-            else:
-                raise PlayError(
-                    f"the play ended with exit status {process.wait(_START_S)}: {_last_line(log_path, log)}"
-                )
-            _prefer(process.pid)
-            yield process
-        finally:
-            if process.poll() is None:
-                process.terminate()
-            process.wait(_START_S)
-            log.write(pipe.read())
-
-
-def _prefer(pid: int) -> None:
-    """A drive answers SYNC whatever else this machine does: real-time priority below jtqd's loop, where allowed."""
-    try:
-        os.sched_setscheduler(pid, os.SCHED_FIFO, os.sched_param(_PLAY_PRIORITY))
-    except PermissionError:
-        print("measured: the play has no real-time priority (not permitted)", file=sys.stderr, flush=True)
-
-
-def _last_line(path: Path, log: Any) -> str:
-    log.flush()
-    return (path.read_text(errors="replace").strip().splitlines() or ["no message"])[-1]
+    name = f"jtqd_after.fitted_on_{other}.yaml" if after else "jtqd_before.yaml"
+    return shipped(f"kinova_gen3/{name}")
 
 
 def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tuple[Path, dict[str, Any]]:
@@ -483,19 +435,19 @@ def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tup
     jtqd outlives the run by AFTER_END_S, and the play must then have ended by itself with exit status 0.
     """
     out.mkdir(parents=True, exist_ok=True)
+    play = [sys.executable, "-m", "jtqd.sim_can", "--bus", bus, "--play", str(run), "--joints"]
     command = [sys.executable, "-m", "jtqd.daemon.jtqd", "--bus", bus, "--config", str(config)]
     command += ["--record", str(out), "--duration", f"{length_s + AFTER_END_S:.3f}", "--json"]
-    with playing(bus, run, out / "play.log") as play:
+    with (
+        (out / "play.log").open("wb") as log,
+        _ready([*play, ",".join(map(str, JOINTS))], log) as playing,
+    ):
         try:
             done = subprocess.run(
-                command,
-                capture_output=True,
-                text=True,
-                stdin=subprocess.DEVNULL,
-                timeout=length_s + _END_S,
-                check=False,
-            )
-            status = play.wait(_START_S) if done.returncode in (0, 3) else 0
+                command, capture_output=True, text=True, stdin=subprocess.DEVNULL,
+                timeout=length_s + _END_S, check=False,
+            )  # fmt: skip
+            status = playing.wait(_START_S) if done.returncode in (0, 3) else 0
         except subprocess.TimeoutExpired as error:
             raise PlayError(f"did not end in {error.timeout:.0f} s: {error.cmd}") from None
     (out / "jtqd.log").write_text(done.stderr)
@@ -511,6 +463,34 @@ def record(bus: str, run: Path, config: Path, length_s: float, out: Path) -> tup
     return Path(path), summary
 
 
+@contextmanager
+def _ready(command: list[str], log: BinaryIO) -> Iterator[subprocess.Popen[bytes]]:
+    """Start the play, ready on the bus; end it with the context. Raises PlayError."""
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, stdin=subprocess.DEVNULL)
+    assert process.stderr is not None
+    try:
+        line = b"no message"
+        for line in process.stderr:
+            log.write(line)
+            if line.startswith(b"bench ready"):
+                break
+        else:
+            raise PlayError(
+                f"the play ended with exit status {process.wait(_START_S)}: {line.decode().strip()}"
+            )
+        try:  # a drive answers SYNC whatever else this machine does
+            os.sched_setscheduler(process.pid, os.SCHED_FIFO, os.sched_param(_PLAY_PRIORITY))
+        except PermissionError:
+            print("measured: the play has no real-time priority (not permitted)", file=sys.stderr, flush=True)
+        yield process
+    finally:
+        if process.poll() is None:
+            process.terminate()
+        process.wait(_START_S)
+        log.write(process.stderr.read())
+        process.stderr.close()
+
+
 def evaluate_bus(bus: str, out: Path) -> list[BusRun]:
     """Play and score all runs, before and after the fit, both joints. Logs stay in `out`.
 
@@ -519,20 +499,16 @@ def evaluate_bus(bus: str, out: Path) -> list[BusRun]:
     """
     columns = ColumnMap.load(shipped("kinova_gen3/columns.yaml"))
     results: list[BusRun] = []
-    for run in RUNS:
+    for run, name in product(RUNS, ("before", "after")):
         path = shipped(f"kinova_gen3/{run}.csv.gz")
         table = read_run(path, columns).table
+        print(f"measured: playing {run} on {bus}, {name} the fit", file=sys.stderr, flush=True)
+        config = config_file(run, name == "after")
         length_s = float(table.time_s[-1] - table.time_s[0])
-        for after in (False, True):
-            name = "after" if after else "before"
-            print(f"measured: playing {run} on {bus}, {name} the fit", file=sys.stderr, flush=True)
-            config = config_file(run, after)
-            log, _ = record(bus, path, config, length_s, out / f"{run}.{name}")
-            joints, settings = configured(config)
-            results += [
-                score_log(log, index, Played(number, run, name, table, joint, settings))
-                for index, (number, joint) in enumerate(zip(JOINTS, joints, strict=True))
-            ]
+        log, _ = record(bus, path, config, length_s, out / f"{run}.{name}")
+        joints, settings = configured(config)
+        for index, (number, joint) in enumerate(zip(JOINTS, joints, strict=True)):
+            results.append(score_log(log, index, Played(number, run, name, table, joint, settings)))
     return results
 
 
@@ -557,28 +533,26 @@ def bus_panels(results: Sequence[BusRun]) -> list[Panel]:
     from jtqd.sysid.report import page as parts
 
     labels = {"before": "before: joint file as shipped", "after": "after: losses fitted on the other run"}
+
+    def line(r: BusRun) -> Line:
+        label = f"{labels[r.config]}, RMSE {r.rmse_nm:.2f} Nm"
+        error, difference = r.published_nm - r.reference_nm, r.published_nm - r.offline_nm
+        return Line(label, r.time_s, r.published_nm, error, difference)
+
     found = []
     for run in dict.fromkeys(result.run for result in results):
         own = [result for result in results if result.run == run]
         last = own[-1]
-        found.append(
-            Panel(
-                f"joint {last.joint}, {run} on the bus",
-                last.time_s,
-                last.reference_nm,
-                [(r.published_nm, f"{labels[r.config]}, RMSE {r.rmse_nm:.2f} Nm") for r in own],
-                (
-                    (last.status == STANDSTILL, parts.STANDING, parts.STANDING_LABEL),
-                    (last.status == STALE, _SILENT, "inputs missing: status stale, no torque published"),
-                ),
-                [r.published_nm - r.offline_nm for r in own],
-            )
+        shades = (
+            (last.status == STANDSTILL, parts.STANDING, parts.STANDING_LABEL),
+            (last.status == STALE, _SILENT, "inputs missing: status stale, no torque published"),
         )
+        title = f"joint {last.joint}, {run} on the bus"
+        found.append(Panel(title, list(map(line, own)), last.reference_nm, shades))
     return found
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument(
         "--bus", help="play the runs on this bus (vcan0, unix:PATH) and score the published estimates of jtqd"
     )
@@ -594,7 +568,6 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Score, draw, and return the tables."""
     if options.bus is not None and options.joint_files is not None:
         raise UsageError("--joint-files: not possible with --bus, which does not fit")
     make_directory(options.out)

@@ -53,7 +53,6 @@ class Step(NamedTuple):
 
     @property
     def text(self) -> str:
-        """The command as one would type it."""
         name = "jtq" if self.module == "jtqd.daemon.jtq" else f"python -m {self.module}"
         return " ".join((name, *self.arguments))
 
@@ -64,7 +63,6 @@ class Step(NamedTuple):
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
     )

@@ -87,7 +87,6 @@ def wilson(good: int, count: int) -> tuple[float, float]:
 
 
 def share_table(rows: Sequence[Share], title: str = "") -> Table:
-    """Return the table of shares."""
     marks = {True: "yes", False: "NO", None: ""}
     return Table(
         ("figure", "found", "95 %", "target", "reached", "trials", "note"),
@@ -108,7 +107,6 @@ def share_table(rows: Sequence[Share], title: str = "") -> Table:
 
 
 def percent(value: float) -> str:
-    """Return a share as text."""
     return f"{100 * value:.1f} %"
 
 

@@ -56,12 +56,10 @@ def made(name: str) -> Bench:
 
 
 def key(name: str, variant: str = "") -> str:
-    """Return what an effect's size is kept under."""
     return f"{name} of {variant}" if variant else name
 
 
 def sizes(bench: str) -> dict[str, float]:
-    """Return the frozen visible sizes of a bench."""
     found: dict[str, float] = json.loads(FILE.read_text(encoding="utf-8"))[bench]
     return found
 
@@ -246,7 +244,6 @@ def campaign(  # noqa: PLR0917
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     default = Counts()
     bench_option(parser, required=False)
     parser.add_argument("--seed", type=int, help="drawn and printed when not given")

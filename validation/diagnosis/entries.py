@@ -68,7 +68,6 @@ class Draws(NamedTuple):
 
     @property
     def channel(self) -> float:
-        """Number of the late channel."""
         return float(int(3 * self.share) if self.variant is None else CHANNELS.index(self.variant))
 
 
@@ -145,7 +144,6 @@ class Entry:
 
     @property
     def bench_parameter(self) -> str:
-        """Parameter that carries the size on a bench."""
         return self.bench.parameter or self.parameter
 
 
@@ -343,7 +341,6 @@ def times(run: int, spans: Sequence[tuple[float, float]]) -> list[dict[str, Any]
 
 
 def line_place(hz: float) -> dict[str, Any]:
-    """Return the place of a fixed frequency."""
     return {"axis": "frequency", "low": 0.93 * hz, "high": 1.07 * hz, "unit": "Hz"}
 
 
@@ -455,7 +452,6 @@ def scaled(
 
 
 def _others(name: str, rng: np.random.Generator) -> dict[str, float]:
-    """Draw the parameters that do not carry the size."""
     phase = float(rng.uniform(-np.pi, np.pi))
     low_order = float(rng.choice([1.0, 2.0, 4.0]))
     high_order = float(rng.choice([6.0, 8.0, 10.0, 12.0, 14.0]))

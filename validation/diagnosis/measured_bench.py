@@ -124,7 +124,6 @@ class MeasuredBench(Bench):
     channels = 2
 
     def draw(self, seed: int, hidden: Sequence[Hidden] = (), *, quiet: bool = False) -> Set:
-        """Return one set."""
         rng = np.random.default_rng([seed, _DRAW])
         size = str(rng.choice(sorted(SIZES)))
         joint = JOINTS[size]

@@ -48,7 +48,6 @@ class Step:
 
     @property
     def worse(self) -> bool:
-        """Return whether a cause went without a line."""
         return bool(self.unreported)
 
     @property
@@ -58,7 +57,6 @@ class Step:
 
     @property
     def text(self) -> str:
-        """What became of the causes."""
         if not self.lost:
             return "kept"
         line = f"; no line about {', '.join(self.unreported)}" if self.unreported else "; explained"
@@ -69,7 +67,6 @@ class Step:
 def step(
     runs: int, fewer: Findings, more: Findings, held_out: Columns, joints: Mapping[int, JointFile]
 ) -> Step:
-    """Return what one more run changes."""
     still = {(c.name, c.joint) for c in more.causes}
     in_classes = " ".join(name for c in more.causes for name in c.names[1:])
     gone = [
@@ -145,7 +142,6 @@ def _own_sets(seed: int) -> Iterator[tuple[str, int, Set]]:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     bench_option(parser, OWN)
     parser.add_argument("--sets", type=count, default=10)
     parser.add_argument("--seed", type=int, required=True)
@@ -153,7 +149,6 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Return what became of the causes, set by set."""
     done: list[Step] = []
     rows = []
     for key, seed, drawn in islice(sets_of(options.bench, options.seed), options.sets):
@@ -165,7 +160,6 @@ def run(options: argparse.Namespace) -> Report:
 
 
 def summary(done: Sequence[Step]) -> str:
-    """Return the figures of these steps in one line."""
     went = [each for each in done if each.lost]
     return (
         f"{len(done)} steps, a cause went in {len(went)}, without a line in {sum(s.worse for s in went)}; "

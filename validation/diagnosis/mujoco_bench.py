@@ -211,7 +211,6 @@ class Signals:
 
 
 def model_xml(joints: tuple[JointPlant, JointPlant]) -> str:
-    """Return the bench in MuJoCo's format."""
     bodies, tendons, motors = [], [], []
     for k, j in enumerate(joints, 1):
         bodies.append(

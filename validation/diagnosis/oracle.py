@@ -196,7 +196,6 @@ def _size(c: CandidateEvidence) -> float:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     bench_option(parser)
     parser.add_argument("--sets", type=int, default=6, help="with nothing hidden (default 6)")
     parser.add_argument("--write", action="store_true", help=f"freeze the visible sizes in {FILE.name}")

@@ -109,7 +109,6 @@ def record(runs: Sequence[Columns], recorder: Recorder, seed: int) -> list[Colum
 
 
 def csv_text(table: Columns, recorder: Recorder) -> str:
-    """Return a recorded table as CSV."""
     cells = [_cells(name, x, recorder) for name, x in table.items()]
     rows = [",".join(row) for row in zip(*cells, strict=True)]
     return "\n".join([",".join(table), *rows]) + "\n"

@@ -232,7 +232,6 @@ def _channel_reported(truth: Truth, findings: Findings) -> bool:
 
 
 def shown(gap: Gap) -> Sequence[Place]:
-    """Return the places that a reader sees first."""
     return gap.localisation[:_PLACES]
 
 

@@ -243,7 +243,6 @@ def unexplained(
 
 
 def rms(parts: Sequence[Array]) -> float:
-    """Return the rms over all parts."""
     square = sum(float(part @ part) for part in parts)
     return float(np.sqrt(square / max(sum(map(len, parts)), 1)))
 
@@ -348,7 +347,6 @@ def _run(task: Task) -> list[Outcome]:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument(
         "--trials", type=natural, default=25, help="benches, each with all kinds (default 25)"
     )

@@ -81,7 +81,6 @@ class Drift:
 
 
 def draw_drift(rng: np.random.Generator) -> Drift:
-    """Return what one run has of its own."""
     return Drift(
         viscous=1.0 + VISCOUS_DRIFT * rng.uniform(-1.0, 1.0, 2),
         sensor_nm=SENSOR_ZERO_NM * float(rng.uniform(-1.0, 1.0)),
@@ -337,7 +336,6 @@ def _current_dead_band(c: Scene) -> Oddity:
 
 
 def _friction_bursts(c: Scene) -> Oddity:
-    """A seal that grabs at random times for a moment."""
     bursts = []
     for motion in c.motions:
         n = len(motion.on)
@@ -426,7 +424,6 @@ class Builder:
         self.tables: list[Columns | None] = [None] * len(self.motions)
 
     def noise(self, run: int) -> np.random.Generator:
-        """Return the generator of one run's noise."""
         return self.stream(*self._noise, run)
 
     def stream(self, *key: int) -> np.random.Generator:
@@ -538,7 +535,6 @@ def _add_dead_times(flat: list[tuple[Builder, int]], truth: Signals) -> None:
 
 
 def _moment(k: int, first: int, last: int) -> dict[str, Any]:
-    """Return a place on the time axis of run k."""
     return {"axis": "time", "run": f"run{k + 1}", "low": first * STEP_S, "high": last * STEP_S}
 
 

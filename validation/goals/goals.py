@@ -144,7 +144,6 @@ _NOT_HERE: Final = (
 
 
 def goal_rows() -> tuple[Row, ...]:
-    """Return the rows of the goals' table."""
     pairs = zip(*(_goals(method) for method in OWN), strict=True)
     return (*(row for pair in pairs for row in pair), *_NOT_HERE)
 
@@ -201,7 +200,6 @@ def goal_table(columns: Sequence[Column]) -> tuple[Table, bool]:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_const", const="quick", dest="size", help="a sixth of the runs")
     size.add_argument("--tiny", action="store_const", const="tiny", dest="size", help="to test the steps")
@@ -223,7 +221,6 @@ def _timed(sizes: Sizes, fit_seed: int, seed: int, plant: PlantFile) -> tuple[Co
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Return the tables."""
     if options.seed == options.fit_seed:
         raise UsageError(
             f"--seed, --fit-seed: found {options.seed} for both, expected two: the same days would fit and judge"

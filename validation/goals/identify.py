@@ -74,7 +74,6 @@ class PlantFile(NamedTuple):
         return plant_from_mapping(self.mapping, self.name, joint_of)
 
     def changed(self, change: Callable[[Mapped], None]) -> PlantFile:
-        """Return the plant with a change of its file."""
         mapping = copy.deepcopy(dict(self.mapping))  # YAML anchors: joints may share a section
         for side in SIDES:
             mapping[side] = copy.deepcopy(mapping[side])
@@ -107,7 +106,6 @@ class Change(NamedTuple):
     link: Callable[[FloatArray, FloatArray], FloatArray] | None = None
 
     def possible(self, plant: PlantFile) -> bool:
-        """Whether the plant has what is changed."""
         return self.link is not None or (self.own_laws if plant.has_own_laws else self.table_i) is not None
 
     def bench(self, plant: PlantFile) -> AnyPlant:
@@ -299,7 +297,6 @@ class Driven(NamedTuple):
     true_nm: FloatArray
 
     def columns(self, number: int, joint: Joint) -> JointColumns:
-        """Return the columns of a joint."""
         return self.table.joint(number, joint.gear_ratio)
 
 
@@ -321,7 +318,6 @@ class Range(NamedTuple):
 
     @classmethod
     def of(cls, runs: Sequence[Driven], number: int, joint: Joint) -> Range:
-        """Return the range of runs."""
         columns = [run.columns(number, joint) for run in runs]
         known = np.concatenate([_present(each.temperature_c) for each in columns])
         return cls(
@@ -449,7 +445,6 @@ def observed(run: Driven, columns: JointColumns, joint: Joint) -> ObservedRun:
 
 
 def example(run: Driven, number: int, joint: Joint) -> Example:
-    """Return a run for the baselines."""
     columns = run.columns(number, joint)
     settings = OF_BASELINES
     dt = np.diff(run.table.time_s, prepend=run.table.time_s[0])

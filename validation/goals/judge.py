@@ -265,7 +265,6 @@ class Outside:
 
     @property
     def least(self) -> Figure:
-        """The kind that is flagged least."""
         return min(self.flagged.values(), key=lambda figure: figure.value)
 
 

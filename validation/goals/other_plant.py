@@ -53,7 +53,6 @@ def first_s(flags: BoolArray, moving: BoolArray, dt_s: float) -> float:
 
 
 def figures(judged: Sequence[Judged], dt_s: float) -> Flagged:
-    """Return the figures of joints in runs that moved."""
     rows = []
     for one in judged:
         if one.moving.any():
@@ -90,13 +89,11 @@ def crossed(
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument("--seed", type=natural, default=JUDGE_SEED, help="of the days (default %(default)s)")
     parser.add_argument("--fit-seed", type=natural, default=FIT_SEED, help="of the campaigns (%(default)s)")
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Return the table."""
     found = crossed(the_three(), QUICK, options.fit_seed, options.seed)
     times = ", ".join(f"{limit:g}" for limit in WITHIN_S)
     head = ("joint files of", "days of", f"flagged within {times} s", "degraded", "inside 90 %", "RMSE now")

@@ -278,7 +278,6 @@ class Plans(NamedTuple):
 
 
 def planned(plant: PlantFile, sizes: Sizes) -> Plans:
-    """Return the motions."""
     joints = nominal_joints(plant)
     plan = make_plan("excitation", scale_of(sizes, joints, FIT_SEED, "excitation"))
     return Plans(plan.runs, judging_runs(sizes, joints, SEED))
@@ -353,7 +352,6 @@ def source_tables(plant: PlantFile, plans: Plans, only: bool, jobs: int) -> list
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument("--plant", choices=PLANTS, default="bad_day", help="default %(default)s")
     parser.add_argument("--sources", action="store_true", help="also take out one source after the other")
     parser.add_argument(
@@ -364,7 +362,6 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Return the tables."""
     plant = plant_file(options.plant, shipped(f"plants/{options.plant}.yaml"))
     plans = planned(plant, SIZES["tiny" if options.tiny else "usual"])
     tables = known_tables(plant, plans)

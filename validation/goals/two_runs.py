@@ -152,7 +152,6 @@ class Row(NamedTuple):
 
     @property
     def reached(self) -> bool:
-        """Whether ours is at most the best regression."""
         return self.rmse_nm[OURS] <= self.rmse_nm[self.best_simple]
 
     @property
@@ -372,7 +371,6 @@ def kinova_cases(joints: Sequence[int]) -> Iterator[Case]:
 
 
 def _titles() -> dict[str, str]:
-    """Return the head of each column of a table."""
     return {**METHODS, **{name: each.title for name, each in SIMPLE.items()}}
 
 
@@ -434,7 +432,6 @@ def _spread(values: Sequence[float]) -> str:
 
 
 def options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of the study."""
     parser.add_argument("--world", choices=("plants", "mujoco", "kinova"), default="plants")
     parser.add_argument("--first", type=int, metavar="SEED", help="of plants and mujoco")
     parser.add_argument("--seeds", type=count, default=25, metavar="N", help="default %(default)s")
@@ -450,7 +447,6 @@ def options(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> Report:
-    """Return the table."""
     if options.world == "kinova":
         rows = [row for case in kinova_cases(options.joints) for row in rows_of(case)]
         reached, honest = sum(row.reached for row in rows), sum(row.honest for row in rows)
