@@ -1,16 +1,12 @@
-"""Findings made up for looking at the report: every verdict.
-
-`python -m tests.sysid.diagnosis.findings_examples DIR` writes the pages.
+"""Findings made up for tests of the report: every verdict.
 
 Their signals follow from their causes (a ripple of the stated size is in the residual), their evidence is invented.
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from pathlib import Path
 
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, OutlierRun, UnexplainedResidual
 from tests.sysid.diagnosis.findings_parts import (
@@ -91,34 +87,24 @@ def one_cause() -> Findings:
 
 def two_causes() -> Findings:
     """Viscous friction for certain, and one of two that cannot be distinguished, with the experiment that would."""
+    limits = {
+        "current_a": 4.0,
+        "velocity_rad_s": 2.0,
+        "torque_nm": 40.0,
+        "travel_rad": 30.0,
+        "temperature_c": 70.0,
+    }
+    held = {"kind": "plateau", "current_a": 2.0, "hold_s": 2.0, "ramp_s": 0.3}
+
+    def reversals(k: int) -> dict[str, object]:
+        segments = [{**held, "velocity_rad_s": s * 0.4 * k} for s in (1, -1)] * 8
+        return {"name": f"reversals_{k}", "velocity_joint": 1, "segments": segments}
+
     plan = {
         "schema": "jtq.plan/1",
         "name": "separate-link-inertia-from-delay",
-        "limits": {
-            "current_a": 4.0,
-            "velocity_rad_s": 2.0,
-            "torque_nm": 40.0,
-            "travel_rad": 30.0,
-            "temperature_c": 70.0,
-        },
-        "runs": [
-            {
-                "name": f"reversals_{k}",
-                "velocity_joint": 1,
-                "segments": [
-                    {
-                        "kind": "plateau",
-                        "velocity_rad_s": s * 0.4 * k,
-                        "current_a": 2.0,
-                        "hold_s": 2.0,
-                        "ramp_s": 0.3,
-                    }
-                    for s in (1, -1)
-                ]
-                * 8,
-            }
-            for k in (1, 2, 3, 4)
-        ],
+        "limits": limits,
+        "runs": [reversals(k) for k in (1, 2, 3, 4)],
     }
     viscous = {"viscous_nms_per_rad": value(5.72, 0.14, "Nms/rad")}
     inertia = {"link_inertia_kgm2": value(0.213, 0.048, "kgm2")}
@@ -273,16 +259,3 @@ EXAMPLES: Mapping[str, Callable[[], Findings]] = {
     "insufficient": insufficient,
     "sensor": sensor,
 }
-
-
-def main(directory: Path) -> None:
-    from jtqd.sysid.diagnosis.report.page import render
-
-    for name, make in EXAMPLES.items():
-        text = render(make(), "Made up for looking at the report.")
-        (directory / f"{name}.html").write_text(text, encoding="utf-8")
-        print(f"{name}.html {len(text.encode()) / 1024:.0f} KiB")
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
