@@ -74,11 +74,13 @@ def test_no_reference_at_all_is_null(log, tmp_path, capsys, monkeypatch):
         ("none/p.png", "none: found no such directory"),
     ],
 )
-def test_a_picture_that_cannot_be_written_is_said_before_the_log_is_read(log, tmp_path, capsys, name, words):
+def test_a_picture_that_cannot_be_written_is_refused_before_the_log_is_read(
+    log, tmp_path, capsys, name, words
+):
     assert plot_command.main(["run.mcap", "--out", str(tmp_path / name)]) == 1
-    said = capsys.readouterr().err
-    assert words in said
-    assert said.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert words in printed
+    assert printed.count("\n") == 1
     assert log == []
 
 
@@ -88,9 +90,9 @@ def test_a_log_that_cannot_be_read_is_one_line(tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(plot_command, "read_topic", refuse)
     assert plot_command.main(["run.mcap", "--out", str(tmp_path / "a.png"), "--json"]) == 1
-    said = capsys.readouterr()
-    assert said.out == ""
-    assert said.err == "jtq plot: run.mcap: not a log\n"
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err == "jtq plot: run.mcap: not a log\n"
 
 
 def test_every_status_has_a_colour_of_its_own(monkeypatch, tmp_path):
@@ -118,7 +120,7 @@ def test_the_legend_covers_no_data(log, tmp_path, monkeypatch):
 
 
 def test_joint_four_without_a_reference_is_drawn(tmp_path, capsys):
-    """From a log of four joints; there is nothing to compare with, and the RMSE says so."""
+    """From a log of four joints; there is nothing to compare with, and has no RMSE."""
     cycles = regular(30, lambda n: tuple(Joint(sensor_nm=float("nan")) for _ in range(4)))
     path = write_log(tmp_path / "a.mcap", cycles, 4)
     assert plot_command.main([str(path), "--joint", "4", "--out", str(tmp_path / "a.png"), "--json"]) == 0
@@ -135,7 +137,7 @@ def with_contacts(flags):
 
 
 def test_contacts_have_panels_where_they_were_watched(tmp_path):
-    """Two contacts, told in 3 of 6 cycles; the flags are those of the loop."""
+    """Two contacts, reported in 3 of 6 cycles; the flags are those of the loop."""
     known, there = FLAG_CONTACT_KNOWN, FLAG_CONTACT_KNOWN | FLAG_CONTACT
     log = with_contacts([7, known, there, there, known, there])
     assert plot_command.contacts(log).tolist() == [False, False, True, True, False, True]

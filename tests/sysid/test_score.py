@@ -139,7 +139,7 @@ def test_both_files_stand_in_one_table(files, capsys):
     assert all(row["change"] is None and len(row["rmse"]) == 1 for row in made["rows"])
 
 
-def test_a_run_that_cannot_be_used_is_told(files, capsys):
+def test_a_run_that_cannot_be_used_is_reported(files, capsys):
     table = swing(0.2)
     columns = replace(table.joints[1], torque_nm=None)
     write_run(files / "blind.csv", RunTable(table.time_s, {1: columns}))
