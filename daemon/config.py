@@ -40,7 +40,7 @@ from jtqd.estimator.decoder import FieldError, Text, below, check, choice, in_fi
 from jtqd.estimator.errors import ConfigError, Verbatim, range_text
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import CONTACT_THRESHOLD, METHODS, EstimatorSettings, PlausibilityLimits
-from jtqd.estimator.sha256 import sha256_hex
+from jtqd.estimator.text import sha256_hex
 from jtqd.models.files import read_regular, read_yaml, shipped
 
 _PDO_BITS: Final = 64

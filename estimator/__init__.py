@@ -32,12 +32,12 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from jtqd.estimator.errors import ConfigError as ConfigError
+    from jtqd.estimator.estimator import estimate_columns as estimate_columns
+    from jtqd.estimator.estimator import make_estimator as make_estimator
     from jtqd.estimator.joint import Effect as Effect
     from jtqd.estimator.joint import Joint as Joint
-    from jtqd.estimator.methods import estimate_columns as estimate_columns
-    from jtqd.estimator.methods import make_estimator as make_estimator
+    from jtqd.estimator.network import NetworkError as NetworkError
     from jtqd.estimator.network import load_network as load_network
-    from jtqd.estimator.onnx_graph import NetworkError as NetworkError
     from jtqd.estimator.run import EstimateRun as EstimateRun
     from jtqd.estimator.run import JointColumns as JointColumns
     from jtqd.estimator.run import RunTable as RunTable
@@ -48,10 +48,9 @@ if TYPE_CHECKING:
 else:  # each process of the daemon imports this package for a few of its modules
     _NAMES = {
         "errors": ("ConfigError",),
+        "estimator": ("estimate_columns", "make_estimator"),
         "joint": ("Effect", "Joint"),
-        "methods": ("estimate_columns", "make_estimator"),
-        "network": ("load_network",),
-        "onnx_graph": ("NetworkError",),
+        "network": ("NetworkError", "load_network"),
         "run": ("EstimateRun", "JointColumns", "RunTable", "RunTableError"),
         "settings": ("METHODS", "EstimatorSettings"),
         "status": ("Estimate",),

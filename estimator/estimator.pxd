@@ -1,7 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
-from jtqd.estimator.contact cimport LinkLaw, LinkState
-from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw
+from jtqd.estimator.detection cimport LinkLaw, LinkState
 from jtqd.estimator.observer cimport (
     FusedObserved,
     FusedObserverLaw,
@@ -11,11 +10,31 @@ from jtqd.estimator.observer cimport (
     Observed,
     ObserverLaw,
     ObserverState,
+    Sample,
 )
-from jtqd.estimator.path_difference cimport AgreementLaw, AgreementState, OffsetLaw, OffsetState
-from jtqd.estimator.perceptron cimport PerceptronLaw
-from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values
-from jtqd.estimator.uncertainty cimport Fused, FusedTrustLaw, FusionLaw, TrustLaw, UncertaintyLaw
+from jtqd.estimator.fusion cimport AgreementLaw, AgreementState, Fused, FusionLaw, Learned, OffsetLaw, OffsetState
+from jtqd.estimator.native_network cimport FusedTrustLaw, PerceptronLaw, TrustLaw
+from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw, UncertaintyLaw
+
+cdef enum:
+    MOST_FEATURES = 8
+
+cdef struct Values:  # `jtqd.estimator.status.Estimate` as a block; NaN where not computed or not to be published
+    double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm
+    double torque_rate_nm_s, load_nm  # `contact`: load of the sample before
+    int status
+
+cdef void no_values(Values *out, int status) noexcept nogil
+
+cdef class Estimator:
+    cdef readonly object joint, settings
+    cdef int width  # features of the network
+    cdef double features[MOST_FEATURES]  # of the last sample that was observed
+    cdef bint observed  # whether the last sample was
+    cdef object run_one  # of a network that is not evaluated natively
+    cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil
+    cdef double ask(self) noexcept with gil
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil
 
 cdef struct NetworkLaw:
     bint used

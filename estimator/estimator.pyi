@@ -1,12 +1,12 @@
+from math import nan
 from typing import Final
 
-from jtqd.estimator.arrays import FloatArray, QuadrantArray
+from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.joint import Joint, Torsion
-from jtqd.estimator.network import FusedNetwork, TorqueNetwork
-from jtqd.estimator.run import EstimateRun, ObservedRun
-from jtqd.estimator.sample import Estimator
+from jtqd.estimator.network import AnyNetwork, FusedNetwork, TorqueNetwork
+from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.status import Zeros
+from jtqd.estimator.status import Estimate, Zeros
 
 STANDSTILL_SIGMAS: Final[float]
 SLOPE_NM: Final[float]
@@ -46,3 +46,46 @@ def observe_run(
     link_position_rad: FloatArray,
     temperature_c: FloatArray | None = None,
 ) -> ObservedRun: ...
+
+class Estimator:
+    joint: Joint
+    settings: EstimatorSettings
+
+    @property
+    def with_network(self) -> bool: ...
+    def reset(self) -> None: ...
+    def step(
+        self,
+        dt_s: float,
+        current_a: float,
+        motor_position_rad: float,
+        motor_velocity_rad_s: float,
+        link_position_rad: float,
+        temperature_c: float = nan,
+        network_wanted: bool = True,
+    ) -> Estimate: ...
+    def run(
+        self,
+        dt_s: FloatArray,
+        current_a: FloatArray,
+        motor_position_rad: FloatArray,
+        motor_velocity_rad_s: FloatArray,
+        link_position_rad: FloatArray,
+        temperature_c: FloatArray | None = None,
+        network_wanted: BoolArray | None = None,
+    ) -> EstimateRun: ...
+
+class PythonEstimator(Estimator):
+    inner: Estimator
+    def __init__(self, inner: object) -> None: ...
+
+def make_estimator(
+    joint: Joint, settings: EstimatorSettings, network: AnyNetwork | None = None
+) -> Estimator: ...
+def estimate_columns(
+    joint: Joint,
+    settings: EstimatorSettings,
+    network: AnyNetwork | None,
+    time_s: FloatArray,
+    columns: JointColumns,
+) -> EstimateRun: ...

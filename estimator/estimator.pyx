@@ -6,27 +6,18 @@
 | `FusedEstimator` | `fused` |
 | `ExtendedEstimator` | any of them for a joint with effects: inputs corrected first (`corrections`) |
 
-`methods.make_estimator` chooses. All inputs of the loss pass the same filter; delay of the result: `settings.age_ms`.
+`make_estimator` chooses. All inputs of the loss pass the same filter; delay of the result: `settings.age_ms`.
 """
 
 from libc.math cimport NAN, fabs, fmin, sqrt
-from libc.string cimport memcmp
+from libc.string cimport memcmp, memcpy, memset
 
-from jtqd.estimator.block cimport copied, put_back
-from jtqd.estimator.contact cimport LinkLoad, fill_link, restart_link, update_link
-from jtqd.estimator.losses cimport (
-    AdditiveLaw,
-    AdditiveLossModel,
-    Loss,
-    LossModel,
-    additive_loss,
-    efficiency_loss,
-    thermal_friction,
-)
+from jtqd.estimator.detection cimport LinkLoad, fill_link, restart_link, update_link
 from jtqd.estimator.observer cimport (
     FusedObserved,
     FusedObserverLaw,
     Observed,
+    Sample,
     fill_fused_observer,
     fill_guard,
     fill_observer,
@@ -34,13 +25,21 @@ from jtqd.estimator.observer cimport (
     observe_fused,
     restart_guard,
 )
-from jtqd.estimator.path_difference cimport (
+from jtqd.estimator.fusion cimport (
+    Fused,
+    Learned,
+    Rest,
     TURN_WAVES,
+    at_rest,
     degrades,
+    disagreement,
     drop_block,
     early_factor,
+    fading,
     fill_agreement,
+    fill_fusion,
     fill_offsets,
+    fuse_paths,
     gather,
     implausible,
     known_nm2,
@@ -52,32 +51,34 @@ from jtqd.estimator.path_difference cimport (
     restart_agreement,
     restart_offsets,
     restart_turn,
+    reweigh,
     turn_differs,
     uncorrected_torque,
     update_agreement,
     update_offsets,
     update_turn,
 )
-from jtqd.estimator.perceptron cimport Perceptron, evaluate
-from jtqd.estimator.sample cimport Estimator, Learned, Sample, Values, no_values
-from jtqd.estimator.uncertainty cimport (
-    Fused,
-    Rest,
-    Spread,
-    at_rest,
-    disagreement,
-    fading,
+from jtqd.estimator.native_network cimport (
+    Perceptron,
+    evaluate,
     fill_fused_trust,
-    fill_fusion,
     fill_trust,
-    fill_uncertainty,
-    fuse_paths,
     fused_trust,
     network_share,
-    reweigh,
+    trust,
+)
+from jtqd.estimator.losses cimport (
+    AdditiveLaw,
+    AdditiveLossModel,
+    Loss,
+    LossModel,
+    Spread,
+    additive_loss,
+    efficiency_loss,
+    fill_uncertainty,
     sigma_moving,
     standing,
-    trust,
+    thermal_friction,
 )
 
 from typing import Final
@@ -85,12 +86,14 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator import status as st
-from jtqd.estimator.corrections import ExtendedInputs
+from jtqd.estimator.corrections import ExtendedInputs, acting_effects, plain_joint
+from jtqd.estimator.observer import columns
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
 from jtqd.estimator.run import EstimateRun, ObservedRun
-from jtqd.estimator.sample import columns
 from jtqd.estimator.settings import METHODS
-from jtqd.estimator.uncertainty import FADE_START, FOREIGN_SIGMAS
+from jtqd.estimator.status import Estimate
+from jtqd.estimator.native_network import FADE_START
+from jtqd.estimator.fusion import FOREIGN_SIGMAS
 
 STANDSTILL_SIGMAS: Final = 3.0
 """Half width of the standstill interval in standard deviations, where torsion narrows the interval of friction.
@@ -105,6 +108,121 @@ cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, STEP = SLOPE_NM, FOREIGN = FOR
 cdef double LOWERED_S = 0.1  # the status stays degraded for so long after the paths have disagreed: it must not flicker
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
 cdef int LEFT = st.LEFT, APART = st.APART
+
+
+# What all estimators share ---------------------------------------------------------------------------------------------
+
+
+cdef void no_values(Values *out, int status) noexcept nogil:
+    """Set `out` to a status without any number."""
+    out.torque_nm = out.sigma_nm = out.tob_nm = out.physics_nm = out.network_nm = NAN
+    out.torque_rate_nm_s = out.load_nm = NAN
+    out.status = status
+
+
+cdef class Estimator:
+    """Estimator of one joint: `advance` is the one step there is; the loop, `step` and `run` call it.
+
+    Attributes:
+        joint, settings: what it was made of.
+    """
+
+    cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil:
+        """Set `out` to the estimate at this sample; without `network_wanted` there is no time for the network."""
+
+    cdef double ask(self) noexcept with gil:
+        """Return the answer for `features` of a network that is not evaluated natively; NaN where it fails."""
+        cdef int n
+        try:
+            return self.run_one(*[self.features[n] for n in range(self.width)])
+        except Exception:
+            return NAN
+
+    cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
+        """Set `out` to what is known of the zeros; return the estimator's whole state and its `size`.
+
+        An estimator that learns nothing: no flag is set, and NULL is returned.
+        """
+        memset(out, 0, sizeof(Learned))
+        size[0] = 0
+        return NULL
+
+    @property
+    def with_network(self):
+        """Whether a network is used."""
+        raise NotImplementedError
+
+    def reset(self):
+        """Forget the past: the next step starts."""
+        raise NotImplementedError
+
+    def step(
+        self,
+        double dt_s,
+        double current_a,
+        double motor_position_rad,
+        double motor_velocity_rad_s,
+        double link_position_rad,
+        double temperature_c=NAN,
+        bint network_wanted=True,
+    ):
+        """Return the `Estimate` at this sample, dt_s [s] after the one before; never raises on any float.
+
+        temperature_c: of the joint, NaN where it is not known. Without network_wanted there is no time for the network:
+        this sample is physics only.
+        """
+        cdef Sample sample = Sample(
+            dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c
+        )
+        cdef Values out
+        no_values(&out, INVALID)  # of an estimator that raises, which Python prints
+        self.advance(&sample, network_wanted, &out)
+        return Estimate(out.torque_nm, out.sigma_nm, out.status, out.tob_nm, out.physics_nm, out.network_nm)
+
+    def run(
+        self,
+        dt_s,
+        current_a,
+        motor_position_rad,
+        motor_velocity_rad_s,
+        link_position_rad,
+        temperature_c=None,
+        network_wanted=None,
+    ):
+        """Return the estimates of a run as an `EstimateRun`: `step` for every sample of arrays [n].
+
+        dt_s[k] is the time since sample k-1; temperature_c, network_wanted: None for NaN and True throughout.
+        Raises ValueError for arrays of different length.
+        """
+        inputs = columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c)
+        n = inputs.shape[1]
+        wanted = np.ones(n, np.uint8) if network_wanted is None else np.ascontiguousarray(network_wanted, np.uint8)
+        values, features, status = np.empty((5, n)), np.full((n, self.width), NAN), np.empty(n, np.uint8)
+        cdef const double[:, ::1] x = inputs
+        cdef const unsigned char[::1] w = wanted
+        cdef double[:, ::1] to = values
+        cdef double[:, ::1] f = features
+        cdef unsigned char[::1] s = status
+        cdef Sample sample
+        cdef Values out
+        cdef Py_ssize_t k
+        cdef int m
+        if w.shape[0] != x.shape[1]:
+            raise ValueError(f"found {w.shape[0]} values of network_wanted, expected {n}")
+        with nogil:
+            for k in range(x.shape[1]):
+                sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+                no_values(&out, INVALID)
+                self.observed = False
+                self.advance(&sample, w[k], &out)
+                to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
+                to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm
+                s[k] = out.status
+                if self.observed:
+                    for m in range(self.width):
+                        f[k, m] = self.features[m]
+        torque, sigma, tob, physics, network = values
+        return EstimateRun(torque, sigma, status, tob, physics, network, features)
 
 
 cdef fill_network(NetworkLaw *law, network, joint):
@@ -326,11 +444,13 @@ cdef class FusedEstimator(Estimator):
 
         Raises ValueError for bytes of another length.
         """
-        return copied(&self.state, sizeof(FusedState))
+        return (<const char *> &self.state)[: sizeof(FusedState)]
 
     @past.setter
-    def past(self, content):
-        put_back(&self.state, sizeof(FusedState), content)
+    def past(self, const unsigned char[::1] content):
+        if <size_t> content.shape[0] != sizeof(FusedState):
+            raise ValueError(f"found a block of {content.shape[0]} bytes, expected {sizeof(FusedState)}")
+        memcpy(&self.state, &content[0], sizeof(FusedState))
 
     def shares_past(self, FusedEstimator other):
         """Return whether the state of `other` is valid here: the parameters that offsets are estimated with are the same.
@@ -693,3 +813,71 @@ cdef class ExtendedEstimator(Estimator):
         for n in range(self.width):
             self.features[n] = self.inner.features[n]
         self.torque_nm = out.torque_nm
+
+
+cdef class PythonEstimator(Estimator):
+    """Estimator written in Python, for the compiled loop: `inner` has `step` and `reset`, and perhaps the rest."""
+
+    cdef readonly object inner
+
+    def __init__(self, inner):
+        self.inner = inner
+        self.joint, self.settings = getattr(inner, "joint", None), getattr(inner, "settings", None)
+
+    cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil:
+        with gil:
+            e = self.inner.step(
+                sample.dt_s,
+                sample.current_a,
+                sample.motor_position_rad,
+                sample.motor_velocity_rad_s,
+                sample.link_position_rad,
+                sample.temperature_c,
+                bool(network_wanted),
+            )
+            out.torque_nm, out.sigma_nm, out.status = e.torque_nm, e.sigma_nm, e.status
+            out.tob_nm, out.physics_nm, out.network_nm = e.tob_nm, e.physics_nm, e.network_nm
+
+    @property
+    def with_network(self):
+        """Whether a network is used."""
+        return self.inner.with_network
+
+    def reset(self):
+        """Forget the past: the next step starts."""
+        self.inner.reset()
+
+
+# Estimator of a joint by method ----------------------------------------------------------------------------------------
+
+
+def make_estimator(joint, settings, network=None):
+    """Return the estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
+    plain = plain_joint(joint)
+    inner = globals()[METHODS[settings.method].estimator](plain, settings, network)
+    return ExtendedEstimator(joint, settings, inner) if acting_effects(joint) else inner
+
+
+def estimate_columns(joint, settings, network, time_s, columns):
+    """Return the estimates of one joint of a run table, time_s [n].
+
+    Raises ConfigError as `make_estimator` does, ValueError for a missing column.
+    """
+    current, motor, velocity, link = _inputs(joint, columns)
+    dt_s = np.diff(time_s, prepend=time_s[0])
+    return make_estimator(joint, settings, network).run(
+        dt_s, current, motor, velocity, link, columns.temperature_c
+    )
+
+
+def _inputs(joint, columns):
+    """Return current, motor position, motor velocity and link position; ValueError for a missing column."""
+    needed = {
+        name: getattr(columns, name)
+        for name in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+    }
+    missing = [name for name, column in needed.items() if column is None]
+    if missing:
+        raise ValueError(f"joint {joint.name}: the run has no {', '.join(missing)}")
+    current, motor, velocity, link = needed.values()
+    return current, motor, velocity, link

@@ -225,7 +225,7 @@ TURN_WAVES: Final = 6
 
 @dataclass(frozen=True, slots=True)
 class Turn:
-    """What the two paths differ by over the motor's turn on runs that the fit had not seen: agreement.pyx.
+    """What the two paths differ by over the motor's turn on runs that the fit had not seen: fusion.pyx.
 
     One number per wave, TURN_WAVES of them: the part that does not change, and those that go with the loss [Nm/Nm], the
     speed and its square. covariance_nm2: lower triangle, row by row, of what days and motions leave of the waves; limit:
@@ -286,7 +286,7 @@ class Agreement:
     link zero that is not taken off, as torque; lowered_nm: doubt that ordinary days have, which lowers no status; 0: not
     known; level_factor, gain_factor, zero_factor: how much larger an error is than its trace in the difference; gain_sigmas:
     of its own standard deviations, what of a gain is no doubt, in `gain` neither; turn: waves over the motor's turn, None:
-    not known. All: agreement.pyx.
+    not known. All: fusion.pyx.
     """
 
     slow_nm: Annotated[float, limits("Nm", gt=0.0)]
@@ -306,11 +306,11 @@ class Agreement:
 
 @dataclass(frozen=True, slots=True)
 class DayZeros:
-    """How far the zero of the link encoder differs from day to day, where `track_zeros` can learn it: zeros.pyx.
+    """How far the zero of the link encoder differs from day to day, where `track_zeros` can learn it: fusion.pyx.
 
     spread_rad: standard deviation over the days of the fit; spread_nm: its part of sigma.torsion_nm, which what is learned
     takes away again; scale: in place of sigma.scale where zeros are tracked; correlation_s: so long the
-    difference of the two paths keeps what is no state of the day, None: `zeros.CORRELATION_S`; early: factor of the spread
+    difference of the two paths keeps what is no state of the day, None: `fusion.CORRELATION_S`; early: factor of the spread
     where nothing is known of the day's zero.
     """
 

@@ -52,3 +52,16 @@ cdef class LossModel:
 
 cdef class AdditiveLossModel:
     cdef AdditiveLaw law
+
+cdef struct Spread:
+    double value, sigma
+
+cdef struct UncertaintyLaw:
+    double floor, u_friction, widened, load
+    bint with_efficiency
+
+cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1
+cdef double sigma_moving(
+    const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double current, double velocity
+) noexcept nogil
+cdef Spread standing(const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double current) noexcept nogil

@@ -11,9 +11,16 @@ plant alike; each opposes the motion and is continuous everywhere:
 
 The functions on parameter blocks are what runs in a cycle; the classes give them to Python, for one value or (suffix
 _many) for arrays of any shape. numpy is loaded where an array comes: the emulated bench has none.
+
+**Standard deviation** of the paper's methods in motion and at standstill: u_f, u_l, floor from the settings,
+
+    moving        sigma^2 = load^2 + (u_f tau_f(v))^2 + floor^2
+                  load: the efficiency table's RMSE as a torque; for the classical observer u_l |tau_raw|
+    standstill    tau_j in [tau_raw - loss(+), tau_raw - loss(-)]
+                  value: the middle; sigma: half the width, wider by u_f, + floor
 """
 
-from libc.math cimport NAN, exp, expm1, fabs, fmax, fmin, isnan, tanh
+from libc.math cimport NAN, exp, expm1, fabs, fmax, fmin, isnan, sqrt, tanh
 
 from typing import Final
 
@@ -264,6 +271,39 @@ cdef class LossModel:
     def rmse_torque(self, double current_a, double joint_velocity_rad_s):
         """Return the table's RMSE as a torque [Nm]: rmse G Kt |i|, times eta^2 if it is motor over joint."""
         return efficiency_rmse(&self.law, current_a, joint_velocity_rad_s)
+
+
+# Standard deviation of the paper's methods -----------------------------------------------------------------------------
+
+
+cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1:
+    """Set the parameters from joint and settings."""
+    law.floor = settings.sigma_floor * joint.rated_torque_nm
+    law.u_friction = settings.friction_uncertainty
+    # what friction can hold is itself known to that part only
+    law.widened = 1.0 + settings.friction_uncertainty
+    law.load = settings.load_uncertainty
+    # without an efficiency the physics is the classical observer's whatever the method
+    law.with_efficiency = settings.method != "tob" and has_efficiency
+    return 0
+
+
+cdef double sigma_moving(const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double i, double v) noexcept nogil:
+    """Return sigma of a moving joint; i: current without acceleration, tau_raw/(G Kt)."""
+    cdef double load = efficiency_rmse(losses, i, v) if law.with_efficiency else law.load * raw
+    cdef double friction = law.u_friction * friction_torque(&losses.friction, v)
+    return sqrt(load * load + friction * friction + law.floor * law.floor)
+
+
+cdef Spread standing(const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double i) noexcept nogil:
+    """Return value and sigma of a standing joint: middle and half width of what friction can hold."""
+    cdef Interval loss
+    if not law.with_efficiency:
+        return Spread(raw, law.widened * losses.friction.static + law.floor)
+    loss = efficiency_standstill(losses, i)
+    return Spread(
+        raw - 0.5 * (loss.forward + loss.backward), 0.5 * law.widened * (loss.forward - loss.backward) + law.floor
+    )
 
 
 # Loss by load, speed, direction and temperature -----------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Networks of one joint: files, metadata, and whether they fit the joint and the method.
+"""AnyNetwork of one joint: files, metadata, and whether they fit the joint and the method.
 
 `TorqueNetwork` is that of the paper's section III (method `network`): six features in, torque out. `FusedNetwork` (method
 `fused`) gives a correction to the physics from speed, load, torsion and ripple angles. Both are ONNX files whose metadata
@@ -6,30 +6,44 @@ say what they were trained on; how far each is trusted is in `validity`.
 
 Program `python -m jtqd.estimator.network`: checks network files by ONNX Runtime. It reads a JSON line [method, path, SHA-256
 or null] per network, and answers each with a line: the fields of a `RuntimeCheck`, or {"refused": why}.
+
+The graph takes "x" [N, n] (named features, SI units, normalisation inside) and gives [N, 1] torque [Nm], float64. The
+metadata hold one JSON value per key; the caller names the keys that must be there. Key `perceptron` holds the weights
+(`perceptron_content`), so that the graph can be evaluated natively. The package onnx, where it is installed, reads them
+from the graph of a file without that key.
+
+    OnnxGraph     checked here by ONNX Runtime, which also evaluates every graph without known weights
+    NativeGraph   checked by ONNX Runtime in another process (`RuntimeCheck`), evaluated natively without the runtime's 40 MB
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
 import json
+import math
 import os
+import stat
+import struct
 import sys
-from typing import ClassVar, Final
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import FieldError, read
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Envelope, Joint
-from jtqd.estimator.onnx_graph import (
-    GraphFile,
-    NativeGraph,
-    NetworkError,
-    OnnxGraph,
-    RuntimeCheck,
-    finite,
-)
-from jtqd.estimator.perceptron import Perceptron
+from jtqd.estimator.native_network import Perceptron
 from jtqd.estimator.settings import METHODS, EstimatorSettings
+from jtqd.estimator.text import sha256_hex
 
 FEATURES: Final = (
     "current_a",
@@ -53,6 +67,378 @@ NATIVE_LIMIT: Final = 1e-6
 """Largest difference between native evaluation and ONNX Runtime, in rated torques."""
 _ZERO_PROBES: Final = 8
 """Samples that distinguish a network whose last layer is zero from one that corrects something."""
+
+PERCEPTRON: Final = "perceptron"
+"""Key of the metadata that holds the weights."""
+_WARM_UP: Final = 50
+_LONGEST_S: Final = 5.0
+"""Processor time of this process for each step before the first use: a busy machine is no endless loop."""
+_TIMES_BY_THE_CLOCK: Final = 6.0
+"""Limit by the clock in units of _LONGEST_S: a step that blocks takes no processor time."""
+_POLL_S: Final = 0.1
+_PROBES: Final = 256
+"""Inputs at which native evaluation is compared: in the range of the training data, and a quarter of it beyond."""
+_SAME: Final = 1e-9
+"""Relative and absolute difference [Nm] up to which weights read from a graph are those that it evaluates."""
+
+
+def finite(value: object) -> bool:
+    """Return whether a value from JSON is a finite number; a bool is none."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class NetworkError(ValueError):
+    """The network file cannot be used; one line that names file, found and expected."""
+
+
+class RuntimeCheck(NamedTuple):
+    """What ONNX Runtime found in a file that it accepts.
+
+    metadata: with the weights under PERCEPTRON where they are known; native_error_nm: largest difference of native
+    evaluation at the probes, None where the weights are not known.
+    """
+
+    sha256: str
+    metadata: dict[str, Any]
+    native_error_nm: float | None
+
+
+def perceptron_content(
+    layers: Sequence[tuple[FloatArray, FloatArray]], gate: Sequence[int] | None = None
+) -> dict[str, Any]:
+    """Return the JSON-able value of the metadata key PERCEPTRON; layers, gate: as `Perceptron` takes them.
+
+    numbers: per layer weights [inputs][outputs], then biases [outputs]; little-endian float64 in base64.
+    """
+    numbers = [np.concatenate((w.ravel(), b)).astype("<f8").tobytes() for w, b in layers]
+    return {
+        "widths": [layers[0][0].shape[0], *(len(b) for _, b in layers)],
+        "numbers": [base64.b64encode(each).decode() for each in numbers],
+        "gate": None if gate is None else list(gate),
+    }
+
+
+def perceptron_of(content: Any) -> Perceptron:
+    """Return the network of a metadata value as `perceptron_content` writes it. Raises ValueError."""
+    try:
+        widths, numbers, gate = (content[key] for key in ("widths", "numbers", "gate"))
+        if len(widths) < 2 or not all(isinstance(each, int) and each > 0 for each in widths):
+            raise ValueError(f"found widths {str(widths)[:40]}, expected at least 2 whole numbers > 0")
+        if len(numbers) != len(widths) - 1:
+            raise ValueError(f"found numbers of {len(numbers)} layers, expected {len(widths) - 1}")
+        layers = []
+        for text, (inputs, outputs) in zip(numbers, pairwise(widths), strict=True):
+            values = np.frombuffer(base64.b64decode(text, validate=True), "<f8").astype(np.float64)
+            if not np.isfinite(values).all():
+                raise ValueError("found a value that is not finite")
+            layers.append((values[:-outputs].reshape(inputs, outputs), values[-outputs:]))
+        return Perceptron(layers, gate)
+    except (TypeError, KeyError, IndexError, OverflowError, binascii.Error) as error:
+        raise ValueError(f"found no layers as 'jtq train' writes them ({error})") from None
+
+
+class GraphFile:
+    """Bytes of a network file with their hash, and access to its metadata.
+
+    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None.
+    Raises NetworkError for an unreadable file or another hash. Public: `name`, `sha256`, `metadata`, `perceptron` (None
+    where the weights are not known), `native_error_nm` (of `RuntimeCheck`), `run_one(*x)` torque of one sample [Nm],
+    `run_many([n, features])` of many.
+    """
+
+    metadata: dict[str, Any]
+    perceptron: Perceptron | None
+    native_error_nm: float | None
+    run_one: Callable[..., float]
+    run_many: Callable[[FloatArray], FloatArray]
+
+    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None) -> None:
+        self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
+        self._data: Final = source if isinstance(source, bytes) else self._read(source)
+        self.sha256: Final = sha256_hex(self._data)
+        if sha256 is not None and sha256.lower() != self.sha256:
+            raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
+
+    @property
+    def check(self) -> RuntimeCheck:
+        """What a `NativeGraph` of the same bytes needs."""
+        return RuntimeCheck(self.sha256, self.metadata, self.native_error_nm)
+
+    def error(self, text: str) -> NetworkError:
+        """Return the error to raise, with the file's name."""
+        return NetworkError(f"{self.name}: {text}")
+
+    def text(self, key: str) -> str:
+        """Return a text of the metadata."""
+        value = self.metadata[key]
+        if not isinstance(value, str) or not value.isprintable() or not value:
+            raise self.error(f"metadata '{key}': found {value!r}, expected a text of printable characters")
+        return value
+
+    def numbers(self, key: str, count: int) -> tuple[float, ...]:
+        """Return `count` finite numbers of the metadata."""
+        values = self.metadata[key]
+        if not (isinstance(values, list) and len(values) == count and all(map(finite, values))):
+            raise self.error(f"metadata '{key}': found {values!r}, expected {count} finite numbers")
+        return tuple(float(value) for value in values)
+
+    def _read(self, path: str | os.PathLike[str]) -> bytes:
+        try:
+            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+                return Path(path).read_bytes()
+            reason = "not a regular file"
+        except OSError as error:
+            reason = error.strerror or str(error)
+        except ValueError as error:  # a NUL in the name
+            reason = str(error)
+        raise self.error(f"cannot be read: {reason}")
+
+    def _perceptron(self) -> Perceptron | None:
+        """Return the network of the metadata; None without key PERCEPTRON."""
+        if PERCEPTRON not in self.metadata:
+            return None
+        try:
+            return perceptron_of(self.metadata[PERCEPTRON])
+        except ValueError as error:
+            raise self.error(f"metadata '{PERCEPTRON}': {error}") from None
+
+
+class NativeGraph(GraphFile):
+    """A graph with known weights that ONNX Runtime has checked in another process.
+
+    source, sha256, errors: as `GraphFile`; check: of the very bytes that are read here. NetworkError for a check of other
+    bytes.
+    """
+
+    def __init__(
+        self, source: bytes | str | os.PathLike[str], sha256: str | None, check: RuntimeCheck
+    ) -> None:
+        super().__init__(source, sha256)
+        if self.sha256 != check.sha256:
+            raise self.error(
+                f"was changed while it was checked: found SHA-256 {self.sha256}, checked {check.sha256}"
+            )
+        self.metadata = check.metadata
+        self.native_error_nm = check.native_error_nm
+        self.perceptron = perceptron = self._perceptron()
+        if perceptron is None:
+            raise self.error(f"metadata '{PERCEPTRON}': missing, expected the weights of the network")
+        self.run_one, self.run_many = perceptron.run_one, perceptron.run_many
+
+
+class OnnxGraph(GraphFile):
+    """A graph loaded and checked by ONNX Runtime.
+
+    source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys: metadata
+    that must be there, the first two of them the lowest and highest value per feature in the training data. Raises
+    NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata, constants that are not
+    finite or stand in another file, and no finite answer or several to one input.
+    """
+
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None,
+        features: tuple[str, ...],
+        keys: tuple[str, ...],
+    ) -> None:
+        super().__init__(source, sha256)
+        self._width: Final = len(features)
+        self._session: Final = self._open()
+        self._check_graph()
+        self.metadata = self._read_metadata(features, keys)
+        low, high = (np.array(self.numbers(key, self._width)) for key in keys[:2])
+        for name, lowest, highest in zip(features, low, high, strict=True):
+            if lowest > highest:
+                raise self.error(
+                    f"metadata range of {name}: found {keys[0]} {lowest:g} above {keys[1]} {highest:g}"
+                )
+        weights = None if PERCEPTRON in self.metadata else self._read_weights()
+        self._x: Final = np.zeros((1, self._width))
+        self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
+        self._pack: Final = struct.Struct(f"={self._width}d").pack_into
+        self.run_one, self.run_many = self._run_one, self._run_many
+        self._answered(partial(self._warm_up, (low + high) / 2))
+        share = np.random.default_rng(0).uniform(-0.25, 1.25, (_PROBES, self._width))
+        probes = low + share * (high - low)
+        answers = self._run_many(probes)
+        with suppress(ValueError):  # weights that do not fit together, or into the block
+            if weights is not None and np.allclose(
+                perceptron_of(weights).run_many(probes), answers, rtol=_SAME, atol=_SAME
+            ):
+                self.metadata[PERCEPTRON] = weights
+        self.perceptron, self.native_error_nm = self._perceptron(), None
+        if self.perceptron is not None:
+            inputs = self.metadata[PERCEPTRON]["widths"][0]
+            if inputs != self._width:
+                raise self.error(f"metadata '{PERCEPTRON}': found {inputs} inputs, expected {self._width}")
+            self.native_error_nm = float(np.max(np.abs(self.perceptron.run_many(probes) - answers)))
+
+    def _run_one(self, *x: float) -> float:
+        self._pack(self._x_bytes, 0, *x)
+        return float(self._session.run(None, {"x": self._x})[0][0, 0])
+
+    def _run_many(self, features: FloatArray) -> FloatArray:
+        if features.ndim != 2 or features.shape[1] != self._width:
+            raise ValueError(f"found features of shape {features.shape}, expected [n, {self._width}]")
+        if len(features) == 0:
+            return np.zeros(0)
+        result: FloatArray = self._session.run(None, {"x": np.ascontiguousarray(features, np.float64)})[0]
+        return result[:, 0]
+
+    def _answered(self, step: Callable[[], Any]) -> Any:
+        """Return what `step` returns; NetworkError when it has not after _LONGEST_S: it may loop for ever, or block.
+
+        ONNX Runtime cannot be interrupted: the thread stays behind until the process, which refuses the network, ends.
+        """
+        results: list[Any] = []
+        errors: list[BaseException] = []
+
+        def run() -> None:
+            try:
+                results.append(step())
+            except BaseException as error:
+                errors.append(error)
+
+        thread = threading.Thread(target=run, daemon=True)
+        thread.start()
+        end_s = time.process_time() + _LONGEST_S
+        latest_s = time.monotonic() + _TIMES_BY_THE_CLOCK * _LONGEST_S
+        while thread.is_alive() and time.process_time() < end_s and time.monotonic() < latest_s:
+            thread.join(_POLL_S)
+        if errors:
+            raise errors[0]
+        if not results:
+            raise self.error(f"found no answer within {_LONGEST_S:g} s, expected one: it is not used")
+        return results[0]
+
+    def _open(self) -> Any:
+        os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read once, when the library is loaded
+        import onnxruntime as ort
+
+        ort.disable_telemetry_events()  # some builds report usage to their maker
+        options = ort.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        options.execution_mode = ort.ExecutionMode.ORT_SEQUENTIAL
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+        # weights in another file, which the SHA-256 is not of, are looked for where no file can be
+        options.add_session_config_entry("session.model_external_initializers_file_folder_path", os.devnull)
+        options.log_severity_level = 4  # faults come as exceptions; nothing else on stderr
+        try:
+            return self._answered(
+                partial(ort.InferenceSession, self._data, options, providers=["CPUExecutionProvider"])
+            )
+        except NetworkError:
+            raise
+        except Exception as error:  # onnxruntime raises its own types, without a common base
+            raise self.error(f"not a usable ONNX model: {_first_line(error)}") from None
+
+    def _check_graph(self) -> None:
+        """NetworkError unless there is one input "x" [N, features] and one output [N, 1]."""
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        if [i.name for i in inputs] != ["x"]:
+            raise self.error(f"found inputs {[i.name for i in inputs]}, expected one, 'x'")
+        if len(outputs) != 1:
+            raise self.error(f"found {len(outputs)} outputs, expected one")
+        for what, node, width in (("input 'x'", inputs[0], self._width), ("output", outputs[0], 1)):
+            if node.type != "tensor(double)":
+                raise self.error(f"found {what} of type {node.type}, expected tensor(double)")
+            shape = list(node.shape)
+            if len(shape) != 2 or isinstance(shape[0], int) or shape[1] != width:
+                raise self.error(f"found {what} of shape {shape}, expected ['N', {width}]")
+
+    def _read_metadata(self, features: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Any]:
+        try:
+            raw = self._session.get_modelmeta().custom_metadata_map
+        except UnicodeDecodeError as error:
+            raise self.error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
+        metadata: dict[str, Any] = {}
+        for key in ("features", *keys, *({PERCEPTRON} & raw.keys())):
+            if key not in raw:
+                raise self.error(f"metadata '{key}': missing, found only {sorted(raw)}")
+            try:
+                metadata[key] = json.loads(raw[key])
+            except (ValueError, RecursionError):  # the latter: nested a thousand times
+                raise self.error(f"metadata '{key}': found {raw[key][:60]!r}, expected JSON") from None
+        if metadata["features"] != list(features):
+            raise self.error(f"metadata 'features': found {metadata['features']}, expected {list(features)}")
+        return metadata
+
+    def _read_weights(self) -> dict[str, Any] | None:
+        """Return the weights of a graph as `jtq train` writes it, as `perceptron_content`, read by the package onnx.
+
+        None without the package, or for any other graph. Raises NetworkError for constants that are not finite.
+        """
+        try:
+            import onnx
+        except ImportError:
+            return None
+        try:
+            model = onnx.load_model_from_string(self._data)
+            constants = dict(_constants(model.graph))
+            for function in model.functions:
+                constants |= dict(_constants(function))
+        except Exception as error:  # of onnx, numpy and protobuf
+            raise self.error(f"found constants that cannot be checked: {_first_line(error)}") from None
+        for name, values in constants.items():
+            if values.dtype.kind not in "OSU" and not np.isfinite(values.astype(np.complex128)).all():
+                raise self.error(f"found weights {ascii(name)[:60]} with a value that is not finite")
+        with suppress(ValueError, KeyError, IndexError):
+            return _perceptron_in(model.graph, constants)
+        return None
+
+    def _warm_up(self, middle: FloatArray) -> None:
+        """First calls allocate: they happen here, not in the loop. A network that fails to run is refused."""
+        sample = middle.tolist()
+        try:
+            values = [self._run_one(*sample) for _ in range(_WARM_UP)]
+        except Exception as error:  # as in _open
+            raise self.error(f"does not run: {_first_line(error)}") from None
+        if not math.isfinite(values[-1]):
+            raise self.error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
+        if len(set(values)) > 1:
+            raise self.error(
+                "found different answers to one input, expected the same: a log could not be replayed"
+            )
+
+
+def _first_line(error: Exception) -> str:
+    lines = str(error).strip().splitlines()
+    return lines[0][:160] if lines else type(error).__name__
+
+
+def _constants(graph: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and values of all constants of a graph or function of onnx, also of those in its loops and branches."""
+    from onnx import numpy_helper
+
+    tensors: list[Any] = []
+    if hasattr(graph, "initializer"):
+        tensors += [*graph.initializer, *(each.values for each in graph.sparse_initializer)]
+    for attribute in (each for node in graph.node for each in node.attribute):
+        sparse = (attribute.sparse_tensor, *attribute.sparse_tensors)
+        tensors += [attribute.t, *attribute.tensors, *(each.values for each in sparse)]
+        yield attribute.name, np.array([attribute.f, *attribute.floats])
+        for inner in (attribute.g, *attribute.graphs):
+            yield from _constants(inner)
+    yield from ((each.name, numpy_helper.to_array(each)) for each in tensors if each.data_type)
+
+
+def _perceptron_in(graph: Any, constants: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Return `perceptron_content` of a graph with operators and names as `jtq train` writes them, None for any other.
+
+    Whether the constants are wired as there shows the comparison with ONNX Runtime.
+    """
+    operators = [node.op_type for node in graph.node]
+    count = operators.count("Gemm")
+    plain = ["Gemm", "Tanh"] * (count - 1) + ["Gemm"]
+    layers: Any = [(constants.get(f"W{n}"), constants.get(f"b{n}")) for n in range(count)]
+    if operators not in (plain, [*plain, "MatMul", "Mul", "MatMul"]) or not all(
+        isinstance(each, np.ndarray) and each.dtype == np.float64 for layer in layers for each in layer
+    ):
+        return None
+    gate = None if operators == plain else constants["pick"].argmax(axis=0).tolist()
+    return perceptron_content(layers, gate)
 
 
 class Network:
@@ -154,8 +540,8 @@ class FusedNetwork(Network):
         self.corrects: Final = any(self.run_one(*probe) != 0.0 for probe in probes.tolist())
 
 
-Networks = TorqueNetwork | FusedNetwork
-_KINDS: Final[dict[str, type[Networks]]] = {kind.__name__: kind for kind in (TorqueNetwork, FusedNetwork)}
+AnyNetwork = TorqueNetwork | FusedNetwork
+_KINDS: Final[dict[str, type[AnyNetwork]]] = {kind.__name__: kind for kind in (TorqueNetwork, FusedNetwork)}
 
 
 def load_network(
@@ -163,7 +549,7 @@ def load_network(
     source: bytes | str | os.PathLike[str],
     sha256: str | None = None,
     check: RuntimeCheck | None = None,
-) -> Networks:
+) -> AnyNetwork:
     """Return the network of a method that uses one, from a file or bytes; arguments and errors as `Network`."""
     return _KINDS[METHODS[method].network](source, sha256, check)
 

@@ -1,7 +1,11 @@
 """Observers and their guard: parameters, states, outputs; the equations stand in observer.pyx."""
 
 from jtqd.estimator.losses cimport MOST_NODES, FrictionLaw
-from jtqd.estimator.sample cimport Sample
+
+cdef struct Sample:
+    double dt_s  # since the sample before
+    double current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad
+    double temperature_c  # NaN where it is not known
 
 cdef struct Observed:  # torques [Nm, joint side], velocities [rad/s, joint side]
     double raw_nm, tob_nm, joint_velocity_rad_s, link_velocity_rad_s

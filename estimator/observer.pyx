@@ -31,7 +31,6 @@ The guard decides on starts, gaps, values that are not finite, and standstill, s
 from libc.math cimport INFINITY, NAN, copysign, cos, expm1, fabs, fmax, fmin, isfinite, isinf, sin
 
 from jtqd.estimator.losses cimport FrictionModel, direction_of, friction_torque
-from jtqd.estimator.sample cimport Sample
 
 from typing import Final
 
@@ -51,6 +50,18 @@ RIPPLE_ORDERS: Final = (2, 4)
 
 cdef double LINK_SPEED_LIMIT = LINK_SPEED_LIMIT_RAD_S
 cdef int STARTING = st.STARTING, VALID = st.VALID, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
+
+
+def columns(*arrays):
+    """Return columns of a run as one array [columns, n], None as NaN; ValueError for different lengths."""
+    given = [np.asarray(each, np.float64) for each in arrays if each is not None]
+    if len({each.shape for each in given}) != 1 or given[0].ndim != 1:
+        raise ValueError(f"found arrays of shapes {[each.shape for each in given]}, expected all of one length")
+    laid = np.full((len(arrays), len(given[0])), NAN)
+    for k, each in enumerate(arrays):
+        if each is not None:
+            laid[k] = each
+    return laid
 
 
 # First-order hold -----------------------------------------------------------------------------------------------------

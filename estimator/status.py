@@ -37,7 +37,7 @@ LINK_JUMP: Final = 0x08
 VELOCITY_MISMATCH: Final = 0x10
 TORSION: Final = 0x20
 CURRENT_FROZEN: Final = 0x40
-"""Bits of faults that `jtqd.estimator.plausibility` finds."""
+"""Bits of faults that `jtqd.estimator.detection` finds."""
 
 CONTACT_OFF, CONTACT_UNKNOWN, CONTACT_NONE, CONTACT_PRESENT = range(4)
 """Codes of a contact; off: not watched (docs/estimator.md)."""

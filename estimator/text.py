@@ -1,10 +1,12 @@
-"""Numbers, percentages, sizes, durations and tables as text. Pure."""
+"""Numbers, percentages, sizes, durations, tables and hashes as text. Pure."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Container, Sequence
-from typing import Final
+from contextlib import suppress
+from importlib import import_module
+from typing import Any, Final
 
 NOTHING: Final = "-"
 """Shown in place of a number that is not known."""
@@ -81,3 +83,19 @@ def table_lines(
         ).rstrip()
         for row in (head, *([["-" * width for width in widths]] if rule else []), *body)
     ]
+
+
+def _implementation() -> Any:
+    """Return `sha256` of CPython up to 3.11, from 3.12 on, or of any other Python."""
+    for module in ("_sha256", "_sha2"):
+        with suppress(ImportError):
+            return import_module(module).sha256
+    return import_module("hashlib").sha256
+
+
+sha256: Final = _implementation()
+
+
+def sha256_hex(data: bytes) -> str:
+    """Return the SHA-256 of some bytes in hexadecimal."""
+    return str(sha256(data).hexdigest())

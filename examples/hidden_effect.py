@@ -34,8 +34,8 @@ from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import check_installed, count, make_directory, natural, seconds
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.estimator import estimate_columns
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import EstimatorSettings

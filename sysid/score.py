@@ -27,8 +27,8 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR as BALANCE_MOTOR
 from jtqd.estimator.effects.effect import TORSION as BALANCE_TORSION
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.estimator import estimate_columns
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.estimator.settings import METHODS, bandwidth_of, recommended

@@ -36,8 +36,8 @@ from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.daemon.logs.read import published_torque, reference_torque, sync_time
 from jtqd.estimator.command_line import make_directory
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.estimator import make_estimator
 from jtqd.estimator.joint import Friction, Joint
-from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import EstimateRun, RunTable
 from jtqd.estimator.settings import EstimatorSettings

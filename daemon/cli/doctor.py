@@ -36,7 +36,7 @@ from jtqd.drivers.bus_socket import AF_CAN, CAN_RAW
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.network import NetworkError
 from jtqd.estimator.text import percent, size
 
 SCHEMA = "jtq.doctor/1"

@@ -8,7 +8,7 @@ from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
 from jtqd.daemon.core.record cimport MOST_JOINTS, RecordRing
 from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
 from jtqd.drivers.frame_socket cimport Frame, FrameSocket
-from jtqd.estimator.sample cimport Learned
+from jtqd.estimator.fusion cimport Learned
 
 # The snapshot: structs that lie in memory as `jtqd.daemon.shared.snapshot` has them
 

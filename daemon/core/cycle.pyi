@@ -9,7 +9,7 @@ from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import FrameSocket
-from jtqd.estimator.methods import AnyEstimator
+from jtqd.estimator.estimator import Estimator
 
 STARTING_CYCLES: Final[int]
 CYCLE_ENDED: Final[int]
@@ -40,7 +40,7 @@ class Cycle:
         self,
         socket: FrameSocket,
         intake: Intake,
-        joints: Sequence[tuple[JointInputs, AnyEstimator]],
+        joints: Sequence[tuple[JointInputs, Estimator]],
         ring: Ring,
         snapshot: Snapshot,
         *,

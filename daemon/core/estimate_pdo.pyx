@@ -151,7 +151,7 @@ NO_JOINT = contact_field_of(NAN, NAN, st.CONTACT_OFF)
 
 
 def contact_field(double torque_rate_nm_s, double contact_nm, int state):
-    """Return the integers (rate, code) of one joint; state: of `jtqd.estimator.contact`."""
+    """Return the integers (rate, code) of one joint; state: of `jtqd.estimator.detection`."""
     cdef ContactField made = contact_field_of(torque_rate_nm_s, contact_nm, state)
     return made.rate, made.code
 

@@ -6,8 +6,8 @@ from jtqd.daemon.core.estimate_pdo cimport ContactField, Published
 from jtqd.daemon.core.intake cimport Input, Intake
 from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
 from jtqd.daemon.core.status cimport JointRules
-from jtqd.estimator.contact cimport ContactLaw, ContactState
-from jtqd.estimator.sample cimport Estimator
+from jtqd.estimator.detection cimport ContactLaw, ContactState
+from jtqd.estimator.estimator cimport Estimator
 
 cdef enum:
     MOST_TPDOS = 4  # of a drive

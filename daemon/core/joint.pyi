@@ -5,17 +5,17 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.core.input_pdos import JointInputs
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.status import JointCounts, JointSafety
-from jtqd.estimator.methods import AnyEstimator
+from jtqd.estimator.estimator import Estimator
 
 STAMP_ACCURACY_NS: Final[int]
 
 class JointCycle:
-    estimator: Final[AnyEstimator]
+    estimator: Final[Estimator]
     def __init__(
         self,
         number: int,
         inputs: JointInputs,
-        estimator: AnyEstimator,
+        estimator: Estimator,
         *,
         intake: Intake,
         snapshot: JointCounts,

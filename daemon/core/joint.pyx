@@ -30,8 +30,7 @@ from jtqd.daemon.core.status cimport JointRules
 from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator import status as st
-from jtqd.estimator.block cimport copied
-from jtqd.estimator.contact cimport (
+from jtqd.estimator.detection cimport (
     CONTACT_PRESENT,
     CONTACT_UNKNOWN,
     ContactState,
@@ -39,8 +38,9 @@ from jtqd.estimator.contact cimport (
     fill_contact,
     restart_contact,
 )
-from jtqd.estimator.sample cimport Estimator, Sample, Values
-from jtqd.estimator.sample import PythonEstimator
+from jtqd.estimator.estimator cimport Estimator, Values
+from jtqd.estimator.observer cimport Sample
+from jtqd.estimator.estimator import PythonEstimator
 
 STAMP_ACCURACY_NS: Final = 5_000
 """Kernel software stamps differ by a few us from the time on the wire."""
@@ -146,7 +146,7 @@ cdef class JointCycle:
 
     @property
     def sample(self):
-        return cr.JOINT.unpack(copied(&self.now.sample, sizeof(JointBlock)))
+        return cr.JOINT.unpack((<const char *> &self.now.sample)[: sizeof(JointBlock)])
 
     def begin_again(self):
         """Restart after a restart of the drive: earlier positions and the observer's state are invalid."""
@@ -309,7 +309,7 @@ cdef const int64_t *_number_at(Intake intake, place) except NULL:
 
 # Contacts of all joints ------------------------------------------------------------------------------------------------
 #
-# The rules of one detector stand in `jtqd.estimator.contact`. Joints that turn one link against each other (`opposed`: 1 and
+# The rules of one detector stand in `jtqd.estimator.detection`. Joints that turn one link against each other (`opposed`: 1 and
 # 2, 3 and 4) share a detector, in the frame of the first; alone, each has its own.
 
 cdef int KNOWN = cr.FLAG_CONTACT_KNOWN, THERE = cr.FLAG_CONTACT

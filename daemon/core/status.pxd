@@ -2,9 +2,9 @@
 
 from libc.stdint cimport int64_t, uint64_t
 
-from jtqd.estimator.observer cimport Reference
-from jtqd.estimator.plausibility cimport Plausibility
-from jtqd.estimator.sample cimport Sample, Values
+from jtqd.estimator.detection cimport Plausibility
+from jtqd.estimator.observer cimport Reference, Sample
+from jtqd.estimator.estimator cimport Values
 
 cdef struct StatusState:
     int held, asked  # the status that stays until a better one was asked for long enough; the worst of those

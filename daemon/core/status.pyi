@@ -1,8 +1,8 @@
 from typing import Any, Final, Protocol
 
 from jtqd.daemon.config import Config, SafetySettings
+from jtqd.estimator.detection import Plausibility
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.plausibility import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
 
 NEEDED: Final[dict[int, int]]

@@ -37,9 +37,9 @@ from jtqd.daemon.shared.counters import COUNTERS, word_of
 from jtqd.daemon.shared.reasons import STATUS_OF_STATE
 from jtqd.drivers.drive import STATE_MASK, STATES
 from jtqd.estimator import status as st
-from jtqd.estimator.observer cimport follow_reference, restart_reference
-from jtqd.estimator.plausibility cimport Plausibility
-from jtqd.estimator.sample cimport Sample, Values
+from jtqd.estimator.detection cimport Plausibility
+from jtqd.estimator.observer cimport Sample, follow_reference, restart_reference
+from jtqd.estimator.estimator cimport Values
 from jtqd.estimator.settings import bandwidth_of
 
 NEEDED: Final = {st.DEGRADED: 100, st.STARTING: 1, st.OFF: 20, st.STALE: 5, st.INVALID: 50, st.DRIVE_FAULT: 100}

@@ -35,9 +35,8 @@ from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
-from jtqd.estimator.network import FusedNetwork, load_network
-from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
+from jtqd.estimator.estimator import Estimator, make_estimator
+from jtqd.estimator.network import AnyNetwork, FusedNetwork, NetworkError, RuntimeCheck, load_network
 from jtqd.estimator.settings import METHODS
 
 _PATIENCE_S = 1.0
@@ -134,7 +133,7 @@ def build_estimator(
     joint: JointConfig,
     check: RuntimeCheck | str | None = None,
     notes: list[str] | None = None,
-) -> AnyEstimator:
+) -> Estimator:
     """Build the estimator of one joint; notes takes lines for the operator. Raises ConfigError, NetworkError.
 
     check: of its network by `check_networks`, or why it is refused; None: ONNX Runtime checks it in this process.
@@ -165,7 +164,7 @@ def loop_filters(config: Config) -> list[CanFilter]:
     return [any_format(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))]
 
 
-def warm_up(estimators: list[AnyEstimator]) -> None:
+def warm_up(estimators: list[Estimator]) -> None:
     """Run every estimator often enough that caches, allocators and the interpreter's specialisation have settled."""
     for estimator in estimators:
         for n in range(_WARM_UP_STEPS):
@@ -209,7 +208,7 @@ def build_cycle(
     request: dict[str, Any],
     report: dict[str, Any],
     socket: FrameSocket,
-    estimators: list[AnyEstimator],
+    estimators: list[Estimator],
 ) -> tuple[Cycle, Grid]:
     """Build cycle and grid from configuration and boot report."""
     grid = Grid(0, config.period_ns)
@@ -242,7 +241,7 @@ def build_cycle(
 
 def build_estimators(
     request: dict[str, Any], notes: list[str] | None = None
-) -> tuple[Config, list[AnyEstimator]]:
+) -> tuple[Config, list[Estimator]]:
     """Load the configuration and warm up the estimators of all joints. Raises ConfigError, NetworkError."""
     config = load_config(Path(request["config"]) if request["config"] else None)
     if config.files_sha256 != request["config_sha256"]:

@@ -22,7 +22,7 @@ from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.command_line import check_output
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.network import NetworkError
 from jtqd.estimator.settings import METHODS
 
 # ---- results as text ----

@@ -51,10 +51,9 @@ from jtqd.daemon.shared.cycle_record import (
 )
 from jtqd.estimator.arrays import BoolArray, FloatArray, RecordArray
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.estimator import Estimator, make_estimator
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.methods import AnyEstimator, AnyNetwork, make_estimator
-from jtqd.estimator.network import NATIVE_LIMIT, load_network
-from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.network import NATIVE_LIMIT, AnyNetwork, NetworkError, load_network
 from jtqd.estimator.settings import METHODS, EstimatorSettings, bandwidth_of
 from jtqd.estimator.status import learner_of, same_past
 from jtqd.models.files import load_joint
@@ -78,7 +77,7 @@ class Model:
     joint: Joint
     settings: EstimatorSettings
     network: AnyNetwork | None
-    estimator: AnyEstimator
+    estimator: Estimator
     source: str
 
 

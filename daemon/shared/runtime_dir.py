@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jtqd.estimator.sha256 import sha256_hex
+from jtqd.estimator.text import sha256_hex
 
 FILE = "about.json"
 SCHEMA = "jtqd.about/1"

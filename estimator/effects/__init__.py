@@ -1,7 +1,6 @@
 """Effect library: physical deviations of a joint from the rigid textbook, one file each, for estimator, plant and diagnosis.
 
 EFFECTS has all effects by name. A new effect is a new file of this folder: a subclass of `effect.Effect` registers itself.
-`terms` turns coefficients of a regression into parameters, `array_functions` evaluates effects over whole runs.
 """
 
 from __future__ import annotations
@@ -18,9 +17,6 @@ from jtqd.estimator.decoder import Field, FieldError, below, field_of, limits, r
 from jtqd.estimator.effects.effect import REGISTERED, Effect
 from jtqd.estimator.errors import ConfigError
 
-_NO_EFFECTS: Final = ("array_functions",)
-"""Not loaded here: it brings numpy, which supervisor and bench do without."""
-
 
 def discover() -> dict[str, Effect]:
     """Import every file of this folder and return the effects by name, in alphabetical order.
@@ -28,8 +24,7 @@ def discover() -> dict[str, Effect]:
     Raises TypeError for an effect that contradicts itself: a mistake of a programmer, seen at the first import.
     """
     for module in pkgutil.iter_modules(__path__):
-        if module.name not in _NO_EFFECTS:
-            importlib.import_module(f"{__name__}.{module.name}")
+        importlib.import_module(f"{__name__}.{module.name}")
     return dict(sorted(REGISTERED.items()))
 
 

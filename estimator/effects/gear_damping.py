@@ -6,8 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, Final
 
-from jtqd.estimator.effects.effect import AnyJoint, Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term, linear
+from jtqd.estimator.effects.effect import (
+    AnyJoint,
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+    linear,
+)
 
 _USUAL_S: Final = 1e-3
 """Damping by stiffness that a column is made for; a fit takes any."""

@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term, Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values, Wave
 
 ORDERS = (1.0, 2.0, 4.0)
 """Shaft, the wave generator's two lobes, and their second harmonic."""

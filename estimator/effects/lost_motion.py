@@ -5,8 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term, linear
+from jtqd.estimator.effects.effect import (
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+    linear,
+)
 
 WIDTHS_RAD = (3e-5, 1e-4, 3e-4, 1e-3)
 """Grid of the search; the fit refines it."""

@@ -6,8 +6,17 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import TORSION, Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Linear, Term
+from jtqd.estimator.effects.effect import (
+    TORSION,
+    Effect,
+    Functions,
+    JointValues,
+    Linear,
+    Parameter,
+    State,
+    Term,
+    Values,
+)
 
 
 class NonlinearStiffness(Effect):

@@ -6,8 +6,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
-from jtqd.estimator.effects.effect import AnyJoint, Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term, linear
+from jtqd.estimator.effects.effect import (
+    AnyJoint,
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+    linear,
+)
 
 
 class RotorInertia(Effect):

@@ -5,8 +5,20 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import FALLBACK_C, Slope, Term, above, linear, reference_of
+from jtqd.estimator.effects.effect import (
+    FALLBACK_C,
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    Slope,
+    State,
+    Term,
+    Values,
+    above,
+    linear,
+    reference_of,
+)
 
 
 class SensorDrift(Effect):

@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
 
 STEP = 0.01
 """1 - 1/g of the column."""

@@ -7,8 +7,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term, linear
+from jtqd.estimator.effects.effect import (
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+    linear,
+)
 
 VELOCITIES_RAD_S = (0.02, 0.035, 0.05, 0.08, 0.12, 0.2)
 """Grid of the search, the joint file's own beside it; the fit refines it."""

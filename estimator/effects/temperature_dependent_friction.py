@@ -7,8 +7,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import SPAN_K, Term, above, reference_of
+from jtqd.estimator.effects.effect import (
+    SPAN_K,
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    State,
+    Term,
+    Values,
+    above,
+    reference_of,
+)
 
 RATES_PER_K = (0.003, 0.015, 0.03)
 """Grid of the search: how curved the fall over temperature is; the fit refines it."""

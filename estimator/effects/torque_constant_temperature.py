@@ -5,8 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Slope, Term, above, reference_of
+from jtqd.estimator.effects.effect import (
+    Effect,
+    Functions,
+    JointValues,
+    Parameter,
+    Slope,
+    State,
+    Term,
+    Values,
+    above,
+    reference_of,
+)
 
 
 class TorqueConstantTemperature(Effect):

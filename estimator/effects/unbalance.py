@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Values
-from jtqd.estimator.effects.terms import Term, Wave
+from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values, Wave
 
 
 class Unbalance(Effect):

@@ -11,8 +11,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
-from jtqd.estimator.effects.array_functions import ArrayFunctions
-from jtqd.estimator.effects.effect import Effect, State, Values
+from jtqd.estimator.effects.effect import ArrayFunctions, Effect, State, Values
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
@@ -394,10 +393,11 @@ class _Stepwise(ArrayFunctions):
     __slots__ = ("_last", "_z")
 
     def __init__(self) -> None:
+        super().__init__()
         self._last: FloatArray | None = None
         self._z: FloatArray = np.zeros(1)
 
-    def slip(self, d: FloatArray, travel: float) -> FloatArray:  # type: ignore[override]
+    def slip(self, d: FloatArray, travel: float) -> FloatArray:
         """Return the states [w] after the deflections went on to d [w]; 0 at the first."""
         moved = np.zeros_like(d) if self._last is None else (d - self._last) / travel
         self._last, self._z = d, np.clip(self._z + moved, -1.0, 1.0)

@@ -15,9 +15,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.effects.array_functions import ArrayFunctions
-from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Values
-from jtqd.estimator.effects.terms import Term
+from jtqd.estimator.effects.effect import MOTOR, TORSION, ArrayFunctions, Effect, Term, Values
 from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, JointSignals

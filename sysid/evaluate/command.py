@@ -12,7 +12,7 @@ from typing import Final
 
 from jtqd.estimator.command_line import check_installed, command_parser, make_directory, write_whole
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.onnx_graph import NetworkError
+from jtqd.estimator.network import NetworkError
 from jtqd.sysid.evaluate.card import (
     BASELINE,
     Card,

@@ -16,8 +16,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from jtqd.estimator.estimator import make_estimator
 from jtqd.estimator.joint import Envelope
-from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.text import counted

@@ -34,10 +34,9 @@ from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.estimator import STANDSTILL_SIGMAS, observe_run, quadrants
+from jtqd.estimator.estimator import STANDSTILL_SIGMAS, estimate_columns, observe_run, quadrants
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.methods import AnyNetwork, estimate_columns
-from jtqd.estimator.network import load_network
+from jtqd.estimator.network import AnyNetwork, load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun, RunTable
 from jtqd.estimator.settings import METHODS, EstimatorSettings, bandwidth_of, recommended

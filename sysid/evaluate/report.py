@@ -13,9 +13,9 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.decoder import plain_values
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS
 from jtqd.estimator.text import counted, table_lines
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.evaluation import Evaluation, against_physics, mse, mse_ratio
 from jtqd.sysid.evaluate.inputs import OURS, PAPERS, TITLES, JointModels, Samples
 from jtqd.sysid.evaluate.scores import (

@@ -40,12 +40,12 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS, Envelope, Joint
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import METHODS
 from jtqd.estimator.status import DEGRADED
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.inputs import OURS, PAPERS_BANDWIDTH, TITLES, Samples, settings_of
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 

@@ -21,7 +21,7 @@ is: its own delay against the encoders is in a and b.
 
 **Standstill** (`fit_standstill`), half width of the interval of a standing joint:
 
-    half = k sd + alpha open + (1 - alpha) half_f           (uncertainty.pyx)
+    half = k sd + alpha open + (1 - alpha) half_f           (fusion.pyx)
 
 open, half_f: what slip and friction leave open are bounds, not deviations, and count in full. sd: of both paths besides.
 All standing samples of a run share its offsets and its pre-load: n runs are n errors. With e = [|error| - bounds]+/sd, where
@@ -46,7 +46,7 @@ scale_q is the conformal quantile of sqrt(error^2 - (1.645 more)^2) over the spr
 
 Before the offset of the day is known the error is wider than the variance that its correction removes. The ratio r of the
 conformal quantiles of the samples that know less than half of it and of the others, k and k' the means of what they know, is
-that of the factors of the spread (`path_difference.pyx`):
+that of the factors of the spread (`fusion.pyx`):
 
     (1 + (early - 1) (1 - k))/(1 + (early - 1) (1 - k')) = r
 
@@ -67,7 +67,7 @@ Held-out residuals: the error of current path and torsion path on a run that the
     more^2 = (disagreement beyond DISAGREE_SIGMAS)^2 + doubt^2
 
 With `track_zeros` the corrections of both paths are in all of them. Definitions of early, disagreement and doubt:
-path_difference.pyx, uncertainty.pyx.
+fusion.pyx.
 """
 
 from __future__ import annotations
@@ -82,12 +82,11 @@ from scipy.special import chdtri, ndtri, stdtrit
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.estimator import SLOPE_NM, quadrants
+from jtqd.estimator.fusion import DISAGREE_SIGMAS, GAUSS, Fusion, faded, track_run
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Standstill, Torsion, Tracking
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.path_difference import track_run
 from jtqd.estimator.settings import TORSION_BANDWIDTH_RAD_S
-from jtqd.estimator.uncertainty import DISAGREE_SIGMAS, GAUSS, Fusion, faded
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import (
     TRACKING_RAD_S,

@@ -24,12 +24,12 @@ Offset of the link encoder (`fused.zeros`): how far it differs from day to day.
 
 The mean error of a run is its offset and the sensor's; reference^2 is the sensor's (`calibration.py`). The
 long-run variance is that of means over WINDOW_S, times WINDOW_S, after least squares with the states of
-`path_difference.pyx` in each run; assumed is that of both paths, less that of the offset. The same runs are then estimated
+`fusion.pyx` in each run; assumed is that of both paths, less that of the offset. The same runs are then estimated
 as in service, each from its start, with offsets tracked. The section is written where that reduces the mean square error by
 at least WORTH; `calibration.py` sets its scale.
 
 Agreement of the paths (`fused.agreement`): quantiles over samples of how far they differ on ordinary days. A difference
-beyond is doubt that grows from zero, so a run slightly beyond costs little (estimator/path_difference.pyx).
+beyond is doubt that grows from zero, so a run slightly beyond costs little (estimator/fusion.pyx).
 
 Waves of the difference over the motor's turn, in contrast, are the same on every day. Least squares finds what all runs have
 in common, with the slow part of each second removed on both sides. The residual waves of a run count by their covariance
@@ -45,6 +45,16 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import (
+    CORRELATION_S,
+    EVERY,
+    MOVING_RAD_S,
+    ONE_WAY,
+    TURNING_RAD_S,
+    Fusion,
+    levels,
+    turn_waves,
+)
 from jtqd.estimator.joint import (
     MAX_CELLS,
     TURN_WAVES,
@@ -59,17 +69,8 @@ from jtqd.estimator.joint import (
     Torsion,
     Turn,
 )
-from jtqd.estimator.path_difference import (
-    CORRELATION_S,
-    EVERY,
-    MOVING_RAD_S,
-    ONE_WAY,
-    TURNING_RAD_S,
-    levels,
-    turn_waves,
-)
+from jtqd.estimator.native_network import envelope_weights
 from jtqd.estimator.text import counted
-from jtqd.estimator.uncertainty import Fusion, envelope_weights
 from jtqd.sysid.fit.calibration import (
     PathResiduals,
     calibrated,
@@ -295,12 +296,12 @@ LOWERED: Final = 0.99
 (`BEYOND_SHARE`), is the 2 % that may be flagged without need."""
 LEVEL_FACTOR: Final = 2.8
 GAIN_FACTOR: Final = 4.0
-"""Of `path_difference.pyx`, chosen with QUANTILE: larger ones cover changed joints no better."""
+"""Of `fusion.pyx`, chosen with QUANTILE: larger ones cover changed joints no better."""
 ZERO_FACTOR: Final = 1.3
-"""Of `path_difference.pyx`: chosen on runs that no figure is reported on. Until the joint has moved both ways, the filter
+"""Of `fusion.pyx`: chosen on runs that no figure is reported on. Until the joint has moved both ways, the filter
 finds less of an offset than there is: friction takes a part."""
 GAIN_SIGMAS: Final = 1.0
-"""Of `path_difference.pyx`: chosen on runs that no figure is reported on. More hold a softer spring less; without, sigma is
+"""Of `fusion.pyx`: chosen on runs that no figure is reported on. More hold a softer spring less; without, sigma is
 wider where a joint is always driven."""
 _START: Final = Agreement(1.0, 1.0, 0.0, 0.0, gain_sigmas=GAIN_SIGMAS)
 _FEWEST_BLOCKS: Final = 200

@@ -26,11 +26,10 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.estimator import estimate_columns
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.methods import estimate_columns
-from jtqd.estimator.network import FEATURES
+from jtqd.estimator.network import FEATURES, PERCEPTRON, perceptron_content
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.onnx_graph import PERCEPTRON, perceptron_content
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID

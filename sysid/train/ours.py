@@ -20,11 +20,12 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import FusedEstimator, quadrants
+from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, Torsion
+from jtqd.estimator.native_network import network_shares
 from jtqd.estimator.network import FUSED_FEATURES
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.text import counted
-from jtqd.estimator.uncertainty import Fusion, network_shares
 from jtqd.sysid.fit.calibration import conformal_scale, loss_and_width
 from jtqd.sysid.fit.fused import envelope_of, folds
 from jtqd.sysid.fit.losses import fit_loss

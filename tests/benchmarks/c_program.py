@@ -14,10 +14,10 @@ from jtqd.daemon.core import schedule
 from jtqd.daemon.core.status import NEEDED
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
+from jtqd.estimator.native_network import FADE_START
 from jtqd.estimator.observer import LINK_SPEED_LIMIT_RAD_S, RAW_LIMIT
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED
-from jtqd.estimator.uncertainty import FADE_START
 from tests.benchmarks.fixture import (
     ENVELOPE_HIGH,
     ENVELOPE_LOW,

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.contact import detect_contacts, link_loads
+from jtqd.estimator.detection import detect_contacts, link_loads
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_PRESENT

@@ -13,7 +13,7 @@ from jtqd.daemon.loop import process as loop
 from jtqd.daemon.loop import realtime
 from jtqd.daemon.shared.cycle_record import FLAG_COMPLETE, FLAG_PUBLISHED
 from jtqd.drivers.frame_socket import FrameSocket, open_frame_socket
-from jtqd.estimator.methods import AnyEstimator
+from jtqd.estimator.estimator import Estimator
 from jtqd.estimator.status import PUBLISHED
 from tests.benchmarks.contender import Task, serve
 from tests.benchmarks.fixture import Fixture
@@ -27,7 +27,7 @@ class JtqdLoop:
         self.task = task
         fixture = Fixture(task.directory)
         self.config: Config = load_config(fixture.config)
-        self.estimators: list[AnyEstimator] = [
+        self.estimators: list[Estimator] = [
             loop.build_estimator(self.config, joint) for joint in self.config.joints
         ]
         loop.warm_up(self.estimators)

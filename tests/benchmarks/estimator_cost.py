@@ -12,10 +12,9 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
-from jtqd.estimator.estimator import JointEstimator
+from jtqd.estimator.estimator import JointEstimator, make_estimator
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import LossModel
-from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork, load_network
 from jtqd.estimator.settings import METHODS, EstimatorSettings, recommended
 from tests.benchmarks.measure import mark, quantile

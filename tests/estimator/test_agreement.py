@@ -12,13 +12,12 @@ from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
+from jtqd.estimator.fusion import DOWN_S, Fusion, faded, levels, track_run
 from jtqd.estimator.joint import Agreement, Joint
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.path_difference import DOWN_S, levels, track_run
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.uncertainty import Fusion, faded
 from tests.estimator.test_fused_estimator import NARROW
 from tests.estimator.test_zeros import OFF, ON, K, driven
 

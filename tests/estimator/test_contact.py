@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.contact import detect_contacts, link_loads
+from jtqd.estimator.detection import detect_contacts, link_loads
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, CONTACT_UNKNOWN

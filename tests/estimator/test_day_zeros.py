@@ -10,10 +10,9 @@ import pytest
 from jtqd.estimator import status as st
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import SLOPE_NM, FusedEstimator, observe_run
+from jtqd.estimator.fusion import Fusion, faded, levels, track_run
 from jtqd.estimator.joint import DayZeros, Joint
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.path_difference import levels, track_run
-from jtqd.estimator.uncertainty import Fusion, faded
 from tests.estimator.fused_helpers import SIGMA
 from tests.estimator.test_agreement import AGREEMENT, WAVIER
 from tests.estimator.test_fused_estimator import NARROW

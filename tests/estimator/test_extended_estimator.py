@@ -17,11 +17,16 @@ from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.corrections import ExtendedInputs, acting_effects
 from jtqd.estimator.effects import EFFECTS
-from jtqd.estimator.estimator import ExtendedEstimator, FusedEstimator, JointEstimator
+from jtqd.estimator.estimator import (
+    ExtendedEstimator,
+    FusedEstimator,
+    JointEstimator,
+    estimate_columns,
+    make_estimator,
+)
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.methods import AnyNetwork, estimate_columns, make_estimator
-from jtqd.estimator.network import load_network
+from jtqd.estimator.network import AnyNetwork, load_network
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 from tests.estimator.effects.effect_signals import PLAIN, extended

@@ -13,12 +13,12 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, FusedEstimator
+from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import QUADRANTS, Joint, Standstill
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
-from jtqd.estimator.uncertainty import Fusion
 from tests.estimator.fused_helpers import (
     SIGMA,
     TRAINED_C,

@@ -8,10 +8,8 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.shared.snapshot import PAST_WORDS
-from jtqd.estimator.estimator import FusedEstimator
+from jtqd.estimator.estimator import Estimator, FusedEstimator, make_estimator
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.estimator.methods import make_estimator
-from jtqd.estimator.sample import Estimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import LEARNED, PAST_LAYOUT, TRACKED, Zeros, same_past
 from tests.estimator.test_fused_estimator import NARROW

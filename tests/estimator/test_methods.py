@@ -9,9 +9,8 @@ import pytest
 
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.estimator import FusedEstimator, JointEstimator
+from jtqd.estimator.estimator import FusedEstimator, JointEstimator, estimate_columns, make_estimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.methods import estimate_columns, make_estimator
 from jtqd.estimator.network import FusedNetwork, TorqueNetwork, load_network
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings

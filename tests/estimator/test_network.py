@@ -19,10 +19,17 @@ import onnxruntime
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from jtqd.estimator import onnx_graph
+from jtqd.estimator import network as network_module
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
-from jtqd.estimator.network import FEATURES, FUSED_FEATURES, FusedNetwork, TorqueNetwork, native_of
-from jtqd.estimator.onnx_graph import PERCEPTRON, NetworkError
+from jtqd.estimator.network import (
+    FEATURES,
+    FUSED_FEATURES,
+    PERCEPTRON,
+    FusedNetwork,
+    NetworkError,
+    TorqueNetwork,
+    native_of,
+)
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.sysid.train.network import Trained, export_network
 from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, joint1, motion, small_network
@@ -447,12 +454,11 @@ def test_a_graph_that_does_not_answer_is_refused(tmp_path: Path) -> None:
 
     (tmp_path / "endless.onnx").write_bytes(edited(endless))
     program = f"""
-from jtqd.estimator import onnx_graph
-from jtqd.estimator.network import TorqueNetwork
-onnx_graph._LONGEST_S = 0.3
+from jtqd.estimator import network
+network._LONGEST_S = 0.3
 try:
-    TorqueNetwork({str(tmp_path / "endless.onnx")!r})
-except onnx_graph.NetworkError as error:
+    network.TorqueNetwork({str(tmp_path / "endless.onnx")!r})
+except network.NetworkError as error:
     print(error)
 """
     result = subprocess.run(
@@ -465,7 +471,7 @@ def test_a_step_that_blocks_is_refused_although_it_takes_no_processor_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     graph, released = TorqueNetwork(small_network().data)._graph, threading.Event()
-    monkeypatch.setattr(onnx_graph, "_LONGEST_S", 0.05)
+    monkeypatch.setattr(network_module, "_LONGEST_S", 0.05)
     try:
         with pytest.raises(NetworkError, match=r"found no answer within 0\.05 s"):
             graph._answered(lambda: released.wait(20.0))  # type: ignore[attr-defined]

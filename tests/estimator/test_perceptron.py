@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.perceptron import Perceptron, tanh_many
+from jtqd.estimator.native_network import Perceptron, tanh_many
 
 
 def layers(seed: int, *widths: int) -> list[tuple[FloatArray, FloatArray]]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.contact import link_loads
+from jtqd.estimator.detection import link_loads
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion, Tracking

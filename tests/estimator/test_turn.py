@@ -12,9 +12,9 @@ from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, observe_run
+from jtqd.estimator.fusion import EVERY, LEAST_S, TURN_BLOCK, TURN_MEMORY_S, TURN_TREND_S, turn_waves
 from jtqd.estimator.joint import TURN_WAVES, Agreement, Joint, Turn
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.path_difference import EVERY, LEAST_S, TURN_BLOCK, TURN_MEMORY_S, TURN_TREND_S, turn_waves
 from jtqd.estimator.run import EstimateRun
 from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.test_fused_estimator import NARROW

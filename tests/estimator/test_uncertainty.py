@@ -13,19 +13,17 @@ from scipy.interpolate import RegularGridInterpolator
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import JointEstimator
+from jtqd.estimator.fusion import HOLD_S, Fusion, faded
 from jtqd.estimator.joint import Envelope, FusedSigma
 from jtqd.estimator.losses import LossModel
-from jtqd.estimator.settings import EstimatorSettings
-from jtqd.estimator.status import STANDSTILL, VALID, Estimate
-from jtqd.estimator.uncertainty import (
+from jtqd.estimator.native_network import (
     DISTANCE_MARGIN,
-    HOLD_S,
     TEMPERATURE_MARGIN_K,
-    Fusion,
     envelope_weights,
-    faded,
     network_weights,
 )
+from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.status import STANDSTILL, VALID, Estimate
 from tests.estimator.estimator_helpers import HIGH, LOW, joint1
 from tests.estimator.fused_helpers import SIGMA, patches
 

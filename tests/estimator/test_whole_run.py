@@ -11,10 +11,9 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.estimator import FusedEstimator, observe_run
+from jtqd.estimator.estimator import FusedEstimator, estimate_columns, observe_run
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings

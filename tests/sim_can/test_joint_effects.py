@@ -9,8 +9,7 @@ import pytest
 import yaml
 
 from jtqd.estimator.effects import EFFECTS, checked_parameters
-from jtqd.estimator.effects.array_functions import ArrayFunctions
-from jtqd.estimator.effects.effect import State
+from jtqd.estimator.effects.effect import ArrayFunctions, State
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.command import main

@@ -213,7 +213,7 @@ def test_a_network_is_opened_only_under_its_hash() -> None:
         for path in (ROOT / package).rglob("*.py")
         if "InferenceSession" in path.read_text(encoding="utf-8")
     ]
-    assert opened == ["estimator/onnx_graph.py"]
+    assert opened == ["estimator/network.py"]
     source = (ROOT / "daemon" / "loop" / "process.py").read_text(encoding="utf-8")
     assert "load_network(method, str(joint.network.path), joint.network.sha256, check)" in source
 

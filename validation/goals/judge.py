@@ -14,15 +14,14 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray, StatusArray
-from jtqd.estimator.estimator import quadrants
+from jtqd.estimator.estimator import estimate_columns, quadrants
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import QUADRANTS
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.network import load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings, bandwidth_of, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.evaluate.inputs import OURS, PAPERS, SETTLE_S
 from jtqd.sysid.planner.campaigns import seed_of
 from jtqd.sysid.planner.plan import Run

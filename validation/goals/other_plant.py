@@ -15,7 +15,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray
 from jtqd.estimator.command_line import natural
-from jtqd.estimator.uncertainty import GAUSS
+from jtqd.estimator.fusion import GAUSS
 from validation.goals.identify import (
     FIT_SEED,
     JUDGE_SEED,

@@ -35,14 +35,14 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import count
+from jtqd.estimator.estimator import estimate_columns
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.few_runs import fit_few_runs
 from jtqd.sysid.fit.losses import LossFitError

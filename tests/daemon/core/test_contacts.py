@@ -24,8 +24,8 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
-from jtqd.estimator.contact import detect_contacts, link_loads
-from jtqd.estimator.methods import make_estimator
+from jtqd.estimator.detection import detect_contacts, link_loads
+from jtqd.estimator.estimator import make_estimator
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, INVALID
 from jtqd.models.files import load_joint, shipped

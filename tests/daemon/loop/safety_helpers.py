@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from jtqd.daemon.config import SafetySettings
 from jtqd.daemon.core.status import JointSafety
-from jtqd.estimator.plausibility import Plausibility
+from jtqd.estimator.detection import Plausibility
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.drives import demo_current, demo_velocity

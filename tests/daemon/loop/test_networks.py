@@ -18,7 +18,7 @@ from jtqd.daemon.loop.process import build_estimator, build_estimators, check_ne
 from jtqd.drivers.bus_socket import CanFilter
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
-from jtqd.estimator.onnx_graph import NetworkError, RuntimeCheck
+from jtqd.estimator.network import NetworkError, RuntimeCheck
 from tests.estimator.estimator_helpers import small_network
 from tests.estimator.fused_configuration import configured, joint_of, networks
 from tests.estimator.fused_helpers import fused_network

@@ -22,9 +22,8 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.estimator.estimator import FusedEstimator
+from jtqd.estimator.estimator import FusedEstimator, make_estimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.methods import make_estimator
 from jtqd.estimator.network import FusedNetwork, load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STALE, VALID

@@ -23,7 +23,7 @@ from jtqd.daemon.shared.cycle_record import FLAG_TEMPERATURE
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.boot import DriveNode
 from jtqd.drivers.drive import Temperature
-from jtqd.estimator.methods import AnyEstimator, make_estimator
+from jtqd.estimator.estimator import Estimator, make_estimator
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
 from tests.daemon import ring_records as rr
@@ -64,7 +64,7 @@ def coupled(velocity: int = 5000) -> list[bytes]:
 class Spy:
     """An estimator that keeps the temperatures it is given."""
 
-    def __init__(self, inner: AnyEstimator) -> None:
+    def __init__(self, inner: Estimator) -> None:
         self.inner = inner
         self.given: list[float] = []
         self.with_network = inner.with_network
@@ -74,7 +74,7 @@ class Spy:
         return self.inner.step(*sample)
 
 
-def fused(number: int) -> AnyEstimator:
+def fused(number: int) -> Estimator:
     network = load_network("fused", network_of(number))
     return make_estimator(joint_of(number), EstimatorSettings(method="fused"), network)
 

@@ -19,7 +19,7 @@ from jtqd.daemon.logs import read_topic
 from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets, read_runs
 from jtqd.daemon.replay.rows import CycleRows, fields
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.estimator.methods import make_estimator
+from jtqd.estimator.estimator import make_estimator
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STALE

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.array_functions import ArrayFunctions
-from jtqd.estimator.effects.effect import HOOKS, Effect, State, Values
+from jtqd.estimator.effects.effect import HOOKS, ArrayFunctions, Effect, State, Values
 from jtqd.estimator.joint import Effect as Entry
 from jtqd.estimator.joint import Friction, Joint
 

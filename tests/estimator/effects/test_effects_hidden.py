@@ -16,10 +16,9 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS, checked_parameters
-from jtqd.estimator.effects.array_functions import ArrayFunctions
-from jtqd.estimator.effects.effect import State
+from jtqd.estimator.effects.effect import ArrayFunctions, State
+from jtqd.estimator.estimator import estimate_columns
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings

@@ -176,7 +176,7 @@ def _command(main: Callable[[list[str]], int], *arguments: str) -> Callable[[Pat
 
 def _network(method: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
-        from jtqd.estimator.methods import make_estimator
+        from jtqd.estimator.estimator import make_estimator
         from jtqd.estimator.network import load_network
         from jtqd.estimator.settings import EstimatorSettings
         from jtqd.models.files import load_joint
@@ -224,7 +224,7 @@ def targets(directory: Path) -> list[Target]:
     from jtqd.drivers.boot import RequestError
     from jtqd.drivers.object_dictionary import EdsError, read_eds
     from jtqd.estimator.errors import ConfigError
-    from jtqd.estimator.onnx_graph import NetworkError
+    from jtqd.estimator.network import NetworkError
     from jtqd.models.files import load_joint
     from jtqd.sim_can.plant_file import load_plant
     from jtqd.sysid.planner.campaigns import Scale, make_plan

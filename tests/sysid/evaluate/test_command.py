@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jtqd.estimator.methods import estimate_columns
+from jtqd.estimator.estimator import estimate_columns
 from jtqd.estimator.network import load_network
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import RunTable

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import FusedSigma, Tracking
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.sysid.fit.calibration import (
     COVERAGE,
     FEWEST_RUNS,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.joint import Envelope
-from jtqd.estimator.uncertainty import envelope_weights
+from jtqd.estimator.native_network import envelope_weights
 from jtqd.sysid.fit.fused import BEYOND_SHARE, MOST_WIDER, envelope_of, velocity_step, widened
 
 

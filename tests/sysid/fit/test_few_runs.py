@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.jtq import main as jtq
+from jtqd.estimator.estimator import estimate_columns
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Friction, Joint
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import VALID
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.few_runs import FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.losses import LossFitError

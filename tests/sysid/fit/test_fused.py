@@ -12,13 +12,12 @@ import pytest
 
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.estimator import FusedEstimator
+from jtqd.estimator.estimator import FusedEstimator, estimate_columns
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import AdditiveLoss, Friction, Joint, Tracking
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.methods import estimate_columns
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.settings import bandwidth_of, recommended
-from jtqd.estimator.uncertainty import GAUSS
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate, emulate_run
 from jtqd.sim_can.plant import joint_friction

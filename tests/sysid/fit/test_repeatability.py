@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.fusion import turn_waves
 from jtqd.estimator.joint import Agreement, DayZeros, Fused, FusedSigma
-from jtqd.estimator.path_difference import turn_waves
 from jtqd.sysid.fit import fused as fits
 from jtqd.sysid.fit.calibration import FusedErrors, PathResiduals, fused_errors
 from jtqd.sysid.fit.fused import LOWERED, QUANTILE, correlation, fit_agreement, fit_turn, fit_zeros

@@ -10,12 +10,12 @@ import pytest
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import FusedEstimator
+from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import Tracking
 from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL
-from jtqd.estimator.uncertainty import Fusion
 from jtqd.sysid.fit.calibration import FusedErrors, bent_square, fit_tracking, fused_errors, path_residuals
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S

@@ -1,4 +1,4 @@
-"""Torque rate, load of the link and detection of contacts: parameters and states; the equations stand in contact.pyx."""
+"""Plausibility of the readings, torque rate, load of the link and contacts: parameters and states; detection.pyx."""
 
 from jtqd.estimator.observer cimport FusedObserverLaw, FusedObserverState
 
@@ -49,3 +49,12 @@ cdef void update_link(
 cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) except -1
 cdef void restart_contact(ContactState *s) noexcept nogil
 cdef void detect_contact(const ContactLaw *law, ContactState *s, double external_nm, double angle) noexcept nogil
+
+cdef class Plausibility:
+    cdef double gap_s, per_turn, jump, limit, longest_frozen_s, twist_limit, twist_jump
+    cdef double low, high, motor, twist, current, frozen_from, frozen_s
+    cdef readonly double mismatch_rad
+    cdef int check(
+        self, double dt_s, double motor_position, double motor_velocity, double link_position, double current
+    ) noexcept nogil
+    cdef int faults(self, double dt_s, double slip, double velocity, double change) noexcept nogil

@@ -1,4 +1,22 @@
-"""Difference of the two torque paths: offsets of link encoder and current, and whether the joint matches its file.
+"""The two torque paths of method `fused`, motor current less loss and torsion: their fusion, and their difference.
+
+**Fusion** of two independent measurements of one torque by their variances:
+
+    tau_c = tau_raw - loss                 follows fast changes and any load; errors: friction
+    tau_t = K d + K3 d^3 + D d' + H z      independent of friction; errors: hysteresis, encoders
+    alpha = s_c^2/(s_c^2 + s_t^2)          physics = tau_c + alpha (tau_t - tau_c)
+    s_c^2 = a^2 + (b v)^2 + (c tau_raw)^2 + half^2      half: half width of the friction interval near v = 0
+    s_t^2 = e^2 + (f tau_t)^2 + open^2     open: half width of the slip's unknown torque, until its bounds meet
+    sigma^2 = s_c^2 s_t^2/(s_c^2 + s_t^2) + reference^2      reference: of the sensor in a comparison, 0 for the torque itself
+
+A, b, c, e, f, reference: section `fused.sigma`. Towards standstill `half` grows to the half width of the friction interval and
+the torsion takes over: continuous, and the value at rest does not depend on the direction of friction. Of a standing joint
+the half width of the interval is
+
+    k sd + alpha open + (1 - alpha) half   k: `fused.standstill`; sd: sigma without `half` and `open`, with the same alpha
+
+A disagreement of the paths widens sigma by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)),
+where that is above 0: which path is wrong is not known, so the worse case counts.
 
 **Offsets** of the link encoder and of the current on one day are states of a small Kalman filter, whose measurement is the
 difference of the torsion path tau_t and the current path tau_c:
@@ -73,11 +91,167 @@ An error that both paths share (gear ratio of both encoders, external load) is n
 from libc.math cimport exp, fabs, fmax, sqrt
 from libc.string cimport memset
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
 from jtqd.estimator.status import BEYOND, LEARNED, TRACKED, Zeros
+
+HOLD_S: Final = 0.05
+"""Time constant with which the friction interval is forgotten after a reversal."""
+DISAGREE_SIGMAS: Final = 3.0
+"""Distance of the two paths in its own standard deviations up to which it is noise."""
+FOREIGN_SIGMAS: Final = 4.0
+"""Distance from which the status is lowered: at least one of the paths contradicts the joint file."""
+GAUSS: Final = 1.6448536269514722
+"""Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
+LEAST_TORSION: Final = 0.05
+"""Part of the torsion's variance that remains, however well its offset is known."""
+
+cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS, LEAST_VARIANCE = LEAST_TORSION
+
+
+# Fusion ---------------------------------------------------------------------------------------------------------------
+
+
+cdef double fading(double half, double before, double dt) noexcept nogil:
+    """Return the friction interval's half width [Nm] with that of the sample before, dt [s] ago, fading.
+
+    Between rest and motion the weight moves from one path to the other. Their errors differ, so it must not move within
+    a few milliseconds: the interval at a reversal counts for HOLD_S longer.
+    """
+    cdef double faded = before * (HOLD / (HOLD + dt))
+    return half if half >= faded else faded
+
+
+def faded(half_nm, dt_s, running):
+    """Return half widths [n] with their memory (`fading`), which starts again after every sample that is not `running`."""
+    cdef const double[::1] half = np.ascontiguousarray(half_nm, np.float64)
+    cdef const double[::1] dt = np.ascontiguousarray(dt_s, np.float64)
+    cdef const unsigned char[::1] on = np.ascontiguousarray(running, np.bool_).view(np.uint8)
+    out = np.empty(len(half))
+    cdef double[::1] to = out
+    cdef double memory = 0.0
+    cdef Py_ssize_t k
+    for k in range(half.shape[0]):
+        memory = fading(half[k], memory, dt[k]) if on[k] else 0.0
+        to[k] = memory
+    return out
+
+
+cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1:
+    """Set the variances from section `fused.sigma` of a joint file."""
+    law.current = sigma.current_nm**2
+    law.viscous = sigma.viscous_nms_per_rad**2
+    law.load = sigma.load**2
+    law.torsion = sigma.torsion_nm**2
+    law.torsion_load = sigma.torsion_load**2
+    law.reference = sigma.reference_nm**2
+    law.with_torsion = with_torsion
+    return 0
+
+
+cdef Fused fuse_paths(
+    const FusionLaw *law, double raw, double loss, double half, double v, double torsion, double open_nm
+) noexcept nogil:
+    """Return share of the torsion, value and standard deviation [Nm] of the fused physics."""
+    cdef double c = law.current + law.viscous * v * v + law.load * raw * raw + half * half
+    cdef double value = raw - loss
+    cdef double t, alpha
+    if not law.with_torsion:
+        return Fused(0.0, value, sqrt(c + law.reference), 0.0, 1.0)
+    t = law.torsion + law.torsion_load * torsion * torsion + open_nm * open_nm
+    alpha = c / (c + t)
+    return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t)
+
+
+cdef void reweigh(Fused *fused, double known) noexcept nogil:
+    """Weigh with a torsion whose variance is less by `known` [Nm^2]; `variance` stays that of the file. For a reference of 0."""
+    cdef double c = fused.alpha * fused.variance, t = fused.variance - c, alpha
+    t = fmax(t - known, LEAST_VARIANCE * t)
+    alpha = c / (c + t)
+    fused.value += (alpha - fused.alpha) * fused.difference
+    fused.alpha, fused.sigma = alpha, sqrt(alpha * t)
+
+
+cdef Rest at_rest(
+    const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
+) noexcept nogil:
+    """Return standard deviation and bound [Nm] of the fused value of a standing joint.
+
+    The friction interval and the unknown slip are no errors that are small on most days: a push from outside changes the torque
+    and not the current, and a joint may have stopped at the end of its hysteresis. Both are bounds, counted by their weights.
+    """
+    cdef double rest = 1.0 - alpha
+    cdef double c = law.current + law.viscous * v * v + law.load * raw * raw
+    cdef double t = law.torsion + law.torsion_load * torsion * torsion if law.with_torsion else 0.0
+    return Rest(sqrt(alpha * alpha * t + rest * rest * c + law.reference), alpha * open_nm + rest * half)
+
+
+cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil:
+    """Return what a disagreement of the paths adds to sigma [Nm]; uncorrected_nm: known offset that is not corrected yet.
+
+    Both are errors of a known size, not of a known variance: the 90 % interval, not sigma, is to hold them.
+    """
+    cdef double more = fabs(fused.difference) - DISAGREE * sqrt(fused.variance)
+    cdef double offset = fused.alpha * uncorrected_nm
+    if more > 0.0:
+        more *= fmax(fused.alpha, 1.0 - fused.alpha)
+        return INTERVAL * sqrt(more * more + offset * offset)
+    return INTERVAL * offset
+
+
+class FusedPaths(NamedTuple):
+    """Fused physics of a run, arrays [n]: share of the torsion, value and standard deviation [Nm], variance of the paths'
+    difference [Nm^2]."""
+
+    alpha: object
+    value_nm: object
+    sigma_nm: object
+    variance_nm2: object
+
+
+cdef class Fusion:
+    """Fusion of whole runs; sigma: `joint.FusedSigma`; with_torsion False: the current path alone, whatever the torsion."""
+
+    def __init__(self, sigma, bint with_torsion):
+        fill_fusion(&self.law, sigma, with_torsion)
+
+    def fuse(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0, loss_nm=0.0, known_nm2=None):
+        """Return the `FusedPaths` of arrays [n] (or numbers for all n).
+
+        half_nm: `AdditiveLossModel.loss_many`; open_nm: `ObservedRun`; known_nm2: part of the torsion's variance that is known.
+        """
+        given = (raw_nm, loss_nm, half_nm, velocity_rad_s, torsion_nm, open_nm, 0.0 if known_nm2 is None else known_nm2)
+        laid = np.ascontiguousarray(np.broadcast_arrays(*given), np.float64)
+        out = np.empty((4, laid.shape[1]))
+        cdef bint known = known_nm2 is not None
+        cdef const double[:, ::1] x = laid
+        cdef double[:, ::1] to = out
+        cdef Fused fused
+        cdef Py_ssize_t k
+        for k in range(x.shape[1]):
+            fused = fuse_paths(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+            if known:
+                reweigh(&fused, x[6, k])
+                fused.sigma = sqrt(fused.sigma * fused.sigma + self.law.reference)
+            to[0, k], to[1, k], to[2, k], to[3, k] = fused.alpha, fused.value, fused.sigma, fused.variance
+        return FusedPaths(*out)
+
+    def at_rest(self, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm=0.0):
+        """Return (standard deviation, bound) [Nm] of the value of a standing joint, arrays [n]."""
+        alpha = self.fuse(raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm).alpha
+        columns = (alpha, raw_nm, half_nm, velocity_rad_s, torsion_nm, open_nm)
+        cdef const double[:, ::1] x = np.ascontiguousarray(np.broadcast_arrays(*columns), np.float64)
+        out = np.empty((2, x.shape[1]))
+        cdef double[:, ::1] to = out
+        cdef Rest rest
+        cdef Py_ssize_t k
+        for k in range(x.shape[1]):
+            rest = at_rest(&self.law, x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], x[5, k])
+            to[0, k], to[1, k] = rest.spread, rest.bound
+        return out[0], out[1]
+
 
 # Offsets --------------------------------------------------------------------------------------------------------------
 

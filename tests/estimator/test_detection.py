@@ -12,8 +12,8 @@ import pytest
 from jtqd.daemon.config import load_config
 from jtqd.daemon.core.status import safety_of
 from jtqd.estimator.decoder import decode
+from jtqd.estimator.detection import FROZEN_RAD
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.plausibility import FROZEN_RAD
 from jtqd.estimator.settings import PlausibilityLimits
 from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION, VELOCITY_MISMATCH
 from jtqd.models.files import shipped

@@ -1,7 +1,8 @@
 from typing import Final
 
+from jtqd.estimator.arrays import CodeArray, FloatArray
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.settings import PlausibilityLimits
+from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
 
 FORGET_S: Final[float]
 JUMP_RAD_S: Final[float]
@@ -23,3 +24,19 @@ class Plausibility:
         link_position_rad: float,
         current_a: float,
     ) -> int: ...
+
+def detect_contacts(
+    external_nm: FloatArray,
+    motor_position_rad: FloatArray,
+    threshold_nm: float,
+    period_s: float = 0.001,
+) -> tuple[FloatArray, CodeArray]: ...
+def link_loads(
+    joint: Joint,
+    settings: EstimatorSettings,
+    dt_s: FloatArray,
+    current_a: FloatArray,
+    motor_position_rad: FloatArray,
+    motor_velocity_rad_s: FloatArray,
+    link_position_rad: FloatArray,
+) -> tuple[FloatArray, FloatArray]: ...

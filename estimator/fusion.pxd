@@ -1,9 +1,42 @@
-"""Difference of the two torque paths as flat blocks; the equations stand in path_difference.pyx."""
+"""Fusion and difference of the two torque paths as flat blocks; the equations stand in fusion.pyx."""
 
 from libc.stdint cimport uint64_t
 
 from jtqd.estimator.observer cimport FusedObserverLaw
-from jtqd.estimator.sample cimport Learned
+
+cdef struct FusionLaw:
+    double current, viscous, load, torsion, torsion_load, reference  # squares
+    bint with_torsion
+
+cdef struct Fused:
+    double alpha, value, sigma
+    double difference, variance  # torsion less current, and its variance; 0 and 1 without torsion
+
+cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1
+cdef double fading(double half, double before, double dt) noexcept nogil
+cdef Fused fuse_paths(
+    const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
+) noexcept nogil
+
+cdef void reweigh(Fused *fused, double known) noexcept nogil
+
+cdef struct Rest:
+    double spread, bound
+
+cdef Rest at_rest(
+    const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
+) noexcept nogil
+
+cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil
+
+cdef class Fusion:
+    cdef FusionLaw law
+
+# Offsets
+
+cdef struct Learned:  # `jtqd.estimator.status.Zeros` as a block
+    double link_rad, link_sigma_rad, link_used_rad, current_a, current_sigma_a, current_used_a, limit_rad
+    uint64_t flags, jumps
 
 cdef enum:
     OFFSET_STATES = 5  # link offset [rad], current offset [A], friction [Nm], viscous [Nms/rad], gain

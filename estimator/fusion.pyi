@@ -1,8 +1,13 @@
-from typing import Final
+from typing import Final, NamedTuple
 
-from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import Fused, Turn
+from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.joint import Fused, FusedSigma, Turn
 
+HOLD_S: Final[float]
+DISAGREE_SIGMAS: Final[float]
+FOREIGN_SIGMAS: Final[float]
+GAUSS: Final[float]
+LEAST_TORSION: Final[float]
 MOVING_RAD_S: Final[float]
 ONE_WAY: Final[float]
 BLOCK: Final[int]
@@ -34,6 +39,36 @@ LEAST_S: Final[float]
 EVERY: Final[int]
 TURN_BLOCK: Final[int]
 
+Numbers = FloatArray | float
+
+class FusedPaths(NamedTuple):
+    alpha: FloatArray
+    value_nm: FloatArray
+    sigma_nm: FloatArray
+    variance_nm2: FloatArray
+
+class Fusion:
+    def __init__(self, sigma: FusedSigma, with_torsion: bool) -> None: ...
+    def fuse(
+        self,
+        raw_nm: Numbers,
+        half_nm: Numbers,
+        velocity_rad_s: Numbers,
+        torsion_nm: Numbers,
+        open_nm: Numbers = 0.0,
+        loss_nm: Numbers = 0.0,
+        known_nm2: FloatArray | None = None,
+    ) -> FusedPaths: ...
+    def at_rest(
+        self,
+        raw_nm: Numbers,
+        half_nm: Numbers,
+        velocity_rad_s: Numbers,
+        torsion_nm: Numbers,
+        open_nm: Numbers = 0.0,
+    ) -> tuple[FloatArray, FloatArray]: ...
+
+def faded(half_nm: FloatArray, dt_s: FloatArray, running: BoolArray) -> FloatArray: ...
 def levels(
     fused: Fused,
     rated_nm: float,

@@ -1,0 +1,43 @@
+"""A multilayer perceptron and the weight of a network as flat blocks; native_network.pyx."""
+
+cdef enum:
+    FEATURES = 6  # of the paper's network (jtqd.estimator.network.FEATURES)
+    MOST_CELLS = 129  # of an envelope's map in each direction, with its frame
+    MOST_LAYERS = 8
+    MOST_WIDTH = 128
+    MOST_NUMBERS = 8192  # weights and biases together
+
+cdef struct PerceptronLaw:
+    int layers
+    int width[MOST_LAYERS + 1]  # inputs of each layer, then the outputs of the last
+    int gated  # the last outputs are gains of the inputs `gate`; 0: the one output is the answer
+    int gate[MOST_WIDTH]
+    double numbers[MOST_NUMBERS]  # per layer: weights [inputs][outputs], biases [outputs]
+
+cdef double evaluate(const PerceptronLaw *law, const double *x) noexcept nogil
+
+cdef class Perceptron:
+    cdef PerceptronLaw law
+
+cdef struct TrustLaw:
+    double low[FEATURES]
+    double high[FEATURES]
+    double inverse_margin[FEATURES]
+    double limit, fade, inverse_fade
+
+cdef struct FusedTrustLaw:
+    double inverse_velocity, inverse_torque, velocity_0, torque_0
+    int velocity_last, torque_last
+    double distance, inverse_fade
+    bint with_temperature
+    double low, high
+    double load  # largest joint torque [Nm]
+    unsigned char known[MOST_CELLS][MOST_CELLS]
+
+cdef int fill_trust(TrustLaw *law, low, high, double margin, double limit) except -1
+cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1
+cdef double trust(const TrustLaw *law, const double *features, double difference) noexcept nogil
+cdef double fused_trust(
+    const FusedTrustLaw *law, double velocity, double raw, double distance, double temperature
+) noexcept nogil
+cdef double network_share(double velocity) noexcept nogil
