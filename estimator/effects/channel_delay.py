@@ -2,29 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    full,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values, full
 
 SENSOR, CURRENT, LINK = 0.0, 1.0, 2.0
 """Codes of `channel`."""
 
 
 class ChannelDelay(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "channel_delay"
     group = "measurement"
     equation = "reading(t) = truth(t - d): sensor = -d dtau/dt, current = -d di/dt, link = -d omega_l"
     source = "a shift in time; rates are means over it (age_s), in the loop its first-order Taylor expansion"
@@ -40,23 +26,21 @@ class ChannelDelay(Effect):
         Parameter("delay_s", "s", -0.02, 0.1),
         Parameter("channel", "", 0.0, 2.0, default=0.0, fixed=True, whole=True, neutral=None),
     )
+    # so small a delay that a mean rate is that of the moment
+    columns = tuple(Column("delay_s", 1e-5, {"channel": channel}) for channel in (SENSOR, CURRENT, LINK))
     rate_based = True
-    hooks = ("sensor_nm", "current_a", "link_rad")
 
-    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the sensor reads above the truth, Nm."""
+    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         if p["channel"] != SENSOR:
             return full(0.0, s.torque_rate_nm_s)
         return -p["delay_s"] * s.torque_rate_nm_s
 
-    def current_a(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the current reads above the truth, A."""
+    def current_a(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         if p["channel"] != CURRENT:
             return full(0.0, s.current_a)
         return -p["delay_s"] * s.current_rate_a_s
 
-    def link_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the link encoder reads above the truth, rad."""
+    def link_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         if p["channel"] != LINK:
             return full(0.0, s.link_velocity_rad_s)
         return -p["delay_s"] * s.link_velocity_rad_s
@@ -66,9 +50,4 @@ class ChannelDelay(Effect):
         return p["delay_s"]
 
     def at_sensor_of(self, p: Values) -> bool:
-        """Return whether it is the sensor that is late."""
         return p["channel"] == SENSOR
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column per channel, of a delay so small that a mean rate is that of the moment."""
-        return tuple(linear("delay_s", 1e-5, channel=channel) for channel in (SENSOR, CURRENT, LINK))

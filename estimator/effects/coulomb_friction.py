@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
 
 
 class CoulombFriction(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "coulomb_friction"
     group = "friction"
     equation = "loss = (Fc' - Fc) s"
     source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30"
@@ -36,13 +23,8 @@ class CoulombFriction(Effect):
     }
     experiment = "speed_ladder"
     parameters = (Parameter("coulomb_nm", "Nm", 0.0, 500.0, key="friction.coulomb_nm"),)
-    hooks = ("loss_nm",)
+    columns = (Column("coulomb_nm", 1.0),)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return the torque lost beyond the file's losses, Nm joint side."""
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return (p["coulomb_nm"] - joint.friction.coulomb_nm) * s.direction
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column."""
-        return (linear("coulomb_nm", 1.0, joint.friction.coulomb_nm),)

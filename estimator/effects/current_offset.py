@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    full,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values, full
 
 
 class CurrentOffset(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "current_offset"
     group = "actuator"
     equation = "i = I + i0"
     source = "zero error of a shunt or Hall current sensor"
@@ -35,12 +21,7 @@ class CurrentOffset(Effect):
     }
     experiment = "zero_reading"
     parameters = (Parameter("offset_a", "A", -5.0, 5.0),)
-    hooks = ("current_a",)
+    columns = (Column("offset_a", 0.01),)
 
-    def current_a(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the current reads above the truth, A."""
+    def current_a(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return full(p["offset_a"], s.current_a)
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column."""
-        return (linear("offset_a", 0.01),)

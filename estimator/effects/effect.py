@@ -21,8 +21,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import Field, dataclass, field
-from typing import Any, ClassVar, Final, Protocol, TypeVar
+from dataclasses import Field, dataclass, field, replace
+from operator import attrgetter
+from typing import Any, ClassVar, Final, NamedTuple, Protocol, TypeVar
 
 Values = Mapping[str, float]
 """Parameters of an effect by name, SI units."""
@@ -35,76 +36,53 @@ GROUPS: Final = ("friction", "transmission", "actuator", "measurement", "load")
 
 
 class FrictionValues(Protocol):
-    """Friction of a joint file as effects read it, joint side (`estimator.joint.Friction`)."""
+    """Friction of a joint file as effects read it (`estimator.joint.Friction`)."""
 
     @property
-    def coulomb_nm(self) -> float:
-        """Coulomb friction, Nm."""
-
+    def coulomb_nm(self) -> float: ...
     @property
-    def viscous_nms_per_rad(self) -> float:
-        """Viscous friction, Nms/rad."""
-
+    def viscous_nms_per_rad(self) -> float: ...
     @property
-    def stribeck_nm(self) -> float:
-        """Height of the Stribeck peak, Nm."""
-
+    def stribeck_nm(self) -> float: ...
     @property
-    def stribeck_velocity_rad_s(self) -> float:
-        """Velocity at which the Stribeck peak has fallen to 1/e, rad/s."""
+    def stribeck_velocity_rad_s(self) -> float: ...
 
 
-class JointValues(Protocol):
+class JointFile(Protocol):
     """Values of a joint file that effects read (`estimator.joint.Joint` has them all)."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
 
     @property
-    def gear_ratio(self) -> float:
-        """Motor revolutions per joint revolution."""
-
+    def gear_ratio(self) -> float: ...
     @property
-    def torque_constant_nm_per_a(self) -> float:
-        """Torque constant on the motor side, Nm/A."""
-
+    def torque_constant_nm_per_a(self) -> float: ...
     @property
-    def rotor_inertia_kgm2(self) -> float:
-        """Rotor inertia on the motor side, kg m2."""
-
+    def rotor_inertia_kgm2(self) -> float: ...
     @property
-    def stiffness_nm_per_rad(self) -> float:
-        """Stiffness of the gear on the joint side, Nm/rad."""
-
+    def stiffness_nm_per_rad(self) -> float: ...
     @property
-    def damping_nms_per_rad(self) -> float:
-        """Damping of the gear on the joint side, Nms/rad."""
-
+    def damping_nms_per_rad(self) -> float: ...
     @property
-    def link_inertia_kgm2(self) -> float:
-        """Inertia between gear and sensor, kg m2."""
-
+    def link_inertia_kgm2(self) -> float: ...
     @property
-    def rated_torque_nm(self) -> float:
-        """Rated torque on the joint side, Nm."""
-
+    def rated_torque_nm(self) -> float: ...
     @property
-    def friction(self) -> FrictionValues:
-        """Additive friction."""
-
+    def friction(self) -> FrictionValues: ...
     @property
-    def provenance(self) -> Mapping[str, Any]:
-        """Origin of the values, among them `temperature_c`."""
+    def provenance(self) -> Mapping[str, Any]: ...
 
 
-AnyJoint = TypeVar("AnyJoint", bound=JointValues)
+AnyJoint = TypeVar("AnyJoint", bound=JointFile)
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter: plausible range low..high in `unit`; default None: must be given, NaN: the joint file's own
-    value; fixed: not refined by fits (an order, a channel); whole: a whole number, a code. key: key of the joint file
-    whose value it replaces, dotted, "" for none. neutral: value without the effect, of a parameter without a key; None where
-    it is where or how the effect acts (a phase, an order) and not how large it is.
+    """One parameter: plausible range low..high in `unit`; default None: must be given, NaN: the joint file's own value.
+
+    fixed: not refined by fits (an order, a channel); whole: a whole number, a code. key: dotted key of the joint file
+    whose value it replaces, "" for none. neutral: value without the effect, of a parameter without a key; None where it is
+    where or how the effect acts (a phase, an order) and not how large it is.
     """
 
     name: str
@@ -116,6 +94,34 @@ class Parameter:
     key: str = ""
     whole: bool = False
     neutral: float | None = 0.0
+
+
+class Column(NamedTuple):
+    """A column of the search for an effect: parameter, its step, parameters that are fixed in it.
+
+    of: key of the joint file that the step is a part of; "" for a step in the parameter's own unit.
+    """
+
+    name: str
+    step: float
+    fixed: Mapping[str, float] = {}
+    of: str = ""
+
+
+def order(low: float = 0.1, default: float | None = 2.0) -> Parameter:
+    """Return the order of a wave over the motor's angle."""
+    return Parameter("order_per_motor_rev", "1/rev", low, 1000.0, default=default, fixed=True, neutral=None)
+
+
+def waves(name: str, step: float, orders: Sequence[float]) -> tuple[Column, ...]:
+    """Return a column of each order of a wave over the motor's angle."""
+    return tuple(Column(name, step, {"order_per_motor_rev": each}) for each in orders)
+
+
+PHASE: Final = Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None)
+REFERENCE: Final = Parameter("reference_c", "°C", -100.0, 200.0, neutral=None)
+SHAFT_ORDERS: Final = (1.0, 2.0, 4.0)
+"""Per motor revolution: shaft, the wave generator's two lobes, and their second harmonic."""
 
 
 @dataclass(slots=True, eq=False)
@@ -147,29 +153,18 @@ class State:
 
 
 class Functions(Protocol):
-    """Elementwise functions for floats (`ScalarFunctions`) or arrays (`ArrayFunctions`).
+    """Elementwise functions for floats (`ScalarFunctions`) or arrays (`ArrayFunctions`); clip: a held within low..high.
 
-    slip(d, travel): Maxwell-slip state in -1..1, dz = dd/travel held within; it remembers, so every effect of every
-    joint has `Functions` of its own in the loop, and an array is taken in order from z = 0.
+    slip: Maxwell-slip state in -1..1, dz = dd/travel held within; it remembers, so every effect of every joint has
+    `Functions` of its own in the loop, and an array is taken in order from z = 0.
     """
 
-    def sin(self, a: Any) -> Any:
-        """Return sin of a."""
-
-    def cos(self, a: Any) -> Any:
-        """Return cos of a."""
-
-    def exp(self, a: Any) -> Any:
-        """Return exp of a."""
-
-    def tanh(self, a: Any) -> Any:
-        """Return tanh of a."""
-
-    def clip(self, a: Any, low: float, high: float) -> Any:
-        """Return a held within low..high."""
-
-    def slip(self, d: Any, travel: float) -> Any:
-        """Return the Maxwell-slip state, -1 to 1."""
+    def sin(self, a: Any) -> Any: ...
+    def cos(self, a: Any) -> Any: ...
+    def exp(self, a: Any) -> Any: ...
+    def tanh(self, a: Any) -> Any: ...
+    def clip(self, a: Any, low: float, high: float) -> Any: ...
+    def slip(self, d: Any, travel: float) -> Any: ...
 
 
 class ScalarFunctions:
@@ -317,6 +312,10 @@ class Linear:
         return Term(tuple(self([float(row == column) for column in count]) for row in count), self)
 
 
+Terms = Sequence[Term]
+"""Ways to look for one effect."""
+
+
 def linear(name: str, step: float, base: float = 0.0, **fixed: float) -> Term:
     """Return the term of one parameter in which the hooks are linear; base: the joint file's value."""
     return Linear((name,), (base,), (step,), fixed).term()
@@ -373,13 +372,12 @@ class Slope:
     def term(self) -> Term:
         """Return the term: columns at the reference and SPAN_K above; both together give slope and constant."""
         return Term(
-            tuple(self.basis(self.step, self.reference_c + span) for span in (0.0, SPAN_K)),
+            tuple(
+                {self.name: self.step, "reference_c": self.reference_c + span} | dict(self.fixed)
+                for span in (0.0, SPAN_K)
+            ),
             self,
         )
-
-    def basis(self, size: float, reference_c: float) -> Mapping[str, float]:
-        """Return the parameters of one column."""
-        return {self.name: size, "reference_c": reference_c} | dict(self.fixed)
 
 
 REGISTERED: Final[dict[str, Effect]] = {}
@@ -387,13 +385,14 @@ REGISTERED: Final[dict[str, Effect]] = {}
 
 
 class Effect:
-    """Base of all effects. A file of this package holds one subclass, named in `name` as the file is.
+    """Base of all effects. A file of this package holds one subclass, which has the file's name.
 
     equation, source: one line each; tell_tale: where it shows and how one recognises it.
     experiment: kind of motion that shows it (`sysid.planner.experiments.EXPERIMENTS`).
     confused_with: effect that looks the same on poor runs -> kind of motion that separates the two; a pair stands in one of
     both files. by_hand: such an effect -> what separates the two besides a motion.
-    hooks: names of the hooks it has; needs: fields of State without which it cannot be judged.
+    hooks: those that it overrides; needs: fields of State without which it cannot be judged.
+    columns: of the search, each the sine or cosine of a wave where a parameter is `PHASE`; none: it overrides `terms`.
     dissipative: loss_nm is a friction (opposes velocity). at_sensor: it belongs to the coupling's sensor, not to a joint.
     geometric: its twist is one of the teeth, so the damper beside the spring feels its rate too (kinematic error), unlike
     a property of the spring itself. follows_torsion: its state follows the torsion itself (slip, play), for which tau/K is
@@ -403,7 +402,7 @@ class Effect:
     """
 
     name: ClassVar[str]
-    group: ClassVar[str]  # friction, transmission, actuator, measurement, load
+    group: ClassVar[str]  # of GROUPS
     equation: ClassVar[str]
     source: ClassVar[str]
     tell_tale: ClassVar[str]
@@ -413,6 +412,7 @@ class Effect:
     parameters: ClassVar[tuple[Parameter, ...]]
     hooks: ClassVar[tuple[str, ...]]
     needs: ClassVar[tuple[str, ...]] = ()
+    columns: ClassVar[tuple[Column, ...]] = ()
     dissipative: ClassVar[bool] = False
     at_sensor: ClassVar[bool] = False
     changes_joint: ClassVar[bool] = False
@@ -423,44 +423,46 @@ class Effect:
     scales_balance: ClassVar[str] = ""
 
     def __init_subclass__(cls) -> None:
-        """Register an instance. Raises TypeError for a name, hook or group that cannot be."""
-        file = cls.__module__.rpartition(".")[2]
-        for what, found, expected in (
-            ("name", {cls.name}, (file,)),
-            ("hooks", set(cls.hooks), HOOKS),
-            ("group", {cls.group}, GROUPS),
-        ):
-            if not found or not found <= {*expected}:
-                raise TypeError(f"effect {file}: found {what} {sorted(found)}, expected of {expected}")
+        """Register an instance. Raises TypeError without a hook, or for an unknown group."""
+        cls.name = cls.__module__.rpartition(".")[2]
+        cls.hooks = tuple(hook for hook in HOOKS if getattr(cls, hook) is not getattr(Effect, hook))
+        if not cls.hooks:
+            raise TypeError(f"effect {cls.name}: found no hook, expected one of {HOOKS}")
+        if cls.group not in GROUPS:
+            raise TypeError(f"effect {cls.name}: found group {cls.group!r}, expected one of {GROUPS}")
         REGISTERED[cls.name] = cls()
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """Motor torque lost in addition to the joint file's losses, Nm joint side."""
         raise NotImplementedError
 
-    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """What the spring sees in addition to theta_m/G - theta_l, rad."""
         raise NotImplementedError
 
-    def load_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """Torque taken between gear and sensor in addition to the file's link inertia, Nm."""
         raise NotImplementedError
 
-    def current_a(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """What the current reads above the truth, A."""
         raise NotImplementedError
 
-    def link_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """What the link encoder reads above the truth, rad."""
         raise NotImplementedError
 
-    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """What the torque sensor reads above the truth, Nm."""
         raise NotImplementedError
 
     def joint(self, p: Values, joint: AnyJoint) -> AnyJoint:
         """Return the joint with the values that the effect replaces (`changes_joint`)."""
-        return joint
+        return (
+            replace(joint, **{each.key: p[each.name] for each in self.parameters})
+            if self.changes_joint
+            else joint
+        )
 
     def at_sensor_of(self, p: Values) -> bool:
         """Return whether it belongs to the coupling's sensor with these parameters (see `at_sensor`)."""
@@ -474,21 +476,33 @@ class Effect:
         """Whether with these parameters it is the motor's encoder that reads wrong: by -G link_rad, motor side."""
         return False
 
-    def largest(self, joint: JointValues, p: Values) -> float:
+    def largest(self, joint: JointFile, p: Values) -> float:
         """Largest size of its leading parameter, beside the others of p, with which the joint would still move as without
         it: one that would have to be larger to show is invisible, whatever its columns say of motions without it.
         """
         return math.inf
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Ways to look for it; the best is taken and its parameters refined."""
-        raise NotImplementedError
+    def terms(self, joint: JointFile) -> Terms:
+        """Ways to look for it, one per column; the best is taken and its parameters refined."""
+        return [self._term(column, joint) for column in self.columns]
+
+    def _term(self, column: Column, joint: JointFile) -> Term:
+        """Return the term of a column: a wave, or linear from the joint file's value on."""
+        name, step, fixed, of = column
+        if PHASE in self.parameters:
+            return Wave(name, step, fixed).term()
+        key = next(each.key for each in self.parameters if each.name == name)
+        own = attrgetter(key)(joint) if key else 0.0
+        return linear(name, step * attrgetter(of)(joint) if of else step, own, **fixed)
 
     def term_of_order(self, order: float) -> Term | None:
-        """Way to look for a wave of `order` per motor revolution; None for effects that are no waves."""
-        return None
+        """Way to look for a wave of `order` per motor revolution; None for other effects."""
+        if not self.is_wave:
+            return None
+        name, step, *_ = self.columns[0]
+        return Wave(name, step, {"order_per_motor_rev": float(order)}).term()
 
     @property
     def is_wave(self) -> bool:
         """Whether it is a wave over the motor's angle, of which several orders may be present at once."""
-        return type(self).term_of_order is not Effect.term_of_order
+        return any(each.name == "order_per_motor_rev" for each in self.parameters)

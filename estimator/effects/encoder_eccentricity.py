@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values, Wave
+from jtqd.estimator.effects.effect import (
+    PHASE,
+    Column,
+    Effect,
+    Functions,
+    JointFile,
+    Parameter,
+    State,
+    Values,
+)
 
 
 class EncoderEccentricity(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "encoder_eccentricity"
     group = "measurement"
     equation = "link = A sin(theta_l + phi); motor_side=1: link = -A/G sin(theta_m + phi), A motor side"
     source = "one-per-revolution error e/r of an eccentric scale; Slocum 1992, Precision Machine Design"
@@ -30,23 +34,19 @@ class EncoderEccentricity(Effect):
     experiment = "full_turns"
     parameters = (
         Parameter("amplitude_rad", "rad", 0.0, 0.1),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
+        PHASE,
         Parameter("motor_side", "", 0.0, 1.0, default=0.0, fixed=True, whole=True),
     )
-    hooks = ("link_rad",)
+    columns = (
+        Column("amplitude_rad", 1e-5, {"motor_side": 0.0}),
+        Column("amplitude_rad", 1e-3, {"motor_side": 1.0}),
+    )
     needs = ("torsion_rad",)
 
-    def link_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the link encoder reads above the truth, rad."""
+    def link_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         if p["motor_side"]:
             return (-p["amplitude_rad"] / joint.gear_ratio) * x.sin(s.motor_position_rad + p["phase_rad"])
         return p["amplitude_rad"] * x.sin(s.link_position_rad + p["phase_rad"])
 
     def at_motor_of(self, p: Values) -> bool:
-        """Return whether it is the motor's encoder."""
         return bool(p["motor_side"])
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return a wave of the link's encoder and one of the motor's."""
-        link = Wave("amplitude_rad", 1e-5, {"motor_side": 0.0}).term()
-        return link, Wave("amplitude_rad", 1e-3, {"motor_side": 1.0}).term()

@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
 
 
 class FrictionAsymmetry(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "friction_asymmetry"
     group = "friction"
     equation = "loss = a |s|"
     source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30 (levels by direction)"
@@ -36,13 +23,8 @@ class FrictionAsymmetry(Effect):
     }
     experiment = "speed_ladder"
     parameters = (Parameter("asymmetry_nm", "Nm", -100.0, 100.0),)
-    hooks = ("loss_nm",)
+    columns = (Column("asymmetry_nm", 1.0),)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return the torque lost beyond the file's losses, Nm joint side."""
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return p["asymmetry_nm"] * abs(s.direction)
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column."""
-        return (linear("asymmetry_nm", 1.0),)

@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
 
 TRAVELS_RAD = (3e-5, 5e-5, 1e-4, 2e-4, 3e-4)
 """Grid of the search; the fit refines it."""
 
 
 class Hysteresis(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "hysteresis"
     group = "transmission"
     equation = "tau = K d + H z, dz = dd/travel within -1..1, so that twist = H/K z"
     source = "Al-Bender, Lampaert, Swevers 2005, IEEE Trans. Automatic Control 50 (one Maxwell-slip element)"
@@ -31,23 +18,12 @@ class Hysteresis(Effect):
         "The torsion balance changes after each reversal of the load, not of the velocity, over a fixed "
         "travel."
     )
-    confused_with = {
-        "lost_motion": "load_ramp",
-        "nonlinear_stiffness": "load_ramp",
-    }
+    confused_with = {"lost_motion": "load_ramp", "nonlinear_stiffness": "load_ramp"}
     experiment = "load_ramp"
-    parameters = (
-        Parameter("torque_nm", "Nm", 0.0, 50.0),
-        Parameter("travel_rad", "rad", 1e-06, 0.01),
-    )
-    hooks = ("twist_rad",)
+    parameters = (Parameter("torque_nm", "Nm", 0.0, 50.0), Parameter("travel_rad", "rad", 1e-06, 0.01))
+    columns = tuple(Column("torque_nm", 1.0, {"travel_rad": travel}) for travel in TRAVELS_RAD)
     needs = ("torsion_rad",)
     follows_torsion = True
 
-    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the spring sees beyond theta_m/G - theta_l, rad."""
+    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return (p["torque_nm"] / joint.stiffness_nm_per_rad) * x.slip(s.torsion_rad, p["travel_rad"])
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column per travel."""
-        return tuple(linear("torque_nm", 1.0, travel_rad=travel) for travel in TRAVELS_RAD)

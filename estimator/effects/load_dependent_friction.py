@@ -2,25 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
 
 
 class LoadDependentFriction(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "load_dependent_friction"
     group = "friction"
     equation = "loss = mu |tau| s"
     source = "Bittencourt, Wernholt, Sander-Tavallaey, Brogardh 2010, IROS; model M3 of BAM, arXiv:2410.08650"
@@ -35,14 +22,9 @@ class LoadDependentFriction(Effect):
     }
     experiment = "load_at_both_directions"
     parameters = (Parameter("load_coefficient", "", 0.0, 0.9),)
-    hooks = ("loss_nm",)
+    columns = (Column("load_coefficient", 0.1),)
     needs = ("torque_nm",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return the torque lost beyond the file's losses, Nm joint side."""
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return p["load_coefficient"] * abs(s.torque_nm) * s.direction
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column."""
-        return (linear("load_coefficient", 0.1),)

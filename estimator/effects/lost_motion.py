@@ -2,47 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
 
 WIDTHS_RAD = (3e-5, 1e-4, 3e-4, 1e-3)
-"""Grid of the search; the fit refines it."""
+"""Grid of the search, whose coefficients scale the width (exact beyond the play); the fit refines it."""
 
 
 class LostMotion(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "lost_motion"
     group = "transmission"
     equation = "twist = -clip(d, -w/2, w/2), w the full width"
     source = "Nordin and Gutman 2002, Automatica 38 (dead zone)"
     tell_tale = "The torsion balance jumps by K w where the torque, not the velocity, changes its sign."
-    confused_with = {
-        "stribeck_friction": "slow_reversals",
-        "nonlinear_stiffness": "load_ramp",
-    }
+    confused_with = {"stribeck_friction": "slow_reversals", "nonlinear_stiffness": "load_ramp"}
     experiment = "load_ramp"
     parameters = (Parameter("width_rad", "rad", 0.0, 0.02),)
-    hooks = ("twist_rad",)
+    columns = tuple(Column("width_rad", width) for width in WIDTHS_RAD)
     needs = ("torsion_rad",)
     follows_torsion = True
 
-    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the spring sees beyond theta_m/G - theta_l, rad."""
+    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         half = 0.5 * p["width_rad"]
         return -x.clip(s.torsion_rad, -half, half)
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column per width; the coefficient scales the width, exact beyond the play."""
-        return tuple(linear("width_rad", width) for width in WIDTHS_RAD)

@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from jtqd.estimator.effects.effect import (
-    TORSION,
     Effect,
     Functions,
-    JointValues,
+    JointFile,
     Linear,
     Parameter,
     State,
-    Term,
+    Terms,
     Values,
 )
 
 
 class NonlinearStiffness(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "nonlinear_stiffness"
     group = "transmission"
     equation = "tau = K' d + K3 d^3, so that twist = (K'/K - 1) d + K3/K d^3"
     source = "Tuttle and Seering 1996, IEEE Trans. Robotics and Automation 12"
     tell_tale = (
         "The torsion balance is an odd function of the torque alone: a slope, and a cubic at large loads."
     )
-    confused_with = {
-        "sensor_gain": "load_at_both_directions",
-    }
+    confused_with = {"sensor_gain": "load_at_both_directions"}
     experiment = "load_ramp"
     parameters = (
         Parameter(
@@ -39,19 +32,17 @@ class NonlinearStiffness(Effect):
         ),
         Parameter("cubic_nm_per_rad3", "Nm/rad3", -100000000000.0, 1000000000000.0, default=0.0),
     )
-    scales_balance = TORSION
-    hooks = ("twist_rad",)
+    scales_balance = "torsion"
     needs = ("torsion_rad",)
 
-    def twist_rad(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the spring sees beyond theta_m/G - theta_l, rad."""
+    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         own = joint.stiffness_nm_per_rad
         d = s.torsion_rad
         return (p.get("stiffness_nm_per_rad", own) / own - 1.0) * d + (p["cubic_nm_per_rad3"] / own) * (
             d * d * d
         )
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
+    def terms(self, joint: JointFile) -> Terms:
         """Return another slope, hardening alone, and both."""
         own = joint.stiffness_nm_per_rad
         # at the rated torque, K3 d^3 is a tenth of the torque

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values, Wave
+from jtqd.estimator.effects.effect import (
+    PHASE,
+    Column,
+    Effect,
+    Functions,
+    JointFile,
+    Parameter,
+    State,
+    Values,
+)
 
 
 class SensorCrosstalk(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "sensor_crosstalk"
     group = "measurement"
     equation = "sensor = (A + share tau) cos(theta_c + phi), theta_c link position of joint 1"
     source = "parasitic bending moment of a torque transducer, fixed in space, first order"
@@ -20,10 +24,7 @@ class SensorCrosstalk(Effect):
         "All balances of both joints swing once per revolution of the coupling; with the load where the "
         "load bends."
     )
-    confused_with = {
-        "unbalance": "full_turns",
-        "sensor_offset": "full_turns",
-    }
+    confused_with = {"unbalance": "full_turns", "sensor_offset": "full_turns"}
     experiment = "full_turns"
     by_hand = {
         "unbalance": "If the class remains, turn the coupling by a quarter and repeat the campaign: crosstalk turns with "
@@ -32,18 +33,12 @@ class SensorCrosstalk(Effect):
     parameters = (
         Parameter("amplitude_nm", "Nm", 0.0, 20.0, default=0.0),
         Parameter("share", "", 0.0, 0.5, default=0.0),
-        Parameter("phase_rad", "rad", -2.0 * math.pi, 2.0 * math.pi, default=0.0, neutral=None),
+        PHASE,
     )
-    hooks = ("sensor_nm",)
+    columns = (Column("amplitude_nm", 0.1, {"share": 0.0}), Column("share", 0.01, {"amplitude_nm": 0.0}))
     needs = ("coupling_position_rad", "torque_nm")
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the sensor reads above the truth, Nm."""
+    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         size = p["amplitude_nm"] + p["share"] * s.torque_nm
         return size * x.cos(s.coupling_position_rad + p["phase_rad"])
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return a wave of constant size and one in proportion to the load."""
-        constant = Wave("amplitude_nm", 0.1, {"share": 0.0}).term()
-        return constant, Wave("share", 0.01, {"amplitude_nm": 0.0}).term()

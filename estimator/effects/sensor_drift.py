@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from jtqd.estimator.effects.effect import (
     FALLBACK_C,
     Effect,
     Functions,
-    JointValues,
+    JointFile,
     Parameter,
     Slope,
     State,
-    Term,
+    Terms,
     Values,
     above,
     linear,
@@ -22,9 +21,6 @@ from jtqd.estimator.effects.effect import (
 
 
 class SensorDrift(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "sensor_drift"
     group = "measurement"
     equation = "tau_s = TAU_S + r t + k (T - T0), t since the run's first sample"
     source = "zero drift and temperature effect on zero, as in data sheets of torque transducers"
@@ -40,16 +36,14 @@ class SensorDrift(Effect):
         Parameter("per_k_nm", "Nm/K", -5.0, 5.0, default=0.0),
         Parameter("reference_c", "°C", -100.0, 200.0, default=FALLBACK_C, neutral=None),
     )
-    hooks = ("sensor_nm",)
     needs = ("time_s",)
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the sensor reads above the truth, Nm."""
+    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         drift = p["rate_nm_per_s"] * s.time_s
         return drift + p["per_k_nm"] * above(s.temperature_c, p["reference_c"]) if p["per_k_nm"] else drift
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
+    def terms(self, joint: JointFile) -> Terms:
         """Return a drift with time, and one with temperature (two columns: slope and constant)."""
         time = linear("rate_nm_per_s", 1e-3, per_k_nm=0.0, reference_c=FALLBACK_C)
         return time, Slope("per_k_nm", 0.01, reference_of(joint.provenance), {"rate_nm_per_s": 0.0}).term()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointValues, Parameter, State, Term, Values
+from jtqd.estimator.effects.effect import Effect, Functions, JointFile, Parameter, State, Term, Terms, Values
 
 STEP = 0.01
 """1 - 1/g of the column."""
@@ -28,9 +28,6 @@ class _Gain:
 
 
 class SensorGain(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "sensor_gain"
     group = "measurement"
     equation = "tau_s = g TAU_S, so that sensor = (1 - 1/g) tau_s of the reading tau_s"
     source = "sensitivity of a torque transducer, as in DIN 51309"
@@ -38,20 +35,15 @@ class SensorGain(Effect):
         "All balances of both joints are proportional to the torque by the same factor, whatever the "
         "direction."
     )
-    confused_with = {
-        "torque_constant": "load_at_both_directions",
-    }
+    confused_with = {"torque_constant": "load_at_both_directions"}
     experiment = "load_at_both_directions"
     parameters = (Parameter("gain", "", 0.5, 2.0, neutral=1.0),)
     scales_all = True
-    hooks = ("sensor_nm",)
     needs = ("torque_nm",)
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return what the sensor reads above the truth, Nm."""
+    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return (1.0 - 1.0 / p["gain"]) * s.torque_nm
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column."""
+    def terms(self, joint: JointFile) -> Terms:
         return (Term(({"gain": 1.0 / (1.0 - STEP)},), _Gain()),)

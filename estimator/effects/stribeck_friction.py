@@ -10,10 +10,11 @@ from typing import Any
 from jtqd.estimator.effects.effect import (
     Effect,
     Functions,
-    JointValues,
+    JointFile,
     Parameter,
     State,
     Term,
+    Terms,
     Values,
     linear,
 )
@@ -48,17 +49,11 @@ class _Merged:
 
 
 class StribeckFriction(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "stribeck_friction"
     group = "friction"
     equation = "loss = (Fs' exp(-(v/vs')^2) - Fs exp(-(v/vs)^2)) s"
     source = "Armstrong-Helouvry, Dupont, Canudas de Wit 1994, Automatica 30"
     tell_tale = "A peak of the motor balance at small velocities, odd in velocity, gone beyond twice vs."
-    confused_with = {
-        "viscous_friction": "slow_reversals",
-        "hysteresis": "slow_reversals",
-    }
+    confused_with = {"viscous_friction": "slow_reversals", "hysteresis": "slow_reversals"}
     experiment = "slow_reversals"
     parameters = (
         Parameter("stribeck_nm", "Nm", 0.0, 200.0, key="friction.stribeck_nm"),
@@ -71,11 +66,9 @@ class StribeckFriction(Effect):
             key="friction.stribeck_velocity_rad_s",
         ),
     )
-    hooks = ("loss_nm",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return the torque lost beyond the file's losses, Nm joint side."""
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         own = joint.friction
         v = s.velocity_rad_s
         new = v / p.get("stribeck_velocity_rad_s", own.stribeck_velocity_rad_s)
@@ -85,7 +78,7 @@ class StribeckFriction(Effect):
             peak = peak - own.stribeck_nm * x.exp(-old * old)
         return peak * s.direction
 
-    def largest(self, joint: JointValues, p: Values) -> float:
+    def largest(self, joint: JointFile, p: Values) -> float:
         """Return the height at which friction falls with velocity as steeply as a drive can hold, peak slope over inertia
         sqrt(2/e) Fs/(vs J) = _HELD_PER_S, and at most half the Coulomb friction. Beyond, the joint sticks and jumps where it
         has crept before: the slow samples in which the peak's foot would show are not there any more.
@@ -95,7 +88,7 @@ class StribeckFriction(Effect):
         held = _HELD_PER_S * inertia * velocity / math.sqrt(2.0 / math.e)
         return min(held, 0.5 * max(friction.coulomb_nm, _LEAST_COULOMB * joint.rated_torque_nm))
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
+    def terms(self, joint: JointFile) -> Terms:
         """Return one column per velocity; where the file has a peak itself, its height and a second peak."""
         own_nm, own = joint.friction.stribeck_nm, joint.friction.stribeck_velocity_rad_s
         height = linear("stribeck_nm", 1.0, own_nm, stribeck_velocity_rad_s=own)

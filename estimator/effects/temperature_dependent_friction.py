@@ -8,13 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from jtqd.estimator.effects.effect import (
+    REFERENCE,
     SPAN_K,
     Effect,
     Functions,
-    JointValues,
+    JointFile,
     Parameter,
     State,
     Term,
+    Terms,
     Values,
     above,
     reference_of,
@@ -61,9 +63,6 @@ class _Exponential:
 
 
 class TemperatureDependentFriction(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "temperature_dependent_friction"
     group = "friction"
     equation = "loss = Fv v (exp(-b (T - T0)) - 1) + Fc s (exp(-c (T - T0)) - 1)"
     source = (
@@ -73,21 +72,17 @@ class TemperatureDependentFriction(Effect):
     tell_tale = (
         "The slope of the motor balance over velocity falls as the joint warms up; nothing changes at rest."
     )
-    confused_with = {
-        "viscous_friction": "warm_up",
-        "torque_constant_temperature": "warm_up",
-    }
+    confused_with = {"viscous_friction": "warm_up", "torque_constant_temperature": "warm_up"}
     experiment = "warm_up"
     parameters = (
         Parameter("viscous_per_k", "1/K", -0.005, 0.2),
         Parameter("coulomb_per_k", "1/K", -0.05, 0.1, default=0.0),
-        Parameter("reference_c", "°C", -100.0, 200.0, neutral=None),
+        REFERENCE,
     )
-    hooks = ("loss_nm",)
     needs = ("temperature_c",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side; NaN temperature: 0."""
         own = joint.friction
         warmer = above(s.temperature_c, p["reference_c"])
@@ -98,7 +93,7 @@ class TemperatureDependentFriction(Effect):
             loss = loss + own.coulomb_nm * s.direction * coulomb
         return loss
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
+    def terms(self, joint: JointFile) -> Terms:
         """Return two columns (slope over temperature, constant) per rate, of viscous and of Coulomb friction."""
         reference = reference_of(joint.provenance)
         viscous, coulomb = "viscous_per_k", "coulomb_per_k"

@@ -2,26 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    MOTOR,
-    Effect,
-    Functions,
-    JointValues,
-    Parameter,
-    State,
-    Term,
-    Values,
-    linear,
-)
+from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
 
 
 class TorqueConstant(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "torque_constant"
     group = "actuator"
     equation = "loss = -G (Kt' - Kt) i"
     source = "definition of Kt; Hanselman 2006, Brushless Permanent Magnet Motor Design"
@@ -38,16 +24,10 @@ class TorqueConstant(Effect):
     parameters = (
         Parameter("torque_constant_nm_per_a", "Nm/A", 0.0001, 100.0, key="torque_constant_nm_per_a"),
     )
-    scales_balance = MOTOR
-    hooks = ("loss_nm",)
+    columns = (Column("torque_constant_nm_per_a", 0.01, of="torque_constant_nm_per_a"),)
+    scales_balance = "motor"
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return the torque lost beyond the file's losses, Nm joint side."""
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         return (
             -joint.gear_ratio * (p["torque_constant_nm_per_a"] - joint.torque_constant_nm_per_a) * s.current_a
         )
-
-    def terms(self, joint: JointValues) -> Sequence[Term]:
-        """Return one column."""
-        own = joint.torque_constant_nm_per_a
-        return (linear("torque_constant_nm_per_a", 0.01 * own, own),)

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from jtqd.estimator.effects.effect import (
+    REFERENCE,
     Effect,
     Functions,
-    JointValues,
+    JointFile,
     Parameter,
     Slope,
     State,
-    Term,
+    Terms,
     Values,
     above,
     reference_of,
@@ -20,9 +20,6 @@ from jtqd.estimator.effects.effect import (
 
 
 class TorqueConstantTemperature(Effect):
-    """Symbols as in `jtqd.estimator.effects.effect`."""
-
-    name = "torque_constant_temperature"
     group = "actuator"
     equation = "Kt (1 + a (T - T0)), so that loss = -G Kt a (T - T0) i"
     source = "reversible remanence coefficient of NdFeB magnets, IEC 60404-8-1: about -0.0011 per K"
@@ -30,22 +27,15 @@ class TorqueConstantTemperature(Effect):
         "The gain of the motor balance over the current drifts with temperature; at equal temperature it "
         "is constant."
     )
-    confused_with = {
-        "sensor_gain": "warm_up",
-    }
+    confused_with = {"sensor_gain": "warm_up"}
     experiment = "warm_up"
-    parameters = (
-        Parameter("per_k", "1/K", -0.02, 0.02),
-        Parameter("reference_c", "°C", -100.0, 200.0, neutral=None),
-    )
-    hooks = ("loss_nm",)
+    parameters = (Parameter("per_k", "1/K", -0.02, 0.02), REFERENCE)
     needs = ("temperature_c",)
 
-    def loss_nm(self, p: Values, s: State, joint: JointValues, x: Functions) -> Any:
-        """Return the torque lost beyond the file's losses, Nm joint side."""
+    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
         scale = -joint.gear_ratio * joint.torque_constant_nm_per_a * p["per_k"]
         return scale * above(s.temperature_c, p["reference_c"]) * s.current_a
 
-    def terms(self, joint: JointValues) -> Sequence[Term]:
+    def terms(self, joint: JointFile) -> Terms:
         """Return two columns: slope over temperature, and constant."""
         return (Slope("per_k", 1e-3, reference_of(joint.provenance)).term(),)
