@@ -597,8 +597,11 @@ def check_fit(joint: Joint, settings: EstimatorSettings, network: object, estima
         if method.network_required:
             raise error(f"found no network, which method '{settings.method}' needs")
         return
-    if isinstance(network, Network) and type(network).__name__ != method.network:
-        found = next(name for name, each in METHODS.items() if each.network == type(network).__name__)
+    if isinstance(network, Network) and not isinstance(network, _KINDS[method.network]):
+        methods = (
+            name for name, each in METHODS.items() if isinstance(network, _KINDS.get(each.network, ()))
+        )
+        found = next(methods, type(network).__name__)
         raise error(f"found a network of method '{found}', expected one of '{settings.method}'")
     if (name := getattr(network, "joint", "")) != joint.name:
         raise error(f"found a network of joint '{name}', expected one of '{joint.name}'")

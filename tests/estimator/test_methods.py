@@ -11,7 +11,7 @@ from jtqd.estimator.decoder import decode
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator, estimate_columns, make_estimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.network import FusedNetwork, TorqueNetwork, load_network
+from jtqd.estimator.network import FusedNetwork, Network, TorqueNetwork, load_network
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.estimator_helpers import joint1, small_network
@@ -54,6 +54,22 @@ def test_networks_of_another_joint_or_kind_are_refused() -> None:
             make_estimator(joint, settings, network)
         with pytest.raises(ConfigError, match=words):
             estimate_columns(joint, settings, network, *table)
+
+
+def test_a_subclass_of_a_network_is_of_its_method() -> None:
+    class Own(TorqueNetwork):
+        pass
+
+    class Third(Network):
+        features, keys = TorqueNetwork.features, TorqueNetwork.keys
+
+    own, third = Own(small_network().data), Third(small_network().data)
+    settings = EstimatorSettings(method="network")
+    assert make_estimator(joint1(), settings, own).with_network
+    with pytest.raises(ConfigError, match="found a network of method 'network', expected one of 'fused'"):
+        make_estimator(JOINT, FUSED, own)
+    with pytest.raises(ConfigError, match="found a network of method 'Third', expected one of 'network'"):
+        make_estimator(joint1(), settings, third)  # type: ignore[arg-type]
 
 
 def test_the_door_gives_the_estimator_of_the_method() -> None:
