@@ -32,7 +32,8 @@ from jtqd.daemon.loop import realtime
 from jtqd.daemon.loop.realtime import stolen_s
 from jtqd.daemon.shared.conditions import read_conditions
 from jtqd.daemon.shared.processes import Child, ChildError
-from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.estimator.command_line import command_parser, seconds
 from jtqd.estimator.errors import ConfigError
@@ -134,7 +135,7 @@ def _listen(bus: str, config: Config, for_s: float, daemon: Daemon | None) -> It
     else:
         try:
             reader = SnapshotReader(daemon.directory / "snapshot")
-        except SnapshotError as error:
+        except SharedMemoryError as error:
             raise CheckError(f"jtqd on {daemon.about.instance} is still starting ({error})") from None
         _progress(f"listening on {bus} for {for_s:g} s beside jtqd, process {daemon.about.pid}")
         bins, view = reader.late_bins(), reader.read()

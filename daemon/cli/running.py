@@ -15,9 +15,9 @@ from typing import Any, NamedTuple
 from jtqd.daemon.recording.run_files import Account, read_account
 from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.events import FILE as NOTICES
-from jtqd.daemon.shared.events import Notice, NoticesError, NoticesReader
-from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, read_about
-from jtqd.daemon.shared.snapshot import SnapshotError, SnapshotReader, View
+from jtqd.daemon.shared.events import Notice, NoticesReader
+from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, SharedMemoryError, read_about
+from jtqd.daemon.shared.snapshot import SnapshotReader, View
 
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
 STILL_S = 0.25
@@ -190,7 +190,7 @@ class Watch:
         if self._notices_reader is None:
             try:
                 self._notices_reader = NoticesReader(self.daemon.directory / NOTICES)
-            except NoticesError:
+            except SharedMemoryError:
                 return ()
         self._notices.extend(self._notices_reader.read()[0])
         return tuple(self._notices)
@@ -199,7 +199,7 @@ class Watch:
         if self._reader is None:
             try:
                 self._reader = SnapshotReader(self.daemon.directory / "snapshot")
-            except SnapshotError:
+            except SharedMemoryError:
                 return None
         view = self._reader.read()
         return view if view.sync_monotonic_ns else None

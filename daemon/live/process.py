@@ -36,10 +36,9 @@ from jtqd.daemon.recording.messages import (
     zeros_of,
 )
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.cycle_record import RingError
-from jtqd.daemon.shared.events import NoticesError, NoticesReader
+from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.processes import CannotBegin, Stop, run_side_process
-from jtqd.daemon.shared.snapshot import SnapshotError
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
 
 # ---- messages ----
 
@@ -283,13 +282,13 @@ _POLL_S = 0.02
 
 
 class Source:
-    """What the daemon leaves in shared memory, as messages. Raises RingError, SnapshotError where it is not there."""
+    """What the daemon leaves in shared memory, as messages. Raises SharedMemoryError where it is not there."""
 
     def __init__(self, request: dict[str, Any]) -> None:
         self._loop = LoopReader(request)
         self._stream = LiveStream(self._loop.joints, request["gear_ratios"])
         self._notices: NoticesReader | None = None
-        with suppress(NoticesError):
+        with suppress(SharedMemoryError):
             self._notices = NoticesReader(Path(request["notices"]))
         self.skip()
 
@@ -340,7 +339,7 @@ def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
     try:
         source = Source(request)
         server = LiveServer(f"jtqd on {request['bus']}", address, len(request["joint_names"]))
-    except (RingError, SnapshotError, RuntimeError, OSError, ValueError) as error:
+    except (SharedMemoryError, RuntimeError, OSError, ValueError) as error:
         raise CannotBegin(f"{address.host}:{address.port}: {error}") from None
     return server.address.url, partial(serve, source, server)
 

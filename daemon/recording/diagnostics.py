@@ -68,7 +68,7 @@ class Diagnostics:
         nodes: whose heartbeats are watched.
 
     Raises:
-        SnapshotError: the snapshot is none.
+        SharedMemoryError: the snapshot is none.
     """
 
     def __init__(self, snapshot: Path | None, bus: str, joints: Sequence[str], nodes: Sequence[Node]) -> None:
@@ -234,7 +234,7 @@ class LoopReader:
         ring: cycle records; reading begins behind those that are there.
 
     Raises:
-        RingError, SnapshotError: the memory is not there.
+        SharedMemoryError: the memory is not there.
     """
 
     def __init__(self, request: Mapping[str, Any]) -> None:

@@ -48,10 +48,10 @@ from jtqd.daemon.recording.run_files import (
     part_files,
 )
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.cycle_record import MOST_JOINTS, RingError, RingReader, layout_of
-from jtqd.daemon.shared.events import NoticesError, NoticesReader
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS, RingReader, layout_of
+from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.processes import Child, ChildError
-from jtqd.daemon.shared.snapshot import SnapshotError
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
 """Spans after which schemas and channels are repeated; a flight recording begins with any span."""
@@ -321,7 +321,7 @@ class Session:
         warn: takes one line for the operator.
 
     Raises:
-        SnapshotError: the request names a snapshot that is none.
+        SharedMemoryError: the request names a snapshot that is none.
     """
 
     def __init__(self, request: RecorderRequest, account: Account, warn: Callable[[str], None]) -> None:
@@ -451,7 +451,7 @@ class Session:
                 return
             try:
                 self._notices = NoticesReader(path)
-            except NoticesError:
+            except SharedMemoryError:
                 return
         news, _ = self._notices.read()
         for notice in news:
@@ -542,7 +542,7 @@ def _open_ring(request: RecorderRequest, signals: _Signals) -> RingReader:
     while True:
         try:
             return RingReader(request.ring, layout_of(request.joints).size)
-        except RingError:
+        except SharedMemoryError:
             if time.monotonic() >= deadline or signals.stop:
                 raise
         time.sleep(POLL_S)
@@ -651,8 +651,8 @@ def record(path: Path) -> int:
 
     Raises:
         RequestError: the request is wrong.
-        RingError: no ring at that path within `wait_s`.
-        SnapshotError: no snapshot at the path of the request.
+        SharedMemoryError: no ring at that path within `wait_s`.
+        SharedMemoryError: no snapshot at the path of the request.
         OSError: the file of the progress cannot be made.
     """
     request = RecorderRequest.from_file(path)
@@ -686,7 +686,7 @@ def main(arguments: list[str] | None = None) -> int:
     except RequestError as error:
         _warn(str(error))
         return 2
-    except (RingError, SnapshotError) as error:
+    except SharedMemoryError as error:
         _warn(str(error))
         return 1
     except OSError as error:  # of the progress: files of the log have their own way

@@ -45,9 +45,8 @@ from jtqd.daemon.ros2.messages import (
     Message,
     diagnostic_array,
 )
-from jtqd.daemon.shared.cycle_record import RingError
 from jtqd.daemon.shared.processes import CannotBegin, Stop, run_side_process
-from jtqd.daemon.shared.snapshot import SnapshotError
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
 
 TOPICS: Final[dict[type[Message], str]] = {
     JointState: "joint_states",
@@ -131,7 +130,7 @@ def qos_of(kind: type[Message]) -> Qos:
 
 
 class Source:
-    """What the daemon leaves in shared memory, as messages. Raises RingError, SnapshotError where it is not there."""
+    """What the daemon leaves in shared memory, as messages. Raises SharedMemoryError where it is not there."""
 
     def __init__(self, request: dict[str, Any]) -> None:
         self._bus = request["bus"]
@@ -184,7 +183,7 @@ def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
         if interface not in (name for _, name in socket.if_nameindex()):
             raise CannotBegin(f"{where}: there is no such network interface")
         writers = Writers(number, interface)
-    except (RingError, SnapshotError) as error:
+    except SharedMemoryError as error:
         raise CannotBegin(str(error)) from None
     except OSError as error:  # a service whose unit forbids them
         raise CannotBegin(f"{where}: no network sockets: {error.strerror or error}") from None

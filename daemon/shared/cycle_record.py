@@ -15,7 +15,6 @@ The ring of records: `Ring`.
 
 from __future__ import annotations
 
-import mmap
 import re
 import struct
 from collections.abc import Collection
@@ -23,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from jtqd.daemon.shared.runtime_dir import new_memory
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError, mapped, new_memory
 
 MOST_JOINTS: Final = 4
 """Joints of one bus: two estimate PDOs of two each."""
@@ -187,10 +186,6 @@ COUNT_WORD = 8
 _LAYOUT = struct.Struct("<QQQ")
 
 
-class RingError(Exception):
-    """The file is not a ring of this layout."""
-
-
 class Ring:
     """Writer's side: memory of `slots` records that the loop fills (`daemon/core/record.pyx`), in a new file on a tmpfs.
 
@@ -222,19 +217,17 @@ class RingReader:
     the last is what lay in the slot a lap ago. Both are dropped and counted.
 
     Raises:
-        RingError: the file is no ring, or of another record size.
+        SharedMemoryError: the file is no ring, or of another record size.
     """
 
     def __init__(self, path: Path, record_size: int) -> None:
-        try:
-            with open(path, "rb") as file:
-                self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError) as error:
-            raise RingError(f"{path}: cannot be read as a ring of cycles: {error}") from None
+        self._memory = mapped(path, "cannot be read as a ring of cycles")
         long_enough = len(self._memory) >= _HEADER_SIZE
         magic, slots, size = _LAYOUT.unpack_from(self._memory, 0) if long_enough else (0, 0, 0)
         if magic != _MAGIC or size != record_size or len(self._memory) != _HEADER_SIZE + slots * size:
-            raise RingError(f"{path}: not a ring of {record_size}-byte records (found record size {size})")
+            raise SharedMemoryError(
+                f"{path}: not a ring of {record_size}-byte records (found record size {size})"
+            )
         self._words = memoryview(self._memory)[:_HEADER_SIZE].cast("Q")
         self._slots, self._record_size, self._newest = slots, record_size, -1
         self.position: int = max(0, self._count() - slots)

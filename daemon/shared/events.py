@@ -12,7 +12,6 @@ torn slot shows), realtime_ns i64, level u8, node u8, length of topic u8, length
 
 from __future__ import annotations
 
-import mmap
 import os
 import struct
 import sys
@@ -25,7 +24,7 @@ from math import inf
 from pathlib import Path
 from typing import NamedTuple, TextIO
 
-from jtqd.daemon.shared.runtime_dir import new_memory
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError, mapped, new_memory
 
 FILE = "notices"
 """Name of the file in the runtime directory of a daemon."""
@@ -39,10 +38,6 @@ _SLOT = struct.Struct("<QqBBBB20s212s4x")
 _COUNT_OFFSET = 16
 _WORD = struct.Struct("<Q")
 _TOPIC_BYTES, _TEXT_BYTES = 20, 212
-
-
-class NoticesError(Exception):
-    """No notices of this layout at the path."""
 
 
 class Notice(NamedTuple):
@@ -80,17 +75,13 @@ class Notices:
 
 
 class NoticesReader:
-    """Reader's side; starts with the oldest notice. Raises NoticesError: nothing there, or of another layout."""
+    """Reader's side; starts with the oldest notice. Raises SharedMemoryError: nothing there, or of another layout."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            with open(path, "rb") as file:
-                self._memory = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        except (OSError, ValueError) as error:
-            raise NoticesError(f"{path}: no notices: {error}") from None
+        self._memory = mapped(path, "no notices")
         magic, self._capacity, _ = _HEAD.unpack(self._memory[: _HEAD.size].ljust(_HEAD.size, b"\0"))
         if magic != _MAGIC or len(self._memory) != _HEAD.size + self._capacity * _SLOT.size:
-            raise NoticesError(f"{path}: no notices of this version")
+            raise SharedMemoryError(f"{path}: no notices of this version")
         self._read = 0
 
     def read(self) -> tuple[list[Notice], int]:

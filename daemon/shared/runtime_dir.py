@@ -54,6 +54,20 @@ def new_memory(path: Path, size: int, head: bytes, mode: int = 0o640) -> mmap.mm
     return memory
 
 
+class SharedMemoryError(Exception):
+    """No memory of this kind and layout at the path: ring, snapshot or notices."""
+
+
+def mapped(path: Path, missing: str, *, writable: bool = False) -> mmap.mmap:
+    """Map shared memory of a running daemon. Raises SharedMemoryError, with what is `missing`."""
+    access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
+    try:
+        with open(path, "r+b" if writable else "rb") as file:
+            return mmap.mmap(file.fileno(), 0, access=access)
+    except (OSError, ValueError) as error:
+        raise SharedMemoryError(f"{path}: {missing}: {error}") from None
+
+
 def claim(bus: str) -> tuple[Path, int]:
     """Make the directory of the instance on `bus` and claim it until this process ends, however it ends.
 

@@ -6,7 +6,6 @@ The last estimate, and all else that is written every 8th cycle, is guarded by a
 
 from __future__ import annotations
 
-import mmap
 import os
 import struct
 import time
@@ -18,7 +17,7 @@ from typing import Any, NamedTuple
 
 from jtqd.daemon.shared.counters import COUNTERS, word_of
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
-from jtqd.daemon.shared.runtime_dir import new_memory
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError, mapped, new_memory
 from jtqd.estimator.status import Zeros
 
 STATUS_CODES = 16
@@ -160,10 +159,6 @@ _PATIENCE_S = 0.05
 _PAUSE_S = 50e-6
 
 
-class SnapshotError(Exception):
-    """No snapshot of this layout at the path."""
-
-
 class _Views:
     """Views of the snapshot's memory, in their order in it; `learned` is guarded by the sequence as `estimate` is."""
 
@@ -218,17 +213,12 @@ class Snapshot(_Views):
 
 
 class SnapshotReader:
-    """Reader's side. Raises SnapshotError where there is nothing to read at the path, or of another layout."""
+    """Reader's side. Raises SharedMemoryError where there is nothing to read at the path, or of another layout."""
 
     def __init__(self, path: Path, *, supervisor: bool = False) -> None:
-        access = mmap.ACCESS_WRITE if supervisor else mmap.ACCESS_READ
-        try:
-            with open(path, "r+b" if supervisor else "rb") as file:
-                self._memory = mmap.mmap(file.fileno(), 0, access=access)
-        except (OSError, ValueError) as error:
-            raise SnapshotError(f"{path}: no running loop: {error}") from None
+        self._memory = mapped(path, "no running loop", writable=supervisor)
         if len(self._memory) != SIZE or _HEAD.unpack_from(self._memory, 0)[0] != _MAGIC:
-            raise SnapshotError(f"{path}: not a status snapshot of this version")
+            raise SharedMemoryError(f"{path}: not a status snapshot of this version")
         self._views = _Views(memoryview(self._memory))
 
     def read(self) -> View:

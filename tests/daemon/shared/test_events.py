@@ -11,12 +11,12 @@ from jtqd.daemon.shared.events import (
     BURST,
     WINDOW_S,
     Notices,
-    NoticesError,
     NoticesReader,
     OperatorLog,
     Priority,
     in_journal,
 )
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
 
 
 class Clock:
@@ -108,5 +108,5 @@ def test_notices_reach_a_reader_in_order_and_the_overwritten_are_counted(tmp_pat
 def test_another_file_is_refused(tmp_path: Path, content: bytes | None) -> None:
     if content is not None:
         (tmp_path / "n").write_bytes(content)
-    with pytest.raises(NoticesError):
+    with pytest.raises(SharedMemoryError):
         NoticesReader(tmp_path / "n")

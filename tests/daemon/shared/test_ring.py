@@ -8,7 +8,8 @@ import time
 
 import pytest
 
-from jtqd.daemon.shared.cycle_record import COUNT_WORD, Ring, RingError, RingReader
+from jtqd.daemon.shared.cycle_record import COUNT_WORD, Ring, RingReader
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
 from tests.daemon.ring_records import append
 
 SIZE = 64
@@ -104,13 +105,13 @@ def test_what_is_no_ring_is_refused(tmp_path, content):
     path = tmp_path / "ring"
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(RingError, match="ring"):
+    with pytest.raises(SharedMemoryError, match="ring"):
         RingReader(path, SIZE)
 
 
 def test_other_record_size_is_refused(tmp_path):
     Ring(tmp_path / "ring", 8, SIZE)
-    with pytest.raises(RingError, match=f"record size {SIZE}"):
+    with pytest.raises(SharedMemoryError, match=f"record size {SIZE}"):
         RingReader(tmp_path / "ring", SIZE + 8)
 
 

@@ -10,13 +10,8 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.snapshot import (
-    INPUT,
-    SIZE,
-    Snapshot,
-    SnapshotError,
-    SnapshotReader,
-)
+from jtqd.daemon.shared.runtime_dir import SharedMemoryError
+from jtqd.daemon.shared.snapshot import INPUT, SIZE, Snapshot, SnapshotReader
 from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import frame, inputs, make, turn
 from tests.daemon.snapshots import EstimateWriter
@@ -75,9 +70,9 @@ def test_the_supervisor_tells_the_loop_what_it_configured(tmp_path: Path) -> Non
 def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "s"
     path.write_bytes(content)
-    with pytest.raises(SnapshotError):
+    with pytest.raises(SharedMemoryError):
         SnapshotReader(path)
-    with pytest.raises(SnapshotError):
+    with pytest.raises(SharedMemoryError):
         SnapshotReader(tmp_path / "none")
 
 
