@@ -8,7 +8,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
@@ -98,6 +99,30 @@ class LibraryBench:
         with open(log, "w") as stream:
             environment = {**os.environ, "RUNTIME_DIRECTORY": str(run)}
             return self._run("jtqd.daemon.jtqd", *arguments, stderr=stream, env=environment)
+
+    @contextmanager
+    def served(
+        self, config: Path | None = None, longest_s: float = 20.0, **changes: Any
+    ) -> Iterator[subprocess.Popen[str]]:
+        """Have a jtqd that uses both joints, and end it in order."""
+        jtqd = self.start(config, **changes)
+        self.expect(self.both_used, longest_s)
+        yield jtqd
+        assert self.stop(jtqd) == 0
+
+    def expect(self, condition: Callable[[], bool] | str, longest_s: float = 20.0) -> None:
+        """Listen until a condition holds, or a text is in the log."""
+        wanted = condition if callable(condition) else lambda: condition in self.log_text()
+        assert self.until(wanted, longest_s), self.log_text()
+
+    def moves(self) -> bool:
+        """A torque of more than 2 Nm was sent."""
+        return any(torque and abs(torque) > 2.0 for pair in self.torques_nm for torque in pair)
+
+    def pairs(self) -> list[tuple[float, float]]:
+        """Torques of cycles in which both joints had one, but for the first."""
+        found = self.torques_nm[100:]
+        return [(one, two) for one, two in found if one is not None and two is not None]
 
     def log_text(self) -> str:
         """Standard error of the last jtqd."""

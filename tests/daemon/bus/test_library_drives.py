@@ -37,97 +37,92 @@ def a_bench(*manners: str, bus: str | None = None) -> Iterator[LibraryBench]:
 
 
 @pytest.fixture(scope="module")
-def bench() -> Iterator[LibraryBench]:
-    with a_bench() as bench:
+def running() -> Iterator[LibraryBench]:
+    """A bench with a jtqd that serves several tests, each of which leaves all nodes in use."""
+    with a_bench() as bench, bench.served():
         yield bench
+
+
+@pytest.fixture
+def bench(running: LibraryBench) -> LibraryBench:
+    running.forget_frames()
+    running.expect(running.both_used)
+    return running
 
 
 def no_errors(bench: LibraryBench) -> bool:
     return not any(node["errors"] for node in bench.order("state").values())
 
 
-def test_first_start_and_restart_after_a_clean_stop_and_after_a_kill(bench: LibraryBench) -> None:
+def agree(pairs: list[tuple[float, float]], within_nm: float) -> None:
+    """Two joints with the same motion and joint file have the same torque; at a reversal one rpm is another quadrant."""
+    assert len(pairs) > 250
+    assert max(abs(one) for one, _ in pairs) > 2.0
+    apart = sorted(abs(one - two) for one, two in pairs)
+    assert apart[round(0.8 * len(apart))] < within_nm
+
+
+def test_first_start_and_restart_after_a_clean_stop_and_after_a_kill() -> None:
     """The drives watch jtqd's heartbeat: 8130h, once it has ended, and no start before that is over."""
-    first = bench.start()
-    assert bench.until(bench.both_used), bench.log_text()
-    assert no_errors(bench), bench.order("state")
-    assert bench.stop(first) == 0
-    assert bench.until(lambda: not no_errors(bench), 3.0), "a drive that misses its master"
-    assert bench.until(lambda: set(bench.emergencies(1)) == {0x8130})
-    bench.forget_frames()
-    second = bench.start()
-    assert bench.until(bench.both_used), bench.log_text()
-    assert no_errors(bench)
-    bench.stop(second, signal.SIGKILL)
-    bench.forget_frames()
-    third = bench.start()  # within the 0.5 s in which the drives still wait for the second one
-    assert bench.until(bench.both_used), bench.log_text()
-    assert no_errors(bench)
-    assert bench.stop(third) == 0
+    with a_bench() as bench:
+        with bench.served():
+            assert no_errors(bench), bench.order("state")
+        bench.expect(lambda: not no_errors(bench), 3.0)
+        bench.expect(lambda: set(bench.emergencies(1)) == {0x8130})
+        second = bench.start()
+        bench.expect(bench.both_used)
+        assert no_errors(bench)
+        bench.stop(second, signal.SIGKILL)
+        with bench.served():  # within the 0.5 s in which the drives still wait for the second one
+            assert no_errors(bench)
 
 
 def test_a_second_jtqd_is_refused_and_the_first_goes_on(bench: LibraryBench) -> None:
-    first = bench.start()
-    assert bench.until(bench.both_used), bench.log_text()
-    bench.forget_frames()
     second = bench.start()
     assert second.wait(20) == 1
     assert "another SYNC producer is on the bus" in bench.log_text()
     assert not [data for can_id, data in bench.heard if can_id == 0x000], "it touches no node"
-    assert bench.until(bench.both_used)
-    assert bench.stop(first) == 0
+    bench.logs.append(bench.logs[0])  # the first one's is the last again
+    bench.expect(bench.both_used)
 
 
 @pytest.mark.parametrize("node", [1, pytest.param(2, marks=pytest.mark.campaign), 3])
-def test_power_cycle_of_a_node_in_service(node: int) -> None:
+def test_power_cycle_of_a_node_in_service(bench: LibraryBench, node: int) -> None:
     """It comes back with 1019h = 0, nothing mapped and no heartbeat, and is used again."""
-    with a_bench() as bench:
-        jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.log_text()
-        bench.order(f"off {node}")
-        if node < 3:
-            assert bench.until(lambda: bench.joint_stale(node - 1))
-        time.sleep(0.5)
-        bench.forget_frames()
-        bench.order(f"on {node}")
-        assert bench.until(lambda: "returned and is configured again" in bench.log_text()), bench.log_text()
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.until(lambda: bench.order("state")[str(node)]["state"] == 5)
-        assert bench.emergencies(node) == []
-        assert bench.stop(jtqd) == 0
+    bench.order(f"off {node}")
+    if node < 3:
+        bench.expect(lambda: bench.joint_stale(node - 1))
+    time.sleep(0.5)
+    bench.forget_frames()
+    bench.order(f"on {node}")
+    bench.expect(f"node {node} returned and is configured again")
+    bench.expect(bench.both_used)
+    bench.expect(lambda: bench.order("state")[str(node)]["state"] == 5)
+    assert bench.emergencies(node) == []
+
+
+def test_bus_off_of_one_node(bench: LibraryBench) -> None:
+    """It neither hears nor is heard for a second: its master's heartbeat is missing, and it waits in pre-operational."""
+    bench.order("cut 1")
+    bench.expect(lambda: bench.joint_stale(0))
+    bench.expect(lambda: 0x8130 in bench.order("state")["1"]["errors"])
+    bench.forget_frames()
+    bench.order("join 1")
+    bench.expect(bench.both_used)
+    bench.expect(lambda: no_errors(bench))
 
 
 def test_emcy_with_and_without_heartbeat(bench: LibraryBench) -> None:
-    jtqd = bench.start()
-    assert bench.until(bench.both_used), bench.log_text()
     bench.order("emcy 1 2310")
-    assert bench.until(lambda: "node 1: EMCY 2310h (continuous overcurrent)" in bench.log_text()), (
-        bench.log_text()
-    )
+    bench.expect("node 1: EMCY 2310h (continuous overcurrent)")
     bench.order("well 1 2310")
-    assert bench.until(lambda: "node 1: EMCY 0000h: error reset" in bench.log_text())
+    bench.expect("node 1: EMCY 0000h: error reset")
     bench.order("mute 2")
-    assert bench.until(lambda: "node 2: no heartbeat for 0.3 s" in bench.log_text()), bench.log_text()
+    bench.expect("node 2: no heartbeat for 0.3 s")
     bench.order("emcy 2 4310")
-    assert bench.until(lambda: "node 2: EMCY 4310h (excess temperature of the drive)" in bench.log_text())
+    bench.expect("node 2: EMCY 4310h (excess temperature of the drive)")
     bench.forget_frames()
-    assert bench.until(bench.both_used), "its PDOs come in time and are used"
-    assert bench.stop(jtqd) == 0
-
-
-def test_bus_off_of_one_node() -> None:
-    """It neither hears nor is heard for a second: its master's heartbeat is missing, and it waits in pre-operational."""
-    with a_bench() as bench:
-        jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.log_text()
-        bench.order("cut 1")
-        assert bench.until(lambda: bench.joint_stale(0)), bench.log_text()
-        assert bench.until(lambda: 0x8130 in bench.order("state")["1"]["errors"])
-        bench.forget_frames()
-        bench.order("join 1")
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.until(lambda: no_errors(bench))
-        assert bench.stop(jtqd) == 0
+    bench.expect(bench.both_used)  # its PDOs come in time and are used
 
 
 @pytest.mark.parametrize(
@@ -141,36 +136,48 @@ def test_bus_off_of_one_node() -> None:
     ids=["boot-up twice", "no 1016h 1029h 1014h", "no 1019h 1008h", "slow, boot-up twice"],
 )
 def test_devices_differ(manners: tuple[str, ...]) -> None:
-    with a_bench(*manners) as bench:
-        jtqd = bench.start()
-        assert bench.until(bench.both_used, 40.0), bench.log_text()
+    with a_bench(*manners) as bench, bench.served(longest_s=40.0):
         if "1016" in manners[-1]:
             assert "1016h:1 consumer heartbeat time: no such object" in bench.log_text()
-        assert bench.stop(jtqd) == 0
 
 
 @pytest.mark.parametrize("fixed", ["mapping", "valid"])
 def test_a_fixed_mapping_is_used_as_it_is(fixed: str) -> None:
     """Quantities in three of four TPDOs, one of them on another COB-ID: read from the drive, also after its power cycle."""
     with a_bench("--fixed", fixed) as bench:
-        jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.log_text()
-        assert "its mapping is used as it is: TPDO1 (181h), TPDO2 (381h), TPDO4 (481h)" in bench.log_text()
-        assert bench.until(
-            lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
-        )
-        bench.order("off 1")
-        assert bench.until(lambda: bench.joint_stale(0))
-        bench.forget_frames()
-        bench.order("on 1")
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.stop(jtqd) == 0
+        booted = items(bench, "0.5", "--drive-sync") if fixed == "mapping" else {}
+        with bench.served():
+            found = "its mapping is used as it is: TPDO1 (181h), TPDO2 (381h), TPDO4 (481h)"
+            assert found in bench.log_text()
+            bench.expect(bench.moves)
+            if booted:  # `jtq check` knows it by its own boot, and beside jtqd
+                assert "node 1: its mapping is used as it is: TPDO1 (181h)" in booted["boot"]
+                beside = items(bench, "0.5", RUNTIME_DIRECTORY=str(bench.runs[-1]))
+                for each in (booted, beside):
+                    assert "481h drive 1 TPDO4" in each
+                    assert "281h drive 1 TPDO2" not in each
+                    assert all("wrong length" not in text for text in each.values())
+            bench.order("off 1")
+            bench.expect(lambda: bench.joint_stale(0))
+            bench.forget_frames()
+            bench.order("on 1")
+            bench.expect(bench.both_used)
 
 
-def test_what_init_writes_for_drives_that_tell_less_runs(
+def items(bench: LibraryBench, *arguments: str, **environment: str) -> dict[str, str]:
+    """Results of `jtq check` with a configuration that does not name the mapping."""
+    command = [sys.executable, "-m", "jtqd.daemon.jtq", "check", *arguments, "--bus", bench.bus, "--json"]
+    command += ["--config", bench.configuration()]
+    run = subprocess.run(
+        command, capture_output=True, text=True, env={**os.environ, **environment}, check=False
+    )
+    return {each["item"]: each["text"] for each in json.loads(run.stdout)["items"]}
+
+
+def test_what_init_writes_for_drives_that_have_fewer_objects_runs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No 60E4h, 606Ch, 6078h: `jtq probe` and `jtq init` say so, and jtqd runs with the files as they are."""
+    """No 60E4h, 606Ch, 6078h: `jtq probe` and `jtq init` report it, and jtqd runs with the files as they are."""
     with a_bench("--without", "60E4,60E6,60EB,606C,6090,6078,6075") as bench:
         assert probe.main(["--bus", bench.bus, "--node", "1"]) == 0
         reported = capsys.readouterr().out
@@ -182,43 +189,8 @@ def test_what_init_writes_for_drives_that_tell_less_runs(
         path = tmp_path / "jtqd.yaml"
         content = yaml.safe_load(path.read_text()) | {"sync": {"period_us": 10_000}}
         path.write_text(yaml.safe_dump(content))
-        jtqd = bench.start(path)
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.until(lambda: any(torque and abs(torque) > 2.0 for torque, _ in bench.torques_nm))
-        assert bench.stop(jtqd) == 0
-
-
-def test_check_knows_the_mapping_of_the_drives() -> None:
-    """By its own boot, and of a jtqd that runs: also where the configuration does not name it."""
-    with a_bench("--fixed", "mapping") as bench:
-
-        def items(*arguments: str, **environment: str) -> dict[str, str]:
-            command = [
-                sys.executable,
-                "-m",
-                "jtqd.daemon.jtq",
-                "check",
-                *arguments,
-                "--bus",
-                bench.bus,
-                "--json",
-            ]
-            command += ["--config", bench.configuration()]
-            done = subprocess.run(
-                command, capture_output=True, text=True, env={**os.environ, **environment}, check=False
-            )
-            return {each["item"]: each["text"] for each in json.loads(done.stdout)["items"]}
-
-        booted = items("0.5", "--drive-sync")
-        assert "node 1: its mapping is used as it is: TPDO1 (181h)" in booted["boot"]
-        jtqd = bench.start()
-        assert bench.until(bench.both_used), bench.log_text()
-        beside = items("0.5", RUNTIME_DIRECTORY=str(bench.runs[-1]))
-        for found in (booted, beside):
-            assert "481h drive 1 TPDO4" in found
-            assert all("wrong length" not in text for text in found.values())
-            assert "281h drive 1 TPDO2" not in found
-        assert bench.stop(jtqd) == 0
+        with bench.served(path):
+            bench.expect(bench.moves)
 
 
 def test_a_drive_that_sends_by_itself_needs_an_age_and_is_used_by_its_stamps() -> None:
@@ -227,133 +199,90 @@ def test_a_drive_that_sends_by_itself_needs_an_age_and_is_used_by_its_stamps() -
         refused = bench.start()
         assert refused.wait(20) == 1
         assert "TPDO1 has transmission type 255: joint_N.max_age_ms allows it" in bench.log_text()
-        ages = {f"joint_{n}": {"max_age_ms": 100} for n in (1, 2)}
-        jtqd = bench.start(**ages)
-        assert bench.until(bench.both_used), bench.log_text()
-        assert "TPDO1 keeps transmission type 255" in bench.log_text()
-        assert bench.until(
-            lambda: any(torque and abs(torque) > 2.0 for pair in bench.torques_nm for torque in pair)
-        )
-        socket = open_frame_socket(bench.bus, [exact(0x181), exact(0x281)])
-        stamps: dict[int, list[int]] = {0x181: [], 0x281: []}
-        until = time.monotonic() + 1.0
-        while time.monotonic() < until:
-            socket.wait(0.05)
-            for n in range(socket.receive()):
-                can_id = int.from_bytes(socket.frames[16 * n : 16 * n + 4], "little")
-                stamps[can_id].append(socket.stamps_ns[n])
-        socket.close()
-        changing, constant = (len(stamps[can_id]) for can_id in (0x181, 0x281))
-        assert 40 < changing < 110, "at most one in 10 ms"
-        assert 10 < constant < 40, "by its timer alone"
-        assert bench.stop(jtqd) == 0
+        with bench.served(**{f"joint_{n}": {"max_age_ms": 100} for n in (1, 2)}):
+            assert "TPDO1 keeps transmission type 255" in bench.log_text()
+            bench.expect(bench.moves)
+            changing, constant = frames_in_a_second(bench.bus, 0x181, 0x281)
+            assert 40 < changing < 110, "at most one in 10 ms"
+            assert 10 < constant < 40, "by its timer alone"
+
+
+def frames_in_a_second(bus: str, *can_ids: int) -> list[int]:
+    socket = open_frame_socket(bus, [exact(can_id) for can_id in can_ids])
+    counts, until = dict.fromkeys(can_ids, 0), time.monotonic() + 1.0
+    while time.monotonic() < until:
+        socket.wait(0.05)
+        for n in range(socket.receive()):
+            counts[int.from_bytes(socket.frames[16 * n : 16 * n + 4], "little")] += 1
+    socket.close()
+    return list(counts.values())
 
 
 @pytest.mark.native
-def test_objects_of_the_makers_own(bench: LibraryBench) -> None:
+def test_objects_of_the_makers_own() -> None:
     """Joint 1 by its drive's mA, counted backwards, and rpm; joint 2, with the same motion, by CiA 402."""
     objects = {
         "current": {"index": 0x2030, "sign": -1, "factor": 0.001},
         "motor_velocity": {"index": 0x2031, "type": "I16", "factor": 2.0 * math.pi / 60.0},
     }
-    jtqd = bench.start(joint_1={"objects": objects}, joint_2={"file": str(shipped("joint1.yaml"))})
-    assert bench.until(bench.both_used), bench.log_text()
-    assert bench.until(lambda: len(bench.torques_nm) > 600)
-    pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
-    assert len(pairs) > 300
-    assert max(abs(one) for one, _ in pairs) > 2.0
-    apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
-    assert apart[round(0.8 * len(apart))] < 0.3
-    assert bench.stop(jtqd) == 0
+    joint_2 = {"file": str(shipped("joint1.yaml"))}
+    with a_bench() as bench, bench.served(joint_1={"objects": objects}, joint_2=joint_2):
+        bench.expect(lambda: len(bench.torques_nm) > 600)
+        agree(bench.pairs(), 0.3)
 
 
 @pytest.mark.native
 def test_one_encoder_no_velocity_and_torque_instead_of_current() -> None:
     """Drives that have none of 60E4h, 606Ch and their scaling; joint 1 by 6077h, counted backwards, joint 2 by 6078h."""
     less = {"link_position": False, "motor_velocity": False}
-    torque = {**less, "current": {"index": 0x6077, "sign": -1}}
-
-    def pairs() -> list[tuple[float, float]]:
-        found = bench.torques_nm[100:]
-        return [(one, two) for one, two in found if one is not None and two is not None]
-
+    joint_1 = {"objects": {**less, "current": {"index": 0x6077, "sign": -1}}}
+    joint_2 = {"objects": less, "file": str(shipped("joint1.yaml"))}
     with a_bench("--without", "60E4,60E6,60EB,606C,6090") as bench:
-        jtqd = bench.start(
-            joint_1={"objects": torque}, joint_2={"objects": less, "file": str(shipped("joint1.yaml"))}
-        )
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.until(lambda: len(pairs()) > 300), bench.log_text()
-        assert bench.stop(jtqd) == 0
-    assert max(abs(one) for one, _ in pairs()) > 2.0
-    apart = sorted(abs(one - two) for one, two in pairs())
-    assert apart[round(0.8 * len(apart))] < 0.3
+        with bench.served(joint_1=joint_1, joint_2=joint_2):
+            bench.expect(lambda: len(bench.pairs()) > 300)
+        agree(bench.pairs(), 0.3)
+
+
+ONE_TO_ONE = {"6091h:1": GEAR, "6091h:2": 1}
+LINK = {"link_position": {"factor": 2.0 * math.pi / LINK_COUNTS}}
+CURRENT = {"current": {"factor": 1e-6 * RATED_MA}}
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize(
-    ("family", "section"),
+    ("family", "objects", "given"),
     [
-        (
-            "epos4",
-            {
-                "objects": {
-                    "motor_position": {"factor": math.pi / (2 * PULSES)},
-                    "link_position": {"factor": 2.0 * math.pi / LINK_COUNTS},
-                    "current": {"factor": 1e-6 * RATED_MA},
-                },
-                "given": {"6091h:1": GEAR, "6091h:2": 1},
-            },
-        ),
-        (
-            "elmo_gold",
-            {
-                "objects": {"link_position": {"factor": 2.0 * math.pi / LINK_COUNTS}},
-                "given": {"608Fh:1": 4 * PULSES, "6090h:1": 4 * PULSES, "6091h:1": GEAR, "6091h:2": 1},
-            },
-        ),
-        (
-            "nanotec",
-            {
-                "objects": {"current": {"factor": 1e-6 * RATED_MA}},
-                "given": {"6091h:1": GEAR, "6091h:2": 1},
-            },
-        ),
+        ("epos4", {"motor_position": {"factor": math.pi / (2 * PULSES)}, **LINK, **CURRENT}, ONE_TO_ONE),
+        ("elmo_gold", LINK, {"608Fh:1": 4 * PULSES, "6090h:1": 4 * PULSES, **ONE_TO_ONE}),
+        ("nanotec", CURRENT, ONE_TO_ONE),
     ],
 )
-def test_a_drive_of_a_family_beside_one_of_cia_402(family: str, section: dict[str, Any]) -> None:
+def test_a_drive_of_a_family_beside_one_of_cia_402(
+    family: str, objects: dict[str, Any], given: dict[str, int]
+) -> None:
     """Joint 1 by its profile, joint 2, with the same motion and joint file, by CiA 402: the torques agree."""
-    with a_bench("--family", family) as bench:
-        joint_2 = {"file": str(shipped("joint1.yaml"))}
-        jtqd = bench.start(joint_1={"profile": family, **section}, joint_2=joint_2)
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.until(lambda: len(bench.torques_nm) > 500)
-        pairs = [(one, two) for one, two in bench.torques_nm[100:] if one is not None and two is not None]
-        assert len(pairs) > 250
-        assert max(abs(one) for one, _ in pairs) > 2.0
-        apart = sorted(abs(one - two) for one, two in pairs)  # at a reversal one rpm is another quadrant
-        assert apart[round(0.8 * len(apart))] < 0.5
-        assert bench.stop(jtqd) == 0
+    joint_1 = {"profile": family, "objects": objects, "given": given}
+    joint_2 = {"file": str(shipped("joint1.yaml"))}
+    with a_bench("--family", family) as bench, bench.served(joint_1=joint_1, joint_2=joint_2):
+        bench.expect(lambda: len(bench.torques_nm) > 500)
+        agree(bench.pairs(), 0.5)
 
 
 @pytest.mark.campaign
 def test_answers_of_half_a_second() -> None:
-    with a_bench("--sdo", "0.5") as bench:
-        jtqd = bench.start(sensor={"sdo_timeout_ms": 800}, nodes={"sdo_timeout_ms": 800})
-        assert bench.until(bench.both_used, 150.0), bench.log_text()
-        assert bench.stop(jtqd) == 0
+    slow = {"sdo_timeout_ms": 800}
+    with a_bench("--sdo", "0.5") as bench, bench.served(longest_s=150.0, sensor=slow, nodes=slow):
+        pass
 
 
 @pytest.mark.socketcan
 def test_first_start_restart_and_power_cycle_on_socketcan() -> None:
     with a_bench(bus=os.environ.get("JTQD_CAN_INTERFACE", "vcan0")) as bench:
         first = bench.start()
-        assert bench.until(bench.both_used), bench.log_text()
+        bench.expect(bench.both_used)
         bench.stop(first, signal.SIGKILL)
-        bench.forget_frames()
-        second = bench.start()
-        assert bench.until(bench.both_used), bench.log_text()
-        bench.order("off 1")
-        assert bench.until(lambda: bench.joint_stale(0))
-        bench.order("on 1")
-        assert bench.until(bench.both_used), bench.log_text()
-        assert bench.stop(second) == 0
+        with bench.served():
+            bench.order("off 1")
+            bench.expect(lambda: bench.joint_stale(0))
+            bench.order("on 1")
+            bench.expect(bench.both_used)

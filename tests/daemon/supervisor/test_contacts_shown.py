@@ -1,4 +1,4 @@
-"""A contact is where a user looks: `jtq status`, the live table, the lines of a log, the summary; and never an old one."""
+"""A contact in `jtq status`; never an old one."""
 
 from __future__ import annotations
 
@@ -16,11 +16,9 @@ from jtqd.daemon.cli.status import Moment, Recent, StatusView, content
 from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
-from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
-from jtqd.daemon.supervisor.display import LiveTable, Summary, plain_line, summary_of
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.daemon.supervisor.process import about
 from tests.daemon.cli import status_daemon
-from tests.daemon.snapshots import EstimateWriter
 
 WATCHED = ContactSettings(threshold_nm=1.5)
 KNOWN, THERE = FLAG_CONTACT_KNOWN, FLAG_CONTACT_KNOWN | FLAG_CONTACT
@@ -49,13 +47,6 @@ def daemon(
     monkeypatch.setattr(status_daemon, "ONE", joints[0])
     monkeypatch.setattr(status_daemon, "TWO", joints[1])
     return status_daemon.running(root, cycling=cycling)
-
-
-def snapshot(path: Path, *joints: tuple[float, ...], contacts: int = 0) -> SnapshotReader:
-    made = Snapshot(path, 1e-3, 0.8)
-    made.counters[COUNTERS.index("contacts")] = contacts
-    EstimateWriter(made).write(8, 8, 1, joints)
-    return SnapshotReader(path)
 
 
 @pytest.mark.parametrize("width", [60, 80, 140])
@@ -112,60 +103,6 @@ def test_a_loop_that_stands_still_says_nothing_of_contacts(
     for each in content(watch.read())["joints"]:
         assert (each["contact"], each["contact_nm"], each["torque_rate_nm_s"]) == (None, None, None)
     assert "contact" not in status_daemon.picture(still, 80)
-
-
-def rows(reader: SnapshotReader, width: int, *, contacts: bool) -> list[str]:
-    view, file = reader.read(), io.StringIO()
-    table = LiveTable(reader, view, view, 1_000_000, "jtqd on sim", contacts=contacts)
-    Console(file=file, width=width).print(table)
-    return file.getvalue().splitlines()
-
-
-@pytest.mark.parametrize("width", range(24, 100))
-def test_the_live_table_shows_a_contact_at_any_width(tmp_path: Path, width: int) -> None:
-    shown = rows(snapshot(tmp_path / "s", PUSHED, QUIET, contacts=3), width, contacts=True)
-    assert max(map(len, shown)) <= width
-    text = " ".join("\n".join(shown).split())
-    assert "+2.9 Nm" in text
-    assert "-117.94" in text
-    assert "valid" in text
-    assert text.endswith("contacts 3")
-
-
-def test_without_watching_the_live_table_is_as_before(tmp_path: Path) -> None:
-    text = "\n".join(rows(snapshot(tmp_path / "s", UNKNOWN, UNKNOWN), 80, contacts=False))
-    assert "contact" not in text
-    for wanted in ("sigma [Nm]", "sensor [Nm]", "error [Nm]"):
-        assert wanted in text
-
-
-def test_lines_where_there_is_no_terminal(tmp_path: Path) -> None:
-    reader = snapshot(tmp_path / "s", PUSHED, QUIET, contacts=1)
-    view = reader.read()
-    line = plain_line(reader, view, view, 1_000_000, contacts=True)
-    assert (
-        "joint 1 valid -117.94 +- 0.48 Nm, contact +2.9 Nm  joint 2 valid -117.94 +- 0.48 Nm  cycle" in line
-    )
-    assert line.endswith("contacts 1")
-
-
-def test_the_summary(tmp_path: Path) -> None:
-    def made(*, watched: bool) -> Summary:
-        return summary_of(
-            snapshot(tmp_path / f"s{watched}", PUSHED, QUIET, contacts=2),
-            {},
-            [],
-            None,
-            history=(),
-            began_s=0.0,
-            stolen_s=0.0,
-            contacts=watched,
-        )
-
-    assert "contacts      2" in made(watched=True).text().splitlines()
-    assert made(watched=True).content()["contacts"] == 2
-    assert "contacts" not in made(watched=False).text()
-    assert made(watched=False).content()["contacts"] is None
 
 
 def test_a_live_view_remembers_the_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
