@@ -193,13 +193,19 @@ class Ring:
     + 1 as the count; it overwrites the oldest record when the reader is slow or gone.
     """
 
-    def __init__(self, path: Path, slots: int, record_size: int) -> None:
+    def __init__(self, path: Path, slots: int, record_size: int, mode: int = 0o600) -> None:
         head = _LAYOUT.pack(_MAGIC, slots, record_size)
-        view = memoryview(new_memory(path, _HEADER_SIZE + slots * record_size, head, 0o600))
+        view = memoryview(new_memory(path, _HEADER_SIZE + slots * record_size, head, mode))
         # One 8-byte store. `struct.pack_into` writes zeros first: the reader would at times see a count of 0.
         self.words = view[:_HEADER_SIZE].cast("Q")
         self.records = view[_HEADER_SIZE:]
         self.size = slots
+
+    def append(self, record: bytes | bytearray | memoryview) -> None:
+        """Write a whole record; the loop fills the slot in place."""
+        start = self.words[COUNT_WORD] % self.size * len(record)
+        self.records[start : start + len(record)] = record
+        self.words[COUNT_WORD] += 1
 
 
 class Batch(NamedTuple):
@@ -221,7 +227,7 @@ class RingReader:
     """
 
     def __init__(self, path: Path, record_size: int) -> None:
-        self._memory = mapped(path, "cannot be read as a ring of cycles")
+        self._memory = mapped(path, "cannot be read as a ring")
         long_enough = len(self._memory) >= _HEADER_SIZE
         magic, slots, size = _LAYOUT.unpack_from(self._memory, 0) if long_enough else (0, 0, 0)
         if magic != _MAGIC or size != record_size or len(self._memory) != _HEADER_SIZE + slots * size:

@@ -3,11 +3,9 @@
 Under systemd standard error is the journal's (JOURNAL_STREAM): a line then begins with <N>, its priority as in sd-daemon(3)
 (`SyslogLevelPrefix=yes`), without the program's name, which the journal has.
 
-The file `notices` of the runtime directory is a ring of the last `CAPACITY` notices with one writer (the supervisor) and
-any number of readers; one that comes late gets the number of those it has missed. Layout: head 32 bytes (magic u64,
-capacity u64, count of notices written u64, reserved), then slots of 256 bytes: number u64 (1.. ; written last, so that a
-torn slot shows), realtime_ns i64, level u8, node u8, length of topic u8, length of text u8, topic 20 bytes, text 212 bytes
-(UTF-8, cut to fit).
+The file `notices` of the runtime directory is a ring of the last `CAPACITY` notices (`cycle_record.Ring`), written by the
+supervisor: number u64 (1, 2, ..), realtime_ns i64, level u8, node u8, lengths of topic and text u8, topic 20 bytes, text 212
+bytes (UTF-8, cut to fit), number u64.
 """
 
 from __future__ import annotations
@@ -22,9 +20,9 @@ from contextlib import suppress
 from enum import IntEnum
 from math import inf
 from pathlib import Path
-from typing import NamedTuple, TextIO
+from typing import Any, NamedTuple, TextIO
 
-from jtqd.daemon.shared.runtime_dir import SharedMemoryError, mapped, new_memory
+from jtqd.daemon.shared.cycle_record import Ring, RingReader
 
 FILE = "notices"
 """Name of the file in the runtime directory of a daemon."""
@@ -32,11 +30,7 @@ CAPACITY = 512
 INFO, WARNING, ERROR = 20, 30, 40
 """Levels, as those of rcl_interfaces/Log and of Python's logging."""
 
-_MAGIC = 0x4A54_5144_4E4F_5401  # "JTQDNOT", layout 1
-_HEAD = struct.Struct("<QQQ8x")
-_SLOT = struct.Struct("<QqBBBB20s212s4x")
-_COUNT_OFFSET = 16
-_WORD = struct.Struct("<Q")
+_NOTICE = struct.Struct("<QqBBBB20s212s4xQ")
 _TOPIC_BYTES, _TEXT_BYTES = 20, 212
 
 
@@ -58,56 +52,35 @@ class Notices:
     """Writer's side, with a new file; a reader of the old one goes on reading that."""
 
     def __init__(self, path: Path, capacity: int = CAPACITY) -> None:
-        head = _HEAD.pack(_MAGIC, capacity, 0)
-        self._memory = new_memory(path, _HEAD.size + capacity * _SLOT.size, head)
-        self._capacity, self._count = capacity, 0
+        # Of a ring's slots all but the one that is being written are sure.
+        self._ring, self._count = Ring(path, capacity + 1, _NOTICE.size, 0o640), 0
 
     def add(self, level: int, topic: str, node: int, text: str) -> None:
         """Write one; the oldest is overwritten. `topic` and `text` are cut to their room."""
         name, line = _cut(topic, _TOPIC_BYTES), _cut(text, _TEXT_BYTES)
         self._count += 1
-        offset = _HEAD.size + (self._count - 1) % self._capacity * _SLOT.size
-        _WORD.pack_into(self._memory, offset, 0)
         values = (time.time_ns(), level, node & 0xFF, len(name), len(line), name, line)
-        _SLOT.pack_into(self._memory, offset, 0, *values)
-        _WORD.pack_into(self._memory, offset, self._count)
-        _WORD.pack_into(self._memory, _COUNT_OFFSET, self._count)
+        self._ring.append(_NOTICE.pack(self._count, *values, self._count))
 
 
 class NoticesReader:
     """Reader's side; starts with the oldest notice. Raises SharedMemoryError: nothing there, or of another layout."""
 
     def __init__(self, path: Path) -> None:
-        self._memory = mapped(path, "no notices")
-        magic, self._capacity, _ = _HEAD.unpack(self._memory[: _HEAD.size].ljust(_HEAD.size, b"\0"))
-        if magic != _MAGIC or len(self._memory) != _HEAD.size + self._capacity * _SLOT.size:
-            raise SharedMemoryError(f"{path}: no notices of this version")
-        self._read = 0
+        self._ring = RingReader(path, _NOTICE.size)
 
     def read(self) -> tuple[list[Notice], int]:
         """Return (notices since the last call, number of notices overwritten before they could be read)."""
-        news: list[Notice] = []
-        (count,) = _WORD.unpack_from(self._memory, _COUNT_OFFSET)
-        lost = max(0, count - self._capacity - self._read)
-        for number in range(self._read + lost + 1, count + 1):
-            notice = self._slot(number)
-            if notice is None:
-                lost += 1  # overwritten while we were reading
-            else:
-                news.append(notice)
-        self._read = count
-        return news, lost
+        batch = self._ring.read()
+        return [_notice(*_NOTICE.unpack(record)) for record in batch.records], batch.lost
 
-    def _slot(self, number: int) -> Notice | None:
-        offset = _HEAD.size + (number - 1) % self._capacity * _SLOT.size
-        raw = self._memory[offset : offset + _SLOT.size]
-        written, realtime_ns, level, node, topic_length, text_length, topic, text = _SLOT.unpack(raw)
-        if written != number or _WORD.unpack_from(self._memory, offset)[0] != number:
-            return None
-        name, line = topic[:topic_length], text[:text_length]
-        return Notice(
-            number, realtime_ns, level, node, name.decode(errors="replace"), line.decode(errors="replace")
-        )
+
+def _notice(number: int, realtime_ns: int, level: int, node: int, *rest: Any) -> Notice:
+    topic_length, text_length, topic, text, _ = rest
+    name, line = topic[:topic_length], text[:text_length]
+    return Notice(
+        number, realtime_ns, level, node, name.decode(errors="replace"), line.decode(errors="replace")
+    )
 
 
 def _cut(text: str, size: int) -> bytes:
@@ -153,7 +126,8 @@ def in_journal(stream: TextIO, environment: Mapping[str, str] = os.environ) -> b
 class OperatorLog:
     """Write lines to `stream` (None: standard error), with priorities where it is the journal's or `journal` is True.
 
-    Lines of one kind come at most `BURST` times in `WINDOW_S`; the next one gives the number of suppressed ones.
+    Lines of one kind come at most `BURST` times in `WINDOW_S`; the next one gives the number of suppressed ones. Events go
+    to the `notices` as well, once these are set, for the log's /events and /log.
     """
 
     def __init__(
@@ -164,6 +138,7 @@ class OperatorLog:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._stream, self._clock = stream, clock
+        self.notices: Notices | None = None
         self._journal = in_journal(stream or sys.stderr) if journal is None else journal
         self._written: dict[str, deque[float]] = {}
         self._suppressed: dict[str, int] = {}
@@ -187,17 +162,9 @@ class OperatorLog:
                 print(shown, file=self._stream or sys.stderr, flush=True)
         return True
 
-
-class EventLog:
-    """Write lines to the operator and to the `notices`, once these are set, for the log's /events and /log."""
-
-    def __init__(self, log: OperatorLog) -> None:
-        self._log = log
-        self.notices: Notices | None = None
-
-    def __call__(self, topic: str, node: int, line: str, kind: str = "", level: int = WARNING) -> None:
-        """Write one line; `topic`, `node` and `level` as in `Notice`, `kind` as in `OperatorLog`."""
-        self._log(line, _PRIORITIES[level], kind)
+    def event(self, topic: str, node: int, line: str, kind: str = "", level: int = WARNING) -> None:
+        """Write one line and notice; `topic`, `node` and `level` as in `Notice`."""
+        self(line, _PRIORITIES[level], kind)
         if self.notices is not None:
             self.notices.add(level, topic, node, line)
 

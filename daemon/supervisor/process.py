@@ -29,7 +29,7 @@ from jtqd.daemon.recording.launch import RecorderProcess, recording_request
 from jtqd.daemon.ros2 import Ros2Publisher
 from jtqd.daemon.shared.conditions import THE_MACHINE, Conditions, ConditionsFile
 from jtqd.daemon.shared.events import FILE as NOTICES
-from jtqd.daemon.shared.events import EventLog, Notices, OperatorLog, Priority
+from jtqd.daemon.shared.events import Notices, OperatorLog, Priority
 from jtqd.daemon.shared.processes import Child, ChildError, ChildSilence, StartChild
 from jtqd.daemon.shared.runtime_dir import (
     About,
@@ -262,7 +262,6 @@ class Supervisor:
         self._children: list[Child] = []
         self._recorder = RecorderProcess(self._child, self._directory)
         self._log = OperatorLog()
-        self._log_event = EventLog(self._log)
         self._conditions = Conditions()
         self._conditions_file = ConditionsFile(self._directory)
         self._health = Health(config, self._conditions)
@@ -335,7 +334,7 @@ class Supervisor:
         text = "; ".join(running["refused"])
         self._conditions.update("not_granted", THE_MACHINE, bool(text), time.monotonic(), text)
         reader = SnapshotReader(self._snapshot, supervisor=True)
-        self._log_event.notices = Notices(self._directory / NOTICES)
+        self._log.notices = Notices(self._directory / NOTICES)
         self._record(report)
         for side in self._sides:
             side.start(self._config, self._directory, self._instance)
@@ -346,9 +345,9 @@ class Supervisor:
             report,
             reader=reader,
             store=store,
-            returning=ReturningNodes(self._config, self._bus, report, self._child, self._log_event),
+            returning=ReturningNodes(self._config, self._bus, report, self._child, self._log.event),
             conditions=self._conditions,
-            log=self._log_event,
+            log=self._log.event,
             directory=self._directory,
         )
         self._bus_service.begin(time.monotonic())
@@ -474,7 +473,7 @@ class Supervisor:
         """Log the lines that are due and keep `conditions.json` up to date."""
         for line in self._conditions.lines(now):
             topic, node = line.definition.topic, line.subject.node
-            self._log_event(topic, node, line.text, line.rate_class, line.severity)
+            self._log.event(topic, node, line.text, line.rate_class, line.severity)
         self._conditions_file.write(self._conditions.present())
 
     def _serve(self, view: View, now: float) -> None:

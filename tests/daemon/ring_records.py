@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 
-from jtqd.daemon.shared.cycle_record import COUNT_WORD, MOST_JOINTS, PAIR, Ring, header_of, layout_of
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, Ring, header_of, layout_of
 
 RECORD_SIZE, FRAME_CAPACITY = PAIR.size, PAIR.frame_capacity
 _BY_SIZE = {layout_of(joints).size: layout_of(joints) for joints in range(1, MOST_JOINTS + 1)}
@@ -20,6 +20,4 @@ def frames_of(record: bytes | memoryview) -> list[tuple[bytes, int]]:
 
 def append(ring: Ring, record: bytes | bytearray | memoryview) -> None:
     """Write a record into the next slot, then publish it."""
-    start = ring.words[COUNT_WORD] % ring.size * len(record)
-    ring.records[start : start + len(record)] = record
-    ring.words[COUNT_WORD] += 1
+    ring.append(record)
