@@ -229,7 +229,9 @@ class LiveServer:
             topic.number: foxglove.Channel(
                 topic.name,
                 message_encoding="cdr",
-                schema=foxglove.Schema(topic.schema, "ros2msg", texts[topic.schema].encode()),
+                schema=foxglove.Schema(
+                    name=topic.schema, encoding="ros2msg", data=texts[topic.schema].encode()
+                ),
                 context=context,
             )
             for topic in messages.topics_of(joints)

@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import signal
 import socket
 import struct
 import subprocess
@@ -13,9 +15,11 @@ from pathlib import Path
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from jtqd.daemon.config import load_config
 from jtqd.daemon.recording import messages
 from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.daemon.shared.events import FILE, Notices
+from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import Snapshot
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import DEFINITIONS, put, record_of
@@ -71,6 +75,41 @@ def request_of(directory, **changes):
     return content | changes
 
 
+class Kept:
+    """The supervisor's side of a side process, with real children on memory without a loop.
+
+    make: start_child -> `SideProcess`.
+    """
+
+    def __init__(self, directory, capfd, make):
+        self.memory = Memory(directory)
+        self.children, self.capfd, self.text = [], capfd, ""
+        self.keeper = make(self._child)
+        self.keeper.start(load_config(None), directory, "vcan7")
+
+    def _child(self, module, arguments, name):
+        self.children.append(Child(module, arguments, name=name))
+        return self.children[-1]
+
+    def until(self, pattern, timeout_s=15.0):
+        """Watch as the supervisor does, until this was written."""
+        end = time.monotonic() + timeout_s
+        while not (found := re.search(pattern, self.text)):
+            assert time.monotonic() < end, self.text
+            self.keeper.watch()
+            self.text += self.capfd.readouterr().err
+            time.sleep(0.02)
+        self.text = self.text[found.end() :]
+        return found
+
+    def kill(self):
+        os.kill(self.keeper.pid, signal.SIGKILL)
+
+    def end(self):
+        for child in self.children:
+            child.end()
+
+
 class LiveProcess:
     """`python -m jtqd.daemon.live.process`; for a `with` statement."""
 
@@ -85,6 +124,7 @@ class LiveProcess:
         )
         self.answer = json.loads(self.process.stdout.readline() or "{}")
         self.url = self.answer.get("listening", "")
+        self.port = int(self.url.rpartition(":")[2] or 0)
 
     def __enter__(self):
         return self

@@ -25,6 +25,14 @@ def memory(tmp_path):
     return Memory(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory):
+    """One process for all who leave it as it was: (memory, process)."""
+    memory = Memory(tmp_path_factory.mktemp("live"))
+    with LiveProcess(memory.directory) as live:
+        yield memory, live
+
+
 # ---- what is made of the cycles: no process ----
 
 
@@ -32,27 +40,25 @@ def stream():
     return LiveStream(("joint_1", "joint_2"), (100.0, None))
 
 
-def of(messages, topic):
-    return [message for message in messages if message.topic == topic.number]
+def of(made, topic):
+    return [message for message in made if message.topic == topic.number]
 
 
 def test_one_set_of_messages_in_20_ms_with_the_bytes_of_the_log():
-    messages = stream().take(record_of(n) for n in range(100, 200))
+    made = stream().take(record_of(n) for n in range(100, 200))
     for topic, size in (
         (messages.JOINT_1, JOINT_ESTIMATE_SIZE),
         (messages.JOINT_2, JOINT_ESTIMATE_SIZE),
         (messages.CAN_FRAMES, CycleMessages(2).frames_size),
     ):
-        found = of(messages, topic)
+        found = of(made, topic)
         assert [len(message.payload) for message in found] == [size] * 5
-        assert [message.time_ns for message in found] == [
-            START_NS + n * 1_000_000 for n in range(100, 200, 20)
-        ]
+        assert [each.time_ns for each in found] == [START_NS + n * 1_000_000 for n in range(100, 200, 20)]
     name = messages.JOINT_2.schema
-    joint = Definition(name, messages.SCHEMAS[name]).decode(of(messages, messages.JOINT_2)[1].payload)
+    joint = Definition(name, messages.SCHEMAS[name]).decode(of(made, messages.JOINT_2)[1].payload)
     fields = dict(zip(cycle_record.JointRecord._fields, joint_values(120, 2), strict=True))
     assert {field: joint[field] for field in fields} == fields
-    assert len(of(messages, messages.JOINT_STATES)) == 5
+    assert len(of(made, messages.JOINT_STATES)) == 5
 
 
 def test_what_lasts_one_cycle_is_an_event_although_its_cycle_is_left_out():
@@ -64,8 +70,8 @@ def test_what_lasts_one_cycle_is_an_event_although_its_cycle_is_left_out():
         Definition(name, messages.SCHEMAS[name]).decode(message.payload)
         for message in of(stream().take(records), messages.EVENTS)
     ]
-    told = [(each["kind"], each["joint"], each["before"], each["after"], each["count"]) for each in events]
-    assert told == [
+    seen = [(each["kind"], each["joint"], each["before"], each["after"], each["count"]) for each in events]
+    assert seen == [
         (messages.STATUS_CHANGED, 1, 2, 4, 0),
         (messages.STATUS_CHANGED, 1, 4, 2, 0),
         (messages.SLOTS_MISSED, 0, 0, 0, 3),
@@ -77,7 +83,7 @@ def test_what_lasts_one_cycle_is_an_event_although_its_cycle_is_left_out():
     assert texts[1][12] == 20, "good news"
 
 
-def test_nobody_is_told_of_changes_while_nobody_looked():
+def test_changes_while_nobody_looked_are_no_events():
     made = stream()
     made.take([record_of(1, statuses=(2, 2))])
     made.forget()
@@ -114,7 +120,7 @@ def test_who_can_reach_an_address():
 
 
 def test_a_viewer_gets_the_topics_and_schemas_of_the_log_at_50_hz(memory):
-    memory.notices.add(20, "boot", 1, "said before anybody looked")
+    memory.notices.add(20, "boot", 1, "before anybody looked")
     with LiveProcess(memory.directory) as live:
         viewer = Viewer(live.url)
         info = viewer.texts[0]
@@ -163,23 +169,18 @@ def test_a_viewer_gets_the_topics_and_schemas_of_the_log_at_50_hz(memory):
 
 @pytest.mark.parametrize(
     ("offered", "chosen"),
-    [
-        ([OLDER], OLDER),
-        ([PROTOCOL], PROTOCOL),
-        ([OLDER, PROTOCOL], PROTOCOL),
-        (["other.v1", OLDER], OLDER),
-    ],
+    [([OLDER], OLDER), ([PROTOCOL], PROTOCOL), ([OLDER, PROTOCOL], PROTOCOL), (["other.v1", OLDER], OLDER)],
 )
-def test_viewers_of_both_protocols_are_served(memory, offered, chosen):
-    with LiveProcess(memory.directory) as live:
-        viewer = Viewer(live.url, ["/joint/1/state"], subprotocols=offered)
-        assert viewer.socket.subprotocol == chosen
-        feeding = memory.feeding(500)
-        viewer.wait_for("/joint/1/state")
-        feeding.join()
-        stamp, message = viewer.messages["/joint/1/state"][0]
-        assert stamp == START_NS + message["cycle"] * 1_000_000
-        viewer.leave()
+def test_viewers_of_both_protocols_are_served(shared, offered, chosen):
+    memory, live = shared
+    viewer = Viewer(live.url, ["/joint/1/state"], subprotocols=offered)
+    assert viewer.socket.subprotocol == chosen
+    feeding = memory.feeding(500)
+    viewer.wait_for("/joint/1/state")
+    feeding.join()
+    stamp, message = viewer.messages["/joint/1/state"][0]
+    assert stamp == START_NS + message["cycle"] * 1_000_000
+    viewer.leave()
 
 
 @pytest.mark.parametrize(
@@ -187,17 +188,15 @@ def test_viewers_of_both_protocols_are_served(memory, offered, chosen):
     ["", "Sec-WebSocket-Protocol: chat\r\n", "Accept: text/html\r\n"],
     ids=["none", "other", "browser"],
 )
-def test_whoever_asks_for_no_known_protocol_is_told_what_to_use(memory, header):
-    with LiveProcess(memory.directory) as live:
-        port = int(live.url.rpartition(":")[2])
-        with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
-            client.sendall(f"GET / HTTP/1.1\r\nHost: a\r\n{header}\r\n".encode())
-            answer = b""
-            while part := client.recv(4096):
-                answer += part
-        assert answer.startswith(b"HTTP/1.1 400 ")
-        for word in ("Foxglove", "Lichtblick", PROTOCOL, OLDER):
-            assert word.encode() in answer
+def test_a_client_without_a_known_protocol_is_answered_what_to_use(shared, header):
+    with socket.create_connection(("127.0.0.1", shared[1].port), timeout=10) as client:
+        client.sendall(f"GET / HTTP/1.1\r\nHost: a\r\n{header}\r\n".encode())
+        answer = b""
+        while part := client.recv(4096):
+            answer += part
+    assert answer.startswith(b"HTTP/1.1 400 ")
+    for word in ("Foxglove", "Lichtblick", PROTOCOL, OLDER):
+        assert word.encode() in answer
 
 
 def test_nothing_that_a_viewer_sends_changes_anything(memory):
@@ -217,7 +216,7 @@ def test_nothing_that_a_viewer_sends_changes_anything(memory):
         viewer.socket.send(struct.pack("<BIII", 2, 1, 1, 4) + b"json{}")
         viewer.watch(0.5)
         refused = [text for text in viewer.texts if text["op"] == "status"]
-        assert refused, f"the server said {viewer.texts}"
+        assert refused, viewer.texts
         assert live.process.poll() is None
         other = Viewer(live.url, ["/joint/1/state"])
         memory_unchanged = [path.read_bytes() for path in memory.files()] == before
@@ -229,65 +228,45 @@ def test_nothing_that_a_viewer_sends_changes_anything(memory):
 
 def test_a_viewer_that_does_not_read_costs_others_nothing(memory):
     """8000 cycles a second give 2.5 MB in 5 s: more than all buffers on the way to the one that is stuck."""
-    with LiveProcess(memory.directory) as live:
-        port = int(live.url.rpartition(":")[2])
-        with socket.socket() as narrow:
-            narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-            narrow.connect(("127.0.0.1", port))
-            stuck = Viewer(live.url, sock=narrow, max_queue=1)  # reads nothing from now on
-            good = Viewer(live.url, ["/joint/1/state"])
-            start_mb = live.resident_mb()
-            feeding = memory.feeding(40_000, rate_hz=8_000)
-            while feeding.is_alive():
-                good.watch(0.2)
-            good.watch(0.5)
-            assert live.process.poll() is None
-            cycles = [message["cycle"] for _, message in good.messages["/joint/1/state"]]
-            assert len(cycles) >= 0.5 * 40_000 / 20, "a busy machine may overrun the ring"
-            assert cycles[-1] > 39_000, "up to the newest"
-            assert live.resident_mb() - start_mb < 10.0
-            unread = len(stuck.messages)
-            stuck.leave()
+    with LiveProcess(memory.directory) as live, socket.socket() as narrow:
+        narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        narrow.connect(("127.0.0.1", live.port))
+        stuck = Viewer(live.url, sock=narrow, max_queue=1)  # reads nothing from now on
+        good = Viewer(live.url, ["/joint/1/state"])
+        start_mb = live.resident_mb()
+        feeding = memory.feeding(40_000, rate_hz=8_000)
+        while feeding.is_alive():
+            good.watch(0.2)
+        good.watch(0.5)
+        assert live.process.poll() is None
+        cycles = [message["cycle"] for _, message in good.messages["/joint/1/state"]]
+        assert len(cycles) >= 0.5 * 40_000 / 20, "a busy machine may overrun the ring"
+        assert cycles[-1] > 39_000, "up to the newest"
+        assert live.resident_mb() - start_mb < 10.0
+        unread = len(stuck.messages)
+        stuck.leave()
     assert unread == 0
 
 
-def test_a_viewer_that_goes_without_a_word_is_no_trouble(memory):
-    with LiveProcess(memory.directory) as live:
-        gone = Viewer(live.url)
-        gone.leave()
-        feeding = memory.feeding(1000)
-        assert Viewer(live.url, ["/joint/1/state"]).wait_for("/joint/1/state")
-        feeding.join()
-
-
-def test_garbage_on_the_port_is_no_trouble(memory):
-    with LiveProcess(memory.directory) as live:
-        port = int(live.url.rpartition(":")[2])
-        for data in (b"\0" * 5000, b"GET / HTTP/1.1\r\n\r\n", b""):
-            with socket.create_connection(("127.0.0.1", port), timeout=5) as raw:
-                raw.sendall(data)
-        feeding = memory.feeding(1000)
-        assert Viewer(live.url, ["/joint/1/state"]).wait_for("/joint/1/state")
-        feeding.join()
+def test_a_viewer_that_goes_without_a_word_and_garbage_are_no_trouble(shared):
+    memory, live = shared
+    Viewer(live.url).leave()
+    for data in (b"\0" * 5000, b"GET / HTTP/1.1\r\n\r\n", b""):
+        with socket.create_connection(("127.0.0.1", live.port), timeout=5) as raw:
+            raw.sendall(data)
+    feeding = memory.feeding(500)
+    viewer = Viewer(live.url, ["/joint/1/state"])
+    assert viewer.wait_for("/joint/1/state")
+    feeding.join()
+    viewer.leave()
 
 
 def test_without_a_viewer_it_reads_no_cycle(memory):
     with LiveProcess(memory.directory) as live:
-        feeding = memory.feeding(1000)
-        feeding.join()
+        memory.feed(500)
         before = live.cpu_s()
         memory.feed(1000)
         assert live.cpu_s() - before <= 0.05
-
-
-def test_a_port_in_use_is_said(memory):
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with LiveProcess(memory.directory, port=port) as live:
-            assert live.process.wait(10) == 1
-            assert live.answer == {"failed": f"127.0.0.1:{port}: Address already in use"}
 
 
 @pytest.mark.parametrize(
@@ -295,15 +274,21 @@ def test_a_port_in_use_is_said(memory):
     [
         ({"ring": "/nowhere/ring"}, "/nowhere/ring: cannot be read as a ring"),
         ({"host": "192.0.2.7", "port": 9}, "192.0.2.7:9: Cannot assign requested address"),
+        ({"port": None}, ": Address already in use"),
     ],
 )
-def test_a_process_that_cannot_begin_says_why(memory, changes, part):
-    with LiveProcess(memory.directory, **changes) as live:
-        assert live.process.wait(10) == 1
-        assert part in live.answer["failed"]
+def test_a_process_that_cannot_begin_answers_why(memory, changes, part):
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        if changes.get("port", 0) is None:
+            changes = {"port": taken.getsockname()[1]}
+        with LiveProcess(memory.directory, **changes) as live:
+            assert live.process.wait(10) == 1
+            assert part in live.answer["failed"]
 
 
-def test_it_ends_when_told(memory):
+def test_it_ends_on_sigterm(memory):
     with LiveProcess(memory.directory) as live:
         Viewer(live.url)
         live.process.terminate()

@@ -16,57 +16,23 @@ from jtqd.daemon import jtqd
 from jtqd.daemon.config import load_config
 from jtqd.daemon.live import Address, LiveView
 from jtqd.daemon.shared import processes as side_process
-from jtqd.daemon.shared.processes import Child
-from tests.daemon.live.live_view_helpers import ROOT, Memory, Viewer
+from tests.daemon.live.live_view_helpers import ROOT, Kept, Viewer
 
 pytestmark = pytest.mark.native
 
 _LISTENING = re.compile(r"jtqd: live view: (ws://127\.0\.0\.1:\d+)\n")
 
 
-class Kept:
-    """A LiveView with real children on memory without a loop."""
-
-    def __init__(self, directory, capfd, port=0):
-        self.memory = Memory(directory)
-        self.children, self.capfd, self.said = [], capfd, ""
-        self.keeper = LiveView(self._child, Address(port=port))
-        self.keeper.start(load_config(None), directory, "vcan7")
-
-    def _child(self, module, arguments, name):
-        self.children.append(Child(module, arguments, name=name))
-        return self.children[-1]
-
-    def until(self, pattern, timeout_s=15.0):
-        """Watch as the supervisor does, until something was said."""
-        end = time.monotonic() + timeout_s
-        while not (found := re.search(pattern, self.said)):
-            assert time.monotonic() < end, self.said
-            self.keeper.watch()
-            self.said += self.capfd.readouterr().err
-            time.sleep(0.02)
-        self.said = self.said[found.end() :]
-        return found
-
-    def end(self):
-        for child in self.children:
-            child.end()
-
-
 @pytest.fixture
 def kept(tmp_path, capfd):
-    made = Kept(tmp_path, capfd)
+    made = Kept(tmp_path, capfd, lambda child: LiveView(child, Address(port=0)))
     yield made
     made.end()
 
 
-def test_where_it_listens_is_said_and_a_viewer_finds_it(kept):
+def test_where_it_listens_is_written_and_one_that_is_killed_is_started_again(kept):
     Viewer(kept.until(_LISTENING)[1]).leave()
-
-
-def test_one_that_is_killed_is_started_again(kept):
-    kept.until(_LISTENING)
-    os.kill(kept.keeper.pid, signal.SIGKILL)
+    kept.kill()
     kept.until("jtqd: the live view ended with exit status -9; restarted, the loop continues\n")
     Viewer(kept.until(_LISTENING)[1]).leave()
 
@@ -75,9 +41,9 @@ def test_one_that_dies_again_and_again_is_left(kept, monkeypatch):
     monkeypatch.setattr(side_process, "_PAUSE_S", 0.0)
     for _ in range(5):
         kept.until(_LISTENING)
-        os.kill(kept.keeper.pid, signal.SIGKILL)
+        kept.kill()
         kept.until("restarted, the loop continues\n")
-    os.kill(kept.keeper.pid, signal.SIGKILL)
+    kept.kill()
     kept.until("exit status -9, too often; the loop continues without it\n")
     assert kept.keeper.pid is None
     started = len(kept.children)
@@ -90,7 +56,7 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        made = Kept(tmp_path, capfd, port)
+        made = Kept(tmp_path, capfd, lambda child: LiveView(child, Address(port=port)))
         made.until(rf"jtqd: no live view: 127\.0\.0\.1:{port}: Address already in use; the loop continues\n")
         for _ in range(5):
             made.keeper.watch()

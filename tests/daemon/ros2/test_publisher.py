@@ -7,7 +7,6 @@ import platform
 import re
 import signal
 import sys
-import time
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -17,8 +16,7 @@ import pytest
 from jtqd.daemon import jtqd
 from jtqd.daemon.config import Ros2Settings, load_config
 from jtqd.daemon.ros2 import Ros2Publisher
-from jtqd.daemon.shared.processes import Child
-from tests.daemon.live.live_view_helpers import Memory
+from tests.daemon.live.live_view_helpers import Kept, Memory
 from tests.daemon.ros2.publisher_helpers import Process, Publisher, Reader, own_domain, request_of
 from tests.paths import ROOT
 
@@ -158,30 +156,32 @@ def test_what_is_sent_leaves_by_the_loopback_alone(memory):
     assert len(bound) > 1
 
 
-def test_an_interface_that_is_not_there_is_said(memory):
-    with Process("-m", "jtqd.daemon.ros2.process", _request(memory, interface="eth77")) as publisher:
-        where = f"domain {own_domain()}, interface eth77"
-        assert publisher.first() == {"failed": f"{where}: there is no such network interface"}
-        assert publisher.process.wait(5) == 1
+FORBIDDEN = (
+    "import socket, sys\n"
+    "def refused(*_): raise OSError(97, 'Address family not supported by protocol')\n"
+    "socket.if_nameindex = refused\n"
+    "from jtqd.daemon.ros2.process import begin\n"
+    "from jtqd.daemon.shared.processes import run_side_process\n"
+    "sys.exit(run_side_process([sys.argv[1]], 'publishing', begin))"
+)
+"""As a unit that forbids network sockets."""
 
 
-def test_a_unit_that_forbids_network_sockets_is_said(memory):
-    forbidden = (
-        "import socket, sys\n"
-        "def refused(*_): raise OSError(97, 'Address family not supported by protocol')\n"
-        "socket.if_nameindex = refused\n"
-        "from jtqd.daemon.ros2.process import begin\n"
-        "from jtqd.daemon.shared.processes import run_side_process\n"
-        "sys.exit(run_side_process([sys.argv[1]], 'publishing', begin))"
-    )
-    with Process("-c", forbidden, _request(memory)) as publisher:
-        assert "no network sockets: Address family not supported by protocol" in publisher.first()["failed"]
-        assert publisher.process.wait(5) == 1
-
-
-def test_without_a_loop_it_says_so(memory):
-    with Process("-m", "jtqd.daemon.ros2.process", _request(memory, ring="/none")) as publisher:
-        assert "/none" in publisher.first()["failed"]
+@pytest.mark.parametrize(
+    ("program", "changes", "failed"),
+    [
+        (
+            ("-m", "jtqd.daemon.ros2.process"),
+            {"interface": "eth77"},
+            "eth77: there is no such network interface",
+        ),
+        (("-m", "jtqd.daemon.ros2.process"), {"ring": "/none"}, "/none"),
+        (("-c", FORBIDDEN), {}, "no network sockets: Address family not supported by protocol"),
+    ],
+)
+def test_one_that_cannot_begin_answers_why(memory, program, changes, failed):
+    with Process(*program, _request(memory, **changes)) as publisher:
+        assert failed in publisher.first()["failed"]
         assert publisher.process.wait(5) == 1
 
 
@@ -192,61 +192,31 @@ def _request(memory, **changes):
 # ---- the supervisor's side ----
 
 
-class Kept:
-    """A Ros2Publisher with real children on memory without a loop."""
-
-    def __init__(self, directory, capfd, **settings):
-        Memory(directory)
-        self.children, self.capfd, self.said = [], capfd, ""
-        self.keeper = Ros2Publisher(self._child, Ros2Settings(domain_id=own_domain(), **settings))
-        self.keeper.start(load_config(None), directory, "vcan7")
-
-    def _child(self, module, arguments, name):
-        self.children.append(Child(module, arguments, name=name))
-        return self.children[-1]
-
-    def until(self, pattern, timeout_s=15.0):
-        end = time.monotonic() + timeout_s
-        while not re.search(pattern, self.said):
-            assert time.monotonic() < end, self.said
-            self.keeper.watch()
-            self.said += self.capfd.readouterr().err
-            time.sleep(0.02)
-        self.said = ""
-
-    def end(self):
-        for child in self.children:
-            child.end()
+def publisher(directory, capfd, **settings):
+    settings = Ros2Settings(domain_id=own_domain(), **settings)
+    return Kept(directory, capfd, lambda child: Ros2Publisher(child, settings))
 
 
 @pytest.fixture
 def kept(tmp_path, capfd):
-    made = Kept(tmp_path, capfd)
+    made = publisher(tmp_path, capfd)
     yield made
     made.end()
 
 
 def test_one_that_is_killed_is_told_and_started_again(kept):
     kept.until(r"jtqd: ROS 2 publisher: /joint_states, .* at 100 Hz, domain \d+, interface lo\n")
-    os.kill(kept.keeper.pid, signal.SIGKILL)
+    kept.kill()
     kept.until("jtqd: the ROS 2 publisher ended with exit status -9; restarted, the loop continues\n")
     kept.until("jtqd: ROS 2 publisher: /joint_states")
 
 
-def test_one_that_cannot_begin_is_told_once(tmp_path, capfd):
-    made = Kept(tmp_path, capfd, interface="eth77")
+def test_one_that_cannot_begin_is_reported_once_and_an_interface_that_others_reach(tmp_path, capfd):
+    made = publisher(tmp_path, capfd, interface="eth77")
+    made.until("jtqd: ROS 2: torques, positions and diagnostics go to every host that is reached by eth77\n")
     made.until("no ROS 2 publisher: domain .*eth77: there is no such network interface; the loop continues\n")
     made.keeper.watch()
     assert len(made.children) == 1
-    made.end()
-
-
-def test_an_interface_that_others_reach_is_said(tmp_path, capfd):
-    made = Kept(tmp_path, capfd, interface="eth77")
-    said = capfd.readouterr().err
-    assert (
-        "jtqd: ROS 2: torques, positions and diagnostics go to every host that is reached by eth77\n" in said
-    )
     made.end()
 
 
