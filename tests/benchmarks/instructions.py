@@ -84,12 +84,12 @@ def cycles() -> None:
     from jtqd.daemon.loop import process as loop
     from jtqd.daemon.shared.snapshot import SnapshotReader
     from jtqd.drivers.frame_socket import open_frame_socket
-    from jtqd.estimator import onnx_graph
+    from jtqd.estimator import network
     from jtqd.estimator.status import PUBLISHED
     from tests.benchmarks.fixture import Fixture
     from tests.benchmarks.host import Cpus, traffic
 
-    onnx_graph._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
+    network._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
     with tempfile.TemporaryDirectory() as name:
         directory = Path(name)
         original = shipped("bench.yaml")
