@@ -135,18 +135,15 @@ def _usage(options: argparse.Namespace) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     from jtqd.models.files import shipped
-    from jtqd.sim_can.plant_source import load_any_plant
+    from jtqd.sim_can.plant_source import load_any_plant, sources_of
 
     if options.cost:
         return _print_cost(options, load_any_plant(options.plant or shipped(PLANT)))
     child = EdsChild(options.drives)  # it reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
-            sources: list[Source] = [_played(options)]
-            profile = "rest"
+            sources, profile = [_played(options)], "rest"
         else:
-            from jtqd.sim_can.plant_source import sources_of
-
             parameters = load_any_plant(options.plant or shipped(PLANT))
             sources = sources_of(parameters, options.seed, options.drives)
             profile = options.profile or parameters.profile
@@ -154,23 +151,19 @@ def _run(options: argparse.Namespace) -> int:
         child.stop()
         raise
     child.take()
-    return _serve(options, sources, profile)
+    from jtqd.sim_can.bench import Bench, run
+
+    bench = Bench(sources[0], profile, sources[1:], with_sensor=not options.no_sensor)
+    return run(options.bus, bench, options.bitrate, options.duration)
 
 
 def _played(options: argparse.Namespace) -> Source:
     from jtqd.sim_can.play import columns_beside, open_play
 
     source = open_play(options.play, options.columns or columns_beside(options.play), options.joints)
-    for note in getattr(source, "notes", ()):
+    for note in source.notes:
         print(f"jtq sim: {note}", file=sys.stderr)
     return source
-
-
-def _serve(options: argparse.Namespace, sources: list[Source], profile: str) -> int:
-    from jtqd.sim_can.bench import Bench, run
-
-    bench = Bench(sources[0], profile, sources[1:], with_sensor=not options.no_sensor)
-    return run(options.bus, bench, options.bitrate, options.duration)
 
 
 def _print_cost(options: argparse.Namespace, parameters: AnyPlant) -> int:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
+from functools import partial
 from typing import Final
 
 from jtqd.drivers.drive import TEMPERATURE_C_PER_UNIT
@@ -29,17 +30,6 @@ QUICK_STOP: Final = 5
 FAULT_REACTION: Final = 6
 FAULT: Final = 7
 
-NAMES: Final = (
-    "not ready to switch on",
-    "switch on disabled",
-    "ready to switch on",
-    "switched on",
-    "operation enabled",
-    "quick stop active",
-    "fault reaction active",
-    "fault",
-)
-
 VOLTAGE: Final = 0x0010  # bit 4, voltage enabled
 REMOTE: Final = 0x0200  # bit 9, the controlword is followed
 FOLLOWS: Final = 0x1000  # bit 12 in csv and cst: the drive follows the target
@@ -51,33 +41,21 @@ STATUSWORDS: Final = tuple(
 
 FAULT_RESET: Final = 0x80
 
-# (mask, value) of the commands, bit 7 = 0 in all of them
-_DISABLE_VOLTAGE: Final = (0x82, 0x00)
-_QUICK_STOP: Final = (0x86, 0x02)
-_SHUTDOWN: Final = (0x87, 0x06)
-_SWITCH_ON: Final = (0x8F, 0x07)
-_ENABLE: Final = (0x8F, 0x0F)
-
-# command -> state before -> state after
+_ON: Final = (READY, SWITCHED_ON, OPERATION_ENABLED)
 _TRANSITIONS: Final = (
+    (0x82, 0x00, dict.fromkeys((*_ON, QUICK_STOP), SWITCH_ON_DISABLED)),  # disable voltage: 7 10 9 12
+    # quick stop: 7 10 11
+    (0x86, 0x02, dict.fromkeys(_ON, SWITCH_ON_DISABLED) | {OPERATION_ENABLED: QUICK_STOP}),
     (
-        _DISABLE_VOLTAGE,
-        dict.fromkeys((READY, SWITCHED_ON, OPERATION_ENABLED, QUICK_STOP), SWITCH_ON_DISABLED),
-    ),  # 7 10 9 12
-    (
-        _QUICK_STOP,
-        {
-            READY: SWITCH_ON_DISABLED,
-            SWITCHED_ON: SWITCH_ON_DISABLED,
-            OPERATION_ENABLED: QUICK_STOP,
-        },  # 7 10 11
-    ),
-    (_SHUTDOWN, {SWITCH_ON_DISABLED: READY, SWITCHED_ON: READY, OPERATION_ENABLED: READY}),  # 2 6 8
-    (_SWITCH_ON, {READY: SWITCHED_ON, OPERATION_ENABLED: SWITCHED_ON}),  # 3 5
-    # 3 and 4 in one: CiA 402 lets a drive go on by itself when "enable operation" comes in "ready to switch
-    # on"
-    (_ENABLE, {READY: OPERATION_ENABLED, SWITCHED_ON: OPERATION_ENABLED}),
+        0x87,
+        0x06,
+        dict.fromkeys((SWITCH_ON_DISABLED, SWITCHED_ON, OPERATION_ENABLED), READY),
+    ),  # shutdown: 2 6 8
+    (0x8F, 0x07, dict.fromkeys((READY, OPERATION_ENABLED), SWITCHED_ON)),  # switch on: 3 5
+    # enable operation: 4, and 3 and 4 in one: CiA 402 lets a drive go on by itself from "ready to switch on"
+    (0x8F, 0x0F, dict.fromkeys((READY, SWITCHED_ON), OPERATION_ENABLED)),
 )
+"""Command by mask and value of 6040h, bit 7 = 0 in all of them; state before -> state after."""
 
 
 class StateMachine:
@@ -108,7 +86,7 @@ class StateMachine:
                 self.state = SWITCH_ON_DISABLED
                 return True
             return False
-        for (mask, value), moves in _TRANSITIONS:
+        for mask, value, moves in _TRANSITIONS:
             if word & mask == value:
                 self.state = moves.get(self.state, self.state)
                 break
@@ -173,7 +151,7 @@ class DriveNode(CanopenNode):
         self.getters = {
             (0x3001, 0): DriveValue(signals, "temperature_c", 1.0 / TEMPERATURE_C_PER_UNIT),
             (0x603F, 0): lambda: self._error_code,
-            (0x6041, 0): self._statusword,
+            (0x6041, 0): lambda: self.machine.statusword,
             (0x6061, 0): lambda: self._mode,
             (0x6064, 0): DriveValue(signals, "motor_position_rad", self._motor_units),
             (0x606C, 0): DriveValue(signals, "motor_velocity_rad_s", self._motor_units),
@@ -213,11 +191,6 @@ class DriveNode(CanopenNode):
         # 6078h is scaled by 6075h as it reads, to the mA
         self._current_units = 1000.0 / (self.store.number(0x6075) * 1e-3)
 
-    # Process objects ----------------------------------------------------------------------------------------
-
-    def _statusword(self) -> int:
-        return self.machine.statusword
-
     # Commands -----------------------------------------------------------------------------------------------
 
     def _controlword(self, word: int) -> None:
@@ -234,16 +207,18 @@ class DriveNode(CanopenNode):
         self._ran = False
 
     def _interpolation_value(self, value: int) -> None:
-        self._interpolate(value, self.store.number(0x60C2, 2))
+        self._interpolate(value=value)
 
     def _interpolation_index(self, index: int) -> None:
         low, high = _INTERPOLATION_UNITS
         if not low <= index <= high:
             raise SdoAbort(VALUE_RANGE)
-        self._interpolate(self.store.number(0x60C2, 1), index)
+        self._interpolate(index=index)
 
-    def _interpolate(self, value: int, index: int) -> None:
-        """Apply 60C2h: value * 10^index seconds from one target velocity to the next."""
+    def _interpolate(self, value: int | None = None, index: int | None = None) -> None:
+        """Apply 60C2h: value * 10^index seconds from one target velocity to the next; None: as it is stored."""
+        value = self.store.number(0x60C2, 1) if value is None else value
+        index = self.store.number(0x60C2, 2) if index is None else index
         self._targets_come_every(value / 10**-index)
 
     def _targets_come_every(self, period_s: float) -> None:
@@ -260,7 +235,7 @@ class DriveNode(CanopenNode):
         """End the built-in motion of this drive."""
         if not self.commanded:
             self.commanded = True
-            self._interpolate(self.store.number(0x60C2, 1), self.store.number(0x60C2, 2))
+            self._interpolate()
             self.machine.release()
             self._mode = 0
 
@@ -314,10 +289,8 @@ class DriveNode(CanopenNode):
         halted = bool(self.store.number(0x6040) & HALT)
         if self._mode == VELOCITY:
             return VELOCITY, 0.0 if halted else self.store.number(0x60FF) / self._motor_units
-        if self._mode == CURRENT:
-            return CURRENT, 0.0 if halted else self.store.number(
-                0x6071
-            ) * self._ratings.rated_current_a / 1000.0
+        if self._mode == CURRENT and not halted:
+            return CURRENT, self.store.number(0x6071) * self._ratings.rated_current_a / 1000.0
         return CURRENT, 0.0
 
     # Once per SYNC ------------------------------------------------------------------------------------------
@@ -357,7 +330,7 @@ class DriveNode(CanopenNode):
         self._ran = False
         self._mode = 0
         self._error_code = 0
-        self._interpolate(self.store.number(0x60C2, 1), self.store.number(0x60C2, 2))
+        self._interpolate()
         self._send_command()
 
 
@@ -387,8 +360,8 @@ class SensorNode(CanopenNode):
             self.getters[0x7130, number] = ChannelValue(channel, 16)
             # the second channel is read in 16 bits (two digits), so its status is that of the 16-bit value
             self.getters[0x6150, number] = ChannelValue(channel, 32 if number == 1 else 16, status=True)
-            self.handlers[0x6125, number] = _autozero(channel)
-            self.handlers[0x6132, number] = _decimals(channel)
+            self.handlers[0x6125, number] = partial(self._autozero, channel)
+            self.handlers[0x6132, number] = partial(self._decimals, channel)
         self.connect()
 
     def on_reset(self) -> None:
@@ -397,20 +370,14 @@ class SensorNode(CanopenNode):
             channel.zero_nm = 0.0
             channel.set_decimals(self.store.number(0x6132, number))
 
-
-def _autozero(channel: Channel) -> Callable[[int], None]:
-    def handler(value: int) -> None:
+    @staticmethod
+    def _autozero(channel: Channel, value: int) -> None:
         if value != AUTOZERO:
             raise SdoAbort(VALUE_RANGE)
         channel.autozero()
 
-    return handler
-
-
-def _decimals(channel: Channel) -> Callable[[int], None]:
-    def handler(value: int) -> None:
+    @staticmethod
+    def _decimals(channel: Channel, value: int) -> None:
         if value > MAX_DECIMALS:
             raise SdoAbort(VALUE_RANGE)
         channel.set_decimals(value)
-
-    return handler

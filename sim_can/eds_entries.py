@@ -1,7 +1,7 @@
-"""Object dictionary entries of the bench's nodes from their EDS files, read in a child process.
+"""Object dictionary entries of the bench's nodes from their EDS files.
 
-canopen's EDS parser takes 20 MB, which the bench would keep for good. A child (`python -m jtqd.sim_can.eds_entries`) reads
-the files and prints the entries as JSON while this process loads everything else.
+canopen's EDS parser takes 20 MB, which the bench would keep for good. A child (`python -m jtqd.sim_can.eds_entries DRIVES`)
+reads the files and prints the entries as JSON while this process loads everything else.
 """
 
 import json
@@ -36,10 +36,7 @@ def entries_of(node: int, file: str) -> list[Entry]:
 
 
 class EdsChild:
-    """Child process that reads the EDS files; start it early, `take` its result before the nodes are made.
-
-    drives: number of drives on the bench.
-    """
+    """Child process that reads the EDS files; start it early, `take` its result before the nodes are made."""
 
     def __init__(self, drives: int = 2) -> None:
         self._files = files_of(drives)

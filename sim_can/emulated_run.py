@@ -91,17 +91,15 @@ def emulate(
     """Run both joints from rest for duration_s; return what was measured every period_s, and the true torques beside it.
 
     Args:
-        plant: the bench. commands: of joint 1 and joint 2; targets are evaluated once per period, at its
-        beginning.
+        commands: of joint 1 and joint 2; targets are evaluated once per period, at its beginning.
         seed: of the measurement noise and of the days; the same arguments give the same table bit by bit.
-        day: number of the day of this seed (0, 1, 2, ...; each has noise of its own), whose values lie within
-        the plant's `run_to_run`; or the values themselves; None: the nominal day, without any drift.
+        day: number of the day of this seed (0, 1, 2, ...; each has noise of its own), whose values lie within the plant's
+            `run_to_run`; or the values themselves; None: the nominal day, without any drift.
         pushes: on the links between the joints, at least one period apart; each lasts until the next.
 
     Returns:
-        A table with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity is None
-        (a drive does not measure it), torque_nm is the one sensor's in both joints. The true torques are those at
-        the same times.
+        A table with joints 1 and 2, n = round(duration_s / period_s) rows from time 0; link_velocity is None (a drive does
+        not measure it), torque_nm is the one sensor's in both joints; and the true torques at the same times.
 
     Raises:
         ValueError: duration or period not positive and finite; pushes on joints with effects.
@@ -115,16 +113,12 @@ def emulate(
     else:
         source = PlantSource(plant, seed)
         source.begin_day(day or Day())
-    rows = np.empty((count, 2 * _SIGNALS + 1))
-    truth = np.empty((count, 2))
+    rows, truth = np.empty((count, 2 * _SIGNALS + 1)), np.empty((count, 2))
     # velocity targets are joint side here, motor side in the drives
-    scale = [
-        drive.gear_ratio if c.mode == VELOCITY else 1.0
-        for drive, c in zip(source.ratings, commands, strict=True)
-    ]
+    ratios = [rating.gear_ratio for rating in source.ratings]
+    scales = [ratio if c.mode == VELOCITY else 1.0 for ratio, c in zip(ratios, commands, strict=True)]
     one, two = source.drives
     channel = source.channels[0]
-    (mode_1, target_1), (mode_2, target_2) = commands
     pushed = {math.floor(each.time_s / period_s): each for each in pushes}
     if pushes and isinstance(source.plant, EffectPlant):
         raise ValueError("found pushes on joints with effects, expected none")
@@ -145,17 +139,16 @@ def emulate(
         )
         truth[k] = source.plant.joint_torques()
         time_s = k * period_s
-        source.command(0, mode_1, scale[0] * target_1(time_s))
-        source.command(1, mode_2, scale[1] * target_2(time_s))
+        for drive, (command, scale) in enumerate(zip(commands, scales, strict=True)):
+            source.command(drive, command.mode, scale * command.target(time_s))
         if k in pushed:
             source.plant.push(pushed[k].torque_nm, pushed[k].time_s - time_s)
         source.advance(period_s)
     torque = np.round(rows[:, -1] / SENSOR_NM_PER_UNIT) * SENSOR_NM_PER_UNIT
+    halves = rows[:, :_SIGNALS], rows[:, _SIGNALS : 2 * _SIGNALS]
     joints = {
-        number: _columns(
-            rows[:, _SIGNALS * (number - 1) : _SIGNALS * number], torque, source.ratings[number - 1]
-        )
-        for number in (1, 2)
+        number: _columns(half, torque, rating)
+        for number, half, rating in zip((1, 2), halves, source.ratings, strict=True)
     }
     time: FloatArray = np.arange(count, dtype=np.float64) * period_s
     return EmulatedRun(RunTable(time_s=time, joints=joints), truth)
@@ -167,15 +160,7 @@ def _columns(signals: FloatArray, torque: FloatArray, ratings: DriveRatings) -> 
     link = 2.0 * math.pi / ratings.link_counts_per_rev
     current = ratings.rated_current_a / 1000.0
     units = (current, motor, motor, link, TEMPERATURE_C_PER_UNIT)
-    i, motor_position, motor_velocity, link_position, temperature = (
+    i, motor_rad, motor_rad_s, link_rad, celsius = (
         np.round(signals[:, k] / unit) * unit for k, unit in enumerate(units)
     )
-    return JointColumns(
-        current_a=i,
-        motor_position_rad=motor_position,
-        motor_velocity_rad_s=motor_velocity,
-        link_position_rad=link_position,
-        link_velocity_rad_s=None,
-        torque_nm=torque,
-        temperature_c=temperature,
-    )
+    return JointColumns(i, motor_rad, motor_rad_s, link_rad, None, torque, celsius)

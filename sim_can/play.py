@@ -34,7 +34,9 @@ COLUMN_MAP_NAME = "columns.yaml"
 class PlaySource:
     """`Source` of two recorded joints, each with a torque sensor channel of its own.
 
-    `notes`: remarks of the run's reader on the joints that are played.
+    Attributes:
+        notes: remarks of the run's reader on the joints that are played.
+        row: of the run that the signals show, from 0.
     """
 
     def __init__(
@@ -43,53 +45,31 @@ class PlaySource:
         time_s = run.table.time_s
         unplayed = tuple(f"j{number}." for number in run.table.joints if number not in joints)
         self.notes = tuple(note for note in run.notes if not note.startswith(unplayed))
-        self._ratings = ratings
+        self.ratings: Sequence[DriveRatings] = ratings
         self._rows = _rows(run, joints, ratings)
         # Row k is the nearest one from _change[k-1] on; the last entry is the end of the run.
         middles = 0.5 * (time_s[1:] + time_s[:-1]) - time_s[0]
         half_last_step = 0.5 * float(time_s[-1] - time_s[-2])
         self._change = [*middles.tolist(), float(time_s[-1] - time_s[0]) + half_last_step]
         self._time_s = 0.0
-        self._row = 0
-        self._drives = (DriveSignals(), DriveSignals())
-        self._channels = (ChannelSignal(), ChannelSignal())
-        for drive in self._drives:
+        self.drives: Sequence[DriveSignals] = (DriveSignals(), DriveSignals())
+        self.channels: Sequence[ChannelSignal] = (ChannelSignal(), ChannelSignal())
+        for drive, channel, joint in zip(self.drives, self.channels, joints, strict=True):
             drive.enabled = True
-        for channel, joint in zip(self._channels, joints, strict=True):
             channel.valid = run.table.joints[joint].torque_nm is not None
         self._show(0)
-
-    @property
-    def ratings(self) -> Sequence[DriveRatings]:
-        """Scaling of the two played drives."""
-        return self._ratings
-
-    @property
-    def drives(self) -> Sequence[DriveSignals]:
-        """The two drives; the same objects every time."""
-        return self._drives
-
-    @property
-    def channels(self) -> Sequence[ChannelSignal]:
-        """The two torque channels; the same objects every time. A dead or missing channel is never valid."""
-        return self._channels
-
-    @property
-    def row(self) -> int:
-        """Row of the run that the signals show, from 0."""
-        return self._row
 
     def advance(self, dt_s: float) -> bool:
         """Go on by dt_s >= 0 [s]; False when the run is over (signals then stay). Raises ValueError."""
         if not 0.0 <= dt_s < math.inf:
             raise ValueError(f"play: found a time step of {dt_s} s, expected a finite one >= 0")
         self._time_s += dt_s
-        time_s, row, change = self._time_s, self._row, self._change
+        time_s, row, change = self._time_s, self.row, self._change
         while time_s >= change[row]:
             if row + 1 == len(change):
                 return False
             row += 1
-        if row != self._row:
+        if row != self.row:
             self._show(row)
         return True
 
@@ -104,20 +84,12 @@ class PlaySource:
 
     def _show(self, row: int) -> None:
         """Set the signals to a row of the run."""
-        self._row = row
-        first, second = self._drives
-        (
-            first.current_a,
-            first.motor_position_rad,
-            first.motor_velocity_rad_s,
-            first.link_position_rad,
-            self._channels[0].torque_nm,
-            second.current_a,
-            second.motor_position_rad,
-            second.motor_velocity_rad_s,
-            second.link_position_rad,
-            self._channels[1].torque_nm,
-        ) = self._rows[row]
+        self.row = row
+        values = iter(self._rows[row])
+        for drive, channel in zip(self.drives, self.channels, strict=True):
+            drive.current_a, drive.motor_position_rad = next(values), next(values)
+            drive.motor_velocity_rad_s, drive.link_position_rad = next(values), next(values)
+            channel.torque_nm = next(values)
 
 
 def columns_beside(run_path: Path | str) -> Path | None:
@@ -130,49 +102,30 @@ def open_play(
     run_path: Path | str,
     columns_path: Path | str | None = None,
     joints: tuple[int, int] | None = None,
-    joint_files: tuple[Path, Path] | None = None,
 ) -> PlaySource:
     """Play two joints of a run as drives 0 and 1 of the bench.
 
     Without `joints`: the two for which the column map names a joint file, else 1 and 2. The drives' ratings
-    come from `joint_files`, else from the column map's `jN.joint_file`, else from the bench's nominal joints.
+    come from the column map's `jN.joint_file`, else from the bench's nominal joints.
     Raises ConfigError: run file, column map or joint file cannot be used.
     """
+    columns = ColumnMap.load(Path(columns_path)) if columns_path is not None else None
+    named = columns.joint_files if columns is not None else {}
+    joints = joints or ((min(named), max(named)) if len(named) == 2 else (1, 2))
+    if len(joints) != 2 or joints[0] == joints[1]:
+        raise ConfigError(f"{run_path}: found joints {joints}, expected two different joints of the run")
     try:
-        return _open(run_path, columns_path, joints, joint_files)
+        run = read_run(run_path, columns)
+        for joint in joints:
+            if joint not in run.table.joints:
+                present = ", ".join(str(number) for number in sorted(run.table.joints))
+                raise ConfigError(f"{run_path}: found no joint {joint}, expected one of {present}")
+        shipped_files = shipped("joint1.yaml"), shipped("joint2.yaml")
+        files = [named.get(k, file) for k, file in zip(joints, shipped_files, strict=True)]
+        first, second = (_ratings(load_joint(path)) for path in files)
+        return PlaySource(run, joints, (first, second))
     except RunError as error:
         raise ConfigError(str(error)) from None
-
-
-def _open(
-    run_path: Path | str,
-    columns_path: Path | str | None,
-    joints: tuple[int, int] | None,
-    joint_files: tuple[Path, Path] | None,
-) -> PlaySource:
-    columns = ColumnMap.load(Path(columns_path)) if columns_path is not None else None
-    joints = joints or _joints_of(columns)
-    if len(joints) != 2 or joints[0] == joints[1]:
-        raise RunError(f"{run_path}: found joints {joints}, expected two different joints of the run")
-    run = read_run(run_path, columns)
-    for joint in joints:
-        if joint not in run.table.joints:
-            present = ", ".join(str(number) for number in sorted(run.table.joints))
-            raise RunError(f"{run_path}: found no joint {joint}, expected one of {present}")
-    files = joint_files or _files_of(columns, joints)
-    first, second = (_ratings(load_joint(path)) for path in files)
-    return PlaySource(run, joints, (first, second))
-
-
-def _joints_of(columns: ColumnMap | None) -> tuple[int, int]:
-    named = sorted(columns.joint_files) if columns is not None else []
-    return (named[0], named[1]) if len(named) == 2 else (1, 2)
-
-
-def _files_of(columns: ColumnMap | None, joints: tuple[int, int]) -> tuple[Path, Path]:
-    given = columns.joint_files if columns is not None else {}
-    first, second = joints
-    return given.get(first, shipped("joint1.yaml")), given.get(second, shipped("joint2.yaml"))
 
 
 def _ratings(joint: Joint) -> DriveRatings:
