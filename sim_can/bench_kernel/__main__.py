@@ -58,7 +58,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _build(options: argparse.Namespace) -> int:
     there = options.unless_vcan and build.ensure_vcan()
-    build.require(build.TESTS if there else (*build.TESTS, *build.needs()))  # asked for once
+    build.require(build.TESTS if there else build.TESTS | build.needs())  # asked for once
     if there:
         print("bench kernel: not needed, this host has vcan0", file=sys.stderr)
         return 0

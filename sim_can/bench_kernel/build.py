@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple
+from typing import IO
 
 # Debian packages
 
@@ -24,32 +24,27 @@ SOURCE_PACKAGE = "linux-source-6.1"
 SOURCE_ARCHIVE = f"/usr/src/{SOURCE_PACKAGE}.tar.xz"
 
 
-class Requirement(NamedTuple):
-    """One Debian package and the program (bare name) or file (absolute path) that shows it is there."""
-
-    package: str
-    proof: str
-
-
-BUILD = (
-    Requirement(SOURCE_PACKAGE, SOURCE_ARCHIVE),
-    Requirement("gcc", "gcc"),
-    Requirement("libc6-dev", "/usr/include/stdio.h"),
-    Requirement("make", "make"),
-    Requirement("flex", "flex"),
-    Requirement("bison", "bison"),
-    Requirement("bc", "bc"),
-    Requirement("libelf-dev", "/usr/include/libelf.h"),
-    Requirement("xz-utils", "xz"),
-)
-GUEST = (Requirement("iproute2", "ip"),)
-TESTS = (Requirement("can-utils", "candump"),)
-SYSTEMD = (
-    Requirement("systemd", "/lib/systemd/systemd"),
-    Requirement("udev", "/lib/systemd/systemd-udevd"),
-    Requirement("dbus", "/usr/bin/dbus-daemon"),
-    Requirement("python3-venv", "/usr/bin/python3"),
-)
+Requirements = dict[str, str]
+"""Debian packages, each with the program (bare name) or file (absolute path) that shows it is there."""
+BUILD: Requirements = {
+    SOURCE_PACKAGE: SOURCE_ARCHIVE,
+    "gcc": "gcc",
+    "libc6-dev": "/usr/include/stdio.h",
+    "make": "make",
+    "flex": "flex",
+    "bison": "bison",
+    "bc": "bc",
+    "libelf-dev": "/usr/include/libelf.h",
+    "xz-utils": "xz",
+}
+GUEST: Requirements = {"iproute2": "ip"}
+TESTS: Requirements = {"can-utils": "candump"}
+SYSTEMD: Requirements = {
+    "systemd": "/lib/systemd/systemd",
+    "udev": "/lib/systemd/systemd-udevd",
+    "dbus": "/usr/bin/dbus-daemon",
+    "python3-venv": "/usr/bin/python3",
+}
 
 
 class MissingPackagesError(RuntimeError):
@@ -57,10 +52,9 @@ class MissingPackagesError(RuntimeError):
 
     def __init__(self, packages: Iterable[str]) -> None:
         self.packages = tuple(packages)
-        super().__init__(
-            "the bench kernel needs Debian packages that are not installed: "
-            f"{' '.join(self.packages)}; install them with: sudo apt-get install {' '.join(self.packages)}"
-        )
+        names = " ".join(self.packages)
+        need = f"the bench kernel needs Debian packages that are not installed: {names}"
+        super().__init__(f"{need}; install them with: sudo apt-get install {names}")
 
 
 def find_program(name: str) -> str | None:
@@ -69,26 +63,22 @@ def find_program(name: str) -> str | None:
 
 
 def missing(
-    requirements: Iterable[Requirement],
+    requirements: Requirements,
     which: Callable[[str], str | None] = find_program,
     exists: Callable[[str], bool] = os.path.exists,
 ) -> list[str]:
     """Return names of the packages whose program or file is not there, in the order of `requirements`."""
-    return [
-        need.package
-        for need in requirements
-        if not (exists(need.proof) if need.proof.startswith("/") else which(need.proof))
-    ]
+    there = {name: exists(proof) if proof[0] == "/" else which(proof) for name, proof in requirements.items()}
+    return [name for name, found in there.items() if not found]
 
 
-def require(requirements: Iterable[Requirement], *, install: bool = True) -> None:
+def require(requirements: Requirements, *, install: bool = True) -> None:
     """Make sure that all packages are there; as root, install what is not.
 
     Raises MissingPackagesError when packages are missing and this user may not install them (or `install` is
     false), RuntimeError when apt-get fails.
     """
-    wanted = tuple(requirements)
-    lacking = missing(wanted)
+    lacking = missing(requirements)
     if not lacking:
         return
     if not install or os.geteuid() != 0 or find_program("apt-get") is None:
@@ -97,8 +87,7 @@ def require(requirements: Iterable[Requirement], *, install: bool = True) -> Non
     _apt_get("update")
     # Recommended packages are left out: those of linux-source alone are several hundred megabytes.
     _apt_get("install", "-y", "--no-install-recommends", *lacking)
-    still = missing(wanted)
-    if still:
+    if still := missing(requirements):
         raise MissingPackagesError(still)
 
 
@@ -261,7 +250,7 @@ def find() -> Path | None:
     return Path(override)
 
 
-def needs() -> tuple[Requirement, ...]:
+def needs() -> Requirements:
     """Packages that a guest needs, and where no kernel is ready, those that it is built with.
 
     Raises BuildError when it has to be built and is not built for this processor.
@@ -270,7 +259,7 @@ def needs() -> tuple[Requirement, ...]:
         return GUEST
     if platform.machine() != "x86_64":
         raise BuildError(f"the bench kernel is built for x86_64 only, this machine is {platform.machine()}")
-    return (*BUILD, *GUEST)
+    return BUILD | GUEST
 
 
 def ensure(*, install: bool = True) -> Path:
@@ -356,27 +345,20 @@ def _build(version: str, root: Path) -> Path:
 
 def _unpack(work: Path, version: str, out: IO[str]) -> Path:
     _say(f"unpacking {SOURCE_ARCHIVE} ({version})")
-    subprocess.run(
-        ["tar", "-xJf", SOURCE_ARCHIVE, "-C", str(work)],
-        stdout=out,
-        stderr=subprocess.STDOUT,
-        check=True,
-    )
+    _logged(["tar", "-xJf", SOURCE_ARCHIVE, "-C", str(work)], out)
     return work / SOURCE_PACKAGE
+
+
+def _logged(command: list[str], out: IO[str], cwd: Path | None = None) -> None:
+    env = _clean_environment()
+    subprocess.run(command, cwd=cwd, env=env, stdout=out, stderr=subprocess.STDOUT, check=True)
 
 
 def _configure(tree: Path, config: bytes, out: IO[str]) -> None:
     _say("configuring")
     fragment = tree.parent / "fragment.config"
     fragment.write_bytes(config)
-    subprocess.run(
-        ["make", *_MAKE_ARCH, "allnoconfig", f"KCONFIG_ALLCONFIG={fragment}"],
-        cwd=tree,
-        env=_clean_environment(),
-        stdout=out,
-        stderr=subprocess.STDOUT,
-        check=True,
-    )
+    _logged(["make", *_MAKE_ARCH, "allnoconfig", f"KCONFIG_ALLCONFIG={fragment}"], out, tree)
     arrived = set(wanted_options((tree / ".config").read_text()))
     refused = [option for option in wanted_options(config.decode()) if option not in arrived]
     if refused:

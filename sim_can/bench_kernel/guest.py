@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Self
+from typing import IO, Any, Self
 
 from jtqd.sim_can.bench_kernel import build
 
@@ -52,22 +52,16 @@ class Result:
 def run(
     command: Sequence[str],
     *,
-    time_travel: bool = False,
     timeout_s: float | None = None,
-    out_dir: str | os.PathLike[str] | None = None,
-    env: Mapping[str, str] | None = None,
-    memory: str = "2G",
     sinks: tuple[IO[bytes], IO[bytes]] | None = None,
-    systemd: bool = False,
+    **options: Any,
 ) -> Result:
-    """Run `command` in a guest of its own and return its result; arguments as in Guest.
+    """Run `command` in a guest of its own and return its result; `options` as in Guest.
 
     `sinks` receives standard output and standard error while the command runs.
     Raises GuestTimeoutError, GuestError, build.BuildError, build.MissingPackagesError.
     """
-    with Guest(
-        command, time_travel=time_travel, out_dir=out_dir, env=env, memory=memory, systemd=systemd
-    ) as guest:
+    with Guest(command, **options) as guest:
         return guest.wait(timeout_s, sinks)
 
 
@@ -107,17 +101,11 @@ class Guest:
             (self.job / "out").write_text("" if out_dir is None else f"{_made(out_dir)}\n")
             (self.job / "uml").mkdir()
             self._console = open(self.job / "console.log", "wb")  # noqa: SIM115 (closed with the guest)
+            arguments = kernel_arguments(self.job, memory, vcans, time_travel=time_travel, systemd=systemd)
+            ram = memory_directory(memory, self.job)
             self._process = subprocess.Popen(
-                [
-                    *_die_with_parent(),
-                    str(kernel),
-                    *kernel_arguments(self.job, memory, vcans, time_travel=time_travel, systemd=systemd),
-                ],
-                env={
-                    "PATH": "/usr/bin:/bin",
-                    "HOME": str(self.job),
-                    "TMPDIR": memory_directory(memory, self.job),
-                },
+                [*_die_with_parent(), str(kernel), *arguments],
+                env={"PATH": "/usr/bin:/bin", "HOME": str(self.job), "TMPDIR": ram},
                 stdin=subprocess.DEVNULL,
                 stdout=self._console,
                 stderr=subprocess.STDOUT,
@@ -243,12 +231,8 @@ def guest_environment(
 
 def command_script(command: Sequence[str], variables: Mapping[str, str], directory: str) -> str:
     """Shell script that sets the variables, enters the directory and becomes the command."""
-    exports = [
-        f"export {name}={shlex.quote(value)}" for name, value in variables.items() if _NAME.match(name)
-    ]
-    return "\n".join(
-        [*exports, f"cd {shlex.quote(directory)} || exit 125", f"exec {shlex.join(command)}", ""]
-    )
+    lines = [f"export {name}={shlex.quote(value)}" for name, value in variables.items() if _NAME.match(name)]
+    return "\n".join([*lines, f"cd {shlex.quote(directory)} || exit 125", f"exec {shlex.join(command)}", ""])
 
 
 def kernel_arguments(

@@ -244,10 +244,10 @@ def test_missing_packages_are_named_in_order():
 
 def test_require_names_the_packages_where_it_may_not_install(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 65534)
-    absent = build.Requirement("no-such-package", "/no/such/file")
+    absent = {"no-such-package": "/no/such/file"}
     with pytest.raises(build.MissingPackagesError, match="apt-get install no-such-package"):
-        build.require([absent, build.Requirement("dash", "sh")])
-    build.require([build.Requirement("dash", "sh")])
+        build.require(absent | {"dash": "sh"})
+    build.require({"dash": "sh"})
 
 
 def test_a_build_asks_once_for_all_that_it_and_the_tests_need(monkeypatch, capsys):
