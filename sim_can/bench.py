@@ -15,17 +15,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Protocol
 
 from jtqd.drivers.bus_socket import PREFIX, CanFilter, exact
-from jtqd.drivers.drive import drive_tpdo1, drive_tpdo2
+from jtqd.drivers.drive import drive_layout
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE, MAX_LENGTH
 from jtqd.drivers.frame_socket import BusDown, BusError, open_frame_socket
 from jtqd.drivers.hub import Hub
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
-from jtqd.drivers.pdo import SYNC_COB_ID, PdoMap
-from jtqd.drivers.sdo import REQUEST_ID
+from jtqd.drivers.pdo import SYNC_COB_ID, tpdo_parameters
+from jtqd.drivers.sdo import REQUEST_ID, Transfer
 from jtqd.drivers.sensor import sensor_tpdo1
 from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.devices import DEFAULT_INTERPOLATION_S, OPERATION_ENABLED, DriveNode, SensorNode
@@ -227,22 +226,6 @@ def _log(text: str) -> None:
     print(f"bench: {text}", file=sys.stderr, flush=True)
 
 
-class _Bus(Protocol):
-    """Bus as the loop uses it."""
-
-    def send(self, frame16: bytes) -> bool:
-        """Send a frame; False: the queue is full and the frame is lost."""
-
-    def serve(self, timeout_s: float) -> None:
-        """Wait up to timeout_s for frames, give them to the bench, send its answers."""
-
-    def linger(self, end_ns: int | None) -> None:
-        """Stay silent until no other member needs the bus, or until end_ns."""
-
-    def close(self) -> None:
-        """Leave the bus."""
-
-
 class _EmbeddedHub:
     """Unix bus whose hub is in this process; the bench is a local port of it."""
 
@@ -321,7 +304,7 @@ class _Socket:
             _log("the interface is down, waiting for it")
 
 
-def _open(bus: str, bitrate: int | None, bench: Bench) -> _Bus:
+def _open(bus: str, bitrate: int | None, bench: Bench) -> _Socket | _EmbeddedHub:
     """Open the bus; a unix bus without a hub gets one here."""
     if not bus.startswith(PREFIX):
         return _Socket(bus, bench)
@@ -346,7 +329,7 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
     before = {number: signal.signal(number, _stop) for number in (signal.SIGTERM, signal.SIGINT)}
     # the default slack of 50 us on every timeout is a frame on the wire at 1 Mbit/s
     ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
-    line: _Bus | None = None
+    line: _Socket | _EmbeddedHub | None = None
     try:
         line = _open(bus, bitrate, bench)
         gc.collect()
@@ -367,12 +350,12 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
     return 0
 
 
-def _tick(line: _Bus, bench: Bench) -> None:
+def _tick(line: _Socket | _EmbeddedHub, bench: Bench) -> None:
     for frame in bench.tick(time.monotonic_ns()):
         line.send(frame)
 
 
-def _loop(line: _Bus, bench: Bench, end_ns: int | None) -> None:
+def _loop(line: _Socket | _EmbeddedHub, bench: Bench, end_ns: int | None) -> None:
     """Serve frames as they come and timers when they are due; sleep in between."""
     while not bench.over:
         now_ns = time.monotonic_ns()
@@ -407,26 +390,20 @@ class Cost:
 
 def map_pdos(bench: Bench) -> None:
     """Write the PDO mapping that jtqd writes at boot by SDO, and start the nodes."""
-    maps = [(node, pdo) for node in (1, 2) for pdo in (drive_tpdo1(node), drive_tpdo2(node))]
-    for node, pdo in [*maps, (3, sensor_tpdo1(3))]:
-        number = (pdo.cob_id - 0x80) // 0x100 - 1
-        for index, subindex, value, size in _mapping_writes(0x1800 + number, pdo):
-            request = bytes([0x23 | (4 - size) << 2]) + index.to_bytes(2, "little") + bytes([subindex])
-            bench.on_frame(REQUEST_ID + node, request + value.to_bytes(4, "little"), 0, 0)
+    pdos = [(node, pdo) for node in (1, 2) for pdo in drive_layout(node)]
+    for node, pdo in (*pdos, (3, sensor_tpdo1(3))):
+        communication, mapping = tpdo_parameters(pdo.number)
+        for key, value, size in (
+            ((communication, 1), 0xC000_0000 | pdo.cob_id, 4),
+            ((mapping, 0), 0, 1),
+            *(((mapping, entry), word, 4) for entry, word in enumerate(pdo.words, 1)),
+            ((mapping, 0), len(pdo.words), 1),
+            ((communication, 2), pdo.transmission_type, 1),
+            ((communication, 1), 0x4000_0000 | pdo.cob_id, 4),
+        ):
+            request = Transfer(*key, value.to_bytes(size, "little")).request
+            bench.on_frame(REQUEST_ID + node, request, 0, 0)
     bench.on_frame(0x000, b"\x01\x00", 0, 0)
-
-
-def _mapping_writes(index: int, pdo: PdoMap) -> list[tuple[int, int, int, int]]:
-    """Return the SDO writes (index, subindex, value, size in bytes) that map the TPDO at `index`."""
-    entries = [(index + 0x200, entry, word, 4) for entry, word in enumerate(pdo.words, 1)]
-    return [
-        (index, 1, 0xC000_0000 | pdo.cob_id, 4),
-        (index + 0x200, 0, 0, 1),
-        *entries,
-        (index + 0x200, 0, len(pdo.words), 1),
-        (index, 2, pdo.transmission_type, 1),
-        (index, 1, 0x4000_0000 | pdo.cob_id, 4),
-    ]
 
 
 def measure(parameters: AnyPlant, cycles: int = 4000) -> Cost:
@@ -448,8 +425,7 @@ def measure(parameters: AnyPlant, cycles: int = 4000) -> Cost:
     reading = _median_us(lambda: source.advance(0.001), cycles)
     plant = source.plant
     stepping = _median_us(lambda: plant.step(0.001), cycles)
-    substeps = round(0.001 / plant.substep_s)
-    return Cost(stepping, reading, whole, substeps, cycles)
+    return Cost(stepping, reading, whole, round(0.001 / plant.substep_s), cycles)
 
 
 def _median_us(call: Callable[[], object], cycles: int) -> float:

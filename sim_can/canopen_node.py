@@ -8,46 +8,30 @@ foreign identifiers are ignored or answered as CiA 301 requires; nothing is rais
 
 from __future__ import annotations
 
-import struct
-from collections.abc import Callable, Mapping, Set
+from collections.abc import Callable
 from functools import partial
 
 from jtqd.drivers import nmt
-from jtqd.drivers.emcy import EMCY_BASE, ErrorHistory
+from jtqd.drivers.emcy import (
+    COMMUNICATION,
+    EMCY,
+    EMCY_BASE,
+    GENERIC,
+    HEARTBEAT_LOST,
+    NO_ERROR,
+    PDO_SHORT,
+    SYNC_LENGTH,
+    ErrorHistory,
+)
 from jtqd.drivers.frame import pack
 from jtqd.drivers.object_dictionary import ObjectStore, SdoServer
 from jtqd.drivers.pdo import LAST_SYNC_TYPE, PdoMap, PdoParameters
-from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, SdoAbort
+from jtqd.drivers.sdo import REQUEST_ID, RESPONSE_ID, SdoAbort, label
 from jtqd.sim_can.transmit import NEVER_NS, TransmitPdo
 
 _NS_PER_MS = 1_000_000
 
 Getter = Callable[[], int]
-
-
-def compile_tpdos(
-    store: ObjectStore,
-    pdos: PdoParameters,
-    getters: Mapping[tuple[int, int], Getter],
-    quiet: Set[tuple[int, int]] = frozenset(),
-) -> list[TransmitPdo]:
-    """Return all TPDOs that exist and map something; objects without a getter are read from the store.
-
-    quiet: objects whose change is no event; a TPDO that maps nothing else is sent by its event timer alone.
-    """
-
-    def getter(index: int, subindex: int) -> Getter:
-        return getters.get((index, subindex)) or (lambda: store.number(index, subindex))
-
-    compiled = []
-    for index in pdos.tpdo_indices:
-        pdo = pdos.active_map(index)
-        if pdo is not None:
-            sources = tuple(getter(mapped.index, mapped.subindex) for mapped in pdo.objects)
-            timed_only = all((mapped.index, mapped.subindex) in quiet for mapped in pdo.objects)
-            start, period_ms = store.number(index, 6), store.number(index, 5)
-            compiled.append(TransmitPdo(pdo, sources, start, period_ms, timed_only))
-    return compiled
 
 
 _CONSUMER = 0x1016
@@ -126,10 +110,7 @@ class HeartbeatConsumer:
         self.due_ns = min(self._due_ns.values(), default=NEVER_NS)
 
 
-_EMCY = struct.Struct("<HB5x")  # error code, error register, manufacturer's field
-ERROR_RESET = 0x0000
-GENERIC = 0x01  # bit 0 of 1001h is set with every error
-CURRENT, COMMUNICATION = 0x02, 0x10
+CURRENT = 0x02  # bit of 1001h
 
 
 class Emergency:
@@ -158,7 +139,7 @@ class Emergency:
     def gone(self, *codes: int) -> list[bytes]:
         """Remove errors; return EMCY 0000h with what is left in the register, if one of them was present."""
         over = [code for code in codes if self._present.pop(code, None) is not None]
-        return [self._message(ERROR_RESET)] if over else []
+        return [self._message(NO_ERROR)] if over else []
 
     def forget(self) -> None:
         """Remove all errors after an NMT reset, without an EMCY."""
@@ -170,12 +151,9 @@ class Emergency:
         for bits in self._present.values():
             register |= bits
         self._store.set_number(0x1001, 0, register)
-        return pack(EMCY_BASE + self._store.node_id, _EMCY.pack(code, register))
+        return pack(EMCY_BASE + self._store.node_id, EMCY.pack(code, register, b""))
 
 
-HEARTBEAT_LOST = 0x8130
-PDO_TOO_SHORT = 0x8210
-SYNC_LENGTH = 0x8240
 _VERIFY, _DOWNLOADED = 0x1020, 0x60
 
 Handler = Callable[[int], None]
@@ -214,20 +192,19 @@ class CanopenNode:
 
     def connect(self) -> None:
         """Tie getters and handlers to the object dictionary; called once by the device when all are there."""
-        for (index, subindex), getter in self.getters.items():
-            self.store.on_read(index, subindex, getter)
-        for (index, subindex), handler in self.handlers.items():
-            entry = self.store.entry(index, subindex)
-            layout = entry.layout
+        for key, getter in self.getters.items():
+            self.store.on_read(*key, getter)
+        for key, handler in self.handlers.items():
+            layout = self.store.entry(*key).layout
             if layout is None:
-                raise ValueError(f"{index:04X}h:{subindex} is not a number")
+                raise ValueError(f"{label(*key)} is not a number")
 
             def on_write(
                 data: bytes, unpack: Callable[[bytes], tuple[int]] = layout.unpack, handle: Handler = handler
             ) -> None:
                 handle(unpack(data)[0])
 
-            self.store.on_write(index, subindex, on_write)
+            self.store.on_write(*key, on_write)
 
     def on_reset(self) -> None:
         """NMT reset node: the device goes to its power-on state."""
@@ -408,12 +385,12 @@ class CanopenNode:
 
     def _on_rpdo(self, pdo: PdoMap, data: bytes) -> list[bytes]:
         if len(data) < pdo.length:
-            return self.raise_error(PDO_TOO_SHORT, COMMUNICATION)
+            return self.raise_error(PDO_SHORT, COMMUNICATION)
         if pdo.transmission_type <= LAST_SYNC_TYPE:
             self._waiting[pdo.cob_id] = data
             return []
         self._apply(pdo, data)
-        return self.clear_error(PDO_TOO_SHORT) + self.after_command()
+        return self.clear_error(PDO_SHORT) + self.after_command()
 
     def _apply_waiting(self) -> None:
         for cob_id, data in self._waiting.items():
@@ -438,5 +415,16 @@ class CanopenNode:
         if self._generation != self._pdos.generation:
             self._generation = self._pdos.generation
             self._receive = {pdo.cob_id: pdo for pdo in self._pdos.rpdos()}
-            self._transmit = compile_tpdos(self.store, self._pdos, self.getters, self.quiet)
+            self._transmit = [
+                self._compiled(index, pdo)
+                for index in self._pdos.tpdo_indices
+                if (pdo := self._pdos.active_map(index)) is not None
+            ]
         return self._transmit
+
+    def _compiled(self, index: int, pdo: PdoMap) -> TransmitPdo:
+        """Return a TPDO; objects without a getter are read from the store; of quiet ones alone: by its event timer alone."""
+        store, keys = self.store, [(mapped.index, mapped.subindex) for mapped in pdo.objects]
+        sources = tuple(self.getters.get(key) or partial(store.number, *key) for key in keys)
+        start, period_ms = store.number(index, 6), store.number(index, 5)
+        return TransmitPdo(pdo, sources, start, period_ms, all(key in self.quiet for key in keys))

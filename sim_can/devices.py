@@ -13,10 +13,11 @@ from functools import partial
 from typing import Final
 
 from jtqd.drivers.drive import TEMPERATURE_C_PER_UNIT
+from jtqd.drivers.emcy import HEARTBEAT_LOST
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.drivers.sdo import VALUE_RANGE, SdoAbort
 from jtqd.sim_can.canopen_node import CURRENT as CURRENT_ERROR
-from jtqd.sim_can.canopen_node import HEARTBEAT_LOST, CanopenNode
+from jtqd.sim_can.canopen_node import CanopenNode
 from jtqd.sim_can.eds_entries import DRIVE, SENSOR, entries_of
 from jtqd.sim_can.source import CURRENT, OFF, VELOCITY, ChannelSignal, DriveRatings, DriveSignals, Source
 from jtqd.sim_can.transmit import Channel, ChannelValue, DriveValue
