@@ -58,8 +58,6 @@ class JointEffects:
         ConfigError: a hook that is not finite, or needs what the inner loop does not know.
     """
 
-    __slots__ = ("bend", "friction", "joint", "load", "loss", "spring", "state")
-
     def __init__(self, joint: Joint) -> None:
         self.joint = joint
         self.state = probe_state(0.0)
@@ -76,9 +74,6 @@ class JointEffects:
                     call = getattr(effect, name)
                     self._check(effect.name, call, values)
                     self._place(effect, name, call, values).append((call, values, ScalarFunctions()))
-
-    def __bool__(self) -> bool:
-        return any((self.friction, self.loss, self.bend, self.spring, self.load))
 
     def _place(self, effect: Effect, name: str, call: Callable[..., Any], values: Values) -> list[Hook]:
         if name == "load_nm":
@@ -100,9 +95,10 @@ class JointEffects:
         for place in PROBES:
             value = call(values, probe_state(place, PROBE_TORSION_RAD), self.joint, ScalarFunctions())
             if not math.isfinite(value):
+                where = f"joint {self.joint.name}: effect {name}"
                 raise ConfigError(
-                    f"joint {self.joint.name}: effect {name}: {call.__name__} is {value!r}, expected a finite number: "
-                    f"its parameters, or it needs a quantity that the plant's inner loop does not have"
+                    f"{where}: {call.__name__} is {value!r}, expected a finite number: "
+                    "its parameters, or it needs a quantity that the plant's inner loop does not have"
                 )
 
     def bend_rad(self, motor_rad: float, link_rad: float = 0.0) -> float:
@@ -155,8 +151,6 @@ class EffectFriction:
     Called like `JointFriction`; the effects see the direction that the joint would move in.
     """
 
-    __slots__ = ("_effects", "_file", "_hooks")
-
     def __init__(self, file: JointFriction, effects: JointEffects) -> None:
         self._file = file
         self._effects = effects
@@ -178,21 +172,6 @@ class EffectFriction:
 
 class _Side:
     """One joint in the inner loop, in its own frame: motor state, torsion, hysteresis of the plant file."""
-
-    __slots__ = (
-        "angle",
-        "bend",
-        "bend_rate",
-        "constants",
-        "effects",
-        "link",
-        "load",
-        "sign",
-        "slip",
-        "slope",
-        "torsion",
-        "velocity",
-    )
 
     def __init__(self, constants: JointConstants, effects: JointEffects, sign: float) -> None:
         self.constants = constants
@@ -295,9 +274,10 @@ class EffectPlant(Plant):
         for side, bend in zip(parameters.joints, bends, strict=True):
             steepest = bend + side.constants.error_slope
             if steepest > STEEPEST_KINEMATIC_ERROR:
+                where = f"joint {side.joint.name}: effects"
                 raise ConfigError(
-                    f"joint {side.joint.name}: effects: the kinematic error changes the gear's transmission by "
-                    f"{steepest:.2g} of itself, expected at most {STEEPEST_KINEMATIC_ERROR:g}"
+                    f"{where}: the kinematic error changes the gear's transmission by {steepest:.2g} of itself, "
+                    f"expected at most {STEEPEST_KINEMATIC_ERROR:g}"
                 )
         self.substep_s = substep_limit(parameters, (one.stiffest_spring(), two.stiffest_spring()), bends)
         files = self.friction
@@ -361,13 +341,8 @@ class EffectPlant(Plant):
             state = side.effects.state
             state.temperature_c = self.temperatures[k].celsius
             state.time_s = self.time_s
-            side.place(
-                self.motor_position[k],
-                self.motor_velocity[k],
-                self.slip[k],
-                side.sign * self.link_position,
-                h,
-            )
+            link = side.sign * self.link_position
+            side.place(self.motor_position[k], self.motor_velocity[k], self.slip[k], link, h)
 
     def joint_torques(self) -> tuple[float, float]:
         """Return (τ1, τ2): torque of each flexible spline in Nm, own frames."""
@@ -398,20 +373,6 @@ class _Truth(NamedTuple):
     torque_nm: float
 
 
-def _between(early: _Truth, late: _Truth, time_s: float) -> _Truth:
-    share = (time_s - early.time_s) / (late.time_s - early.time_s)
-
-    def mix(a: float, b: float) -> float:
-        return a + share * (b - a)
-
-    return _Truth(
-        time_s,
-        (mix(early.currents[0], late.currents[0]), mix(early.currents[1], late.currents[1])),
-        mix(early.link_rad, late.link_rad),
-        mix(early.torque_nm, late.torque_nm),
-    )
-
-
 class _Past:
     """Samples of the truth over the last `span_s`; before the first one it was as in the first one."""
 
@@ -437,7 +398,15 @@ class _Past:
             return samples[0]._replace(time_s=time_s)
         for k in range(len(samples) - 2, -1, -1):
             if samples[k].time_s <= time_s:
-                return _between(samples[k], samples[k + 1], time_s)
+                early, late = samples[k], samples[k + 1]
+                share = (time_s - early.time_s) / (late.time_s - early.time_s)
+                (i1, i2), link, torque = early.currents, early.link_rad, early.torque_nm
+                i1, i2 = i1 + share * (late.currents[0] - i1), i2 + share * (late.currents[1] - i2)
+                link, torque = (
+                    link + share * (late.link_rad - link),
+                    torque + share * (late.torque_nm - torque),
+                )
+                return _Truth(time_s, (i1, i2), link, torque)
         raise AssertionError("the first sample is earlier")
 
 

@@ -59,21 +59,12 @@ def uses_temperature(joint: Joint) -> bool:
 
 def probe_state(position_rad: float, torsion_rad: float = 0.0) -> State:
     """Return a state in which everything that the inner loop knows is a number."""
-    return State(
-        current_a=1.0,
-        velocity_rad_s=0.5,
-        direction=1.0,
-        motor_position_rad=position_rad,
-        motor_acceleration_rad_s2=0.0,
-        link_position_rad=0.1,
-        link_velocity_rad_s=0.5,
-        link_acceleration_rad_s2=0.0,
-        coupling_position_rad=0.1,
-        torque_nm=1.0,
-        torsion_rad=torsion_rad,
-        temperature_c=30.0,
-        time_s=1.0,
-    )
+    state = State(motor_position_rad=position_rad, torsion_rad=torsion_rad, temperature_c=30.0)
+    state.current_a = state.direction = state.torque_nm = state.time_s = 1.0
+    state.velocity_rad_s = state.link_velocity_rad_s = 0.5
+    state.link_position_rad = state.coupling_position_rad = 0.1
+    state.motor_acceleration_rad_s2 = state.link_acceleration_rad_s2 = 0.0
+    return state
 
 
 # Plant files
@@ -303,14 +294,12 @@ class PlantParameters:
 
 
 def load_plant(path: Path) -> PlantParameters:
-    """Read a plant file, or a joint file (known by its key gear_ratio), which then serves both joints without
-    deviations.
+    """Read a plant file, or a joint file (known by its key gear_ratio), which serves both joints without deviations.
 
     Joint files named in a plant file are looked up beside it.
 
     Raises:
-        ConfigError: unreadable file, unknown or missing key, value out of range; the message names file and
-        key.
+        ConfigError: unreadable file, unknown or missing key, value out of range; the message names file and key.
     """
     mapping = load_yaml(path)
     where = str(path)
@@ -322,11 +311,7 @@ def load_plant(path: Path) -> PlantParameters:
 def plant_from_mapping(
     mapping: Mapping[str, Any], where: str, joint_of: Callable[[str], Joint]
 ) -> PlantParameters:
-    """Return the checked parameters of a plant file's mapping; joint_of(file name) -> Joint.
-
-    Raises:
-        ConfigError: as in `load_plant`.
-    """
+    """Return the checked parameters of a plant file's mapping; joint_of(file name) -> Joint. Raises ConfigError."""
     with in_file(where):
         file = read(_PlantFile, mapping)
         sides = (
