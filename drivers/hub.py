@@ -17,7 +17,7 @@ import sys
 from collections import deque
 from collections.abc import Hashable
 from types import FrameType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jtqd.drivers.bus_socket import PREFIX, BusError, reachable, require_directory
 from jtqd.drivers.frame import FRAME, arbitration_key, stuffed_bits
@@ -138,7 +138,7 @@ class WireModel:
 
 # The hub
 
-__all__ = ["MAX_CLIENTS", "Hub", "listen", "main"]
+__all__ = ["MAX_CLIENTS", "Hub", "StopError", "listen", "main", "until_stopped"]
 
 
 def listen(path: str, backlog: int) -> socket.socket:
@@ -216,12 +216,21 @@ class Hub(Relay):
             pass
 
 
-class _StopError(Exception):
+class StopError(Exception):
     """SIGINT or SIGTERM."""
 
 
 def _stop(_number: int, _frame: FrameType | None) -> None:
-    raise _StopError
+    raise StopError
+
+
+def until_stopped() -> dict[int, Any]:
+    """Let SIGINT and SIGTERM raise StopError, and timeouts end in time; return the handlers before.
+
+    The default slack of 50 us on every timeout is one short frame at 1 Mbit/s.
+    """
+    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    return {number: signal.signal(number, _stop) for number in (signal.SIGTERM, signal.SIGINT)}
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -240,17 +249,14 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"found {options.bus!r}, expected unix:PATH")
     if options.bitrate is not None and options.bitrate <= 0:
         parser.error(f"--bitrate must be positive, not {options.bitrate}")
-    signal.signal(signal.SIGTERM, _stop)
-    signal.signal(signal.SIGINT, _stop)
-    # The default slack of 50 us on every timeout is one short frame at 1 Mbit/s.
-    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    until_stopped()
     hub = None
     try:
         hub = Hub(options.bus.removeprefix(PREFIX), options.bitrate)
         print(f"hub: {options.bus} is up", flush=True)
         while True:  # bounded: a signal that comes just before the wait does not end it
             hub.run_once(0.5)
-    except _StopError:
+    except StopError:
         return 0
     except BusError as error:
         print(f"hub: {error}", file=sys.stderr)

@@ -235,26 +235,29 @@ class BusSurvey:
     def read(self, node: int) -> Survey | None:
         """Survey one node; None when it does not answer. Raises SurveyError."""
         try:
-            with _of(node):
-                return survey(self._access(node), node)
+            with self._access(node) as access:
+                return survey(access, node)
         except SdoTimeout:
             return None
 
-    def _access(self, node: int) -> SdoClient:
-        """Return the SDO client of one node, which repeats a request as the boot does."""
-        return SdoClient(self._socket, node, PATIENCE * ANSWER_S)
-
     def numbers(self, node: int, keys: Iterable[Key]) -> dict[Key, int]:
         """Read further numbers of one node; those that it does not have are left out. Raises SurveyError."""
-        access = self._access(node)
-        with _of(node):
+        with self._access(node) as access:
             found = {key: _number(access, key) for key in keys}
         return {key: number for key, number in found.items() if number is not None}
 
     def tpdos(self, node: int) -> tuple[Tpdo, ...]:
         """Read the TPDOs of one node. Raises SurveyError."""
-        with _of(node):
-            return tpdos(self._access(node))
+        with self._access(node) as access:
+            return tpdos(access)
+
+    @contextmanager
+    def _access(self, node: int) -> Iterator[SdoClient]:
+        """Give the SDO client of one node, which repeats a request as the boot does; a SurveyError names the node."""
+        try:
+            yield SdoClient(self._socket, node, PATIENCE * ANSWER_S)
+        except SurveyError as error:
+            raise SurveyError(f"node {node}: {error}") from None
 
     def _answers(self, timeout_s: float) -> set[int]:
         return {can_id - RESPONSE_ID for can_id in self._received(timeout_s) if can_id > RESPONSE_ID}
@@ -264,15 +267,6 @@ class BusSurvey:
         if not socket.wait(timeout_s):
             return []
         return [FRAME.unpack_from(socket.frames, FRAME_SIZE * at)[0] for at in range(socket.receive())]
-
-
-@contextmanager
-def _of(node: int) -> Iterator[None]:
-    """Name the node in a SurveyError."""
-    try:
-        yield
-    except SurveyError as error:
-        raise SurveyError(f"node {node}: {error}") from None
 
 
 def _text(raw: bytes) -> str:

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import gc
 import signal
 import sys
@@ -14,13 +13,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from jtqd.drivers.bus_socket import PREFIX, CanFilter, exact
 from jtqd.drivers.drive import drive_layout
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, FRAME_SIZE, MAX_LENGTH
 from jtqd.drivers.frame_socket import BusDown, BusError, open_frame_socket
-from jtqd.drivers.hub import Hub
+from jtqd.drivers.hub import Hub, StopError, until_stopped
 from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.own_objects import COMMANDER_NODE, JTQD_NODE
 from jtqd.drivers.pdo import SYNC_COB_ID, tpdo_parameters
@@ -207,19 +205,10 @@ class Bench:
 
 # The bench on a bus
 
-_PR_SET_TIMERSLACK = 29
 _RETRY_S = 0.2  # between two looks at an interface that is down
 _NOT_DATA = CAN_EFF_FLAG | CAN_RTR_FLAG | CAN_ERR_FLAG
 _LONGEST_WAIT_S = 1.0
 _LINGER_STEP_S = 0.05
-
-
-class _StopError(Exception):
-    """SIGINT or SIGTERM."""
-
-
-def _stop(_number: int, _frame: FrameType | None) -> None:
-    raise _StopError
 
 
 def _log(text: str) -> None:
@@ -326,9 +315,7 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
     Raises:
         BusError: the bus cannot be opened or has gone.
     """
-    before = {number: signal.signal(number, _stop) for number in (signal.SIGTERM, signal.SIGINT)}
-    # the default slack of 50 us on every timeout is a frame on the wire at 1 Mbit/s
-    ctypes.CDLL(None).prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(1), 0, 0, 0)
+    before = until_stopped()
     line: _Socket | _EmbeddedHub | None = None
     try:
         line = _open(bus, bitrate, bench)
@@ -338,7 +325,7 @@ def run(bus: str, bench: Bench, bitrate: int | None = None, duration_s: float | 
         _tick(line, bench)
         print(f"bench ready on {bus}", file=sys.stderr, flush=True)  # other processes wait for this line
         _loop(line, bench, end_ns)
-    except _StopError:
+    except StopError:
         pass
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # leaving takes a moment and happens once

@@ -53,11 +53,17 @@ class PlantSource:
     """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit.
 
     Where the plant file has `run_to_run`, the source starts in day 0 of its seed, and each time a drive is enabled after
-    both were off it is the next day, unless the run goes on (`resume`). `noise_seed`: of the noise, where it is not `seed`.
+    both were off it is the next day, unless the run goes on (`resume`).
+
+    Args:
+        noise_seed: of the noise, where it is not `seed`.
+        nodes: 1: the second joint has no node; it is the passive load of the first one.
     """
 
-    def __init__(self, parameters: AnyPlant, seed: int = 0, noise_seed: str | None = None) -> None:
-        self.ratings = tuple(ratings_of(side) for side in parameters.joints)
+    def __init__(
+        self, parameters: AnyPlant, seed: int = 0, noise_seed: str | None = None, nodes: int = 2
+    ) -> None:
+        self.ratings: Sequence[DriveRatings] = [ratings_of(side) for side in parameters.joints[:nodes]]
         noise = Noise(random.Random(seed if noise_seed is None else noise_seed).random)
         self.plant: TwoJoints
         self._readings: Readings | None = None
@@ -69,8 +75,8 @@ class PlantSource:
         else:
             self.plant = Plant(parameters)
         self._instruments = Instruments(parameters, noise)
-        self.drives = self._instruments.drives
-        self.channels = (self._instruments.channel,)
+        self.drives: Sequence[DriveSignals] = self._instruments.drives[:nodes]
+        self.channels: Sequence[ChannelSignal] = (self._instruments.channel,)
         self._widths = parameters.run_to_run
         self._seed = seed
         self._modes = [OFF, OFF]
@@ -118,39 +124,9 @@ _SEEDS_APART = 1_000_003
 """Between the seeds of two pairs: noise and days of each are its own."""
 
 
-class SingleJoint:
-    """`Source` of the first joint of a pair; the second one is its load.
-
-    pair: whose drive 0 it is.
-    """
-
-    def __init__(self, pair: Source) -> None:
-        self._pair = pair
-        self.ratings: Sequence[DriveRatings] = tuple(pair.ratings[:1])
-        self.drives: Sequence[DriveSignals] = tuple(pair.drives[:1])
-        self.channels: Sequence[ChannelSignal] = tuple(pair.channels[:1])
-
-    def advance(self, dt_s: float) -> bool:
-        """As `Source.advance`."""
-        return self._pair.advance(dt_s)
-
-    def command(self, drive: int, mode: int, target: float) -> None:
-        """As `Source.command`; there is drive 0 only."""
-        self._pair.command(drive, mode, target)
-
-    def resume(self) -> None:
-        """As `Source.resume`."""
-        self._pair.resume()
-
-    def interpolate(self, drive: int, period_s: float) -> None:
-        """As `Source.interpolate`; there is drive 0 only."""
-        self._pair.interpolate(drive, period_s)
-
-
 def sources_of(parameters: AnyPlant, seed: int, joints: int) -> list[Source]:
     """Return the plants of a bench with so many joints; with two it is the one pair of this seed."""
-    sources: list[Source] = []
-    for number in range((joints + 1) // 2):
-        pair = PlantSource(parameters, seed + number * _SEEDS_APART)
-        sources.append(pair if 2 * number + 1 < joints else SingleJoint(pair))
-    return sources
+    return [
+        PlantSource(parameters, seed + number * _SEEDS_APART, nodes=min(2, joints - 2 * number))
+        for number in range((joints + 1) // 2)
+    ]
