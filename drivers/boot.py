@@ -2,9 +2,7 @@
 
 The request is a `BootRequest`; all keys but "bus", "nodes", "node" and "kind" have defaults:
 
-    {"bus": "can0", "master_node": 32, "heartbeat_ms": 100, "master_timeout_ms": 500, "answer_timeout_s": 0.5,
-     "error_behaviour": 0, "reset": true,
-     "sync": {"cob_id": 128, "counter_overflow": 0, "check_foreign": true},
+    {"bus": "can0", "heartbeat_ms": 100, "answer_timeout_s": 0.5, "reset": true, "sync": {"counter_overflow": 0},
      "nodes": [{"node": 1, "kind": "drive", "identity": {"vendor": 1953, "product": 1026}},
                {"node": 2, "kind": "drive", "given": {"6091h:1": 100}, "temperature": {"index": 12289}},
                {"node": 3, "kind": "sensor", "channels": [1], "mandatory": false}]}
@@ -16,8 +14,7 @@ With an EDS it also has the entries of that file as "own_entries": the caller ne
 A node that comes back is booted by the same command with a shorter list of nodes.
 
 jtqd's heartbeat begins with its boot-up message: a drive that watches it (1016h) misses it from its configuration on. At the
-first boot this process sends it, also after its report, until its standard input is closed: the loop has
-taken over.
+first boot this process sends it, after its report too, until its standard input is closed: the loop has taken over.
 """
 
 from __future__ import annotations
@@ -226,8 +223,8 @@ class BootReport:
 class BootBus:
     """A frame socket that keeps what the nodes send during the boot, and sends jtqd's heartbeat while it waits.
 
-    It receives the nodes' answers, heartbeats and EMCY; in a first boot also SYNC and frames of jtqd's own node-ID, whose
-    other producers make the boot refuse the bus. All methods raise BusError.
+    In a first boot it also receives SYNC and frames of jtqd's own node-ID: another producer of them makes the boot refuse
+    the bus. All methods raise BusError.
 
     Attributes:
         frames: of the last `receive`, as of a FrameSocket.
@@ -298,21 +295,19 @@ class BootBus:
         return True
 
     def _observe(self, can_id: int, data: bytes) -> None:
+        node = can_id & 0x7F
         if can_id == self._own_id:
             self._own_ids += 1
         elif can_id >= nmt.HEARTBEAT_BASE:
             if len(data) == 1:
-                self._on_heartbeat(can_id - nmt.HEARTBEAT_BASE, data[0])
+                self.states[node] = data[0] & 0x7F
+                if data[0] == nmt.BOOT_UP:
+                    self.restarted.add(node)
+                    self.boot_ups[node] += 1
         elif can_id == self._settings.sync.cob_id:
             self._syncs += 1
         elif can_id < RESPONSE_ID:
-            self.emergencies[can_id - EMCY_BASE] = parse(data)
-
-    def _on_heartbeat(self, node: int, state: int) -> None:
-        self.states[node] = state & 0x7F
-        if state == nmt.BOOT_UP:
-            self.restarted.add(node)
-            self.boot_ups[node] += 1
+            self.emergencies[node] = parse(data)
 
     def forget(self, node: int) -> None:
         """Discard the node's state and boot-up messages so far."""
@@ -323,10 +318,6 @@ class BootBus:
         """Return the newest state once it is `wanted` (None: any), or what it is after `timeout_s`."""
         self.run(timeout_s, lambda: node in self.states and wanted in (None, self.states[node]))
         return self.states.get(node)
-
-    def command(self, number: int, node: int) -> None:
-        """Send an NMT command."""
-        self.send(nmt.command(number, node))
 
     def begin_heartbeat(self) -> None:
         """Send jtqd's boot-up message and heartbeat from here on; nothing beside a loop that sends it.
@@ -394,7 +385,7 @@ def boot(request: BootRequest, bus: BootBus) -> BootReport:
         attempt(node, partial(_require_heartbeat, bus, node, wait_s))
     bus.require_one_master()
     for node in booted:
-        bus.command(nmt.START, node)
+        bus.send(nmt.command(nmt.START, node))
     for node in list(booted):
         attempt(node, partial(_require_operational, bus, node, wait_s))
     return BootReport(booted, time.monotonic() - started, absent)
@@ -408,7 +399,7 @@ def _reset(bus: BootBus, request: BootRequest) -> None:
     nodes = [profile.node_id for profile in request.profiles]
     for node in nodes:
         bus.forget(node)
-        bus.command(nmt.RESET_COMMUNICATION, node)
+        bus.send(nmt.command(nmt.RESET_COMMUNICATION, node))
     began = time.monotonic()
     for node in nodes:
         left = began + request.timeout_s(node) - time.monotonic()
@@ -426,7 +417,7 @@ def _configure(bus: BootBus, request: BootRequest, profile: Profile, *, ran: Col
     sdo = SdoClient(bus, node, request.timeout_s(node), answer_s)
     for attempt in range(1, _ATTEMPTS + 1):
         # A running node would refuse to be re-mapped, and a stopped one does not answer SDO.
-        bus.command(nmt.ENTER_PRE_OPERATIONAL, node)
+        bus.send(nmt.command(nmt.ENTER_PRE_OPERATIONAL, node))
         procedure = NodeBoot(sdo, profile, request)
         device_type = procedure.check_device_type()
         sdo.wait_longer(PATIENCE * answer_s)
@@ -478,7 +469,7 @@ def _require_operational(bus: BootBus, node: int, wait_s: float) -> None:
     """
     state = bus.state(node, nmt.OPERATIONAL, wait_s)
     if state == nmt.PRE_OPERATIONAL and node not in bus.restarted:
-        bus.command(nmt.START, node)
+        bus.send(nmt.command(nmt.START, node))
         state = bus.state(node, nmt.OPERATIONAL, wait_s)
     if node in bus.restarted:
         raise reset_during_boot(node)

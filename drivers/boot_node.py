@@ -66,11 +66,10 @@ class BootError(Exception):
 
     Attributes:
         node: node number; None: the bus as a whole.
-        object: "1018h:2", or what else was looked at.
-        expected, found: as text; "" where the message has no such pair.
-        letter: error status of CiA 302-2; "" where it has none. A not in the configuration, B no answer, C device type,
-            D vendor, M product, N revision, O serial number, G no software version, H another one, J configuration refused
-            or not taken, K no heartbeat, L was already operational.
+        object: "1018h:2", or what else was looked at; expected, found: as text, "" for none.
+        letter: error status of CiA 302-2; "" for none. A not in the configuration, B no answer, C device type, D vendor,
+            M product, N revision, O serial number, G no software version, H another one, J configuration refused or not
+            taken, K no heartbeat, L was already operational.
     """
 
     def __init__(
@@ -108,14 +107,9 @@ def mismatch(node: int, key: Key, name: str, *, expected: str, found: str, lette
 
 
 class NodeObjects:
-    """Objects of one node, read and written as numbers; every failure is a BootError that names node and object.
+    """Objects of one node, read and written as unsigned numbers of `size` bytes; a failure is a BootError.
 
-    Numbers are unsigned, little endian, `size` bytes.
-
-    Attributes:
-        node: node number.
-        access: to its SDO server.
-        values: newest value of each number that was read; the boot makes the configuration hash of them.
+    values: newest value of each number that was read; the boot makes the configuration hash of them.
     """
 
     def __init__(self, access: SdoAccess, node: int) -> None:
@@ -311,10 +305,7 @@ def _timer_rows(pdo: PdoMap) -> list[_Row]:
 class TpdoSetup:
     """TPDOs of one node. `run` raises BootError for what the node lacks, refuses or does not keep.
 
-    Args:
-        objects: of the node; the values in force are in its `values` afterwards.
-        profile: which TPDOs are wanted.
-        notes: takes what the operator should know although nothing is wrong.
+    The values in force are in `values` of `objects` afterwards; `notes` takes what the operator should know.
     """
 
     def __init__(self, objects: NodeObjects, profile: Profile, notes: list[str]) -> None:
@@ -337,8 +328,6 @@ class TpdoSetup:
                 raise
             return self._use_as_found(refused)
         return self._profile.tpdos
-
-    # As wanted ------------------------------------------------------------------------------------------------------
 
     def _as_wanted(self, pdo: PdoMap) -> bool:
         """Return whether a TPDO is valid and as wanted."""
@@ -407,8 +396,6 @@ class TpdoSetup:
         if cob_id is not None and not cob_id & INVALID:
             self._change(key, cob_id | INVALID, 4)
             self._objects.require(key, cob_id | INVALID, 4, "COB-ID")
-
-    # As found -------------------------------------------------------------------------------------------------------
 
     def _use_as_found(self, refused: BootError) -> tuple[PdoMap, ...]:
         """Put back what was changed and use the TPDOs as they are; raises `refused`, and why they are not enough."""
@@ -546,7 +533,7 @@ class NodeBoot:
         """Do all steps between `check_device_type`, whose result it takes, and error control and NMT start."""
         objects, profile = self._objects, self._profile
         serial = self.check_identity()
-        self.check_temperature()
+        self._check_temperature()
         tpdos = self.configure_pdos()
         self.configure_sync()
         self.configure_heartbeat()
@@ -596,7 +583,7 @@ class NodeBoot:
         if found != expected:
             raise mismatch(self._node, key, name, expected=expected, found=found, letter="H")
 
-    def check_temperature(self) -> None:
+    def _check_temperature(self) -> None:
         """Require the object of a drive whose temperature is asked for; its value does not matter here."""
         profile = self._profile
         wanted = profile.temperature if isinstance(profile, DriveProfile) else None

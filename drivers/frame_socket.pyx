@@ -99,17 +99,14 @@ cdef class FrameReceiver:
 
     @property
     def lengths(self):
-        """Bytes of each message of the last `receive`."""
         return [self.messages[i].msg_len for i in range(self.count)]
 
     @property
     def flags(self):
-        """msg_flags of each message of the last `receive`."""
         return [self.messages[i].msg_hdr.msg_flags for i in range(self.count)]
 
     @property
     def stamps_ns(self):
-        """Kernel time stamp of each message of the last `receive`."""
         return [self.stamps_c[i] for i in range(self.count)]
 
     def receive(self, int fd):
@@ -212,17 +209,14 @@ cdef class FrameSocket:
 
     @property
     def stamps_ns(self):
-        """Kernel receive time stamps of the last `receive`, CLOCK_REALTIME in ns."""
         return self.receiver.stamps_ns
 
     @property
     def lengths(self):
-        """Bytes of each message of the last `receive`."""
         return self.receiver.lengths
 
     @property
     def own(self):
-        """Whether each frame of the last `receive` is the echo of one sent here."""
         return [bool(self.own_c[i]) for i in range(self.receiver.count)]
 
     def send(self, bytes frame16 not None):

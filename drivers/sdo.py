@@ -354,13 +354,8 @@ class SdoQueue:
 
     A node has one default SDO server, which holds one transfer: requests to it queue, those to different nodes need not.
 
-    Args:
-        limit: requests that may wait.
-        answer_s: silence after which a request is repeated.
-
-    Attributes:
-        ignored: answers that belonged to no request of ours.
-        repeats, timeouts, refusals: requests repeated, never answered, refused.
+    `limit` requests may wait; each is repeated after `answer_s` of silence. Attributes: `ignored`, answers that belonged to
+    no request of ours; `repeats`, `timeouts`, `refusals`, requests repeated, never answered, refused.
     """
 
     def __init__(self, limit: int = 32, answer_s: float = ANSWER_S) -> None:
