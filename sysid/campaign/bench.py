@@ -35,14 +35,7 @@ from jtqd.estimator.decoder import FieldError, below, in_file
 from jtqd.estimator.errors import ConfigError, Verbatim
 from jtqd.estimator.joint import Joint
 from jtqd.sim_can.bench_kernel import build, guest
-from jtqd.sysid.motion.setpoints import (
-    Limits,
-    MotionResult,
-    OutOfPlaceError,
-    Setpoints,
-    Surroundings,
-    Timing,
-)
+from jtqd.sysid.motion.setpoints import Limits, MotionResult, OutOfPlaceError, Setpoints, Surroundings, Timing
 from jtqd.sysid.motion.shell import Progress, play
 from jtqd.sysid.planner.campaigns import allowed_torque, approach
 from jtqd.sysid.planner.design import current_at

@@ -331,11 +331,7 @@ class BenchSetup:
     """All devices of the bench, over a frame socket. Raises BusError when the bus cannot be opened."""
 
     def __init__(
-        self,
-        bus: str,
-        drives: Sequence[DriveProfile],
-        sensor: SensorProfile | None,
-        timing: Timing,
+        self, bus: str, drives: Sequence[DriveProfile], sensor: SensorProfile | None, timing: Timing
     ) -> None:
         self._socket = open_frame_socket(
             bus, [exact(SYNC_COB_ID), exact(nmt.HEARTBEAT_BASE + COMMANDER_NODE)]

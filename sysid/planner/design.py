@@ -132,13 +132,7 @@ class Candidates:
     """
 
     def __init__(
-        self,
-        bench: Bench,
-        limits: ExcitationLimits,
-        *,
-        duration_s: float,
-        harmonics: int,
-        rate_hz: float,
+        self, bench: Bench, limits: ExcitationLimits, *, duration_s: float, harmonics: int, rate_hz: float
     ) -> None:
         self.bench: Final = bench
         self.limits: Final = limits

@@ -342,11 +342,7 @@ MATTERS: Final = 0.02
 _BIN_S: Final = 0.02
 _FEWEST_BINS: Final = 50
 _GAIN: Final = (0.5, 2.0)
-_EXCHANGES: Final = {
-    "current_a": (1, 0, 0),
-    "torque_nm": (0, 0, 1),
-    "position and velocity": (0, 1, 0),
-}
+_EXCHANGES: Final = {"current_a": (1, 0, 0), "torque_nm": (0, 0, 1), "position and velocity": (0, 1, 0)}
 """What may be exchanged: which of current, motion and torque come from the other joint."""
 
 Signals = tuple[FloatArray, ...]
@@ -473,20 +469,19 @@ _PEAK: Final = 10.0
 """Times rated torque; joints are overloaded two- or threefold."""
 _HOTTEST_C: Final = 150.0
 _STEP_K, _WARMING_K_PER_S = 2.0, 1.0  # between two samples: resolution, and more than any joint warms
-_ENCODERS: Final = {2**bits: 2**bits / (2.0 * math.pi) for bits in range(10, 25)}
+_TURN: Final = 1.0 / (2.0 * math.pi)
+_ENCODERS: Final = {f"({2**bits} per revolution)": 2**bits / (2.0 * math.pi) for bits in range(10, 25)}
 _ANGLES: Final = {
     "degrees": 180.0 / math.pi,
-    "revolutions": 1.0 / (2.0 * math.pi),
-    **{f"encoder counts ({counts} per revolution)": factor for counts, factor in _ENCODERS.items()},
+    "revolutions": _TURN,
+    **{f"encoder counts {each}": factor for each, factor in _ENCODERS.items()},
 }
 """Unit of an angle -> its value per rad."""
 _SPEEDS: Final = {
     "rpm": 60.0 / (2.0 * math.pi),
     "degrees per second": 180.0 / math.pi,
-    "revolutions per second": 1.0 / (2.0 * math.pi),
-    **{
-        f"encoder counts per second ({counts} per revolution)": factor for counts, factor in _ENCODERS.items()
-    },
+    "revolutions per second": _TURN,
+    **{f"encoder counts per second {each}": factor for each, factor in _ENCODERS.items()},
 }
 """Unit of a velocity -> its value per rad/s."""
 
@@ -532,25 +527,25 @@ def _velocity(c: Channels) -> RunIssue | None:
     ratio = abs(float(np.median(by_velocity[turning] / by_position[turning])))
     if _near(ratio, 1.0) or ratio == 0.0:
         return None
-    channel, expected = "motor_velocity_rad_s", "rad/s"
-    if (unit := _named(ratio, _SPEEDS)) is not None:
-        pass
-    elif (unit := _named(1.0 / ratio, _ANGLES)) is not None:
-        channel, expected = "motor_position_rad", "rad"
-    elif _near(ratio, 1000.0) or _near(ratio, 1e6):
-        unit = "milliseconds" if ratio < 1e5 else "microseconds"
-        channel, expected = "time_s", "seconds"
-    elif _near(ratio, 1.0 / c.joint.gear_ratio):
-        unit, expected = "the joint side's velocity", "the motor's"
-    elif _near(ratio, 1.0 / 6.0):
-        unit, expected = "rpm and degrees", "rad/s and rad"
-    else:
-        return None  # a scale without a name: `check_channels` reports it
-    at = f"{c.where}: time_s" if channel == "time_s" else f"{c.where}.{channel}"
-    text = (
-        f"found {ratio:.4g} times the derivative of motor_position_rad, expected the same: {unit} suspected"
-    )
-    return RunIssue("motor_velocity_rad_s_unit", f"{at}: {text}, expected {expected}")
+    suspects = [
+        *((ratio, factor, ".motor_velocity_rad_s", unit, "rad/s") for unit, factor in _SPEEDS.items()),
+        *((1.0 / ratio, factor, ".motor_position_rad", unit, "rad") for unit, factor in _ANGLES.items()),
+        (ratio, 1000.0, ": time_s", "milliseconds", "seconds"),
+        (ratio, 1e6, ": time_s", "microseconds", "seconds"),
+        (
+            ratio,
+            1.0 / c.joint.gear_ratio,
+            ".motor_velocity_rad_s",
+            "the joint side's velocity",
+            "the motor's",
+        ),
+        (ratio, 1.0 / 6.0, ".motor_velocity_rad_s", "rpm and degrees", "rad/s and rad"),
+    ]
+    for found, factor, at, unit, expected in suspects:
+        if _near(found, factor):
+            text = f"found {ratio:.4g} times the derivative of motor_position_rad, expected the same: {unit} suspected"
+            return RunIssue("motor_velocity_rad_s_unit", f"{c.where}{at}: {text}, expected {expected}")
+    return None  # a scale without a name: `check_channels` reports it
 
 
 def _angles(c: Channels) -> RunIssue | None:
@@ -560,9 +555,10 @@ def _angles(c: Channels) -> RunIssue | None:
     turns, gear = abs(c.gear_ratio), c.joint.gear_ratio
     off = turns / gear
     found = f"found {turns:.5g} motor turns per turn of the link, gear_ratio of {c.joint.name} is {gear:g}"
-    for channel, factor in (("motor_position_rad", off), ("link_position_rad", 1.0 / off)):
-        if (unit := _named(factor, _ANGLES)) is not None:
-            return c.issue(channel, "unit", f"{found}: {unit} suspected, expected rad")
+    for channel, value in (("motor_position_rad", off), ("link_position_rad", 1.0 / off)):
+        for unit, factor in _ANGLES.items():
+            if _near(value, factor):
+                return c.issue(channel, "unit", f"{found}: {unit} suspected, expected rad")
     if _near(off, 1.0 / gear):
         text = f"{found}: an angle of the joint side suspected, expected the motor's"
         return c.issue("motor_position_rad", "unit", text)
@@ -605,16 +601,13 @@ def _torque_and_current(c: Channels) -> RunIssue | None:
         return RunIssue("joint_file", text)
     size = abs(slope)
     if size > 1.0:
-        channel = "torque_nm"
-        unit = (
-            "mNm"
-            if 200.0 < size < 5000.0
-            else "inch pounds or kgf cm"
-            if 5.0 < size < 15.0
-            else "mNm or counts"
-        )
+        channel, unit = "torque_nm", "mNm or counts"
         if sizes["torque_nm"] < _PEAK and sizes["current_a"] < 0.01:
             channel, unit = "current_a", "kA, or a value relative to rated current,"
+        elif 200.0 < size < 5000.0:
+            unit = "mNm"
+        elif 5.0 < size < 15.0:
+            unit = "inch pounds or kgf cm"
     elif sizes["current_a"] > sizes["torque_nm"] and sizes["current_a"] >= _PEAK:
         channel = "current_a"
         unit = "mA or counts" if 1.0 / size > 100.0 else "per mille of rated current, or counts,"
@@ -669,10 +662,6 @@ def _torsion(c: Channels) -> RunIssue | None:
         "suspected in motor_position_rad and link_position_rad, expected rad, or a joint file of another joint"
     )
     return RunIssue("position_unit", text)
-
-
-def _named(ratio: float, units: dict[str, float]) -> str | None:
-    return next((name for name, factor in units.items() if _near(ratio, factor)), None)
 
 
 def _near(ratio: float, factor: float) -> bool:

@@ -403,10 +403,7 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
     if outliers.any():
         position = np.interp(time_s, time_s[~outliers], position[~outliers])
     step = float(np.median(np.diff(time_s)))
-    longest = min(
-        max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)),
-        (len(position) - 1) // 2,
-    )
+    longest = min(max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)), (len(position) - 1) // 2)
     if longest < 2:
         velocity = np.gradient(position, time_s)
         return velocity, np.gradient(velocity, time_s)

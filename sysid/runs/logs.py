@@ -110,11 +110,11 @@ def log_to_run(
 
     have = ", ".join(map(str, there))
     leave_out({n: f"found no joint {n}, the log has {have}" for n in wanted if n not in there})
-    by_log = _temperatures_of(log, there)
-    node_of = dict(zip(there, nodes or [node for node, _ in by_log], strict=False))
-    scale_of = {number: scale for number, (_, scale) in zip(there, by_log, strict=True)}
+    sources = _temperatures_of(log, there)
+    for number, node in zip(there, nodes or (), strict=False):
+        sources[number] = node, sources[number][1]
     read = dict.fromkeys(number for number in (*wanted, *enabled) if number in there)
-    states, readings = _read(log, name, {n: (node_of.get(n, n), scale_of[n]) for n in read})
+    states, readings = _read(log, name, {number: sources[number] for number in read})
     others = {number: states.pop(number) for number in list(states) if number not in wanted}
     leave_out({number: why for number, state in states.items() if (why := _unusable(number, state))})
     states = {number: state for number, state in states.items() if number not in left_out}
@@ -172,7 +172,7 @@ TemperatureOf = tuple[int, float]
 """Node-ID of a drive, and degrees Celsius per unit of what its TPDO3 carries."""
 
 
-def _temperatures_of(log: Path | Sequence[Path], there: Sequence[int]) -> list[TemperatureOf]:
+def _temperatures_of(log: Path | Sequence[Path], there: Sequence[int]) -> dict[int, TemperatureOf]:
     """Return those of the joints by the attached configuration; where it cannot be read, their numbers and 3001h."""
     mapping: Mapping[str, Any] = {}
     with LogFile(log_parts(log)[0]) as file:
@@ -180,19 +180,18 @@ def _temperatures_of(log: Path | Sequence[Path], there: Sequence[int]) -> list[T
             if index.name == _CONFIGURATION:
                 with contextlib.suppress(ConfigError, LogError):
                     mapping = parse_yaml(file.attachment(index), _CONFIGURATION)
-    return [_temperature_of(number, mapping.get(f"joint_{number}")) for number in there]
-
-
-def _temperature_of(number: int, section: object) -> TemperatureOf:
-    """Return that of one joint by its section, which is not checked yet."""
-    keys = section if isinstance(section, dict) else {}
-    node, objects = keys.get("node"), keys.get("objects")
-    own = objects.get("temperature") if isinstance(objects, dict) else None
-    scale = own.get("factor") if isinstance(own, dict) else None
-    return (
-        node if isinstance(node, int) else number,
-        float(scale) if isinstance(scale, int | float) else TEMPERATURE_C_PER_UNIT,
-    )
+    found = {}
+    for number in there:
+        section = mapping.get(f"joint_{number}")  # not checked yet
+        keys = section if isinstance(section, dict) else {}
+        node, objects = keys.get("node"), keys.get("objects")
+        own = objects.get("temperature") if isinstance(objects, dict) else None
+        scale = own.get("factor") if isinstance(own, dict) else None
+        found[number] = (
+            node if isinstance(node, int) else number,
+            float(scale) if isinstance(scale, int | float) else TEMPERATURE_C_PER_UNIT,
+        )
+    return found
 
 
 Readings = tuple[NDArray[np.int64], FloatArray]

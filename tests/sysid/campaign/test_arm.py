@@ -19,22 +19,9 @@ from jtqd.sysid.campaign.bench import Bench, BenchConfig
 from jtqd.sysid.campaign.command import main
 from jtqd.sysid.campaign.emulated import PLANT, emulated_run
 from jtqd.sysid.campaign.runner import findings
-from jtqd.sysid.motion.setpoints import (
-    Limits,
-    MotionResult,
-    OutOfPlaceError,
-    Setpoints,
-    Timing,
-    path,
-)
+from jtqd.sysid.motion.setpoints import Limits, MotionResult, OutOfPlaceError, Setpoints, Timing, path
 from jtqd.sysid.planner.campaigns import Scale, make_plan_of, range_of, units_of
-from jtqd.sysid.planner.plan import (
-    DEFAULT_LIMITS,
-    Plateau,
-    Rest,
-    Run,
-    expand,
-)
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Plateau, Rest, Run, expand
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.logs import LoggedRun
 from jtqd.sysid.runs.options import with_joint

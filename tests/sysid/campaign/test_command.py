@@ -1,7 +1,6 @@
 """`jtq campaign` from the outside, without a bus: usage, dry run, refusals; each one line, none a traceback."""
 
 import json
-import os
 import shutil
 import subprocess
 import sys
@@ -10,6 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from jtqd.daemon.jtq import main as jtq
 from jtqd.models.files import shipped
 from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.campaign.command import main, parser, recipe, wanted_plan
@@ -220,20 +220,14 @@ def test_a_campaign_that_is_done_needs_no_bus(plan, tmp_path, capsys):
 
 
 def test_the_same_directory_takes_no_other_plan(plan, tmp_path, capsys):
-    out = tmp_path / "out"
-    done_directory(out, ["validate", "--quick", "--seed", "3"])
-    for other in (
-        [plan],
-        ["validate", "--quick", "--seed", "4"],
-        ["validate", "--quick", "--seed", "3", "--runs", "5"],
-        ["validate", "--quick", "--seed", "3", "--limit", "torque_nm=9"],
-    ):
-        assert main([*other, "--bus", "unix:/nonexistent/bus", "--out", str(out)]) == 1
-        error = capsys.readouterr().err
-        assert "of another plan" in error
-        assert len(error.splitlines()) == 1
-    same = ["validate", "--quick", "--seed", "3", "--bus", "unix:/nonexistent/bus", "--out", str(out)]
-    assert main(same) == 0
+    where = ["--bus", "unix:/nonexistent/bus", "--out", str(tmp_path / "out")]
+    same = ["validate", "--quick", "--seed", "3", "--runs", "1", "--seconds", "4"]
+    done_directory(tmp_path / "out", same)
+    for other in ([plan], [*same, "--seed", "4"], [*same, "--runs", "2"], [*same, "--limit", "torque_nm=9"]):
+        assert main([*other, *where]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "of another plan" in line
+    assert main([*same, *where]) == 0
 
 
 def test_a_plan_that_was_designed_once_is_not_designed_again(tmp_path, monkeypatch, capsys):
@@ -276,14 +270,8 @@ def test_the_error_of_a_jtqd_that_does_not_start_is_passed_on(plan, tmp_path, mo
         hub.wait(10)
 
 
-def test_help_has_an_example_and_jtq_knows_the_command():
-    done = subprocess.run(
-        [sys.executable, "-m", "jtqd.daemon.jtq", "campaign", "--help"],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, "COLUMNS": "100"},
-    )
-    assert done.returncode == 0
-    assert "jtq campaign efficiency --dry-run" in done.stdout
-    assert not done.stderr
+def test_help_has_an_example_and_jtq_knows_the_command(capsys):
+    with pytest.raises(SystemExit) as left:
+        jtq(["campaign", "--help"])
+    assert left.value.code == 0
+    assert "jtq campaign efficiency --dry-run" in capsys.readouterr().out

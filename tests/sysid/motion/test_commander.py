@@ -85,11 +85,7 @@ def one_encoder_and_torque(node: int) -> DriveProfile:
 
 def three_tpdos(node: int) -> DriveProfile:
     """Every quantity in another place than usual."""
-    words = (
-        (0x60410010, 0x60640020),
-        (0x606C0020,),
-        (0x60780010, 0x60E40120),
-    )
+    words = ((0x60410010, 0x60640020), (0x606C0020,), (0x60780010, 0x60E40120))
     bases = (0x180, 0x380, 0x280)
     layout = [
         map_of(node, Tpdo(number, base + node, each), CIA_402)

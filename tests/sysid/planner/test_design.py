@@ -176,10 +176,7 @@ def test_emulated_bench_stays_within_the_limits_of_a_loaded_design():
     v, i = (dict(zip(np.round(time_s, 3).tolist(), a.tolist(), strict=True)) for a in (velocity, current))
     table = emulate_run(
         load_plant(shipped("plant.yaml")),
-        (
-            JointCommand.velocity(lambda t: v[round(t, 3)]),
-            JointCommand.current(lambda t: i[round(t, 3)]),
-        ),
+        (JointCommand.velocity(lambda t: v[round(t, 3)]), JointCommand.current(lambda t: i[round(t, 3)])),
         10.0,
     )
     predicted = Bench(*JOINTS).torque(current[:-1], velocity[:-1], acceleration[:-1])

@@ -24,16 +24,7 @@ from tests.paths import ROOT
 from tests.sysid.campaign_helpers import plateau_run
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 from tests.sysid.runs.random_motion import Excitation, random_current, random_velocity
-from tests.sysid.runs.spoiled_runs import (
-    ANGLES,
-    DEGREES,
-    bench,
-    changed,
-    checked,
-    column,
-    motion,
-    times,
-)
+from tests.sysid.runs.spoiled_runs import ANGLES, DEGREES, bench, changed, checked, column, motion, times
 
 JOINT = joint1()
 POINTS = [(v, i) for v in (0.4, 2.0, -1.0) for i in (0.0, 3.0, 5.0, -4.0)]
