@@ -12,7 +12,7 @@ from scipy.signal import lfilter
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.run import JointColumns
 from jtqd.models.files import shipped
-from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.plateaus import (
     Plateau,
@@ -26,7 +26,7 @@ from jtqd.sysid.fit.plateaus import (
 from jtqd.sysid.runs.channels import integral
 from tests.estimator.estimator_helpers import joint1
 from tests.sysid.campaign_helpers import plateau_run
-from tests.sysid.runs.random_motion import Excitation, random_current, random_velocity
+from tests.sysid.runs.spoiled_runs import drawn
 
 JOINT = joint1()
 NM_PER_A = JOINT.gear_ratio * JOINT.torque_constant_nm_per_a
@@ -269,12 +269,7 @@ def test_emulated_holds_of_the_shipped_bench() -> None:
 
 
 def test_a_random_motion_never_settles() -> None:
-    limits, rng = Excitation(), np.random.default_rng(2)
-    commands = (
-        JointCommand.velocity(random_velocity(limits, 20.0, rng)),
-        JointCommand.current(random_current(limits, rng)),
-    )
-    table = emulate_run(load_plant(shipped("plant.yaml")), commands, 20.0, 2)
+    table = emulate_run(load_plant(shipped("plant.yaml")), drawn(2, 20.0), 20.0, 2)
     with pytest.raises(PlateauError, match="no settled plateau"):
         find_plateaus(table.time_s, table.joint(1, 100.0), JOINT)
 

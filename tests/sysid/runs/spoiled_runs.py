@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
+from jtqd.sysid.planner.design import ExcitationLimits, design
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 
 JOINTS = {number: load_joint(shipped(f"joint{number}.yaml")) for number in (1, 2)}
@@ -25,6 +28,17 @@ def motion(scale: float = 1.0, offset: float = 0.0) -> tuple[JointCommand, Joint
     return (
         JointCommand.velocity(lambda t: scale * 0.9 * math.sin(1.1 * t) * math.sin(0.4 * t + 0.3) + offset),
         JointCommand.current(lambda t: 2.5 * math.sin(1.7 * t + 0.1)),
+    )
+
+
+def drawn(seed: int, seconds: float) -> tuple[JointCommand, JointCommand]:
+    """A Fourier motion and load with drawn coefficients."""
+    limits = ExcitationLimits(velocity_rad_s=2.6, travel_rad=2.6, current_a=4.5)
+    [one] = design(limits, count=1, duration_s=seconds, seed=seed, evaluations=1)
+    time_s = 1e-3 * np.arange(round(seconds * 1e3) + 1)
+    v, i = one.segment.velocity.motion(time_s)[1].tolist(), one.segment.current.value(time_s).tolist()
+    return JointCommand.velocity(lambda t: v[round(t * 1e3)]), JointCommand.current(
+        lambda t: i[round(t * 1e3)]
     )
 
 

@@ -13,7 +13,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.emulated_run import JointCommand, emulate_run
+from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant, plant_of_joint
 from jtqd.sysid.runs.channels import Channels, check_channels
 from jtqd.sysid.runs.checks import check_runs
@@ -23,8 +23,17 @@ from tests.estimator.estimator_helpers import joint1
 from tests.paths import ROOT
 from tests.sysid.campaign_helpers import plateau_run
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
-from tests.sysid.runs.random_motion import Excitation, random_current, random_velocity
-from tests.sysid.runs.spoiled_runs import ANGLES, DEGREES, bench, changed, checked, column, motion, times
+from tests.sysid.runs.spoiled_runs import (
+    ANGLES,
+    DEGREES,
+    bench,
+    changed,
+    checked,
+    column,
+    drawn,
+    motion,
+    times,
+)
 
 JOINT = joint1()
 POINTS = [(v, i) for v in (0.4, 2.0, -1.0) for i in (0.0, 3.0, 5.0, -4.0)]
@@ -57,13 +66,8 @@ def test_good_runs_have_no_finding(noisy, ideal, number):
 
 @pytest.mark.parametrize("seed", [3, 4])
 def test_random_motion_through_all_quadrants_has_no_finding(seed):
-    rng = np.random.default_rng(seed)
-    commands = (
-        JointCommand.velocity(random_velocity(Excitation(), 12.0, rng)),
-        JointCommand.current(random_current(Excitation(), rng)),
-    )
     for plant in (load_plant(shipped("plant.yaml")), plant_of_joint(JOINT)):
-        table = emulate_run(plant, commands, 12.0, seed)
+        table = emulate_run(plant, drawn(seed, 12.0), 12.0, seed)
         assert kinds(table) == []
         assert kinds(table, number=2) == []
 
