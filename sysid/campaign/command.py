@@ -311,7 +311,8 @@ def dry_run_content(
 
 def dry_run_text(content: Mapping[str, Any], limits: Limits, load: BusLoad) -> str:
     """Return `dry_run_content` for people."""
-    cells = "{run}|{velocity_joint}{alone}|{segments}|{seconds:.1f}|{peak_velocity_rad_s:.2f}|{peak_current_a:.2f}|{travel_rad:.1f}"
+    cells = "{run}|{velocity_joint}{alone}|{segments}|{seconds:.1f}|"
+    cells += "{peak_velocity_rad_s:.2f}|{peak_current_a:.2f}|{travel_rad:.1f}"
     table = [["run", "velocity joint", "segments", "seconds", "peak rad/s", "peak A", "travel rad"]]
     table += [
         cells.format(**row, alone=" alone" if row["current_joint"] is None else "").split("|")

@@ -70,16 +70,7 @@ TWO_MS = {"sync": {"period_us": 2000}}
         ([1, 1, 2], True, {}, "excitation", 1, ["bus load", "95%"]),
     ],
 )
-def test_runs_of_all_units_that_can_be_driven(  # noqa: PLR0917
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    channels: list[int | None],
-    sensor: bool,
-    more: dict[str, Any],
-    kind: str,
-    status: int,
-    words: list[str],
-) -> None:
+def test_runs_of_all_units_that_can_be_driven(tmp_path, capsys, channels, sensor, more, kind, status, words):  # noqa: PLR0917
     file = config_file(tmp_path, channels, sensor=sensor, **more)
     assert main([kind, "--quick", "--evaluations", "1", "--dry-run", "--config", str(file)]) == status
     printed = capsys.readouterr()

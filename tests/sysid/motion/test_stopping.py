@@ -6,7 +6,6 @@ so the true velocities are known.
 
 import re
 import struct
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -100,13 +99,8 @@ DRIVEN, DRIVING = (lambda lock, k=k: lock.source.plant.drives[k].current_a for k
     ids=["current of the driving joint", "current of the velocity joint, driving both", "velocity", "torque"],
 )
 def test_a_limit_stops_the_motion_when_the_true_value_reaches_it(  # noqa: PLR0917
-    lock: LockStep,
-    speed: float,
-    limit: dict[str, float],
-    measured: Callable[[LockStep], float],
-    tolerance: float,
-    reason: str,
-) -> None:
+    lock, speed, limit, measured, tolerance, reason
+):
     lock.commander(plateau(speed, CURRENT, ramp_ms=300 if speed == SPEED else 1000), replace(WIDE, **limit))
     until_stop(lock, 2000)
     (value,) = limit.values()
