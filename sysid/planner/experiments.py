@@ -25,7 +25,6 @@ from jtqd.sysid.planner.campaigns import LADDER, STEEPEST, allowed_torque, seed_
 from jtqd.sysid.planner.design import OVER, STEPS, Bench, ExcitationLimits, current_at, design, rounded_down
 from jtqd.sysid.planner.plan import (
     EDGE_S,
-    Fourier,
     Off,
     Plateau,
     Point,
@@ -133,10 +132,14 @@ def pair_range_of(
     return PairRange(pair, limits, velocity_rad_s, acceleration, (own[0], own[1]))
 
 
-def _points(reach: PairRange, name: str, role: int, points: Iterable[Point], ramp_s: float = _RAMP_S) -> Run:
+Runs = Mapping[str, tuple[Segment, ...]]
+"""Segments of the runs of an experiment by what distinguishes their names."""
+
+
+def _over(reach: PairRange, points: Iterable[Point], ramp_s: float = _RAMP_S) -> tuple[Segment, ...]:
     """From rest over all points, each held after a ramp that the joints can follow, back to rest."""
     rounded = [(velocity, round(current, 4), round(hold_s, 3)) for velocity, current, hold_s in points]
-    return run_over(name, role, rounded, lambda step: reach.ramp_s(step, ramp_s), EDGE_S)
+    return run_over("", 1, rounded, lambda step: reach.ramp_s(step, ramp_s), EDGE_S).segments
 
 
 def _turned_unloaded(points: Sequence[Point]) -> list[Point]:
@@ -149,7 +152,7 @@ def _turned_unloaded(points: Sequence[Point]) -> list[Point]:
     return result
 
 
-def _fourier(reach: PairRange, count: int, purpose: str) -> list[Fourier]:
+def _fourier(reach: PairRange, count: int, purpose: str) -> list[tuple[Segment, ...]]:
     limits = ExcitationLimits(
         velocity_rad_s=reach.velocity_rad_s,
         acceleration_rad_s2=reach.acceleration_rad_s2,
@@ -160,115 +163,112 @@ def _fourier(reach: PairRange, count: int, purpose: str) -> list[Fourier]:
     )
     seed = seed_of(purpose, reach.velocity_rad_s, 0)
     drawn = design(limits, count=count, duration_s=_FOURIER_S, seed=seed, evaluations=1, joints=reach.joints)
-    return [one.segment for one in drawn]
+    return [trajectory_run("", 1, one.segment).segments for one in drawn]
 
 
-def _pair_excitation(reach: PairRange, role: int, prefix: str) -> list[Run]:
-    motions = _fourier(reach, 4, "diagnosis excitation")[2 * (role - 1) : 2 * role]
-    return [trajectory_run(f"{prefix}_{k}", role, each) for k, each in enumerate(motions, 1)]
+def _pair_excitation(reach: PairRange, role: int) -> Runs:
+    return dict(zip("12", _fourier(reach, 4, "diagnosis excitation")[2 * (role - 1) :], strict=False))
 
 
-def _pair_repeat(reach: PairRange, role: int, prefix: str) -> list[Run]:
-    motion = _fourier(reach, 2, "diagnosis repeat")[role - 1]
-    return [trajectory_run(f"{prefix}_{k}", role, motion) for k in (1, 2, 3)]
+def _pair_repeat(reach: PairRange, role: int) -> Runs:
+    return dict.fromkeys("123", _fourier(reach, 2, "diagnosis repeat")[role - 1])
 
 
-def _both_ways(reach: PairRange, role: int, prefix: str, speeds: Sequence[float], load: float) -> list[Run]:
+def _both_ways(reach: PairRange, speeds: Sequence[float], load: float) -> Runs:
     """Each speed in both directions, without load and with one of either sign."""
-    return [
-        _points(reach, f"{prefix}_{name}", role, [(s * v, i, 1.5) for v in speeds for s in (1.0, -1.0)])
+    return {
+        name: _over(reach, [(s * v, i, 1.5) for v in speeds for s in (1.0, -1.0)])
         for name, i in (("idle", 0.0), ("pull", load), ("push", -load))
-    ]
+    }
 
 
-def _pair_speed_ladder(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_speed_ladder(reach: PairRange, role: int) -> Runs:
     speeds = [share * reach.velocity_rad_s for share in (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)]
-    return _both_ways(reach, role, prefix, speeds, 0.5 * reach.load_of(role))
+    return _both_ways(reach, speeds, 0.5 * reach.load_of(role))
 
 
-def _pair_slow_reversals(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_slow_reversals(reach: PairRange, role: int) -> Runs:
     # the last ones show the Coulomb friction by itself
     speeds = (0.04, 0.055, 0.075, 0.1, 0.14, 0.2, 0.35, 0.5 * reach.velocity_rad_s)
-    return _both_ways(reach, role, prefix, speeds, 0.6 * reach.load_of(role, speeds[-1]))
+    return _both_ways(reach, speeds, 0.6 * reach.load_of(role, speeds[-1]))
 
 
-def _pair_both_directions(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_both_directions(reach: PairRange, role: int) -> Runs:
     """All loads up and down at one velocity, then the same the other way round: the same torques in both directions."""
     shares = (0.0, 0.25, 0.5, 0.75, 1.0, 0.6, 0.2, -0.2, -0.6, -1.0, -0.75, -0.5, -0.25, 0.0)
-    runs = []
-    for k, part in enumerate((0.15, 0.5), 1):
+    runs = {}
+    for name, part in (("1", 0.15), ("2", 0.5)):
         speed = part * reach.velocity_rad_s
         highest = reach.load_of(role, speed)
-        points = [(s * speed, share * highest, 0.8) for s in (1.0, -1.0) for share in shares]
-        runs.append(_points(reach, f"{prefix}_{k}", role, points))
+        runs[name] = _over(
+            reach, [(s * speed, share * highest, 0.8) for s in (1.0, -1.0) for share in shares]
+        )
     return runs
 
 
-def _pair_load_ramp(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_load_ramp(reach: PairRange, role: int) -> Runs:
     """Standing, loads up and down: three sizes, three rates. The joint creeps first, so that it stands unloaded."""
     highest = reach.load_of(role, 0.0)
-    runs = []
-    for k, ramp_s in enumerate((0.3, 1.0, 3.0), 1):
+    runs = {}
+    for name, ramp_s in (("1", 0.3), ("2", 1.0), ("3", 3.0)):
         points = [(0.2, 0.0, 0.5), (-0.2, 0.0, 0.5), (0.0, 0.0, 0.5)]
         for share in (0.35, 0.7, 1.0, 0.35) if ramp_s < 2.0 else (0.35, 1.0):
             points += [(0.0, sign * share * highest, 0.2) for sign in (1.0, -1.0, 1.0, -1.0)]
             points.append((0.0, 0.0, 0.3))
-        runs.append(_points(reach, f"{prefix}_{k}", role, points, ramp_s))
+        runs[name] = _over(reach, points, ramp_s)
     return runs
 
 
-def _pair_full_turns(reach: PairRange, role: int, prefix: str) -> list[Run]:
-    runs = []
-    for k, part in enumerate((0.4, 0.65), 1):
+def _pair_full_turns(reach: PairRange, role: int) -> Runs:
+    runs = {}
+    for name, part in (("1", 0.4), ("2", 0.65)):
         speed = part * reach.velocity_rad_s
         load = 0.9 * reach.load_of(role, speed)
         points = [(s * speed, i, 1.2 * _TURN_RAD / speed) for i in (0.0, load, -load) for s in (1.0, -1.0)]
-        runs.append(_points(reach, f"{prefix}_{k}", role, _turned_unloaded(points)))
+        runs[name] = _over(reach, _turned_unloaded(points))
     return runs
 
 
-def _pair_quick_changes(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_quick_changes(reach: PairRange, role: int) -> Runs:
     """Velocity back and forth at rising rates without and with load, then load back and forth at constant velocity."""
-    runs = []
     load = 0.4 * reach.load_of(role)
+    start = Rest(EDGE_S, 0.0)
+    runs: dict[str, tuple[Segment, ...]] = {}
     for name, current in (("idle", 0.0), ("loaded", load)):
-        segments: list[Segment] = [Rest(EDGE_S, 0.0)]
+        changes: list[Segment] = []
         for share in (0.25, 0.5, 1.0):
             speed = 0.3 * reach.velocity_rad_s
             ramp_s = round(STEEPEST * 2.0 * speed / (share * reach.acceleration_rad_s2), 3)
-            segments += [Plateau(s * speed, current, 0.05, ramp_s) for s in (1.0, -1.0) * 6]
-        segments.append(Rest(EDGE_S, _RAMP_S))
-        runs.append(Run(f"{prefix}_{name}", role, tuple(segments)))
-    swing: list[Segment] = [Rest(EDGE_S, 0.0)]
+            changes += [Plateau(s * speed, current, 0.05, ramp_s) for s in (1.0, -1.0) * 6]
+        runs[name] = (start, *changes, Rest(EDGE_S, _RAMP_S))
+    swing: list[Segment] = []
     for s in (1.0, -1.0):
         speed = s * 0.4 * reach.velocity_rad_s
         swing.append(Plateau(speed, 0.0, 0.3, reach.ramp_s(speed)))
         for ramp_s in (0.4, 0.2, 0.1, 0.06):
             swing += [Plateau(speed, round(sign * load, 4), 0.1, ramp_s) for sign in (1.0, -1.0) * 2]
         swing.append(Rest(0.3, _RAMP_S))
-    runs.append(Run(f"{prefix}_load", role, tuple(swing)))
-    return runs
+    return runs | {"load": (start, *swing)}
 
 
-def _pair_warm_up(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_warm_up(reach: PairRange, role: int) -> Runs:
     """One long run: a check, then fast and loaded back and forth, a check again, and so on while the joints warm."""
     fast, load = reach.velocity_rad_s, reach.load_of(role)
     check: list[Point] = [(0.0, 0.0, 2.0)]
     check += [(s * v * fast, 0.0, 1.0) for v in (0.15, 0.5, 1.0) for s in (1.0, -1.0)]
     check += [(s * 0.25 * fast, i * load, 1.0) for i in (0.8, -0.8) for s in (1.0, -1.0)]
     warm: list[Point] = [(s * fast, s * 0.8 * load, 6.0) for s in (1.0, -1.0)] * 6
-    return [_points(reach, prefix, role, _turned_unloaded((check + warm) * 5 + check))]
+    return {"": _over(reach, _turned_unloaded((check + warm) * 5 + check))}
 
 
-def _pair_zero_reading(reach: PairRange, role: int, prefix: str) -> list[Run]:
+def _pair_zero_reading(reach: PairRange, role: int) -> Runs:
     """Rests with the drives switched off, each reached from the other direction, with slow turning between."""
     speed = 0.2 * reach.velocity_rad_s
     ramp_s = reach.ramp_s(speed)
     segments: list[Segment] = [Rest(EDGE_S, 0.0), Off(_OFF_S)]
-    for _ in range(3):
-        for s in (1.0, -1.0):
-            segments += [Plateau(s * speed, 0.0, 2.0, ramp_s), Rest(0.5, ramp_s), Off(_OFF_S)]
-    return [Run(f"{prefix}_{k}", role, tuple(segments)) for k in (1, 2)]
+    for s in (1.0, -1.0) * 3:
+        segments += [Plateau(s * speed, 0.0, 2.0, ramp_s), Rest(0.5, ramp_s), Off(_OFF_S)]
+    return dict.fromkeys("12", tuple(segments))
 
 
 # One joint ------------------------------------------------------------------------------------------------------
@@ -362,9 +362,13 @@ def _ladder(joint: JointRange, shares: Iterable[float]) -> list[Move]:
     return moves
 
 
-def _joint_excitation(joint: JointRange, name: str) -> list[Motion]:
+Motions = Mapping[str, tuple[str, Sequence[Move]]]
+"""Condition for people and moves of the motions of an experiment, by what distinguishes their names."""
+
+
+def _joint_excitation(joint: JointRange) -> Motions:
     """Random targets, speeds and rests from a fixed seed: every position in both directions at several speeds."""
-    made = []
+    made = {}
     for k in (1, 2, 3, 4):
         rng = np.random.default_rng(k)
         moves = [
@@ -376,59 +380,48 @@ def _joint_excitation(joint: JointRange, name: str) -> list[Motion]:
             )
             for _ in range(24)
         ]
-        made.append(_played(f"{name}_{k}", _EMPTY if k < 3 else _LOADED, joint, moves))
+        made[str(k)] = (_EMPTY if k < 3 else _LOADED, moves)
     return made
 
 
-def _joint_repeat(joint: JointRange, name: str) -> list[Motion]:
-    moves = _ladder(joint, (0.2, 0.5, 1.0))
-    return [_played(f"{name}_{k}", "the same motion again", joint, moves) for k in (1, 2, 3, 4)]
+def _joint_repeat(joint: JointRange) -> Motions:
+    return dict.fromkeys("1234", ("the same motion again", _ladder(joint, (0.2, 0.5, 1.0))))
 
 
-def _both_payloads(shares: Sequence[float]) -> Callable[[JointRange, str], list[Motion]]:
-    def made(joint: JointRange, name: str) -> list[Motion]:
-        moves = _ladder(joint, shares)
-        return [
-            _played(f"{name}_{k}_{label}", what, joint, moves)
-            for k in (1, 2)
-            for label, what in (("empty", _EMPTY), ("loaded", _LOADED))
-        ]
-
-    return made
+def _both_payloads(shares: Sequence[float]) -> Callable[[JointRange], Motions]:
+    return lambda joint: {
+        f"{k}_{label}": (what, _ladder(joint, shares))
+        for k in (1, 2)
+        for label, what in (("empty", _EMPTY), ("loaded", _LOADED))
+    }
 
 
-def _joint_load_ramp(joint: JointRange, name: str) -> list[Motion]:
+def _joint_load_ramp(joint: JointRange) -> Motions:
     """Standing at five positions, each reached from both sides: gravity is the load that goes up and down."""
     at = np.linspace(joint.low_rad, joint.high_rad, 5)
     speed, a = 0.3 * joint.velocity_rad_s, 0.5 * joint.acceleration_rad_s2
     moves = [(float(q), speed, a, 2.0) for q in (*at, *at[::-1])]
-    return [
-        _played(f"{name}_{label}", what, joint, moves)
-        for label, what in (("empty", _EMPTY), ("loaded", _LOADED))
-    ]
+    return {"empty": (_EMPTY, moves), "loaded": (_LOADED, moves)}
 
 
-def _joint_quick_changes(joint: JointRange, name: str) -> list[Motion]:
-    made = []
-    for k, share in enumerate((0.3, 0.6, 1.0), 1):
+def _joint_quick_changes(joint: JointRange) -> Motions:
+    made = {}
+    for name, share in (("1", 0.3), ("2", 0.6), ("3", 1.0)):
         a = share * joint.acceleration_rad_s2
         half = min(0.25 * joint.span_rad, 0.5 * joint.velocity_rad_s**2 / a)
-        moves: list[Move] = [
-            (joint.middle_rad + s * half, joint.velocity_rad_s, a, 0.0) for s in (-1.0, 1.0) * 10
-        ]
-        made.append(_played(f"{name}_{k}", _EMPTY, joint, moves))
+        moves = [(joint.middle_rad + s * half, joint.velocity_rad_s, a, 0.0) for s in (-1.0, 1.0) * 10]
+        made[name] = (_EMPTY, moves)
     return made
 
 
-def _joint_warm_up(joint: JointRange, name: str) -> list[Motion]:
+def _joint_warm_up(joint: JointRange) -> Motions:
     check = _ladder(joint, (0.1, 0.3, 1.0))
     a = joint.acceleration_rad_s2
     work: list[Move] = [(q, joint.velocity_rad_s, a, 0.0) for q in (joint.low_rad, joint.high_rad)] * 30
-    moves = (check + work) * 4 + check
-    return [_played(f"{name}_{k}", "from cold, without a break", joint, moves) for k in (1, 2)]
+    return dict.fromkeys("12", ("from cold, without a break", (check + work) * 4 + check))
 
 
-def _joint_zero_reading(joint: JointRange, name: str) -> list[Motion]:
+def _joint_zero_reading(joint: JointRange) -> Motions:
     """Two stops of 5 s, each reached from both sides; the brake holds."""
     a, speed = 0.5 * joint.acceleration_rad_s2, 0.3 * joint.velocity_rad_s
     moves: list[Move] = [
@@ -436,7 +429,7 @@ def _joint_zero_reading(joint: JointRange, name: str) -> list[Motion]:
         for k, s in enumerate((1.0, 0.5, -1.0, -0.5) * 2)
     ]
     what = "in each stop of 5 s: brake on, power stage off, recorded as jN.enabled 0"
-    return [_played(f"{name}_{k}", what, joint, moves) for k in (1, 2)]
+    return dict.fromkeys("12", (what, moves))
 
 
 # Kinds of experiment --------------------------------------------------------------------------------------------
@@ -452,9 +445,9 @@ class Experiment:
     """
 
     pair_text: str
-    pair: Callable[[PairRange, int, str], Sequence[Run]]
+    pair: Callable[[PairRange, int], Runs]
     joint_text: str
-    joint: Callable[[JointRange, str], Sequence[Motion]]
+    joint: Callable[[JointRange], Motions]
 
 
 EXPERIMENTS: Final = {
@@ -531,13 +524,17 @@ EXPERIMENTS: Final = {
 def pair_runs(kinds: Iterable[str], reach: PairRange) -> tuple[Run, ...]:
     """Return the runs of these kinds of experiment on a towing bench, either joint as the velocity joint."""
     return tuple(
-        run
+        Run(f"{kind}_v{role}_{name}".removesuffix("_"), role, segments)
         for kind in kinds
         for role in _ROLES
-        for run in EXPERIMENTS[kind].pair(reach, role, f"{kind}_v{role}")
+        for name, segments in EXPERIMENTS[kind].pair(reach, role).items()
     )
 
 
 def joint_motions(kinds: Iterable[str], joint: JointRange) -> list[Motion]:
     """Return the motions of one joint for these kinds of experiment."""
-    return [motion for kind in kinds for motion in EXPERIMENTS[kind].joint(joint, kind)]
+    return [
+        _played(f"{kind}_{name}", what, joint, moves)
+        for kind in kinds
+        for name, (what, moves) in EXPERIMENTS[kind].joint(joint).items()
+    ]
