@@ -10,20 +10,11 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks import (
-    cycle,
-    host,
-    log_reading,
-    long_run,
-    recording,
-    replay_speed,
-    service_cost,
-    stages,
-    start,
-)
+from tests.benchmarks import cycle, log_reading, long_run, recording, replay_speed, stages, start
+from tests.benchmarks.contender import description
 from tests.benchmarks.fixture import make_fixture
 
-NAMES = ("cycle", "stages", "grid", "start", "logs", "recording", "replay", "service")
+NAMES = ("cycle", "stages", "grid", "start", "logs", "recording", "replay")
 _BITRATE = 1_000_000
 _EXAMPLES = """examples:
   python -m tests.benchmarks                   everything, about 13 minutes
@@ -58,7 +49,7 @@ def main(arguments: list[str] | None = None) -> int:
         parser.error(f"found {unknown[0]!r}, expected one of {', '.join(NAMES)}")
     if options.quick:
         options.rounds, options.seconds, options.minutes = 2, 0.6, 5.0 / 60.0
-    results: dict[str, Any] = {"machine": host.description()}
+    results: dict[str, Any] = {"machine": description()}
     if not options.json:
         print(f"{results['machine']}\n")
     # So that what was started is ended and what was written is removed.
@@ -86,7 +77,6 @@ def _measure(name: str, directory: Path, options: argparse.Namespace) -> tuple[A
         "start": (start, {}),
         "recording": (recording, {"seconds": 5.0 if options.quick else 30.0}),
         "logs": (log_reading, {"minutes": 0.25 if options.quick else 5.0}),
-        "service": (service_cost, {}),
         "replay": (replay_speed, {}),
     }
     if name in small:

@@ -10,7 +10,6 @@ import numpy as np
 
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.core import joint as joint_cycle
-from jtqd.daemon.core import schedule
 from jtqd.daemon.core.status import NEEDED
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.losses import BLEND_CURRENT_A, LossModel
@@ -52,9 +51,9 @@ def _header(config: Config) -> str:
         "MAX_GAP_S": config.estimator.max_gap_s,
         "WAIT_NS": config.input_wait_ns,
         "DEADLINE_NS": config.input_deadline_ns,
-        "FOLLOW_STEP_NS": schedule._STEP_NS,
-        "FOLLOW_MARGIN_NS": schedule._MARGIN_NS,
-        "FOLLOW_SHORTEST_NS": schedule._SHORTEST_NS,
+        "FOLLOW_STEP_NS": 160,  # these three as in daemon/core/schedule.pyx
+        "FOLLOW_MARGIN_NS": 10_000,
+        "FOLLOW_SHORTEST_NS": 50_000,
         "MOTOR_RAD_PER_COUNT": SCALING["motor_rad_per_count"],
         "MOTOR_RAD_S_PER_UNIT": SCALING["motor_rad_s_per_unit"],
         "LINK_RAD_PER_COUNT": SCALING["link_rad_per_count"],
@@ -110,21 +109,12 @@ def _joint(joint: Joint, settings: EstimatorSettings, network: SmallNetwork) -> 
 
 
 def _weights(network: SmallNetwork) -> str:
-    (w1, b1), (w2, b2), (w3, b3), (w4, b4) = network.layers
-    values: dict[str, object] = {
-        "w1": w1,
-        "b1": b1,
-        "w2": w2,
-        "b2": b2,
-        "w3": w3,
-        "b3": b3,
-        "w4": w4[:, 0],
-        "b4": float(b4[0]),
-        "input_mean": network.input_mean,
-        "input_std": network.input_std,
-        "output_mean": network.output_mean,
-        "output_std": network.output_std,
-    }
+    *hidden, (w4, b4) = network.layers
+    values: dict[str, object] = {"w4": w4[:, 0], "b4": float(b4[0])}
+    for n, (w, b) in enumerate(hidden, 1):
+        values |= {f"w{n}": w, f"b{n}": b}
+    scales = ("input_mean", "input_std", "output_mean", "output_std")
+    values |= {name: getattr(network, name) for name in scales}
     return "{" + ", ".join(f".{name} = {_literal(value)}" for name, value in values.items()) + "}"
 
 

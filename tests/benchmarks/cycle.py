@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from tests.benchmarks import c_program, host
+from tests.benchmarks import c_program, contender
 from tests.benchmarks.contender import Process, Task, python
 from tests.benchmarks.fixture import Fixture
 from tests.benchmarks.measure import SETTLE_CYCLES, Samples, mark, table
@@ -24,10 +24,10 @@ WIRE_RATIO, WIRE_AFTER_LAST_US, WIRE_POINTS = 1.3, 60.0, -1.0
 def run(
     fixture: Fixture, *, rounds: int, seconds: float, quiet: bool, bitrate: int | None = None
 ) -> dict[str, Any]:
-    """Measure; `quiet` keeps the contenders' core awake (see host.py), `bitrate` spaces the frames as a wire does."""
+    """Measure; `quiet` keeps the contenders' core awake (see contender.py), `bitrate` spaces the frames as a wire does."""
     program = c_program.build(fixture)
-    where = host.cpus()
-    traffic = host.traffic(fixture.directory, where, bitrate)
+    where = contender.cpus()
+    traffic = contender.traffic(fixture.directory, where, bitrate)
     bus = fixture.directory / "bus"
     task = Task(f"unix:{bus}", fixture.directory, where.loop)
     contenders = {
@@ -36,9 +36,9 @@ def run(
         C: Process(_c_command(program, bus, task), C),
         FOLLOWING: Process([*_c_command(program, bus, task), "follow"], FOLLOWING),
     }
-    spinner = host.quiet_core(program, where) if quiet else None
+    spinner = contender.quiet_core(program, where) if quiet else None
     samples = {name: Samples() for name in contenders}
-    load = host.OtherLoad()
+    load = contender.OtherLoad()
     try:
         for _ in range(rounds):
             for name, process in contenders.items():
@@ -68,6 +68,23 @@ def run(
     }
 
 
+COLUMNS = {
+    "CPU median us": "{cpu_median_us:.1f}",
+    "p99": "{cpu_p99_us:.1f}",
+    "mean": "{cpu_mean_us:.1f}",
+    "rounds": "{round_median_low_us:.1f}..{round_median_high_us:.1f}",
+    "answer us": "{answer_median_us:.0f}",
+    "p99 ": "{answer_p99_us:.0f}",
+    "after last us": "{after_last_median_us:.0f}",
+    "p99  ": "{after_last_p99_us:.0f}",
+    "sleeps": "{switches_per_cycle:.1f}",
+    "cycles": "{cycles:.0f}",
+    "missed": "{missed:.0f}",
+    "with torque": "{with_torque_percent:.1f} %",
+}
+"""Head of a column and what stands in it, of `Samples.figures`."""
+
+
 def _c_command(program: Path, bus: Path, task: Task) -> list[str]:
     cpu = -1 if task.cpu is None else task.cpu
     return [str(program), "run", str(bus), str(cpu), str(task.priority), str(task.directory / "c.ring")]
@@ -81,40 +98,10 @@ def text(result: dict[str, Any]) -> str:
         f"{result['cpus_busy']:.1f} CPUs busy",
         "",
     ]
-    rows = []
-    for name, f in result["contenders"].items():
-        rows.append(
-            [
-                name,
-                f"{f['cpu_median_us']:.1f}",
-                f"{f['cpu_p99_us']:.1f}",
-                f"{f['cpu_mean_us']:.1f}",
-                f"{f['round_median_low_us']:.1f}..{f['round_median_high_us']:.1f}",
-                f"{f['answer_median_us']:.0f}",
-                f"{f['answer_p99_us']:.0f}",
-                f"{f['after_last_median_us']:.0f}",
-                f"{f['after_last_p99_us']:.0f}",
-                f"{f['switches_per_cycle']:.1f}",
-                f"{f['cycles']:.0f}",
-                f"{f['missed']:.0f}",
-                f"{100.0 * f['published'] / max(f['cycles'], 1):.1f} %",
-            ]
-        )
-    head = [
-        "",
-        "CPU median us",
-        "p99",
-        "mean",
-        "rounds",
-        "answer us",
-        "p99",
-        "after last us",
-        "p99",
-        "sleeps",
-        "cycles",
-        "missed",
-        "with torque",
+    rows = [
+        [name, *(form.format(**f) for form in COLUMNS.values())] for name, f in result["contenders"].items()
     ]
+    head = ["", *(text.strip() for text in COLUMNS)]
     lines.append(table(head, rows))
     ratios = result["ratios"]
     lines += [

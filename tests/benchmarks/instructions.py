@@ -86,8 +86,8 @@ def cycles() -> None:
     from jtqd.drivers.frame_socket import open_frame_socket
     from jtqd.estimator import network
     from jtqd.estimator.status import PUBLISHED
+    from tests.benchmarks.contender import Cpus, traffic
     from tests.benchmarks.fixture import Fixture
-    from tests.benchmarks.host import Cpus, traffic
 
     network._LONGEST_S = math.inf  # type: ignore[misc]  # valgrind takes fifty times as long
     with tempfile.TemporaryDirectory() as name:

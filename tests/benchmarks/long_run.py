@@ -29,7 +29,7 @@ from math import nan, sqrt
 from typing import Any
 
 from jtqd.daemon.core.schedule import Grid
-from tests.benchmarks import host
+from tests.benchmarks import contender
 from tests.benchmarks.contender import Process, Task, die_with_parent, python, serve
 from tests.benchmarks.fixture import Fixture
 from tests.benchmarks.measure import CycleMeter, mark_beside_error, punctual, quantile, table
@@ -85,8 +85,8 @@ def beyond(one: list[int], other: list[int], slots: int) -> dict[str, float]:
 
 def run(fixture: Fixture, *, minutes: float) -> dict[str, Any]:
     """Run all for `minutes`, as the machine is: no core is kept awake."""
-    where = host.cpus()
-    traffic = host.traffic(fixture.directory, where)
+    where = contender.cpus()
+    traffic = contender.traffic(fixture.directory, where)
     task = Task(f"unix:{fixture.directory / 'bus'}", fixture.directory, where.loop)
     answering = [] if where.traffic is None else [str(where.traffic)]
     processes = {
@@ -96,7 +96,7 @@ def run(fixture: Fixture, *, minutes: float) -> dict[str, Any]:
         WAKING: Process(python("long_run", task.to_json(), "waking", *answering), "the waking sleeper"),
     }
     loops = {name: Loop() for name in processes}
-    load = host.OtherLoad()
+    load = contender.OtherLoad()
     rounds = max(_FEWEST_ROUNDS, 2 * round(minutes * 30.0 / _ROUND_S))
     cycles = max(1, round(minutes * 60_000 / rounds))
     try:
@@ -123,17 +123,9 @@ def run(fixture: Fixture, *, minutes: float) -> dict[str, Any]:
 
 def text(result: dict[str, Any]) -> str:
     """All loops side by side, and what one misses beyond another."""
+    form = "{slots:.0f} {missed:.0f} {rate:.0f} {late_median_us:.0f} {late_p99_us:.0f} {late_p999_us:.0f} {late_max_us:.0f}"
     rows = [
-        [
-            name,
-            f"{f['slots']:.0f}",
-            f"{f['missed']:.0f}",
-            f"{1e6 * f['missed'] / f['slots']:.0f}",
-            f"{f['late_median_us']:.0f}",
-            f"{f['late_p99_us']:.0f}",
-            f"{f['late_p999_us']:.0f}",
-            f"{f['late_max_us']:.0f}",
-        ]
+        [name, *form.format(rate=1e6 * f["missed"] / f["slots"], **f).split()]
         for name, f in result["loops"].items()
     ]
     head = ["", "slots", "missed", "per million", "late us median", "p99", "p99.9", "max begun"]

@@ -12,7 +12,7 @@ from typing import Any
 
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.schedule import Grid
-from tests.benchmarks import c_program, host
+from tests.benchmarks import c_program, contender
 from tests.benchmarks.contender import Process, Task, python, serve
 from tests.benchmarks.contender_jtqd import JtqdLoop
 from tests.benchmarks.fixture import Fixture
@@ -78,11 +78,11 @@ class StagedLoop(JtqdLoop):
 
 
 def run(fixture: Fixture, *, seconds: float, quiet: bool) -> dict[str, Any]:
-    where = host.cpus()
-    traffic = host.traffic(fixture.directory, where)
+    where = contender.cpus()
+    traffic = contender.traffic(fixture.directory, where)
     task = Task(f"unix:{fixture.directory / 'bus'}", fixture.directory, where.loop)
     process = Process(python("stages", task.to_json()), "the staged loop")
-    spinner = host.quiet_core(c_program.build(fixture), where) if quiet else None
+    spinner = contender.quiet_core(c_program.build(fixture), where) if quiet else None
     try:
         result = process.run(SETTLE_CYCLES + round(seconds * 1000))
     finally:
