@@ -13,7 +13,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from contextlib import suppress
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -29,6 +28,7 @@ from jtqd.daemon.shared.cycle_record import RingReader
 from tests.benchmarks.contender import ROOT
 from tests.benchmarks.measure import mark, table
 from tests.daemon import ring_records as rr
+from tests.processes import of_module
 
 SIZE_LIMIT_GB, CORE_LIMIT_PERCENT = 1.2, 3.0
 _PARTS_PER_HOUR = 6
@@ -99,10 +99,8 @@ def _daemon(directory: Path, disk: Path, seconds: float) -> tuple[dict[str, Any]
 def _recorder(daemon: subprocess.Popen[str]) -> int:
     deadline = time.monotonic() + 30.0
     while time.monotonic() < deadline and daemon.poll() is None:
-        for pid in Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split():
-            with suppress(OSError):
-                if b"jtqd.daemon.recording.recorder" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                    return int(pid)
+        if (pid := of_module(daemon.pid, "jtqd.daemon.recording.recorder")) is not None:
+            return pid
         time.sleep(0.05)
     raise RuntimeError("the daemon started no recorder")
 

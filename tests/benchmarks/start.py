@@ -17,6 +17,7 @@ from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.estimator.status import PUBLISHED
 from tests.benchmarks.contender import ROOT
 from tests.benchmarks.measure import mark, table
+from tests.processes import family
 
 START_LIMIT_S, MEMORY_LIMIT_MB = 2.0, 120.0
 _ESTIMATE_ID = 0x1A0
@@ -48,7 +49,7 @@ def run(directory: Path, *, duration_s: float = 4.0) -> dict[str, Any]:
         try:
             bus_s, first_s, estimate_s = _first_estimates(daemon, path, started)
             time.sleep(_SETTLE_S)
-            memory = {pid: _memory(pid) for pid in _family(daemon.pid)}
+            memory = {pid: _memory(pid) for pid in family(daemon.pid)}
         except RuntimeError as error:
             errors.seek(0)
             raise RuntimeError(f"{error}: {errors.read().strip()[-400:]}") from None
@@ -106,19 +107,6 @@ def _listen(daemon: subprocess.Popen[bytes], path: Path, started: float) -> Fram
 def _alive(daemon: subprocess.Popen[bytes]) -> None:
     if daemon.poll() is not None:
         raise RuntimeError(f"jtqd ended with exit status {daemon.returncode}")
-
-
-def _family(root: int) -> list[int]:
-    parents = {}
-    for each in Path("/proc").iterdir():
-        if each.name.isdigit():
-            with contextlib.suppress(OSError):
-                stat = (each / "stat").read_text(encoding="utf-8")
-                parents[int(each.name)] = int(stat.rpartition(")")[2].split()[1])
-    family = [root]
-    for pid in family:
-        family += [child for child, parent in parents.items() if parent == pid]
-    return family
 
 
 def _memory(pid: int) -> dict[str, Any] | None:

@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.slow.faults [--case N ...] [--json | --markdown]`."""
+"""Command line: `python -m tests.slow.faults [--case N ...] [--json]`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import sys
-from collections.abc import Iterable
 from typing import Any
 
 from jtqd.sim_can.bench_kernel import build, guest
@@ -16,7 +15,6 @@ from tests.slow.faults.runner import Outcome, play
 _EXAMPLES = """examples:
   python -m tests.slow.faults                 every case that is played on the bus, as a table
   python -m tests.slow.faults --case 16 12    only these (16: all its parts; 16a: this part)
-  python -m tests.slow.faults --markdown      the table of docs/testing.md
   python -m tests.slow.faults --library       with nodes that share no code with jtqd or its bench
 
 Where this machine has no SocketCAN, it runs in the bench kernel, with exact time. Exit status 1: a case does not hold.
@@ -60,18 +58,11 @@ def cells(outcome: Outcome) -> list[str]:
     ]
 
 
-HEAD = ("case", "fault", "injected", "proof", "status 1 / 2", "EMCY", "counters", "noticed", "recovered", "")
-
-
 def line(outcome: Outcome) -> str:
     """One line for a terminal, and one for each thing that is wrong."""
     key, title, _, proof, status, emcy, counters, noticed, recovered, verdict = cells(outcome)
     text = f"{key:>4} {title:46.46} {status:12} {emcy:22} {noticed:>9} {recovered:>9} {verdict:3} {counters}"
     return "\n".join([text, f"       {proof}", *(f"       {each}" for each in outcome.wrong)])
-
-
-def row(texts: Iterable[str]) -> str:
-    return "| " + " | ".join(texts) + " |"
 
 
 def _ms(value: float | None) -> str:
@@ -90,7 +81,6 @@ def main(arguments: list[str] | None = None) -> int:
         "--case", nargs="+", metavar="N", help="numbers of cases, with or without their letter"
     )
     parser.add_argument("--json", action="store_true", help="as JSON")
-    parser.add_argument("--markdown", action="store_true", help="as the table of docs/testing.md")
     parser.add_argument(
         "--library",
         action="store_true",
@@ -112,13 +102,9 @@ def main(arguments: list[str] | None = None) -> int:
         return guest.run(command, time_travel=True, sinks=sinks).returncode
 
     def tell(outcome: Outcome) -> None:
-        if options.markdown:
-            print(row(cells(outcome)), flush=True)
-        elif not options.json:
+        if not options.json:
             print(line(outcome), flush=True)
 
-    if options.markdown:
-        print(row(HEAD), row("---" for _ in HEAD), sep="\n", flush=True)
     outcomes = play(chosen, bus, tell, library=options.library)
     if options.json:
         print(json.dumps([as_json(each) for each in outcomes], indent=1))

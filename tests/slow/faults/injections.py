@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from jtqd.drivers.object_dictionary import ObjectStore
 from jtqd.sim_can.canopen_node import CURRENT, CanopenNode
 from jtqd.sim_can.devices import OVERCURRENT
+from tests.processes import state
 from tests.slow.faults.listener import Seen
 
 if TYPE_CHECKING:
@@ -243,8 +244,7 @@ def forget(rig: Rig, number: int) -> None:
 
 
 def stands_still(name: str, pid: int) -> Seen:
-    state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    return Seen(state == "T", f"{name} in state {state}")
+    return Seen(state(pid) == "T", f"{name} in state {state(pid)}")
 
 
 def loop_stands_still(rig: Rig) -> Seen:

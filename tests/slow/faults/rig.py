@@ -31,6 +31,7 @@ from jtqd.sim_can.bench import Bench, bench_filters
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sim_can.plant_source import PlantSource
 from tests.library_drives.in_step import LibraryNodes
+from tests.processes import of_module
 from tests.slow.faults.injections import Fault
 from tests.slow.faults.listener import Ears
 
@@ -209,7 +210,10 @@ class Rig:
                 raise DaemonEndedError(f"no estimate within 60 s: {self.said()}")
             (snapshot,) = (self._directory / "run").glob("*/snapshot")
             self.reader = SnapshotReader(snapshot)
-            self.loop_pid = self._child(b"jtqd.daemon.loop.process")
+            loop = of_module(self.process.pid, "jtqd.daemon.loop.process")
+            if loop is None:
+                raise DaemonEndedError(f"no loop process: {self.said()}")
+            self.loop_pid = loop
         except BaseException:
             self.__exit__()
             raise
@@ -248,15 +252,6 @@ class Rig:
     def _open(self) -> None:
         own = (exact(ESTIMATE), exact(OWN_EMCY), exact(0x5A0))
         self.socket = open_frame_socket(self.bus, [*bench_filters(), *own])
-
-    def _child(self, module: bytes) -> int:
-        for process in Path("/proc").glob("[0-9]*"):
-            with suppress(OSError):  # it has just ended
-                parent = process.joinpath("stat").read_text().rpartition(")")[2].split()[1]
-                command = process.joinpath("cmdline").read_bytes().split(b"\0")
-                if int(parent) == self.process.pid and module in command:
-                    return int(process.name)
-        raise DaemonEndedError(f"no process {module.decode()}: {self.said()}")
 
     # For faults ---------------------------------------------------------------------------------------------
 

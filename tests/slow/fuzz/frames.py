@@ -107,27 +107,8 @@ class FrameReport:
         return not self.exceptions and not self.oracle.findings and self.oracle.valid > self.cycles // 10
 
     def as_json(self) -> dict[str, Any]:
-        oracle = self.oracle
-        return {
-            "seed": self.seed,
-            "frames": self.frames,
-            "cycles": self.cycles,
-            "exceptions": self.exceptions,
-            "exception": self.exception,
-            "valid_estimates": oracle.valid,
-            "valid_from_stale_input": oracle.stale,
-            "valid_from_unprovable_input": oracle.stale_loose,
-            "believed_stale_input": oracle.believed,
-            "believed_unprovable_input": oracle.believed_loose,
-            "torque_without_valid_status": oracle.leaked,
-            "wrong_sequence": oracle.wrong_sequence,
-            "first_wrong": oracle.first_wrong,
-            **self.counters,
-            "memory_growth_kb": self.growth_kb,
-            "digest": f"{self.digest:08x}",
-            "episodes": self.episodes,
-            "seconds": round(self.seconds, 1),
-        }
+        rest = {k: v for k, v in vars(self).items() if k not in ("oracle", "counters")}
+        return {**rest, **vars(self.oracle), **self.counters}
 
 
 def make_cycle(directory: Path, script: Script) -> tuple[Cycle, BusInTime]:

@@ -18,6 +18,7 @@ import numpy as np
 
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
+from tests.processes import state
 from tests.slow.faults import listener as proofs
 from tests.slow.faults.listener import Heard, Proof, Seen
 from tests.slow.soak.bench import BUS_OFF, RESTARTED
@@ -75,29 +76,21 @@ class Scene:
         os.kill(pid, signal.SIGSTOP)
         try:
             time.sleep(seconds)
-            state = state_of(pid)
+            stood = state(pid)
         finally:
             os.kill(pid, signal.SIGCONT)
-        if state != "T":
-            raise NotInjectedError(f"{name} was not stopped but {state}")
+        if stood != "T":
+            raise NotInjectedError(f"{name} was not stopped but {stood}")
 
     def kill(self, name: str) -> None:
         """SIGKILL. Raises NotInjectedError where it lives on."""
         pid = self.pid(name)
         os.kill(pid, signal.SIGKILL)
         end = time.monotonic() + _KILLED_S
-        while state_of(pid) not in ("", "Z"):
+        while state(pid) not in ("", "Z"):
             if time.monotonic() > end:
                 raise NotInjectedError(f"{name} lives on")
             time.sleep(0.002)
-
-
-def state_of(pid: int) -> str:
-    """State letter of a process; "" where there is none."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return ""
 
 
 _STOP, _RESET = 2, 129

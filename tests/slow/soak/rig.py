@@ -20,6 +20,7 @@ from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.models.files import shipped
 from tests.paths import ROOT
+from tests.processes import of_module
 from tests.slow.faults.listener import Ears
 
 _NAMES = {"jtqd.daemon.loop.process": "loop", "jtqd.daemon.recording.recorder": "recorder"}
@@ -132,17 +133,9 @@ class Rig:
     def processes(self) -> dict[str, int]:
         """Process-ID of each process of the daemon, and of the bench, by name."""
         found = {"supervisor": self.daemon.pid, "bench": self.bench.pid}
-        for entry in Path("/proc").iterdir():
-            if not entry.name.isdigit():
-                continue
-            try:
-                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-                words = (entry / "cmdline").read_bytes().decode().split("\0")
-            except OSError:
-                continue
-            for module, name in _NAMES.items():
-                if parent == self.daemon.pid and module in words:
-                    found[name] = int(entry.name)
+        for module, name in _NAMES.items():
+            if (pid := of_module(self.daemon.pid, module)) is not None:
+                found[name] = pid
         return found
 
     def end(self) -> None:
