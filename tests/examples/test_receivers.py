@@ -24,6 +24,7 @@ from jtqd.drivers.can_unix import UnixBus
 from jtqd.drivers.hub import Hub
 from jtqd.estimator import status
 from tests.paths import ROOT
+from tests.processes import family
 from tests.shipped_bench import shipped_bench
 
 # -7.75 Nm, sigma 0.2 Nm, valid; joint 2 stale; SYNC counter 42
@@ -373,7 +374,7 @@ def test_beside_jtqd_withheld_late_and_lost_estimates(program, tmp_path: Path) -
         assert until(receiver.stdout, "USE")[-1].startswith("USE   ")
 
         time.sleep(0.3)
-        for process in (daemon.pid, *children_of(daemon.pid)):
+        for process in family(daemon.pid):
             os.kill(process, signal.SIGSTOP)  # nothing is said any more: as after a crash
         assert until(receiver.stdout, "STOP")[-1].startswith("STOP  too old, status ")
         out = receiver.stdout.read()  # not communicate(): a line may wait in the buffer of the lines before
@@ -382,7 +383,7 @@ def test_beside_jtqd_withheld_late_and_lost_estimates(program, tmp_path: Path) -
         assert int(out.rpartition(" ")[2]) > 300, "contact PDOs, with section contact"
     finally:
         for side in sides:
-            for process in (*children_of(side.pid), side.pid) if side.poll() is None else ():
+            for process in reversed(family(side.pid)) if side.poll() is None else ():
                 os.kill(process, signal.SIGKILL)
             side.communicate(timeout=30)
 
@@ -392,18 +393,6 @@ def with_contacts(directory: Path) -> Path:
     path = directory / "contact.yaml"
     path.write_text(yaml.safe_dump(shipped_bench() | {"contact": {"opposed": True}}))
     return path
-
-
-def children_of(pid: int) -> list[int]:
-    parents = {}
-    for process in Path("/proc").glob("[0-9]*"):
-        try:
-            fields = (process / "stat").read_text().rpartition(")")[2].split()
-        except OSError:  # it has just ended
-            continue
-        parents[int(process.name)] = int(fields[1])
-    found = [each for each, parent in parents.items() if parent == pid]
-    return found + [each for child in found for each in children_of(child)]
 
 
 def test_estimates_that_are_lost_on_the_way(program, tmp_path):

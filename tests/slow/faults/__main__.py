@@ -39,30 +39,18 @@ def as_json(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def cells(outcome: Outcome) -> list[str]:
-    seen = as_json(outcome)
-    statuses = [",".join(map(str, each)) or "-" for each in seen["status"]]
-    expected = outcome.case.counters
-    counters = {name: n for name, n in outcome.counters.items() if name in expected} or outcome.counters
-    return [
-        outcome.case.key,
-        outcome.case.title,
-        outcome.case.injected,
-        outcome.proof,
-        " / ".join(statuses) if statuses != ["-", "-"] else "-",
-        " ".join(seen["emcy"]) or "-",
-        ", ".join(f"{name} {n}" for name, n in counters.items()) or "-",
-        _ms(outcome.noticed_ms),
-        _ms(outcome.recovered_ms) if outcome.one or outcome.two else "-",
-        "OK" if seen["ok"] else "NOT",
-    ]
-
-
 def line(outcome: Outcome) -> str:
     """One line for a terminal, and one for each thing that is wrong."""
-    key, title, _, proof, status, emcy, counters, noticed, recovered, verdict = cells(outcome)
-    text = f"{key:>4} {title:46.46} {status:12} {emcy:22} {noticed:>9} {recovered:>9} {verdict:3} {counters}"
-    return "\n".join([text, f"       {proof}", *(f"       {each}" for each in outcome.wrong)])
+    case, seen = outcome.case, as_json(outcome)
+    status = " / ".join(",".join(map(str, each)) or "-" for each in seen["status"]).replace("- / -", "-")
+    expected = {name: n for name, n in outcome.counters.items() if name in case.counters}
+    counters = ", ".join(f"{name} {n}" for name, n in (expected or outcome.counters).items()) or "-"
+    recovered = _ms(outcome.recovered_ms) if outcome.one or outcome.two else "-"
+    text = (
+        f"{case.key:>4} {case.title:46.46} {status:12} {' '.join(seen['emcy']) or '-':22} "
+        f"{_ms(outcome.noticed_ms):>9} {recovered:>9} {'OK' if seen['ok'] else 'NOT':3} {counters}"
+    )
+    return "\n".join([text, *(f"       {each}" for each in (outcome.proof, *outcome.wrong))])
 
 
 def _ms(value: float | None) -> str:
