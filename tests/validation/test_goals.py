@@ -13,7 +13,7 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.run import ObservedRun
+from jtqd.estimator.run import ObservedRun, RunTable
 from jtqd.estimator.status import DEGRADED, VALID
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate
@@ -328,8 +328,13 @@ def test_the_true_torsion_deflects_as_the_bench_does() -> None:
 def test_zeros_of_the_days_are_those_of_the_bench() -> None:
     bench = BAD_DAY.bench()
     assert isinstance(bench, TowingBench)
-    assert BAD_DAY.changed(SOURCES["zeros of the encoders, by day"]).bench().run_to_run.link_zero_rad == 0.0  # type: ignore[union-attr]
-    assert not day_zeros(bench, [], 500, 1)
+    runs = [Driven(name, RunTable(np.arange(2.0), {}), np.zeros((2, 2))) for name in ("a", "b")]
+    zeros, other = (day_zeros(bench, runs, seed, 1) for seed in (500, 501))
+    assert set(zeros) == {"a", "b"}
+    assert len({*zeros.values(), *other.values()}) == 4, "each run has its day"
+    without = BAD_DAY.changed(SOURCES["zeros of the encoders, by day"]).bench()
+    assert isinstance(without, TowingBench)
+    assert day_zeros(without, runs, 500, 1) == {"a": 0.0, "b": 0.0}
 
 
 @pytest.mark.campaign

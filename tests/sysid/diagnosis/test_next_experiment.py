@@ -87,7 +87,6 @@ def test_every_effect_and_all_that_it_is_confused_with_have_an_experiment(name: 
         assert set(kinds) == {PAIRS.get(frozenset((name, other)))} or {kind_of(name), kind_of(other)} == set(
             kinds
         )
-    assert EFFECTS[name].name == name
 
 
 def test_the_table_of_pairs_speaks_of_effects_and_kinds_that_exist() -> None:
