@@ -1,5 +1,4 @@
 """How good the estimate and the diagnosis are: studies on emulated, independent and measured benches.
 
 Not part of the product: nothing of the wheel imports it. `python -m validation` lists the studies (README.md).
-Sub-packages: `goals`, `hidden` and `worlds` (trials of the diagnosis), `measured` (the shipped runs of an arm).
 """

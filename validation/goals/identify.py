@@ -116,46 +116,55 @@ class Change(NamedTuple):
         return (plant if how is None else plant.changed(how)).bench()
 
 
-def _scaled(part: str, keys: tuple[str, ...], factor: float) -> Callable[[Mapped], None]:
-    def change(mapping: Mapped) -> None:
+def of_sides(change: Callable[[Mapped], None]) -> Callable[[Mapped], None]:
+    """Return a change of both joints of a plant's file."""
+
+    def both(mapping: Mapped) -> None:
         for side in SIDES:
-            for key in keys:
-                value = mapping[side][part].get(key, 1.0)
-                scaled = [factor * each for each in value] if isinstance(value, list) else factor * value
-                mapping[side][part][key] = scaled
+            change(mapping[side])
+
+    return both
+
+
+def _scaled(part: str, keys: tuple[str, ...], factor: float) -> Callable[[Mapped], None]:
+    @of_sides
+    def change(side: Mapped) -> None:
+        for key in keys:
+            value = side[part].get(key, 1.0)
+            side[part][key] = [factor * each for each in value] if isinstance(value, list) else factor * value
 
     return change
 
 
-def _harder(mapping: Mapped) -> None:
-    for side in SIDES:
-        k1, k2, k3 = mapping[side]["gear"]["stiffness_nm_per_rad"]
-        mapping[side]["gear"]["stiffness_nm_per_rad"] = [k1, 1.1 * k2, 1.2 * k3]
+@of_sides
+def _harder(side: Mapped) -> None:
+    k1, k2, k3 = side["gear"]["stiffness_nm_per_rad"]
+    side["gear"]["stiffness_nm_per_rad"] = [k1, 1.1 * k2, 1.2 * k3]
 
 
-def _wider(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["gear"]["slips"].append({"torque_nm": 0.6, "travel_rad": 3.0e-4})
+@of_sides
+def _wider(side: Mapped) -> None:
+    side["gear"]["slips"].append({"torque_nm": 0.6, "travel_rad": 3.0e-4})
 
 
-def _wider_table_i(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["deviations"]["hysteresis"] = {"torque_nm": 1.0, "travel_rad": 2.5e-4}
+@of_sides
+def _wider_table_i(side: Mapped) -> None:
+    side["deviations"]["hysteresis"] = {"torque_nm": 1.0, "travel_rad": 2.5e-4}
 
 
-def _wavier(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["gear"]["errors"][0]["amplitude_rad"] += 1.1e-4
+@of_sides
+def _wavier(side: Mapped) -> None:
+    side["gear"]["errors"][0]["amplitude_rad"] += 1.1e-4
 
 
-def _wavier_table_i(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["deviations"]["kinematic_error"]["amplitude_rad"] += 1.1e-4
+@of_sides
+def _wavier_table_i(side: Mapped) -> None:
+    side["deviations"]["kinematic_error"]["amplitude_rad"] += 1.1e-4
 
 
-def _steeper_load(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["friction"]["load_exponent"] += 0.15
+@of_sides
+def _steeper_load(side: Mapped) -> None:
+    side["friction"]["load_exponent"] += 0.15
 
 
 CHANGES: Final = (
@@ -459,15 +468,15 @@ def judging_runs(sizes: Sizes, joints: tuple[Joint, Joint], seed: int = JUDGE_SE
     return make_plan("validate", scale_of(sizes, joints, seed, "validate")).runs
 
 
-def _stronger(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["drive"] |= {"current_limit_a": 14.0, "trip_current_a": 16.0}
+@of_sides
+def _stronger(side: Mapped) -> None:
+    side["drive"] |= {"current_limit_a": 14.0, "trip_current_a": 16.0}
 
 
-def _warmer(mapping: Mapped) -> None:
-    for side in SIDES:
-        warmth = mapping[side]["warmth" if "warmth" in mapping[side] else "thermal"]
-        warmth["ambient_c"] = warmth.get("ambient_c", warmth["reference_c"]) + WARMER_K
+@of_sides
+def _warmer(side: Mapped) -> None:
+    warmth = side["warmth" if "warmth" in side else "thermal"]
+    warmth["ambient_c"] = warmth.get("ambient_c", warmth["reference_c"]) + WARMER_K
 
 
 def outside(

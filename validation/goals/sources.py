@@ -18,7 +18,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,6 @@ from jtqd.sysid.planner.campaigns import make_plan
 from jtqd.sysid.planner.plan import Run
 from validation.goals.identify import (
     QUICK,
-    SIDES,
     TINY,
     Driven,
     Identified,
@@ -47,6 +46,7 @@ from validation.goals.identify import (
     fit_physics,
     judging_runs,
     nominal_joints,
+    of_sides,
     plant_file,
     scale_of,
 )
@@ -71,23 +71,18 @@ def _days(*names: str) -> Callable[[Mapped], None]:
     return without
 
 
-def _each(section: str, **values: Any) -> Callable[[Mapped], None]:
-    def without(mapping: Mapped) -> None:
-        for side in SIDES:
-            mapping[side][section] |= values
+def _each(**sections: Mapped) -> Callable[[Mapped], None]:
+    @of_sides
+    def without(side: Mapped) -> None:
+        for section, values in sections.items():
+            side[section] |= values
 
     return without
 
 
-def _straight(mapping: Mapped) -> None:
-    for side in SIDES:
-        gear = mapping[side]["gear"]
-        gear["stiffness_nm_per_rad"] = 3 * [gear["stiffness_nm_per_rad"][1]]
-
-
-def _quiet(mapping: Mapped) -> None:
-    for side in SIDES:
-        mapping[side]["measurement"] |= {"link_noise_rad": 0.0, "current_noise_a": 0.0}
+@of_sides
+def _straight(side: Mapped) -> None:
+    side["gear"]["stiffness_nm_per_rad"] = 3 * [side["gear"]["stiffness_nm_per_rad"][1]]
 
 
 SOURCES: Final[Mapping[str, Callable[[Mapped], None]]] = {
@@ -95,18 +90,15 @@ SOURCES: Final[Mapping[str, Callable[[Mapped], None]]] = {
     "friction, by day": _days("viscous", "coulomb"),
     "temperature, by day": _days("temperature_k"),
     "zero and gain of the current, by day": _days("current_zero_a", "current_gain"),
-    "waves of friction over the motor's turn": _each("friction", angle=[]),
-    "friction by load": _each("friction", load_nm=0.0),
-    "kinematic errors of the gear": _each("gear", errors=[]),
-    "errors of the motor encoder": _each("measurement", motor_errors=[]),
-    "errors of the link encoder": _each("measurement", link_errors=[]),
-    "slips of the gear": _each("gear", slips=[]),
+    "waves of friction over the motor's turn": _each(friction={"angle": []}),
+    "friction by load": _each(friction={"load_nm": 0.0}),
+    "kinematic errors of the gear": _each(gear={"errors": []}),
+    "errors of the motor encoder": _each(measurement={"motor_errors": []}),
+    "errors of the link encoder": _each(measurement={"link_errors": []}),
+    "slips of the gear": _each(gear={"slips": []}),
     "hardening of the spring": _straight,
-    "cogging and ripple of the current": lambda mapping: (
-        _each("motor", cogging=[])(mapping),
-        _each("measurement", current_ripple=[])(mapping),
-    )[0],
-    "noise of link encoder and current": _quiet,
+    "cogging and ripple of the current": _each(motor={"cogging": []}, measurement={"current_ripple": []}),
+    "noise of link encoder and current": _each(measurement={"link_noise_rad": 0.0, "current_noise_a": 0.0}),
 }
 """What is taken out, by name."""
 

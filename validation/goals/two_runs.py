@@ -40,7 +40,7 @@ from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.run import JointColumns, ObservedRun
+from jtqd.estimator.run import JointColumns, ObservedRun, RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.models.files import load_joint, shipped
@@ -274,7 +274,7 @@ def _inside(error: FloatArray, half: FloatArray, where: BoolArray) -> float:
     return 100.0 * float(np.mean(np.abs(error[where]) <= half[where])) if where.any() else float("nan")
 
 
-def guessed(joint: Joint, rng: np.random.Generator, friction: float = 0.35) -> Joint:
+def guessed(joint: Joint, rng: np.random.Generator, friction: float) -> Joint:
     """Return a joint file that is wrong as guesses are; friction: standard deviation of the logarithm of its factors."""
     coulomb, viscous, inertia, constant = rng.normal(size=4)
     old = joint.friction
@@ -315,19 +315,31 @@ def _cut(columns: JointColumns, rows: slice) -> JointColumns:
     return replace(columns, **arrays)
 
 
+def _cases(
+    world: str,
+    seed: int,
+    nominal: Sequence[Joint],
+    runs: Sequence[tuple[str, RunTable]],
+    friction: float = 0.35,
+) -> Iterator[Case]:
+    """Yield the joints of which both runs have a window in motion."""
+    for number, file in zip(NUMBERS, nominal, strict=True):
+        rng = np.random.default_rng([seed, number])
+        joint = guessed(file, rng, friction)
+        one, two = (
+            window(name, table.time_s, table.joint(number, joint.gear_ratio), joint, rng)
+            for name, table in runs
+        )
+        if one is not None and two is not None:
+            yield Case(world, f"{number}, seed {seed}", joint, (one, two))
+
+
 def plant_cases(plant: PlantFile, seeds: Sequence[int]) -> Iterator[Case]:
     """Yield both joints of a plant for each seed. Raises ConfigError."""
     bench, nominal = plant.bench(), nominal_joints(plant)
     for seed in seeds:
         driven = drive(bench, variable_runs(DEFAULT_LIMITS, 2, RUN_S, seed=seed, joints=nominal), seed)
-        for number in NUMBERS:
-            rng = np.random.default_rng([seed, number])
-            joint = guessed(nominal[number - 1], rng)
-            one, two = (
-                window(run.name, run.table.time_s, run.columns(number, joint), joint, rng) for run in driven
-            )
-            if one is not None and two is not None:
-                yield Case(plant.name, f"{number}, seed {seed}", joint, (one, two))
+        yield from _cases(plant.name, seed, nominal, [(run.name, run.table) for run in driven])
 
 
 def mujoco_cases(seeds: Sequence[int]) -> Iterator[Case]:
@@ -336,15 +348,9 @@ def mujoco_cases(seeds: Sequence[int]) -> Iterator[Case]:
     for seed in seeds:
         rng = np.random.default_rng([seed, 77])
         drawn = MujocoBench(2, 8.0).draw(seed, [each for number in NUMBERS for each in _hidden(number, rng)])
-        for number in NUMBERS:
-            rng = np.random.default_rng([seed, number])
-            joint = guessed(Joint.from_mapping(dict(drawn.joints[number]), "mujoco"), rng, friction=0.0)
-            one, two = (
-                window(f"run{n}", columns["time_s"], run_table(columns, (number,)).joints[number], joint, rng)
-                for n, columns in enumerate(drawn.runs, 1)
-            )
-            if one is not None and two is not None:
-                yield Case("MuJoCo", f"{number}, seed {seed}", joint, (one, two))
+        nominal = [Joint.from_mapping(dict(drawn.joints[number]), "mujoco") for number in NUMBERS]
+        runs = [(f"run{n}", run_table(columns, NUMBERS)) for n, columns in enumerate(drawn.runs, 1)]
+        yield from _cases("MuJoCo", seed, nominal, runs, 0.0)
 
 
 def _hidden(number: int, rng: np.random.Generator) -> list[Hidden]:
