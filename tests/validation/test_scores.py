@@ -59,7 +59,9 @@ def test_name_beside_the_right_one_is_wrong() -> None:
     [
         (("sensor_gain", "torque_constant"), PLAN, True),
         (("sensor_gain", "torque_constant"), None, False),
-        (("torque_constant", "sensor_gain"), PLAN, True),
+        (("torque_constant", "sensor_gain"), PLAN, False),  # of joint 1, which has no such effect
+        (("torque_constant", "sensor_gain of joint 2"), PLAN, False),
+        (("torque_constant", "sensor_gain of the sensor"), PLAN, True),
         (("torque_constant", "sensor_gain of the sensor", "hysteresis"), PLAN, True),
         (("sensor_gain", "a", "b", "c"), PLAN, False),
         (("torque_constant", "hysteresis"), PLAN, False),

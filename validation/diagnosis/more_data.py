@@ -27,7 +27,7 @@ from validation.diagnosis.benches import Counts, bench_option, jobs, made
 from validation.diagnosis.entries import SENSOR, Columns, Set
 from validation.diagnosis.entries import Joint as JointFile
 from validation.diagnosis.recorder import PRESETS, Recorder
-from validation.diagnosis.scores import judged
+from validation.diagnosis.scores import judged, members
 from validation.diagnosis.trials import joint_files, orders_of, rms, run_table, tables, unexplained
 from validation.generator.draw import Order, draw_many
 from validation.study import Report, Table
@@ -67,13 +67,8 @@ class Step:
 def step(
     runs: int, fewer: Findings, more: Findings, held_out: Columns, joints: Mapping[int, JointFile]
 ) -> Step:
-    still = {(c.name, c.joint) for c in more.causes}
-    in_classes = " ".join(name for c in more.causes for name in c.names[1:])
-    gone = [
-        c
-        for c in fewer.causes
-        if len(c.names) == 1 and (c.name, c.joint) not in still and c.name not in in_classes
-    ]
+    still = {key for c in more.causes for key in members(c)}
+    gone = [c for c in fewer.causes if len(c.names) == 1 and (c.name, c.joint) not in still]
     if not gone:
         return Step(runs, (), (), float("nan"), float("nan"))
     return Step(

@@ -26,7 +26,7 @@ from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Place
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import joints_of
 from jtqd.sysid.runs.run_file import RunError
-from validation.diagnosis.entries import Columns, Joint
+from validation.diagnosis.entries import SENSOR, Columns, Joint
 from validation.diagnosis.recorder import Recorder, csv_text, record
 from validation.generator.motions import RUN_S
 from validation.study import Share, share
@@ -151,19 +151,22 @@ def _alone(truth: Truth, causes: Sequence[Cause]) -> Cause | None:
     return None
 
 
+def members(cause: Cause) -> set[tuple[str, Any]]:
+    """Return (name, joint) of the effects of a cause's class; one of another joint has it in its name."""
+    found: set[tuple[str, Any]] = {(cause.name, cause.joint)}
+    for text in cause.names[1:]:
+        name, _, where = text.partition(" of ")
+        other = SENSOR if where == "the sensor" else int(where.removeprefix("joint ") or 0)
+        found.add((name, other or cause.joint))
+    return found
+
+
 def _classed(truth: Truth, findings: Findings) -> bool:
     """Return whether a class holds it that is small enough and comes with the experiment that settles it."""
-    if findings.next_experiment is None:
-        return False
-    label = (
-        f"{truth['name']} of {'the sensor' if truth['joint'] == 'sensor' else 'joint ' + str(truth['joint'])}"
+    return findings.next_experiment is not None and any(
+        1 < len(c.names) <= LARGEST_CLASS and (truth["name"], truth["joint"]) in members(c)
+        for c in findings.causes
     )
-    for c in findings.causes:
-        first = c.joint == truth["joint"] and c.name == truth["name"]
-        other = label in c.names or (truth["name"] in c.names[1:])
-        if 1 < len(c.names) <= LARGEST_CLASS and (first or other):
-            return True
-    return False
 
 
 def intervals(truth: Truth, causes: Sequence[Cause]) -> list[tuple[str, str, bool]]:
