@@ -20,7 +20,6 @@ from jtqd.sysid.fit.efficiency import (
     EfficiencyFit,
     EtaPoint,
     default_current_min,
-    distinct_points,
     efficiency_findings,
     eta_points,
     fit_efficiency,
@@ -168,14 +167,14 @@ def test_standard_errors_of_the_coefficients_are_their_scatter() -> None:
     rng = np.random.default_rng(21)
     exact = grid()
     estimates, claimed = [], []
-    for _ in range(150):
+    for _ in range(80):
         noisy = [
             replace(p, torque=Mean(p.torque.value * (1.0 + 0.02 * rng.normal()), p.torque.se)) for p in exact
         ]
         fit = fit_efficiency(points_of(noisy), "joint_over_motor", JOINT).quadrants["i_pos_w_pos"]
         estimates.append([getattr(fit.polynomial, key) for key in COEFFICIENTS])
         claimed.append([fit.errors[key] for key in COEFFICIENTS])
-    assert np.mean(claimed, axis=0) == pytest.approx(np.std(estimates, axis=0), rel=0.25)
+    assert np.mean(claimed, axis=0) == pytest.approx(np.std(estimates, axis=0), rel=0.3)
 
 
 def test_weights_follow_the_sensors_offset() -> None:
@@ -212,41 +211,41 @@ def test_quadrants_by_sign() -> None:
     assert [quadrant_of(i, v) for i, v in ((1, 1), (-1, -1), (-1, 1), (1, -1))] == list(QUADRANTS)
 
 
-def test_a_quadrant_without_data_is_refused_by_name() -> None:
-    fit = fit_efficiency([p for p in points_of(grid()) if p.driving], "joint_over_motor", JOINT)
+POINTS = points_of(grid())
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        ([p for p in POINTS if p.driving], "i_neg_w_pos: found 0 distinct operating points"),
+        # a plateau measured again does not make a quadrant
+        (
+            [p for p in POINTS if p.quadrant == "i_neg_w_pos"][:6] * 5,
+            "found 6 distinct operating points (30 plateaus), expected at least 7",
+        ),
+        # two velocities do not span the surface
+        ([p for p in POINTS if abs(p.plateau.velocity.value) in (0.2, 3.0)], "found a condition number of"),
+    ],
+)
+def test_a_quadrant_that_cannot_be_fitted_is_refused_by_name(points: list[EtaPoint], words: str) -> None:
+    assert words in fit_efficiency(points, "joint_over_motor", JOINT).refused["i_neg_w_pos"]
+
+
+def test_refused_quadrants_are_those_of_a_joint_file_of_the_same_convention() -> None:
+    fit = fit_efficiency([p for p in POINTS if p.driving], "joint_over_motor", JOINT)
     assert list(fit.quadrants) == ["i_pos_w_pos", "i_neg_w_neg"]
     assert list(fit.refused) == ["i_neg_w_pos", "i_pos_w_neg"]
-    assert fit.refused["i_neg_w_pos"].startswith("i_neg_w_pos: found 0 distinct operating points")
-    with pytest.raises(
-        ValueError, match="found no fit of i_neg_w_pos, i_pos_w_neg, and the joint file has no eff"
+    for kept, words in (
+        (None, "found no fit of i_neg_w_pos, i_pos_w_neg, and the joint file has no eff"),
+        (replace(TABLE_I, convention="motor_over_joint"), "one in the convention motor_over_joint"),
     ):
-        fit.efficiency()
-    kept = fit.efficiency(TABLE_I)
-    assert kept.i_neg_w_pos == TABLE_I.i_neg_w_pos
-    assert kept.i_pos_w_pos == fit.quadrants["i_pos_w_pos"].polynomial
-    with pytest.raises(ValueError, match="one in the convention motor_over_joint"):
-        fit.efficiency(replace(TABLE_I, convention="motor_over_joint"))
-
-
-def test_repeated_plateaus_do_not_make_a_quadrant() -> None:
-    points = [p for p in points_of(grid()) if p.quadrant == "i_pos_w_pos"]
-    few = points[:6] * 5
-    assert distinct_points(few) == 6
-    refused = fit_efficiency(few, "joint_over_motor", JOINT).refused["i_pos_w_pos"]
-    assert "found 6 distinct operating points (30 plateaus), expected at least 7" in refused
-
-
-def test_points_that_do_not_span_the_surface_are_refused() -> None:
-    two = [p for p in points_of(grid()) if abs(p.plateau.velocity.value) in (0.2, 3.0)]
-    refused = fit_efficiency(two, "joint_over_motor", JOINT).refused
-    assert list(refused) == list(QUADRANTS)
-    assert "condition number" in refused["i_pos_w_pos"]
-    assert "three currents at three velocities" in refused["i_pos_w_pos"]
-
-
-def test_an_unknown_convention_is_refused() -> None:
+        with pytest.raises(ValueError, match=words):
+            fit.efficiency(kept)
+    kept_table = fit.efficiency(TABLE_I)
+    assert kept_table.i_neg_w_pos == TABLE_I.i_neg_w_pos
+    assert kept_table.i_pos_w_pos == fit.quadrants["i_pos_w_pos"].polynomial
     with pytest.raises(ValueError, match="found 'eta', expected one of joint_over_motor, motor_over_joint"):
-        fit_efficiency(points_of(grid()), "eta", JOINT)
+        fit_efficiency(POINTS, "eta", JOINT)
 
 
 BOTH = ["eta_above_1_driving", "eta_below_1_back_driven"]
@@ -352,11 +351,8 @@ def test_texts_of_the_picture_do_not_overlap(close: bool) -> None:
         for label in (tick.label1, tick.label2)
         if not min(axis.get_view_interval()) <= tick.get_loc() <= max(axis.get_view_interval())
     }
-    texts = [
-        text
-        for text in figure.findobj(mpl.text.Text)
-        if text.get_visible() and text.get_text().strip() and text not in beyond
-    ]
+    every = set(figure.findobj(mpl.text.Text)) - beyond
+    texts = [text for text in every if text.get_visible() and text.get_text().strip()]
     boxes = [(text.get_text(), text.get_window_extent()) for text in texts]
     panels = [axes for axes in figure.axes if "plateaus" in axes.get_title(loc="left")]
     edges = {axes.get_title(loc="left"): axes.get_window_extent().x1 for axes in panels}

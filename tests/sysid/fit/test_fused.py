@@ -45,21 +45,17 @@ from tests.sysid.fit.fused_signals import (
 MADE = replace(fused_joint(), friction=Friction(3.0, 2.0, 0.8, 0.05))
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 5, 6, 7, 8, 17])
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 8, 17])
 def test_folds_never_split_a_run_and_hold_out_each_once(count: int) -> None:
     one = made_run(1, smooth_loss(), count=300)
     runs = [replace(one, name=f"run {k}") for k in range(count)]
-    held_out_of_all: list[int] = []
     parts = list(folds(runs))
     assert len(parts) == min(FOLDS, count)
     for known, held_out in parts:
-        assert known
         names = [run.name for run in known]
-        assert not set(names) & {runs[n].name for n in held_out}
+        assert names
         assert sorted(names + [runs[n].name for n in held_out]) == sorted(run.name for run in runs)
-        assert all(any(run is whole for whole in runs) for run in known)
-        held_out_of_all += held_out
-    assert sorted(held_out_of_all) == list(range(count))
+    assert sorted(n for _, held_out in parts for n in held_out) == list(range(count))
 
 
 # Runs made from a known joint --------------------------------------------------------------------------
@@ -289,7 +285,7 @@ def fit_of_days() -> FusedFit:
 def test_runs_of_other_days_are_as_wrong_as_sigma(fit_of_days: FusedFit) -> None:
     """Other motions, eight other days with their offsets and friction: each day 0.5 Nm RMS of up to 30 Nm.
 
-    Against the true torque, without the sensor's offset. 80 % or more of all moving samples are in the 90 % interval (eight
+    Against the true torque, without the sensor's offset. 80 % or more of all moving samples are in the 90 % interval (six
     days are few), 95 % of the standing ones in theirs.
     """
     ours = replace(joint(1), fused=fit_of_days.fused)

@@ -86,7 +86,7 @@ positive = st.floats(1e-9, 1e9)
 any_float = st.floats(-1e30, 1e30)  # what a file may hold
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=40)
 @given(positive, positive, any_float, any_float, st.floats(0.0, 1e12))
 def test_numbers_of_any_size_come_back_exactly(a: float, b: float, p: float, q: float, c: float) -> None:
     """YAML 1.1 takes 7e-5 for text and 1_0 for a number; what is written must be neither."""

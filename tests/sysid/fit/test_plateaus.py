@@ -10,18 +10,26 @@ import pytest
 from scipy.signal import lfilter
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Friction
+from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.run import JointColumns
 from jtqd.models.files import shipped
 from jtqd.sim_can.emulated_run import emulate_run
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.plateaus import (
+    FitError,
+    Mean,
     Plateau,
     PlateauError,
     PlateauRules,
     cut_cells,
+    effective_samples,
     find_plateaus,
+    fit_no_load,
     means_between,
+    no_load,
     standard_error,
+    student_975,
 )
 from jtqd.sysid.runs.channels import integral
 from tests.estimator.estimator_helpers import joint1
@@ -136,14 +144,32 @@ def test_a_mean_over_cells_does_not_contain_the_ripple(speed: float) -> None:
         assert np.max(np.abs(means_between(time_s, ripple, starts, starts + 0.1))) > 0.15
 
 
-def test_load_that_moves_at_constant_velocity_is_no_plateau() -> None:
-    time_s = DT_S * np.arange(8000)
-    v = np.full(8000, 1.0)
-    tau = 15.0 + 10.0 * np.sin(2.0 * math.pi * 0.5 * time_s)
-    with pytest.raises(
-        PlateauError, match=r"x: found no settled plateau \(longest settled stretch 0.\d+ s\)"
-    ):
-        find_plateaus(time_s, columns(v, (tau + 5.0) / NM_PER_A, tau), JOINT, "x")
+TIME = DT_S * np.arange(6000)
+FLAT, SWING = np.ones(6000), np.sin(2.0 * math.pi * 0.5 * TIME)
+CREEP = 0.001 * np.random.default_rng(0).normal(size=6000)
+
+
+@pytest.mark.parametrize(
+    ("v", "i", "tau", "words"),
+    [
+        (
+            FLAT,
+            3.0 + SWING,
+            15.0 + 10.0 * SWING,
+            r"x: found no settled plateau \(longest settled stretch 0.\d+ s\)",
+        ),
+        (FLAT, 2.0 + 0.5 * TIME, 12.0 * FLAT, "no settled plateau"),  # beside a stuck torque
+        (1.0 + 0.3 * SWING, 3.0 * FLAT, 12.0 * FLAT, "no settled plateau"),
+        *((speed + CREEP, FLAT, 3.0 * FLAT, r"moves at 0.05 rad/s") for speed in (0.0, 0.01, 0.03)),
+        (FLAT[:50], FLAT[:50], FLAT[:50], r"longest settled stretch 0.00 s"),
+    ],
+    ids=["load", "current", "velocity", "still", "0.01", "creeping", "shorter than a cell"],
+)
+def test_what_moves_and_what_hardly_moves_is_no_plateau(
+    v: FloatArray, i: FloatArray, tau: FloatArray, words: str
+) -> None:
+    with pytest.raises(PlateauError, match=words):
+        find_plateaus(TIME[: len(v)], columns(v, i, tau), JOINT, "x")
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -163,30 +189,6 @@ def test_swings_of_any_size_and_period_under_noise_are_no_plateaus(seed: int) ->
         for plateau in found:
             inside = (time_s >= plateau.start_s) & (time_s <= plateau.end_s)
             assert np.ptp(tau[inside]) < 0.02 * JOINT.rated_torque_nm
-
-
-def test_current_that_moves_at_constant_torque_is_no_plateau() -> None:
-    """A drifting current beside a constant (stuck) torque has no efficiency."""
-    time_s = DT_S * np.arange(6000)
-    i = np.linspace(2.0, 5.0, 6000)
-    with pytest.raises(PlateauError, match="no settled plateau"):
-        find_plateaus(time_s, columns(np.full(6000, 1.0), i, np.full(6000, 12.0)), JOINT)
-
-
-def test_velocity_that_moves_under_constant_load_is_no_plateau() -> None:
-    time_s = DT_S * np.arange(8000)
-    v = 1.0 + 0.3 * np.sin(2.0 * math.pi * 0.5 * time_s)
-    with pytest.raises(PlateauError, match="no settled plateau"):
-        find_plateaus(time_s, columns(v, np.full(8000, 3.0), np.full(8000, 12.0)), JOINT)
-
-
-@pytest.mark.parametrize("speed", [0.0, 0.01, 0.03])
-def test_a_standing_or_creeping_joint_is_no_plateau(speed: float) -> None:
-    rng = np.random.default_rng(0)
-    time_s = DT_S * np.arange(6000)
-    v = np.full(6000, speed) + 0.001 * rng.normal(size=6000)
-    with pytest.raises(PlateauError, match=r"moves at 0.05 rad/s"):
-        find_plateaus(time_s, columns(v, np.full(6000, 1.0), np.full(6000, 3.0)), JOINT)
 
 
 def test_neighbours_that_differ_little_are_two_plateaus() -> None:
@@ -227,7 +229,7 @@ def test_standard_errors_hold_for_coloured_noise_under_ripple(
     """Error of the mean in units of its standard error: 1 is right; sqrt(n) would claim 2.5 to 10 of them."""
     rng = np.random.default_rng(5)
     errors, naive = [], []
-    for _ in range(200):
+    for _ in range(120):
         noise = coloured(rng, samples, 0.3, memory_s)
         angle = 100.0 * DT_S * np.arange(samples)
         seen = noise + 0.4 * np.cos(2.0 * angle + rng.uniform(0.0, 6.0))
@@ -274,8 +276,66 @@ def test_a_random_motion_never_settles() -> None:
         find_plateaus(table.time_s, table.joint(1, 100.0), JOINT)
 
 
-def test_a_run_shorter_than_a_cell_is_refused_in_one_line() -> None:
-    time_s = DT_S * np.arange(50)
-    flat = np.ones(50)
-    with pytest.raises(PlateauError, match=r"longest settled stretch 0.00 s"):
-        find_plateaus(time_s, columns(flat, flat, flat), JOINT)
+# Friction at no load ------------------------------------------------------------------------------------
+
+
+def idle(friction: Friction, zero_nm: float, noise: float, velocities: list[float]) -> list[Plateau]:
+    rng = np.random.default_rng(4)
+    loss = FrictionModel(friction).torque_many(np.array(velocities))
+    return [
+        Plateau(
+            "r", 0.0, 1.0, Mean(v, 0.0), Mean(0.0, 0.0), Mean(-f - zero_nm + noise * rng.normal(), 0.0), 9
+        )
+        for v, f in zip(velocities, loss.tolist(), strict=True)
+    ]
+
+
+BOTH = [s * v for v in (0.2, 0.6, 1.0, 1.4, 1.8, 2.2, 2.6, 3.0) for s in (1.0, -1.0)]
+
+
+def test_friction_at_no_load_is_separated_from_the_offset_of_the_sensor() -> None:
+    truth = Friction(3.7, 1.4, stribeck_nm=0.8, stribeck_velocity_rad_s=0.05)
+    fit = fit_no_load(idle(truth, 0.35, 0.05, BOTH), joint1())
+    values = {term.name: term for term in fit.terms}
+    for name, expected in (("coulomb_nm", 3.7), ("viscous_nms_per_rad", 1.4), ("zero_nm", 0.35)):
+        assert abs(values[name].value - expected) < 1.5 * values[name].ci95
+        assert values[name].ci95 < 0.1
+    assert fit.rmse_nm < 0.08
+    assert fit.warnings == ()
+    assert fit.friction.stribeck_nm == joint1().friction.stribeck_nm
+
+
+def test_one_direction_warns_and_what_drives_is_refused() -> None:
+    fit = fit_no_load(idle(Friction(3.0, 2.0), 0.0, 0.0, BOTH[::2]), joint1())
+    assert "one direction" in fit.warnings[0]
+    assert [term.name for term in fit.terms] == ["coulomb_nm", "viscous_nms_per_rad"]
+    with pytest.raises(FitError, match="found 2 velocities at no load"):
+        fit_no_load(idle(Friction(3.0, 2.0), 0.0, 0.0, [0.2, -0.2, 1.0]), joint1())
+    wrong = [replace(p, torque=Mean(-p.torque.value, 0.0)) for p in idle(Friction(3.0, 2.0), 0.0, 0.0, BOTH)]
+    with pytest.raises(FitError, match="expected a friction >= 0: swapped sign"):
+        fit_no_load(wrong, joint1())
+
+
+def test_no_load_is_no_current_or_no_torque() -> None:
+    def at(i: float, tau: float) -> Plateau:
+        return Plateau("r", 0.0, 1.0, Mean(1.0, 0.0), Mean(i, 0.0), Mean(tau, 0.0), 9)
+
+    plateaus = [at(0.0, -8.0), at(0.6, -6.0), at(0.9, 1.9), at(1.2, 3.0), at(5.0, 25.0)]
+    assert no_load(plateaus, joint1(), 0.61) == plateaus[:3]
+
+
+def test_effective_samples_of_white_and_of_correlated_noise() -> None:
+    random_ = np.random.default_rng(1)
+    white = random_.normal(size=20000)
+    assert effective_samples(white) == pytest.approx(20000, rel=0.1)
+    # rho = 0.9 from sample to sample: n (1 - rho)/(1 + rho) = n/19
+    keep = -DT_S / math.log(0.9)
+    noise = coloured(random_, 20000, 1.0, keep)
+    assert effective_samples(noise) == pytest.approx(20000 / 19.0, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    ("freedom", "value"), [(3, 3.182), (5, 2.571), (10, 2.228), (30, 2.042), (1000, 1.962)]
+)
+def test_student_quantile_against_the_table(freedom: float, value: float) -> None:
+    assert student_975(freedom) == pytest.approx(value, rel=0.02)
