@@ -24,13 +24,14 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.effects.effect import MOTOR as BALANCE_MOTOR
 from jtqd.estimator.effects.effect import TORSION as BALANCE_TORSION
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import estimate_columns
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.observer import low_pass
-from jtqd.estimator.run import RunTable, RunTableError
+from jtqd.estimator.run import RunTable
 from jtqd.estimator.settings import METHODS, bandwidth_of, recommended
 from jtqd.estimator.text import finite
 from jtqd.estimator.text import table_lines as aligned
@@ -173,43 +174,30 @@ def to_mapping(
     rows: Sequence[Row], *, joint: int, files: Sequence[str], notes: Sequence[str]
 ) -> dict[str, Any]:
     """Return the table for programs; what has no value is null."""
-    return {
-        "schema": SCHEMA,
-        "joint": joint,
-        "files": list(files),
-        "rows": [
-            {
-                "what": row.what,
-                "run": row.run,
-                "unit": row.unit,
-                "rmse": [finite(error) for error in row.errors],
-                "change": finite(row.change),
-            }
-            for row in rows
-        ],
-        "notes": list(notes),
-    }
+    table = [
+        {
+            "what": row.what,
+            "run": row.run,
+            "unit": row.unit,
+            "rmse": [finite(error) for error in row.errors],
+            "change": finite(row.change),
+        }
+        for row in rows
+    ]
+    return {"schema": SCHEMA, "joint": joint, "files": list(files), "rows": table, "notes": list(notes)}
 
 
 def table_lines(rows: Sequence[Row], files: Sequence[str]) -> list[str]:
     """Return the table as lines of text."""
-    names = ["before", "after"][: len(files)] if len(files) > 1 else ["rmse"]
-    head = ["error, rms", "run", *names, "unit", *(["change"] if len(files) > 1 else [])]
-    body = [
-        [
-            row.what if row.run == "all" else "",
-            row.run,
-            *(_number(error) for error in row.errors),
-            row.unit,
-            *(
-                [f"{100.0 * row.change:+.0f} %" if math.isfinite(row.change) else "-"]
-                if len(files) > 1
-                else []
-            ),
-        ]
-        for row in rows
-    ]
-    return aligned([head, *body], (0, 1, len(names) + 2), rule=True)
+    two = len(files) > 1
+    names = ["before", "after"] if two else ["rmse"]
+    lines = [["error, rms", "run", *names, "unit", *["change"] * two]]
+    for row in rows:
+        what = row.what if row.run == "all" else ""
+        errors = [f"{error:.4g}" if math.isfinite(error) else "-" for error in row.errors]
+        change = f"{100.0 * row.change:+.0f} %" if math.isfinite(row.change) else "-"
+        lines.append([what, row.run, *errors, row.unit, *[change] * two])
+    return aligned(lines, (0, 1, len(names) + 2), rule=True)
 
 
 def _rms(values: FloatArray) -> float:
@@ -222,10 +210,6 @@ def _together(errors: FloatArray, weights: FloatArray) -> float:
     if not good.any():
         return math.nan
     return float(np.sqrt(np.sum(weights[good] * errors[good] ** 2) / np.sum(weights[good])))
-
-
-def _number(value: float) -> str:
-    return f"{value:.4g}" if math.isfinite(value) else "-"
 
 
 BY: Final = "jtq score"
@@ -253,7 +237,7 @@ def main(argv: list[str]) -> int:
             print(f"{BY}: {line}", file=sys.stderr)
         if not scored[0]:
             raise RunError(f"found no run in which joint {number} can be scored")
-    except (ConfigError, RunError, RunTableError, OSError) as error:
+    except (ValueError, OSError) as error:
         print(f"{BY}: {error}", file=sys.stderr)
         return 1
     rows = rows_of(scored)
@@ -299,17 +283,14 @@ def _scored(
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq score`."""
-    parser = argparse.ArgumentParser(
-        prog=BY,
-        description="Print the error of a joint file's simulation and of each of its estimators on runs that have a torque "
+    parser = command_parser(
+        BY,
+        "Print the error of a joint file's simulation and of each of its estimators on runs that have a torque "
         "reference;\nwith --after the same for a second file. Nothing is fitted.",
-        epilog=(
-            "examples:\n"
-            "  jtq score joint3.yaml new_run.csv --columns columns.yaml --number 3\n"
-            "  jtq score joint3.yaml new_*.csv --columns columns.yaml --number 3 --after diagnosis/extended.joint.yaml\n\n"
-            "Exit status: 0 done; 1 failure; 2 usage; 3 done, but a run could not be used."
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "examples:\n"
+        "  jtq score joint3.yaml new_run.csv --columns columns.yaml --number 3\n"
+        "  jtq score joint3.yaml new_*.csv --columns columns.yaml --number 3 --after diagnosis/extended.joint.yaml\n\n"
+        "Exit status: 0 done; 1 failure; 2 usage; 3 done, but a run could not be used.",
     )
     parser.add_argument("joint", type=Path, metavar="JOINT.yaml", help="joint file")
     add_runs(parser)

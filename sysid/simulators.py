@@ -22,7 +22,7 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from jtqd.estimator.command_line import check_output, write_whole
+from jtqd.estimator.command_line import check_output, command_parser, write_whole
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
@@ -250,18 +250,15 @@ def main(argv: list[str]) -> int:
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq export-model`."""
-    parser = argparse.ArgumentParser(
-        prog=BY,
-        description="Write a joint file with its effects for another simulator: rotor inertia, friction, gear, spring.\n"
+    parser = command_parser(
+        BY,
+        "Write a joint file with its effects for another simulator: rotor inertia, friction, gear, spring.\n"
         "What the format has no words for is listed on stderr and in the file.",
-        epilog=(
-            "examples:\n"
-            "  jtq export-model diagnosis/extended.joint.yaml --out joint.xml\n"
-            "  jtq export-model diagnosis/extended.joint.yaml --flexible --out joint.xml\n"
-            "  jtq export-model diagnosis/extended.joint.yaml --format urdf\n\n"
-            "Exit status: 0 done; 1 failure; 2 usage; 3 done, but something of the joint file is not in the model."
-        ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "examples:\n"
+        "  jtq export-model diagnosis/extended.joint.yaml --out joint.xml\n"
+        "  jtq export-model diagnosis/extended.joint.yaml --flexible --out joint.xml\n"
+        "  jtq export-model diagnosis/extended.joint.yaml --format urdf\n\n"
+        "Exit status: 0 done; 1 failure; 2 usage; 3 done, but something of the joint file is not in the model.",
     )
     parser.add_argument("joint", type=Path, metavar="JOINT.yaml", help="joint file")
     parser.add_argument(

@@ -64,6 +64,7 @@ AFTER_END_S = 0.3
 _PUBLISHED = (VALID, DEGRADED, STANDSTILL)
 _ALL_INPUTS = 7  # input_flags: both PDOs of the drive and the sensor's
 _SILENT = "#d9d9e6"
+_STANDING_LABEL = "standstill: the estimate is the middle of an interval"
 _PLAY_PRIORITY = 70  # real-time, below jtqd's loop
 _START_S, _END_S = 60.0, 120.0
 
@@ -240,8 +241,10 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
             if line.difference_nm is not None:
                 column[2].plot(line.time_s, 1e3 * line.difference_nm, color=colour, linewidth=0.6)
         time_s = panel.lines[-1].time_s
-        parts.sensor_line(column[0], time_s, panel.reference_nm)
-        parts.room_for_legend(column[0], 0.45)
+        label = "torque sensor, filtered like the estimate"
+        column[0].plot(time_s, panel.reference_nm, color=parts.SENSOR, linewidth=1.4, label=label)
+        low, high = column[0].get_ylim()
+        column[0].set_ylim(low, high + 0.45 * (high - low))  # room for the legend
         column[0].set_title(panel.title, fontsize=10)
         column[1].axhline(0.0, color=parts.SENSOR, linewidth=0.8)
         column[-1].set_xlabel("time [s]")
@@ -250,7 +253,7 @@ def draw(panels: Sequence[Panel], path: Path) -> None:
                 named = label if axis is column[0] and where.any() else None
                 parts.shade(axis, time_s, where, colour, named)
             parts.plain(axis)
-        parts.legend(column[0])
+        column[0].legend(loc="upper left", fontsize=8, framealpha=0.85, edgecolor="none")
     labels = ("joint torque [Nm]", "estimate - sensor [Nm]", "published - offline [mNm]")
     for axis, label in zip(axes[:, 0], labels, strict=False):
         axis.set_ylabel(label)
@@ -267,7 +270,7 @@ def panel(case: Case) -> Panel:
     after = f"after: losses fitted on {case.fitted_on}, RMSE {case.after.rmse_nm:.2f} Nm"
     estimates = ((before, case.before_nm), (after, case.after_nm))
     lines = [Line(label, t, values, values - reference) for label, values in estimates]
-    shade = (case.standstill, parts.STANDING, parts.STANDING_LABEL)
+    shade = (case.standstill, parts.STANDING, _STANDING_LABEL)
     return Panel(f"joint {case.joint}, {case.run}", lines, reference, [shade])
 
 
@@ -544,7 +547,7 @@ def bus_panels(results: Sequence[BusRun]) -> list[Panel]:
         own = [result for result in results if result.run == run]
         last = own[-1]
         shades = (
-            (last.status == STANDSTILL, parts.STANDING, parts.STANDING_LABEL),
+            (last.status == STANDSTILL, parts.STANDING, _STANDING_LABEL),
             (last.status == STALE, _SILENT, "inputs missing: status stale, no torque published"),
         )
         title = f"joint {last.joint}, {run} on the bus"

@@ -77,20 +77,19 @@ def score(samples: Sequence[Samples], method: str) -> Score | None:
     """Return the score of a method over the scored samples of joints and runs; None where one lacks it, or without any."""
     if any(method not in each.estimate_nm for each in samples):
         return None
-    errors = [(each.scored_error_nm(method), each.rated_nm) for each in samples if each.scored.any()]
+    errors = [each.scored_error_nm(method) for each in samples if each.scored.any()]
     if not errors:
         return None
-    error = np.concatenate([part for part, _ in errors])
-    share = np.concatenate([part / rated for part, rated in errors])
-    size = np.abs(error)
+    error = np.concatenate(errors)
+    share = np.concatenate([each.scored_error_nm(method) / each.rated_nm for each in samples])
     mse = float(np.mean(error * error))
     return Score(
         len(error),
         mse,
         math.sqrt(mse),
         100.0 * math.sqrt(float(np.mean(share * share))),
-        float(np.quantile(size, 0.95)),
-        float(size.max()),
+        float(np.quantile(np.abs(error), 0.95)),
+        float(np.abs(error).max()),
     )
 
 
@@ -161,23 +160,20 @@ class ErrorTables:
 def error_tables(samples: Sequence[Samples], velocity_joints: Mapping[str, int | None]) -> ErrorTables:
     """Return the tables of some runs; velocity_joints: by run, None where it is not known."""
     tested = [each for each in samples if velocity_joints.get(each.run) == each.number]
-    own = by_joint(samples)
-    bins = range(len(VELOCITY_EDGES_RAD_S) - 1)
+    quadrants: dict[int, dict[str, Row]] = {}
+    velocities: dict[int, dict[str, Row]] = {}
+    for number, part in by_joint(samples).items():
+        quadrants[number] = {name: row(in_quadrant(part, k)) for k, name in enumerate(QUADRANTS)}
+        velocities[number] = {
+            bin_name(k): row([each.where(velocity_bins(each.velocity_rad_s) == k) for each in part])
+            for k in range(len(VELOCITY_EDGES_RAD_S) - 1)
+        }
     return ErrorTables(
         tested=row(tested),
         both=row(samples),
-        joints={number: row(part) for number, part in own.items()},
-        quadrants={
-            number: {name: row(in_quadrant(part, k)) for k, name in enumerate(QUADRANTS)}
-            for number, part in own.items()
-        },
-        velocities={
-            number: {
-                bin_name(k): row([each.where(velocity_bins(each.velocity_rad_s) == k) for each in part])
-                for k in bins
-            }
-            for number, part in own.items()
-        },
+        joints={number: row(part) for number, part in by_joint(samples).items()},
+        quadrants=quadrants,
+        velocities=velocities,
         bare_network_mse_nm2={"tested": _bare(tested), "both": _bare(samples)},
         runs={(each.run, each.number): row([each]) for each in samples},
     )
@@ -244,7 +240,7 @@ def coverage(inside: Sequence[BoolArray]) -> Coverage | None:
     return Coverage(int(count.sum()), len(runs), share, se)
 
 
-def covered(samples: Sequence[Samples], method: str, level: float = NOMINAL) -> Coverage | None:
+def covered(samples: Sequence[Samples], method: str = OURS, level: float = NOMINAL) -> Coverage | None:
     """Return how often value +- z(level) sigma holds the sensor, over scored samples."""
     return coverage(
         [
@@ -267,27 +263,27 @@ class IntervalTables:
     curve: Mapping[int | str, Mapping[float, Coverage]]
 
 
-def interval_tables(samples: Sequence[Samples], method: str = OURS) -> IntervalTables | None:
-    """Return the coverage of a method over runs; None where it has no scored sample."""
-    own = [each for each in samples if method in each.estimate_nm]
-    overall = covered(own, method)
+def interval_tables(samples: Sequence[Samples]) -> IntervalTables | None:
+    """Return the coverage of ours over runs; None where it has no scored sample."""
+    own = [each for each in samples if OURS in each.estimate_nm]
+    overall = covered(own)
     if overall is None:
         return None
     joints: dict[int, Coverage] = {}
     quadrants: dict[int, dict[str, Coverage]] = {}
-    curve: dict[int | str, dict[float, Coverage]] = {"both": _curve(own, method)}
+    curve: dict[int | str, dict[float, Coverage]] = {"both": _curve(own)}
     for number, part in by_joint(own).items():
-        one = covered(part, method)
+        one = covered(part)
         if one is None:
             continue
-        joints[number], curve[number] = one, _curve(part, method)
-        by_quadrant = {name: covered(in_quadrant(part, k), method) for k, name in enumerate(QUADRANTS)}
+        joints[number], curve[number] = one, _curve(part)
+        by_quadrant = {name: covered(in_quadrant(part, k)) for k, name in enumerate(QUADRANTS)}
         quadrants[number] = {name: value for name, value in by_quadrant.items() if value is not None}
-    return IntervalTables(method, overall, joints, quadrants, curve)
+    return IntervalTables(OURS, overall, joints, quadrants, curve)
 
 
-def _curve(samples: Sequence[Samples], method: str) -> dict[float, Coverage]:
-    points = {level: covered(samples, method, level) for level in LEVELS}
+def _curve(samples: Sequence[Samples]) -> dict[float, Coverage]:
+    points = {level: covered(samples, level=level) for level in LEVELS}
     return {level: point for level, point in points.items() if point is not None}
 
 

@@ -36,7 +36,7 @@ from jtqd.sysid.fit.few_runs import MOST_RUNS, FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
 from jtqd.sysid.fit.losses import PER_K_PRIOR
-from jtqd.sysid.fit.plateaus import PlateauRules, fit_no_load, mean_temperature, no_load, plateaus_of
+from jtqd.sysid.fit.plateaus import SHORTEST_S, fit_no_load, mean_temperature, no_load, plateaus_of
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
 from jtqd.sysid.report.page import check_picture
 from jtqd.sysid.runs.checks import channel_findings
@@ -143,7 +143,7 @@ def _plateau_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--min-hold",
         type=_positive,
-        default=PlateauRules().shortest_s,
+        default=SHORTEST_S,
         metavar="S",
         help="shortest plateau in seconds (default %(default)s)",
     )
@@ -262,7 +262,7 @@ def _efficiency_result(
     )
     if result.findings:
         return result
-    plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
+    plateaus = plateaus_of(runs, number, joint, options.min_hold)
     points, left_out = eta_points(plateaus, joint, result.current_min_a)
     found = efficiency_findings(points, joint)
     fits: list[EfficiencyFit] = []
@@ -286,7 +286,7 @@ def _fit_friction(joint: Joint, number: int, runs: list[RunFile], options: argpa
     if found:
         lines = [f"{item.kind}: {item.text}" for item in found]
         return Outcome(lines, log=[f"{counted(len(found), 'finding')}, not fitted"], status=3)
-    plateaus = plateaus_of(runs, number, joint, PlateauRules(shortest_s=options.min_hold))
+    plateaus = plateaus_of(runs, number, joint, options.min_hold)
     chosen = no_load(plateaus, joint, options.min_current or default_current_min(joint))
     fit = fit_no_load(chosen, joint)
     mapping = {

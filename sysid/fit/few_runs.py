@@ -7,7 +7,7 @@ alpha = dv/dt, s the observer's direction, c_d linear between loads of -R, 0 and
 inertia. A few seconds do not separate these: where a joint turns one way only, an offset looks like Coulomb friction, and
 where load and speed come together, load friction looks like viscous. Least squares then takes any split that fits, and errs
 by ten newton metres once the joint turns the other way. Here each has a Gaussian prior about the joint file, in proportion
-to the joint (`Prior`): the runs change what they determine, the rest stays near the file and widens sigma.
+to the joint: the runs change what they determine, the rest stays near the file and widens sigma.
 
 - c_d = Fc +- o + m |x| + k x: Coulomb, offset of current and sensor, load friction, error of torque constant or sensor gain.
   The deviation of each c and f from that has a prior, too: no joint is the same both ways.
@@ -41,36 +41,28 @@ MOST_RUNS: Final = 5
 """From six runs on `fit_fused` holds out whole runs."""
 
 
-class Prior(NamedTuple):
-    """Standard deviations of the prior; `_rated`: parts of the rated torque (per rad/s where it is viscous).
-
-    From catalogues where these have any, else estimates, settled on emulated joints. Their influence: docs/results.md.
-    """
-
-    coulomb_share: float = 0.5
-    """Of the file's value; no-load running torques scatter by as much over parts and temperatures."""
-    coulomb_rated: float = 0.02
-    viscous_share: float = 0.5
-    viscous_rated: float = 0.02
-    load_mean: float = 0.05
-    load: float = 0.1
-    """A harmonic drive loses 5 to 15 % of the load beside its no-load torque (catalogue efficiency 0.7 to 0.85)."""
-    gain: float = 0.05
-    """Catalogues allow 5 to 10 % on the torque constant."""
-    inertia_share: float = 0.3
-    offset_rated: float = 0.01
-    zero_rated: float = 0.01
-    other_way_rated: float = 0.005
-    """Of the constant part at no load, one direction against the other."""
-    curved_rated: float = 0.01
-    """The same at rated load: a loss is no straight line."""
-    other_way_viscous: float = 0.1
-    """Of the viscous part's own prior."""
-    day_share: float = 0.1
-    """Of the loss, from day to day."""
-
-
-PRIOR: Final = Prior()
+# Standard deviations of the prior; `_RATED`: parts of the rated torque (per rad/s where it is viscous), `_SHARE`: of the
+# file's value. From catalogues where these have any, else estimates, settled on emulated joints (docs/results.md).
+_COULOMB_SHARE: Final = 0.5
+"""No-load running torques scatter by as much over parts and temperatures."""
+_COULOMB_RATED: Final = 0.02
+_VISCOUS_SHARE: Final = 0.5
+_VISCOUS_RATED: Final = 0.02
+_LOAD_MEAN: Final = 0.05
+_LOAD: Final = 0.1
+"""A harmonic drive loses 5 to 15 % of the load beside its no-load torque (catalogue efficiency 0.7 to 0.85)."""
+_GAIN: Final = 0.05
+"""Catalogues allow 5 to 10 % on the torque constant."""
+_INERTIA_SHARE: Final = 0.3
+_OFFSET_RATED: Final = 0.01
+_OTHER_WAY_RATED: Final = 0.005
+"""Of the constant part at no load, one direction against the other."""
+_CURVED_RATED: Final = 0.01
+"""The same at rated load: a loss is no straight line."""
+_OTHER_WAY_VISCOUS: Final = 0.1
+"""Of the viscous part's own prior."""
+_DAY_SHARE: Final = 0.1
+"""Of the loss, from day to day."""
 _SAMPLE_S: Final = 0.005
 _LONGEST_S: Final = 0.1
 """The error of a law that is not quite that of the joint is correlated for so long at least."""
@@ -157,7 +149,7 @@ class _Block(NamedTuple):
     motion_s: float
 
 
-def fit_few_runs(runs: Sequence[RunSignals], joint: Joint, prior: Prior = PRIOR) -> FewRunsFit:
+def fit_few_runs(runs: Sequence[RunSignals], joint: Joint) -> FewRunsFit:
     """Return the joint with loss, sigma and rotor inertia of one to five runs.
 
     joint: what is known before the runs. Raises LossFitError for too little motion.
@@ -170,7 +162,7 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint, prior: Prior = PRIOR)
             f"found {motion_s:.2g} s in motion (above {_SLOW_RAD_S} rad/s), expected at least {_LEAST_MOTION_S} s"
         )
     blocks = [block for block in blocks if len(block.y)]
-    before = _before(joint, prior)
+    before = _before(joint)
     weights = [
         block.motion_s / _LONGEST_S / len(block.y) / (2.0 * _LEAST_RATED * rated) ** 2 for block in blocks
     ]
@@ -181,9 +173,7 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint, prior: Prior = PRIOR)
     residual = _rms([_error(block, w, n) for n, block in enumerate(blocks)])
     held_out = _rms(_held_out_errors(blocks, weights, before))
     speed = max(float(np.abs(block.v).max()) for block in blocks)
-    sigma = _sigma(
-        w[_LOSS], covariance[_LOSS, _LOSS], max(held_out, _LEAST_RATED * rated), rated, speed, prior
-    )
+    sigma = _sigma(w[_LOSS], covariance[_LOSS, _LOSS], max(held_out, _LEAST_RATED * rated), rated, speed)
     loss = _loss(w, joint, speed, _temperature(runs))
     fitted = replace(
         joint, rotor_inertia_kgm2=float(w[_INERTIA]) / joint.gear_ratio**2, fused=Fused(loss, None, sigma)
@@ -249,28 +239,28 @@ class _Before(NamedTuple):
     offset_nm: float
 
 
-def _before(joint: Joint, prior: Prior) -> _Before:
+def _before(joint: Joint) -> _Before:
     rated, friction = joint.rated_torque_nm, joint.friction
-    viscous = float(np.hypot(prior.viscous_share * friction.viscous_nms_per_rad, prior.viscous_rated * rated))
+    viscous = float(np.hypot(_VISCOUS_SHARE * friction.viscous_nms_per_rad, _VISCOUS_RATED * rated))
     sigmas = np.array(
         (
-            np.hypot(prior.coulomb_share * friction.coulomb_nm, prior.coulomb_rated * rated),
-            prior.load,
+            np.hypot(_COULOMB_SHARE * friction.coulomb_nm, _COULOMB_RATED * rated),
+            _LOAD,
             viscous,
-            prior.offset_rated * rated,
-            prior.gain,
-            prior.inertia_share * _reflected(joint),
+            _OFFSET_RATED * rated,
+            _GAIN,
+            _INERTIA_SHARE * _reflected(joint),
         )
     )
     means = np.array(
-        (friction.coulomb_nm, prior.load_mean, friction.viscous_nms_per_rad, 0.0, 0.0, _reflected(joint))
+        (friction.coulomb_nm, _LOAD_MEAN, friction.viscous_nms_per_rad, 0.0, 0.0, _reflected(joint))
     )
-    side = np.array((prior.curved_rated, prior.other_way_rated, prior.curved_rated)) * rated
-    own = np.concatenate((side, side, np.full(2, prior.other_way_viscous * viscous), [0.0]))
+    side = np.array((_CURVED_RATED, _OTHER_WAY_RATED, _CURVED_RATED)) * rated
+    own = np.concatenate((side, side, np.full(2, _OTHER_WAY_VISCOUS * viscous), [0.0]))
     b = _mixing(rated)
     covariance = b @ np.diag(sigmas**2) @ b.T + np.diag(own**2)
     precision = np.asarray(np.linalg.inv(covariance), np.float64)
-    return _Before(b @ means, covariance, precision, prior.zero_rated * rated)
+    return _Before(b @ means, covariance, precision, _OFFSET_RATED * rated)
 
 
 def _solve(
@@ -336,15 +326,15 @@ def _rms(parts: Sequence[FloatArray]) -> float:
     return float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
 
 
-def _sigma(  # noqa: PLR0917
-    w: FloatArray, covariance: FloatArray, residual_nm: float, rated: float, speed: float, prior: Prior
+def _sigma(
+    w: FloatArray, covariance: FloatArray, residual_nm: float, rated: float, speed: float
 ) -> FusedSigma:
     """Return sigma of the current path on another day, over loads up to the rated one and speeds up to the fastest."""
     slow = min(_SLOW_RAD_S, speed)
     speeds = np.linspace(2.0 * slow if speed > 2.0 * slow else slow, speed, 8)
     raw, v = (each.ravel() for each in np.meshgrid(np.linspace(-rated, rated, 21), np.r_[-speeds, speeds]))
     x = _columns(raw, v, np.sign(v), rated)
-    variance = np.einsum("ij,jk,ik->i", x, covariance, x) + residual_nm**2 + (prior.day_share * (x @ w)) ** 2
+    variance = np.einsum("ij,jk,ik->i", x, covariance, x) + residual_nm**2 + (_DAY_SHARE * (x @ w)) ** 2
     a, b, c = nnls(np.column_stack((np.ones_like(v), v * v, raw * raw)), variance)[0]
     a = max(a, (0.5 * _LEAST_RATED * rated) ** 2)
     ratio = variance / (a + b * v * v + c * raw * raw)

@@ -50,31 +50,22 @@ class PlateauError(ValueError):
     """A run lacks a column, or nothing in it settled; one line: found and expected."""
 
 
-@dataclass(frozen=True)
-class PlateauRules:
-    """What counts as settled.
-
-    Attributes:
-        shortest_s, fewest_cells: of a plateau.
-        slowest_rad_s: of a plateau, joint side; below it the Stribeck range begins.
-        cell_s: shortest cell. longest_cell_s: a joint whose ripple period takes longer is too slow to be averaged.
-        ripple_per_motor_rev: ripple periods per motor revolution.
-        velocity_band_rad_s, velocity_band: width of the band of a plateau's velocity, absolute and as a share of it;
-        the wider one counts.
-        load_band, load_band_most: width of the band of torque and motor torque as a share of rated torque. Where
-        the noise from cell to cell is larger the band follows it, up to `load_band_most`.
-    """
-
-    shortest_s: float = 0.5
-    fewest_cells: int = 3
-    slowest_rad_s: float = 0.05
-    cell_s: float = 0.1
-    longest_cell_s: float = 1.0
-    ripple_per_motor_rev: float = 2.0
-    velocity_band_rad_s: float = 0.005
-    velocity_band: float = 0.01
-    load_band: float = 0.01
-    load_band_most: float = 0.05
+SHORTEST_S: Final = 0.5
+"""Plateaus, unless the caller asks for shorter ones."""
+_FEWEST_CELLS: Final = 3
+_SLOWEST_RAD_S: Final = 0.05
+"""Joint side; below it the Stribeck range begins."""
+_CELL_S: Final = 0.1
+_LONGEST_CELL_S: Final = 1.0
+"""A joint whose ripple period takes longer is too slow to be averaged."""
+_RIPPLE_PER_MOTOR_REV: Final = 2.0
+_VELOCITY_BAND_RAD_S: Final = 0.005
+_VELOCITY_BAND: Final = 0.01
+"""Width of the band of a plateau's velocity, absolute and as a share of it; the wider one counts."""
+_LOAD_BAND: Final = 0.01
+_LOAD_BAND_MOST: Final = 0.05
+"""Width of the band of torque and motor torque, parts of rated torque; where the noise from cell to cell is larger the band
+follows it, up to the latter."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +94,7 @@ class Plateau:
 
 
 def find_plateaus(
-    time_s: FloatArray, run: JointColumns, joint: Joint, name: str = "", rules: PlateauRules | None = None
+    time_s: FloatArray, run: JointColumns, joint: Joint, name: str = "", shortest_s: float = SHORTEST_S
 ) -> list[Plateau]:
     """Return the plateaus of one joint in one run, in order of time.
 
@@ -113,23 +104,15 @@ def find_plateaus(
     Raises:
         PlateauError: a column is missing, or nothing settled.
     """
-    rules = rules or PlateauRules()
     current, omega_m, torque = _needed_columns(run, name)
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
     speed = omega_m / joint.gear_ratio
-    cells = cut_cells(
-        time_s,
-        (speed, torque, nm_per_a * current),
-        omega_m,
-        shortest_s=rules.cell_s,
-        longest_s=rules.longest_cell_s,
-        periods_per_motor_rev=rules.ripple_per_motor_rev,
-    )
-    found, longest_s = _stretches(cells, joint.rated_torque_nm, rules)
+    cells = cut_cells(time_s, (speed, torque, nm_per_a * current), omega_m)
+    found, longest_s = _stretches(cells, joint.rated_torque_nm, shortest_s)
     if not found:
         raise PlateauError(
             f"{name}: found no settled plateau (longest settled stretch {longest_s:.2f} s), expected velocity and load "
-            f"constant for {rules.shortest_s:g} s while the joint moves at {rules.slowest_rad_s:g} rad/s or more"
+            f"constant for {shortest_s:g} s while the joint moves at {_SLOWEST_RAD_S:g} rad/s or more"
         )
     angle = integral(time_s, omega_m)
     plateaus = []
@@ -204,11 +187,11 @@ def _resolution_error(samples: FloatArray) -> float:
     return step / math.sqrt(12.0) if float(np.std(samples)) < 0.5 * step else 0.0
 
 
-def _stretches(cells: Cells, rated_nm: float, rules: PlateauRules) -> tuple[list[tuple[int, int]], float]:
+def _stretches(cells: Cells, rated_nm: float, shortest_s: float) -> tuple[list[tuple[int, int]], float]:
     """Plateaus as (first, last + 1) of cells, in order of time; and the length [s] of the longest stretch of all."""
     found: list[tuple[int, int]] = []
     longest_s = 0.0
-    reach = _reach(cells, _load_bands(cells, rated_nm, rules), rules)
+    reach = _reach(cells, _load_bands(cells, rated_nm))
     todo = [(0, len(cells.means))]
     while todo:
         low, high = todo.pop()
@@ -220,42 +203,42 @@ def _stretches(cells: Cells, rated_nm: float, rules: PlateauRules) -> tuple[list
         first = low + int(np.argmax(lengths))
         last = int(ends[first - low])
         longest_s = max(longest_s, float(lengths.max()))
-        if float(lengths.max()) < rules.shortest_s:
+        if float(lengths.max()) < shortest_s:
             continue
         todo += [(low, first), (last, high)]
         first, last = _trimmed(cells.means, first, last, rated_nm)
-        long_enough = cells.end_s[last - 1] - cells.start_s[first] >= rules.shortest_s
-        fast_enough = abs(float(np.mean(cells.means[first:last, 0]))) >= rules.slowest_rad_s
-        if last - first >= rules.fewest_cells and long_enough and fast_enough:
+        long_enough = cells.end_s[last - 1] - cells.start_s[first] >= shortest_s
+        fast_enough = abs(float(np.mean(cells.means[first:last, 0]))) >= _SLOWEST_RAD_S
+        if last - first >= _FEWEST_CELLS and long_enough and fast_enough:
             found.append((first, last))
     return sorted(found), longest_s
 
 
-def _load_bands(cells: Cells, rated_nm: float, rules: PlateauRules) -> FloatArray:
-    """Widths [2] of the band in Nm for torque and motor torque: of the rules, or of the noise from cell to cell."""
-    moving = cells.usable & (np.abs(cells.means[:, 0]) >= rules.slowest_rad_s)
+def _load_bands(cells: Cells, rated_nm: float) -> FloatArray:
+    """Widths [2] of the band in Nm for torque and motor torque: _LOAD_BAND, or of the noise from cell to cell."""
+    moving = cells.usable & (np.abs(cells.means[:, 0]) >= _SLOWEST_RAD_S)
     # Third differences suppress a drift and a slow swing, and have sqrt(20) times the noise of the cells.
     # The lowest fifth: cells of a transition are no noise, and in a run of short holds they are many.
     steps = np.abs(np.diff(cells.means[:, 1:], n=3, axis=0))
     steps = steps[moving[3:] & moving[2:-1] & moving[1:-2] & moving[:-3]]
     if not len(steps):
-        return np.full(2, rules.load_band * rated_nm)
+        return np.full(2, _LOAD_BAND * rated_nm)
     # 20 % of a normal are within 0.2533 sigma; 8 sigma hold a hundred cells of one plateau
     noise = np.quantile(steps, 0.2, axis=0) / (0.2533 * math.sqrt(20.0))
-    result: FloatArray = np.clip(8.0 * noise, rules.load_band * rated_nm, rules.load_band_most * rated_nm)
+    result: FloatArray = np.clip(8.0 * noise, _LOAD_BAND * rated_nm, _LOAD_BAND_MOST * rated_nm)
     return result
 
 
-def _reach(cells: Cells, load_bands: FloatArray, rules: PlateauRules) -> NDArray[np.intp]:
+def _reach(cells: Cells, load_bands: FloatArray) -> NDArray[np.intp]:
     """For each cell k the end (exclusive) of the longest stretch from k on that stays within all bands."""
     count = len(cells.means)
     reach = np.arange(count)
-    moving = (cells.usable & (np.abs(cells.means[:, 0]) >= 0.5 * rules.slowest_rad_s)).tolist()
+    moving = (cells.usable & (np.abs(cells.means[:, 0]) >= 0.5 * _SLOWEST_RAD_S)).tolist()
     rows = cells.means.tolist()
     torque_band, motor_band = load_bands.tolist()
     for first in range(count):
         v_low, t_low, m_low = v_high, t_high, m_high = rows[first]
-        velocity_band = max(rules.velocity_band_rad_s, rules.velocity_band * abs(v_low))
+        velocity_band = max(_VELOCITY_BAND_RAD_S, _VELOCITY_BAND * abs(v_low))
         last = first
         while last < count and moving[last]:
             v, t, m = rows[last]
@@ -283,7 +266,7 @@ def _trimmed(means: FloatArray, first: int, last: int, rated_nm: float) -> tuple
 
 
 def plateaus_of(
-    runs: Sequence[RunFile], number: int, joint: Joint, rules: PlateauRules | None = None
+    runs: Sequence[RunFile], number: int, joint: Joint, shortest_s: float = SHORTEST_S
 ) -> list[Plateau]:
     """Return the plateaus of one joint in all runs; a run without any is named on standard error.
 
@@ -295,7 +278,7 @@ def plateaus_of(
     for run in progress(runs, "finding plateaus"):
         columns = run.table.joint(number, joint.gear_ratio)
         try:
-            plateaus += find_plateaus(run.table.time_s, columns, joint, run.name, rules)
+            plateaus += find_plateaus(run.table.time_s, columns, joint, run.name, shortest_s)
         except PlateauError as error:
             unsettled.append(error)
     if not plateaus:
@@ -317,30 +300,22 @@ class Cells(NamedTuple):
     usable: NDArray[np.bool_]
 
 
-def cut_cells(
-    time_s: FloatArray,
-    signals: Sequence[FloatArray],
-    motor_velocity_rad_s: FloatArray,
-    *,
-    shortest_s: float,
-    longest_s: float,
-    periods_per_motor_rev: float,
-) -> Cells:
-    """Cut a run [n] into cells of as many whole ripple periods as take at least `shortest_s`.
+def cut_cells(time_s: FloatArray, signals: Sequence[FloatArray], motor_velocity_rad_s: FloatArray) -> Cells:
+    """Cut a run [n] into cells of as many whole ripple periods as take at least _CELL_S.
 
     time_s rising, steps may be uneven; the angle is the motor velocity's integral, so that positions that roll over or
     are not measured do not matter.
     """
     distance = integral(time_s, np.abs(motor_velocity_rad_s))
-    periods = distance * periods_per_motor_rev / math.tau
+    periods = distance * _RIPPLE_PER_MOTOR_REV / math.tau
     starts, ends, usable = [], [], []
     start, last = float(time_s[0]), float(time_s[-1])
-    while start + shortest_s <= last:
-        at, ahead = np.interp((start, start + shortest_s), time_s, periods).tolist()
+    while start + _CELL_S <= last:
+        at, ahead = np.interp((start, start + _CELL_S), time_s, periods).tolist()
         end = _time_of(at + max(1, math.ceil(ahead - at - 1e-9)), time_s, periods)
-        good = end - start <= longest_s
+        good = end - start <= _LONGEST_CELL_S
         if not good:
-            end = start + shortest_s
+            end = start + _CELL_S
         starts.append(start)
         ends.append(end)
         usable.append(good)

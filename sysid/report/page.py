@@ -51,8 +51,6 @@ DARK: Final = {
     "series_4": "#5fc793",
     "series_5": "#72b4f0",
 }
-TEXT: Final = ("ink", "soft", "before", "after", "good", "bad", "warn")
-"""Roles that are written with, on `paper` and on `panel`."""
 
 
 def render(
@@ -61,17 +59,10 @@ def render(
     content: Mapping[str, Any],
     filters: Mapping[str, Callable[..., Any]] | None = None,
 ) -> str:
-    """Return the HTML page of a template that extends "base.html.j2".
+    """Return the HTML page of a template (its file name, in a package) that extends "base.html.j2".
 
-    Args:
-        package: that the template lies in.
-        template: its file name.
-        content: variables of the template; `made`, when and by what the page was made, goes to its foot.
-        filters: filters of the template.
-
-    Raises:
-        ImportError: jinja2 is not installed.
-        jinja2.UndefinedError: the template uses a variable that `content` does not have.
+    content: variables of the template; `made`, when and by what the page was made, goes to its foot. Raises ImportError
+    without jinja2, jinja2.UndefinedError for a variable that `content` does not have.
     """
     from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
@@ -83,25 +74,10 @@ def render(
         lstrip_blocks=True,
     )
     environment.filters.update(filters or {})
-    page = environment.get_template(template)
-    return f"{page.render(light=variables(LIGHT), dark=variables(DARK), **content)}\n"
-
-
-def variables(colours: dict[str, str]) -> str:
-    """Return the declarations of the roles for a style sheet."""
-    return " ".join(f"--{role}: {colour};" for role, colour in colours.items())
-
-
-def contrast(one: str, other: str) -> float:
-    """Return the contrast ratio of two colours, 1 to 21 (WCAG 2.1: text needs 4.5)."""
-    light, dark = sorted((_luminance(one), _luminance(other)), reverse=True)
-    return (light + 0.05) / (dark + 0.05)
-
-
-def _luminance(colour: str) -> float:
-    shares = [int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)]
-    linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in shares]
-    return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+    light, dark = (
+        " ".join(f"--{role}: {colour};" for role, colour in colours.items()) for colours in (LIGHT, DARK)
+    )
+    return f"{environment.get_template(template).render(light=light, dark=dark, **content)}\n"
 
 
 SENSOR, BEFORE, AFTER = LIGHT["ink"], LIGHT["before"], LIGHT["after"]
@@ -110,7 +86,6 @@ PICTURES: Final = (".png", ".svg", ".pdf", ".jpg", ".jpeg", ".webp", ".tif", ".t
 """Endings of the pictures that a command writes."""
 BUCKETS = 700
 """Of a curve over time: each keeps its lowest and highest sample, so that no spike is lost."""
-STANDING_LABEL = "standstill: the estimate is the middle of an interval"
 STYLE: Final[dict[str, Any]] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "jtqd",
@@ -147,13 +122,8 @@ def check_picture(path: Path) -> None:
 def page_svg(draw: Callable[[], Any], name: str) -> str:
     """Return a figure as SVG for a page: its colours are the page's, its ids begin with `name`; "" without a figure.
 
-    Args:
-        draw: makes the matplotlib figure, in colours of `LIGHT`, or returns None. It runs with the settings `STYLE`; those
-            outside are left alone.
-        name: unique on the page.
-
-    Raises:
-        ImportError: matplotlib is not installed.
+    draw: makes the matplotlib figure, in colours of `LIGHT` and with the settings `STYLE`, or returns None. name: unique on
+    the page. Raises ImportError without matplotlib.
     """
     import matplotlib as mpl
 
@@ -203,30 +173,12 @@ def shade(
     )
 
 
-def sensor_line(axis: Any, time_s: FloatArray, reference_nm: FloatArray) -> None:
-    """The reference of a measured run, over the estimates."""
-    axis.plot(
-        time_s, reference_nm, color=SENSOR, linewidth=1.4, label="torque sensor, filtered like the estimate"
-    )
-
-
-def room_for_legend(axis: Any, share: float) -> None:
-    """Leave a share of the height above the curves."""
-    low, high = axis.get_ylim()
-    axis.set_ylim(low, high + share * (high - low))
-
-
 def plain(axis: Any) -> None:
     """Light grid, no frame above and on the right."""
     axis.grid(True, color=GRID, linewidth=0.6)
     axis.set_axisbelow(True)
     for side in ("top", "right"):
         axis.spines[side].set_visible(False)
-
-
-def legend(axis: Any) -> None:
-    """Legend at the upper left; the curves shine through."""
-    axis.legend(loc="upper left", fontsize=8, framealpha=0.85, edgecolor="none")
 
 
 def as_svg(figure: Any) -> str:

@@ -285,7 +285,7 @@ def fit_of_days() -> FusedFit:
 def test_runs_of_other_days_are_as_wrong_as_sigma(fit_of_days: FusedFit) -> None:
     """Other motions, eight other days with their offsets and friction: each day 0.5 Nm RMS of up to 30 Nm.
 
-    Against the true torque, without the sensor's offset. 80 % or more of all moving samples are in the 90 % interval (six
+    Against the true torque, without the sensor's offset. 80 % or more of all moving samples are in the 90 % interval (eight
     days are few), 95 % of the standing ones in theirs.
     """
     ours = replace(joint(1), fused=fit_of_days.fused)

@@ -21,7 +21,6 @@ from jtqd.sysid.fit.plateaus import (
     Mean,
     Plateau,
     PlateauError,
-    PlateauRules,
     cut_cells,
     effective_samples,
     find_plateaus,
@@ -133,8 +132,7 @@ def test_a_mean_over_cells_does_not_contain_the_ripple(speed: float) -> None:
     time_s = np.cumsum(steps)
     omega = np.full(4000, 100.0 * speed)
     ripple = np.cos(2.0 * integral(time_s, omega) + rng.uniform(0.0, 6.0))
-    rules = {"shortest_s": 0.1, "longest_s": 1.0, "periods_per_motor_rev": 2.0}
-    cells = cut_cells(time_s, (ripple,), omega, **rules)
+    cells = cut_cells(time_s, (ripple,), omega)
     assert cells.usable.all() or not cells.usable[-1]
     # what is left is the edges' interpolation within a sample: far below the mean over the same time cut anywhere
     assert np.max(np.abs(cells.means[cells.usable, 0])) < 0.01
@@ -211,12 +209,11 @@ def test_a_noisy_sensor_widens_the_band_and_the_standard_error() -> None:
 
 def test_a_short_hold_is_found_only_when_asked_for() -> None:
     steps = [(1.0, 3.0, 10.0), (1.0, 4.0, 15.0)]
-    time_s, v, i, tau = staircase(steps, hold_s=0.25)
+    time_s, v, i, tau = staircase(steps, hold_s=0.42)
     with pytest.raises(PlateauError, match=r"constant for 0.5 s"):
         find_plateaus(time_s, columns(v, i, tau), JOINT)
-    # the last cell of the first hold reaches into the ramp, so what is left of 0.25 s is shorter
-    found = find_plateaus(time_s, columns(v, i, tau), JOINT, rules=PlateauRules(shortest_s=0.15, cell_s=0.04))
-    check(found, steps, errors=6.0)
+    # the last cell of the first hold reaches into the ramp, so what is left of the hold is shorter
+    check(find_plateaus(time_s, columns(v, i, tau), JOINT, shortest_s=0.3), steps, errors=6.0)
 
 
 @pytest.mark.parametrize(
