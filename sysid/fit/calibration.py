@@ -139,6 +139,11 @@ class PathResiduals(NamedTuple):
         """What the array methods of `Fusion` take."""
         return self.raw_nm, self.half_nm, self.velocity_rad_s, self.torsion_nm, self.open_nm
 
+    @property
+    def difference(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """What the functions of `path_difference.pyx` take of the paths' difference."""
+        return self.dt_s, self.apart_nm, self.direction, self.velocity_rad_s, self.torsion_nm
+
     def with_tracked_torsion(self) -> PathResiduals:
         """Return the run with the tracked torsion, delayed as the motor path: the estimator compares these two."""
         return self._replace(
@@ -222,11 +227,7 @@ def fused_errors(
         torsion, current, known, doubt, gain, early = track_run(
             fused,
             rated_nm,
-            run.dt_s,
-            run.apart_nm,
-            run.direction,
-            run.velocity_rad_s,
-            run.torsion_nm,
+            *run.difference,
             paths.variance_nm2,
             run.slope,
             run.stiffness_nm_per_rad,

@@ -86,6 +86,8 @@ from jtqd.sysid.fit.losses import LossFit, fit_loss
 from jtqd.sysid.fit.signals import RunSignals
 from jtqd.sysid.fit.torsion import fit_torsion
 
+# Operating envelope ----------------------------------------------------------------------------------
+
 VELOCITY_STEP_RAD_S: Final = 0.25
 VELOCITY_STEP_SHARE: Final = 1.0 / 12.0
 """Of the largest speed of the runs: the same 0.25 rad/s on the shipped joints (3 rad/s)."""
@@ -219,6 +221,8 @@ def fit_envelope(
     return replace(widened(made, [(run.velocity_rad_s, run.raw_nm) for run in seen]), load_nm=load)
 
 
+# Day-to-day offsets ----------------------------------------------------------------------------------
+
 WORTH: Final = 0.05
 """Share of the held-out mean square error that tracked offsets must remove."""
 _MOST: Final = 0.9
@@ -243,18 +247,12 @@ def fit_zeros(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) -> D
     stiffness = float(np.mean([run.stiffness_nm_per_rad.mean() for run in runs]))
     spread = float(np.sqrt(variance))
     found = DayZeros(spread / stiffness, spread, (1.0, 1.0, 1.0, 1.0), correlation(runs, sigma, spread))
-    without, with_it = (
-        float(
-            np.mean(
-                [
-                    np.mean(fused_errors(run, section, rated_nm, track_zeros=True).error_nm ** 2)
-                    for run in runs
-                ]
-            )
-        )
-        for section in (fused, replace(fused, zeros=found))
-    )
-    return found if with_it < (1.0 - WORTH) * without else None
+
+    def square(section: Fused) -> float:
+        errors = [fused_errors(run, section, rated_nm, track_zeros=True).error_nm for run in runs]
+        return float(np.mean([np.mean(error**2) for error in errors]))
+
+    return found if square(replace(fused, zeros=found)) < (1.0 - WORTH) * square(fused) else None
 
 
 def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: float) -> float | None:
@@ -289,6 +287,8 @@ def correlation(runs: Sequence[PathResiduals], sigma: FusedSigma, spread_nm: flo
     return float(np.clip(WINDOW_S * np.mean(found) / np.mean(assumed), _SHORTEST_S, CORRELATION_S))
 
 
+# Agreement of the paths ------------------------------------------------------------------------------
+
 QUANTILE: Final = 0.75
 """Of the blocks of all runs: the rest of ordinary days has a little doubt. Chosen on runs that no figure is reported on."""
 LOWERED: Final = 0.99
@@ -320,11 +320,7 @@ def fit_agreement(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) 
             levels(
                 usual,
                 rated_nm,
-                run.dt_s,
-                run.apart_nm,
-                run.direction,
-                run.velocity_rad_s,
-                run.torsion_nm,
+                *run.difference,
                 fusion.fuse(*run.fusion_inputs).variance_nm2,
                 run.slope,
             )
@@ -352,6 +348,8 @@ def fit_agreement(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) 
     found = replace(found, lowered_nm=max(float(np.quantile(doubt, LOWERED)), _FLOOR_NM))
     return replace(found, turn=fit_turn(moving))
 
+
+# Waves of the turn -----------------------------------------------------------------------------------
 
 TURN_BEYOND: Final = 1.1
 """The limit in parts of the largest square of any run. Chosen on runs that no figure is reported on."""
@@ -404,6 +402,8 @@ def _common_waves(runs: Sequence[PathResiduals]) -> FloatArray:
             products += rest[:, :-1].T @ rest[:, -1]
     return np.asarray(np.linalg.lstsq(squares, products, rcond=None)[0], np.float64).reshape(4, TURN_WAVES)
 
+
+# The whole section -----------------------------------------------------------------------------------
 
 FOLDS: Final = 4
 _LEAST_RUNS: Final = 6
