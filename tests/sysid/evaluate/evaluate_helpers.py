@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -25,6 +25,8 @@ from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.tables import write_run
 from jtqd.sysid.train.network import Trained, export_network
 from tests.estimator.estimator_helpers import small_network
+
+T = TypeVar("T")
 
 
 def samples(
@@ -65,6 +67,12 @@ def samples(
         missing=np.zeros(n, bool),
         bare_nm=np.full(n, np.nan) if bare_nm is None else bare_nm,
     )
+
+
+def known(value: T | None) -> T:
+    """The value, which must be there."""
+    assert value is not None
+    return value
 
 
 def simple_fused() -> Fused:

@@ -108,14 +108,8 @@ def test_what_was_not_measured_is_named() -> None:
         one = sweep(f"run{'x' * k}")
         keep = (np.abs(one.velocity_rad_s) < 1.5) & (one.sensor_nm * one.velocity_rad_s > 0.0)
         keep &= np.abs(one.sensor_nm) < 20.0
-        runs.append(
-            replace(
-                one,
-                scored=keep,
-                standing=np.zeros(8000, bool),
-                temperature_c=np.full(8000, 22.0),
-            )
-        )
+        warm = np.full(8000, 22.0)
+        runs.append(replace(one, scored=keep, standing=np.zeros(8000, bool), temperature_c=warm))
     texts = {each.key: each.text for each in card_of(runs).advice}
     assert [key for key in texts if key != "corners"] == ["loads", "speeds", "warmth", "standing", "runs"]
     assert "motor drives the load: 50 to 100 %; load drives the motor: 0 to 100 %" in texts["loads"]

@@ -22,7 +22,7 @@ from jtqd.sysid.evaluate.scores import (
     interval_tables,
     score,
 )
-from tests.sysid.evaluate.evaluate_helpers import samples
+from tests.sysid.evaluate.evaluate_helpers import known, samples
 
 EMPTY = Evaluation(
     models=(),
@@ -72,8 +72,7 @@ def covered(*shares: float, kinds: tuple[str, ...] = ("variable",)) -> Evaluatio
         sign = np.full(n, 1.0 - 2.0 * k)
         error = np.where(np.arange(n) < share * n, 0.0, 9.0)
         runs.append(samples({"fused": error}, run=str(k), raw_nm=sign, velocity_rad_s=sign))
-    tables = interval_tables(runs)
-    assert tables is not None
+    tables = known(interval_tables(runs))
     return replace(EMPTY, intervals=dict.fromkeys(kinds, tables))
 
 
@@ -81,9 +80,7 @@ def outside(*rmse_nm: tuple[float, float | None], flagged: float = 1.0) -> Evalu
     """Joints with the RMSE of ours and of the physics."""
 
     def scored(rmse: float) -> Score:
-        found = score([samples({"fused": np.full(10, rmse)})], "fused")
-        assert found is not None
-        return found
+        return known(score([samples({"fused": np.full(10, rmse)})], "fused"))
 
     limits = Range((-9.0, 9.0), None)
     joints = [
@@ -175,8 +172,7 @@ def ticking(step_ns: int, slow_ns: int = 0) -> Callable[[], int]:
 
 def test_both_joints_count_and_the_median_leaves_out_what_the_machine_did(bench: Path) -> None:
     models = load_models(bench / "models")
-    found = loop_time(runs_of(bench, models), models, ticking(1500, 1_000_000))
-    assert found is not None
+    found = known(loop_time(runs_of(bench, models), models, ticking(1500, 1_000_000)))
     assert found.joints == 2
     assert found.step_us == dict.fromkeys(TIMED, pytest.approx(3.0))
     assert found.extra_us("network") == pytest.approx(0.0)
@@ -186,8 +182,7 @@ def test_both_joints_count_and_the_median_leaves_out_what_the_machine_did(bench:
 
 def test_a_real_clock_finds_that_the_network_costs_something(bench: Path) -> None:
     models = load_models(bench / "models")
-    found = loop_time(runs_of(bench, models), models)
-    assert found is not None
+    found = known(loop_time(runs_of(bench, models), models))
     assert found.step_us["network"] > found.step_us["tob"] > 0.0
 
 

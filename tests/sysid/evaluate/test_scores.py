@@ -40,7 +40,7 @@ from jtqd.sysid.evaluate.scores import (
 from jtqd.sysid.fit.plateaus import Mean, Plateau
 from jtqd.sysid.report.page import thinned
 from jtqd.sysid.runs.tables import read_truth, truth_path, write_truth
-from tests.sysid.evaluate.evaluate_helpers import samples
+from tests.sysid.evaluate.evaluate_helpers import known, samples
 
 
 def test_a_score_has_squares_percentile_and_largest_error() -> None:
@@ -48,8 +48,7 @@ def test_a_score_has_squares_percentile_and_largest_error() -> None:
         samples({"fused": np.array(errors)}, rated_nm=rated)
         for errors, rated in (([3.0, -4.0], 40.0), ([0.0, 5.0], 20.0))
     ]
-    one = score(parts, "fused")
-    assert one is not None
+    one = known(score(parts, "fused"))
     assert one.samples == 4
     assert one.mse_nm2 == pytest.approx(50.0 / 4)
     assert one.rmse_nm == pytest.approx(math.sqrt(12.5))
@@ -67,16 +66,16 @@ def test_velocity_bins_have_their_lower_edge_inside() -> None:
 
 
 def test_the_standard_error_of_a_coverage_is_the_one_between_runs() -> None:
-    """2000 campaigns of 20 runs of 50 to 500 samples that are right, or wrong, as a whole."""
+    """1000 campaigns of 20 runs of 50 to 500 samples that are right, or wrong, as a whole."""
     seed = 11
     rng = np.random.default_rng(seed)
     found = [
-        coverage([np.full(rng.integers(50, 500), rng.random() < 0.9) for _ in range(20)]) for _ in range(2000)
+        coverage([np.full(rng.integers(50, 500), rng.random() < 0.9) for _ in range(20)]) for _ in range(1000)
     ]
     shares = np.array([one.share for one in found if one is not None])
     claimed = np.sqrt(np.mean([one.se**2 for one in found if one is not None]))
     assert claimed == pytest.approx(shares.std(), rel=0.1), seed
-    assert math.isnan(coverage([np.ones(5, bool)]).se)  # type: ignore[union-attr]
+    assert math.isnan(known(coverage([np.ones(5, bool)])).se)
     assert coverage([]) is None
 
 
@@ -85,11 +84,8 @@ def test_intervals_of_a_normal_error_cover_their_level() -> None:
     rng = np.random.default_rng(seed)
     runs = [samples({"fused": rng.normal(0.0, 2.0, 4000)}, run=str(k), sigma_nm=2.0) for k in range(10)]
     for level in LEVELS:
-        one = covered(runs, "fused", level)
-        assert one is not None
-        assert one.share == pytest.approx(level, abs=0.01), (seed, level)
-    table = interval_tables(runs)
-    assert table is not None
+        assert known(covered(runs, "fused", level)).share == pytest.approx(level, abs=0.01), (seed, level)
+    table = known(interval_tables(runs))
     assert table.curve["both"][0.8].share == pytest.approx(0.8, abs=0.01)
     assert list(table.quadrants[1]) == ["i_pos_w_pos"]  # the only quadrant with samples
     assert interval_tables([samples({"tob": np.zeros(5)})]) is None
@@ -147,10 +143,8 @@ def test_the_median_run_is_the_one_in_the_middle_by_ours() -> None:
         samples({"tob": np.full(9, 9.0 - k), "fused": np.full(9, float(k))}, run=f"r{k}")
         for k in (3, 0, 2, 1, 4)
     ]
-    chosen = median_run(runs)
-    assert chosen is not None
-    assert chosen.run == "r2"
-    assert median_run(runs[:2]).run == "r0"  # type: ignore[union-attr]  # the lower one of two
+    assert known(median_run(runs)).run == "r2"
+    assert known(median_run(runs[:2])).run == "r0"  # the lower one of two
     assert median_run([]) is None
 
 
@@ -202,8 +196,7 @@ def test_the_hardest_plateaus_are_back_driven_fast_and_heavy() -> None:
     right = [one("back", 2.5, -30.0, 0.3), one("back", -2.45, 34.0, -0.6)]
     wrong = [one("forward", 2.5, 30.0, 9.0), one("back", 1.5, 30.0, 9.0), one("back", 2.5, 20.0, 9.0)]
     assert hardest_plateaus(right + wrong) == right
-    found = worst_plateau(right, "fused", "rated_percent")
-    assert found is not None
+    found = known(worst_plateau(right, "fused", "rated_percent"))
     assert found[0] == pytest.approx(1.5)
     assert found[1] is right[1]
     assert worst_plateau(right, "tob", "percent") is None
@@ -304,8 +297,7 @@ def _reversal(step_nm: float, swing_nm: float = 0.0, late: int = 0) -> Samples:
 
 @pytest.mark.parametrize("step", [0.3, -2.0])
 def test_a_step_at_a_reversal_is_a_jump_of_its_size(step: float) -> None:
-    jump = largest_jump([_reversal(step)], "fused")
-    assert jump is not None
+    jump = known(largest_jump([_reversal(step)], "fused"))
     assert jump.nm == pytest.approx(abs(step))
     assert (jump.of, jump.crossings) == ("v = 0", 1)
     assert jump.time_s == pytest.approx(0.5, abs=0.011)
@@ -313,12 +305,9 @@ def test_a_step_at_a_reversal_is_a_jump_of_its_size(step: float) -> None:
 
 
 def test_a_swing_of_the_torque_is_no_jump_even_when_it_is_followed_late() -> None:
-    followed = largest_jump([_reversal(0.0, swing_nm=10.0)], "fused")
-    late = largest_jump([_reversal(0.0, swing_nm=10.0, late=5)], "fused", passage=True)
-    both = largest_jump([_reversal(3.0, swing_nm=10.0)], "fused")
-    assert followed is not None
-    assert late is not None
-    assert both is not None
+    followed = known(largest_jump([_reversal(0.0, swing_nm=10.0)], "fused"))
+    late = known(largest_jump([_reversal(0.0, swing_nm=10.0, late=5)], "fused", passage=True))
+    both = known(largest_jump([_reversal(3.0, swing_nm=10.0)], "fused"))
     assert followed.nm <= 1e-9
     assert late.nm <= 1e-9
     assert late.unshifted_nm == pytest.approx(2.5, abs=0.3)  # 5 of 20 samples
@@ -329,11 +318,11 @@ def test_a_spike_within_the_window_is_seen_and_one_elsewhere_is_not() -> None:
     spike = np.zeros(1001)
     spike[505] = 4.0
     v = np.linspace(-0.5, 0.5, 1001)
-    at = largest_jump([samples({"fused": spike}, velocity_rad_s=v)], "fused")
-    assert at is not None
+    at = known(largest_jump([samples({"fused": spike}, velocity_rad_s=v)], "fused"))
     assert at.nm == pytest.approx(4.0)
-    away = largest_jump([samples({"fused": np.roll(spike, 200)}, velocity_rad_s=v)], "fused", passage=True)
-    assert away is not None
+    away = known(
+        largest_jump([samples({"fused": np.roll(spike, 200)}, velocity_rad_s=v)], "fused", passage=True)
+    )
     assert away.nm == 0.0
 
 
@@ -342,14 +331,11 @@ def test_jumps_are_shown_beside_those_anywhere_in_motion() -> None:
     n = 10_001
     error = np.where(np.arange(n) % 100 == 50, 0.7, 0.0)
     v = np.sin(2.0 * np.pi * (np.arange(n) - 50) / 2500.0)  # 8 crossings, each at a spike
-    found = largest_jump([samples({"fused": error}, velocity_rad_s=v)], "fused")
-    assert found is not None
+    found = known(largest_jump([samples({"fused": error}, velocity_rad_s=v)], "fused"))
     assert found.crossings == 8
     assert found.nm == found.elsewhere_nm == pytest.approx(0.7)  # 1 of 8 < 1 of 5
-    calm = largest_jump(
-        [samples({"fused": np.where(np.arange(n) == 50, 0.7, 0.0)}, velocity_rad_s=v)], "fused"
-    )
-    assert calm is not None
+    once = np.where(np.arange(n) == 50, 0.7, 0.0)
+    calm = known(largest_jump([samples({"fused": once}, velocity_rad_s=v)], "fused"))
     assert calm.elsewhere_nm == 0.0
 
 
@@ -357,8 +343,8 @@ def test_a_passage_includes_entry_and_exit_of_a_long_rest() -> None:
     v = np.concatenate((np.full(200, -0.5), np.zeros(600), np.full(200, 0.5)))
     error = np.where(np.arange(1000) < 203, 0.0, 1.5)  # steps as it comes to rest
     runs = [samples({"fused": error}, velocity_rad_s=v)]
-    assert largest_jump(runs, "fused").nm == 0.0  # type: ignore[union-attr]  # zero is crossed at 800
-    assert largest_jump(runs, "fused", passage=True).nm == pytest.approx(1.5)  # type: ignore[union-attr]
+    assert known(largest_jump(runs, "fused")).nm == 0.0  # zero is crossed at 800
+    assert known(largest_jump(runs, "fused", passage=True)).nm == pytest.approx(1.5)
 
 
 def test_jumps_are_not_taken_over_gaps() -> None:
@@ -379,25 +365,20 @@ TORQUE = 20.0 * np.sin(2.0 * np.pi * 0.5 * TIME)
 def test_an_offset_of_the_sensor_is_no_error_against_the_truth() -> None:
     """The estimate is 0.5 Nm from the sensor, which is 0.5 Nm off: it is right."""
     one = samples({"fused": np.full(4000, -0.5)}, sensor_nm=TORQUE + 0.5, sigma_nm=0.2)
-    tables = truth_tables([replace(one, true_nm=TORQUE)])
-    assert tables is not None
+    tables = known(truth_tables([replace(one, true_nm=TORQUE)]))
     assert tables.now[1]["fused"].rmse_nm == pytest.approx(0.0, abs=1e-12)
     assert tables.aligned[1]["fused"].rmse_nm == pytest.approx(
         0.005 * 20.0 * 2.0 * np.pi * 0.5 / np.sqrt(2.0), rel=0.02
     )
-    assert tables.intervals is not None
-    shifted = truth_tables([replace(one, true_nm=TORQUE + 2.0)])
-    assert shifted is not None
-    assert shifted.intervals is not None
-    assert shifted.intervals.overall.share < 0.01
+    shifted = known(truth_tables([replace(one, true_nm=TORQUE + 2.0)]))
+    assert known(shifted.intervals).overall.share < 0.01
     assert shifted.now[1]["fused"].rmse_rated_percent == pytest.approx(5.0)
 
 
 def test_samples_without_truth_are_in_no_table() -> None:
     one = samples({"fused": np.zeros(4000)}, sensor_nm=TORQUE)
     assert truth_tables([one]) is None
-    both = truth_tables([one, replace(one, number=2, true_nm=TORQUE + 1.0)])
-    assert both is not None
+    both = known(truth_tables([one, replace(one, number=2, true_nm=TORQUE + 1.0)]))
     assert list(both.now) == [2]
 
 

@@ -32,12 +32,9 @@ def runs_of_days(offset_nm: float, within_nm: float = 0.2) -> list[PathResiduals
         slow = np.repeat(rng.normal(0.0, within_nm, n // 100), 100)
         friction = rng.normal(0.0, 0.3) * np.sign(v) + np.repeat(rng.normal(0.0, 0.5, n // 100), 100)
         none = np.zeros(n)
-        found.append(
-            PathResiduals(
-                torque, v, none, torque, none, friction, offset + slow, np.full(n, 1e-3), np.tanh(v / 0.02), none,
-                stiffness_nm_per_rad=np.full(n, K), loss_nm=none, turn=np.zeros((n, 6)),
-            )
-        )  # fmt: skip
+        paths = (torque, v, none, torque, none, friction, offset + slow)
+        further = {"stiffness_nm_per_rad": np.full(n, K), "loss_nm": none, "turn": np.zeros((n, 6))}
+        found.append(PathResiduals(*paths, np.full(n, 1e-3), np.tanh(v / 0.02), none, **further))
     return found
 
 
@@ -89,9 +86,8 @@ def test_tracked_offsets_reduce_error_and_spread() -> None:
         return float(np.mean([np.mean(run.error_nm[5000:] ** 2) for run in of]))
 
     assert mean_square(tracked) < 0.8 * mean_square(plain)
-    assert np.mean([run.spread_nm[-1] for run in tracked]) < 0.9 * np.mean(
-        [run.spread_nm[0] for run in plain]
-    )
+    last, first = (np.mean([run.spread_nm[k] for run in of]) for of, k in ((tracked, -1), (plain, 0)))
+    assert last < 0.9 * first
 
 
 # Agreement ---------------------------------------------------------------------------------------------
@@ -153,20 +149,8 @@ def turning(seed: int, parts: FloatArray = PARTS, speed: float = 1.0) -> PathRes
     apart = np.einsum("nk,nk->n", waves, size) + source.normal() + 0.5 * source.normal() * v
     apart += 0.05 * source.normal(size=n)
     none = np.zeros(n)
-    return PathResiduals(
-        none,
-        speed * v,
-        none,
-        none,
-        none,
-        none,
-        apart,
-        np.full(n, 1e-3),
-        np.ones(n),
-        none,
-        loss_nm=loss,
-        turn=waves,
-    )
+    paths = (none, speed * v, none, none, none, none, apart)
+    return PathResiduals(*paths, np.full(n, 1e-3), np.ones(n), none, loss_nm=loss, turn=waves)
 
 
 def test_waves_of_the_turn_are_those_that_runs_have_in_common() -> None:
