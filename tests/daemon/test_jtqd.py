@@ -218,9 +218,10 @@ def a_daemon(bus: str, environment: dict[str, str]) -> Iterator[Daemon]:
         process.communicate()
 
 
-@pytest.fixture
-def bench(tmp_path: Path) -> Iterator[str]:
-    with a_bench(tmp_path) as bus:
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """One for all daemons of this file, each of which ends with its test."""
+    with a_bench(tmp_path_factory.mktemp("bench")) as bus:
         yield bus
 
 
@@ -337,15 +338,10 @@ def test_a_node_that_restarts_is_configured_again_before_it_is_believed(daemon: 
     assert process.returncode == 0
 
 
-def test_the_bus_that_ends_is_said(bench: str, environment: dict[str, str], tmp_path: Path) -> None:
-    process = started("--bus", bench, environment=environment)
-    socket = open_frame_socket(bench, [exact(0x1A0)])
-    assert socket.wait(20)
-    for pid in Path("/proc").iterdir():
-        if pid.name.isdigit() and bench in (pid / "cmdline").read_bytes().decode(errors="replace"):
-            command = (pid / "cmdline").read_bytes()
-            if b"sim_can" in command:
-                os.kill(int(pid.name), signal.SIGKILL)
+def test_the_bus_that_ends_is_said(environment: dict[str, str], tmp_path: Path) -> None:
+    with a_bench(tmp_path) as bus:
+        process = started("--bus", bus, environment=environment)
+        until_it_publishes(process, environment)
     out, err = process.communicate(timeout=20)
     assert process.returncode == 1
     assert "Traceback" not in err

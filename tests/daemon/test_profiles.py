@@ -148,29 +148,22 @@ def test_a_wrong_line_is_one_line_that_names_it(line: dict[str, Any], text: str,
     assert str(path) in str(caught.value)
 
 
+def own_profile(directory: Path, value: float) -> Path:
+    """A profile mine.yaml with one value."""
+    line = {"key": "objects.current.factor", "value": value, "why": "w", "source": "s"}
+    whole = {"title": "t", "vendor": 1, "lines": [line | {"state": "tried on the bus"}]}
+    (directory / "mine.yaml").write_text(yaml.safe_dump(whole))
+    return directory / "mine.yaml"
+
+
 def test_a_profile_of_ones_own_lies_beside_the_configuration(tmp_path: Path) -> None:
-    line = {
-        "key": "objects.current.factor",
-        "value": 0.25,
-        "why": "w",
-        "source": "s",
-        "state": "tried on the bus",
-    }
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
+    own_profile(tmp_path, 0.25)
     (joint,) = load_config(configuration(tmp_path, profile="mine.yaml")).joints
     assert joint.objects.current.factor == 0.25
 
 
 def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Path) -> None:
-    line = {
-        "key": "objects.current.factor",
-        "value": 0.25,
-        "why": "w",
-        "source": "s",
-        "state": "tried on the bus",
-    }
-    profile = tmp_path / "mine.yaml"
-    profile.write_text(yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line]}))
+    profile = own_profile(tmp_path, 0.25)
     config = load_config(configuration(tmp_path, profile="mine.yaml"))
     attached = {name: data for name, _, data in launch._attached_files(config)}
     assert attached["mine.yaml"] == profile.read_bytes()
@@ -185,18 +178,19 @@ def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Pat
     empty.mkdir()
     setup = read_setup(tmp_path / "a.mcap", attached, empty)
     assert setup.config.joints[0].objects.current.factor == 0.25
-    changed = load_config(configuration(write_again(tmp_path, line), profile="mine.yaml"))
+    own_profile(tmp_path, 0.5)
+    changed = load_config(configuration(tmp_path, profile="mine.yaml"))
     assert changed.sha256 == config.sha256
     assert changed.files_sha256 != config.files_sha256
 
 
-def write_again(directory: Path, line: dict[str, Any]) -> Path:
-    text = yaml.safe_dump({"title": "t", "vendor": 1, "lines": [line | {"value": 0.5}]})
-    (directory / "mine.yaml").write_text(text)
-    return directory
-
-
 # On a bus -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes of these buses answer at once."""
+    monkeypatch.setattr("jtqd.drivers.survey._PRESENT_S", 0.15)
 
 
 @pytest.fixture(scope="module", params=FAMILIES)

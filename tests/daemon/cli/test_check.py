@@ -38,8 +38,6 @@ from jtqd.estimator.text import duration, number, percent, size
 from tests.drivers.hub_helpers import until_it_listens
 from tests.shipped_bench import shipped_bench
 
-pytestmark = pytest.mark.native
-
 MS = 1_000_000
 US = 1_000
 ORDER = {0x181: (8, 335), 0x182: (8, 470), 0x183: (5, 575), 0x281: (8, 710), 0x282: (8, 845)}

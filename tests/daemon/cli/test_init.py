@@ -283,17 +283,12 @@ def test_wrong_input_is_one_line(arguments, status, problem, tmp_path, capsys):
 @pytest.mark.parametrize(
     "data", [b"", b"garbage\x00\xff", b"[DeviceInfo]\nVendorNumber=zz\n", b"\0" * 16_000_001]
 )
-def test_a_broken_eds_is_one_line(data, tmp_path):
-    """Of a process of its own, as the library's parser writes to stderr by itself."""
+def test_a_broken_eds_is_one_line(data, tmp_path, capfd):
+    """Also on the file descriptor, as the library's parser writes to stderr by itself."""
     (tmp_path / "bad.eds").write_bytes(data)
-    command = [
-        sys.executable,
-        *["-m", "jtqd.daemon.jtq", "init", "--from-eds", "bad.eds", "--node", "5", "--out", "d"],
-    ]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False)
-    assert done.returncode == (1 if data else 2)
-    assert (done.stdout, done.stderr.count("\n")) == ("", 1)
-    assert "bad.eds" in done.stderr
+    status, out, err = run(capfd, "--node 5 --out", tmp_path / "d", "--from-eds", tmp_path / "bad.eds")
+    assert (status, out, err.count("\n")) == (1 if data else 2, "", 1)
+    assert "bad.eds" in err
 
 
 def test_a_pipe_is_not_waited_for(tmp_path, capsys):
@@ -318,10 +313,17 @@ def test_files_that_jtqd_refuses_do_not_stay(tmp_path, capsys):
     assert [each.read_text() for each in tmp_path.iterdir()] == ["mine"], "nothing is lost"
 
 
-@pytest.fixture
-def bench(tmp_path):
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch):
+    """Nodes of these buses answer at once."""
+    monkeypatch.setattr("jtqd.drivers.survey.SYNC_LISTEN_S", 0.05)
+    monkeypatch.setattr("jtqd.drivers.survey._PRESENT_S", 0.15)
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory):
     """The emulated bench on a unix bus."""
-    bus = f"unix:{tmp_path}/bus"
+    bus = f"unix:{tmp_path_factory.mktemp('bench')}/bus"
     process = subprocess.Popen(
         [sys.executable, "-m", "jtqd.sim_can", "--bus", bus], stderr=subprocess.PIPE, text=True
     )

@@ -25,8 +25,6 @@ from jtqd.daemon.shared.events import ERROR, WARNING, Notices
 from jtqd.daemon.shared.runtime_dir import start_ticks, write_about
 from tests.daemon.cli.status_daemon import picture, running
 
-pytestmark = pytest.mark.native
-
 Status = Callable[..., tuple[int, str, str]]
 
 

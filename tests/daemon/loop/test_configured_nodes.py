@@ -300,7 +300,7 @@ class Events:
 
     def rest(self) -> None:
         """Nothing more happens to the node: all that is left to do is done."""
-        for _ in range(5):
+        for _ in range(3):
             for what in "FSAELFS":
                 self.step(what)
             self.now_s += 20.0
@@ -364,7 +364,7 @@ def test_short_words_of_everything(tmp_path: Path, config: Any) -> None:
         tried(tmp_path, config, "restarted", "FS" + "".join(word))
         count += 1
     rng = random.Random(11)
-    for _ in range(1500):
+    for _ in range(300):
         begin = rng.choice(("restarted", "doubted", "stopped"))
         tried(tmp_path, config, begin, "".join(rng.choices("BLFSAE", (1, 4, 3, 4, 2, 2), k=25)))
     print(f"{count} words")
