@@ -59,7 +59,7 @@ GROUPS = {
         "export-model": ("jtqd.sysid.simulators", "write a joint file for other simulators: MJCF, URDF"),
     },
     "shell: this terminal": {
-        "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish"),
+        "completion": ("jtqd.daemon.cli.completion", "print a completion script for bash, zsh, tcsh or fish")
     },
 }
 """Heading -> subcommand -> (module, one line of help)."""

@@ -189,12 +189,7 @@ def _input(pdo: PdoCount, traffic: Traffic, config: Config) -> CheckResult:
         length = f", {pdo.wrong_length} of a wrong length" if pdo.wrong_length else ""
         hint += ", and that its TPDO has transmission type 1 (SYNC)"
         return CheckResult(name, FAIL, f"none{length}", hint)
-    faults = {
-        "missing": pdo.missing,
-        "late": pdo.late,
-        "twice": pdo.twice,
-        "wrong length": pdo.wrong_length,
-    }
+    faults = {"missing": pdo.missing, "late": pdo.late, "twice": pdo.twice, "wrong length": pdo.wrong_length}
     found = ", ".join(f"{kind} {count}" for kind, count in faults.items() if count)
     bad = (pdo.missing + pdo.late + pdo.twice) / cycles
     only_late = not pdo.missing + pdo.twice + pdo.wrong_length

@@ -189,10 +189,7 @@ def test_files(tmp_path: Path) -> None:
     for text, words in (
         (b"a: 1\na: 2\n", "line 2, column 1 not YAML: the key 'a' is given twice"),
         (b"a: &a {b: 1}\nc: {<<: *a, <<: *a}\n", "line 2, column 13 not YAML: the key '<<' is given twice"),
-        (
-            b"a: &a [1]\nc: {<<: *a}\n",
-            "not YAML: expected the mapping that << merges",
-        ),
+        (b"a: &a [1]\nc: {<<: *a}\n", "not YAML: expected the mapping that << merges"),
         (b"a: [1\n", "line 2, column 1 not YAML: expected ',' or ']', found the end of the file"),
         (b'a: "b\n', "found the end of the file (while scanning a text in quotes that begins in line 1)"),
         (

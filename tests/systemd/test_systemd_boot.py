@@ -18,13 +18,7 @@ from tests.systemd.systemd_wheels import ROOT, make_environment, make_wheels
 DRIVER = Path(__file__).with_name("systemd_driver.py")
 PYTHON = Path("/usr/bin/python3")
 pytestmark = pytest.mark.boots
-SHORT = (
-    "start",
-    "changed file",
-    "stopped loop",
-    "stop",
-    "wrong configuration",
-)
+SHORT = ("start", "changed file", "stopped loop", "stop", "wrong configuration")
 LONG = (
     *("start", "changed file", "stopped loop", "stopped supervisor"),
     *("killed supervisor", "killed loop"),

@@ -220,10 +220,7 @@ def acyclic(tmp_path: Path) -> Config:
 
 @pytest.mark.parametrize(
     ("cycles", "level", "text"),
-    [
-        (4, GOOD, "500 per s, sent by the drive itself; age at SYNC"),
-        (12, FAIL, "older than 5 ms in 60"),
-    ],
+    [(4, GOOD, "500 per s, sent by the drive itself; age at SYNC"), (12, FAIL, "older than 5 ms in 60")],
 )
 def test_an_acyclic_pdo_is_judged_by_its_age(tmp_path: Path, cycles: int, level: str, text: str) -> None:
     """Every fourth cycle and twice then: good within 5 ms; every twelfth: too old in six of twelve cycles."""
@@ -425,9 +422,9 @@ def test_the_report_is_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_numbers_for_people() -> None:
     assert [duration(each) for each in (0.0451, 2.34, 59.94, 59.96, 751.2, 11_100.0, 187_300.0, NAN)] == [
-        *("45 ms", "2.3 s", "59.9 s", "1 min 00 s", "12 min 31 s", "3 h 05 min", "2 d 04 h", "-"),
+        *("45 ms", "2.3 s", "59.9 s", "1 min 00 s", "12 min 31 s", "3 h 05 min", "2 d 04 h", "-")
     ]
     assert [size(each) for each in (0, 999, 1000, 123_456, 1_230_000_000, None)] == [
-        *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-"),
+        *("0 B", "999 B", "1 kB", "123 kB", "1.23 GB", "-")
     ]
     assert (number(-1.005), number(NAN), percent(0.8476), percent(NAN)) == ("-1.00", "-", "84.8 %", "-")

@@ -56,10 +56,7 @@ def _steps(time_s: float) -> float:
 
 
 RUNS = {
-    "demo": (
-        (JointCommand.velocity(demo_velocity), JointCommand.current(demo_current)),
-        12.0,
-    ),
+    "demo": ((JointCommand.velocity(demo_velocity), JointCommand.current(demo_current)), 12.0),
     "steps": ((JointCommand.velocity(_steps), JointCommand.current(lambda t: 1.5)), 4.0),
     "current steps": (
         (

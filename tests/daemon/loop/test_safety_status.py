@@ -99,13 +99,7 @@ def test_what_comes_and_goes_waits_longer_and_longer() -> None:
 
 
 @settings(max_examples=120, deadline=None)
-@given(
-    some.lists(
-        some.tuples(some.sampled_from(CODES), some.integers(1, 60)),
-        min_size=1,
-        max_size=120,
-    )
-)
+@given(some.lists(some.tuples(some.sampled_from(CODES), some.integers(1, 60)), min_size=1, max_size=120))
 def test_whatever_comes_in(runs: list[tuple[int, int]]) -> None:
     """Never better than what is asked for; a number only after enough good cycles; at most 50 returns a second."""
     rank = {

@@ -114,11 +114,7 @@ def test_the_layout_of_the_drives_takes_the_place_of_the_wanted_one(tmp_path: Pa
             {},
             "TPDO1 has COB-ID 391h, expected one of 181h, 281h, 381h, 481h",
         ),
-        (
-            [{**SCATTERED[0], "number": 5}],
-            {},
-            "number': found 5, expected a whole number from 1 to 4",
-        ),
+        ([{**SCATTERED[0], "number": 5}], {}, "number': found 5, expected a whole number from 1 to 4"),
         ([*SCATTERED[:2], {**SCATTERED[2], "number": 2}], {}, "found number 1, 2, 2, expected each once"),
         (
             [*SCATTERED[:2], {**SCATTERED[2], "cob_id": 0x281}],
