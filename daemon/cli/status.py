@@ -12,7 +12,6 @@ import time
 import tty
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from math import isfinite, log1p, nan
 from typing import Any, Final
 
@@ -206,50 +205,43 @@ def histogram(bins: Sequence[int], bin_us: float, columns: int) -> str:
 # ---- last seconds of a live view ----
 
 
-@dataclass(frozen=True)
-class Moment:
-    """One reading: time of the view [s], torques [Nm] (NaN: none), histograms of work and lateness, contacts until then."""
-
-    time_s: float
-    torques: tuple[float, ...]
-    work: tuple[int, ...]
-    late: tuple[int, ...]
-    contacts: int = 0
-
-
 class Recent:
-    """Readings of the last WINDOW_S seconds."""
+    """Readings of the last WINDOW_S seconds, each with its time [s]."""
 
     def __init__(self) -> None:
-        self._moments: deque[Moment] = deque()
+        self._readings: deque[tuple[float, Reading]] = deque()
 
-    def add(self, moment: Moment) -> None:
+    def add(self, time_s: float, reading: Reading) -> None:
         """Add a reading and drop those older than the window; a histogram that has shrunk is that of another daemon."""
-        if self._moments and sum(moment.work) < sum(self._moments[-1].work):
-            self._moments.clear()
-        self._moments.append(moment)
-        while moment.time_s - self._moments[0].time_s > WINDOW_S:
-            self._moments.popleft()
+        readings = self._readings
+        if readings and sum(reading.work) < sum(readings[-1][1].work):
+            readings.clear()
+        readings.append((time_s, reading))
+        while time_s - readings[0][0] > WINDOW_S:
+            readings.popleft()
 
     @property
     def seconds(self) -> float:
         """Time from the first reading to the last [s]."""
-        return self._moments[-1].time_s - self._moments[0].time_s if self._moments else 0.0
+        return self._readings[-1][0] - self._readings[0][0] if self._readings else 0.0
 
     def torques(self, joint: int) -> list[float]:
-        """Return the torques of a joint (0, 1, ...), oldest first."""
-        return [each.torques[joint] for each in self._moments if joint < len(each.torques)]
+        """Return the torques of a joint (0, 1, ...) [Nm], oldest first; NaN: none."""
+        joints = (view.joints for _, each in self._readings if (view := each.view) is not None)
+        seen = (each[joint] for each in joints if joint < len(each))
+        return [each.torque_nm if each.status in PUBLISHED else nan for each in seen]
 
     @property
     def contacts(self) -> int:
         """Number of contacts that have begun in the window."""
-        return self._moments[-1].contacts - self._moments[0].contacts if self._moments else 0
+        views = [each.view for _, each in self._readings if each.view is not None]
+        return views[-1].counters["contacts"] - views[0].counters["contacts"] if views else 0
 
     def largest_us(self, bin_us: float, *, late: bool) -> float | None:
         """Return the upper edge of the largest work time (or lateness) in the window [us]; None without a cycle."""
-        if not self._moments:
+        if not self._readings:
             return None
-        first, last = self._moments[0], self._moments[-1]
+        first, last = self._readings[0][1], self._readings[-1][1]
         before, now = (first.late, last.late) if late else (first.work, last.work)
         grown = [n for n, (old, new) in enumerate(zip(before, now, strict=True)) if new > old]
         return (grown[-1] + 1) * bin_us if grown else None
@@ -261,6 +253,10 @@ class Recent:
 def _ago_s(now_ns: int, then_ns: int) -> float | None:
     """Return the age of a stamp; None for one that has never been set."""
     return (now_ns - then_ns) * 1e-9 if then_ns else None
+
+
+def _ago(now_ns: int, then_ns: int) -> str:
+    return duration((now_ns - then_ns) * 1e-9)
 
 
 def content(reading: Reading) -> dict[str, Any]:
@@ -386,27 +382,26 @@ class StatusView:
             yield Text(f"NOT RUNNING: {reading.why}" if view else reading.why, style=_BAD)
         if view is None:
             return
-        yield ""
-        yield _joints(data["joints"], still=still)
-        if not still:
-            yield from _reasons(data["joints"])
-            for joint, zeros in zip(about.joints, view.zeros, strict=False):
-                if zeros.tracked:
-                    yield _line(f"zeros {joint.number}", zeros.text, "" if zeros.plausible else "yellow")
-            yield from _contacts(about, view, self._recent)
-            if self._recent is not None:
-                yield from _last_seconds(self._recent, len(about.joints), width)
-        yield ""
-        yield _inputs(data["inputs"], view.period_s)
-        yield ""
-        yield from _loop(reading, view.counters, width)
-        yield from _bus(data, view.counters)
-        yield ""
-        yield _nodes(data["nodes"], about, view)
-        yield ""
-        yield from _recorder(data["recorder"])
-        yield from _conditions(reading)
-        yield from _notices(reading)
+        now_ns = time.monotonic_ns()
+        conditions = (
+            (SEVERITIES[each.severity], f"{each.line} (for {_ago(now_ns, each.since_ns)})", each.severity)
+            for each in reading.conditions
+        )
+        notices = (
+            (time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9)), each.text, each.level)
+            for each in reading.notices[-_LAST_NOTICES:]
+        )
+        details = () if still else _details(about, view, data["joints"], self._recent, width)
+        for section in (
+            [_joints(data["joints"], still=still), *details],
+            [_inputs(data["inputs"], view.period_s)],
+            [*_loop(reading, view.counters, width), *_bus(data, view.counters)],
+            [_nodes(data["nodes"], about, view)],
+            [*_recorder(data["recorder"])],
+            [_line(heading, text, _style_of(level)) for heading, text, level in conditions],
+            [_line(heading, text, _style_of(level)) for heading, text, level in notices],
+        ):
+            yield from ("", *section) if section else ()
 
 
 def _title(about: About, view: View | None) -> Text:
@@ -436,19 +431,21 @@ def _joints(joints: Sequence[Mapping[str, Any]], *, still: bool) -> Columns:
     return table
 
 
-def _reasons(joints: Sequence[Mapping[str, Any]]) -> Iterator[Text]:
-    """Return one line per joint, so that the view keeps its height."""
+def _details(
+    about: About, view: View, joints: Sequence[Mapping[str, Any]], recent: Recent | None, width: int
+) -> Iterator[RenderableType]:
+    """Return status with its reason, zeros and contact of each joint, and what a live view remembers.
+
+    A joint always has its line, so that the view keeps its height. A short contact falls between two readings: contacts
+    are counted as well.
+    """
     for each in joints:
         status, why = each["status"], each["reason"]
-        yield Text.assemble(
-            f"joint {each['joint']} ",
-            (f"{status} for {duration(each['since_s'])}", COLOURS.get(status, _BAD)),
-            f": {why}" if why else "",
-        )
-
-
-def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[RenderableType]:
-    """Return a line per joint that is watched, and their number: a short contact falls between two readings."""
+        lasting = (f"{status} for {duration(each['since_s'])}", COLOURS.get(status, _BAD))
+        yield Text.assemble(f"joint {each['joint']} ", lasting, f": {why}" if why else "")
+    for joint, zeros in zip(about.joints, view.zeros, strict=False):
+        if zeros.tracked:
+            yield _line(f"zeros {joint.number}", zeros.text, "" if zeros.plausible else "yellow")
     watched = False
     for joint, seen in zip(about.joints, view.joints, strict=False):
         if joint.contact_threshold_nm is not None:
@@ -461,6 +458,8 @@ def _contacts(about: About, view: View, recent: Recent | None) -> Iterator[Rende
             style = _BAD if recent.contacts else ""
             text.append(f", {recent.contacts} in the last {recent.seconds:.0f} s", style=style)
         yield _line("contacts", text)
+    if recent is not None:
+        yield from _last_seconds(recent, len(joints), width)
 
 
 def _last_seconds(recent: Recent, joints: int, width: int) -> Iterator[RenderableType]:
@@ -566,24 +565,6 @@ def _style_of(level: int) -> str:
     return _BAD if level >= ERROR else "yellow" if level >= WARNING else ""
 
 
-def _conditions(reading: Reading) -> Iterator[RenderableType]:
-    """Return the present conditions and their durations."""
-    if reading.conditions:
-        yield ""
-    now_ns = time.monotonic_ns()
-    for each in reading.conditions:
-        text = f"{each.line} (for {duration((now_ns - each.since_ns) * 1e-9)})"
-        yield _line(SEVERITIES[each.severity], text, _style_of(each.severity))
-
-
-def _notices(reading: Reading) -> Iterator[RenderableType]:
-    if reading.notices:
-        yield ""
-    for each in reading.notices[-_LAST_NOTICES:]:
-        when = time.strftime("%H:%M:%S", time.localtime(each.realtime_ns * 1e-9))
-        yield _line(when, each.text, _style_of(each.level))
-
-
 # ---- command ----
 
 
@@ -637,7 +618,8 @@ def _live(console: Console, daemon: Daemon) -> int:
         while True:
             if daemon.about.running():
                 reading = watch.read()
-                _remember(recent, reading)
+                if reading.state == RUNNING:
+                    recent.add(time.monotonic(), reading)
                 shown, number = paged(console, StatusView(reading, recent), number)
                 live.update(shown, refresh=True)
             else:
@@ -647,14 +629,6 @@ def _live(console: Console, daemon: Daemon) -> int:
                 if again is not None:
                     daemon, watch, recent = again, Watch(again), Recent()
             number += keys.turned(_PERIOD_S)
-
-
-def _remember(recent: Recent, reading: Reading) -> None:
-    view = reading.view
-    if view is not None and reading.state == RUNNING:
-        torques = tuple(each.torque_nm if each.status in PUBLISHED else nan for each in view.joints)
-        contacts = view.counters["contacts"]
-        recent.add(Moment(time.monotonic(), torques, reading.work, reading.late, contacts))
 
 
 def _lines(daemon: Daemon) -> int:

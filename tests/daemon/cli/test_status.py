@@ -17,13 +17,14 @@ import pytest
 from rich.console import Console, Group
 from rich.text import Text
 
-from jtqd.daemon.cli.running import Watch, find_daemons
-from jtqd.daemon.cli.status import WINDOW_S, Moment, Recent, StatusView, histogram, main, paged, sparkline
+from jtqd.daemon.cli.running import Reading, Watch, find_daemons
+from jtqd.daemon.cli.status import WINDOW_S, Recent, StatusView, histogram, main, paged, sparkline
 from jtqd.daemon.recording.run_files import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
 from jtqd.daemon.shared.events import ERROR, WARNING, Notices
 from jtqd.daemon.shared.runtime_dir import start_ticks, write_about
 from tests.daemon.cli.status_daemon import picture, running
+from tests.daemon.supervisor.watch_views import WELL, view
 
 Status = Callable[..., tuple[int, str, str]]
 
@@ -195,7 +196,7 @@ def test_no_line_is_dropped_on_a_small_terminal(tmp_path: Path) -> None:
     console = Console(file=io.StringIO(), width=80, height=24, force_terminal=True)
     reading = Watch(running(tmp_path)).read()
     recent = Recent()
-    recent.add(Moment(0.0, (1.0, -1.0), reading.work, reading.late))
+    recent.add(0.0, reading)
     picture = StatusView(replace(reading, earlier=reading.view), recent)
     console.print(picture)
     whole = Text.from_ansi(console.file.getvalue()).plain.splitlines()
@@ -277,25 +278,26 @@ def test_a_sparkline_spans_its_values_and_leaves_gaps():
     assert sparkline(range(100), 8) == "▁▂▃▄▅▆▇█", "the newest"
 
 
-def moment(time_s, work, late=(0, 0, 0), torque=0.0):
-    return Moment(time_s, (torque, torque), tuple(work), tuple(late))
+def reading(work, late=(0, 0, 0), torque=0.0):
+    joints = (WELL._replace(torque_nm=torque),) * 2
+    return Reading(None, "running", "", view(8)._replace(joints=joints), work=tuple(work), late=tuple(late))
 
 
 def test_a_slow_cycle_of_long_ago_is_forgotten():
     recent = Recent()
-    recent.add(moment(0.0, [5, 0, 0]))
-    recent.add(moment(1.0, [9, 0, 1]))
+    recent.add(0.0, reading([5, 0, 0]))
+    recent.add(1.0, reading([9, 0, 1]))
     assert recent.largest_us(2.0, late=False) == 6.0
-    recent.add(moment(1.0 + WINDOW_S, [20, 0, 1]))
-    recent.add(moment(2.0 + WINDOW_S, [30, 1, 1]))
+    recent.add(1.0 + WINDOW_S, reading([20, 0, 1]))
+    recent.add(2.0 + WINDOW_S, reading([30, 1, 1]))
     assert recent.largest_us(2.0, late=False) == 4.0
     assert recent.largest_us(2.0, late=True) is None, "nothing was late"
 
 
 def test_another_daemon_clears_the_window():
     recent = Recent()
-    recent.add(moment(0.0, [500, 1, 0], torque=3.0))
-    recent.add(moment(1.0, [2, 0, 0], torque=4.0))
+    recent.add(0.0, reading([500, 1, 0], torque=3.0))
+    recent.add(1.0, reading([2, 0, 0], torque=4.0))
     assert recent.torques(0) == [4.0]
     assert recent.torques(2) == []
     assert recent.largest_us(1.0, late=False) is None

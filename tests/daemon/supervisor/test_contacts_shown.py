@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from jtqd.daemon.cli import status
 from jtqd.daemon.cli.running import Daemon, Watch
-from jtqd.daemon.cli.status import Moment, Recent, StatusView, content
+from jtqd.daemon.cli.status import Recent, StatusView, content
 from jtqd.daemon.config import ContactSettings, load_config
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
@@ -76,10 +75,13 @@ def test_what_is_not_known_is_said_and_what_is_not_watched_takes_no_line(
 def test_a_short_contact_between_two_readings_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    watch, recent = Watch(daemon(tmp_path, monkeypatch, (QUIET, QUIET))), Recent()
+    made = daemon(tmp_path, monkeypatch, (QUIET, QUIET))
+    watch, recent = Watch(made), Recent()
+    writer = SnapshotReader(made.directory / "snapshot", supervisor=True)
     for second, contacts in enumerate((4, 4, 6)):
-        recent.add(Moment(float(second), (0.0, 0.0), (1,), (1,), contacts))
-    watch.read()
+        writer._views.counters[COUNTERS.index("contacts")] = contacts
+        recent.add(float(second), watch.read())
+    assert recent.contacts == 2
     file = io.StringIO()
     Console(file=file, width=80).print(StatusView(watch.read(), recent))
     assert "since the start, 2 in the last 2 s" in file.getvalue()
@@ -103,14 +105,3 @@ def test_a_loop_that_stands_still_says_nothing_of_contacts(
     for each in content(watch.read())["joints"]:
         assert (each["contact"], each["contact_nm"], each["torque_rate_nm_s"]) == (None, None, None)
     assert "contact" not in status_daemon.picture(still, 80)
-
-
-def test_a_live_view_remembers_the_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    made = daemon(tmp_path, monkeypatch, (QUIET, QUIET))
-    watch, recent = Watch(made), Recent()
-    watch.read()
-    status._remember(recent, watch.read())
-    writer = SnapshotReader(made.directory / "snapshot", supervisor=True)
-    writer._views.counters[COUNTERS.index("contacts")] = 2
-    status._remember(recent, watch.read())
-    assert recent.contacts == 2
