@@ -646,7 +646,7 @@ def test_a_processor_hog_costs_counted_cycles_and_nothing_that_is_published_is_s
     logs = tmp_path / "logs"
     deadlines = {"wait_us": 2000, "deadline_us": 4250}  # daemon and bench take turns on one processor
     config = slow_configuration(tmp_path, PERIOD_US, inputs=deadlines)
-    options = ["--bus", "sim", "--config", str(config), "--duration", "6", "--record", str(logs), "--json"]
+    options = ["--bus", "sim", "--config", str(config), "--duration", "4", "--record", str(logs), "--json"]
     process = started(*options, environment=environment, limit=lambda: os.sched_setaffinity(0, {cpu}))
     until_it_publishes(process, environment, 200)
     hog = subprocess.run(
