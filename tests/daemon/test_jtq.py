@@ -87,7 +87,7 @@ def test_options_may_stand_before_the_log(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "command", [["--help"], ["layout"], ["bus-load"], ["campaign", "validate", "--quick", "--dry-run"]]
+    "command", [["--help"], ["bus-load"], ["campaign", "validate", "--quick", "--dry-run"]]
 )
 def test_closed_or_full_output_is_no_traceback(command):
     jtq = [sys.executable, "-m", "jtqd.daemon.jtq", *command]

@@ -163,7 +163,7 @@ def test_random_garbage_never_gets_past_as_another_exception() -> None:
     seed = 20260
     rng = np.random.default_rng(seed)
     garbage: list[Any] = [None, "x", -1, [], {}, float("nan"), True, [[1]], {"a": 1}, b"x", 1e400]
-    for round_ in range(400):
+    for round_ in range(150):
         change: Any = mapping()
         inner = change
         for _ in range(rng.integers(0, 3)):
