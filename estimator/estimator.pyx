@@ -53,9 +53,7 @@ from jtqd.estimator.fusion cimport (
     restart_turn,
     reweigh,
     turn_differs,
-    uncorrected_torque,
-    update_agreement,
-    update_offsets,
+    update_difference,
     update_turn,
 )
 from jtqd.estimator.native_network cimport (
@@ -502,7 +500,7 @@ cdef class FusedEstimator(Estimator):
         """Take a sample of the difference of the paths: into the offsets, and into the check that the joint is that of its file."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
-        cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm, dt, innovation
+        cdef double v = seen.joint_velocity_rad_s, raw = seen.raw_nm
         cdef double noise = physics.variance - law.offsets.spread_nm  # the day's offset is a state, no noise
         cdef Loss next
         cdef double wave[TURN_WAVES]
@@ -516,21 +514,15 @@ cdef class FusedEstimator(Estimator):
         if status != VALID:
             drop_block(&s.offsets)
         elif gather(&s.offsets, x.dt_s, physics.difference, seen.direction, v, seen.torsion_nm, noise):
-            dt = s.offsets.block.dt
             next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
-            innovation = update_offsets(
-                &law.offsets, &s.offsets, local_stiffness(&law.observer, s.observer.d), (next.nm - loss) / STEP
+            update_difference(
+                &law.offsets,
+                &s.offsets,
+                &law.agreement,
+                &s.agreement,
+                local_stiffness(&law.observer, s.observer.d),
+                (next.nm - loss) / STEP,
             )
-            if law.agreement.used:
-                update_agreement(
-                    &law.agreement,
-                    &s.agreement,
-                    innovation,
-                    dt,
-                    s.offsets.x[4],
-                    s.offsets.p[4][4],
-                    uncorrected_torque(&law.offsets, &s.offsets),
-                )
 
     cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil:
         """Return whether the paths contradict the joint file: they disagree, or the link's offset is implausible."""
@@ -604,14 +596,7 @@ cdef class FusedEstimator(Estimator):
         if law.agreement.used:
             mismatch = mismatch_variance(&s.agreement, physics.alpha, seen.torsion_nm)
             if degrades(
-                &law.agreement,
-                &s.agreement,
-                mismatch,
-                out.sigma_nm,
-                s.offsets.x[4],
-                s.offsets.p[4][4],
-                physics.alpha,
-                seen.torsion_nm,
+                &law.agreement, &s.agreement, &s.offsets, mismatch, out.sigma_nm, physics.alpha, seen.torsion_nm
             ):
                 s.degraded_s, degraded = LOWERED_S, True
             # an offset estimated while the paths disagree is as uncertain as they are

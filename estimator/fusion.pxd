@@ -17,7 +17,6 @@ cdef double fading(double half, double before, double dt) noexcept nogil
 cdef Fused fuse_paths(
     const FusionLaw *law, double raw, double loss, double half, double velocity, double torsion, double open_nm
 ) noexcept nogil
-
 cdef void reweigh(Fused *fused, double known) noexcept nogil
 
 cdef struct Rest:
@@ -77,10 +76,8 @@ cdef bint gather(
     OffsetState *s, double dt, double y, double direction, double velocity, double torsion, double variance
 ) noexcept nogil
 cdef double local_stiffness(const FusedObserverLaw *law, double deflection) noexcept nogil
-cdef double update_offsets(const OffsetLaw *law, OffsetState *s, double stiffness, double slope) noexcept nogil
 cdef double known_nm2(const OffsetLaw *law, const OffsetState *s) noexcept nogil
 cdef double early_factor(const OffsetLaw *law, double known) noexcept nogil
-cdef double uncorrected_torque(const OffsetLaw *law, const OffsetState *s) noexcept nogil
 cdef bint implausible(const OffsetLaw *law, const OffsetState *s) noexcept nogil
 cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *out) noexcept nogil
 cdef offsets_of(const OffsetLaw *law, const OffsetState *s)
@@ -123,14 +120,13 @@ cdef struct AgreementState:
 
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
 cdef void restart_agreement(AgreementState *s) noexcept nogil
-cdef void update_agreement(
+cdef void update_difference(
+    const OffsetLaw *offset_law,
+    OffsetState *offsets,
     const AgreementLaw *law,
     AgreementState *s,
-    double innovation,
-    double dt,
-    double gain,
-    double gain_variance,
-    double uncorrected_nm,
+    double stiffness,
+    double slope,
 ) noexcept nogil
 cdef void pause_turn(AgreementState *s) noexcept nogil
 cdef void restart_turn(AgreementState *s) noexcept nogil
@@ -149,10 +145,9 @@ cdef double mismatch_variance(const AgreementState *s, double alpha, double tors
 cdef bint degrades(
     const AgreementLaw *law,
     const AgreementState *s,
+    const OffsetState *offsets,
     double mismatch,
     double sigma,
-    double gain,
-    double gain_variance,
     double alpha,
     double torsion,
 ) noexcept nogil

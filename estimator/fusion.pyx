@@ -70,7 +70,7 @@ Level, gain, zero: `level_factor`, `gain_factor`, `zero_factor`, above 1, becaus
 N: `gain_sigmas`, because a joint that is always driven cannot separate friction from a gain. Which path is wrong is not known:
 the larger weight counts.
 
-The status is degraded by a mismatch above LOWER_SIGMAS sigmas and LEAST_SHARE of the rated torque; where the file has the
+The status is degraded by a mismatch above 4 sigmas and LEAST_SHARE of the rated torque; where the file has the
 mismatch of ordinary days (`lowered_nm`), above that too, with only the significant part of the gain, |g| - SURE_SIGMAS sigma_g.
 
 **Waves over the motor's turn** identify another joint faster than levels: errors of gear and motor encoder and waves of friction
@@ -105,10 +105,9 @@ FOREIGN_SIGMAS: Final = 4.0
 """Distance from which the status is lowered: at least one of the paths contradicts the joint file."""
 GAUSS: Final = 1.6448536269514722
 """Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
-LEAST_TORSION: Final = 0.05
-"""Part of the torsion's variance that remains, however well its offset is known."""
 
-cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS, LEAST_VARIANCE = LEAST_TORSION
+cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS
+cdef double LEAST_VARIANCE = 0.05  # part of the torsion's variance that remains, however well its offset is known
 
 
 # Fusion ---------------------------------------------------------------------------------------------------------------
@@ -257,40 +256,29 @@ cdef class Fusion:
 
 MOVING_RAD_S: Final = 0.05
 ONE_WAY: Final = 0.9
-BLOCK: Final = 16
-"""Samples of a block."""
 CORRELATION_S: Final = 0.3
 """Correlation time of the difference's error; chosen, as the other constants, on runs that no reported figure uses."""
-SHRUNK_BELOW: Final = 2.0
-KEPT_ABOVE: Final = 4.0
-COVERED: Final = 0.5
-"""Part of the torsion's sigma in the joint file that is added to sigma_e: model errors do not average out, and an offset
-within the file's sigma needs no correction."""
-SLEW_S: Final = 0.25
-LARGEST_LINK: Final = 0.3
-"""Prior standard deviation of the link offset as a torque, part of the rated torque."""
-CURRENT_SHARE: Final = 0.2
-"""Prior standard deviation of the current offset as a torque, part of the current path's: the rest is friction."""
-LEAST_GAIN: Final = 0.03
-"""Least prior standard deviation of the gain."""
-FRICTION_SHARE: Final = 0.2
-"""Prior standard deviation of the day's friction as a part of the file's without load, in addition to the path's sigma: cold
-grease must not be taken for an offset."""
-DRIFT_S: Final = 600.0
-"""Time in which a state may change by a tenth of its prior standard deviation: grease warms, encoders do not."""
-JUMP: Final = 4.0
-JUMP_S: Final = 0.3
-"""Paths that differ by more than JUMP standard deviations for JUMP_S: the encoder has slipped, its offset is unknown again."""
-KNOWN_SHARE: Final = 0.5
-"""Part of the variance of the day's friction below which the link offset counts as learned: motion in one direction alone does
-not reach it."""
 
-cdef int SAMPLES = BLOCK
-cdef double CORRELATION = CORRELATION_S, INVERSE_SLEW = 1.0 / SLEW_S
-cdef double SLOWEST = MOVING_RAD_S, ONE_SIDED = ONE_WAY
-cdef double JUMP_SIGMAS = JUMP, LONGEST_S = JUMP_S
+cdef int BLOCK = 16  # samples of a block
+cdef double CORRELATION = CORRELATION_S, SLOWEST = MOVING_RAD_S, ONE_SIDED = ONE_WAY
+cdef double SHRUNK_BELOW = 2.0, KEPT_ABOVE = 4.0, INVERSE_RANGE = 1.0 / (KEPT_ABOVE - SHRUNK_BELOW)
+# part of the torsion's sigma in the joint file that is added to sigma_e: model errors do not average out, and an offset within
+# the file's sigma needs no correction
+cdef double COVERED = 0.5
+cdef double SLEW_S = 0.25, INVERSE_SLEW = 1.0 / SLEW_S
+cdef double LARGEST_LINK = 0.3  # prior standard deviation of the link offset as a torque, part of the rated torque
+cdef double CURRENT_SHARE = 0.2  # of the current offset as a torque, part of the current path's: the rest is friction
+cdef double LEAST_GAIN = 0.03  # least one of the gain
+# prior standard deviation of the day's friction as a part of the file's without load, in addition to the path's sigma: cold
+# grease must not be taken for an offset
+cdef double FRICTION_SHARE = 0.2
+cdef double DRIFT_S = 600.0  # in which a state may change by a tenth of its prior standard deviation: grease warms, encoders do not
+# paths that differ by more than JUMP standard deviations for JUMP_S: the encoder has slipped, its offset is unknown again
+cdef double JUMP = 4.0, JUMP_S = 0.3
+# part of the variance of the day's friction below which the link offset counts as learned: motion in one direction alone does
+# not reach it
+cdef double KNOWN_SHARE = 0.5
 cdef int IS_TRACKED = TRACKED, IS_LEARNED = LEARNED, IS_BEYOND = BEYOND
-cdef double LOW = SHRUNK_BELOW, HIGH = KEPT_ABOVE, INVERSE_RANGE = 1.0 / (KEPT_ABOVE - SHRUNK_BELOW)
 
 
 cdef (double, double) _friction(loss):
@@ -354,7 +342,7 @@ cdef void drop_block(OffsetState *s) noexcept nogil:
 cdef bint gather(
     OffsetState *s, double dt, double y, double direction, double velocity, double torsion, double variance
 ) noexcept nogil:
-    """Add a sample in motion to the block; return whether it is complete and `update_offsets` is due.
+    """Add a sample in motion to the block; return whether it is complete and `update_difference` is due.
 
     y: tau_t - tau_c [Nm]; variance: of y [Nm^2]. A sample near a reversal drops the block.
     """
@@ -369,7 +357,7 @@ cdef bint gather(
     b.torsion += torsion
     b.variance += variance
     b.samples += 1
-    return b.samples == SAMPLES
+    return b.samples == BLOCK
 
 
 cdef double local_stiffness(const FusedObserverLaw *law, double d) noexcept nogil:
@@ -389,7 +377,7 @@ cdef double _share(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
 
 cdef double _shrunk(double x, double variance, double least) noexcept nogil:
     """Return the correction of an offset x by firm shrinkage, in addition to the part `least`."""
-    cdef double w = (fabs(x) / sqrt(variance) - LOW) * INVERSE_RANGE
+    cdef double w = (fabs(x) / sqrt(variance) - SHRUNK_BELOW) * INVERSE_RANGE
     if w >= 1.0:
         w = 1.0
     return x * (w - least) if w > least else 0.0
@@ -437,14 +425,14 @@ cdef void _forget_link(const OffsetLaw *law, double (*p)[OFFSET_STATES]) noexcep
     p[0][0] = law.prior[0]
 
 
-cdef double update_offsets(const OffsetLaw *law, OffsetState *s, double stiffness, double slope) noexcept nogil:
+cdef double _update_offsets(const OffsetLaw *law, OffsetState *s, double stiffness, double slope) noexcept nogil:
     """Take the complete block; return its innovation [Nm].
 
     stiffness: local, of the spring; slope: dL/draw of the loss.
     """
     cdef Block b = s.block
     cdef double h[OFFSET_STATES]
-    cdef double share = 1.0 / SAMPLES, measured, innovation, way, remaining, before = s.disagreeing_s
+    cdef double share = 1.0 / BLOCK, measured, innovation, way, remaining, before = s.disagreeing_s
     cdef int n
     memset(&s.block, 0, sizeof(Block))
     h[0], h[1] = -stiffness, -law.torque_per_ampere * (1.0 - slope)
@@ -455,9 +443,9 @@ cdef double update_offsets(const OffsetLaw *law, OffsetState *s, double stiffnes
         s.p[n][n] += law.drift[n] * b.dt
         s.day_p[n][n] += law.drift[n] * b.dt
     innovation = _innovation(h, s.x, measured)
-    s.disagreeing_s = s.disagreeing_s + b.dt if fabs(innovation) > JUMP_SIGMAS * sqrt(b.variance * share) else 0.0
-    if s.disagreeing_s > LONGEST_S:
-        if before <= LONGEST_S and s.p[0][0] < law.known:
+    s.disagreeing_s = s.disagreeing_s + b.dt if fabs(innovation) > JUMP * sqrt(b.variance * share) else 0.0
+    if s.disagreeing_s > JUMP_S:
+        if before <= JUMP_S and s.p[0][0] < law.known:
             s.jumps += 1
         _forget_link(law, s.p)
         _forget_link(law, s.day_p)
@@ -491,14 +479,14 @@ cdef double early_factor(const OffsetLaw *law, double known) noexcept nogil:
     return 1.0 + law.early * (law.spread_nm - known)
 
 
-cdef double uncorrected_torque(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
+cdef double _uncorrected_torque(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
     """Return the estimated link offset that is not corrected, as torque [Nm]."""
     return law.stiffness * (s.x[0] - s.link_rad)
 
 
 cdef bint implausible(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
     """Return whether the link offset is significantly beyond the file's limit for a healthy joint."""
-    return fabs(s.x[0]) > law.limit and fabs(s.x[0]) > HIGH * sqrt(s.p[0][0])
+    return fabs(s.x[0]) > law.limit and fabs(s.x[0]) > KEPT_ABOVE * sqrt(s.p[0][0])
 
 
 cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *out) noexcept nogil:
@@ -516,34 +504,16 @@ cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *ou
 
 
 cdef offsets_of(const OffsetLaw *law, const OffsetState *s):
+    """Return the `Zeros` of `report_offsets`."""
     cdef Learned report
     report_offsets(law, s, &report)
-    return Zeros(
-        report.link_rad,
-        report.link_sigma_rad,
-        report.link_used_rad,
-        report.current_a,
-        report.current_sigma_a,
-        report.current_used_a,
-        report.limit_rad,
-        report.flags,
-        report.jumps,
-    )
+    return Zeros(**report)
+
 
 # Agreement ------------------------------------------------------------------------------------------------------------
 
 
-TREND_S: Final = 0.1
-UP_S: Final = 0.15
 DOWN_S: Final = 5.0
-LOWER_SIGMAS: Final = 4.0
-LEAST_SHARE: Final = 0.02
-"""The status is degraded by a mismatch of this many sigmas of the estimate, and this part of the rated torque."""
-SURE_SIGMAS: Final = 2.0
-"""Standard deviations of a gain that do not count for the status."""
-
-TURN_ORDERS: Final = (1, 2, 4)
-"""Of the motor's turn."""
 TURNING_RAD_S: Final = 0.1
 """At lower speeds a wave of the motor's angle looks like a change of friction."""
 TURN_TREND_S: Final = 0.05
@@ -551,18 +521,18 @@ TURN_MEMORY_S: Final = 1.0
 """Time constant of forgetting, in time of motion."""
 LEAST_S: Final = 0.02
 """Prior of no waves at all, as time of motion times the square of a wave."""
-TURN_SETTLE_S: Final = 0.05
-"""Wait after a start of the observer: ten of its time constants."""
 EVERY: Final = 4
 TURN_BLOCK: Final = 16
 """Every fourth sample counts; after TURN_BLOCK of them the waves are compared with the file's: 64 ms at 1 kHz."""
 
-cdef double INVERSE_TREND = 1.0 / TREND_S, INVERSE_UP = 1.0 / UP_S, INVERSE_DOWN = 1.0 / DOWN_S
-cdef double SLOWEST_TURN = TURNING_RAD_S
-cdef double INVERSE_TURN_TREND = 1.0 / TURN_TREND_S, INVERSE_MEMORY = 1.0 / TURN_MEMORY_S, LEAST = LEAST_S
-cdef double SETTLE = TURN_SETTLE_S
+cdef double INVERSE_TREND = 1.0 / 0.1, INVERSE_UP = 1.0 / 0.15, INVERSE_DOWN = 1.0 / DOWN_S  # TREND_S, UP_S
+# the status is degraded by a mismatch of so many sigmas of the estimate, squared, and this part of the rated torque
+cdef double LOWER_SQUARE = 4.0**2, LEAST_SHARE = 0.02
+cdef double SURE_SIGMAS = 2.0  # standard deviations of a gain that do not count for the status
+cdef double SLOWEST_TURN = TURNING_RAD_S, LEAST = LEAST_S
+cdef double INVERSE_TURN_TREND = 1.0 / TURN_TREND_S, INVERSE_MEMORY = 1.0 / TURN_MEMORY_S
+cdef double TURN_SETTLE_S = 0.05  # wait after a start of the observer: ten of its time constants
 cdef int TAKEN_EVERY = EVERY, TAKEN_BLOCK = TURN_BLOCK
-cdef double LOWER_SQUARE = LOWER_SIGMAS**2, SURE_GAIN = SURE_SIGMAS
 
 
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1:
@@ -606,21 +576,19 @@ cdef double _level(double level, double square, double dt) noexcept nogil:
     return level + (square - level) * (1.0 - exp(-dt * (INVERSE_UP if square > level else INVERSE_DOWN)))
 
 
-cdef double _excess(double gain, double gain_variance, double sigmas) noexcept nogil:
-    """Return the magnitude of a gain less so many of its standard deviations, at least 0."""
-    return fmax(0.0, fabs(gain) - sigmas * sqrt(gain_variance))
+cdef double _excess(const OffsetState *offsets, double sigmas) noexcept nogil:
+    """Return the magnitude of the gain less so many of its standard deviations, at least 0."""
+    return fmax(0.0, fabs(offsets.x[4]) - sigmas * sqrt(offsets.p[4][4]))
 
 
-cdef void update_agreement(
-    const AgreementLaw *law,
-    AgreementState *s,
-    double innovation,
-    double dt,
-    double gain,
-    double gain_variance,
-    double uncorrected_nm,
+cdef double _gain_mismatch(const AgreementLaw *law, const OffsetState *offsets, double sigmas) noexcept nogil:
+    return law.gain_factor * fmax(0.0, _excess(offsets, sigmas) - law.gain)
+
+
+cdef void _update_agreement(
+    const AgreementLaw *law, AgreementState *s, const OffsetState *offsets, double uncorrected_nm, double innovation, double dt
 ) noexcept nogil:
-    """Take the innovation [Nm] of a block of length dt [s], the gain state, and the offset that is not corrected [Nm]."""
+    """Take the innovation [Nm] of a block of length dt [s], and the offset that is not corrected [Nm]."""
     cdef double rest
     s.trend += (innovation - s.trend) * (1.0 - exp(-dt * INVERSE_TREND))
     rest = innovation - s.trend
@@ -628,7 +596,22 @@ cdef void update_agreement(
     s.fast = _level(s.fast, rest * rest, dt)
     s.mismatch = law.level_square * (fmax(0.0, s.slow - law.slow) + fmax(0.0, s.fast - law.fast))
     s.mismatch += law.zero_square * fmax(0.0, uncorrected_nm * uncorrected_nm - law.zero)
-    s.gain_mismatch = law.gain_factor * fmax(0.0, _excess(gain, gain_variance, law.gain_sigmas) - law.gain)
+    s.gain_mismatch = _gain_mismatch(law, offsets, law.gain_sigmas)
+
+
+cdef void update_difference(
+    const OffsetLaw *offset_law,
+    OffsetState *offsets,
+    const AgreementLaw *law,
+    AgreementState *s,
+    double stiffness,
+    double slope,
+) noexcept nogil:
+    """Take the complete block into the offsets and the agreement; stiffness, slope: as `_update_offsets`."""
+    cdef double dt = offsets.block.dt
+    cdef double innovation = _update_offsets(offset_law, offsets, stiffness, slope)
+    if law.used:
+        _update_agreement(law, s, offsets, _uncorrected_torque(offset_law, offsets), innovation, dt)
 
 
 cdef void pause_turn(AgreementState *s) noexcept nogil:
@@ -638,7 +621,7 @@ cdef void pause_turn(AgreementState *s) noexcept nogil:
 
 cdef void restart_turn(AgreementState *s) noexcept nogil:
     """Wait for the observer, which starts perhaps in the middle of an acceleration."""
-    s.turn.going, s.turn.settle_s = False, SETTLE
+    s.turn.going, s.turn.settle_s = False, TURN_SETTLE_S
 
 
 cdef void update_turn(
@@ -775,38 +758,33 @@ def turn_waves(turn, dt_s, difference_nm, direction, velocity_rad_s, loss_nm, wa
     return np.array(found, np.float64).reshape(-1, TURN_WAVES), np.array(squares, np.float64)
 
 
+cdef double _by_share(double alpha, double mismatch, double gain, double torsion) noexcept nogil:
+    """Return the mismatch [Nm^2], with that of the gain at this torsion [Nm], by the larger weight of both paths."""
+    cdef double share = fmax(alpha, 1.0 - alpha), by_gain = gain * torsion
+    return share * share * (mismatch + by_gain * by_gain)
+
+
 cdef double mismatch_variance(const AgreementState *s, double alpha, double torsion) noexcept nogil:
     """Return the addition to sigma^2 [Nm^2] of the fused value; alpha: share of the torsion [Nm] in it."""
-    cdef double share = fmax(alpha, 1.0 - alpha), by_gain = s.gain_mismatch * torsion
-    return share * share * (s.mismatch + by_gain * by_gain)
-
-
-cdef double _significant_mismatch(
-    const AgreementLaw *law, const AgreementState *s, double gain, double gain_variance, double torsion
-) noexcept nogil:
-    """Return the mismatch [Nm^2] of the torsion [Nm] with the significant part of the gain."""
-    cdef double by_gain = law.gain_factor * fmax(0.0, fabs(gain) - SURE_GAIN * sqrt(gain_variance) - law.gain) * torsion
-    return s.mismatch + by_gain * by_gain
+    return _by_share(alpha, s.mismatch, s.gain_mismatch, torsion)
 
 
 cdef bint degrades(
     const AgreementLaw *law,
     const AgreementState *s,
+    const OffsetState *offsets,
     double mismatch,
     double sigma,
-    double gain,
-    double gain_variance,
     double alpha,
     double torsion,
 ) noexcept nogil:
     """Return whether a mismatch [Nm^2], as `mismatch_variance`, degrades the status beside the estimate's own sigma [Nm]."""
-    cdef double most = fmax(LOWER_SQUARE * sigma * sigma, law.relevant), share
+    cdef double most = fmax(LOWER_SQUARE * sigma * sigma, law.relevant)
     if not mismatch > most:
         return False
     if law.lowered == 0.0:
         return True
-    share = fmax(alpha, 1.0 - alpha)
-    return share * share * _significant_mismatch(law, s, gain, gain_variance, torsion) > fmax(most, law.lowered)
+    return _by_share(alpha, s.mismatch, _gain_mismatch(law, offsets, SURE_SIGMAS), torsion) > fmax(most, law.lowered)
 
 
 def levels(fused, double rated_nm, dt_s, difference_nm, direction, velocity_rad_s, torsion_nm, variance_nm2, slope):
@@ -833,15 +811,14 @@ def levels(fused, double rated_nm, dt_s, difference_nm, direction, velocity_rad_
     for k in range(x.shape[0]):
         if gather(&offsets, x[k, 0], x[k, 1], x[k, 2], x[k, 3], x[k, 4], x[k, 5] - law.spread_nm):
             dt, torsion = offsets.block.dt, offsets.block.torsion / offsets.block.samples
-            # these readings are not corrected, as `update_offsets` expects them
+            # these readings are not corrected, as `_update_offsets` expects them
             offsets.block.y += law.stiffness * offsets.link_rad * offsets.block.samples
             offsets.block.y += (1.0 - x[k, 6]) * offsets.current_a * offsets.block.samples
-            innovation = update_offsets(&law, &offsets, law.stiffness, x[k, 6])
-            remaining = uncorrected_torque(&law, &offsets)
-            update_agreement(&levels_law, &s, innovation, dt, offsets.x[4], offsets.p[4][4], remaining)
-            mismatch = sqrt(_significant_mismatch(&levels_law, &s, offsets.x[4], offsets.p[4][4], torsion))
-            gain = _excess(offsets.x[4], offsets.p[4][4], levels_law.gain_sigmas)
-            found.append((s.slow, s.fast, gain, fabs(remaining), mismatch))
+            innovation = _update_offsets(&law, &offsets, law.stiffness, x[k, 6])
+            remaining = _uncorrected_torque(&law, &offsets)
+            _update_agreement(&levels_law, &s, &offsets, remaining, innovation, dt)
+            mismatch = sqrt(_by_share(1.0, s.mismatch, _gain_mismatch(&levels_law, &offsets, SURE_SIGMAS), torsion))
+            found.append((s.slow, s.fast, _excess(&offsets, levels_law.gain_sigmas), fabs(remaining), mismatch))
     return tuple(np.array(found, np.float64).reshape(-1, 5).T)
 
 
@@ -863,7 +840,7 @@ def track_run(
     cdef OffsetState s
     cdef AgreementLaw levels_law
     cdef AgreementState agreement
-    cdef double link, current, dt, innovation
+    cdef double link, current
     cdef Py_ssize_t k
     # the current offset counts as a torque: its part of the difference does not depend on the torque per ampere
     fill_offsets(&law, 1.0, rated_nm, fused, tracked, True)
@@ -876,8 +853,5 @@ def track_run(
         to[3, k], to[4, k] = agreement.mismatch, agreement.gain_mismatch
         to[5, k] = early_factor(&law, to[2, k])
         if gather(&s, x[k, 0], x[k, 1] + link - current, x[k, 2], x[k, 3], x[k, 4] + link, x[k, 5] - law.spread_nm):
-            dt = s.block.dt
-            innovation = update_offsets(&law, &s, x[k, 7], x[k, 6])
-            if levels_law.used:
-                update_agreement(&levels_law, &agreement, innovation, dt, s.x[4], s.p[4][4], uncorrected_torque(&law, &s))
+            update_difference(&law, &s, &levels_law, &agreement, x[k, 7], x[k, 6])
     return tuple(out)
