@@ -1,8 +1,8 @@
-"""AnyNetwork of one joint: files, metadata, and whether they fit the joint and the method.
+"""Networks of one joint: files, metadata, and whether they fit the joint and the method.
 
 `TorqueNetwork` is that of the paper's section III (method `network`): six features in, torque out. `FusedNetwork` (method
 `fused`) gives a correction to the physics from speed, load, torsion and ripple angles. Both are ONNX files whose metadata
-say what they were trained on; how far each is trusted is in `validity`.
+say what they were trained on; how far each is trusted is in `native_network`.
 
 Program `python -m jtqd.estimator.network`: checks network files by ONNX Runtime. It reads a JSON line [method, path, SHA-256
 or null] per network, and answers each with a line: the fields of a `RuntimeCheck`, or {"refused": why}.
@@ -11,9 +11,6 @@ The graph takes "x" [N, n] (named features, SI units, normalisation inside) and 
 metadata hold one JSON value per key; the caller names the keys that must be there. Key `perceptron` holds the weights
 (`perceptron_content`), so that the graph can be evaluated natively. The package onnx, where it is installed, reads them
 from the graph of a file without that key.
-
-    OnnxGraph     checked here by ONNX Runtime, which also evaluates every graph without known weights
-    NativeGraph   checked by ONNX Runtime in another process (`RuntimeCheck`), evaluated natively without the runtime's 40 MB
 """
 
 from __future__ import annotations
@@ -137,148 +134,55 @@ def perceptron_of(content: Any) -> Perceptron:
         raise ValueError(f"found no layers as 'jtq train' writes them ({error})") from None
 
 
-class GraphFile:
-    """Bytes of a network file with their hash, and access to its metadata.
+class _Graph:
+    """A graph loaded and checked by ONNX Runtime; errors as of `Network`.
 
-    source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None.
-    Raises NetworkError for an unreadable file or another hash. Public: `name`, `sha256`, `metadata`, `perceptron` (None
-    where the weights are not known), `native_error_nm` (of `RuntimeCheck`), `run_one(*x)` torque of one sample [Nm],
-    `run_many([n, features])` of many.
+    name: of the file; features, keys: as of `Network`. perceptron: None where the weights are not known.
     """
 
-    metadata: dict[str, Any]
-    perceptron: Perceptron | None
-    native_error_nm: float | None
-    run_one: Callable[..., float]
-    run_many: Callable[[FloatArray], FloatArray]
-
-    def __init__(self, source: bytes | str | os.PathLike[str], sha256: str | None) -> None:
-        self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
-        self._data: Final = source if isinstance(source, bytes) else self._read(source)
-        self.sha256: Final = sha256_hex(self._data)
-        if sha256 is not None and sha256.lower() != self.sha256:
-            raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
-
-    @property
-    def check(self) -> RuntimeCheck:
-        """What a `NativeGraph` of the same bytes needs."""
-        return RuntimeCheck(self.sha256, self.metadata, self.native_error_nm)
-
-    def error(self, text: str) -> NetworkError:
-        """Return the error to raise, with the file's name."""
-        return NetworkError(f"{self.name}: {text}")
-
-    def text(self, key: str) -> str:
-        """Return a text of the metadata."""
-        value = self.metadata[key]
-        if not isinstance(value, str) or not value.isprintable() or not value:
-            raise self.error(f"metadata '{key}': found {value!r}, expected a text of printable characters")
-        return value
-
-    def numbers(self, key: str, count: int) -> tuple[float, ...]:
-        """Return `count` finite numbers of the metadata."""
-        values = self.metadata[key]
-        if not (isinstance(values, list) and len(values) == count and all(map(finite, values))):
-            raise self.error(f"metadata '{key}': found {values!r}, expected {count} finite numbers")
-        return tuple(float(value) for value in values)
-
-    def _read(self, path: str | os.PathLike[str]) -> bytes:
-        try:
-            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
-                return Path(path).read_bytes()
-            reason = "not a regular file"
-        except OSError as error:
-            reason = error.strerror or str(error)
-        except ValueError as error:  # a NUL in the name
-            reason = str(error)
-        raise self.error(f"cannot be read: {reason}")
-
-    def _perceptron(self) -> Perceptron | None:
-        """Return the network of the metadata; None without key PERCEPTRON."""
-        if PERCEPTRON not in self.metadata:
-            return None
-        try:
-            return perceptron_of(self.metadata[PERCEPTRON])
-        except ValueError as error:
-            raise self.error(f"metadata '{PERCEPTRON}': {error}") from None
-
-
-class NativeGraph(GraphFile):
-    """A graph with known weights that ONNX Runtime has checked in another process.
-
-    source, sha256, errors: as `GraphFile`; check: of the very bytes that are read here. NetworkError for a check of other
-    bytes.
-    """
-
-    def __init__(
-        self, source: bytes | str | os.PathLike[str], sha256: str | None, check: RuntimeCheck
-    ) -> None:
-        super().__init__(source, sha256)
-        if self.sha256 != check.sha256:
-            raise self.error(
-                f"was changed while it was checked: found SHA-256 {self.sha256}, checked {check.sha256}"
-            )
-        self.metadata = check.metadata
-        self.native_error_nm = check.native_error_nm
-        self.perceptron = perceptron = self._perceptron()
-        if perceptron is None:
-            raise self.error(f"metadata '{PERCEPTRON}': missing, expected the weights of the network")
-        self.run_one, self.run_many = perceptron.run_one, perceptron.run_many
-
-
-class OnnxGraph(GraphFile):
-    """A graph loaded and checked by ONNX Runtime.
-
-    source, sha256: as `GraphFile`; features: names and order of the inputs, which the metadata must repeat; keys: metadata
-    that must be there, the first two of them the lowest and highest value per feature in the training data. Raises
-    NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata, constants that are not
-    finite or stand in another file, and no finite answer or several to one input.
-    """
-
-    def __init__(
-        self,
-        source: bytes | str | os.PathLike[str],
-        sha256: str | None,
-        features: tuple[str, ...],
-        keys: tuple[str, ...],
-    ) -> None:
-        super().__init__(source, sha256)
+    def __init__(self, name: str, data: bytes, features: tuple[str, ...], keys: tuple[str, ...]) -> None:
+        self._name: Final = name
         self._width: Final = len(features)
-        self._session: Final = self._open()
+        self._session: Final = self._open(data)
         self._check_graph()
-        self.metadata = self._read_metadata(features, keys)
-        low, high = (np.array(self.numbers(key, self._width)) for key in keys[:2])
-        for name, lowest, highest in zip(features, low, high, strict=True):
+        self.metadata: Final = self._read_metadata(features, keys)
+        low, high = (np.array(_numbers(self.metadata, key, self._width, name)) for key in keys[:2])
+        for feature, lowest, highest in zip(features, low, high, strict=True):
             if lowest > highest:
-                raise self.error(
-                    f"metadata range of {name}: found {keys[0]} {lowest:g} above {keys[1]} {highest:g}"
+                raise self._error(
+                    f"metadata range of {feature}: found {keys[0]} {lowest:g} above {keys[1]} {highest:g}"
                 )
-        weights = None if PERCEPTRON in self.metadata else self._read_weights()
+        weights = None if PERCEPTRON in self.metadata else self._read_weights(data)
         self._x: Final = np.zeros((1, self._width))
         self._x_bytes: Final[Any] = self._x.reshape(-1).view(np.uint8).data
         self._pack: Final = struct.Struct(f"={self._width}d").pack_into
-        self.run_one, self.run_many = self._run_one, self._run_many
         self._answered(partial(self._warm_up, (low + high) / 2))
         share = np.random.default_rng(0).uniform(-0.25, 1.25, (_PROBES, self._width))
         probes = low + share * (high - low)
-        answers = self._run_many(probes)
+        answers = self.run_many(probes)
         with suppress(ValueError):  # weights that do not fit together, or into the block
             if weights is not None and np.allclose(
                 perceptron_of(weights).run_many(probes), answers, rtol=_SAME, atol=_SAME
             ):
                 self.metadata[PERCEPTRON] = weights
-        self.perceptron, self.native_error_nm = self._perceptron(), None
+        self.perceptron: Final = _perceptron(self.metadata, name)
+        self.native_error_nm: float | None = None
         if self.perceptron is not None:
             inputs = self.metadata[PERCEPTRON]["widths"][0]
             if inputs != self._width:
-                raise self.error(f"metadata '{PERCEPTRON}': found {inputs} inputs, expected {self._width}")
+                raise self._error(f"metadata '{PERCEPTRON}': found {inputs} inputs, expected {self._width}")
             self.native_error_nm = float(np.max(np.abs(self.perceptron.run_many(probes) - answers)))
 
-    def _run_one(self, *x: float) -> float:
+    def _error(self, text: str) -> NetworkError:
+        return NetworkError(f"{self._name}: {text}")
+
+    def run_one(self, *x: float) -> float:
+        """Return the answer for one sample [Nm]."""
         self._pack(self._x_bytes, 0, *x)
         return float(self._session.run(None, {"x": self._x})[0][0, 0])
 
-    def _run_many(self, features: FloatArray) -> FloatArray:
+    def run_many(self, features: FloatArray) -> FloatArray:
+        """Return the answers [n] for samples [n, features]."""
         if features.ndim != 2 or features.shape[1] != self._width:
             raise ValueError(f"found features of shape {features.shape}, expected [n, {self._width}]")
         if len(features) == 0:
@@ -309,10 +213,10 @@ class OnnxGraph(GraphFile):
         if errors:
             raise errors[0]
         if not results:
-            raise self.error(f"found no answer within {_LONGEST_S:g} s, expected one: it is not used")
+            raise self._error(f"found no answer within {_LONGEST_S:g} s, expected one: it is not used")
         return results[0]
 
-    def _open(self) -> Any:
+    def _open(self, data: bytes) -> Any:
         os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")  # read once, when the library is loaded
         import onnxruntime as ort
 
@@ -327,45 +231,45 @@ class OnnxGraph(GraphFile):
         options.log_severity_level = 4  # faults come as exceptions; nothing else on stderr
         try:
             return self._answered(
-                partial(ort.InferenceSession, self._data, options, providers=["CPUExecutionProvider"])
+                partial(ort.InferenceSession, data, options, providers=["CPUExecutionProvider"])
             )
         except NetworkError:
             raise
         except Exception as error:  # onnxruntime raises its own types, without a common base
-            raise self.error(f"not a usable ONNX model: {_first_line(error)}") from None
+            raise self._error(f"not a usable ONNX model: {_first_line(error)}") from None
 
     def _check_graph(self) -> None:
         """NetworkError unless there is one input "x" [N, features] and one output [N, 1]."""
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         if [i.name for i in inputs] != ["x"]:
-            raise self.error(f"found inputs {[i.name for i in inputs]}, expected one, 'x'")
+            raise self._error(f"found inputs {[i.name for i in inputs]}, expected one, 'x'")
         if len(outputs) != 1:
-            raise self.error(f"found {len(outputs)} outputs, expected one")
+            raise self._error(f"found {len(outputs)} outputs, expected one")
         for what, node, width in (("input 'x'", inputs[0], self._width), ("output", outputs[0], 1)):
             if node.type != "tensor(double)":
-                raise self.error(f"found {what} of type {node.type}, expected tensor(double)")
+                raise self._error(f"found {what} of type {node.type}, expected tensor(double)")
             shape = list(node.shape)
             if len(shape) != 2 or isinstance(shape[0], int) or shape[1] != width:
-                raise self.error(f"found {what} of shape {shape}, expected ['N', {width}]")
+                raise self._error(f"found {what} of shape {shape}, expected ['N', {width}]")
 
     def _read_metadata(self, features: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, Any]:
         try:
             raw = self._session.get_modelmeta().custom_metadata_map
         except UnicodeDecodeError as error:
-            raise self.error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
+            raise self._error(f"metadata: found bytes that are not UTF-8 ({error.reason})") from None
         metadata: dict[str, Any] = {}
         for key in ("features", *keys, *({PERCEPTRON} & raw.keys())):
             if key not in raw:
-                raise self.error(f"metadata '{key}': missing, found only {sorted(raw)}")
+                raise self._error(f"metadata '{key}': missing, found only {sorted(raw)}")
             try:
                 metadata[key] = json.loads(raw[key])
             except (ValueError, RecursionError):  # the latter: nested a thousand times
-                raise self.error(f"metadata '{key}': found {raw[key][:60]!r}, expected JSON") from None
+                raise self._error(f"metadata '{key}': found {raw[key][:60]!r}, expected JSON") from None
         if metadata["features"] != list(features):
-            raise self.error(f"metadata 'features': found {metadata['features']}, expected {list(features)}")
+            raise self._error(f"metadata 'features': found {metadata['features']}, expected {list(features)}")
         return metadata
 
-    def _read_weights(self) -> dict[str, Any] | None:
+    def _read_weights(self, data: bytes) -> dict[str, Any] | None:
         """Return the weights of a graph as `jtq train` writes it, as `perceptron_content`, read by the package onnx.
 
         None without the package, or for any other graph. Raises NetworkError for constants that are not finite.
@@ -375,15 +279,15 @@ class OnnxGraph(GraphFile):
         except ImportError:
             return None
         try:
-            model = onnx.load_model_from_string(self._data)
+            model = onnx.load_model_from_string(data)
             constants = dict(_constants(model.graph))
             for function in model.functions:
                 constants |= dict(_constants(function))
         except Exception as error:  # of onnx, numpy and protobuf
-            raise self.error(f"found constants that cannot be checked: {_first_line(error)}") from None
+            raise self._error(f"found constants that cannot be checked: {_first_line(error)}") from None
         for name, values in constants.items():
             if values.dtype.kind not in "OSU" and not np.isfinite(values.astype(np.complex128)).all():
-                raise self.error(f"found weights {ascii(name)[:60]} with a value that is not finite")
+                raise self._error(f"found weights {ascii(name)[:60]} with a value that is not finite")
         with suppress(ValueError, KeyError, IndexError):
             return _perceptron_in(model.graph, constants)
         return None
@@ -392,13 +296,13 @@ class OnnxGraph(GraphFile):
         """First calls allocate: they happen here, not in the loop. A network that fails to run is refused."""
         sample = middle.tolist()
         try:
-            values = [self._run_one(*sample) for _ in range(_WARM_UP)]
+            values = [self.run_one(*sample) for _ in range(_WARM_UP)]
         except Exception as error:  # as in _open
-            raise self.error(f"does not run: {_first_line(error)}") from None
+            raise self._error(f"does not run: {_first_line(error)}") from None
         if not math.isfinite(values[-1]):
-            raise self.error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
+            raise self._error(f"found {values[-1]} at the centre of its envelope, expected a finite torque")
         if len(set(values)) > 1:
-            raise self.error(
+            raise self._error(
                 "found different answers to one input, expected the same: a log could not be replayed"
             )
 
@@ -441,21 +345,46 @@ def _perceptron_in(graph: Any, constants: Mapping[str, Any]) -> dict[str, Any] |
     return perceptron_content(layers, gate)
 
 
+def _numbers(metadata: Mapping[str, Any], key: str, count: int, name: str) -> tuple[float, ...]:
+    """Return `count` finite numbers of the metadata. Raises NetworkError."""
+    values = metadata[key]
+    if not (isinstance(values, list) and len(values) == count and all(map(finite, values))):
+        raise NetworkError(f"{name}: metadata '{key}': found {values!r}, expected {count} finite numbers")
+    return tuple(float(value) for value in values)
+
+
+def _perceptron(metadata: Mapping[str, Any], name: str) -> Perceptron | None:
+    """Return the network of the metadata; None without key PERCEPTRON. Raises NetworkError."""
+    try:
+        return perceptron_of(metadata[PERCEPTRON]) if PERCEPTRON in metadata else None
+    except ValueError as error:
+        raise NetworkError(f"{name}: metadata '{PERCEPTRON}': {error}") from None
+
+
 class Network:
     """A network file, loaded and checked; base of both kinds.
 
     source: path of an ONNX file, or its bytes; sha256: expected hash of the bytes (hex), not checked when None; check: of
-    ONNX Runtime in another process on these bytes: a graph with known weights then runs without it here.
+    ONNX Runtime in another process on these bytes: a graph with known weights then runs here without the runtime's 40 MB.
 
-    Public: `name`, `sha256`, `joint` (name), `data_sha256` (training data); `run_one(*x)` answer for one sample [Nm],
-    `run_many([n, features])` for many; `perceptron`, `native_error_nm` and `check` as `GraphFile` has them.
+    Public: `name`, `sha256`, `joint` (name), `data_sha256` (training data), `metadata`; `run_one(*x)` answer for one sample
+    [Nm], `run_many([n, features])` for many; `perceptron`, None where the weights are not known; `check` for another process
+    with its `native_error_nm`.
 
-    Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata.
+    Raises NetworkError for an unreadable or corrupt file, another hash, shape, type or missing metadata, constants that are
+    not finite or stand in another file, no finite answer or several to one input, and a check of other bytes.
     """
 
     features: ClassVar[tuple[str, ...]]
+    """Names and order of the inputs, which the metadata must repeat."""
     keys: ClassVar[tuple[str, ...]]
     """Metadata, each value JSON; the first two are lowest and highest value per feature in the training data."""
+
+    metadata: dict[str, Any]
+    perceptron: Perceptron | None
+    native_error_nm: float | None
+    run_one: Callable[..., float]
+    run_many: Callable[[FloatArray], FloatArray]
 
     def __init__(
         self,
@@ -463,21 +392,58 @@ class Network:
         sha256: str | None = None,
         check: RuntimeCheck | None = None,
     ) -> None:
-        graph: GraphFile
-        if check is None or check.native_error_nm is None:
-            graph = OnnxGraph(source, sha256, self.features, self.keys)
+        self.name: Final = "network (bytes)" if isinstance(source, bytes) else os.fspath(source)
+        data = source if isinstance(source, bytes) else self._read(source)
+        self.sha256: Final = sha256_hex(data)
+        if sha256 is not None and sha256.lower() != self.sha256:
+            raise self.error(f"found SHA-256 {self.sha256}, expected {sha256}")
+        if check is not None and check.native_error_nm is not None:
+            if self.sha256 != check.sha256:
+                raise self.error(
+                    f"was changed while it was checked: found SHA-256 {self.sha256}, checked {check.sha256}"
+                )
+            self.metadata, self.native_error_nm = check.metadata, check.native_error_nm
+            self.perceptron = native = _perceptron(self.metadata, self.name)
+            if native is None:
+                raise self.error(f"metadata '{PERCEPTRON}': missing, expected the weights of the network")
+            self.run_one, self.run_many = native.run_one, native.run_many
         else:
-            graph = NativeGraph(source, sha256, check)
-        self._graph: Final = graph
-        self.check: Final = graph.check
-        self.name: Final = graph.name
-        self.sha256: Final = graph.sha256
-        self.joint: Final = graph.text("joint")
-        self.data_sha256: Final = graph.text("data_sha256")
-        self.run_one: Final = graph.run_one
-        self.run_many: Final = graph.run_many
-        self.perceptron: Final = graph.perceptron
-        self.native_error_nm: Final = graph.native_error_nm
+            self._graph = graph = _Graph(self.name, data, self.features, self.keys)
+            self.metadata, self.native_error_nm = graph.metadata, graph.native_error_nm
+            self.perceptron, self.run_one, self.run_many = graph.perceptron, graph.run_one, graph.run_many
+        self.joint: Final = self.text("joint")
+        self.data_sha256: Final = self.text("data_sha256")
+
+    @property
+    def check(self) -> RuntimeCheck:
+        """What another process needs to run these bytes natively."""
+        return RuntimeCheck(self.sha256, self.metadata, self.native_error_nm)
+
+    def error(self, text: str) -> NetworkError:
+        """Return the error to raise, with the file's name."""
+        return NetworkError(f"{self.name}: {text}")
+
+    def text(self, key: str) -> str:
+        """Return a text of the metadata."""
+        value = self.metadata[key]
+        if not isinstance(value, str) or not value.isprintable() or not value:
+            raise self.error(f"metadata '{key}': found {value!r}, expected a text of printable characters")
+        return value
+
+    def numbers(self, key: str, count: int) -> tuple[float, ...]:
+        """Return `count` finite numbers of the metadata."""
+        return _numbers(self.metadata, key, count, self.name)
+
+    def _read(self, path: str | os.PathLike[str]) -> bytes:
+        try:
+            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
+                return Path(path).read_bytes()
+            reason = "not a regular file"
+        except OSError as error:
+            reason = error.strerror or str(error)
+        except ValueError as error:  # a NUL in the name
+            reason = str(error)
+        raise self.error(f"cannot be read: {reason}")
 
 
 class TorqueNetwork(Network):
@@ -490,18 +456,13 @@ class TorqueNetwork(Network):
     features = FEATURES
     keys = ("envelope_low", "envelope_high", "sigma_nm", "joint", "data_sha256")
 
-    def __init__(
-        self,
-        source: bytes | str | os.PathLike[str],
-        sha256: str | None = None,
-        check: RuntimeCheck | None = None,
-    ) -> None:
-        super().__init__(source, sha256, check)
-        self.envelope_low: Final = self._graph.numbers("envelope_low", len(FEATURES))
-        self.envelope_high: Final = self._graph.numbers("envelope_high", len(FEATURES))
-        sigma = self._graph.metadata["sigma_nm"]
+    def __init__(self, *source: Any, **options: Any) -> None:
+        super().__init__(*source, **options)
+        self.envelope_low: Final = self.numbers("envelope_low", len(FEATURES))
+        self.envelope_high: Final = self.numbers("envelope_high", len(FEATURES))
+        sigma = self.metadata["sigma_nm"]
         if not finite(sigma) or sigma <= 0.0:
-            raise self._graph.error(f"metadata 'sigma_nm': found {sigma!r}, expected a number in Nm > 0")
+            raise self.error(f"metadata 'sigma_nm': found {sigma!r}, expected a number in Nm > 0")
         self.sigma_nm: Final = float(sigma)
 
 
@@ -517,25 +478,19 @@ class FusedNetwork(Network):
     features = FUSED_FEATURES
     keys = ("input_low", "input_high", "envelope", "sigma_scale", "joint", "data_sha256")
 
-    def __init__(
-        self,
-        source: bytes | str | os.PathLike[str],
-        sha256: str | None = None,
-        check: RuntimeCheck | None = None,
-    ) -> None:
-        super().__init__(source, sha256, check)
-        graph = self._graph
+    def __init__(self, *source: Any, **options: Any) -> None:
+        super().__init__(*source, **options)
         try:
-            self.envelope: Final = read(Envelope, graph.metadata["envelope"])
+            self.envelope: Final = read(Envelope, self.metadata["envelope"])
         except FieldError as error:
-            raise graph.error(
+            raise self.error(
                 f"metadata 'envelope': {f'{error.key}: ' if error.key else ''}{error.problem}"
             ) from None
-        a, b, c, d = graph.numbers("sigma_scale", 4)
+        a, b, c, d = self.numbers("sigma_scale", 4)
         if min(a, b, c, d) <= 0.0:
-            raise graph.error(f"metadata 'sigma_scale': found {[a, b, c, d]}, expected numbers > 0")
+            raise self.error(f"metadata 'sigma_scale': found {[a, b, c, d]}, expected numbers > 0")
         self.sigma_scale: Final = (a, b, c, d)
-        low, high = (np.array(graph.numbers(key, len(FUSED_FEATURES))) for key in self.keys[:2])
+        low, high = (np.array(self.numbers(key, len(FUSED_FEATURES))) for key in self.keys[:2])
         probes = low + np.linspace(0.05, 0.95, _ZERO_PROBES)[:, None] * (high - low)
         self.corrects: Final = any(self.run_one(*probe) != 0.0 for probe in probes.tolist())
 
