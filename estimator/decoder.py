@@ -154,12 +154,6 @@ def read(kind: type[T], mapping: object, **given: Any) -> T:
         raise FieldError(error.where, error.key, found, error.expected) from None
 
 
-def read_kind(kinds: Mapping[str, type], section: Mapping[str, Any]) -> Any:
-    """Return the dataclass that the key `kind` of a section names, with its other keys. Raises FieldError."""
-    kind, others = split(section, "kind", Annotated[str, choice(kinds)])
-    return read(kinds[kind], others)
-
-
 def split(section: Mapping[str, Any], key: str, hint: Any) -> tuple[Any, dict[str, Any]]:
     """Return the value of a key of this annotation, and the section's other keys. Raises FieldError."""
     value = field_of(key, hint).read(section)

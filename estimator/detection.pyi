@@ -2,13 +2,9 @@ from typing import Final
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.settings import EstimatorSettings, PlausibilityLimits
+from jtqd.estimator.settings import PlausibilityLimits
 
-FORGET_S: Final[float]
-JUMP_RAD_S: Final[float]
-LAG_S: Final[float]
 FROZEN_RAD: Final[float]
-LONGEST_STEP_S: Final[float]
 
 class Plausibility:
     mismatch_rad: float
@@ -31,12 +27,3 @@ def detect_contacts(
     threshold_nm: float,
     period_s: float = 0.001,
 ) -> tuple[FloatArray, CodeArray]: ...
-def link_loads(
-    joint: Joint,
-    settings: EstimatorSettings,
-    dt_s: FloatArray,
-    current_a: FloatArray,
-    motor_position_rad: FloatArray,
-    motor_velocity_rad_s: FloatArray,
-    link_position_rad: FloatArray,
-) -> tuple[FloatArray, FloatArray]: ...

@@ -48,29 +48,21 @@ from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.observer cimport fill_fused_observer, fill_guard, observe_fused, restart_guard
-from jtqd.estimator.observer cimport FusedObserved, GuardLaw, GuardState, Sample
 from jtqd.estimator.fusion cimport local_stiffness
 
 from jtqd.estimator import status as st
-from jtqd.estimator.observer import columns
 
 # Plausibility ----------------------------------------------------------------------------------------------------------
 
-FORGET_S: Final = 1.0
-JUMP_RAD_S: Final = 300.0
-"""Motor side: how wrong the velocity of one sample may be, as a drive's filter lags while the motor accelerates."""
-LAG_S: Final = 0.05
-"""Motor side: with FORGET_S, the velocity's scale may be wrong by a twentieth."""
 FROZEN_RAD: Final = 5.0
 """Motor side: a current that is regulated moves its last digits while the motor turns so far."""
-LONGEST_STEP_S: Final = 0.05
-"""Differences over a longer step are not judged."""
-_GAP_PERIODS: Final = 5.0
-"""A longer step is a gap: its slip is acceleration that was not measured, and is not added up."""
 
-cdef double FORGET_RATE = 1.0 / FORGET_S
-cdef double JUMP = JUMP_RAD_S, LAG = LAG_S, FROZEN = FROZEN_RAD, LONGEST = LONGEST_STEP_S
+cdef double FORGET_S = 1.0, FORGET_RATE = 1.0 / FORGET_S
+cdef double JUMP_RAD_S = 300.0  # motor side: how wrong the velocity of one sample may be, as a drive's filter lags while the motor accelerates
+cdef double LAG_S = 0.05  # motor side: with FORGET_S, the velocity's scale may be wrong by a twentieth
+cdef double FROZEN = FROZEN_RAD
+cdef double LONGEST_STEP_S = 0.05  # differences over a longer step are not judged
+cdef double GAP_PERIODS = 5.0  # a longer step is a gap: its slip is acceleration that was not measured, and is not added up
 cdef int MOTOR_JUMP = st.MOTOR_JUMP, LINK_JUMP = st.LINK_JUMP, VELOCITY_MISMATCH = st.VELOCITY_MISMATCH
 cdef int TORSION = st.TORSION, CURRENT_FROZEN = st.CURRENT_FROZEN
 
@@ -83,7 +75,7 @@ cdef class Plausibility:
     """
 
     def __init__(self, joint, double torque_limit, limits, double period_s=0.001):
-        self.gap_s = _GAP_PERIODS * period_s
+        self.gap_s = GAP_PERIODS * period_s
         self.per_turn = 1.0 / joint.gear_ratio
         self.jump = limits.motor_jump_rad
         self.limit = limits.mismatch_rad
@@ -148,17 +140,17 @@ cdef class Plausibility:
             return 0
         if not self.low < self.twist < self.high:
             faults |= TORSION
-        if not 0.0 < dt_s <= LONGEST:
+        if not 0.0 < dt_s <= LONGEST_STEP_S:
             self.mismatch_rad = self.frozen_s = 0.0
             return faults
-        if fabs(slip) > self.jump + JUMP * dt_s:
+        if fabs(slip) > self.jump + JUMP_RAD_S * dt_s:
             faults |= MOTOR_JUMP
             self.mismatch_rad = 0.0  # reported once: it is no velocity that is wrong
         elif fabs(change) > self.twist_jump:
             faults |= LINK_JUMP
         if dt_s >= self.gap_s:
             self.mismatch_rad = 0.0
-        elif fabs(self.mismatch_rad) > self.limit + LAG * fabs(velocity):
+        elif fabs(self.mismatch_rad) > self.limit + LAG_S * fabs(velocity):
             faults |= VELOCITY_MISMATCH
         if (
             self.frozen_s >= self.longest_frozen_s
@@ -359,41 +351,3 @@ def detect_contacts(external_nm, motor_position_rad, double threshold_nm, double
         detect_contact(&law, &state, x[k], angle[k])
         m[k], c[k] = state.residual_nm, state.code
     return residual, code
-
-
-def link_loads(joint, settings, dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad):
-    """Return (torque rate [n] in Nm/s, load [n] in Nm, of the sample before) of a run of one joint; arrays [n].
-
-    Raises ValueError for a joint without torsion, or arrays of different length.
-    """
-    if joint.fused is None or joint.fused.torsion is None:
-        raise ValueError(f"joint {joint.name}: found no section fused.torsion, expected one")
-    inputs = columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad)
-    cdef GuardLaw guard
-    cdef GuardState guarded
-    cdef FusedObserverLaw law
-    cdef FusedObserverState state
-    cdef FusedObserved seen
-    cdef LinkLaw link
-    cdef LinkState at
-    cdef LinkLoad out
-    cdef Sample sample
-    cdef Py_ssize_t k
-    fill_guard(&guard, joint, settings)
-    fill_fused_observer(&law, joint, joint.fused.torsion, settings)
-    fill_link(&link, joint, joint.fused.torsion)
-    restart_guard(&guarded)
-    restart_link(&at)
-    rate, load = np.full(inputs.shape[1], NAN), np.full(inputs.shape[1], NAN)
-    cdef const double[:, ::1] x = inputs
-    cdef double[::1] r = rate
-    cdef double[::1] l = load
-    with nogil:
-        for k in range(x.shape[1]):
-            sample = Sample(x[0, k], x[1, k], x[2, k], x[3, k], x[4, k], NAN)
-            if observe_fused(&guard, &guarded, &law, &state, &sample, &seen):
-                update_link(&link, &at, &law, &state, seen.torsion_nm + seen.ahead_nm, sample.dt_s, &out)
-                r[k], l[k] = out.rate_nm_s, out.load_nm
-            else:
-                restart_link(&at)
-    return rate, load

@@ -28,6 +28,7 @@ cdef void no_values(Values *out, int status) noexcept nogil
 
 cdef class Estimator:
     cdef readonly object joint, settings
+    cdef readonly bint with_network
     cdef int width  # features of the network
     cdef double features[MOST_FEATURES]  # of the last sample that was observed
     cdef bint observed  # whether the last sample was

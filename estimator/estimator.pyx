@@ -123,6 +123,7 @@ cdef class Estimator:
 
     Attributes:
         joint, settings: what it was made of.
+        with_network: whether a network is used.
     """
 
     cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil:
@@ -144,11 +145,6 @@ cdef class Estimator:
         memset(out, 0, sizeof(Learned))
         size[0] = 0
         return NULL
-
-    @property
-    def with_network(self):
-        """Whether a network is used."""
-        raise NotImplementedError
 
     def reset(self):
         """Forget the past: the next step starts."""
@@ -195,7 +191,7 @@ cdef class Estimator:
         inputs = columns(dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c)
         n = inputs.shape[1]
         wanted = np.ones(n, np.uint8) if network_wanted is None else np.ascontiguousarray(network_wanted, np.uint8)
-        values, features, status = np.empty((5, n)), np.full((n, self.width), NAN), np.empty(n, np.uint8)
+        values, features, status = np.empty((7, n)), np.full((n, self.width), NAN), np.empty(n, np.uint8)
         cdef const double[:, ::1] x = inputs
         cdef const unsigned char[::1] w = wanted
         cdef double[:, ::1] to = values
@@ -215,12 +211,13 @@ cdef class Estimator:
                 self.advance(&sample, w[k], &out)
                 to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
                 to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm
+                to[5, k], to[6, k] = out.torque_rate_nm_s, out.load_nm
                 s[k] = out.status
                 if self.observed:
                     for m in range(self.width):
                         f[k, m] = self.features[m]
-        torque, sigma, tob, physics, network = values
-        return EstimateRun(torque, sigma, status, tob, physics, network, features)
+        torque, sigma, *others = values
+        return EstimateRun(torque, sigma, status, *others, features)
 
 
 cdef fill_network(NetworkLaw *law, network, joint):
@@ -269,6 +266,7 @@ cdef class JointEstimator(Estimator):
         self.law.inverse_gain = 1.0 / losses.torque_per_ampere
         self.law.limit = settings.torque_limit * joint.rated_torque_nm
         self.law.network_sigma = 0.0 if used is None else used.sigma_nm
+        self.with_network = used is not None
         self.run_one = fill_network(&self.law.network, used, joint)
         if used is not None:
             limit_nm = settings.network_limit * joint.rated_torque_nm
@@ -276,11 +274,6 @@ cdef class JointEstimator(Estimator):
                 &self.law.trust, used.envelope_low, used.envelope_high, settings.envelope_margin, limit_nm
             )
         self.reset()
-
-    @property
-    def with_network(self):
-        """Whether a network is used."""
-        return bool(self.law.network.used)
 
     def reset(self):
         """Restart at the next sample."""
@@ -400,6 +393,7 @@ cdef class FusedEstimator(Estimator):
         self.law.network_limit = settings.network_limit * joint.rated_torque_nm
         self.law.fade = FADE_START * self.law.network_limit
         self.law.inverse_fade = 1.0 / max(self.law.network_limit - self.law.fade, 1e-12)
+        self.with_network = network is not None
         self.run_one = fill_network(&self.law.network, network, joint)
         envelope = fused.envelope if network is None else network.envelope
         self.law.with_envelope = envelope is not None
@@ -407,11 +401,6 @@ cdef class FusedEstimator(Estimator):
             fill_fused_trust(&self.law.trust, envelope)
         self.state.temperature, self.state.thermal = NAN, 0.0
         self.reset()
-
-    @property
-    def with_network(self):
-        """Whether a network is used."""
-        return bool(self.law.network.used)
 
     def reset(self):
         """Restart at the next sample."""
@@ -652,7 +641,7 @@ cdef class FusedEstimator(Estimator):
         n = len(seen.raw_nm)
         if self.law.agreement.with_turn and len(seen.turn) != n:
             raise ValueError("found a run without waves of the motor's turn, expected one of `observe_run`")
-        values, features, status = np.full((5, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
+        values, features, status = np.full((7, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
         turn = seen.turn if len(seen.turn) == n else np.zeros((n, 2))
         rows = np.column_stack(
             (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm, seen.ahead_nm, turn)
@@ -693,8 +682,8 @@ cdef class FusedEstimator(Estimator):
                 code[k] = out.status
                 for m in range(self.width):
                     f[k, m] = self.features[m]
-        torque, sigma, tob, physics, network = values
-        return EstimateRun(torque, sigma, status, tob, physics, network, features)
+        torque, sigma, *others = values
+        return EstimateRun(torque, sigma, status, *others, features)
 
 
 def observe_run(
@@ -755,14 +744,9 @@ cdef class ExtendedEstimator(Estimator):
 
     def __init__(self, joint, settings, Estimator inner):
         self.joint, self.settings, self.inner = joint, settings, inner
-        self.width = inner.width
+        self.width, self.with_network = inner.width, inner.with_network
         self.corrections = ExtendedInputs(joint, settings)
         self.torque_nm = NAN
-
-    @property
-    def with_network(self):
-        """Whether a network is used."""
-        return self.inner.with_network
 
     @property
     def zeros(self):
@@ -806,7 +790,7 @@ cdef class PythonEstimator(Estimator):
     cdef readonly object inner
 
     def __init__(self, inner):
-        self.inner = inner
+        self.inner, self.with_network = inner, getattr(inner, "with_network", False)
         self.joint, self.settings = getattr(inner, "joint", None), getattr(inner, "settings", None)
 
     cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil:
@@ -822,11 +806,6 @@ cdef class PythonEstimator(Estimator):
             )
             out.torque_nm, out.sigma_nm, out.status = e.torque_nm, e.sigma_nm, e.status
             out.tob_nm, out.physics_nm, out.network_nm = e.tob_nm, e.physics_nm, e.network_nm
-
-    @property
-    def with_network(self):
-        """Whether a network is used."""
-        return self.inner.with_network
 
     def reset(self):
         """Forget the past: the next step starts."""

@@ -260,17 +260,6 @@ cdef class LossModel:
                 to[k] = efficiency_loss(&self.law, currents[k], velocities[k])
         return out.reshape(shape)
 
-    def standstill_bounds(self, double current_a):
-        """Return the losses [Nm] just before moving in the positive (>= 0) and the negative direction (<= 0).
-
-        The joint torque of a standing joint lies between G Kt i minus the one and G Kt i minus the other.
-        """
-        cdef Interval loss = efficiency_standstill(&self.law, current_a)
-        return loss.forward, loss.backward
-
-    def rmse_torque(self, double current_a, double joint_velocity_rad_s):
-        """Return the table's RMSE as a torque [Nm]: rmse G Kt |i|, times eta^2 if it is motor over joint."""
-        return efficiency_rmse(&self.law, current_a, joint_velocity_rad_s)
 
 
 # Standard deviation of the paper's methods -----------------------------------------------------------------------------

@@ -13,8 +13,6 @@ DISTANCE_MARGIN: Final[float]
 Numbers = FloatArray | float
 Layers = Sequence[tuple[FloatArray, FloatArray]]
 
-def tanh_many(values: FloatArray) -> FloatArray: ...
-
 class Perceptron:
     def __init__(self, layers: Layers, gate: Sequence[int] | None = None) -> None: ...
     @staticmethod

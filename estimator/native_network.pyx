@@ -79,18 +79,6 @@ cdef inline double tanh_of(double x) noexcept nogil:
     return copysign(((p - q) - power.number * (p + q)) / ((p - q) + power.number * (p + q)), x)
 
 
-def tanh_many(values):
-    """Return the hyperbolic tangents [n] of values [n], as the networks take them."""
-    cdef const double[::1] x = np.ascontiguousarray(values, np.float64)
-    out = np.empty(x.shape[0])
-    cdef double[::1] to = out
-    cdef Py_ssize_t k
-    with nogil:
-        for k in range(x.shape[0]):
-            to[k] = tanh_of(x[k])
-    return out
-
-
 # The network ----------------------------------------------------------------------------------------------------------
 
 

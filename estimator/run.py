@@ -193,7 +193,10 @@ class ObservedRun:
 
 @dataclass(frozen=True, slots=True)
 class EstimateRun:
-    """Fields of `Estimate` as read-only arrays [n], and the network's features [n, 6 or 7], NaN where not running."""
+    """Fields of `Estimate` as read-only arrays [n], and the network's features [n, 6 or 7], NaN where not running.
+
+    torque_rate_nm_s, load_nm: of the link (`detection`), load of the sample before; NaN where not known.
+    """
 
     torque_nm: FloatArray
     sigma_nm: FloatArray
@@ -201,6 +204,8 @@ class EstimateRun:
     tob_nm: FloatArray
     physics_nm: FloatArray
     network_nm: FloatArray
+    torque_rate_nm_s: FloatArray
+    load_nm: FloatArray
     features: FloatArray
 
     def __post_init__(self) -> None:

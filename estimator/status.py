@@ -5,8 +5,7 @@ The status codes are those published on the bus (low or high nibble of the estim
 
 from __future__ import annotations
 
-from math import nan
-from typing import Any, Final, NamedTuple, Protocol, Self
+from typing import Any, Final, NamedTuple
 
 OFF: Final = 0
 STARTING: Final = 1
@@ -56,11 +55,6 @@ class Estimate(NamedTuple):
     tob_nm: float
     physics_nm: float
     network_nm: float
-
-
-STARTING_ESTIMATE: Final = Estimate(nan, nan, STARTING, nan, nan, nan)
-INVALID_ESTIMATE: Final = Estimate(nan, nan, INVALID, nan, nan, nan)
-"""What a joint that is not estimated shows."""
 
 
 # What an estimator has learned ---------------------------------------------------------------------------------------
@@ -139,21 +133,8 @@ PAST_LAYOUT: Final = 6
 `tests/estimator/test_learned.py` has the size that belongs to it."""
 
 
-class Learner(Protocol):
-    """An estimator that learns zeros; `jtqd.estimator.estimator.FusedEstimator` is one."""
-
-    past: bytes | memoryview
-
-    @property
-    def zeros(self) -> Zeros | None:
-        """Return what is known of the zeros, None where they are not tracked."""
-
-    def shares_past(self, other: Self) -> bool:
-        """Return whether the past of `other` means the same here."""
-
-
 def learner_of(estimator: object) -> Any:
-    """Return the `Learner` of an estimator, which may stand behind the corrections of effects; None without one."""
+    """Return the `FusedEstimator` that learns zeros, which may stand behind the corrections of effects; None without one."""
     inner = getattr(estimator, "inner", estimator)
     return inner if getattr(inner, "zeros", None) is not None else None
 

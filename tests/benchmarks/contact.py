@@ -16,6 +16,7 @@ import random
 import sys
 from collections.abc import Iterable
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import NamedTuple
@@ -23,7 +24,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.detection import detect_contacts, link_loads
+from jtqd.estimator.detection import detect_contacts
+from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_PRESENT
@@ -46,7 +48,7 @@ MARGIN = 1.2
 RUNS, RUN_S, HOLD_S = 12, 8.0, 0.6
 PERIOD_MS = 1.0
 LATE_MS = 100.0
-SETTINGS = recommended("fused")
+SETTINGS = replace(recommended("fused"), track_zeros=False)
 
 
 class Watched(NamedTuple):
@@ -125,7 +127,7 @@ def watched(joints: tuple[Joint, Joint], made: EmulatedRun, threshold_nm: float,
     for number, joint in enumerate(joints, start=1):
         c = made.table.joint(number, joint.gear_ratio)
         inputs = c.current_a, c.motor_position_rad, c.motor_velocity_rad_s, c.link_position_rad
-        loads.append(link_loads(joint, SETTINGS, dt, *inputs)[1])  # type: ignore[arg-type]
+        loads.append(FusedEstimator(joint, SETTINGS).run(dt, *inputs).load_nm)  # type: ignore[arg-type]
     angle = made.table.joints[1].motor_position_rad
     assert angle is not None
     return Watched(

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import CodeArray, FloatArray
-from jtqd.estimator.detection import detect_contacts, link_loads
+from jtqd.estimator.detection import detect_contacts
+from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, CONTACT_UNKNOWN
@@ -18,7 +19,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import EmulatedRun, JointCommand, Push, emulate
 from jtqd.sim_can.plant_source import load_any_plant
 
-SETTINGS = recommended("fused")
+SETTINGS = replace(recommended("fused"), track_zeros=False)
 THRESHOLD_NM = 0.6
 JOINTS = tuple(load_joint(shipped(f"trained/joint{n}.yaml")) for n in (1, 2))
 SINGLE, BLANK = 0.8, 6
@@ -35,7 +36,8 @@ def loads_of(
         c = made.table.joint(number, joint.gear_ratio)
         columns = c.current_a, c.motor_position_rad, c.motor_velocity_rad_s, c.link_position_rad
         inputs = [each[rows] for each in columns if each is not None]
-        found.append(link_loads(joint, SETTINGS, np.diff(time_s, prepend=time_s[0]), *inputs)[1])
+        dt_s = np.diff(time_s, prepend=time_s[0])
+        found.append(FusedEstimator(joint, SETTINGS).run(dt_s, *inputs).load_nm)
     return found
 
 
@@ -175,8 +177,9 @@ def test_of_one_joint_the_residual_is_the_push_itself() -> None:
     x = np.zeros(20 * 600)
     x[20 * 300 + 7 :] = 2.0
     zero, dt = np.zeros(600), np.full(600, 1e-3)
-    rate, load = link_loads(JOINTS[0], SETTINGS, dt, zero, zero, zero, link_on_its_spring(x))
-    residual, code = alone(-load, 0.5)
+    run = FusedEstimator(JOINTS[0], SETTINGS).run(dt, zero, zero, zero, link_on_its_spring(x))
+    rate = run.torque_rate_nm_s
+    residual, code = alone(-run.load_nm, 0.5)
     assert np.flatnonzero(code == CONTACT_PRESENT)[0] <= 302
     assert residual[310:320] == pytest.approx(2.0, abs=0.4)  # the joint's slip carries 0.35 Nm
     assert np.nanmin(rate[300:306]) < -300.0  # the joint's torque opposes the push
@@ -236,7 +239,5 @@ def test_a_threshold_or_period_out_of_range_is_refused(threshold_nm: float, peri
 
 def test_inputs_that_do_not_fit_are_refused() -> None:
     zero = np.zeros(3)
-    with pytest.raises(ValueError, match="joint joint1: found no section fused"):
-        link_loads(load_joint(shipped("joint1.yaml")), SETTINGS, zero, zero, zero, zero, zero)
     with pytest.raises(ValueError, match="found 2 angles, expected 3"):
         detect_contacts(zero, np.zeros(2), 1.0)

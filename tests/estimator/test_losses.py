@@ -177,30 +177,8 @@ def test_without_efficiency_the_loss_is_friction() -> None:
     model = LossModel(joint)
     assert not model.has_efficiency
     assert model.loss(4.0, 0.7) == FrictionModel(joint.friction).torque(0.7)
-    assert model.standstill_bounds(4.0) == (3.8, -3.8)
     with pytest.raises(ValueError, match="no efficiency"):
         model.eta(1.0, 1.0)
-
-
-def test_standstill_bounds_are_the_losses_of_the_first_motion() -> None:
-    """At |i| >> i_b they are G Kt |i| |1-eta| at the lowest speed; at i = 0 the static friction."""
-    model = LossModel(joint1())
-    assert model.standstill_bounds(0.0) == pytest.approx((3.8, -3.8))
-    for i in (-4.0, 2.0, 5.0):
-        forward, backward = model.standstill_bounds(i)
-        raw = 6.2 * abs(i)
-        assert forward == pytest.approx(raw * abs(1 - model.eta(i, 0.2)))
-        assert backward == pytest.approx(-raw * abs(1 - model.eta(i, -0.2)))
-        assert forward >= 0.0 >= backward
-
-
-def test_rmse_as_torque() -> None:
-    joint = joint1()
-    assert LossModel(joint).rmse_torque(3.0, 1.0) == pytest.approx(0.01963 * 6.2 * 3.0)
-    assert LossModel(joint).rmse_torque(-3.0, 1.0) == pytest.approx(0.05599 * 6.2 * 3.0)
-    # eta' = 1/eta known to rmse: tau = G Kt i/eta' is known to rmse G Kt |i|/eta'^2
-    other = LossModel(replace(joint, efficiency=reciprocal_efficiency(joint)))
-    assert other.rmse_torque(3.0, 1.0) == pytest.approx(0.01963 * 6.2 * 3.0 * other.eta(3.0, 1.0) ** 2)
 
 
 W0 = 0.02

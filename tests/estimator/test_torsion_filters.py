@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.detection import link_loads
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator
 from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion, Tracking
@@ -286,8 +285,9 @@ def test_the_load_of_the_link_does_not_depend_on_the_filter_of_the_torsion() -> 
     joint = lossless(0.3, 0.4, damping=9.0)
     columns = list(twisted(14).arrays())
     columns[0] = np.full(len(columns[0]), 0.001)  # uneven steps give no acceleration
-    (_, one), (rate, other) = (link_loads(joint, settings, *columns) for settings in (OWN, TRACKED))
-    assert min(np.isfinite(one).sum(), np.isfinite(rate).sum()) > 200
+    low, kalman = (FusedEstimator(joint, settings).run(*columns) for settings in (OWN, TRACKED))
+    one, other = low.load_nm, kalman.load_nm
+    assert min(np.isfinite(one).sum(), np.isfinite(kalman.torque_rate_nm_s).sum()) > 200
     np.testing.assert_allclose(other, one, atol=1e-6)
 
 
@@ -295,8 +295,8 @@ def test_the_torque_rate_is_that_of_the_torsion() -> None:
     dt = np.full(500, 0.001)
     t = np.cumsum(dt)
     joint = lossless(0.3, 0.4)
-    rate, _ = link_loads(joint, TRACKED, dt, *moving(joint, 20.0 * t, SPEED * t))
-    assert rate[300:] == pytest.approx(np.full(200, 20.0), abs=0.05)
+    run = FusedEstimator(joint, TRACKED).run(dt, *moving(joint, 20.0 * t, SPEED * t))
+    assert run.torque_rate_nm_s[300:] == pytest.approx(np.full(200, 20.0), abs=0.05)
 
 
 # ---- configuration

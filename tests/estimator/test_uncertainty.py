@@ -24,7 +24,7 @@ from jtqd.estimator.native_network import (
 )
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL, VALID, Estimate
-from tests.estimator.estimator_helpers import HIGH, LOW, joint1
+from tests.estimator.estimator_helpers import HIGH, LOW, joint1, reciprocal_efficiency
 from tests.estimator.fused_helpers import SIGMA, patches
 
 # ---- fusion
@@ -172,6 +172,10 @@ def steady(method: str, current_a: float, v: float, **changes: Any) -> Estimate:
     return found
 
 
+RECIPROCAL = replace(joint1(), efficiency=reciprocal_efficiency(joint1()))
+ETA = LossModel(RECIPROCAL).eta(3.0, 1.0)
+
+
 @pytest.mark.parametrize(
     ("method", "current_a", "changes", "load"),
     [
@@ -179,6 +183,13 @@ def steady(method: str, current_a: float, v: float, **changes: Any) -> Estimate:
         ("network", -3.0, {}, 0.05599 * 18.6),
         ("tob", 3.0, {}, 0.15 * 18.6),
         ("network", 3.0, {"efficiency": None}, 0.15 * 18.6),
+        # eta' = 1/eta known to rmse: tau = G Kt i/eta' is known to rmse G Kt |i|/eta'^2
+        (
+            "efficiency",
+            3.0,
+            {"efficiency": RECIPROCAL.efficiency},
+            0.01963 * 18.6 * LossModel(RECIPROCAL).eta(3.0, 1.0) ** 2,
+        ),
     ],
 )
 def test_sigma_by_hand(method: str, current_a: float, changes: dict[str, Any], load: float) -> None:
@@ -193,6 +204,12 @@ def test_standstill_is_the_interval_that_friction_can_hold() -> None:
         raw, found = 6.2 * i, steady("efficiency", i, 0.0)
         assert found.status == STANDSTILL
         low, high = found.torque_nm - found.sigma_nm, found.torque_nm + found.sigma_nm
+        if (
+            abs(i) >= 2.0
+        ):  # well above i_b: the losses of the first motion, G Kt |i| |1 - eta| at the lowest speed
+            forward, backward = (abs(raw * (1.0 - losses.eta(i, v))) for v in (0.2, -0.2))
+            assert found.torque_nm == pytest.approx(raw - 0.5 * (forward - backward), abs=1e-9)
+            assert found.sigma_nm == pytest.approx(1.15 * 0.5 * (forward + backward) + 0.2, abs=1e-9)
         # friction stronger than the file's by its uncertainty still holds the joint inside
         for v in (-0.02, 0.02):
             assert low <= raw - 1.15 * losses.loss(i, v) <= high

@@ -24,8 +24,8 @@ from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
-from jtqd.estimator.detection import detect_contacts, link_loads
-from jtqd.estimator.estimator import make_estimator
+from jtqd.estimator.detection import detect_contacts
+from jtqd.estimator.estimator import FusedEstimator, make_estimator
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, INVALID
 from jtqd.models.files import load_joint, shipped
@@ -39,7 +39,6 @@ CYCLES = 400
 PUSHED, MISSING = 300, 200
 THRESHOLD_NM = 0.8
 SETTINGS = replace(recommended("fused"), track_zeros=False)
-"""Of arrays: `link_loads` takes no zero off that is learned in the loop."""
 UNITS = (2.0 * math.pi / 65536, 2.0 * math.pi / 65536, 2.0 * math.pi / 524288, 0.008)
 SCALE = dict(
     zip(
@@ -189,9 +188,8 @@ def test_the_loop_says_what_the_arrays_say(tmp_path: Path, exact: ExactTime) -> 
                 "link_position_rad",
             )
         )
-        loads[n, used] = link_loads(
-            load_joint(shipped(f"trained/joint{n + 1}.yaml")), SETTINGS, *(np.array(each) for each in columns)
-        )[1]
+        joint = load_joint(shipped(f"trained/joint{n + 1}.yaml"))
+        loads[n, used] = FusedEstimator(joint, SETTINGS).run(*(np.array(each) for each in columns)).load_nm
     angle = np.array([each.motor_position_rad for each in joints[0]])
     residual, codes = detect_contacts(loads[1] - loads[0], angle, THRESHOLD_NM)
     np.testing.assert_array_equal([each.contact_nm for each in joints[0]], residual)
