@@ -130,7 +130,7 @@ class Zeros(NamedTuple):
 
 PAST_LAYOUT: Final = 6
 """Number of the layout of `past`, which logs hold: another one where its fields, their order or their meaning change.
-`tests/estimator/test_learned.py` has the size that belongs to it."""
+`tests/estimator/test_path_difference.py` has the size that belongs to it."""
 
 
 def learner_of(estimator: object) -> Any:

@@ -10,8 +10,20 @@ from typing import Any
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, LossSide, Torsion
+from jtqd.estimator.joint import (
+    AdditiveLoss,
+    Agreement,
+    DayZeros,
+    Envelope,
+    Fused,
+    FusedSigma,
+    Joint,
+    LossSide,
+    Torsion,
+)
+from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.network import FUSED_FEATURES
+from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.estimator_helpers import Motion, SmallNetwork, joint1, motion
 
 NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)
@@ -119,3 +131,57 @@ def temperatures(kind: str, seed: int, count: int) -> FloatArray | None:
         rising[count // 2 : count // 2 + 100] = np.nan
         rising[rng.integers(0, count, 3)] = (np.inf, -np.inf, 1e300)
     return np.full(count, 27.0) if kind == "constant" else rising
+
+
+K, GAIN = 12000.0, 6.2
+PLAIN = fused_joint(
+    torsion=replace(TORSION, cubic_nm_per_rad3=0.0, zero_rad=0.0, cos_rad=(0.0, 0.0), sin_rad=(0.0, 0.0))
+)
+"""Torsion torque is K (theta_m/G - theta_l) without more."""
+NARROW = replace(PLAIN, fused=replace(PLAIN.fused, sigma=SIGMA))  # type: ignore[type-var]
+ON = EstimatorSettings(method="fused", track_zeros=True)
+OFF = EstimatorSettings(method="fused")
+AGREEMENT = Agreement(slow_nm=0.15, fast_nm=0.3, gain=0.02, zero_nm=0.6)
+DAYS = DayZeros(2.5e-5, 0.3, SIGMA.scale)
+
+
+def with_section(joint: Joint = NARROW, **sections: Any) -> Joint:
+    """Return the joint with these parts of section `fused`."""
+    assert joint.fused is not None
+    return replace(joint, fused=replace(joint.fused, **sections))
+
+
+USUAL, LEARNING = with_section(agreement=AGREEMENT), with_section(zeros=DAYS)
+
+
+def wavier(t: FloatArray, motor: FloatArray, link: FloatArray) -> FloatArray:
+    """Link position with a kinematic error of 150 urad more than the file has."""
+    result: FloatArray = link + 150e-6 * np.sin(200.0 * motor)
+    return result
+
+
+def driven(
+    seconds: float = 5.0,
+    velocity: Callable[[FloatArray], FloatArray] = lambda t: 1.2 * np.sin(2.5 * t + 0.4),
+    load: Callable[[FloatArray], FloatArray] = lambda t: 8.0 * np.sin(1.7 * t),
+    friction_nm: float = 0.0,
+    link_zero_rad: float | FloatArray = 0.0,
+) -> tuple[tuple[FloatArray, ...], FloatArray]:
+    """Samples of a joint that is as its file says, but for friction and zero; and the motor torque less loss [n]."""
+    t = np.asarray(np.arange(round(1000 * seconds)) * 1e-3, np.float64)
+    v, raw = velocity(t), load(t)
+    model = AdditiveLossModel(NARROW.fused.loss)  # type: ignore[union-attr]
+    turns: FloatArray = np.tanh(v / 0.02)
+    torque = raw - model.loss_many(raw, v, np.full(len(t), 25.0), turns)[0] - friction_nm * turns
+    motor = 100.0 * np.cumsum(v) * 1e-3
+    link = motor / 100.0 - torque / K + link_zero_rad
+    noise = np.random.default_rng(4).normal(0.0, 6e-6, len(t))
+    rotor = NARROW.rotor_inertia_kgm2 * 100.0 * np.gradient(v, t) / NARROW.torque_constant_nm_per_a
+    return (
+        np.full(len(t), 1e-3),
+        raw / GAIN + rotor,
+        motor,
+        100.0 * v,
+        link + noise,
+        np.full(len(t), 25.0),
+    ), torque

@@ -20,32 +20,18 @@ from jtqd.estimator.network import FusedNetwork
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
 from tests.estimator.fused_helpers import (
-    SIGMA,
+    GAIN,
+    NARROW,
+    PLAIN,
     TRAINED_C,
     FakeNetwork,
+    K,
     everywhere,
     fused_joint,
     fused_network,
 )
 
 FUSED = EstimatorSettings(method="fused")
-JOINT = fused_joint()
-K, GAIN = 12000.0, 6.2
-PLAIN = replace(
-    JOINT,
-    fused=replace(
-        JOINT.fused,  # type: ignore[arg-type, type-var]
-        torsion=replace(
-            JOINT.fused.torsion,  # type: ignore[type-var, union-attr]
-            cubic_nm_per_rad3=0.0,
-            zero_rad=0.0,
-            cos_rad=(0.0, 0.0),
-            sin_rad=(0.0, 0.0),
-        ),
-    ),
-)
-"""Torsion torque is K (theta_m/G - theta_l) without more."""
-NARROW = replace(PLAIN, fused=replace(PLAIN.fused, sigma=SIGMA))  # type: ignore[type-var]
 
 
 def estimator(network: Any = None, joint: Joint = PLAIN, **settings: Any) -> FusedEstimator:

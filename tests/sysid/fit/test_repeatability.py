@@ -14,7 +14,7 @@ from jtqd.estimator.joint import Agreement, DayZeros, Fused, FusedSigma
 from jtqd.sysid.fit import fused as fits
 from jtqd.sysid.fit.calibration import FusedErrors, PathResiduals, fused_errors
 from jtqd.sysid.fit.fused import LOWERED, QUANTILE, correlation, fit_agreement, fit_turn, fit_zeros
-from tests.estimator.test_fused_estimator import NARROW
+from tests.estimator.fused_helpers import NARROW
 
 K, RATED, DAYS = 12000.0, 40.0, 24
 SIGMA = FusedSigma(0.6, 0.0, 0.0, 0.5, 0.0, 0.02, (1.0, 1.0, 1.0, 1.0))

@@ -20,11 +20,8 @@ from jtqd.sysid.fit.calibration import FusedErrors, bent_square, fit_tracking, f
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.fit.torsion import TRACKING_RAD_S, WAVE_RAD_S
 from tests.estimator.estimator_helpers import first_order_hold, joint1
-from tests.estimator.fused_helpers import twisted
-from tests.estimator.test_agreement import AGREEMENT, WAVIER
-from tests.estimator.test_day_zeros import DAYS, LEARNING
+from tests.estimator.fused_helpers import AGREEMENT, DAYS, LEARNING, driven, twisted, wavier
 from tests.estimator.test_torsion_filters import lossless
-from tests.estimator.test_zeros import driven
 from tests.sysid.fit.fused_signals import FUSED, STIFF, made_run, smooth_loss
 from tests.sysid.fit.test_repeatability import fused
 
@@ -120,7 +117,7 @@ def test_value_and_sigma_are_those_of_the_estimator(track_zeros: bool) -> None:
     assert joint.fused is not None
     inputs, _ = driven(8.0, link_zero_rad=4e-5)
     dt, current, motor, velocity, link, temperature = inputs
-    link = link + 0.5 * (WAVIER(np.cumsum(dt), motor / 100.0, link) - link)
+    link = link + 0.5 * (wavier(np.cumsum(dt), motor / 100.0, link) - link)
     settings = EstimatorSettings(method="fused", track_zeros=track_zeros, track_torsion=True)
     got = FusedEstimator(joint, settings).run(dt, current, motor, velocity, link, temperature)
     run = run_signals(
