@@ -444,7 +444,7 @@ class Fused:
     def __post_init__(self) -> None:
         if self.zeros is not None and not self.zeros.spread_nm < self.sigma.torsion_nm:
             expected = f"less than sigma.torsion_nm ({self.sigma.torsion_nm:g} Nm), of which it is a part"
-            raise FieldError("fused.zeros", "spread_nm", self.zeros.spread_nm, expected)
+            raise FieldError("fused", "zeros.spread_nm", self.zeros.spread_nm, expected)
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists, as `Joint.to_mapping`."""
