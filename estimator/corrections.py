@@ -107,27 +107,6 @@ def hooks_of(pairs: Pairs, name: str, functions: Any) -> tuple[Hook, ...]:
 class ExtendedInputs:
     """Corrections of one joint's inputs, sample by sample, in one preallocated `State`."""
 
-    __slots__ = (
-        "_current",
-        "_gear",
-        "_inertia_a",
-        "_inverse_gain",
-        "_joint",
-        "_last_current",
-        "_link",
-        "_loss",
-        "_max_gap",
-        "_motor",
-        "_rate",
-        "_rate_rad_s",
-        "_running",
-        "_slip_rad_s",
-        "_slips",
-        "_state",
-        "_twist",
-        "_zero",
-    )
-
     def __init__(self, joint: Joint, settings: EstimatorSettings) -> None:
         pairs = acting_effects(joint)
         self._joint: Final = replace(joint, effects=())

@@ -261,7 +261,7 @@ cdef class JointEstimator(Estimator):
         fill_guard(&self.law.guard, joint, settings)
         fill_observer(&self.law.observer, joint, settings)
         self.law.losses = (<LossModel>losses).law
-        fill_uncertainty(&self.law.uncertainty, joint, settings, losses.has_efficiency)
+        fill_uncertainty(&self.law.uncertainty, joint, settings)
         self.law.with_efficiency = settings.method != "tob"
         self.law.inverse_gain = 1.0 / losses.torque_per_ampere
         self.law.limit = settings.torque_limit * joint.rated_torque_nm

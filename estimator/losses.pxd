@@ -60,7 +60,7 @@ cdef struct UncertaintyLaw:
     double floor, u_friction, widened, load
     bint with_efficiency
 
-cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1
+cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings) except -1
 cdef double sigma_moving(
     const UncertaintyLaw *law, const EfficiencyLaw *losses, double raw, double current, double velocity
 ) noexcept nogil

@@ -89,11 +89,6 @@ cdef class FrictionModel:
         self.law.inverse_stribeck = 1.0 / friction.stribeck_velocity_rad_s
         self.law.static = static_friction(friction)
 
-    @property
-    def static(self):
-        """Torque [Nm] below which the joint may stand still."""
-        return self.law.static
-
     def torque(self, double velocity_rad_s):
         """Return friction [Nm, joint side] at a joint-side velocity [rad/s]; its sign is the velocity's."""
         return friction_torque(&self.law, velocity_rad_s)
@@ -215,11 +210,6 @@ cdef class LossModel:
         return self.law.torque_per_ampere
 
     @property
-    def has_efficiency(self):
-        """Whether the joint file has an efficiency, not friction alone."""
-        return bool(self.law.has_efficiency)
-
-    @property
     def quadrants(self):
         """Parameters of Eq. (8) as evaluated, in |i| and |v|: c00, c10, c01, c20, c11, c02, eta low and high, |i| max, rmse.
 
@@ -265,7 +255,7 @@ cdef class LossModel:
 # Standard deviation of the paper's methods -----------------------------------------------------------------------------
 
 
-cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficiency) except -1:
+cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings) except -1:
     """Set the parameters from joint and settings."""
     law.floor = settings.sigma_floor * joint.rated_torque_nm
     law.u_friction = settings.friction_uncertainty
@@ -273,7 +263,7 @@ cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings, bint has_efficie
     law.widened = 1.0 + settings.friction_uncertainty
     law.load = settings.load_uncertainty
     # without an efficiency the physics is the classical observer's whatever the method
-    law.with_efficiency = settings.method != "tob" and has_efficiency
+    law.with_efficiency = settings.method != "tob" and joint.efficiency is not None
     return 0
 
 

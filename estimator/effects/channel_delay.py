@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values, full
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values, full
 
 SENSOR, CURRENT, LINK = 0.0, 1.0, 2.0
 """Codes of `channel`."""
@@ -30,17 +30,17 @@ class ChannelDelay(Effect):
     columns = tuple(Column("delay_s", 1e-5, {"channel": channel}) for channel in (SENSOR, CURRENT, LINK))
     rate_based = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         if p["channel"] != SENSOR:
             return full(0.0, s.torque_rate_nm_s)
         return -p["delay_s"] * s.torque_rate_nm_s
 
-    def current_a(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         if p["channel"] != CURRENT:
             return full(0.0, s.current_a)
         return -p["delay_s"] * s.current_rate_a_s
 
-    def link_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         if p["channel"] != LINK:
             return full(0.0, s.link_velocity_rad_s)
         return -p["delay_s"] * s.link_velocity_rad_s

@@ -8,7 +8,7 @@ from jtqd.estimator.effects.effect import (
     PHASE,
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     State,
     Values,
@@ -34,5 +34,5 @@ class Cogging(Effect):
     columns = waves("amplitude_nm", 0.1, ORDERS)
     needs = ("motor_position_rad",)
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return p["amplitude_nm"] * x.cos(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class CoulombFriction(Effect):
@@ -26,5 +26,5 @@ class CoulombFriction(Effect):
     columns = (Column("coulomb_nm", 1.0),)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return (p["coulomb_nm"] - joint.friction.coulomb_nm) * s.direction

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values, full
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values, full
 
 
 class CurrentOffset(Effect):
@@ -23,5 +23,5 @@ class CurrentOffset(Effect):
     parameters = (Parameter("offset_a", "A", -5.0, 5.0),)
     columns = (Column("offset_a", 0.01),)
 
-    def current_a(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return full(p["offset_a"], s.current_a)

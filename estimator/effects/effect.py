@@ -48,7 +48,7 @@ class FrictionValues(Protocol):
     def stribeck_velocity_rad_s(self) -> float: ...
 
 
-class JointFile(Protocol):
+class Joint(Protocol):
     """Values of a joint file that effects read (`estimator.joint.Joint` has them all)."""
 
     __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
@@ -73,7 +73,7 @@ class JointFile(Protocol):
     def provenance(self) -> Mapping[str, Any]: ...
 
 
-AnyJoint = TypeVar("AnyJoint", bound=JointFile)
+AnyJoint = TypeVar("AnyJoint", bound=Joint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -432,27 +432,27 @@ class Effect:
             raise TypeError(f"effect {cls.name}: found group {cls.group!r}, expected one of {GROUPS}")
         REGISTERED[cls.name] = cls()
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """Motor torque lost in addition to the joint file's losses, Nm joint side."""
         raise NotImplementedError
 
-    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """What the spring sees in addition to theta_m/G - theta_l, rad."""
         raise NotImplementedError
 
-    def load_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """Torque taken between gear and sensor in addition to the file's link inertia, Nm."""
         raise NotImplementedError
 
-    def current_a(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def current_a(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """What the current reads above the truth, A."""
         raise NotImplementedError
 
-    def link_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """What the link encoder reads above the truth, rad."""
         raise NotImplementedError
 
-    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """What the torque sensor reads above the truth, Nm."""
         raise NotImplementedError
 
@@ -476,17 +476,17 @@ class Effect:
         """Whether with these parameters it is the motor's encoder that reads wrong: by -G link_rad, motor side."""
         return False
 
-    def largest(self, joint: JointFile, p: Values) -> float:
+    def largest(self, joint: Joint, p: Values) -> float:
         """Largest size of its leading parameter, beside the others of p, with which the joint would still move as without
         it: one that would have to be larger to show is invisible, whatever its columns say of motions without it.
         """
         return math.inf
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         """Ways to look for it, one per column; the best is taken and its parameters refined."""
         return [self._term(column, joint) for column in self.columns]
 
-    def _term(self, column: Column, joint: JointFile) -> Term:
+    def _term(self, column: Column, joint: Joint) -> Term:
         """Return the term of a column: a wave, or linear from the joint file's value on."""
         name, step, fixed, of = column
         if PHASE in self.parameters:

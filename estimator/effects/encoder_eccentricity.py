@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    PHASE,
-    Column,
-    Effect,
-    Functions,
-    JointFile,
-    Parameter,
-    State,
-    Values,
-)
+from jtqd.estimator.effects.effect import PHASE, Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class EncoderEccentricity(Effect):
@@ -43,7 +34,7 @@ class EncoderEccentricity(Effect):
     )
     needs = ("torsion_rad",)
 
-    def link_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def link_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         if p["motor_side"]:
             return (-p["amplitude_rad"] / joint.gear_ratio) * x.sin(s.motor_position_rad + p["phase_rad"])
         return p["amplitude_rad"] * x.sin(s.link_position_rad + p["phase_rad"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class GearDamping(Effect):
@@ -24,6 +24,6 @@ class GearDamping(Effect):
     needs = ("torsion_rate_rad_s",)
     changes_joint = True
 
-    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         more = p["damping_nms_per_rad"] - joint.damping_nms_per_rad
         return more / joint.stiffness_nm_per_rad * s.torsion_rate_rad_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 TRAVELS_RAD = (3e-5, 5e-5, 1e-4, 2e-4, 3e-4)
 """Grid of the search; the fit refines it."""
@@ -25,5 +25,5 @@ class Hysteresis(Effect):
     needs = ("torsion_rad",)
     follows_torsion = True
 
-    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return (p["torque_nm"] / joint.stiffness_nm_per_rad) * x.slip(s.torsion_rad, p["travel_rad"])

@@ -9,7 +9,7 @@ from jtqd.estimator.effects.effect import (
     SHAFT_ORDERS,
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     State,
     Values,
@@ -35,10 +35,10 @@ class KinematicError(Effect):
     needs = ("motor_position_rad", "torque_nm")
     geometric = True
 
-    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return p["amplitude_rad"] * x.sin(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         k = p["order_per_motor_rev"]
         slope = joint.gear_ratio * k * p["amplitude_rad"] * x.cos(k * s.motor_position_rad + p["phase_rad"])
         return s.torque_nm * slope

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class LinkInertia(Effect):
@@ -20,5 +20,5 @@ class LinkInertia(Effect):
     needs = ("link_acceleration_rad_s2",)
     changes_joint = True
 
-    def load_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return (p["link_inertia_kgm2"] - joint.link_inertia_kgm2) * s.link_acceleration_rad_s2

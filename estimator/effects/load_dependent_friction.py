@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class LoadDependentFriction(Effect):
@@ -26,5 +26,5 @@ class LoadDependentFriction(Effect):
     needs = ("torque_nm",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return p["load_coefficient"] * abs(s.torque_nm) * s.direction

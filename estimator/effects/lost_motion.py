@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 WIDTHS_RAD = (3e-5, 1e-4, 3e-4, 1e-3)
 """Grid of the search, whose coefficients scale the width (exact beyond the play); the fit refines it."""
@@ -22,6 +22,6 @@ class LostMotion(Effect):
     needs = ("torsion_rad",)
     follows_torsion = True
 
-    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         half = 0.5 * p["width_rad"]
         return -x.clip(s.torsion_rad, -half, half)

@@ -5,16 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    Effect,
-    Functions,
-    JointFile,
-    Linear,
-    Parameter,
-    State,
-    Terms,
-    Values,
-)
+from jtqd.estimator.effects.effect import Effect, Functions, Joint, Linear, Parameter, State, Terms, Values
 
 
 class NonlinearStiffness(Effect):
@@ -35,14 +26,14 @@ class NonlinearStiffness(Effect):
     scales_balance = "torsion"
     needs = ("torsion_rad",)
 
-    def twist_rad(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def twist_rad(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         own = joint.stiffness_nm_per_rad
         d = s.torsion_rad
         return (p.get("stiffness_nm_per_rad", own) / own - 1.0) * d + (p["cubic_nm_per_rad3"] / own) * (
             d * d * d
         )
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         """Return another slope, hardening alone, and both."""
         own = joint.stiffness_nm_per_rad
         # at the rated torque, K3 d^3 is a tenth of the torque

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class RotorInertia(Effect):
@@ -19,6 +19,6 @@ class RotorInertia(Effect):
     needs = ("motor_acceleration_rad_s2",)
     changes_joint = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         more = p["rotor_inertia_kgm2"] - joint.rotor_inertia_kgm2
         return joint.gear_ratio * more * s.motor_acceleration_rad_s2

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    PHASE,
-    Column,
-    Effect,
-    Functions,
-    JointFile,
-    Parameter,
-    State,
-    Values,
-)
+from jtqd.estimator.effects.effect import PHASE, Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class SensorCrosstalk(Effect):
@@ -39,6 +30,6 @@ class SensorCrosstalk(Effect):
     needs = ("coupling_position_rad", "torque_nm")
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         size = p["amplitude_nm"] + p["share"] * s.torque_nm
         return size * x.cos(s.coupling_position_rad + p["phase_rad"])

@@ -8,7 +8,7 @@ from jtqd.estimator.effects.effect import (
     FALLBACK_C,
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     Slope,
     State,
@@ -39,11 +39,11 @@ class SensorDrift(Effect):
     needs = ("time_s",)
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         drift = p["rate_nm_per_s"] * s.time_s
         return drift + p["per_k_nm"] * above(s.temperature_c, p["reference_c"]) if p["per_k_nm"] else drift
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         """Return a drift with time, and one with temperature (two columns: slope and constant)."""
         time = linear("rate_nm_per_s", 1e-3, per_k_nm=0.0, reference_c=FALLBACK_C)
         return time, Slope("per_k_nm", 0.01, reference_of(joint.provenance), {"rate_nm_per_s": 0.0}).term()

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from jtqd.estimator.effects.effect import Effect, Functions, JointFile, Parameter, State, Term, Terms, Values
+from jtqd.estimator.effects.effect import Effect, Functions, Joint, Parameter, State, Term, Terms, Values
 
 STEP = 0.01
 """1 - 1/g of the column."""
@@ -42,8 +42,8 @@ class SensorGain(Effect):
     needs = ("torque_nm",)
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return (1.0 - 1.0 / p["gain"]) * s.torque_nm
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         return (Term(({"gain": 1.0 / (1.0 - STEP)},), _Gain()),)

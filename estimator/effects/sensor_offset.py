@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values, full
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values, full
 
 
 class SensorOffset(Effect):
@@ -18,5 +18,5 @@ class SensorOffset(Effect):
     columns = (Column("offset_nm", 0.1),)
     at_sensor = True
 
-    def sensor_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def sensor_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return full(p["offset_nm"], s.torque_nm)

@@ -10,7 +10,7 @@ from typing import Any
 from jtqd.estimator.effects.effect import (
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     State,
     Term,
@@ -68,7 +68,7 @@ class StribeckFriction(Effect):
     )
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         own = joint.friction
         v = s.velocity_rad_s
         new = v / p.get("stribeck_velocity_rad_s", own.stribeck_velocity_rad_s)
@@ -78,7 +78,7 @@ class StribeckFriction(Effect):
             peak = peak - own.stribeck_nm * x.exp(-old * old)
         return peak * s.direction
 
-    def largest(self, joint: JointFile, p: Values) -> float:
+    def largest(self, joint: Joint, p: Values) -> float:
         """Return the height at which friction falls with velocity as steeply as a drive can hold, peak slope over inertia
         sqrt(2/e) Fs/(vs J) = _HELD_PER_S, and at most half the Coulomb friction. Beyond, the joint sticks and jumps where it
         has crept before: the slow samples in which the peak's foot would show are not there any more.
@@ -88,7 +88,7 @@ class StribeckFriction(Effect):
         held = _HELD_PER_S * inertia * velocity / math.sqrt(2.0 / math.e)
         return min(held, 0.5 * max(friction.coulomb_nm, _LEAST_COULOMB * joint.rated_torque_nm))
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         """Return one column per velocity; where the file has a peak itself, its height and a second peak."""
         own_nm, own = joint.friction.stribeck_nm, joint.friction.stribeck_velocity_rad_s
         height = linear("stribeck_nm", 1.0, own_nm, stribeck_velocity_rad_s=own)

@@ -12,7 +12,7 @@ from jtqd.estimator.effects.effect import (
     SPAN_K,
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     State,
     Term,
@@ -82,7 +82,7 @@ class TemperatureDependentFriction(Effect):
     needs = ("temperature_c",)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         """Return the torque lost beyond the file's losses, Nm joint side; NaN temperature: 0."""
         own = joint.friction
         warmer = above(s.temperature_c, p["reference_c"])
@@ -93,7 +93,7 @@ class TemperatureDependentFriction(Effect):
             loss = loss + own.coulomb_nm * s.direction * coulomb
         return loss
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         """Return two columns (slope over temperature, constant) per rate, of viscous and of Coulomb friction."""
         reference = reference_of(joint.provenance)
         viscous, coulomb = "viscous_per_k", "coulomb_per_k"

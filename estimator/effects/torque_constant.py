@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class TorqueConstant(Effect):
@@ -27,7 +27,7 @@ class TorqueConstant(Effect):
     columns = (Column("torque_constant_nm_per_a", 0.01, of="torque_constant_nm_per_a"),)
     scales_balance = "motor"
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return (
             -joint.gear_ratio * (p["torque_constant_nm_per_a"] - joint.torque_constant_nm_per_a) * s.current_a
         )

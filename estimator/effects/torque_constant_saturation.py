@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class TorqueConstantSaturation(Effect):
@@ -20,6 +20,6 @@ class TorqueConstantSaturation(Effect):
     parameters = (Parameter("saturation_per_a", "1/A", 0.0, 0.5),)
     columns = (Column("saturation_per_a", 0.01),)
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         scale = joint.gear_ratio * joint.torque_constant_nm_per_a * p["saturation_per_a"]
         return scale * s.current_a * abs(s.current_a)

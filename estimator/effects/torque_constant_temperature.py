@@ -8,7 +8,7 @@ from jtqd.estimator.effects.effect import (
     REFERENCE,
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     Slope,
     State,
@@ -32,10 +32,10 @@ class TorqueConstantTemperature(Effect):
     parameters = (Parameter("per_k", "1/K", -0.02, 0.02), REFERENCE)
     needs = ("temperature_c",)
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         scale = -joint.gear_ratio * joint.torque_constant_nm_per_a * p["per_k"]
         return scale * above(s.temperature_c, p["reference_c"]) * s.current_a
 
-    def terms(self, joint: JointFile) -> Terms:
+    def terms(self, joint: Joint) -> Terms:
         """Return two columns: slope over temperature, and constant."""
         return (Slope("per_k", 1e-3, reference_of(joint.provenance)).term(),)

@@ -9,7 +9,7 @@ from jtqd.estimator.effects.effect import (
     SHAFT_ORDERS,
     Effect,
     Functions,
-    JointFile,
+    Joint,
     Parameter,
     State,
     Values,
@@ -31,5 +31,5 @@ class TorqueRipple(Effect):
     columns = waves("amplitude_nm", 0.1, SHAFT_ORDERS)
     needs = ("motor_position_rad",)
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return p["amplitude_nm"] * x.cos(p["order_per_motor_rev"] * s.motor_position_rad + p["phase_rad"])

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import (
-    PHASE,
-    Column,
-    Effect,
-    Functions,
-    JointFile,
-    Parameter,
-    State,
-    Values,
-)
+from jtqd.estimator.effects.effect import PHASE, Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class Unbalance(Effect):
@@ -29,5 +20,5 @@ class Unbalance(Effect):
     columns = (Column("moment_nm", 0.1),)
     needs = ("link_position_rad",)
 
-    def load_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def load_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return p["moment_nm"] * x.sin(s.link_position_rad + p["phase_rad"])

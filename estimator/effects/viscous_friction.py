@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from jtqd.estimator.effects.effect import Column, Effect, Functions, JointFile, Parameter, State, Values
+from jtqd.estimator.effects.effect import Column, Effect, Functions, Joint, Parameter, State, Values
 
 
 class ViscousFriction(Effect):
@@ -19,5 +19,5 @@ class ViscousFriction(Effect):
     columns = (Column("viscous_nms_per_rad", 1.0),)
     dissipative = True
 
-    def loss_nm(self, p: Values, s: State, joint: JointFile, x: Functions) -> Any:
+    def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:
         return (p["viscous_nms_per_rad"] - joint.friction.viscous_nms_per_rad) * s.velocity_rad_s

@@ -67,7 +67,7 @@ def _header(config: Config) -> str:
 
 def _joint(joint: Joint, settings: EstimatorSettings, network: SmallNetwork) -> str:
     friction, losses = joint.friction, LossModel(joint)
-    assert losses.has_efficiency
+    assert joint.efficiency is not None
     margin = settings.envelope_margin
     limit = settings.network_limit * joint.rated_torque_nm
     values: dict[str, object] = {
