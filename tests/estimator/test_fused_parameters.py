@@ -1,8 +1,10 @@
-"""Section `fused` of a joint file: written and read back, and every wrong value named by file, key, found, expected."""
+"""Section `fused` of a joint file and the envelope of networks: read back, and every wrong value named by its key."""
 
 from __future__ import annotations
 
 import copy
+import json
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -11,16 +13,19 @@ from typing import Any
 import pytest
 import yaml
 
+from jtqd.estimator.decoder import FieldError, read
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.joint import MAX_NODES, Joint
+from jtqd.estimator.joint import MAX_NODES, Envelope, Joint
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.joint_writer import write_joint
-from tests.estimator.fused_helpers import NODES, SIGMA, TORSION, fused_joint, loss_of, side
+from tests.estimator.fused_helpers import NODES, SIGMA, TORSION, everywhere, fused_joint, loss_of, side
+
+# ---- sections
 
 Mapping = dict[str, Any]
 
 
-def read(mapping: Mapping) -> Joint:
+def joint_of(mapping: Mapping) -> Joint:
     return Joint.from_mapping(mapping, "some.yaml")
 
 
@@ -29,7 +34,7 @@ def refused(change: Callable[[Mapping], object]) -> str:
     mapping = copy.deepcopy(fused_joint().to_mapping())
     change(mapping["fused"])
     with pytest.raises(ConfigError) as caught:
-        read(mapping)
+        joint_of(mapping)
     message = str(caught.value)
     assert "\n" not in message
     assert message.startswith("some.yaml: key 'fused")
@@ -76,8 +81,8 @@ def test_round_trip(torsion: Any) -> None:
     joint = fused_joint(3, torsion)
     mapping = joint.to_mapping()
     assert ("torsion" in mapping["fused"]) == (torsion is not None)
-    assert read(mapping) == joint
-    assert read(yaml.safe_load(yaml.safe_dump(mapping))) == joint
+    assert joint_of(mapping) == joint
+    assert joint_of(yaml.safe_load(yaml.safe_dump(mapping))) == joint
     assert Joint.from_mapping(mapping, "x").to_mapping() == mapping
 
 
@@ -90,7 +95,7 @@ def test_round_trip_through_a_file(tmp_path: Path) -> None:
 def test_one_order_of_the_kinematic_error_is_enough() -> None:
     one = replace(TORSION, orders_per_motor_rev=(2.0,), cos_rad=(1e-5,), sin_rad=(0.0,))
     joint = fused_joint(1, one)
-    assert read(joint.to_mapping()) == joint
+    assert joint_of(joint.to_mapping()) == joint
 
 
 @pytest.mark.parametrize(
@@ -173,3 +178,78 @@ def test_values_made_in_code_are_checked_too() -> None:
     for change in ({"current_nm": 0.0}, {"torsion_nm": -1.0}, {"scale": (1.0, 1.0, 1.0, 0.0)}):
         with pytest.raises(ConfigError, match=f"fused.sigma.{next(iter(change))}: found"):
             replace(SIGMA, **change)
+
+
+# ---- envelope
+
+MAP = ((0, 1, 0), (1, 1, 1), (0, 1, 0))
+GOOD = Envelope(0.25, 3.0, MAP, 4.0, (20.0, 30.0))
+
+
+def with_envelope(envelope: Envelope | None) -> Joint:
+    plain = fused_joint()
+    assert plain.fused is not None
+    return replace(plain, fused=replace(plain.fused, envelope=envelope))
+
+
+@pytest.mark.parametrize(
+    "envelope", [GOOD, replace(GOOD, temperature_c=None), replace(GOOD, load_nm=38.5), None]
+)
+def test_a_joint_file_holds_it(envelope: Envelope | None) -> None:
+    mapping = with_envelope(envelope).to_mapping()
+    assert Joint.from_mapping(mapping, "j.yaml") == with_envelope(envelope)
+    if envelope is not None:
+        assert mapping["fused"]["envelope"]["known"] == ["010", "111", "010"]
+
+
+@pytest.mark.parametrize("envelope", [GOOD, everywhere(), replace(GOOD, temperature_c=None)])
+def test_metadata_of_a_network_hold_it(envelope: Envelope) -> None:
+    mapping = json.loads(json.dumps(envelope.to_mapping()))
+    assert read(Envelope, mapping) == envelope
+    assert mapping["known"] == [list(row) for row in envelope.known]
+
+
+WRONG: list[tuple[str, Any, str]] = [
+    ("known", ..., "missing"),
+    ("kown", 1, "unknown key"),
+    ("velocity_step_rad_s", 0.0, "found 0.0, expected a number in rad/s from 1e-06"),
+    ("velocity_step_rad_s", True, "found True"),
+    ("torque_step_nm", "3 Nm", "found '3 Nm'"),
+    ("torque_step_nm", math.nan, "found nan"),
+    ("distance_nm", 0.0, "found 0.0"),
+    ("distance_nm", 1e-320, "found 1e-320"),
+    *(
+        ("known", value, "expected odd numbers of rows and of cells in each")
+        for value in (
+            *([], "010", 7, {"a": 1}, [1, 0, 1], [[]], ["01", "10"], [[1, 1, 1], [1, 1, 1]], [[1, 1]]),
+            *([[1, 1, 1], [1], [1, 1, 1]], ["012"], [[2]], [[True]], [[0.5]], [[[1]]], [None], [["0 "]]),
+        )
+    ),
+    ("known", ["0" * 129], "expected at most 127 of either"),
+    *(
+        ("temperature_c", value, "expected [lowest, highest] in degC, or none")
+        for value in ([30.0, 20.0], [20.0], 25.0, [20.0, math.inf], [20.0, None], [True, 20.0], ["1", "2"])
+    ),
+]
+
+
+@pytest.mark.parametrize(("key", "value", "words"), WRONG)
+def test_wrong_values_are_refused_with_key_and_in_a_joint_file_with_its_name(
+    key: str, value: Any, words: str
+) -> None:
+    mapping = with_envelope(GOOD).to_mapping()
+    envelope = {k: v for k, v in (mapping["fused"]["envelope"] | {key: value}).items() if v is not ...}
+    mapping["fused"]["envelope"] = envelope
+    with pytest.raises(ConfigError) as caught:
+        Joint.from_mapping(mapping, "j.yaml")
+    assert str(caught.value).startswith(f"j.yaml: key 'fused.envelope.{key}': ")
+    assert words in str(caught.value)
+    with pytest.raises(FieldError) as error:
+        read(Envelope, envelope)
+    assert (error.value.key, words in str(error.value)) == (key, True)
+
+
+@pytest.mark.parametrize("value", [None, [], "x", 3])
+def test_an_envelope_that_is_no_mapping(value: object) -> None:
+    with pytest.raises(FieldError, match="expected a mapping"):
+        read(Envelope, value)

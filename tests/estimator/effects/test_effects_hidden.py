@@ -27,7 +27,7 @@ from validation.diagnosis.entries import Hidden
 from validation.generator.draw import Case, Order, draw_many
 
 SEED = 8
-DURATION_S = 12.0
+DURATION_S = 6.0
 AT_SENSOR = {"sensor_offset", "sensor_gain", "sensor_drift", "sensor_crosstalk"}
 FIXED: dict[str, tuple[dict[str, float], ...]] = {
     "channel_delay": ({"channel": 0.0}, {"channel": 1.0}, {"channel": 2.0}),
