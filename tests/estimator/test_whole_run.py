@@ -80,7 +80,7 @@ def test_random_runs_equal_their_twin(torsion: Any, with_network: bool) -> None:
             network = FusedNetwork(small.data)
         own = (None, 800.0)[seed // 2 % 2]
         settings = replace(FUSED, bandwidth_rad_s=(200.0, 90.0)[seed % 2], torsion_bandwidth_rad_s=own)
-        m = with_faults(twisted(seed), seed) if seed % 4 else twisted(seed)
+        m = with_faults(twisted(seed, 1500), seed) if seed % 4 else twisted(seed, 1500)
         temperature = temperatures(("none", "gaps", "constant", "rising")[seed // 2 % 4], seed, len(m.dt_s))
         run = compare(fused_joint(seed, torsion), settings, network, m, temperature, f"seed {seed}")
         seen |= set(run.status.tolist())
