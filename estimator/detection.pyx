@@ -80,9 +80,7 @@ cdef class Plausibility:
         self.jump = limits.motor_jump_rad
         self.limit = limits.mismatch_rad
         self.longest_frozen_s = limits.frozen_s
-        self.twist_limit = (
-            2.0 * torque_limit * joint.rated_torque_nm / joint.stiffness_nm_per_rad + limits.twist_rad
-        )
+        self.twist_limit = (2.0 * torque_limit * joint.rated_torque_nm / joint.stiffness_nm_per_rad + limits.twist_rad)
         self.twist_jump = 0.5 * self.twist_limit
         self.reset()
 

@@ -2,15 +2,8 @@
 
 from jtqd.estimator.detection cimport LinkLaw, LinkState
 from jtqd.estimator.observer cimport (
-    FusedObserved,
-    FusedObserverLaw,
-    FusedObserverState,
-    GuardLaw,
-    GuardState,
-    Observed,
-    ObserverLaw,
-    ObserverState,
-    Sample,
+    FusedObserved, FusedObserverLaw, FusedObserverState, GuardLaw, GuardState, Observed, ObserverLaw, ObserverState,
+    Sample
 )
 from jtqd.estimator.fusion cimport AgreementLaw, AgreementState, Fused, FusionLaw, Learned, OffsetLaw, OffsetState
 from jtqd.estimator.native_network cimport FusedTrustLaw, PerceptronLaw, TrustLaw

@@ -14,69 +14,21 @@ from libc.string cimport memcmp, memcpy, memset
 
 from jtqd.estimator.detection cimport LinkLoad, fill_link, restart_link, update_link
 from jtqd.estimator.observer cimport (
-    FusedObserved,
-    FusedObserverLaw,
-    Observed,
-    Sample,
-    fill_fused_observer,
-    fill_guard,
-    fill_observer,
-    observe,
-    observe_fused,
-    restart_guard,
+    FusedObserved, FusedObserverLaw, Observed, Sample, fill_fused_observer, fill_guard, fill_observer, observe,
+    observe_fused, restart_guard
 )
 from jtqd.estimator.fusion cimport (
-    Fused,
-    Learned,
-    Rest,
-    TURN_WAVES,
-    at_rest,
-    degrades,
-    disagreement,
-    drop_block,
-    early_factor,
-    fading,
-    fill_agreement,
-    fill_fusion,
-    fill_offsets,
-    fuse_paths,
-    gather,
-    implausible,
-    known_nm2,
-    local_stiffness,
-    mismatch_variance,
-    offsets_of,
-    pause_turn,
-    report_offsets,
-    restart_agreement,
-    restart_offsets,
-    restart_turn,
-    reweigh,
-    turn_differs,
-    update_difference,
-    update_turn,
+    Fused, Learned, Rest, TURN_WAVES, at_rest, degrades, disagreement, drop_block, early_factor, fading,
+    fill_agreement, fill_fusion, fill_offsets, fuse_paths, gather, implausible, known_nm2, local_stiffness,
+    mismatch_variance, offsets_of, pause_turn, report_offsets, restart_agreement, restart_offsets, restart_turn,
+    reweigh, turn_differs, update_difference, update_turn
 )
 from jtqd.estimator.native_network cimport (
-    Perceptron,
-    evaluate,
-    fill_fused_trust,
-    fill_trust,
-    fused_trust,
-    network_share,
-    trust,
+    Perceptron, evaluate, fill_fused_trust, fill_trust, fused_trust, network_share, trust
 )
 from jtqd.estimator.losses cimport (
-    AdditiveLaw,
-    AdditiveLossModel,
-    Loss,
-    LossModel,
-    Spread,
-    additive_loss,
-    efficiency_loss,
-    fill_uncertainty,
-    sigma_moving,
-    standing,
-    thermal_friction,
+    AdditiveLaw, AdditiveLossModel, Loss, LossModel, Spread, additive_loss, efficiency_loss, fill_uncertainty,
+    sigma_moving, standing, thermal_friction
 )
 
 from typing import Final
@@ -174,14 +126,8 @@ cdef class Estimator:
         return Estimate(out.torque_nm, out.sigma_nm, out.status, out.tob_nm, out.physics_nm, out.network_nm)
 
     def run(
-        self,
-        dt_s,
-        current_a,
-        motor_position_rad,
-        motor_velocity_rad_s,
-        link_position_rad,
-        temperature_c=None,
-        network_wanted=None,
+        self, dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad, temperature_c=None,
+        network_wanted=None
     ):
         """Return the estimates of a run as an `EstimateRun`: `step` for every sample of arrays [n].
 
@@ -270,9 +216,7 @@ cdef class JointEstimator(Estimator):
         self.run_one = fill_network(&self.law.network, used, joint)
         if used is not None:
             limit_nm = settings.network_limit * joint.rated_torque_nm
-            fill_trust(
-                &self.law.trust, used.envelope_low, used.envelope_high, settings.envelope_margin, limit_nm
-            )
+            fill_trust(&self.law.trust, used.envelope_low, used.envelope_high, settings.envelope_margin, limit_nm)
         self.reset()
 
     def reset(self):
@@ -505,12 +449,8 @@ cdef class FusedEstimator(Estimator):
         elif gather(&s.offsets, x.dt_s, physics.difference, seen.direction, v, seen.torsion_nm, noise):
             next = additive_loss(&law.loss, raw + STEP, v, s.thermal, seen.direction)
             update_difference(
-                &law.offsets,
-                &s.offsets,
-                &law.agreement,
-                &s.agreement,
-                local_stiffness(&law.observer, s.observer.d),
-                (next.nm - loss) / STEP,
+                &law.offsets, &s.offsets, &law.agreement, &s.agreement, local_stiffness(&law.observer, s.observer.d),
+                (next.nm - loss) / STEP
             )
 
     cdef bint inconsistent(self, const Fused *physics, double dt) noexcept nogil:
@@ -560,9 +500,7 @@ cdef class FusedEstimator(Estimator):
         difference = 0.0 if out.status == STANDSTILL else self.features[2]
         if law.network.used:
             if network_wanted:
-                correction = (
-                    evaluate(&law.network.perceptron, self.features) if law.network.native else self.ask()
-                )
+                correction = (evaluate(&law.network.perceptron, self.features) if law.network.native else self.ask())
                 out.network_nm = out.physics_nm + correction
                 size = fabs(correction)
                 if size <= law.network_limit:  # not so for NaN
@@ -616,13 +554,8 @@ cdef class FusedEstimator(Estimator):
         if law.stand_sigmas == 0.0:
             return fmin(friction, STANDSTILL_WIDTH * sigma)
         rest = at_rest(
-            &law.fusion,
-            physics.alpha,
-            seen.raw_nm,
-            self.state.half,
-            seen.joint_velocity_rad_s,
-            seen.torsion_nm,
-            seen.open_nm,
+            &law.fusion, physics.alpha, seen.raw_nm, self.state.half, seen.joint_velocity_rad_s, seen.torsion_nm,
+            seen.open_nm
         )
         width = law.stand_sigmas * rest.spread + rest.bound
         if more > 0.0:
@@ -687,15 +620,8 @@ cdef class FusedEstimator(Estimator):
 
 
 def observe_run(
-    joint,
-    settings,
-    torsion,
-    dt_s,
-    current_a,
-    motor_position_rad,
-    motor_velocity_rad_s,
-    link_position_rad,
-    temperature_c=None,
+    joint, settings, torsion, dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad,
+    temperature_c=None
 ):
     """Return the outputs of the fused observer and its guard over a run, an `ObservedRun`; arrays [n], dt_s[k] since sample k-1.
 
@@ -728,9 +654,7 @@ def observe_run(
             s[k] = guard.status
     raw, v, torsion_nm, direction, open_nm, ahead_nm = rows
     ripple, turn = np.ascontiguousarray(waves[:, :4]), np.ascontiguousarray(waves[:, 4:])
-    return ObservedRun(
-        status, raw, v, torsion_nm, ripple, inputs[5], direction, inputs[0], open_nm, ahead_nm, turn
-    )
+    return ObservedRun(status, raw, v, torsion_nm, ripple, inputs[5], direction, inputs[0], open_nm, ahead_nm, turn)
 
 
 # Joints with effects --------------------------------------------------------------------------------------------------
@@ -769,13 +693,8 @@ cdef class ExtendedEstimator(Estimator):
         cdef int n
         with gil:
             corrected.current_a, corrected.link_position_rad = self.corrections.step(
-                x.dt_s,
-                x.current_a,
-                x.motor_position_rad,
-                x.motor_velocity_rad_s,
-                x.link_position_rad,
-                x.temperature_c,
-                self.torque_nm,
+                x.dt_s, x.current_a, x.motor_position_rad, x.motor_velocity_rad_s, x.link_position_rad, x.temperature_c,
+                self.torque_nm
             )
         self.inner.advance(&corrected, network_wanted, out)
         self.observed = self.inner.observed
@@ -796,13 +715,8 @@ cdef class PythonEstimator(Estimator):
     cdef void advance(self, const Sample *sample, bint network_wanted, Values *out) noexcept nogil:
         with gil:
             e = self.inner.step(
-                sample.dt_s,
-                sample.current_a,
-                sample.motor_position_rad,
-                sample.motor_velocity_rad_s,
-                sample.link_position_rad,
-                sample.temperature_c,
-                bool(network_wanted),
+                sample.dt_s, sample.current_a, sample.motor_position_rad, sample.motor_velocity_rad_s,
+                sample.link_position_rad, sample.temperature_c, bool(network_wanted)
             )
             out.torque_nm, out.sigma_nm, out.status = e.torque_nm, e.sigma_nm, e.status
             out.tob_nm, out.physics_nm, out.network_nm = e.tob_nm, e.physics_nm, e.network_nm
@@ -829,9 +743,7 @@ def estimate_columns(joint, settings, network, time_s, columns):
     """
     current, motor, velocity, link = _inputs(joint, columns)
     dt_s = np.diff(time_s, prepend=time_s[0])
-    return make_estimator(joint, settings, network).run(
-        dt_s, current, motor, velocity, link, columns.temperature_c
-    )
+    return make_estimator(joint, settings, network).run(dt_s, current, motor, velocity, link, columns.temperature_c)
 
 
 def _inputs(joint, columns):

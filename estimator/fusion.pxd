@@ -121,12 +121,8 @@ cdef struct AgreementState:
 cdef int fill_agreement(AgreementLaw *law, agreement, double rated_nm) except -1
 cdef void restart_agreement(AgreementState *s) noexcept nogil
 cdef void update_difference(
-    const OffsetLaw *offset_law,
-    OffsetState *offsets,
-    const AgreementLaw *law,
-    AgreementState *s,
-    double stiffness,
-    double slope,
+    const OffsetLaw *offset_law, OffsetState *offsets, const AgreementLaw *law, AgreementState *s, double stiffness,
+    double slope
 ) noexcept nogil
 cdef void pause_turn(AgreementState *s) noexcept nogil
 cdef void restart_turn(AgreementState *s) noexcept nogil

@@ -600,12 +600,8 @@ cdef void _update_agreement(
 
 
 cdef void update_difference(
-    const OffsetLaw *offset_law,
-    OffsetState *offsets,
-    const AgreementLaw *law,
-    AgreementState *s,
-    double stiffness,
-    double slope,
+    const OffsetLaw *offset_law, OffsetState *offsets, const AgreementLaw *law, AgreementState *s, double stiffness,
+    double slope
 ) noexcept nogil:
     """Take the complete block into the offsets and the agreement; stiffness, slope: as `_update_offsets`."""
     cdef double dt = offsets.block.dt
@@ -653,9 +649,7 @@ cdef void update_turn(
     if t.going and t.skipped < TAKEN_EVERY:
         return
     for k in range(TURN_WAVES):
-        rest -= wave[k] * (
-            law.own[k][0] + law.own[k][1] * loss + law.own[k][2] * velocity + law.own[k][3] * square
-        )
+        rest -= wave[k] * (law.own[k][0] + law.own[k][1] * loss + law.own[k][2] * velocity + law.own[k][3] * square)
     dt = t.dt
     t.dt, t.skipped = 0.0, 0
     if not t.going:

@@ -88,10 +88,6 @@ cdef bint observe(
     const GuardLaw *guard, GuardState *g, const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out
 ) noexcept nogil
 cdef bint observe_fused(
-    const GuardLaw *guard,
-    GuardState *g,
-    const FusedObserverLaw *law,
-    FusedObserverState *s,
-    const Sample *x,
-    FusedObserved *out,
+    const GuardLaw *guard, GuardState *g, const FusedObserverLaw *law, FusedObserverState *s, const Sample *x,
+    FusedObserved *out
 ) noexcept nogil

@@ -619,9 +619,7 @@ cdef void _mark_started(const GuardLaw *law, GuardState *g, double v) noexcept n
 cdef bint _judge(const GuardLaw *law, GuardState *g, double raw, double v, double link_velocity) noexcept nogil:
     """Set the status of an observed sample; False when it is implausible."""
     # written so that NaN fails too
-    if not (
-        -law.raw_limit <= raw <= law.raw_limit and -LINK_SPEED_LIMIT <= link_velocity <= LINK_SPEED_LIMIT
-    ):
+    if not (-law.raw_limit <= raw <= law.raw_limit and -LINK_SPEED_LIMIT <= link_velocity <= LINK_SPEED_LIMIT):
         g.running = False
         g.status = INVALID
         return False
@@ -649,12 +647,8 @@ cdef bint observe(
 
 
 cdef bint observe_fused(
-    const GuardLaw *guard,
-    GuardState *g,
-    const FusedObserverLaw *law,
-    FusedObserverState *s,
-    const Sample *x,
-    FusedObserved *out,
+    const GuardLaw *guard, GuardState *g, const FusedObserverLaw *law, FusedObserverState *s, const Sample *x,
+    FusedObserved *out
 ) noexcept nogil:
     """Take a sample as `observe`."""
     if _garbage(g, x):
