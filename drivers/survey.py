@@ -255,7 +255,7 @@ class BusSurvey:
     def _access(self, node: int) -> Iterator[SdoClient]:
         """Give the SDO client of one node, which repeats a request as the boot does; a SurveyError names the node."""
         try:
-            yield SdoClient(self._socket, node, PATIENCE * ANSWER_S)
+            yield SdoClient(self._socket, node, PATIENCE * ANSWER_S, ANSWER_S)
         except SurveyError as error:
             raise SurveyError(f"node {node}: {error}") from None
 

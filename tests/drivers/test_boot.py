@@ -279,39 +279,34 @@ def test_a_late_answer_to_another_request_is_not_taken(bench):
 
 
 @pytest.mark.parametrize(
-    ("node", "key", "value", "text"),
+    ("identity", "place", "value", "text"),
     [
         (
-            1,
-            (0x1000, 0),
+            "",
+            (1, 0x1000, 0),
             0x20194,
             "device type: expected profile 402 (0x....0192), found 0x00020194 (status C)",
         ),
-        (1, (0x1005, 0), 0x90, "COB-ID SYNC: expected 080h, found 0x00000090"),
-        (2, (0x6091, 2), 0, "gear ratio driving shaft revolutions: expected 1..2147483648, found 0"),
-        (2, (0x6075, 0), 0, "motor rated current in mA: expected 1..1000000, found 0"),
-        (3, (0x6112, 1), 0, "channel operating mode: expected 1 (normal operation), found 0"),
+        ("", (1, 0x1005, 0), 0x90, "COB-ID SYNC: expected 080h, found 0x00000090"),
+        ("", (2, 0x6091, 2), 0, "gear ratio driving shaft revolutions: expected 1..2147483648, found 0"),
+        ("", (2, 0x6075, 0), 0, "motor rated current in mA: expected 1..1000000, found 0"),
+        ("", (3, 0x6112, 1), 0, "channel operating mode: expected 1 (normal operation), found 0"),
+        ("vendor", (2, 0x1018, 1), 0x403, "vendor-ID: expected 0x00000402, found 0x00000403 (status D)"),
+        ("product", (2, 0x1018, 2), 0x403, "product code: expected 0x00000402, found 0x00000403 (status M)"),
+        (
+            "revision",
+            (2, 0x1018, 3),
+            0x403,
+            "revision number: expected 0x00000402, found 0x00000403 (status N)",
+        ),
+        ("serial", (2, 0x1018, 4), 0x403, "serial number: expected 0x00000402, found 0x00000403 (status O)"),
     ],
 )
-def test_a_wrong_value_is_named(bench, node, key, value, text):
-    bench.nodes[node - 1].store.set_number(*key, value)
-    assert str(bench.fails()) == f"node {node}: {key[0]:04X}h:{key[1]} {text}"
-
-
-@pytest.mark.parametrize(
-    ("subindex", "key", "name", "letter"),
-    [
-        (1, "vendor", "vendor-ID", "D"),
-        (2, "product", "product code", "M"),
-        (3, "revision", "revision number", "N"),
-        (4, "serial", "serial number", "O"),
-    ],
-)
-def test_wrong_identity(bench, subindex, key, name, letter):
-    bench.drive2.store.set_number(0x1018, subindex, 0x403)
-    error = bench.fails(nodes=[{"node": 2, "kind": "drive", "identity": {key: 0x402}}])
-    expected = f"1018h:{subindex} {name}: expected 0x00000402, found 0x00000403 (status {letter})"
-    assert str(error) == f"node 2: {expected}"
+def test_a_wrong_value_is_named(bench, identity, place, value, text):
+    node, index, subindex = place
+    bench.nodes[node - 1].store.set_number(index, subindex, value)
+    nodes = [{"node": 2, "kind": "drive", "identity": {identity: 0x402}}] if identity else NODES
+    assert str(bench.fails(nodes=nodes)) == f"node {node}: {index:04X}h:{subindex} {text}"
 
 
 @pytest.mark.parametrize(("present", "letter"), [(True, "H"), (False, "G")])

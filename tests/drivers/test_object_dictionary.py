@@ -181,24 +181,19 @@ def text_store(text):
     return store
 
 
-def test_expedited_upload_of_1_2_and_4_bytes(server):
-    talk(
-        server,
+TRANSCRIPTS = {
+    "expedited_upload_of_three_bytes": ("abc", "40 04 22 00 00 00 00 00 -> 47 04 22 00 61 62 63 00", {}),
+    "expedited_upload_of_1_2_and_4_bytes": (
+        None,
         """
         40 29 10 01 00 00 00 00 -> 4F 29 10 01 00 00 00 00   # U8: three bytes unused
         40 17 10 00 00 00 00 00 -> 4B 17 10 00 00 00 00 00   # U16
         40 00 10 00 00 00 00 00 -> 43 00 10 00 92 01 02 00   # U32
         """,
-    )
-
-
-def test_expedited_upload_of_three_bytes():
-    talk(SdoServer(text_store("abc")), "40 04 22 00 00 00 00 00 -> 47 04 22 00 61 62 63 00")
-
-
-def test_expedited_download_of_1_2_and_4_bytes(server, store):
-    talk(
-        server,
+        {},
+    ),
+    "expedited_download_of_1_2_and_4_bytes": (
+        None,
         """
         2F 19 10 00 F0 00 00 00 -> 60 19 10 00 00 00 00 00
         2B 17 10 00 64 00 00 00 -> 60 17 10 00 00 00 00 00
@@ -206,16 +201,10 @@ def test_expedited_download_of_1_2_and_4_bytes(server, store):
         22 75 60 00 88 13 00 00 -> 60 75 60 00 00 00 00 00   # size not indicated, 4 bytes
         22 17 10 00 65 00 FF FF -> 60 17 10 00 00 00 00 00   # size not indicated: the object's 2 count
         """,
-    )
-    assert store.number(0x1019) == 240
-    assert store.number(0x1017) == 101
-    assert store.number(0x1016, 1) == 0x002001F4
-    assert store.number(0x6075) == 5000
-
-
-def test_segmented_upload_with_toggle(server):
-    talk(
-        server,  # "emulated joint drive", 20 bytes = 7 + 7 + 6
+        {(0x1019, 0): 240, (0x1017, 0): 101, (0x1016, 1): 0x002001F4, (0x6075, 0): 5000},
+    ),
+    "segmented_upload_with_toggle": (
+        None,
         """
         40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
         60 00 00 00 00 00 00 00 -> 00 65 6D 75 6C 61 74 65
@@ -223,57 +212,45 @@ def test_segmented_upload_with_toggle(server):
         60 00 00 00 00 00 00 00 -> 03 20 64 72 69 76 65 00
         70 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05   # the transfer is over
         """,
-    )
-
-
-def test_upload_of_exactly_seven_bytes_is_one_segment():
-    talk(
-        SdoServer(text_store("abcdefg")),
+        {},
+    ),
+    "upload_of_exactly_seven_bytes_is_one_segment": (
+        "abcdefg",
         """
         40 04 22 00 00 00 00 00 -> 41 04 22 00 07 00 00 00
         60 00 00 00 00 00 00 00 -> 01 61 62 63 64 65 66 67
         """,
-    )
-
-
-def test_upload_of_nothing_is_an_empty_segment():
-    talk(
-        SdoServer(text_store("")),
+        {},
+    ),
+    "upload_of_nothing_is_an_empty_segment": (
+        "",
         """
         40 04 22 00 00 00 00 00 -> 41 04 22 00 00 00 00 00
         60 00 00 00 00 00 00 00 -> 0F 00 00 00 00 00 00 00
         """,
-    )
-
-
-def test_segmented_download_of_a_number(server, store):
-    talk(
-        server,
+        {},
+    ),
+    "segmented_download_of_a_number": (
+        None,
         """
         21 75 60 00 04 00 00 00 -> 60 75 60 00 00 00 00 00   # size 4 announced
         00 10 27 00 00 00 00 00 -> 80 75 60 00 12 00 07 06   # 7 bytes are more than 4
         21 75 60 00 04 00 00 00 -> 60 75 60 00 00 00 00 00
         07 10 27 00 00 00 00 00 -> 20 00 00 00 00 00 00 00   # n=3 unused, c=1
         """,
-    )
-    assert store.number(0x6075) == 10000
-
-
-def test_segmented_download_in_two_segments_without_size(server, store):
-    talk(
-        server,
+        {(0x6075, 0): 10000},
+    ),
+    "segmented_download_in_two_segments_without_size": (
+        None,
         """
         20 75 60 00 00 00 00 00 -> 60 75 60 00 00 00 00 00
         0A 39 30 00 00 00 00 00 -> 20 00 00 00 00 00 00 00   # two bytes, more follows
         1B 00 00 00 00 00 00 00 -> 30 00 00 00 00 00 00 00   # two bytes, toggle 1, last
         """,
-    )
-    assert store.number(0x6075) == 12345
-
-
-def test_size_mismatches(server, store):
-    talk(
-        server,
+        {(0x6075, 0): 12345},
+    ),
+    "size_mismatches": (
+        None,
         """
         2F 75 60 00 01 00 00 00 -> 80 75 60 00 13 00 07 06   # 1 byte into a U32
         23 17 10 00 01 00 00 00 -> 80 17 10 00 12 00 07 06   # 4 bytes into a U16
@@ -284,8 +261,68 @@ def test_size_mismatches(server, store):
         20 75 60 00 00 00 00 00 -> 60 75 60 00 00 00 00 00
         0B 01 00 00 00 00 00 00 -> 80 75 60 00 13 00 07 06   # not announced, found by the object
         """,
-    )
-    assert store.number(0x6075) == 5000
+        {(0x6075, 0): 5000},
+    ),
+    "toggle_errors_end_the_transfer": (
+        None,
+        """
+        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
+        70 00 00 00 00 00 00 00 -> 80 08 10 00 00 00 03 05
+        60 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05   # nothing runs any more
+        20 75 60 00 00 00 00 00 -> 60 75 60 00 00 00 00 00
+        0A 39 30 00 00 00 00 00 -> 20 00 00 00 00 00 00 00
+        0B 00 00 00 00 00 00 00 -> 80 75 60 00 00 00 03 05   # toggle repeated
+        """,
+        {(0x6075, 0): 5000},
+    ),
+    "unknown_commands": (
+        None,
+        """
+        A0 08 10 00 00 00 00 00 -> 80 08 10 00 01 00 04 05   # block upload
+        C2 75 60 00 00 00 00 00 -> 80 75 60 00 01 00 04 05   # block download
+        E0 00 10 00 00 00 00 00 -> 80 00 10 00 01 00 04 05   # reserved
+        60 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05   # segment of no transfer
+        00 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05
+        """,
+        {},
+    ),
+    "segment_of_the_other_direction": (
+        None,
+        """
+        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
+        01 00 00 00 00 00 00 00 -> 80 08 10 00 01 00 04 05
+        """,
+        {},
+    ),
+    "abort_by_the_client_ends_silently": (
+        None,
+        """
+        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
+        80 08 10 00 00 00 04 05 -> nothing
+        60 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05
+        """,
+        {},
+    ),
+    "a_new_initiate_replaces_the_running_transfer": (
+        None,
+        """
+        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
+        60 00 00 00 00 00 00 00 -> 00 65 6D 75 6C 61 74 65
+        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
+        60 00 00 00 00 00 00 00 -> 00 65 6D 75 6C 61 74 65
+        """,
+        {},
+    ),
+}
+"""Name -> (text of 2204h, None: a drive; requests and replies; numbers afterwards)."""
+
+
+@pytest.mark.parametrize("name", TRANSCRIPTS)
+def test_transcripts(name):
+    text, transcript, numbers = TRANSCRIPTS[name]
+    store = drive_store(1) if text is None else text_store(text)
+    talk(SdoServer(store), transcript)
+    assert {key: store.number(*key) for key in numbers} == numbers
 
 
 def test_a_string_shorter_than_announced_is_refused():
@@ -302,21 +339,6 @@ def test_a_string_shorter_than_announced_is_refused():
         """,
     )
     assert store.read(0x2204, 0) == b"abcdefgh"
-
-
-def test_toggle_errors_end_the_transfer(server, store):
-    talk(
-        server,
-        """
-        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
-        70 00 00 00 00 00 00 00 -> 80 08 10 00 00 00 03 05
-        60 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05   # nothing runs any more
-        20 75 60 00 00 00 00 00 -> 60 75 60 00 00 00 00 00
-        0A 39 30 00 00 00 00 00 -> 20 00 00 00 00 00 00 00
-        0B 00 00 00 00 00 00 00 -> 80 75 60 00 00 00 03 05   # toggle repeated
-        """,
-    )
-    assert store.number(0x6075) == 5000
 
 
 def test_rights_and_absence(server):
@@ -340,52 +362,6 @@ def test_an_abort_of_the_hook_reaches_the_client(server, store):
 
     store.on_write(0x1017, 0, refuse)
     talk(server, "2B 17 10 00 64 00 00 00 -> 80 17 10 00 22 00 00 08")
-
-
-def test_unknown_commands(server):
-    talk(
-        server,
-        """
-        A0 08 10 00 00 00 00 00 -> 80 08 10 00 01 00 04 05   # block upload
-        C2 75 60 00 00 00 00 00 -> 80 75 60 00 01 00 04 05   # block download
-        E0 00 10 00 00 00 00 00 -> 80 00 10 00 01 00 04 05   # reserved
-        60 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05   # segment of no transfer
-        00 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05
-        """,
-    )
-
-
-def test_segment_of_the_other_direction(server):
-    talk(
-        server,
-        """
-        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
-        01 00 00 00 00 00 00 00 -> 80 08 10 00 01 00 04 05
-        """,
-    )
-
-
-def test_abort_by_the_client_ends_silently(server):
-    talk(
-        server,
-        """
-        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
-        80 08 10 00 00 00 04 05 -> nothing
-        60 00 00 00 00 00 00 00 -> 80 00 00 00 01 00 04 05
-        """,
-    )
-
-
-def test_a_new_initiate_replaces_the_running_transfer(server):
-    talk(
-        server,
-        """
-        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
-        60 00 00 00 00 00 00 00 -> 00 65 6D 75 6C 61 74 65
-        40 08 10 00 00 00 00 00 -> 41 08 10 00 14 00 00 00
-        60 00 00 00 00 00 00 00 -> 00 65 6D 75 6C 61 74 65
-        """,
-    )
 
 
 @pytest.mark.parametrize("length", [0, 1, 7, 9])

@@ -51,38 +51,33 @@ def test_every_length_round_trips_at_its_ends(bits, letter):
             layout.pack(high + 1)
 
 
-@pytest.mark.parametrize("bits", [0, 1, 7, 12, 24, 40, 128])
-def test_partial_objects_are_refused(bits):
-    with pytest.raises(PdoError, match=rf"6064h:0: {bits} bits mapped"):
-        MappedObject(0x6064, 0, bits, True)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        *(((0x6064, 0, bits, True), rf"6064h:0: {bits} bits mapped") for bits in (0, 1, 7, 12, 24, 40, 128)),
+        *(((index, 0, 8, False), "no such object") for index in (0x0005, 0x0FFF, 0x10000)),
+    ],
+)
+def test_objects_that_cannot_be_mapped(arguments, message):
+    with pytest.raises(PdoError, match=message):
+        MappedObject(*arguments)
 
 
-@pytest.mark.parametrize("index", [0x0005, 0x0FFF, 0x10000])
-def test_dummy_entries_and_nonsense_are_refused(index):
-    with pytest.raises(PdoError, match="no such object"):
-        MappedObject(index, 0, 8, False)
+SERVICES = 0x000, 0x080, 0x180, 0x580, 0x600, 0x701, 0x801, 0x20000181
 
 
-def test_more_than_a_frame_is_refused():
-    with pytest.raises(PdoError, match="PDO 181h: 9 bytes mapped, a frame holds 8"):
-        PdoMap(0x181, (POSITION, VELOCITY, STATUS))
-
-
-def test_empty_is_refused():
-    with pytest.raises(PdoError, match="maps no object"):
-        PdoMap(0x181, ())
-
-
-@pytest.mark.parametrize("cob_id", [0x000, 0x080, 0x180, 0x580, 0x600, 0x701, 0x801, 0x20000181])
-def test_identifiers_of_other_services_are_refused(cob_id):
-    with pytest.raises(PdoError, match=re.escape(f"COB-ID {cob_id:X}h")):
-        PdoMap(cob_id, (POSITION,))
-
-
-@pytest.mark.parametrize("kind", [-1, 241, 251, 256])
-def test_reserved_transmission_types_are_refused(kind):
-    with pytest.raises(PdoError, match="reserved"):
-        PdoMap(0x181, (POSITION,), kind)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0x181, (POSITION, VELOCITY, STATUS)), "PDO 181h: 9 bytes mapped, a frame holds 8"),
+        ((0x181, ()), "maps no object"),
+        *(((cob_id, (POSITION,)), f"COB-ID {cob_id:X}h") for cob_id in SERVICES),
+        *(((0x181, (POSITION,), kind), "reserved") for kind in (-1, 241, 251, 256)),
+    ],
+)
+def test_maps_that_cannot_be(arguments, message):
+    with pytest.raises(PdoError, match=re.escape(message)):
+        PdoMap(*arguments)
 
 
 def test_names_take_no_part_in_equality():

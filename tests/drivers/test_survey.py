@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 
+from jtqd.drivers import survey as survey_module
 from jtqd.drivers.frame import pack
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.drivers.hub import Hub
@@ -139,7 +140,7 @@ def bus(tmp_path):
     hub, stop, syncs = Hub(str(tmp_path / "bus")), threading.Event(), threading.Event()
     servers = {node: SdoServer(ObjectStore(DRIVE_EDS, node)) for node in (5, 8, 127)}
     late = []
-    """Answers of node 8: 0.65 s after the request, so that each request is sent twice."""
+    """Answers of node 8: 0.22 s after the request, so that each request is sent twice."""
 
     def serve_hub():
         while not stop.is_set():
@@ -156,7 +157,7 @@ def bus(tmp_path):
                 if server is not None:
                     answer = server.handle(data)
                     if answer is not None and can_id == REQUEST_ID + 8:
-                        late.append((time.monotonic() + 0.65, pack(RESPONSE_ID + 8, answer)))
+                        late.append((time.monotonic() + 0.22, pack(RESPONSE_ID + 8, answer)))
                     elif answer is not None:
                         socket.send(pack(RESPONSE_ID + can_id - REQUEST_ID, answer))
             while late and late[0][0] <= time.monotonic():
@@ -175,8 +176,10 @@ def bus(tmp_path):
     hub.close()
 
 
-def test_nodes_are_found_on_a_bus_and_read(bus):
+def test_nodes_are_found_on_a_bus_and_read(bus, monkeypatch):
     path, _ = bus
+    monkeypatch.setattr(survey_module, "ANSWER_S", 0.2)
+    monkeypatch.setattr(survey_module, "_PRESENT_S", 0.35)
     reader = BusSurvey(path)
     try:
         assert reader.nodes() == [5, 8, 127]
@@ -185,9 +188,8 @@ def test_nodes_are_found_on_a_bus_and_read(bus):
         assert found is not None
         assert found.profile == DRIVE
         assert reader.read(6) is None
-        assert reader.numbers(8, [(0x6091, 1), (0x6041, 7)]) == {(0x6091, 1): 100}, (
-            "slow, and one is not there"
-        )
+        slow = reader.numbers(8, [(0x6091, 1), (0x6041, 7)])
+        assert slow == {(0x6091, 1): 100}, "one is not there"
     finally:
         reader.close()
 

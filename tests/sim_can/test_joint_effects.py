@@ -3,6 +3,7 @@ estimator/effects/effect.py leave over; and files with it load."""
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from jtqd.estimator.effects import EFFECTS, checked_parameters
 from jtqd.estimator.effects.effect import ArrayFunctions, State
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can import bench
 from jtqd.sim_can.command import main
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import (
@@ -91,7 +93,7 @@ def targets(t):
     return velocity, 3.0 * np.sin(2 * np.pi * t / 0.71 + 0.4) + 0.6
 
 
-def record(parameters, joint, seconds=1.0):
+def record(parameters, joint, seconds=0.6):
     """Step [s], and true state and readings of one joint at each step, with the plant's friction of its file."""
     source = PlantSource(parameters)
     plant = source.plant
@@ -206,8 +208,8 @@ def delayed(truth, reading, rate, h):
 @pytest.mark.parametrize("number", [1, 2])
 @pytest.mark.parametrize("channel", [0, 1, 2])
 def test_what_is_late_reads_the_past_and_nothing_else_is_touched(channel, number):
-    bench = bench_with("channel_delay", {"delay_s": 0.002, "channel": channel}, number)
-    h, rows = record(bench, number, 0.5)
+    late = bench_with("channel_delay", {"delay_s": 0.002, "channel": channel}, number)
+    h, rows = record(late, number, 0.5)
     _, _, link, link_speed, _, _, torque, current, _, link_read, current_read, torque_read, _ = rows
     signals = [(torque, torque_read), (current, current_read), (link, link_read)]
     rates = [np.gradient(torque, h), np.gradient(current, h), link_speed]
@@ -231,7 +233,8 @@ def test_a_joint_file_with_it_is_a_plant(tmp_path, name, parameters, shows):
     assert source.plant.motor_velocity[0] > 0.3 * G
 
 
-def test_jtq_sim_takes_a_file_with_every_effect(tmp_path, capsys):
+def test_jtq_sim_takes_a_file_with_every_effect(tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(bench, "measure", partial(bench.measure, cycles=50))
     every = {name: parameters for name, parameters, _ in CASES}
     path = tmp_path / "extended.joint.yaml"
     effects = [{"name": name, "parameters": parameters} for name, parameters in every.items()]
