@@ -134,17 +134,16 @@ def _usage(options: argparse.Namespace) -> str:
 
 
 def _run(options: argparse.Namespace) -> int:
-    from jtqd.models.files import shipped
-    from jtqd.sim_can.plant_source import load_any_plant, sources_of
-
     if options.cost:
-        return _print_cost(options, load_any_plant(options.plant or shipped(PLANT)))
+        return _print_cost(options, _plant(options))
     child = EdsChild(options.drives)  # it reads while this process loads numpy and makes the plant
     try:
         if options.play is not None:
             sources, profile = [_played(options)], "rest"
         else:
-            parameters = load_any_plant(options.plant or shipped(PLANT))
+            from jtqd.sim_can.plant_source import sources_of
+
+            parameters = _plant(options)
             sources = sources_of(parameters, options.seed, options.drives)
             profile = options.profile or parameters.profile
     except BaseException:
@@ -155,6 +154,13 @@ def _run(options: argparse.Namespace) -> int:
 
     bench = Bench(sources[0], profile, sources[1:], with_sensor=not options.no_sensor)
     return run(options.bus, bench, options.bitrate, options.duration)
+
+
+def _plant(options: argparse.Namespace) -> AnyPlant:
+    from jtqd.models.files import shipped
+    from jtqd.sim_can.plant_source import load_any_plant
+
+    return load_any_plant(options.plant or shipped(PLANT))
 
 
 def _played(options: argparse.Namespace) -> Source:
