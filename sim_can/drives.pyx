@@ -64,14 +64,14 @@ cdef class ChannelSignal:
 cdef class DriveControl:
     """Loops of a drive; `plan` once per control cycle (1 ms), `step` once per integration step.
 
-    Current loop (closed): di/dt = 2π B (i_ref - i), discretised exactly, |i_ref| limited. With the power
-    stage off the current decays with the same time constant. Velocity loop (mode 9, motor side): i_ref = kp e
-    + ∫ kp/Ti e + (Jff α_ref + friction feedforward) / Kt, e = ω_ref - ω. ω_ref goes to a new target in a
-    straight line (linear interpolation of CSV) within `interpolation_s` (60C2h), at least within one control
-    cycle, at most with the acceleration limit: a master that sends a target every 2 ms sets it, and the
-    feedforward sees the slope of its trajectory instead of a staircase.
-    The integrator stands while the current is limited in the direction of the error. The drive's own velocity
-    is taken as exact: its encoder interpolation is far finer than what it reports.
+    Current loop (closed): di/dt = 2π B (i_ref - i), discretised exactly, |i_ref| limited; with the power stage off the current
+    decays with the same time constant. Velocity loop (mode 9, motor side), e = ω_ref - ω:
+
+        i_ref = kp e + ∫ kp/Ti e + (Jff α_ref + friction feedforward) / Kt
+
+    ω_ref goes to a new target in a straight line (linear interpolation of CSV) within `interpolation_s` (60C2h), at least one
+    control cycle, at most with the acceleration limit. The integrator stands while the current is limited in the direction of
+    the error. The drive's own velocity is exact: its encoder interpolation is far finer than what it reports.
     """
 
     def __init__(self, side):

@@ -7,7 +7,6 @@ current and without a node on the bus.
 from __future__ import annotations
 
 import random
-from collections.abc import Sequence
 from pathlib import Path
 
 from jtqd.models.files import load_joint, load_yaml
@@ -15,7 +14,7 @@ from jtqd.sim_can.drives import Instruments, Noise, TwoJoints
 from jtqd.sim_can.effect_plant import EffectPlant, Readings
 from jtqd.sim_can.plant import Plant
 from jtqd.sim_can.plant_file import JointPlant, PlantParameters, load_plant
-from jtqd.sim_can.source import OFF, ChannelSignal, Day, DriveRatings, DriveSignals, Source
+from jtqd.sim_can.source import OFF, Day, DriveRatings, Source
 from jtqd.sim_can.towing import bench_file
 from jtqd.sim_can.towing.bench_file import TowedJoint, TowingBench
 from jtqd.sim_can.towing.plant import TowingPlant
@@ -49,7 +48,7 @@ def ratings_of(side: JointPlant | TowedJoint) -> DriveRatings:
     )
 
 
-class PlantSource:
+class PlantSource(Source):
     """`Source` of the emulated bench; the same seed and the same calls give the same signals bit by bit.
 
     Where the plant file has `run_to_run`, the source starts in day 0 of its seed, and each time a drive is enabled after
@@ -63,7 +62,7 @@ class PlantSource:
     def __init__(
         self, parameters: AnyPlant, seed: int = 0, noise_seed: str | None = None, nodes: int = 2
     ) -> None:
-        self.ratings: Sequence[DriveRatings] = [ratings_of(side) for side in parameters.joints[:nodes]]
+        self.ratings = [ratings_of(side) for side in parameters.joints[:nodes]]
         noise = Noise(random.Random(seed if noise_seed is None else noise_seed).random)
         self.plant: TwoJoints
         self._readings: Readings | None = None
@@ -75,8 +74,8 @@ class PlantSource:
         else:
             self.plant = Plant(parameters)
         self._instruments = Instruments(parameters, noise)
-        self.drives: Sequence[DriveSignals] = self._instruments.drives[:nodes]
-        self.channels: Sequence[ChannelSignal] = (self._instruments.channel,)
+        self.drives = self._instruments.drives[:nodes]
+        self.channels = (self._instruments.channel,)
         self._widths = parameters.run_to_run
         self._seed = seed
         self._modes = [OFF, OFF]

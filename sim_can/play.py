@@ -23,7 +23,7 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.models.files import load_joint, shipped
-from jtqd.sim_can.source import ChannelSignal, DriveRatings, DriveSignals
+from jtqd.sim_can.source import ChannelSignal, DriveRatings, DriveSignals, Source
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run
 from jtqd.sysid.runs.run_file import RunError, RunFile
@@ -31,7 +31,7 @@ from jtqd.sysid.runs.run_file import RunError, RunFile
 COLUMN_MAP_NAME = "columns.yaml"
 
 
-class PlaySource:
+class PlaySource(Source):
     """`Source` of two recorded joints, each with a torque sensor channel of its own.
 
     Attributes:
@@ -45,15 +45,15 @@ class PlaySource:
         time_s = run.table.time_s
         unplayed = tuple(f"j{number}." for number in run.table.joints if number not in joints)
         self.notes = tuple(note for note in run.notes if not note.startswith(unplayed))
-        self.ratings: Sequence[DriveRatings] = ratings
+        self.ratings = ratings
         self._rows = _rows(run, joints, ratings)
         # Row k is the nearest one from _change[k-1] on; the last entry is the end of the run.
         middles = 0.5 * (time_s[1:] + time_s[:-1]) - time_s[0]
         half_last_step = 0.5 * float(time_s[-1] - time_s[-2])
         self._change = [*middles.tolist(), float(time_s[-1] - time_s[0]) + half_last_step]
         self._time_s = 0.0
-        self.drives: Sequence[DriveSignals] = (DriveSignals(), DriveSignals())
-        self.channels: Sequence[ChannelSignal] = (ChannelSignal(), ChannelSignal())
+        self.drives = (DriveSignals(), DriveSignals())
+        self.channels = (ChannelSignal(), ChannelSignal())
         for drive, channel, joint in zip(self.drives, self.channels, joints, strict=True):
             drive.enabled = True
             channel.valid = run.table.joints[joint].torque_nm is not None
@@ -72,15 +72,6 @@ class PlaySource:
         if row != self.row:
             self._show(row)
         return True
-
-    def command(self, drive: int, mode: int, target: float) -> None:
-        """Ignored: what was measured cannot be commanded."""
-
-    def resume(self) -> None:
-        """Ignored, as `command`."""
-
-    def interpolate(self, drive: int, period_s: float) -> None:
-        """Ignored, as `command`."""
 
     def _show(self, row: int) -> None:
         """Set the signals to a row of the run."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Final, NamedTuple, Protocol
+from typing import Annotated, Final, NamedTuple
 
 from jtqd.estimator.decoder import FieldError, limits
 from jtqd.estimator.errors import range_text
@@ -115,38 +115,33 @@ class DriveRatings:
     link_counts_per_rev: int = 524288  # 60E6h/60EBh
 
 
-class Source(Protocol):
-    """Measurements of one or two drives and one or two torque channels. Pure: time comes in as dt_s, nothing here
-    reads a clock.
+class Source:
+    """Measurements of one or two drives and one or two torque channels. Pure: time comes in as dt_s.
+
+    A recorded run ignores `command`, `resume` and `interpolate`, which do nothing here.
+
+    Attributes:
+        ratings: one or two entries, fixed for the life of the source.
+        drives: one entry for each rating; the same objects every time, updated by `advance`.
+        channels: one or two entries; the same objects every time, updated by `advance`.
     """
 
-    @property
-    def ratings(self) -> Sequence[DriveRatings]:
-        """One or two entries, fixed for the life of the source."""
-
-    @property
-    def drives(self) -> Sequence[DriveSignals]:
-        """One entry for each rating; the same objects every time, updated by `advance`."""
-
-    @property
-    def channels(self) -> Sequence[ChannelSignal]:
-        """One or two entries; the same objects every time, updated by `advance`."""
+    ratings: Sequence[DriveRatings]
+    drives: Sequence[DriveSignals]
+    channels: Sequence[ChannelSignal]
 
     def advance(self, dt_s: float) -> bool:
         """Advance by dt_s >= 0 and sample. False: the run is over (signals keep their last value); the bench then ends."""
+        raise NotImplementedError
 
     def command(self, drive: int, mode: int, target: float) -> None:
-        """Command drive 0 or 1: OFF, VELOCITY (rad/s, motor side) or CURRENT (A). A recorded run ignores it."""
+        """Command drive 0 or 1: OFF, VELOCITY (rad/s, motor side) or CURRENT (A)."""
 
     def resume(self) -> None:
-        """Continue the run: a drive that was switched off, but not set up again, is about to be enabled again.
-
-        A recorded run ignores it.
-        """
+        """Continue the run: a drive that was switched off, but not set up again, is about to be enabled again."""
 
     def interpolate(self, drive: int, period_s: float) -> None:
-        """Set the time between two targets of drive 0 or 1 [s] (60C2h).
+        """Set the time between two targets of drive 0 or 1 [s] (60C2h); without, it is one control cycle.
 
-        VELOCITY targets are approached in a straight line of that length. Not called: one control cycle. A recorded run
-        ignores it.
+        VELOCITY targets are approached in a straight line of that length.
         """
