@@ -30,6 +30,7 @@ from jtqd.daemon.recording.diagnostics import LoopReader
 from jtqd.daemon.recording.messages import (
     SCANNED,
     CycleMessages,
+    EventKind,
     EventLog,
     JointStateMessage,
     diagnostics,
@@ -307,7 +308,7 @@ class Source:
         made = stream.take(self._loop.ring.read().records)
         for notice in () if self._notices is None else self._notices.read()[0]:
             what, level, at_ns = notice.text, notice.level, notice.realtime_ns
-            stream.events.note(messages.NOTICE, what, level=level, time_ns=at_ns, count=notice.node)
+            stream.events.note(EventKind.NOTICE, what, level=level, time_ns=at_ns, count=notice.node)
         found = self._loop.diagnosis(time.monotonic_ns(), now_ns)
         if found is not None:
             view, statuses = found

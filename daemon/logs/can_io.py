@@ -30,8 +30,8 @@ _SPAN_NS = 1_000_000
 _CHUNK_BYTES = 256 << 10
 _FLUSH_NS = 500_000_000
 """A crash costs this much at most, in time of the frames."""
-_HEAD = struct.Struct("<4sII8sQq16x8B")
-"""Encapsulation, stamp, frame_id, cycle, monotonic time, numbers of the loop (none here), counts."""
+_HEAD = struct.Struct("<4sII8sQ8x16xxB6x")
+"""Encapsulation, stamp, frame_id, cycle, number of frames; zeros: monotonic time and numbers of the loop."""
 _FRAME = struct.Struct("<IB3x8s")
 _FRAME_ID = struct.pack("<I4s", 4, b"can\0")
 
@@ -58,14 +58,7 @@ class McapCanReader(MessageReader):  # type: ignore[misc]
     def __iter__(self) -> Iterator[can.Message]:
         for topic in self._topics:
             for frames in iter_frames(self._path, topic):
-                rows = zip(
-                    frames.stamps_ns.tolist(),
-                    frames.ids.tolist(),
-                    frames.lengths.tolist(),
-                    frames.data,
-                    strict=True,
-                )
-                for stamp, can_id, length, data in rows:
+                for stamp, can_id, length, data in frames.rows():
                     remote = bool(can_id & REMOTE)
                     yield can.Message(
                         timestamp=stamp * 1e-9,
@@ -74,7 +67,7 @@ class McapCanReader(MessageReader):  # type: ignore[misc]
                         is_remote_frame=remote,
                         is_error_frame=bool(can_id & ERROR),
                         dlc=length,
-                        data=None if remote else data[:length].tobytes(),
+                        data=None if remote else data,
                     )
 
     def stop(self) -> None:
@@ -131,22 +124,7 @@ class McapCanWriter(SizedMessageWriter):  # type: ignore[misc]
             return
         first, count = self._stamps[0], len(self._stamps)
         seconds, nanoseconds = divmod(first, 1_000_000_000)
-        head = _HEAD.pack(
-            b"\0\1\0\0",
-            seconds & 0xFFFF_FFFF,
-            nanoseconds,
-            _FRAME_ID,
-            self._count,
-            0,
-            0,
-            count,
-            0,
-            0,
-            0,
-            0,
-            0,
-            0,
-        )
+        head = _HEAD.pack(b"\0\1\0\0", seconds & 0xFFFF_FFFF, nanoseconds, _FRAME_ID, self._count, count)
         frames = b"".join(self._frames).ljust(_FRAME.size * _CAPACITY, b"\0")
         stamps = struct.pack(f"<{_CAPACITY}q", *self._stamps, *([0] * (_CAPACITY - count)))
         self._writer.add_message(
@@ -160,9 +138,8 @@ class McapCanWriter(SizedMessageWriter):  # type: ignore[misc]
         self._stamps, self._frames = [], []
         if abs(first - self._flushed_ns) >= _FLUSH_NS:
             self._flushed_ns = first
-            flush = getattr(self._writer, "flush", None)  # mcap 1.6 and later
-            if flush is not None:
-                flush()
+            if hasattr(self._writer, "flush"):  # mcap 1.6 and later
+                self._writer.flush()
             self.file.flush()
 
     def file_size(self) -> int:

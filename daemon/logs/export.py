@@ -13,8 +13,9 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -27,6 +28,7 @@ from jtqd.daemon.logs.read import (
     EXTENDED,
     REMOTE,
     Frames,
+    Logs,
     Records,
     can_topics,
     iter_frames,
@@ -37,6 +39,7 @@ from jtqd.daemon.logs.read import (
     topics_of,
 )
 from jtqd.daemon.recording.messages import JOINTS
+from jtqd.estimator.text import counted
 
 _EXAMPLES = """examples:
   jtq export csv run.mcap --out run.csv.gz              the run table: time_s, j1.current_a, ...
@@ -59,26 +62,17 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    result.add_argument("what", choices=("csv", "parquet", "candump", "dbc"))
-    result.add_argument(
-        "logs", nargs="*", type=Path, metavar="LOG", help="parts of one run, or their directory"
-    )
-    result.add_argument(
-        "--out", type=Path, metavar="FILE", help="default: standard output (candump and dbc only)"
-    )
-    result.add_argument(
-        "--topic", metavar="TOPIC", help="csv, parquet: this topic's fields; candump: its frames"
-    )
-    result.add_argument("--start", type=_seconds, metavar="S", help="seconds from the first message on")
-    result.add_argument("--end", type=_seconds, metavar="S", help="up to this time (excluded)")
-    result.add_argument(
-        "--all-cycles", action="store_true", help="run table: keep cycles with missing values (NaN)"
-    )
-    result.add_argument("--interface", default="can0", help="name in candump's lines (default can0)")
-    result.add_argument(
-        "--config", type=Path, metavar="FILE", help="dbc: of a configuration instead of a log"
-    )
-    result.add_argument("--json", action="store_true", help="result as JSON on standard output")
+    add = result.add_argument
+    add("what", choices=("csv", "parquet", "candump", "dbc"))
+    add("logs", nargs="*", type=Path, metavar="LOG", help="parts of one run, or their directory")
+    add("--out", type=Path, metavar="FILE", help="default: standard output (candump and dbc only)")
+    add("--topic", metavar="TOPIC", help="csv, parquet: this topic's fields; candump: its frames")
+    add("--start", type=_seconds, metavar="S", help="seconds from the first message on")
+    add("--end", type=_seconds, metavar="S", help="up to this time (excluded)")
+    add("--all-cycles", action="store_true", help="run table: keep cycles with missing values (NaN)")
+    add("--interface", default="can0", help="name in candump's lines (default can0)")
+    add("--config", type=Path, metavar="FILE", help="dbc: of a configuration instead of a log")
+    add("--json", action="store_true", help="result as JSON on standard output")
     return result
 
 
@@ -116,125 +110,107 @@ def main(argv: list[str] | None = None) -> int:
         print(", ".join(f"{name} {value}" for name, value in result.items()))
     left_out = result.get("left_out", 0)
     if left_out:
-        print(
-            f"jtq export: {left_out} {_cycles(left_out)} with a missing value left out (--all-cycles keeps all)",
-            file=sys.stderr,
-        )
+        what = f"{counted(left_out, 'cycle')} with a missing value left out (--all-cycles keeps all)"
+        print(f"jtq export: {what}", file=sys.stderr)
     return 3 if left_out else 0
 
 
 def _check_usage(command: argparse.ArgumentParser, options: argparse.Namespace) -> None:
     """Exit with status 2 where the combination of options cannot be meant."""
-    of_config = options.what == "dbc" and options.config is not None
-    if of_config == bool(options.logs):
-        command.error("expected a log" + (" or --config" if options.what == "dbc" else "") + ", and not both")
-    if options.what in ("csv", "parquet") and options.out is None:
+    what, logs, out = options.what, options.logs, options.out
+    if (what == "dbc" and options.config is not None) == bool(logs):
+        command.error("expected a log" + (" or --config" if what == "dbc" else "") + ", and not both")
+    if what in ("csv", "parquet") and out is None:
         command.error("expected --out FILE")
-    if options.out is None and options.json:
+    if out is None and options.json:
         command.error("--json needs --out FILE: standard output is used for one of them")
-    if options.out is not None and any(_same(options.out, log) for log in options.logs):
-        command.error(f"--out {options.out}: that is the log")
+    if out is not None and any(_same(out, log) for log in logs):
+        command.error(f"--out {out}: that is the log")
     start = max(0.0, options.start or 0.0)
     if options.end is not None and options.end <= start:
         command.error(
             f"--end: found {options.end:g}, expected a time above {start:g} s, where --start begins"
         )
-    twice = next(
-        (one for n, one in enumerate(options.logs) for other in options.logs[:n] if _same(one, other)), None
-    )
-    if twice is not None:
-        command.error(f"found the log {twice} twice, expected every part once")
+    for n, one in enumerate(logs):
+        if any(_same(one, other) for other in logs[:n]):
+            command.error(f"found the log {one} twice, expected every part once")
 
 
-def _same(out: Path, log: Path) -> bool:
-    return out.exists() and log.exists() and out.samefile(log)
+def _same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.samefile(other)
 
 
 def _export(options: argparse.Namespace) -> dict[str, Any]:
+    logs: Logs = options.logs[0] if len(options.logs) == 1 else options.logs
+    out: Path | None = options.out
     if options.what == "dbc":
-        return _dbc(options.logs, options.config, options.out)
-    logs = options.logs[0] if len(options.logs) == 1 else options.logs
-    span = _span(logs, options.start, options.end)
+        return _dbc(logs, options.config, out)
+    span: dict[str, int] = {}
+    if (options.start, options.end) != (None, None):
+        with LogFile(log_parts(logs)[0]) as log:
+            times = {"start_ns": options.start, "end_ns": options.end}
+            span = {key: log.start_ns + round(s * 1e9) for key, s in times.items() if s is not None}
     if options.what == "candump":
         return _candump(logs, options, span)
+    assert out is not None
     write = write_csv if options.what == "csv" else write_parquet
     result: dict[str, int] = {}
     if options.topic is not None:
-        _require_topic(logs, options.topic)
-        size = write(options.out, topic_blocks(logs, options.topic, **span))
+        _one_of(logs, sorted(topics_of(logs)), options.topic, "topic")
+        size = write(out, topic_blocks(logs, options.topic, **span))
     else:
         table = RunTable(logs, all_cycles=options.all_cycles, **span)
-        size = write(options.out, table.blocks())
+        size = write(out, table.blocks())
         result = {"left_out": table.left_out}
-    return {"path": str(options.out), "rows": size.rows, "columns": size.columns} | result
+    return {"path": str(out), "rows": size.rows, "columns": size.columns} | result
 
 
-def _require_topic(logs: Path | Sequence[Path], topic: str) -> None:
+def _one_of(logs: Logs, there: Sequence[str], topic: str, what: str) -> None:
     """Raise LogError for a topic that is not in the log."""
-    topics = topics_of(logs)
-    if topic not in topics:
+    if topic not in there:
         raise LogError(
-            f"{_named(logs)}: found no topic {topic}, expected one of {', '.join(sorted(topics)) or 'none'}"
+            f"{_named(logs)}: found no {what} {topic}, expected one of {', '.join(there) or 'none'}"
         )
 
 
-def _named(path: Path | Sequence[Path]) -> str:
+def _named(path: Logs) -> str:
     return str(path) if isinstance(path, Path) else ", ".join(map(str, path))
 
 
-def _span(logs: Path | Sequence[Path], start: float | None, end: float | None) -> dict[str, int | None]:
-    """Log times of a span given in seconds from the first message on."""
-    if start is None and end is None:
-        return {}
-    with LogFile(log_parts(logs)[0]) as log:
-        first = log.start_ns
-    return {
-        "start_ns": None if start is None else first + round(start * 1e9),
-        "end_ns": None if end is None else first + round(end * 1e9),
-    }
-
-
-def _candump(
-    logs: Path | Sequence[Path], options: argparse.Namespace, span: dict[str, int | None]
-) -> dict[str, Any]:
+def _candump(logs: Logs, options: argparse.Namespace, span: dict[str, int]) -> dict[str, Any]:
     topics = can_topics(logs)
     topic = options.topic or topics[0]
-    if topic not in topics:
-        raise LogError(f"{_named(logs)}: found no frames on {topic}, expected one of {', '.join(topics)}")
+    _one_of(logs, topics, topic, "frames on")
     frames = 0
-    if options.out is None:
-        for part in iter_frames(logs, topic, **span):
-            sys.stdout.writelines(line + "\n" for line in candump_lines(part, options.interface))
-            frames += len(part.ids)
-        return {"frames": frames}
-    with whole_file(options.out) as file:
+    with nullcontext(sys.stdout.buffer) if options.out is None else whole_file(options.out) as file:
         for part in iter_frames(logs, topic, **span):
             file.write("".join(line + "\n" for line in candump_lines(part, options.interface)).encode())
             frames += len(part.ids)
-    return {"path": str(options.out), "frames": frames}
+    return ({} if options.out is None else {"path": str(options.out)}) | {"frames": frames}
 
 
-def _dbc(logs: Sequence[Path], config: Path | None, out: Path | None) -> dict[str, Any]:
-    if config is not None:
-        text = _dbc_of_configuration(config)
-    else:
-        attachments = read_attachments(list(logs) if len(logs) > 1 else logs[0])
-        if _DBC not in attachments:
-            have = ", ".join(sorted(attachments)) or "none"
-            raise LogError(
-                f"{logs[0]}: found attachments {have}, expected {_DBC} (--config makes one without a log)"
-            )
-        text = attachments[_DBC].decode("utf-8", "replace")
-        if "\nBO_ " not in text:
-            raise LogError(
-                f"{logs[0]}: found no message in its {_DBC} ({len(text)} characters), expected a DBC"
-            )
+def _dbc(logs: Logs, config: Path | None, out: Path | None) -> dict[str, Any]:
+    text = _dbc_of_log(logs) if config is None else _dbc_of_configuration(config)
     if out is None:
         print(text, end="" if text.endswith("\n") else "\n")
         return {}
     with whole_file(out) as file:
         file.write(text.encode())
     return {"path": str(out), "messages": text.count("\nBO_ ")}
+
+
+def _dbc_of_log(logs: Logs) -> str:
+    attachments = read_attachments(logs)
+    where = logs if isinstance(logs, Path) else logs[0]
+    if _DBC not in attachments:
+        have = ", ".join(sorted(attachments)) or "none"
+        raise LogError(
+            f"{where}: found attachments {have}, expected {_DBC} (--config makes one without a log)"
+        )
+    text = attachments[_DBC].decode("utf-8", "replace")
+    if "\nBO_ " not in text:
+        raise LogError(f"{where}: found no message in its {_DBC} ({len(text)} characters), expected a DBC")
+    return text
 
 
 def _dbc_of_configuration(path: Path) -> str:
@@ -249,13 +225,10 @@ def _dbc_of_configuration(path: Path) -> str:
 
 def candump_lines(frames: Frames, interface: str) -> Iterator[str]:
     """Yield frames as lines of `candump -L`, without their ends: `(1700000000.000000) can0 181#0011223344556677`."""
-    rows = zip(
-        frames.stamps_ns.tolist(), frames.ids.tolist(), frames.lengths.tolist(), frames.data, strict=True
-    )
-    for stamp, can_id, length, data in rows:
+    for stamp, can_id, length, data in frames.rows():
         seconds, rest = divmod(stamp, 1_000_000_000)
         number = f"{can_id & 0x3FFFFFFF:08X}" if can_id & (EXTENDED | ERROR) else f"{can_id & 0x7FF:03X}"
-        content = f"R{length or ''}" if can_id & REMOTE else data[:length].tobytes().hex().upper()
+        content = f"R{length or ''}" if can_id & REMOTE else data.hex().upper()
         yield f"({seconds}.{rest // 1000:06d}) {interface} {number}#{content}"
 
 
@@ -274,8 +247,6 @@ RUN_FIELDS = {
     "temperature_c": "temperature_c",
 }
 """Column of a joint in a run table -> field of its message. What a run calls torque is measured."""
-_JOINT_TOPICS = {joint: topic.name for joint, topic in enumerate(JOINTS, start=1)}
-"""Of the joints that a log may have; every log has the first."""
 _ROW = np.dtype(
     [("cycle", "<u8"), ("sync_monotonic_ns", "<i8"), *((field, "<f8") for field in RUN_FIELDS.values())]
 )
@@ -302,16 +273,19 @@ class RunTable:
 
     def __init__(
         self,
-        path: Path | Sequence[Path],
+        path: Logs,
         *,
         start_ns: int | None = None,
         end_ns: int | None = None,
         all_cycles: bool = False,
     ) -> None:
         self.cycles = self.left_out = 0
-        self._path, self._start_ns, self._end_ns, self._all = path, start_ns, end_ns, all_cycles
+        self._path, self._all = path, all_cycles
+        self._span: dict[str, Any] = {"start_ns": start_ns, "end_ns": end_ns}
         there = topics_of(path)
-        self._topics = {n: topic for n, topic in _JOINT_TOPICS.items() if n == 1 or topic in there}
+        self._topics = {
+            n: topic.name for n, topic in enumerate(JOINTS, start=1) if n == 1 or topic.name in there
+        }
         wanted = {f"j{n}.{column}": (n, field) for n in self._topics for column, field in RUN_FIELDS.items()}
         found: set[str] = set()
         count = 0
@@ -325,10 +299,10 @@ class RunTable:
             if len(found) == len(wanted):
                 break
         if not count:
-            when = " in that time" if start_ns is not None or end_ns is not None else ""
+            when = _when(self._span)
             raise LogError(f"{_named(path)}: found no cycle of the joints{when}, expected one at least")
         if not found:
-            raise LogError(f"{_named(path)}: found no measured value in {count} {_cycles(count)}")
+            raise LogError(f"{_named(path)}: found no measured value in {counted(count, 'cycle')}")
         self._wanted = {name: where for name, where in wanted.items() if name in found}
         self.columns = tuple(self._wanted)
 
@@ -353,7 +327,7 @@ class RunTable:
         kept = self.cycles - self.left_out
         if kept < 2:
             raise LogError(
-                f"{_named(self._path)}: found {kept} {_cycles(kept)} with every column, expected at least 2 "
+                f"{_named(self._path)}: found {counted(kept, 'cycle')} with every column, expected at least 2 "
                 "(--all-cycles keeps all)"
             )
 
@@ -361,7 +335,7 @@ class RunTable:
         """Yield rows (`_ROW`) of all joints, of the same cycles."""
         rest = {number: np.empty(0, _ROW) for number in self._topics}
         topics = tuple(self._topics.values())
-        for found in iter_topics(self._path, topics, start_ns=self._start_ns, end_ns=self._end_ns):
+        for found in iter_topics(self._path, topics, **self._span):
             for number, topic in self._topics.items():
                 if topic in found:
                     rest[number] = np.concatenate([rest[number], _picked(found[topic].records, topic)])
@@ -380,8 +354,8 @@ class RunTable:
             )
 
 
-def _cycles(number: int) -> str:
-    return "cycle" if number == 1 else "cycles"
+def _when(span: Mapping[str, int | None]) -> str:
+    return " in that time" if any(bound is not None for bound in span.values()) else ""
 
 
 def _picked(records: Records, topic: str) -> Records:
@@ -394,7 +368,7 @@ def _picked(records: Records, topic: str) -> Records:
 
 
 def topic_blocks(
-    path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
+    path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Columns]:
     """Yield all fields of a topic as columns, chunk by chunk: `log_time_ns`, then every field by its path.
 
@@ -408,48 +382,40 @@ def topic_blocks(
         found = True
         yield columns
     if not found:
-        when = " in that time" if start_ns is not None or end_ns is not None else ""
+        when = _when({"start_ns": start_ns, "end_ns": end_ns})
         raise LogError(f"{_named(path)}: found no message on {topic}{when}, expected one at least")
 
 
 def _flatten(prefix: str, values: NDArray[Any], columns: Columns) -> None:
+    """Put the fields below `prefix` into columns; of the decoder's objects the attributes, a sequence as text."""
     kind = values.dtype
+    below = f"{prefix}." if prefix else ""
     if kind.names is not None:
         for name in kind.names:
-            _flatten(_below(prefix, name), values[name], columns)
+            _flatten(below + name, values[name], columns)
     elif values.ndim > 1:
         for n in range(values.shape[1]):
             _flatten(f"{prefix}[{n}]", values[:, n], columns)
     elif kind.kind == "S":
         columns[prefix] = np.array([each.decode("utf-8", "replace") for each in values.tolist()], object)
-    elif kind.kind == "O":
-        _flatten_objects(prefix, values.tolist(), columns)
-    else:
+    elif kind.kind != "O":
         columns[prefix] = values
-
-
-def _flatten_objects(prefix: str, values: list[Any], columns: Columns) -> None:
-    """Take the attributes of the decoder's objects; a sequence becomes text."""
-    names = getattr(values[0], "__slots__", None)
-    if names is not None:
-        for name in names:
-            _flatten_objects(_below(prefix, name), [getattr(each, name) for each in values], columns)
+    elif hasattr(values[0], "__slots__"):
+        for name in values[0].__slots__:
+            inner = np.empty(len(values), object)
+            inner[:] = [getattr(each, name) for each in values]
+            _flatten(below + name, inner, columns)
     elif isinstance(values[0], int | float):
-        columns[prefix] = np.array(values)
+        columns[prefix] = np.array(values.tolist())
     else:
         columns[prefix] = np.array([_as_text(each) for each in values], object)
-
-
-def _below(prefix: str, name: str) -> str:
-    return f"{prefix}.{name}" if prefix else name
 
 
 def _as_text(value: Any) -> str:
     if isinstance(value, str):
         return value
-    names = getattr(value, "__slots__", None)
-    if names is not None:
-        return " ".join(f"{name}={_as_text(getattr(value, name))}" for name in names)
+    if hasattr(value, "__slots__"):
+        return " ".join(f"{name}={_as_text(getattr(value, name))}" for name in value.__slots__)
     if isinstance(value, Iterable):
         return " ".join(map(_as_text, value))
     return repr(value) if isinstance(value, float) else str(value)
@@ -550,17 +516,11 @@ def write_parquet(path: Path, blocks: Iterable[Columns]) -> TableSize:
 def _gathered(blocks: Iterable[Columns]) -> Iterator[Columns]:
     """Yield blocks of at least `_GROUP_ROWS`, but for the last: Parquet packs each on its own."""
     kept: list[Columns] = []
-    for block in blocks:
-        kept.append(block)
-        if sum(map(_length, kept)) >= _GROUP_ROWS:
-            yield _joined(kept)
+    for block in chain(blocks, [None]):
+        kept += [] if block is None else [block]
+        if kept and (block is None or sum(map(_length, kept)) >= _GROUP_ROWS):
+            yield {name: np.concatenate([each[name] for each in kept]) for name in kept[0]}
             kept = []
-    if kept:
-        yield _joined(kept)
-
-
-def _joined(blocks: list[Columns]) -> Columns:
-    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
 def _length(block: Columns) -> int:

@@ -13,7 +13,6 @@ import zlib
 from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple
@@ -40,7 +39,7 @@ from mcap.records import (
 from mcap.summary import Summary
 from numpy.typing import NDArray
 
-from jtqd.daemon.recording.mcap_file import MAGIC, SealedChunk, attachment_index, bytes_of, index_record
+from jtqd.daemon.recording.mcap_file import MAGIC, SealedChunk, attachment_index, bytes_of, seal
 from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS
 from jtqd.daemon.recording.run_files import ACTIVE
 
@@ -60,6 +59,7 @@ MESSAGE_BODY = MESSAGE_HEAD.itemsize - HEAD.size
 """Bytes of a Message record between opcode and length and the payload."""
 _MESSAGE_INDEX_ENTRY = 16
 """[byte] the least that a message takes of a file."""
+_FOOTER_SIZE = HEAD.size + 20
 _U2, _U4, _U8 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 
 
@@ -72,38 +72,6 @@ class ChunkError(ValueError):
 
 
 # ---- records ----
-
-
-class _Body(ReadDataStream):  # type: ignore[misc]
-    """Body of one record for the library's parsers; a read past its end raises EndOfFile or struct.error."""
-
-    def __init__(self, data: bytes) -> None:
-        self._data, self._at = data, 0
-
-    @property
-    def count(self) -> int:
-        return self._at
-
-    def read(self, length: int) -> bytes:
-        begin, self._at = self._at, self._at + length
-        if self._at > len(self._data):
-            raise EndOfFile
-        return self._data[begin : self._at]
-
-    def _number(self, code: struct.Struct) -> int:
-        value: int = code.unpack_from(self._data, self._at)[0]
-        self._at += code.size
-        return value
-
-    def read2(self) -> int:
-        return self._number(_U2)
-
-    def read4(self) -> int:
-        return self._number(_U4)
-
-    def read8(self) -> int:
-        return self._number(_U8)
-
 
 _DATA_KINDS: dict[int, Any] = {
     Opcode.HEADER: Header,
@@ -123,11 +91,38 @@ _SUMMARY_KINDS: dict[int, Any] = {
 _KINDS = _DATA_KINDS | _SUMMARY_KINDS | {Opcode.CHUNK: Chunk, Opcode.FOOTER: Footer}
 
 
+class _Bytes(ReadDataStream):  # type: ignore[misc]
+    """The library's stream over bytes, faster: a log of an hour has 30 000 chunk indexes."""
+
+    def __init__(self, data: bytes) -> None:
+        self._data, self._count = data, 0
+
+    def read(self, length: int) -> bytes:
+        begin, self._count = self._count, self._count + length
+        if self._count > len(self._data):
+            raise EndOfFile
+        return self._data[begin : self._count]
+
+    def _number(self, code: struct.Struct) -> int:
+        value: int = code.unpack_from(self._data, self._count)[0]
+        self._count += code.size
+        return value
+
+    def read2(self) -> int:
+        return self._number(_U2)
+
+    def read4(self) -> int:
+        return self._number(_U4)
+
+    def read8(self) -> int:
+        return self._number(_U8)
+
+
 def parse(opcode: int, body: bytes) -> Any:
-    """Return a record of the library from the bytes behind its head; None where they do not make one."""
+    """Return the library's record of the bytes behind its head; None where they are not one."""
     kind = _KINDS.get(opcode)
     try:
-        return None if kind is None else kind.read(_Body(body))
+        return None if kind is None else kind.read(_Bytes(body))
     except (McapError, struct.error, ValueError):
         return None
 
@@ -153,29 +148,33 @@ class Source:
         end = offset + HEAD.size + length
         return (opcode, end) if end <= self.size else None
 
-    def record(self, offset: int, end: int) -> bytes:
-        """Bytes of a record; empty for one that is too large to be read."""
-        return self.read(offset, end - offset) if end - offset <= MAX_CHUNK else b""
-
-    def parsed(self, offset: int, opcode: int) -> Any:
-        """Return the record of this kind at `offset`, intact to its last byte; None where there is none.
-
-        The CRC of an attachment is checked.
-        """
+    def parsed(self, offset: int) -> Any:
+        """Return the record at `offset`, intact to its last byte (an attachment's CRC is one of them); else None."""
         framed = self.head(offset)
-        if framed is None or framed[0] != opcode:
+        if framed is None or framed[1] - offset > MAX_CHUNK:
             return None
-        data = self.record(offset, framed[1])
-        record = parse(opcode, data[HEAD.size :])
+        data = self.read(offset, framed[1] - offset)
+        record = parse(framed[0], data[HEAD.size :])
         return record if record is not None and bytes_of(record) == data else None
 
     def unpack(self, chunk: Chunk) -> bytes:
-        """Content of a chunk, checked against its size and CRC. Raises ChunkError."""
-        size = chunk.uncompressed_size
+        """Content of a chunk, checked against its size and CRC; never more than its size is unpacked. Raises ChunkError."""
+        size, packed = chunk.uncompressed_size, chunk.data
         if size > MAX_CHUNK:
             raise ChunkError(f"found {size} bytes unpacked in its head, expected at most {MAX_CHUNK}")
         try:
-            data = self._decompressed(chunk.compression, chunk.data, size)
+            if chunk.compression == "zstd":
+                # The decompressor allocates what the frame's own head names, whatever the limit.
+                framed = zstandard.frame_content_size(packed)
+                if framed > size:
+                    raise ChunkError(f"found {framed} bytes unpacked in its frame, expected {size}")
+                data: bytes = self._zstd.decompress(packed, max_output_size=max(size, 1))
+            elif chunk.compression == "lz4":
+                data = LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+            elif chunk.compression:
+                raise ChunkError(f"found compression {chunk.compression!r:.20}, expected zstd, lz4 or none")
+            else:
+                data = packed
         except (zstandard.ZstdError, RuntimeError, MemoryError) as error:
             raise ChunkError(f"cannot be unpacked ({chunk.compression}): {error}") from None
         if len(data) != size:
@@ -184,34 +183,18 @@ class Source:
             raise ChunkError("its CRC does not match")
         return data
 
-    def _decompressed(self, compression: str, packed: bytes, size: int) -> bytes:
-        """Never more than `size` + 1 bytes."""
-        if compression == "zstd":
-            # The decompressor allocates what the frame's own head names, whatever the limit.
-            framed = zstandard.frame_content_size(packed)
-            if framed > size:
-                raise ChunkError(f"found {framed} bytes unpacked in its frame, expected {size}")
-            return self._zstd.decompress(packed, max_output_size=max(size, 1))
-        if compression == "lz4":
-            data: bytes = LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
-            return data
-        if compression:
-            raise ChunkError(f"found compression {compression!r:.20}, expected zstd, lz4 or none")
-        return packed
-
 
 def read_summary(source: Source) -> tuple[Summary, int] | None:
     """Return the summary and where the data section ends; None where the file ends too early, or its CRC is wrong."""
-    footer_size = HEAD.size + 20
-    at = source.size - len(MAGIC) - footer_size
-    if at < len(MAGIC) or source.read(at + footer_size, len(MAGIC)) != MAGIC:
+    at = source.size - len(MAGIC) - _FOOTER_SIZE
+    footer = source.parsed(at) if at >= len(MAGIC) else None
+    if not isinstance(footer, Footer) or source.read(at + _FOOTER_SIZE, len(MAGIC)) != MAGIC:
         return None
-    footer = source.parsed(at, Opcode.FOOTER)
-    begin = at if footer is None else footer.summary_start or at
-    if footer is None or not len(MAGIC) <= begin <= at or at - begin > MAX_CHUNK:
+    begin = footer.summary_start or at
+    if not len(MAGIC) <= begin <= at or at - begin > MAX_CHUNK:
         return None
-    section = source.read(begin, at + footer_size - 4 - begin)
-    if footer.summary_crc and zlib.crc32(section) != footer.summary_crc:
+    section = source.read(begin, source.size - begin)
+    if footer.summary_crc and zlib.crc32(section[: -len(MAGIC) - 4]) != footer.summary_crc:
         return None
     data_end = begin - HEAD.size - 4
     if source.head(data_end) != (Opcode.DATA_END, begin):
@@ -220,28 +203,23 @@ def read_summary(source: Source) -> tuple[Summary, int] | None:
     place = 0
     while place < at - begin:
         opcode, length = HEAD.unpack_from(section, place)
-        body = section[place + HEAD.size : place + HEAD.size + length]
-        record = parse(opcode, body)
-        if record is None and opcode != Opcode.SUMMARY_OFFSET:
-            return None
-        _put(found, record)
+        match parse(opcode, section[place + HEAD.size : place + HEAD.size + length]):
+            case ChunkIndex() as record:
+                found.chunk_indexes.append(record)
+            case Schema() as record:
+                found.schemas[record.id] = record
+            case Channel() as record:
+                found.channels[record.id] = record
+            case AttachmentIndex() as record:
+                found.attachment_indexes.append(record)
+            case MetadataIndex() as record:
+                found.metadata_indexes.append(record)
+            case Statistics() as record:
+                found.statistics = record
+            case _ if opcode != Opcode.SUMMARY_OFFSET:
+                return None
         place += HEAD.size + length
     return found, data_end
-
-
-def _put(summary: Summary, record: Any) -> None:
-    if isinstance(record, Schema):
-        summary.schemas[record.id] = record
-    elif isinstance(record, Channel):
-        summary.channels[record.id] = record
-    elif isinstance(record, Statistics):
-        summary.statistics = record
-    elif isinstance(record, ChunkIndex):
-        summary.chunk_indexes.append(record)
-    elif isinstance(record, AttachmentIndex):
-        summary.attachment_indexes.append(record)
-    elif isinstance(record, MetadataIndex):
-        summary.metadata_indexes.append(record)
 
 
 # ---- messages of a chunk ----
@@ -376,7 +354,7 @@ class LogFile:
             if not self._chunks and (statistics is None or statistics.message_count):
                 raise self._error("found no index of chunks, expected every message in one (`mcap compress`)")
         elif self.path.suffix == ACTIVE:
-            contents = scan(source)
+            contents = Contents(source)
             self.schemas, self.channels = contents.schemas, contents.channels
             self.attachments = [index for _, index in contents.attachments]
             self._chunks = [chunk.index for chunk in contents.chunks]
@@ -441,8 +419,8 @@ class LogFile:
 
     def _batches_of(self, index: ChunkIndex) -> list[Batch]:
         at, length = index.chunk_start_offset, index.chunk_length
-        record = self._source.record(at, at + length)
         try:
+            record = self._source.read(at, length) if length <= MAX_CHUNK else b""
             if record[: HEAD.size] != HEAD.pack(Opcode.CHUNK, length - HEAD.size):
                 raise ChunkError("found none, expected one")
             chunk = parse(Opcode.CHUNK, record[HEAD.size :])
@@ -454,8 +432,8 @@ class LogFile:
 
     def attachment(self, index: AttachmentIndex) -> bytes:
         """Return the content of an attachment. Raises LogError where it is damaged."""
-        record = self._source.parsed(index.offset, Opcode.ATTACHMENT)
-        if record is None:
+        record = self._source.parsed(index.offset)
+        if not isinstance(record, Attachment):
             raise LogError(f"{self.path}: attachment {index.name!r} is damaged")
         data: bytes = record.data
         return data
@@ -488,6 +466,11 @@ class IntactChunk(NamedTuple):
     marks: Mapping[int, int]
     unchanged: bool
 
+    @property
+    def gap(self) -> Gap:
+        """Return what is missing without it."""
+        return Gap(self.index.chunk_start_offset, self.end, True, self.index.message_end_time)
+
 
 class Gap(NamedTuple):
     """Bytes that cannot be kept; `end_ns`: last log time of the chunk that stood there, where its head tells."""
@@ -498,9 +481,13 @@ class Gap(NamedTuple):
     end_ns: int | None = None
 
 
-@dataclass
 class Contents:
-    """Intact records of a file.
+    """Intact records of a file, found by going through the data section record by record, past damaged ones.
+
+    A chunk is intact by its CRC, another record where it parses to its last byte. Behind a damaged record the scan goes
+    on where its length leads to an intact one, where the summary has one, or at the next zstd chunk. Chunks of the
+    recorder's cycles that lack the others of their span are left out: readers take the arrays of two joints for arrays of
+    the same cycles. Raises OSError.
 
     Attributes:
         tail: summary, and where the data section ends; None without an intact summary.
@@ -515,24 +502,37 @@ class Contents:
         cycles: channels with a message in every cycle.
     """
 
-    tail: tuple[Summary, int] | None
-    end: int = 0
-    magic: bool = False
-    header: Header | None = None
-    attachments: list[tuple[Attachment, AttachmentIndex]] = field(default_factory=list)
-    metadata: list[tuple[Metadata, MetadataIndex]] = field(default_factory=list)
-    schemas: dict[int, Schema] = field(default_factory=dict)
-    channels: dict[int, Channel] = field(default_factory=dict)
-    unproven: bool = False
-    contradicted: bool = False
-    undefined: int = 0
-    chunks: list[IntactChunk] = field(default_factory=list)
-    gaps: list[Gap] = field(default_factory=list)
-    cycles: frozenset[int] = frozenset()
-    head: list[Schema | Channel] = field(default_factory=list)
-    """Definitions that no CRC covers."""
-    rebuilt_to: int = 0
-    """Message indexes before this offset are rebuilt from the chunk before them."""
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self.tail = read_summary(source)
+        self.magic = source.read(0, len(MAGIC)) == MAGIC
+        self.header: Header | None = None
+        self.attachments: list[tuple[Attachment, AttachmentIndex]] = []
+        self.metadata: list[tuple[Metadata, MetadataIndex]] = []
+        self.schemas: dict[int, Schema] = {}
+        self.channels: dict[int, Channel] = {}
+        self.unproven = self.contradicted = False
+        self.undefined = 0
+        self.chunks: list[IntactChunk] = []
+        self.gaps: list[Gap] = []
+        self.cycles: frozenset[int] = frozenset()
+        self._head: list[Schema | Channel] = []
+        """Definitions that no CRC covers."""
+        self._rebuilt_to = 0
+        """Message indexes before this offset are rebuilt from the chunk before them."""
+        self._limit, self._places = source.size, list[int]()
+        if self.tail is not None:
+            summary, self._limit = self.tail
+            self.schemas, self.channels = dict(summary.schemas), dict(summary.channels)
+            self._places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
+            self._places += [each.offset for each in (*summary.metadata_indexes, *summary.attachment_indexes)]
+        self._scan()
+        self._settle_definitions()
+        if not self.foreign:
+            self.cycles = frozenset(n for n, each in self.channels.items() if each.topic in _CYCLE_TOPICS)
+        if self.gaps or self.tail is None:
+            for place in reversed(_torn([chunk.marks for chunk in self.chunks], self.cycles)):
+                self.gaps.append(self.chunks.pop(place).gap)
 
     @property
     def counts(self) -> Counter[int]:
@@ -560,85 +560,138 @@ class Contents:
             and all(own.channels.get(number) == self.channels[number] for number in self.counts)
         )
 
+    def _scan(self) -> None:
+        at = len(MAGIC)
+        while at < self._limit:
+            found = self._intact(at)
+            if found is not None:
+                at = self._take(at, *found)
+                continue
+            if self.tail is None and self._summary_begins(at):
+                break
+            end = self._resume(at)
+            self._leave_out(at, end)
+            at = end
+        self.end = min(at, self._limit)
 
-def scan(source: Source) -> Contents:
-    """Go through the data section record by record, past damaged ones.
+    def _intact(self, at: int) -> tuple[Any, int] | None:
+        """Return the intact record at `at` (a chunk as `sealed_chunk` returns it) and where it ends; else None."""
+        framed = self._source.head(at)
+        if framed is None or framed[1] > self._limit:
+            return None
+        opcode, end = framed
+        if opcode == Opcode.MESSAGE_INDEX:  # of a chunk that is left out, or whose indexes are rebuilt
+            size = int.from_bytes(self._source.read(at + HEAD.size + 2, 4), "little")
+            whole = end - at == HEAD.size + 6 + size and size % _MESSAGE_INDEX_ENTRY == 0
+            return (None, end) if whole else None
+        if opcode == Opcode.CHUNK:
+            record: Any = sealed_chunk(self._source, at)
+        else:
+            record = self._source.parsed(at) if opcode in _DATA_KINDS else None
+        return None if record is None else (record, end)
 
-    A chunk is intact by its CRC, another record where it parses to its last byte. Behind a damaged record the scan goes
-    on where its length leads to an intact one, where the summary has one, or at the next zstd chunk. Chunks of the
-    recorder's cycles that lack the others of their span are left out: readers take the arrays of two joints for arrays of
-    the same cycles.
-    """
-    found = Contents(read_summary(source))
-    limit, places = source.size, []
-    if found.tail is not None:
-        summary, limit = found.tail
-        found.schemas, found.channels = dict(summary.schemas), dict(summary.channels)
-        places = [chunk.chunk_start_offset for chunk in summary.chunk_indexes]
-        places += [each.offset for each in (*summary.metadata_indexes, *summary.attachment_indexes)]
-    found.magic = source.read(0, len(MAGIC)) == MAGIC
-    at = len(MAGIC)
-    while at < limit:
-        end = _take(source, at, limit, found)
-        if end is None and found.tail is None and _summary_begins(source, at):
-            break
-        if end is None:
-            end = _resume(source, at, limit, [found.rebuilt_to, *sorted(places)])
-            _leave_out(source, at, end, found)
-        at = end
-    found.end = min(at, limit)
-    _settle_definitions(found)
-    if not found.foreign:
-        found.cycles = frozenset(n for n, each in found.channels.items() if each.topic in _CYCLE_TOPICS)
-    if found.gaps or found.tail is None:
-        for place in reversed(_torn([chunk.marks for chunk in found.chunks], found.cycles)):
-            found.gaps.append(_gap_of(found.chunks.pop(place)))
-    return found
+    def _take(self, at: int, record: Any, end: int) -> int:
+        """Keep an intact record; returns where the next one begins."""
+        match record:
+            case Header():
+                self.header = record
+            case Attachment():
+                self.attachments.append((record, attachment_index(record, at, end - at)))
+            case Metadata():
+                self.metadata.append((record, MetadataIndex(at, end - at, record.name)))
+            case Schema() | Channel():
+                self._head.append(record)
+            case (sealed, data, batches):
+                return self._take_chunk(at, sealed, data, batches)
+        return end
 
+    def _take_chunk(self, at: int, sealed: SealedChunk, data: bytes, batches: list[Batch]) -> int:
+        unchanged = self._source.read(at, len(sealed.data)) == sealed.data
+        self._rebuilt_to = at + len(sealed.data)
+        end = self._rebuilt_to if unchanged else at + sealed.length
+        marks = {each.channel: zlib.crc32(pieces(data, each.offsets + 11, 12).tobytes()) for each in batches}
+        self.chunks.append(IntactChunk(sealed.index(at), end, sealed.counts, marks, unchanged))
+        if not any(each.step for each in batches):
+            for opcode, begin, behind in _records_in(data):
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    record = parse(opcode, data[begin + HEAD.size : behind])
+                    if record is not None:
+                        self._known(record).setdefault(record.id, record)
+        return end
 
-def _take(source: Source, at: int, limit: int, found: Contents) -> int | None:
-    """Add the record at `at` to what was found; returns where it ends, None where it is not intact."""
-    framed = source.head(at)
-    if framed is None or framed[1] > limit:
-        return None
-    opcode, end = framed
-    if opcode == Opcode.CHUNK:
-        return _take_chunk(source, at, found)
-    if opcode == Opcode.MESSAGE_INDEX:  # of a chunk that is left out, or whose indexes are rebuilt
-        size = int.from_bytes(source.read(at + HEAD.size + 2, 4), "little")
-        return end if end - at == HEAD.size + 6 + size and size % _MESSAGE_INDEX_ENTRY == 0 else None
-    record = source.parsed(at, opcode) if opcode in _DATA_KINDS else None
-    if record is None:
-        return None
-    if isinstance(record, Header):
-        found.header = record
-    elif isinstance(record, Attachment):
-        found.attachments.append((record, attachment_index(record, at, end - at)))
-    elif isinstance(record, Metadata):
-        found.metadata.append((record, MetadataIndex(at, end - at, record.name)))
-    else:
-        found.head.append(record)
-    return end
+    def _summary_begins(self, at: int) -> bool:
+        """Return whether the data section ends at `at`: there is DataEnd, or a record that stands in the summary only."""
+        opcode, end = self._source.head(at) or (0, 0)
+        if opcode == Opcode.DATA_END:
+            return end - at == HEAD.size + 4
+        return opcode in _SUMMARY_KINDS and self._source.parsed(at) is not None
 
+    def _resume(self, at: int) -> int:
+        """Return where the scan goes on behind a damaged record at `at`."""
+        source, limit = self._source, self._limit
+        framed = source.head(at)
+        for place in (*([] if framed is None else [framed[1]]), self._rebuilt_to, *sorted(self._places)):
+            if at < place <= limit and (
+                place == limit
+                or self._is_framed_chunk(place)
+                or self._intact(place) is not None
+                or self._summary_begins(place)
+            ):
+                return place
+        for begin in range(at + 1, limit, _WINDOW):
+            window = source.read(begin, min(_WINDOW + _CHUNK_MARK_AT + len(_CHUNK_MARK), limit - begin))
+            place = window.find(_CHUNK_MARK, _CHUNK_MARK_AT)
+            while place >= 0:
+                start = begin + place - _CHUNK_MARK_AT
+                if self._is_framed_chunk(start) and sealed_chunk(source, start) is not None:
+                    return start
+                place = window.find(_CHUNK_MARK, place + 1)
+        return limit
 
-def _take_chunk(source: Source, at: int, found: Contents) -> int | None:
-    made = sealed_chunk(source, at)
-    if made is None:
-        return None
-    sealed, data, batches = made
-    unchanged = source.read(at, len(sealed.data)) == sealed.data
-    found.rebuilt_to = at + len(sealed.data)
-    end = found.rebuilt_to if unchanged else at + sealed.length
-    marks = {each.channel: zlib.crc32(pieces(data, each.offsets + 11, 12).tobytes()) for each in batches}
-    found.chunks.append(IntactChunk(sealed.index(at), end, sealed.counts, marks, unchanged))
-    if not any(each.step for each in batches):
-        for opcode, begin, behind in _records_in(data):
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                record = parse(opcode, data[begin + HEAD.size : behind])
-                known: dict[int, Any] = found.schemas if opcode == Opcode.SCHEMA else found.channels
-                if record is not None:
-                    known.setdefault(record.id, record)
-    return end
+    def _is_framed_chunk(self, at: int) -> bool:
+        """Return whether a zstd chunk begins at `at` whose lengths agree; its content is not looked at."""
+        head = self._source.read(at, _CHUNK_SIZES.size)
+        if len(head) < _CHUNK_SIZES.size or head[_CHUNK_MARK_AT:][: len(_CHUNK_MARK)] != _CHUNK_MARK:
+            return False
+        opcode, length, _, _, packed = _CHUNK_SIZES.unpack(head)
+        behind = at + HEAD.size + length
+        return bool(opcode == Opcode.CHUNK and at + _CHUNK_SIZES.size + packed == behind <= self._limit)
+
+    def _leave_out(self, start: int, end: int) -> None:
+        """Note the damaged bytes from `start` to `end`, as far as they are not rebuilt from others."""
+        framed, start = self._source.head(start), max(start, self._rebuilt_to)
+        if start >= end:
+            return
+        if framed is not None and framed[1] == end and framed[0] in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self.contradicted = True  # known from elsewhere, or its chunks are left out
+            return
+        head = self._source.read(start, _CHUNK_SIZES.size)
+        is_chunk = head[:1] == bytes([Opcode.CHUNK])
+        end_ns = _CHUNK_SIZES.unpack(head)[3] if is_chunk and len(head) == _CHUNK_SIZES.size else None
+        self.gaps.append(Gap(start, end, is_chunk, end_ns))
+
+    def _known(self, record: Schema | Channel) -> dict[int, Any]:
+        return self.schemas if isinstance(record, Schema) else self.channels
+
+    def _settle_definitions(self) -> None:
+        """Choose definitions, those that a CRC covers before others; leave out chunks with an undefined channel."""
+        unproven = set()
+        for record in self._head:
+            chosen = self._known(record).setdefault(record.id, record)
+            self.contradicted |= chosen != record
+            if chosen is record:
+                unproven.add((type(record), record.id))
+        for number, channel in list(self.channels.items()):
+            if channel.schema_id and channel.schema_id not in self.schemas:
+                del self.channels[number]
+        for place, chunk in reversed(list(enumerate(self.chunks))):
+            if not chunk.counts.keys() <= self.channels.keys():
+                self.undefined += 1
+                self.gaps.append(self.chunks.pop(place).gap)
+        self.unproven = any(
+            not unproven.isdisjoint(((Channel, number), (Schema, self.channels[number].schema_id)))
+            for number in self.counts
+        )
 
 
 def sealed_chunk(source: Source, at: int) -> tuple[SealedChunk, bytes, list[Batch]] | None:
@@ -646,8 +699,8 @@ def sealed_chunk(source: Source, at: int) -> tuple[SealedChunk, bytes, list[Batc
 
     The second value is its unpacked content, the third its messages. None: its content is damaged.
     """
-    chunk = source.parsed(at, Opcode.CHUNK)
-    if chunk is None or chunk.compression != "zstd" or not chunk.uncompressed_crc:
+    chunk = source.parsed(at)
+    if not isinstance(chunk, Chunk) or chunk.compression != "zstd" or not chunk.uncompressed_crc:
         return None
     try:
         size = zstandard.frame_content_size(chunk.data)
@@ -659,110 +712,11 @@ def sealed_chunk(source: Source, at: int) -> tuple[SealedChunk, bytes, list[Batc
     if any(len(each.offsets) for each in batches):
         chunk.message_start_time = min(int(each.log_times.min()) for each in batches)
         chunk.message_end_time = max(int(each.log_times.max()) for each in batches)
-    record = bytes_of(chunk)
-    indexes, offsets, end = [], {}, len(record)
-    for each in batches:
-        entries = np.stack([each.log_times, each.offsets.astype(np.uint64)], axis=1)
-        indexes.append(index_record(each.channel, entries.ravel().tolist()))
-        offsets[each.channel] = end
-        end += len(indexes[-1])
-    sealed = SealedChunk(
-        data=b"".join((record, *indexes)),
-        length=len(record),
-        start_ns=chunk.message_start_time,
-        end_ns=chunk.message_end_time,
-        raw_size=chunk.uncompressed_size,
-        packed_size=len(chunk.data),
-        counts={each.channel: len(each.offsets) for each in batches},
-        index_offsets=offsets,
-    )
-    return sealed, data, batches
-
-
-def _summary_begins(source: Source, at: int) -> bool:
-    """Return whether the data section ends at `at`: there is DataEnd, or a record that stands in the summary only."""
-    framed = source.head(at)
-    if framed is None or framed[0] not in (Opcode.DATA_END, *_SUMMARY_KINDS):
-        return False
-    return (
-        framed[1] - at == HEAD.size + 4
-        if framed[0] == Opcode.DATA_END
-        else bool(source.parsed(at, framed[0]))
-    )
-
-
-def _resume(source: Source, at: int, limit: int, places: Iterable[int]) -> int:
-    """Return where the scan goes on behind a damaged record at `at`; `places`: where other records should begin."""
-    framed = source.head(at)
-    for place in ([] if framed is None else [framed[1]]) + list(places):
-        if at < place <= limit and (
-            place == limit
-            or _is_framed_chunk(source, place, limit)
-            or _take(source, place, limit, Contents(None)) is not None
-            or _summary_begins(source, place)
-        ):
-            return place
-    begin = at + 1
-    while begin < limit:
-        window = source.read(begin, min(_WINDOW + _CHUNK_MARK_AT + len(_CHUNK_MARK), limit - begin))
-        place = window.find(_CHUNK_MARK, _CHUNK_MARK_AT)
-        while place >= 0:
-            start = begin + place - _CHUNK_MARK_AT
-            if _is_framed_chunk(source, start, limit) and sealed_chunk(source, start) is not None:
-                return start
-            place = window.find(_CHUNK_MARK, place + 1)
-        begin += _WINDOW
-    return limit
-
-
-def _is_framed_chunk(source: Source, at: int, limit: int) -> bool:
-    """Return whether a zstd chunk begins at `at` whose lengths agree; its content is not looked at."""
-    head = source.read(at, _CHUNK_SIZES.size)
-    if len(head) < _CHUNK_SIZES.size or head[_CHUNK_MARK_AT:][: len(_CHUNK_MARK)] != _CHUNK_MARK:
-        return False
-    opcode, length, _, _, packed = _CHUNK_SIZES.unpack(head)
-    behind = at + HEAD.size + length
-    return bool(opcode == Opcode.CHUNK and at + _CHUNK_SIZES.size + packed == behind <= limit)
-
-
-def _leave_out(source: Source, start: int, end: int, found: Contents) -> None:
-    """Note the damaged bytes from `start` to `end`, as far as they are not rebuilt from others."""
-    framed, start = source.head(start), max(start, found.rebuilt_to)
-    if start >= end:
-        return
-    if framed is not None and framed[1] == end and framed[0] in (Opcode.SCHEMA, Opcode.CHANNEL):
-        found.contradicted = True  # known from elsewhere, or its chunks are left out
-        return
-    head = source.read(start, _CHUNK_SIZES.size)
-    is_chunk = head[:1] == bytes([Opcode.CHUNK])
-    end_ns = _CHUNK_SIZES.unpack(head)[3] if is_chunk and len(head) == _CHUNK_SIZES.size else None
-    found.gaps.append(Gap(start, end, is_chunk, end_ns))
-
-
-def _gap_of(chunk: IntactChunk) -> Gap:
-    return Gap(chunk.index.chunk_start_offset, chunk.end, True, chunk.index.message_end_time)
-
-
-def _settle_definitions(found: Contents) -> None:
-    """Choose definitions, those that a CRC covers before others; leave out chunks with an undefined channel."""
-    unproven = set()
-    for record in found.head:
-        known: dict[int, Any] = found.schemas if isinstance(record, Schema) else found.channels
-        chosen = known.setdefault(record.id, record)
-        found.contradicted |= chosen != record
-        if chosen is record:
-            unproven.add((type(record), record.id))
-    for number, channel in list(found.channels.items()):
-        if channel.schema_id and channel.schema_id not in found.schemas:
-            del found.channels[number]
-    for place, chunk in reversed(list(enumerate(found.chunks))):
-        if not chunk.counts.keys() <= found.channels.keys():
-            found.undefined += 1
-            found.gaps.append(_gap_of(found.chunks.pop(place)))
-    found.unproven = any(
-        not unproven.isdisjoint(((Channel, number), (Schema, found.channels[number].schema_id)))
-        for number in found.counts
-    )
+    indexed = {
+        each.channel: np.stack([each.log_times, each.offsets.astype(np.uint64)], axis=1).ravel().tolist()
+        for each in batches
+    }
+    return seal(chunk, indexed), data, batches
 
 
 def _torn(chunks: Iterable[Mapping[int, int]], cycles: frozenset[int]) -> list[int]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,9 +36,11 @@ class Messages(NamedTuple):
     records: Records
 
 
-def read_topic(
-    path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
-) -> Records:
+Logs = Path | Sequence[Path]
+"""A log, a directory with the parts of one run, or the parts themselves."""
+
+
+def read_topic(path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None) -> Records:
     """Read all messages of a topic in the order of the files, one field per field of the schema [n].
 
     Nested messages are nested fields, `header.stamp.sec` is ["header"]["stamp"]["sec"]. See `read_topics`.
@@ -47,11 +49,7 @@ def read_topic(
 
 
 def read_topics(
-    path: Path | Sequence[Path],
-    topics: Sequence[str],
-    *,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
+    path: Logs, topics: Sequence[str], *, start_ns: int | None = None, end_ns: int | None = None
 ) -> dict[str, Records]:
     """Messages of several topics as `read_topic` returns them, in one pass: unpacking the file is what takes the time.
 
@@ -70,11 +68,7 @@ def read_topics(
 
 
 def read_messages(
-    path: Path | Sequence[Path],
-    topics: Sequence[str],
-    *,
-    start_ns: int | None = None,
-    end_ns: int | None = None,
+    path: Logs, topics: Sequence[str], *, start_ns: int | None = None, end_ns: int | None = None
 ) -> dict[str, Messages]:
     """Read like `read_topics`, with the log time of every message."""
     parts = log_parts(path)
@@ -89,7 +83,7 @@ def read_messages(
 
 
 def iter_messages(
-    path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
+    path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Messages]:
     """Read one topic chunk by chunk, for logs larger than memory. Raises as `read_topics` does."""
     for found in iter_topics(path, (topic,), start_ns=start_ns, end_ns=end_ns):
@@ -97,7 +91,7 @@ def iter_messages(
 
 
 def iter_topics(
-    path: Path | Sequence[Path],
+    path: Logs,
     topics: Sequence[str],
     *,
     start_ns: int | None = None,
@@ -124,10 +118,7 @@ def _taken(tables: dict[str, _Table]) -> dict[str, Messages]:
 
 
 class _Piece(NamedTuple):
-    """Messages of one topic out of one chunk, with their file and schema.
-
-    expected: messages of the topic in the file, by its summary.
-    """
+    """Messages of one topic out of one chunk; `expected`: those of the topic in the file, by its summary."""
 
     path: Path
     topic: str
@@ -140,7 +131,7 @@ def _pieces(
     parts: Sequence[Path], topics: Sequence[str], start_ns: int | None, end_ns: int | None
 ) -> Iterator[_Piece]:
     """Yield messages of the parts in their order; those that two parts have come once."""
-    filtered = _DuplicateFilter() if len(parts) > 1 else None
+    duplicates = _DuplicateFilter()
     for path in parts:
         with LogFile(path) as log:
             expected = log.expected if start_ns is None and end_ns is None else {}
@@ -151,14 +142,13 @@ def _pieces(
             }
             for batch in log.batches(wanted, start_ns, end_ns):
                 topic, schema, count = wanted[batch.channel]
-                fresh = batch if filtered is None else filtered.new(topic, batch)
+                fresh = duplicates.new(topic, batch) if len(parts) > 1 else batch
                 if len(fresh.offsets):
                     yield _Piece(path, topic, schema, fresh, count)
-        if filtered is not None:
-            filtered.next_part()
+        duplicates.next_part()
 
 
-def topics_of(path: Path | Sequence[Path]) -> dict[str, str]:
+def topics_of(path: Logs) -> dict[str, str]:
     """Return the topics of a log and the names of their schemas. Raises LogError, OSError."""
     found = {}
     for part in log_parts(path):
@@ -181,7 +171,7 @@ def _schema(log: LogFile, channel: Channel) -> Schema:
     return schema
 
 
-def read_attachments(path: Path | Sequence[Path]) -> dict[str, bytes]:
+def read_attachments(path: Logs) -> dict[str, bytes]:
     """Return attachments by name: those of the first part; of several with one name the last.
 
     Raises:
@@ -192,7 +182,7 @@ def read_attachments(path: Path | Sequence[Path]) -> dict[str, bytes]:
         return {index.name: log.attachment(index) for index in log.attachments}
 
 
-def log_parts(path: Path | Sequence[Path]) -> list[Path]:
+def log_parts(path: Logs) -> list[Path]:
     """Return the files of one run in the order of writing.
 
     A directory may hold one run of jtqd, or any MCAP files that follow one another. Raises LogError for one with several
@@ -216,19 +206,17 @@ def log_parts(path: Path | Sequence[Path]) -> list[Path]:
     return _in_order(files)
 
 
-def _in_order(paths: Iterable[Path]) -> list[Path]:
+def _in_order(paths: Sequence[Path]) -> list[Path]:
     """By part number where the names have one, else by the first log time, else as given."""
-    given = list(paths)
-    if len(given) == 1:
-        return given
-    named = [found for each in given if (found := PART_PATTERN.fullmatch(each.name))]
-    if len(named) == len(given) and len({found.group("prefix", "run") for found in named}) == 1:
-        return [path for _, path in sorted(zip([int(n["part"]) for n in named], given, strict=True))]
-    starts = []
-    for n, path in enumerate(given):
-        with LogFile(path) as log:
-            starts.append((log.start_ns, n, path))
-    return [path for *_, path in sorted(starts)]
+    named = [found for each in paths if (found := PART_PATTERN.fullmatch(each.name))]
+    if len(named) == len(paths) and len({found.group("prefix", "run") for found in named}) == 1:
+        return [path for _, path in sorted(zip([int(n["part"]) for n in named], paths, strict=True))]
+    return list(paths) if len(paths) == 1 else sorted(paths, key=_start_ns)
+
+
+def _start_ns(path: Path) -> int:
+    with LogFile(path) as log:
+        return log.start_ns
 
 
 # ---- fixed rows ----
@@ -538,8 +526,14 @@ class Frames(NamedTuple):
     data: NDArray[np.uint8]
     """[n, 8], zeros behind the length."""
 
+    def rows(self) -> Iterator[tuple[int, int, int, bytes]]:
+        """Yield stamp, identifier, length and data of each frame."""
+        numbers = self.stamps_ns.tolist(), self.ids.tolist(), self.lengths.tolist()
+        for stamp, can_id, length, data in zip(*numbers, self.data, strict=True):
+            yield stamp, can_id, length, data[:length].tobytes()
 
-def can_topics(path: Path | Sequence[Path]) -> list[str]:
+
+def can_topics(path: Logs) -> list[str]:
     """Topics that carry CAN frames. Raises LogError where there is none, OSError."""
     found = [topic for topic, schema in topics_of(path).items() if schema in FRAMES_NAMES]
     if not found:
@@ -548,7 +542,7 @@ def can_topics(path: Path | Sequence[Path]) -> list[str]:
 
 
 def iter_frames(
-    path: Path | Sequence[Path], topic: str, *, start_ns: int | None = None, end_ns: int | None = None
+    path: Logs, topic: str, *, start_ns: int | None = None, end_ns: int | None = None
 ) -> Iterator[Frames]:
     """Yield frames of one topic, chunk by chunk. Raises LogError, OSError."""
     for messages in iter_messages(path, topic, start_ns=start_ns, end_ns=end_ns):

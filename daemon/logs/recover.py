@@ -1,7 +1,7 @@
 """Recovery of logs that a crash left unfinished, or that were damaged later; `jtq recover`.
 
-The intact contents of a log (`jtqd.daemon.logs.log_file.scan`) are written by the recorder's own writer to a copy beside it,
-chunks as they are packed. The copy is read back and synced, and replaces the file in one step: an interrupted recovery
+The intact contents of a log (`log_file.Contents`) are written by the recorder's own writer to a copy beside it, chunks as
+they are packed. The copy is read back and synced, and replaces the file in one step: an interrupted recovery
 leaves the file as it was and is repeated. Memory holds some chunks at a time.
 
 The recorder runs `python -m jtqd.daemon.logs.recover DIRECTORY PREFIX RESERVE_BYTES` at the lowest priority for the files
@@ -17,21 +17,21 @@ import json
 import os
 import sys
 from bisect import bisect
-from collections.abc import Iterator
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
 
-from jtqd.daemon.logs.log_file import Contents, LogError, Source, scan, sealed_chunk
+from jtqd.daemon.logs.log_file import Contents, LogError, Source, sealed_chunk
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
 from jtqd.daemon.recording.run_files import ACTIVE, PartFile, free_bytes, part_files
 from jtqd.estimator.text import counted
 
 _PARTIAL = ".recovering"
 """Ending of the copy while it is written."""
-_WRITE_BYTES = 8 << 20
+_MB = 1 << 20
+_WRITE_BYTES = 8 * _MB
 """Chunks are written and synced in pieces of this size."""
 _LONGEST_TORN_CHUNK_S = 600.0
 """A torn chunk whose head claims more than this is not believed."""
@@ -99,24 +99,25 @@ def recover(
         _lock(descriptor, path, shared=dry_run)
         before = os.fstat(descriptor)
         source = Source(descriptor)
-        found = scan(source)
-        if found.foreign:
-            assert found.header is not None
-            library = found.header.library
+        found = Contents(source)
+        attached = bool(found.attachments or found.metadata)
+        if found.header is not None and found.foreign:
             raise SkippedError(
-                f"{path}: found a log of {library!r:.60}, expected one of jtqd (others: `mcap recover`)"
+                f"{path}: found a log of {found.header.library!r:.60}, expected one of jtqd (others: `mcap recover`)"
             )
-        if not (found.header or found.chunks or _has_attachments(found)):
+        if not (found.header or found.chunks or attached):
             raise RecoverError(f"{path}: found no readable content, expected an MCAP file")
         now = os.fstat(descriptor)
         if (now.st_size, now.st_mtime_ns) != (before.st_size, before.st_mtime_ns):
             raise SkippedError(f"{path}: found that it is being written, expected a closed file")
         final = _final_name(path)
         changed = not found.whole
-        report = _report(source, found) if changed else _Report()
-        if report.lossy and not found.counts and not (attachments_are_enough and _has_attachments(found)):
+        missing, torn = _missing(found), bool(found.gaps) or found.unproven
+        lossy = changed and (torn or missing > 0)
+        findings = _findings(source, found) if changed else []
+        if lossy and not found.counts and not (attachments_are_enough and attached):
             raise RecoverError(
-                f"{path}: found no message that can be read ({report.findings[0]}), expected one at least: left as it is"
+                f"{path}: found no message that can be read ({findings[0]}), expected one at least: left as it is"
             )
         if changed and not dry_run:
             _replace(path, source, found, keep_free)
@@ -126,24 +127,44 @@ def recover(
     finally:
         os.close(descriptor)
     start_ns, end_ns = _times(found)
+    lost_s = None if lossy and not torn else _lost_s(found) if changed else 0.0
     return Recovery(
         path=path if dry_run else final,
         changed=changed,
         renamed=final != path,
-        lossy=report.lossy,
+        lossy=lossy,
         messages=sum(found.counts.values()),
         chunks=len(found.chunks),
         attachments=len(found.attachments),
         seconds=(end_ns - start_ns) * 1e-9,
         lost_bytes=sum(gap.end - gap.start for gap in found.gaps),
         lost_chunks=sum(gap.is_chunk for gap in found.gaps),
-        lost_s=None if report.lost_s is None else round(report.lost_s, 3),
-        findings=tuple(report.findings),
+        lost_s=None if lost_s is None else round(lost_s, 3),
+        findings=tuple(findings),
     )
 
 
-def _has_attachments(found: Contents) -> bool:
-    return bool(found.attachments or found.metadata)
+def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
+    try:
+        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except OSError as error:
+        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
+            raise SkippedError(
+                f"{path}: found that a recorder is writing it, expected a closed file"
+            ) from None
+        # A file system without locks: the check remains that the file does not change meanwhile.
+
+
+def _final_name(path: Path) -> Path:
+    if path.suffix != ACTIVE:
+        return path
+    final = path.with_suffix("")
+    if final.exists():
+        raise RecoverError(f"{path}: found {final.name} beside it, expected that name to be free")
+    return final
+
+
+# ---- what is lost ----
 
 
 def _times(found: Contents) -> tuple[int, int]:
@@ -153,52 +174,40 @@ def _times(found: Contents) -> tuple[int, int]:
     return first, max((index.message_end_time for index in indexes), default=0)
 
 
-# ---- what is lost ----
+def _missing(found: Contents) -> int:
+    """Messages of the summary that were not found."""
+    statistics = None if found.tail is None else found.tail[0].statistics
+    return 0 if statistics is None else statistics.message_count - sum(found.counts.values())
 
 
-@dataclass
-class _Report:
-    findings: list[str] = field(default_factory=list)
-    lossy: bool = False
-    lost_s: float | None = 0.0
-
-
-def _report(source: Source, found: Contents) -> _Report:
-    """Return the findings about a file that must be rewritten."""
-    report = _Report(lossy=bool(found.gaps) or found.unproven, lost_s=_lost_s(found))
+def _findings(source: Source, found: Contents) -> list[str]:
+    """Return the findings about a file that must be rewritten, one line each."""
+    lines = []
     for gap in sorted(found.gaps):
         size = gap.end - gap.start
         if gap.end < found.end or found.tail is not None:
             what = f"bytes {gap.start} to {gap.end} cannot be read{' (a chunk)' if gap.is_chunk else ''}"
-        elif _zeros(source, gap.start, gap.end):
+        elif not any(any(source.read(at, min(gap.end - at, _MB))) for at in range(gap.start, gap.end, _MB)):
             what = f"{counted(size, 'byte')} of zeros at the end"
         else:
             what = f"truncated at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
-        report.findings.append(what)
-    statistics = None if found.tail is None else found.tail[0].statistics
-    missing = 0 if statistics is None else statistics.message_count - sum(found.counts.values())
-    if not report.lossy and missing > 0:
-        report.findings.append(f"{counted(missing, 'message')} of the summary are not in the file")
-        report.lossy, report.lost_s = True, None
-    if found.undefined:
-        report.findings.append(f"{counted(found.undefined, 'chunk')} with an undefined channel")
-    if found.unproven:
-        report.findings.append("no readable chunk has schemas and channels: taken from the head, unchecked")
-    if found.contradicted:
-        report.findings.append(
-            "schemas or channels at the head are damaged: taken from a chunk or the summary"
-        )
-    if not found.magic or found.header is None:
-        report.findings.append("magic bytes or header damaged: rewritten")
+        lines.append(what)
+    missing = 0 if found.gaps or found.unproven else _missing(found)
     rebuilt = sum(not chunk.unchanged for chunk in found.chunks)
-    if rebuilt:
-        report.findings.append(f"head or message indexes of {counted(rebuilt, 'chunk')} rewritten")
-    report.findings.append("no summary: written" if found.tail is None else "summary rewritten")
-    return report
-
-
-def _zeros(source: Source, start: int, end: int) -> bool:
-    return not any(any(source.read(at, min(end - at, 1 << 20))) for at in range(start, end, 1 << 20))
+    for is_so, line in (
+        (missing > 0, f"{counted(missing, 'message')} of the summary are not in the file"),
+        (found.undefined, f"{counted(found.undefined, 'chunk')} with an undefined channel"),
+        (found.unproven, "no readable chunk has schemas and channels: taken from the head, unchecked"),
+        (
+            found.contradicted,
+            "schemas or channels at the head are damaged: taken from a chunk or the summary",
+        ),
+        (not found.magic or found.header is None, "magic bytes or header damaged: rewritten"),
+        (rebuilt, f"head or message indexes of {counted(rebuilt, 'chunk')} rewritten"),
+    ):
+        if is_so:
+            lines.append(line)
+    return [*lines, "no summary: written" if found.tail is None else "summary rewritten"]
 
 
 def _lost_s(found: Contents) -> float | None:
@@ -258,7 +267,7 @@ def _replace(path: Path, source: Source, found: Contents, keep_free: int) -> Non
             os.chmod(partial, before.st_mode & 0o777)
             os.chown(partial, before.st_uid, before.st_gid)
         with open(partial, "rb") as copy:
-            again = scan(Source(copy.fileno()))
+            again = Contents(Source(copy.fileno()))
         if not again.whole or again.counts != found.counts:
             raise RecoverError(
                 f"{path}: found a copy that reads back differently, expected the written content"
@@ -279,46 +288,18 @@ def _write(path: Path, source: Source, found: Contents) -> None:
     time_ns = found.attachments[0][0].log_time if found.attachments else 0
     file = McapFile(path, head, metadata, time_ns)
     try:
-        for chunks in _sealed(source, found):
-            file.append(Span(tuple(chunks), 0))
+        chunks: list[SealedChunk] = []
+        for n, chunk in enumerate(found.chunks, start=1):
+            made = sealed_chunk(source, chunk.index.chunk_start_offset)
+            assert made is not None, "the file changed while it was locked"
+            chunks.append(made[0])
+            if n == len(found.chunks) or sum(len(each.data) for each in chunks) >= _WRITE_BYTES:
+                file.append(Span(tuple(chunks), 0))
+                chunks = []
     except OSError:
         file.abandon()
         raise
     file.finish(path.name)
-
-
-def _sealed(source: Source, found: Contents) -> Iterator[list[SealedChunk]]:
-    """Yield the intact chunks with their message indexes, some at a time."""
-    chunks: list[SealedChunk] = []
-    for chunk in found.chunks:
-        made = sealed_chunk(source, chunk.index.chunk_start_offset)
-        assert made is not None, "the file changed while it was locked"
-        chunks.append(made[0])
-        if sum(len(each.data) for each in chunks) >= _WRITE_BYTES:
-            yield chunks
-            chunks = []
-    if chunks:
-        yield chunks
-
-
-def _lock(descriptor: int, path: Path, *, shared: bool) -> None:
-    try:
-        fcntl.flock(descriptor, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except OSError as error:
-        if error.errno in (errno.EWOULDBLOCK, errno.EACCES):
-            raise SkippedError(
-                f"{path}: found that a recorder is writing it, expected a closed file"
-            ) from None
-        # A file system without locks: what is left is the check that the file does not change meanwhile.
-
-
-def _final_name(path: Path) -> Path:
-    if path.suffix != ACTIVE:
-        return path
-    final = path.with_suffix("")
-    if final.exists():
-        raise RecoverError(f"{path}: found {final.name} beside it, expected that name to be free")
-    return final
 
 
 def _sync_directory(directory: Path) -> None:
@@ -336,9 +317,14 @@ def _sync_directory(directory: Path) -> None:
 def recover_unfinished(file: PartFile, keep_free: int = 0) -> tuple[str, bool] | None:
     """Recover one file of an earlier run: what was done, and whether something was lost. None: it is being written."""
     path = file.path
-    if _is_being_written(path):
-        return None
     try:
+        with open(path, "rb") as opened:
+            try:
+                fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return None
+            except OSError:  # a file system without locks
+                pass
         if path.stat().st_size == 0:  # its recorder died before the first byte
             path.unlink()
             return f"{path.name} was empty: removed", False
@@ -352,15 +338,6 @@ def recover_unfinished(file: PartFile, keep_free: int = 0) -> tuple[str, bool] |
         time = "unknown time" if found.lost_s is None else f"{found.lost_s:.1f} s"
         text += f", {found.lost_bytes} B ({time}) unreadable"
     return text, found.lossy
-
-
-def _is_being_written(path: Path) -> bool:
-    with suppress(OSError), open(path, "rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
 
 
 def _recover_earlier_runs(arguments: list[str]) -> int:
@@ -412,9 +389,15 @@ def main(argv: list[str] | None = None) -> int:
     for path in options.logs:
         if not path.is_dir() and not path.name.endswith(_ENDINGS):
             parser().error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
+    files = [
+        (each, path.is_dir())
+        for path in options.logs
+        for each in (sorted(path.iterdir()) if path.is_dir() else [path])
+        if not path.is_dir() or (each.is_file() and each.name.endswith(_ENDINGS))
+    ]
     results: list[Recovery] = []
     failures: list[dict[str, str]] = []
-    for path, in_directory in _files(options.logs):
+    for path, in_directory in files:
         try:
             found = recover(path, dry_run=in_directory or options.dry_run)
             if in_directory and not (found.changed or found.renamed):
@@ -437,17 +420,6 @@ def main(argv: list[str] | None = None) -> int:
     if failures:
         return 1
     return 3 if any(each.lossy for each in results) else 0
-
-
-def _files(paths: list[Path]) -> Iterator[tuple[Path, bool]]:
-    """Yield every file, and whether it was named by its directory only."""
-    for path in paths:
-        if not path.is_dir():
-            yield path, False
-            continue
-        for each in sorted(path.iterdir()):
-            if each.is_file() and each.name.endswith(_ENDINGS):
-                yield each, True
 
 
 def _text(result: Recovery, dry_run: bool) -> str:

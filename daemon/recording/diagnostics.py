@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.messages import Status
@@ -20,6 +20,10 @@ from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.cycle_record import RingReader, layout_of
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import nmt
+from jtqd.estimator.text import counted
+
+if TYPE_CHECKING:
+    from jtqd.daemon.recording.parts import FlightRecorder, Parts
 
 OK, WARN, ERROR, STALE = range(4)
 _OF_THE_BUS = shown_in(Shown.BUS)
@@ -38,24 +42,6 @@ class Node(NamedTuple):
 
     node_id: int
     name: str
-
-
-class RecorderState(NamedTuple):
-    """What the recorder knows of itself; sizes in bytes, `budget` -1 for none, `free` -1 for unknown."""
-
-    mode: str
-    obstacle: str
-    backlog: int
-    cpu_percent: float
-    events_left_out: int
-    part: int
-    part_bytes: int
-    total_bytes: int
-    free: int
-    reserve: int
-    budget: int
-    memory_bytes: int
-    memory_s: float
 
 
 class Diagnostics:
@@ -98,11 +84,57 @@ class Diagnostics:
         self._before, self._cycle = dict(view.counters), view.cycle
         return view, result
 
-    def of_recorder(self, account: Account, state: RecorderState) -> list[Status]:
+    def of_recorder(
+        self,
+        account: Account,
+        parts: Parts,
+        flight: FlightRecorder | None,
+        *,
+        backlog: int,
+        cpu_percent: float,
+        events_left_out: int,
+    ) -> list[Status]:
         """Return the statuses of recorder and disk."""
-        result = [self._recorder(account, state), self._disk(state)]
+        mode = "recording" if flight is None else "saving" if flight.saving else "in memory"
+        mode = "waiting" if parts.obstacle else mode
+        level, text = OK, mode
+        if account.lost:
+            level, text = WARN, f"{counted(account.lost, 'cycle')} lost so far"
+        if account.lost > self._lost:
+            lost = account.lost - self._lost
+            level, text = ERROR, f"{counted(lost, 'cycle')} lost since the last message"
         self._lost = account.lost
-        return result
+        values: dict[str, float | str] = {
+            "mode": mode,
+            "backlog": backlog,
+            "cycles": account.cycles,
+            "written": account.written,
+            "lost_overwritten": account.overwritten,
+            "lost_unwritten": account.unwritten,
+            "let_go": account.let_go,
+            "events_left_out": events_left_out,
+            "cpu_percent": cpu_percent,
+            "part": parts.part,
+            "memory_mb": (0 if flight is None else flight.memory_bytes) / MEGABYTE,
+            "memory_s": 0.0 if flight is None else flight.memory_s,
+        }
+        return [Status("jtqd: recorder", self._bus, level, text, values), self._disk(parts)]
+
+    def _disk(self, parts: Parts) -> Status:
+        free, reserve, budget = parts.free_bytes, parts.rules.reserve, parts.rules.budget
+        level, text = OK, "room"
+        if 0 <= free < _NEAR * reserve:
+            level, text = WARN, "little room"
+        if parts.obstacle:
+            level, text = ERROR, parts.obstacle
+        values: dict[str, float | str] = {
+            "part_mb": parts.size / MEGABYTE,
+            "logs_mb": parts.total_size / MEGABYTE,
+            "budget_mb": "none" if budget is None else budget / MEGABYTE,
+            "free_mb": free / MEGABYTE if free >= 0 else "unknown",
+            "reserve_mb": reserve / MEGABYTE,
+        }
+        return Status("jtqd: disk", self._bus, level, text, values)
 
     def _risen(self, view: View) -> list[Condition]:
         """Return conditions whose counter has risen since the last message."""
@@ -120,7 +152,7 @@ class Diagnostics:
         level, text = _level(found, "loop", "running")
         missed = view.counters["missed"] - self._before.get("missed", 0)
         if self._before and missed:
-            text = f"{missed} {'slot' if missed == 1 else 'slots'} missed since the last message"
+            text = f"{counted(missed, 'slot')} missed since the last message"
         if view.cycle == self._cycle:
             level, text = STALE, "the loop is stalled"
         values: dict[str, float | str] = {"cycle": view.cycle}
@@ -178,44 +210,6 @@ class Diagnostics:
             level, text = STALE, "no heartbeat"
         values: dict[str, float | str] = {"nmt_state": name, "heartbeat_age_s": age_s}
         return Status(f"jtqd: node {node.node_id}", node.name, level, text, values)
-
-    def _recorder(self, account: Account, state: RecorderState) -> Status:
-        level, text = OK, state.mode
-        if account.lost:
-            level, text = WARN, f"{account.lost} cycle{'s' if account.lost != 1 else ''} lost so far"
-        if account.lost > self._lost:
-            lost = account.lost - self._lost
-            level, text = ERROR, f"{lost} cycle{'s' if lost != 1 else ''} lost since the last message"
-        values: dict[str, float | str] = {
-            "mode": state.mode,
-            "backlog": state.backlog,
-            "cycles": account.cycles,
-            "written": account.written,
-            "lost_overwritten": account.overwritten,
-            "lost_unwritten": account.unwritten,
-            "let_go": account.let_go,
-            "events_left_out": state.events_left_out,
-            "cpu_percent": state.cpu_percent,
-            "part": state.part,
-            "memory_mb": state.memory_bytes / MEGABYTE,
-            "memory_s": state.memory_s,
-        }
-        return Status("jtqd: recorder", self._bus, level, text, values)
-
-    def _disk(self, state: RecorderState) -> Status:
-        level, text = OK, "room"
-        if 0 <= state.free < _NEAR * state.reserve:
-            level, text = WARN, "little room"
-        if state.obstacle:
-            level, text = ERROR, state.obstacle
-        values: dict[str, float | str] = {
-            "part_mb": state.part_bytes / MEGABYTE,
-            "logs_mb": state.total_bytes / MEGABYTE,
-            "budget_mb": state.budget / MEGABYTE if state.budget >= 0 else "none",
-            "free_mb": state.free / MEGABYTE if state.free >= 0 else "unknown",
-            "reserve_mb": state.reserve / MEGABYTE,
-        }
-        return Status("jtqd: disk", self._bus, level, text, values)
 
 
 def _level(found: Sequence[Condition], subject: str, otherwise: str) -> tuple[int, str]:

@@ -17,7 +17,7 @@ from typing import Any
 
 from jtqd.daemon.config import Config
 from jtqd.daemon.recording.dbc import dbc_text
-from jtqd.daemon.recording.run_files import Account, ProgressFile, free_run, part_files
+from jtqd.daemon.recording.run_files import Account, free_run, part_files, read_account
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.processes import Child, ChildError, StartChild
 from jtqd.daemon.shared.runtime_dir import versions
@@ -48,17 +48,16 @@ class RecorderProcess:
         self._child: Child | None = None
         self._starts: list[float] = []
         self._waits = False
-        self._directory: Path | None = None
-        self._prefix = self._run_name = ""
+        self._files: tuple[Path, str, str] | None = None
+        """Directory, prefix and run."""
         self._result: dict[str, Any] | None = None
 
     def start(self, request: dict[str, Any]) -> None:
         """Start the recorder with the request of `recording_request`. Raises OSError."""
-        self._directory, self._prefix = Path(request["directory"]), str(request["prefix"])
-        self._run_name = free_run(self._directory, self._prefix, time.time_ns())
-        request = request | {"run": self._run_name}
+        directory, prefix = Path(request["directory"]), str(request["prefix"])
+        self._files = directory, prefix, free_run(directory, prefix, time.time_ns())
         self.progress.unlink(missing_ok=True)
-        self._request.write_text(json.dumps(request), encoding="utf-8")
+        self._write(request)
         self._run()
 
     @property
@@ -69,7 +68,7 @@ class RecorderProcess:
     @property
     def lost(self) -> int:
         """Cycles lost so far."""
-        return self._settled().lost
+        return (read_account(self.progress) or Account()).lost
 
     def save(self) -> bool:
         """Request the flight recording; return False without a recorder."""
@@ -81,12 +80,15 @@ class RecorderProcess:
 
     def renew(self, request: dict[str, Any]) -> None:
         """Begin a new part with the new files attached. Raises OSError."""
-        if self._child is None:
-            return
+        if self._child is not None:
+            self._write(request)
+            self._child.process.send_signal(signal.SIGHUP)
+
+    def _write(self, request: dict[str, Any]) -> None:
+        assert self._files is not None
         temporary = self._request.with_name(self._request.name + ".new")
-        temporary.write_text(json.dumps(request | {"run": self._run_name}), encoding="utf-8")
+        temporary.write_text(json.dumps(request | {"run": self._files[2]}), encoding="utf-8")
         temporary.replace(self._request)
-        self._child.process.send_signal(signal.SIGHUP)
 
     def watch(self) -> None:
         """Restart a recorder that died; it continues where it was.
@@ -139,12 +141,9 @@ class RecorderProcess:
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
-    def _settled(self) -> Account:
-        return ProgressFile(self.progress).load() if self.progress.exists() else Account()
-
     def _account(self, error: str) -> dict[str, Any]:
         """Return the account of a recorder that gave none; cycles not written count as lost."""
-        settled = self._settled()
+        settled = read_account(self.progress) or Account()
         cycles = SnapshotReader(self._snapshot).read().counters["cycles"]
         return {
             "path": None,
@@ -156,10 +155,10 @@ class RecorderProcess:
 
     def _unfinished(self) -> list[str]:
         """Return unfinished files of this run left by killed recorders."""
-        if self._directory is None:
+        if self._files is None:
             return []
-        files = part_files(self._directory, self._prefix)
-        return [str(each.path) for each in files if each.active and each.run == self._run_name]
+        directory, prefix, run = self._files
+        return [str(each.path) for each in part_files(directory, prefix) if each.active and each.run == run]
 
 
 # ---- request ----
@@ -170,10 +169,7 @@ _EDS_DIRECTORY = Path(__file__).resolve().parents[2] / "drivers" / "eds"
 def loop_request(config: Config, runtime: Path, bus: str) -> dict[str, Any]:
     """Return the part that is common to the requests of all processes that read the loop's memory.
 
-    Args:
-        config: configuration in force.
-        runtime: jtqd's runtime directory.
-        bus: name of the bus as it can stand in a file name.
+    runtime: jtqd's runtime directory; bus: its name as it can stand in a file name.
     """
     nodes = [(joint.node_id, f"drive {joint.number}") for joint in config.joints]
     if config.sensor is not None:
@@ -194,10 +190,7 @@ def recording_request(
 ) -> dict[str, Any]:
     """Return the request for the recorder: configuration, joint files, EDS, DBC, networks and versions attached.
 
-    Args:
-        report: boot report with the scaling read from the devices.
-        directory: where logs go.
-        config, runtime, bus: as of `loop_request`.
+    report: of the boot, with the scaling read from the devices; directory: where logs go; others as of `loop_request`.
     """
     provenance = json.dumps(_provenance(config, report))
     attachments: list[dict[str, str]] = [
@@ -206,7 +199,7 @@ def recording_request(
         {"name": "provenance.json", "media_type": "application/json", "text": provenance},
     ]
     # By their content: a recorder that is started later attaches what is in force, even if the files have changed.
-    for name, kind, data in _attached_files(config):
+    for name, (kind, data) in _attached_files(config).items():
         content = base64.b64encode(data).decode("ascii")
         attachments.append({"name": name, "media_type": kind, "base64": content})
     for name in sorted(("drive.eds", own_sheet(len(config.joints)), "torque_sensor.eds")):
@@ -236,8 +229,8 @@ def _attachment_names(config: Config) -> dict[Path, str]:
     return names
 
 
-def _attached_files(config: Config) -> list[tuple[str, str, bytes]]:
-    """(name, media type, content) of joint files, networks and profiles."""
+def _attached_files(config: Config) -> dict[str, tuple[str, bytes]]:
+    """Name -> media type and content of joint files, networks and profiles."""
     names = _attachment_names(config)
     found: dict[str, tuple[str, bytes]] = {}
     for joint in config.joints:
@@ -246,7 +239,7 @@ def _attached_files(config: Config) -> list[tuple[str, str, bytes]]:
             found.setdefault(names[joint.network.path], ("application/octet-stream", joint.network.data))
         if joint.profile_path:
             found.setdefault(names[joint.profile_path], ("application/yaml", joint.profile_data))
-    return [(name, kind, data) for name, (kind, data) in found.items()]
+    return found
 
 
 def _provenance(config: Config, report: dict[str, Any]) -> dict[str, Any]:

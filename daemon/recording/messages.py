@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from enum import IntEnum
 from typing import NamedTuple
 
 from mcap.records import Channel, Schema
@@ -24,40 +25,36 @@ from jtqd.daemon.shared import cycle_record as cycle
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, layout_of
 from jtqd.daemon.shared.snapshot import PAST_WORDS, View
 from jtqd.estimator.status import NAMES, PAST_LAYOUT, STANDSTILL, STARTING, VALID, Zeros
+from jtqd.estimator.text import counted
 
 # ---- definitions and topics ----
 
 STATUS_NAMES = {code: name.upper() for code, name in NAMES.items()}
 """Status codes of the estimate PDO; the same names are constants of the JointEstimate definition."""
 
-EVENT_NAMES = dict(
-    enumerate(
-        (
-            "RECORDER_STARTED",
-            "RECORDER_STOPPED",
-            "RECORDS_LOST",
-            "STATUS_CHANGED",
-            "SLOTS_MISSED",
-            "WRITE_FAILED",
-            "SPACE_LOW",
-            "FILE_RETIRED",
-            "FILE_REMOVED",
-            "FILE_REPAIRED",
-            "FLIGHT_SAVED",
-            "NOTICE",
-        ),
-        start=1,
-    )
-)
-"""Kinds of events; the same names are constants of the Event definition."""
-RECORDER_STARTED, RECORDER_STOPPED, RECORDS_LOST, STATUS_CHANGED, SLOTS_MISSED, WRITE_FAILED = range(1, 7)
-SPACE_LOW, FILE_RETIRED, FILE_REMOVED, FILE_REPAIRED, FLIGHT_SAVED, NOTICE = range(7, 13)
+
+class EventKind(IntEnum):
+    """Kinds of events; the names are constants of the Event definition."""
+
+    RECORDER_STARTED = 1
+    RECORDER_STOPPED = 2
+    RECORDS_LOST = 3
+    STATUS_CHANGED = 4
+    SLOTS_MISSED = 5
+    WRITE_FAILED = 6
+    SPACE_LOW = 7
+    FILE_RETIRED = 8
+    FILE_REMOVED = 9
+    FILE_REPAIRED = 10
+    FLIGHT_SAVED = 11
+    NOTICE = 12
+
 
 _TIME = "int32 sec\nuint32 nanosec\n"
 _HEADER = "builtin_interfaces/Time stamp\nstring frame_id\n"
 
 _STATUS_CONSTANTS = "".join(f"uint16 {name}={code}\n" for code, name in STATUS_NAMES.items())
-_EVENT_CONSTANTS = "".join(f"uint8 {name}={code}\n" for code, name in EVENT_NAMES.items())
+_EVENT_CONSTANTS = "".join(f"uint8 {kind.name}={kind}\n" for kind in EventKind)
 
 _JOINT_ESTIMATE = f"""\
 # One joint in one cycle: the inputs in SI units and every stage of the torque estimate.
@@ -283,26 +280,19 @@ JOINTS = tuple(
     for joint, number in ((1, 1), (2, 2), (3, 8), (4, 9))
 )
 """Of the joints that a bus may have."""
-JOINT_1, JOINT_2 = JOINTS[:2]
 CAN_FRAMES = Topic(3, "/can/frames", frames_name(2))
 JOINT_STATES = Topic(4, "/joint_states", "sensor_msgs/msg/JointState")
 DIAGNOSTICS = Topic(5, "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 EVENTS = Topic(6, "/events", "jtqd_msgs/msg/Event")
 LOG = Topic(7, "/log", "rcl_interfaces/msg/Log")
-_OTHERS = (JOINT_STATES, DIAGNOSTICS, EVENTS, LOG)
 ZEROS = tuple(Topic(9 + joint, f"/joint/{joint}/zeros", ZEROS_SCHEMA) for joint in range(1, MOST_JOINTS + 1))
 """Of the joints that a bus may have; without a message where nothing is tracked."""
-
-
-def joint_topics(joints: int) -> tuple[Topic, ...]:
-    """Return /joint/1/state, /joint/2/state, ... of a bus with so many joints."""
-    return JOINTS[:joints]
 
 
 def topics_of(joints: int) -> tuple[Topic, ...]:
     """Return all topics in the log of a bus with so many joints."""
     frames = CAN_FRAMES._replace(schema=frames_name(joints))
-    return *joint_topics(joints), frames, *_OTHERS, *ZEROS[:joints]
+    return *JOINTS[:joints], frames, JOINT_STATES, DIAGNOSTICS, EVENTS, LOG, *ZEROS[:joints]
 
 
 TOPICS = topics_of(2)
@@ -417,7 +407,7 @@ class CycleMessages:
         self.frames_size = struct.calcsize("<" + frames_code)
         packed = struct.Struct("<" + joints * ("11sIqq" + _JOINT_CODE) + "11sIqq" + frames_code)
         self._pack = packed.pack
-        topics = joint_topics(joints)
+        topics = JOINTS[:joints]
         step = _RECORD_HEAD.size + JOINT_ESTIMATE_SIZE
         self.parts = tuple((topic.number, n * step) for n, topic in enumerate((*topics, CAN_FRAMES)))
         self._joints = [
@@ -590,7 +580,7 @@ def diagnostics(time_ns: int, statuses: Sequence[Status]) -> bytes:
 INFO, WARN, ERROR = 20, 30, 40
 _PER_SPAN = 50
 """A status that flaps every cycle must not fill the disk; what is left out is counted."""
-_BOUNDED = (STATUS_CHANGED, SLOTS_MISSED, NOTICE)
+_BOUNDED = (EventKind.STATUS_CHANGED, EventKind.SLOTS_MISSED, EventKind.NOTICE)
 _GOOD = (STARTING, VALID, STANDSTILL)
 """Statuses that a healthy joint goes through."""
 
@@ -660,13 +650,13 @@ class EventLog:
                     names = [STATUS_NAMES.get(code, str(code)) for code in (old, new)]
                     text = f"joint {joint}: {names[0]} -> {names[1]}"
                     level = INFO if new in _GOOD else WARN
-                    self.note(STATUS_CHANGED, text, level=level, joint=joint, change=(old, new))
+                    self.note(EventKind.STATUS_CHANGED, text, level=level, joint=joint, change=(old, new))
         if missed != self._missed:
-            slots = missed - (missed if self._missed is None else self._missed)
+            slots = 0 if self._missed is None else missed - self._missed
             self._missed = missed
             if slots > 0:
-                text = f"the loop missed {slots} {'slot' if slots == 1 else 'slots'}"
-                self.note(SLOTS_MISSED, text, level=WARN, count=slots)
+                text = f"the loop missed {counted(slots, 'slot')}"
+                self.note(EventKind.SLOTS_MISSED, text, level=WARN, count=slots)
         return statuses != before
 
 

@@ -13,9 +13,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from jtqd.daemon.recording import messages
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
-from jtqd.daemon.recording.messages import ERROR, INFO, WARN, EventLog
+from jtqd.daemon.recording.messages import ERROR, INFO, STATUS_NAMES, WARN, EventKind, EventLog
 from jtqd.daemon.recording.run_files import (
     ACTIVE,
     MEGABYTE,
@@ -51,7 +50,7 @@ class Parts:
     """Writes spans, or counts their cycles as lost.
 
     Args:
-        rules: of this run.
+        rules: of this run; kept as an attribute.
         head: beginning of every part.
         builder: of the spans: a part begins with the definitions, and may end with a span of its own.
         events: takes what must be noted.
@@ -66,7 +65,7 @@ class Parts:
     def __init__(
         self, rules: Rules, head: Head, builder: ChunkBuilder, events: EventLog, account: Account
     ) -> None:
-        self._rules = rules
+        self.rules = rules
         self._head = head
         self._builder = builder
         self._events = events
@@ -97,7 +96,7 @@ class Parts:
     def free_bytes(self) -> int:
         """Free space; -1 where it is unknown."""
         try:
-            return free_bytes(self._rules.directory) if self._file is None else self._file.free_bytes
+            return free_bytes(self.rules.directory) if self._file is None else self._file.free_bytes
         except OSError:
             return -1
 
@@ -110,7 +109,7 @@ class Parts:
 
     def open(self, why: str) -> bool:
         """Begin the next part; if that fails, report it once and return False."""
-        rules = self._rules
+        rules = self.rules
         try:
             if free_bytes(rules.directory) < rules.reserve * (_ROOM_AGAIN if self.obstacle else 1.0):
                 return self._no_room()
@@ -118,16 +117,10 @@ class Parts:
             earlier = [each for each in part_files(rules.directory, rules.prefix) if each.run == rules.run]
             part = max([self.part, *(each.part for each in earlier)]) + 1
             name = part_name(rules.prefix, rules.run, part)
-            previous = self._previous or (
-                part_name(rules.prefix, rules.run, earlier[-1].part) if earlier else ""
-            )
-            metadata = {
-                "run": rules.run,
-                "part": str(part),
-                "previous": previous,
-                "prefix": rules.prefix,
-                "reason": why,
-            }
+            previous = part_name(rules.prefix, rules.run, earlier[-1].part) if earlier else ""
+            previous = self._previous or previous
+            metadata = {"run": rules.run, "part": str(part), "previous": previous}
+            metadata |= {"prefix": rules.prefix, "reason": why}
             path = rules.directory / (name + ACTIVE)
             self._file = McapFile(path, self._head, metadata, time.time_ns())
         except OSError as error:
@@ -151,7 +144,7 @@ class Parts:
             file.abandon(remove=True)
             return
         try:
-            file.finish(part_name(self._rules.prefix, self._rules.run, self.part))
+            file.finish(part_name(self.rules.prefix, self.rules.run, self.part))
         except OSError as error:
             self.all_ended = False
             self._events.warn(
@@ -186,14 +179,14 @@ class Parts:
             return
         if self._began_ns is None:
             self._began_ns = at_ns
-        budget = self._rules.budget
+        budget = self.rules.budget
         if budget is not None and not self._over_budget and self._others + file.size > budget:
             self._enforce_budget()
-        if 0 <= self.free_bytes < self._rules.reserve:
+        if 0 <= self.free_bytes < self.rules.reserve:
             self._no_room()
-        elif at_ns - self._began_ns >= self._rules.rotate_ns:
+        elif at_ns - self._began_ns >= self.rules.rotate_ns:
             self.rotate("time")
-        elif file.size >= self._rules.rotate_bytes:
+        elif file.size >= self.rules.rotate_bytes:
             self.rotate("size")
 
     def _append(self, span: Span) -> bool:
@@ -225,18 +218,18 @@ class Parts:
         self._account.written -= count
         self._account.unwritten += count
         text = f"part {self.part} was removed while it was being written: cycles lost with it: {count}"
-        self._events.report(messages.FILE_REMOVED, text, level=ERROR, count=count)
+        self._events.report(EventKind.FILE_REMOVED, text, level=ERROR, count=count)
 
     # ---- obstacles ----
 
     def _no_room(self) -> bool:
         """Handle a disk below the reserve. Always False."""
-        free, reserve = self.free_bytes / MEGABYTE, self._rules.reserve / MEGABYTE
+        free, reserve = self.free_bytes / MEGABYTE, self.rules.reserve / MEGABYTE
         text = (
-            f"recording pauses: {free:.4g} MB are free in {self._rules.directory}, {reserve:.4g} MB stay free"
+            f"recording pauses: {free:.4g} MB are free in {self.rules.directory}, {reserve:.4g} MB stay free"
         )
         if not self.obstacle and self._file is not None:
-            self._events.note(messages.SPACE_LOW, text, level=ERROR)
+            self._events.note(EventKind.SPACE_LOW, text, level=ERROR)
             last = self._builder.seal()
             with suppress(OSError):
                 if last is not None:
@@ -261,13 +254,13 @@ class Parts:
         self.obstacle = ""
         count, self._missed = self._missed, 0
         text = f"recording continues in part {self.part}; cycles not written: {count}"
-        self._events.report(messages.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
+        self._events.report(EventKind.WRITE_FAILED, text, level=ERROR if count else WARN, count=count)
 
     # ---- budget ----
 
     def _enforce_budget(self) -> None:
         """Remove files to meet the budget, oldest first."""
-        rules = self._rules
+        rules = self.rules
         active = part_name(rules.prefix, rules.run, self.part) + ACTIVE
         found = [each for each in part_files(rules.directory, rules.prefix) if each.path.name != active]
         if rules.budget is not None:
@@ -279,12 +272,12 @@ class Parts:
                     continue
                 found.remove(each)
                 text = f"removed {each.path.name}: budget of {rules.budget / MEGABYTE:g} MB"
-                self._events.report(messages.FILE_RETIRED, text, level=INFO)
+                self._events.report(EventKind.FILE_RETIRED, text, level=INFO)
         self._others = sum(each.size for each in found)
         over = rules.budget is not None and self.total_size > rules.budget
         if over and not self._over_budget:
             text = "the budget is exceeded by files that are not removed; recording continues"
-            self._events.report(messages.FILE_RETIRED, text, level=WARN)
+            self._events.report(EventKind.FILE_RETIRED, text, level=WARN)
         self._over_budget = over
 
 
@@ -311,7 +304,7 @@ class FaultTrigger:
             if new != old:
                 self._stale_since[n] = at_ns if new == STALE else None
                 if new in (DRIVE_FAULT, INVALID):
-                    why = f"joint {n + 1}: {messages.STATUS_NAMES[new]}"
+                    why = f"joint {n + 1}: {STATUS_NAMES[new]}"
         return why
 
     def passed(self, at_ns: int) -> str:
@@ -389,14 +382,14 @@ class FlightRecorder:
         if not begun:
             return
         self.saved += 1
-        self._events.report(messages.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
+        self._events.report(EventKind.FLIGHT_SAVED, f"flight recording: {why}", level=WARN)
         self._parts.open(why)
         while self._memory:
             span, at_ns = self._memory.popleft()
             self._account.let_go -= span.cycles
             self._parts.write(span, at_ns)
 
-    def finish(self) -> None:
+    def end(self) -> None:
         """End the file if one is being written."""
         self._until_ns = None
         self._parts.end()

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from jtqd.daemon.recording import messages
-from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
+from jtqd.daemon.recording.diagnostics import Diagnostics, Node
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, NamedData, Span
 from jtqd.daemon.recording.messages import (
     ERROR,
@@ -33,6 +33,7 @@ from jtqd.daemon.recording.messages import (
     SCANNED,
     WARN,
     CycleMessages,
+    EventKind,
     EventLog,
     JointStateMessage,
     diagnostics,
@@ -43,6 +44,7 @@ from jtqd.daemon.recording.run_files import (
     MEGABYTE,
     RUN_PATTERN,
     Account,
+    PartFile,
     ProgressFile,
     free_run,
     part_files,
@@ -52,6 +54,7 @@ from jtqd.daemon.shared.cycle_record import MOST_JOINTS, RingReader, layout_of
 from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.processes import Child, ChildError
 from jtqd.daemon.shared.runtime_dir import SharedMemoryError
+from jtqd.estimator.text import counted
 
 _REPEAT_EVERY, _REPEAT_EVERY_IN_MEMORY = 60, 10
 """Spans after which schemas and channels are repeated; a flight recording begins with any span."""
@@ -113,17 +116,18 @@ class RecorderRequest:
     gear_ratios: tuple[float | None, ...] = (None, None)
 
     def __post_init__(self) -> None:
-        if not 0.01 <= self.chunk_s <= 60.0:
-            raise RequestError(f"chunk_s: found {self.chunk_s!r}, expected 0.01 to 60 s")
-        if "/" in self.prefix or not self.prefix:
-            raise RequestError(f"prefix: found {self.prefix!r}, expected the beginning of a file name")
-        if self.run is not None and not RUN_PATTERN.fullmatch(self.run):
-            raise RequestError(f"run: found {self.run!r}, expected YYYYmmddTHHMMSSZ")
+        checks = [
+            ("chunk_s", 0.01 <= self.chunk_s <= 60.0, "0.01 to 60 s"),
+            ("prefix", self.prefix and "/" not in self.prefix, "the beginning of a file name"),
+            ("run", self.run is None or RUN_PATTERN.fullmatch(self.run), "YYYYmmddTHHMMSSZ"),
+        ]
         for key in ("rotate_s", "rotate_mb", "budget_mb", "reserve_mb", "flight_recorder_s"):
             value = getattr(self, key)
-            if value is not None and not 0.0 <= value < math.inf:
-                raise RequestError(f"{key}: found {value!r}, expected a number from 0 on")
-        if not len(self.gear_ratios) == self.joints <= MOST_JOINTS or not self.joints:
+            checks.append((key, value is None or 0.0 <= value < math.inf, "a number from 0 on"))
+        for key, good, expected in checks:
+            if not good:
+                raise RequestError(f"{key}: found {getattr(self, key)!r}, expected {expected}")
+        if not 1 <= len(self.gear_ratios) == self.joints <= MOST_JOINTS:
             raise RequestError(f"joint_names and gear_ratios: expected 1 to {MOST_JOINTS}, as many of each")
         for ratio in self.gear_ratios:
             if ratio is not None and not (math.isfinite(ratio) and ratio != 0.0):
@@ -175,7 +179,10 @@ class RecorderRequest:
         loaded = []
         for item in self.attachments:
             try:
-                data = _content(item)
+                if "base64" in item:
+                    data = base64.b64decode(item["base64"], validate=True)
+                else:
+                    data = item["text"].encode() if "text" in item else Path(item["path"]).read_bytes()
             except OSError as error:
                 warn(f"attachment {item['name']}: {error.strerror}: {item['path']}")
             except ValueError as error:
@@ -199,13 +206,6 @@ class RecorderRequest:
         )
 
 
-def _content(item: dict[str, str]) -> bytes:
-    """Return bytes of an attachment. Raises OSError: a file that cannot be read; ValueError: wrong base64."""
-    if "base64" in item:
-        return base64.b64decode(item["base64"], validate=True)
-    return item["text"].encode() if "text" in item else Path(item["path"]).read_bytes()
-
-
 # ---- cycles ----
 
 OVERVIEW_PERIOD_NS = 20_000_000
@@ -222,7 +222,7 @@ class Sink(Protocol):
 
 
 class Recording:
-    """One run of the loop on its way into files.
+    """Cycle records of one run of the loop on their way into spans: each cycle, the 50 Hz overview, events.
 
     Args:
         builder: of the spans.
@@ -296,8 +296,8 @@ class Recording:
         """Count cycles that the ring overwrote before they were read."""
         self.account.cycles += count
         self.account.overwritten += count
-        text = f"{count} cycle{'' if count == 1 else 's'} overwritten before the recorder read them"
-        self.events.note(messages.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
+        text = f"{counted(count, 'cycle')} overwritten before the recorder read them"
+        self.events.note(EventKind.RECORDS_LOST, text, level=ERROR, time_ns=time_ns, count=count)
 
     def flush(self) -> None:
         """End the span and hand it on."""
@@ -330,14 +330,13 @@ class Session:
         self.account = account
         now_ns = time.time_ns()
         self.run = request.run or free_run(request.directory, request.prefix, now_ns)
-        self._rules = request.rules(self.run)
         definitions, channels = messages.definitions(request.joints)
         head = Head(definitions, channels, request.load_attachments(warn))
         keep_s = request.flight_recorder_s
         repeat = _REPEAT_EVERY if keep_s is None else _REPEAT_EVERY_IN_MEMORY
         self._builder = ChunkBuilder(definitions, channels, CycleMessages(request.joints).parts, repeat)
         self.events = EventLog(self._builder.add, warn)
-        self.parts = Parts(self._rules, head, self._builder, self.events, account)
+        self.parts = Parts(request.rules(self.run), head, self._builder, self.events, account)
         self._flight = None if keep_s is None else FlightRecorder(self.parts, self.events, account, keep_s)
         self.recording = Recording(
             self._builder,
@@ -352,10 +351,9 @@ class Session:
         self._notices: NoticesReader | None = None
         self._repair: Child | None = None
         self._repair_due = request.repair
-        self.events.note(messages.RECORDER_STARTED, "recorder started", level=INFO, time_ns=now_ns)
+        self.events.note(EventKind.RECORDER_STARTED, "recorder started", level=INFO, time_ns=now_ns)
         if self._flight is None:
-            earlier = any(each.run == self.run for each in part_files(request.directory, request.prefix))
-            self.parts.open("recorder restarted" if earlier else "start")
+            self.parts.open("recorder restarted" if self._own_files() else "start")
 
     def save(self, why: str) -> None:
         """Write the flight recording; without a flight recorder begin the next part, so that this one is complete."""
@@ -389,25 +387,15 @@ class Session:
     def diagnose(self, backlog: int, cpu_percent: float) -> None:
         """Write /diagnostics, once a second."""
         now_ns = time.time_ns()
-        parts, flight, rules = self.parts, self._flight, self._rules
-        mode = "recording" if flight is None else "saving" if flight.saving else "in memory"
-        state = RecorderState(
-            mode="waiting" if parts.obstacle else mode,
-            obstacle=parts.obstacle,
+        view, statuses = self._diagnostics.of_loop(now_ns)
+        statuses += self._diagnostics.of_recorder(
+            self.account,
+            self.parts,
+            self._flight,
             backlog=backlog,
             cpu_percent=cpu_percent,
             events_left_out=self.events.left_out,
-            part=parts.part,
-            part_bytes=parts.size,
-            total_bytes=parts.total_size,
-            free=parts.free_bytes,
-            reserve=rules.reserve,
-            budget=-1 if rules.budget is None else rules.budget,
-            memory_bytes=0 if flight is None else flight.memory_bytes,
-            memory_s=0.0 if flight is None else flight.memory_s,
         )
-        view, statuses = self._diagnostics.of_loop(now_ns)
-        statuses += self._diagnostics.of_recorder(self.account, state)
         self._builder.add(messages.DIAGNOSTICS.number, now_ns, diagnostics(now_ns, statuses))
         if view is not None and view.cycle != self._zeros_cycle:
             self._zeros_cycle = view.cycle
@@ -416,20 +404,16 @@ class Session:
 
     def finish(self) -> dict[str, Any]:
         """End everything; returns the summary of the run."""
-        account = self.account
+        account, flight = self.account, self._flight
         text = f"recorder stopped: cycles {account.cycles}, lost {account.lost}"
-        self.events.note(messages.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
+        self.events.note(EventKind.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
         self._read_notices()
         self.recording.flush()
-        if self._flight is None:
-            self.parts.end()
-        else:
-            self._flight.finish()
+        (flight or self.parts).end()
         if self._repair is not None:
             self._repair.process.kill()  # it may be interrupted anywhere, and goes on at the next start
             self._repair.process.wait()
-        files = part_files(self._request.directory, self._request.prefix)
-        own = [each for each in files if each.run == self.run]  # one that could not be ended among them
+        own = self._own_files()  # one that could not be ended among them
         return {
             "path": str(own[-1].path) if own else None,
             "paths": [str(each.path) for each in own],
@@ -440,38 +424,32 @@ class Session:
             "lost_overwritten": account.overwritten,
             "lost_unwritten": account.unwritten,
             "let_go": account.let_go,
-            "flight_recordings": None if self._flight is None else self._flight.saved,
+            "flight_recordings": None if flight is None else flight.saved,
             "bytes": sum(each.size for each in own),
         }
 
+    def _own_files(self) -> list[PartFile]:
+        files = part_files(self._request.directory, self._request.prefix)
+        return [each for each in files if each.run == self.run]
+
     def _read_notices(self) -> None:
-        path = self._request.notices
-        if self._notices is None:
-            if path is None or not path.exists():
-                return
-            try:
-                self._notices = NoticesReader(path)
-            except SharedMemoryError:
-                return
-        news, _ = self._notices.read()
-        for notice in news:
+        if self._notices is None and self._request.notices is not None:
+            with suppress(SharedMemoryError):
+                self._notices = NoticesReader(self._request.notices)
+        for each in () if self._notices is None else self._notices.read()[0]:
             self.events.note(
-                messages.NOTICE,
-                notice.text,
-                level=notice.level,
-                time_ns=notice.realtime_ns,
-                count=notice.node,
+                EventKind.NOTICE, each.text, level=each.level, time_ns=each.realtime_ns, count=each.node
             )
 
     def _poll_repair(self) -> None:
         """Start the repair of earlier files once something has been recorded, and report its results."""
-        request = self._request
-        if self._repair_due and self._has_begun():
+        request, account, parts = self._request, self.account, self.parts
+        if self._repair_due and (account.written > 0 or account.let_go > 0 or parts.obstacle):
             self._repair_due = False
             files = part_files(request.directory, request.prefix)
-            current = self.parts.part if self.parts.is_open else 0
+            current = parts.part if parts.is_open else 0
             if any(each.active and (each.run, each.part) != (self.run, current) for each in files):
-                arguments = [str(request.directory), request.prefix, str(self._rules.reserve)]
+                arguments = [str(request.directory), request.prefix, str(parts.rules.reserve)]
                 self._repair = Child("jtqd.daemon.logs.recover", arguments, name="the repair")
         if self._repair is None:
             return
@@ -482,13 +460,9 @@ class Session:
             answer = {"text": str(error), "lossy": True}
         if answer is not None:
             level = WARN if answer["lossy"] else INFO
-            self.events.report(messages.FILE_REPAIRED, str(answer["text"]), level=level)
+            self.events.report(EventKind.FILE_REPAIRED, str(answer["text"]), level=level)
         elif ended:
             self._repair = None
-
-    def _has_begun(self) -> bool:
-        """Return whether a span has been through; a repair delays nothing any more."""
-        return self.account.written > 0 or self.account.let_go > 0 or bool(self.parts.obstacle)
 
 
 # ---- the process ----
@@ -513,14 +487,11 @@ class _Signals:
         self._parent = os.getppid()
         self._received: set[int] = set()
         for number in (signal.SIGHUP, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2):
-            signal.signal(number, self._on_signal)
+            signal.signal(number, lambda number, _frame: self._received.add(number))
         # Ctrl-C reaches every process of the terminal; the supervisor ends the loop, then sends SIGTERM.
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         # `launch.RecorderProcess` starts us with it blocked
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
-
-    def _on_signal(self, number: int, _frame: object) -> None:
-        self._received.add(number)
 
     def take(self, number: int) -> bool:
         """Return whether this signal came since the last call."""
@@ -537,55 +508,53 @@ class _Signals:
         return signal.SIGTERM in self._received or self.orphaned
 
 
-def _open_ring(request: RecorderRequest, signals: _Signals) -> RingReader:
-    deadline = time.monotonic() + request.wait_s
-    while True:
-        try:
-            return RingReader(request.ring, layout_of(request.joints).size)
-        except SharedMemoryError:
-            if time.monotonic() >= deadline or signals.stop:
-                raise
-        time.sleep(POLL_S)
-
-
 class Recorder:
     """The polling loop around one `Session`.
 
     Args:
-        progress: takes how far the recording is; None: nothing does.
-        request_path: read again on SIGHUP.
+        path: of the request; read again on SIGHUP.
+
+    Raises:
+        RequestError: the request is wrong.
+        SharedMemoryError: no ring at that path within `wait_s`, or no snapshot at the path of the request.
+        OSError: the file of the progress cannot be made.
     """
 
-    def __init__(
-        self,
-        reader: RingReader,
-        session: Session,
-        signals: _Signals,
-        progress: ProgressFile | None,
-        request_path: Path,
-    ) -> None:
-        self._reader = reader
-        self._session = session
-        self._recording = session.recording
-        self._signals = signals
-        self._progress = progress
-        self._request_path = request_path
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        request = self._request = RecorderRequest.from_file(path)
+        self._signals = _Signals()
+        with suppress(OSError):
+            os.nice(_NICE)
+        self._reader = self._open_ring()
+        self._progress = None if request.progress is None else ProgressFile(request.progress)
+        account = Account() if self._progress is None else self._progress.load()
+        self._session = Session(request, account, _warn)
+        self._recording = self._session.recording
 
-    def _take(self) -> int:
-        """Take everything that is in the ring now; returns how many cycles that were."""
-        taken = 0
+    def _open_ring(self) -> RingReader:
+        deadline = time.monotonic() + self._request.wait_s
         while True:
-            batch = self._reader.read()
-            if batch.lost:
-                self._recording.count_lost(batch.lost, time.time_ns())
-            for record in batch.records:
-                self._recording.add(record)
-            taken += batch.lost + len(batch.records)
-            if not self._reader.backlog or not batch.records:
-                return taken
-            self.settle()
+            try:
+                return RingReader(self._request.ring, layout_of(self._request.joints).size)
+            except SharedMemoryError:
+                if time.monotonic() >= deadline or self._signals.stop:
+                    raise
+            time.sleep(POLL_S)
 
-    def run(self, chunk_s: float) -> None:
+    def record(self) -> int:
+        """Record one run; returns the exit status and prints the summary."""
+        self._run()
+        session = self._session
+        summary = session.finish()
+        self._settle()
+        try:
+            print(json.dumps(summary), flush=True)
+        except OSError:  # its reader has gone, and the interpreter would report that at its end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0 if session.parts.all_ended and not session.account.lost else 3
+
+    def _run(self) -> None:
         """Record until an order to end, then until the loop is quiet."""
         settled = self._recording.account.cycles
         if self._reader.position > settled:
@@ -619,11 +588,25 @@ class Recorder:
             # Spans end by recorded time; this is for a loop that stands still.
             if taken:
                 last_flush = now
-            elif now - last_flush >= chunk_s:
+            elif now - last_flush >= self._request.chunk_s:
                 self._recording.flush()
                 last_flush = now
-            self.settle()
+            self._settle()
             time.sleep(POLL_S)
+
+    def _take(self) -> int:
+        """Take everything that is in the ring now; returns how many cycles that were."""
+        taken = 0
+        while True:
+            batch = self._reader.read()
+            if batch.lost:
+                self._recording.count_lost(batch.lost, time.time_ns())
+            for record in batch.records:
+                self._recording.add(record)
+            taken += batch.lost + len(batch.records)
+            if not self._reader.backlog or not batch.records:
+                return taken
+            self._settle()
 
     def _answer_signals(self) -> None:
         signals = self._signals
@@ -633,45 +616,14 @@ class Recorder:
             self._session.save("on request")
         if signals.take(signal.SIGHUP):
             try:
-                self._session.renew(RecorderRequest.from_file(self._request_path))
+                self._session.renew(RecorderRequest.from_file(self._path))
             except RequestError as error:
                 _warn(str(error))
 
-    def settle(self) -> None:
+    def _settle(self) -> None:
         """Store how far the recording is."""
         if self._progress is not None:
             self._progress.store(self._recording.progress)
-
-
-def record(path: Path) -> int:
-    """Record one run; returns the exit status and prints the summary. SIGHUP reads the request again.
-
-    Args:
-        path: of the request.
-
-    Raises:
-        RequestError: the request is wrong.
-        SharedMemoryError: no ring at that path within `wait_s`.
-        SharedMemoryError: no snapshot at the path of the request.
-        OSError: the file of the progress cannot be made.
-    """
-    request = RecorderRequest.from_file(path)
-    signals = _Signals()
-    with suppress(OSError):
-        os.nice(_NICE)
-    reader = _open_ring(request, signals)
-    progress = None if request.progress is None else ProgressFile(request.progress)
-    account = Account() if progress is None else progress.load()
-    session = Session(request, account, _warn)
-    recorder = Recorder(reader, session, signals, progress, path)
-    recorder.run(request.chunk_s)
-    summary = session.finish()
-    recorder.settle()
-    try:
-        print(json.dumps(summary), flush=True)
-    except OSError:  # its reader has gone, and the interpreter would report that at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return 0 if session.parts.all_ended and not account.lost else 3
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -682,7 +634,7 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     path = Path(arguments[0])
     try:
-        return record(path)
+        return Recorder(path).record()
     except RequestError as error:
         _warn(str(error))
         return 2

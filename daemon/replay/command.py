@@ -17,7 +17,7 @@ from jtqd.daemon.recording.messages import SCHEMAS, CycleMessages
 from jtqd.daemon.recording.run_files import ACTIVE
 from jtqd.daemon.replay.compare import Comparison, Contacts, Difference, Identity, Unknown
 from jtqd.daemon.replay.logged import ADDED, SAMPLE, STAMP, stamps_ns
-from jtqd.daemon.replay.session import ReplayOptions, Result, as_json, content, replay_each
+from jtqd.daemon.replay.session import Result, as_json, content, replay
 from jtqd.daemon.shared.cycle_record import layout_of
 from jtqd.estimator.arrays import RecordArray
 from jtqd.estimator.command_line import check_output
@@ -240,24 +240,19 @@ def parser() -> argparse.ArgumentParser:
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    made.add_argument(
-        "logs", nargs="+", type=Path, metavar="LOG", help="MCAP files of jtqd, or the directory of one run"
-    )
-    made.add_argument(
+    add = made.add_argument
+    add("logs", nargs="+", type=Path, metavar="LOG", help="MCAP files of jtqd, or the directory of one run")
+    add(
         "--model",
         type=Path,
         metavar="DIR",
         help="other models: jointN.yaml or extended.jointN.yaml, jointN.onnx, jointN.fused.onnx; the rest as logged",
     )
-    made.add_argument("--method", choices=METHODS, help="another method of the estimator")
-    made.add_argument("--compare", action="store_true", help="show differences also with the logged models")
-    made.add_argument("--json", action="store_true", help="results as JSON")
-    made.add_argument(
-        "--out",
-        type=Path,
-        metavar="FILE",
-        help="write a new MCAP with both: /joint/N/state and /joint/N/replay",
-    )
+    add("--method", choices=METHODS, help="another method of the estimator")
+    add("--compare", action="store_true", help="show differences also with the logged models")
+    add("--json", action="store_true", help="results as JSON")
+    both = "write a new MCAP with both: /joint/N/state and /joint/N/replay"
+    add("--out", type=Path, metavar="FILE", help=both)
     return made
 
 
@@ -270,12 +265,11 @@ def main(argv: list[str]) -> int:
     if options.out is not None and options.out.exists():
         print(f"jtq replay: {options.out}: exists already, expected a new file", file=sys.stderr)
         return 2
-    replay_options = ReplayOptions(options.model, options.method)
     bar = _Bar()
     try:
         if options.out is not None:
             check_output(options.out)
-        good = _replay(options, replay_options, bar)
+        good = _replay(options, bar)
     except (LogError, ConfigError, NetworkError) as error:
         return _failed(bar, str(error))
     except OSError as error:
@@ -283,12 +277,12 @@ def main(argv: list[str]) -> int:
     return 0 if good else 3
 
 
-def _replay(options: argparse.Namespace, replay_options: ReplayOptions, bar: _Bar) -> bool:
+def _replay(options: argparse.Namespace, bar: _Bar) -> bool:
     """Replay, print, and write what is asked for; whether all is good. Only --out keeps more than one result in memory."""
     kept: list[Result] = []
     made: list[Any] = []
     good = True
-    results = replay_each(options.logs, replay_options, bar.update)
+    results = replay(options.logs, options.model, options.method, progress=bar.update)
     while (result := next(results, None)) is not None:
         good &= result.good
         made.append(content(result) if options.json else text(result, compared=options.compare))

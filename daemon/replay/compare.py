@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -77,51 +78,46 @@ def compare(
     both = np.isfinite(logged["torque_nm"]) & np.isfinite(replayed["torque_nm"])
     apart = np.abs(replayed["torque_nm"][both] - logged["torque_nm"][both])
     beside = np.logical_and.reduce([both, *map(np.isfinite, sensors)])
-    sensor, of_replay = (each[beside] for each in sensors)
+    errors = [
+        estimates["torque_nm"][beside] - sensor[beside]
+        for estimates, sensor in zip((logged, replayed), sensors, strict=True)
+    ]
     at = int(np.argmax(apart)) if len(apart) else None
     changed = logged["status"] != replayed["status"]
     return Comparison(
-        number,
-        len(logged),
-        int(pdo_equal(logged, replayed).sum()),
-        int(both.sum()),
-        _rms(apart),
-        float(apart[at]) if at is not None else np.nan,
-        int(logged["cycle"][both][at]) if at is not None else None,
-        len(sensor),
-        _rms(logged["torque_nm"][beside] - sensor),
-        _rms(replayed["torque_nm"][beside] - of_replay),
-        float(logged["sigma_nm"][both].mean()) if both.any() else np.nan,
-        float(replayed["sigma_nm"][both].mean()) if both.any() else np.nan,
-        int(changed.sum()),
-        _changes(logged["status"][changed], replayed["status"][changed]),
+        joint=number,
+        cycles=len(logged),
+        pdo_equal=int(pdo_equal(logged, replayed).sum()),
+        both=int(both.sum()),
+        rms_nm=_rms(apart),
+        max_nm=np.nan if at is None else float(apart[at]),
+        max_cycle=None if at is None else int(logged["cycle"][both][at]),
+        sensor_cycles=int(beside.sum()),
+        sensor_logged_nm=_rms(errors[0]),
+        sensor_replayed_nm=_rms(errors[1]),
+        sigma_logged_nm=float(logged["sigma_nm"][both].mean()) if both.any() else np.nan,
+        sigma_replayed_nm=float(replayed["sigma_nm"][both].mean()) if both.any() else np.nan,
+        status_changed=int(changed.sum()),
+        changes=_changes(logged["status"][changed].tolist(), replayed["status"][changed].tolist()),
     )
 
 
 def pdo_equal(logged: RecordArray, replayed: RecordArray) -> BoolArray:
     """Return whether a joint's fields of the estimate PDO are the same [n]."""
     one, two = (
-        fields(each["torque_nm"], each["sigma_nm"], each["status"].astype(np.uint16))
+        np.array(fields(each["torque_nm"], each["sigma_nm"], each["status"].astype(np.uint16)))
         for each in (logged, replayed)
     )
-    equal: BoolArray = np.ones(len(logged), np.bool_)
-    for a, b in zip(one, two, strict=True):
-        equal &= a == b
-    return equal
+    return np.asarray((one == two).all(axis=0))
 
 
 def _rms(values: FloatArray) -> float:
     return float(np.sqrt(np.mean(np.square(values)))) if len(values) else np.nan
 
 
-def _changes(before: npt.NDArray[np.uint16], after: npt.NDArray[np.uint16]) -> tuple[StatusChange, ...]:
-    pairs, counts = np.unique(
-        np.column_stack((before, after)).astype(np.int64).reshape(-1, 2), axis=0, return_counts=True
-    )
-    found = [
-        StatusChange(NAMES.get(a, str(a)), NAMES.get(b, str(b)), int(count))
-        for (a, b), count in zip(pairs.tolist(), counts.tolist(), strict=True)
-    ]
+def _changes(before: list[int], after: list[int]) -> tuple[StatusChange, ...]:
+    counts = sorted(Counter(zip(before, after, strict=True)).items())
+    found = [StatusChange(NAMES.get(a, str(a)), NAMES.get(b, str(b)), n) for (a, b), n in counts]
     return tuple(sorted(found, key=lambda each: -each.cycles))
 
 
@@ -179,14 +175,14 @@ def contacts(
         rows = np.flatnonzero(different)
         found.append(
             Contacts(
-                number,
-                int(((before & FLAG_CONTACT_KNOWN) != 0).sum()),
-                _beginnings(before),
-                _beginnings(after),
-                len(rows),
-                int(one["cycle"][rows[0]]) if len(rows) else None,
-                largest,
-                excused,
+                joint=number,
+                known=int(((before & FLAG_CONTACT_KNOWN) != 0).sum()),
+                logged=_beginnings(before),
+                replayed=_beginnings(after),
+                different=len(rows),
+                first_cycle=int(one["cycle"][rows[0]]) if len(rows) else None,
+                largest_nm=largest,
+                excused=excused,
             )
         )
     return tuple(found)
@@ -300,8 +296,10 @@ def identity(
     cycle = logged[0]["cycle"].astype(np.int64)
     same = bits = [_same(one, two) for one, two in zip(logged, replayed, strict=True)]
     if network_nm:
-        pairs = zip(same, logged, replayed, strict=True)
-        same = [each | _same_network(one, two, network_nm) for each, one, two in pairs]
+        same = [
+            each | (_same(one, two, network_nm) & ~bits_equal(one["network_nm"], two["network_nm"]))
+            for each, one, two in zip(bits, logged, replayed, strict=True)
+        ]
     recorded: BoolArray = np.zeros(len(cycle), np.bool_)
     pdo: BoolArray = ~recorded
     if estimate is not None:
@@ -357,18 +355,13 @@ def _compared(replayed: RecordArray) -> list[str]:
     return sorted(names, key=lambda name: _FIELDS.index(name) if name in _FIELDS else len(_FIELDS))
 
 
-def _same(logged: RecordArray, replayed: RecordArray) -> BoolArray:
-    same = [_equal(logged, replayed, name) for name in _compared(replayed)]
+def _same(logged: RecordArray, replayed: RecordArray, network_nm: float = 0.0) -> BoolArray:
+    """Equal bit for bit [n]; `network_nm`: but for the network's share, by which the numbers may differ so much."""
+    same = [
+        _equal(logged, replayed, name, network_nm if name in ("network_nm", "torque_nm", "sigma_nm") else 0.0)
+        for name in _compared(replayed)
+    ]
     return np.asarray(np.logical_and.reduce(same))
-
-
-def _same_network(logged: RecordArray, replayed: RecordArray, limit: float) -> BoolArray:
-    """Equal bit for bit but for the network's share, which differs by no more than `limit` [n]."""
-    same = ~bits_equal(logged["network_nm"], replayed["network_nm"])
-    for name in _compared(replayed):
-        share = name in ("network_nm", "torque_nm", "sigma_nm")
-        same &= _equal(logged, replayed, name, limit if share else 0.0)
-    return same
 
 
 def _equal(logged: RecordArray, replayed: RecordArray, name: str, tolerance: float = 0.0) -> BoolArray:

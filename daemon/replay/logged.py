@@ -30,7 +30,7 @@ import yaml
 from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, input_pdos, joint_inputs, joint_temperatures
 from jtqd.daemon.logs import LogError, iter_messages, iter_topics, log_parts, read_attachments
-from jtqd.daemon.recording.messages import CAN_FRAMES, ZEROS, joint_topics
+from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS, ZEROS
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, MOST_JOINTS
 from jtqd.daemon.shared.snapshot import PAST_WORDS
@@ -228,14 +228,19 @@ class _Attachments:
         return hashlib.sha256(data).hexdigest()
 
 
+_QUANTITIES = {
+    "motor_position": ("motor_position_rad", "motor_rad_per_count"),
+    "motor_velocity": ("motor_velocity_rad_s", "motor_rad_s_per_unit"),
+    "link_position": ("link_position_rad", "link_rad_per_count"),
+    "current": ("current_a", "ampere_per_unit"),
+}
+"""Quantity of a drive -> its field in the log, and its factor in the scaling."""
+_POSITIONS = ("motor_position", "link_position")
+
+
 def _check_scaling(inputs: JointInputs) -> None:
     """ValueError unless all factors are numbers that are not 0 (the sensor's may be); a drive may count backwards."""
-    for quantity, name in (
-        ("motor_position", "motor_rad_per_count"),
-        ("motor_velocity", "motor_rad_s_per_unit"),
-        ("link_position", "link_rad_per_count"),
-        ("current", "ampere_per_unit"),
-    ):
+    for quantity, (_, name) in _QUANTITIES.items():
         factor = getattr(inputs, name)
         if quantity in inputs.places and (not isfinite(factor) or factor == 0.0):
             raise ValueError(f"{name} is {factor}: the drive was absent at the start of the log")
@@ -384,16 +389,12 @@ def _counts(
 
 
 def _counted(name: str, each: JointInputs, records: RecordArray) -> IntegerArray:
-    """Integers of a quantity of the drive."""
-    if name == "motor_position":
-        return _rolled(_whole(records["motor_position_rad"], each.motor_rad_per_count))
-    if name == "link_position":
-        return _rolled(_whole(records["link_position_rad"], each.link_rad_per_count))
-    if name == "motor_velocity":
-        return _whole(records["motor_velocity_rad_s"], each.motor_rad_s_per_unit)
-    if name == "current":
-        return _whole(records["current_a"], each.ampere_per_unit)
-    return records["statusword"].astype(np.int64)
+    """Integers of a quantity of the drive; a position is 32 bits wide and rolls over."""
+    if name not in _QUANTITIES:
+        return records["statusword"].astype(np.int64)
+    field, factor = _QUANTITIES[name]
+    counts = _whole(records[field], getattr(each, factor))
+    return (counts + _HALF) % _FULL - _HALF if name in _POSITIONS else counts
 
 
 def _whole(values: FloatArray, unit: float) -> IntegerArray:
@@ -403,25 +404,16 @@ def _whole(values: FloatArray, unit: float) -> IntegerArray:
     return np.where(np.isfinite(counts), counts, 0.0).astype(np.int64)
 
 
-def _rolled(counts: IntegerArray) -> IntegerArray:
-    """Convert to a 32-bit position with roll-over."""
-    return (counts + _HALF) % _FULL - _HALF
-
-
 def offsets(pdos: Sequence[Pdo], records: RecordArray, each: JointInputs, row: int) -> tuple[int, int]:
     """Whole ranges [counts] that motor and link position had rolled over by `row`: from the log."""
     found = []
-    for quantity, name, unit in (
-        ("motor_position", "motor_position_rad", each.motor_rad_per_count),
-        ("link_position", "link_position_rad", each.link_rad_per_count),
-    ):
-        place = each.places.get(quantity)
-        if place is None:
-            found.append(0)
-            continue
-        column = pdos[place.pdo].values[place.entry]
-        counts = int(_whole(records[name][row : row + 1], unit)[0])
-        found.append(round((counts - int(column[row])) / _FULL) * _FULL)
+    for quantity in _POSITIONS:
+        name, factor = _QUANTITIES[quantity]
+        place, offset = each.places.get(quantity), 0
+        if place is not None:
+            counts = int(_whole(records[name][row : row + 1], getattr(each, factor))[0])
+            offset = round((counts - int(pdos[place.pdo].values[place.entry][row])) / _FULL) * _FULL
+        found.append(offset)
     return found[0], found[1]
 
 
@@ -560,7 +552,7 @@ STRETCH_CYCLES = 650_000
 """Longest stretch: one part of ten minutes at 1 kHz with something to spare."""
 _KEPT_ROWS = 5_000
 """Of the stretch before: no time step depends on what was earlier."""
-_FIRST_TOPIC = joint_topics(1)[0].name
+_FIRST_TOPIC = JOINTS[0].name
 """Of the joint that every log has."""
 
 Progress = Callable[[str, int, int], None]
@@ -665,7 +657,7 @@ def _stretches(
 ) -> Iterator[tuple[tuple[RecordArray, ...], Inputs, tuple[EstimatorStates, ...]]]:
     """Yield joints, inputs and states of the estimators of a run, stretch by stretch. Raises LogError, OSError."""
     count = len(setup.config.joints)
-    joints, zeros = [each.name for each in joint_topics(count)], [each.name for each in ZEROS[:count]]
+    joints, zeros = [each.name for each in JOINTS[:count]], [each.name for each in ZEROS[:count]]
     needed = {**dict.fromkeys(joints, JOINT), CAN_FRAMES.name: FRAMES}
     pending: dict[str, list[RecordArray]] = {}
     last, made = -1, False

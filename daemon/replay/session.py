@@ -11,11 +11,13 @@ import hashlib
 import tempfile
 import time
 from array import array
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -45,10 +47,6 @@ from jtqd.daemon.replay.logged import (
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.cycle_record import (
-    FLAG_NETWORK_SKIPPED,
-    FLAG_TEMPERATURE,
-)
 from jtqd.estimator.arrays import BoolArray, FloatArray, RecordArray
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import Estimator, make_estimator
@@ -60,14 +58,8 @@ from jtqd.models.files import load_joint
 
 _PROGRESS_CYCLES = 1 << 14
 """Between two calls of `progress`."""
-
-
-@dataclass
-class _Counters:
-    """Counters of the loop in shared memory; not read here."""
-
-    counters: array[int] = field(default_factory=lambda: array("Q", [0] * len(COUNTERS)))
-    errors: array[float] = field(default_factory=lambda: array("d", [0.0] * 3 * cr.MOST_JOINTS))
+_Events = defaultdict[int, list[Callable[[], object]]]
+"""Row -> what happens before it."""
 
 
 @dataclass(frozen=True)
@@ -95,32 +87,32 @@ class Replayed:
     joints: tuple[RecordArray, ...]
     estimate: npt.NDArray[np.uint8]
     temperatures_from_log: int
-    states_differ: tuple[tuple[int, int], ...] = ()
+    states_differ: tuple[tuple[int, int], ...]
 
 
 class Replayer:
-    """Replay cycle by cycle; keeps the joints from one part of a log to the next.
+    """Replay cycle by cycle; keeps the joints from one stretch of a log to the next.
 
     Args:
         setup: configuration and scaling.
-        models: of each joint.
-
-    Attributes:
-        models: as given.
+        models: of each joint; kept as an attribute.
     """
 
     def __init__(self, setup: Setup, models: Sequence[Model]) -> None:
         config = setup.config
         self._setup, self.models = setup, models
         self._intake = Intake(input_pdos(config), joint_temperatures(config))
-        counters = _Counters()
+        # Counters of the loop in shared memory; not read here.
+        unread = SimpleNamespace(
+            counters=array("Q", [0] * len(COUNTERS)), errors=array("d", [0.0] * 3 * cr.MOST_JOINTS)
+        )
         self._joints = [
             JointCycle(
                 n,
                 inputs,
                 model.estimator,
                 intake=self._intake,
-                snapshot=counters,
+                snapshot=unread,
                 period_ns=config.period_ns,
                 safety=JointSafety(config.safety, model.settings, model.joint, config.period_ns),
             )
@@ -129,9 +121,7 @@ class Replayer:
         self._unknown = [True] * len(self._joints)
         self._states_differ: list[tuple[int, int]] = []
         self._contacts = contacts_of(config)
-        self._time_ns = [1 << 60] * len(
-            self._joints
-        )  # any but 0, which would mean that there was no sample yet
+        self._time_ns = [1 << 60] * len(self._joints)  # any but 0: that is a joint without a sample yet
 
     def run(
         self,
@@ -141,17 +131,18 @@ class Replayer:
         progress: Callable[[int], None] = lambda _: None,
         states: Sequence[EstimatorStates] = (),
     ) -> Replayed:
-        """Replay the cycles of one part; `joints` are its states as logged. `progress` is called with the cycles done.
+        """Replay the cycles of one stretch; `joints` are its states as logged. `progress` is called with the cycles done.
 
         states: of each joint, states of its estimator in the log. The first one after a place where the state was not known
         is continued from; the others are compared.
         """
         count = len(joints[0])
-        celsius, happens = self._temperatures(inputs, joints)
+        events: _Events = defaultdict(list)
+        celsius = self._temperatures(inputs, joints, events)
         for n in range(len(self._joints)):
             known = states[n] if states else NO_STATES
-            for row, marks in self._marks(n, joints[n], inputs, steps[n], known).items():
-                happens.setdefault(row, []).extend(marks)
+            for row, event in self._marks(n, joints[n], inputs, steps[n], known):
+                events[row].append(event)
         times = np.array(
             [start + np.cumsum(each.dt_ns) for start, each in zip(self._time_ns, steps, strict=True)]
         )
@@ -165,14 +156,13 @@ class Replayer:
             cycle=joints[0]["cycle"],
             counter=joints[0]["sync_counter"],
             sync_ns=times,
-            wanted=[(each["input_flags"] & FLAG_NETWORK_SKIPPED) == 0 for each in joints],
+            wanted=[(each["input_flags"] & cr.FLAG_NETWORK_SKIPPED) == 0 for each in joints],
             contacts=self._contacts,
             withdrawn=(joints[0]["cycle_flags"] & cr.FLAG_WITHDRAWN) != 0,
         )
-        ends = sorted({*happens, *range(0, count, _PROGRESS_CYCLES), count})
-        for first, end in pairwise(ends):
-            for each in happens.get(first, ()):
-                each()
+        for first, end in pairwise(sorted({*events, *range(0, count, _PROGRESS_CYCLES), count})):
+            for happen in events.get(first, ()):
+                happen()
             rows.go_on(first, end)
             progress(end)
         if count:
@@ -182,41 +172,35 @@ class Replayer:
         return Replayed(samples, rows.estimates, rows.temperatures_from_log, differ)
 
     def _temperatures(
-        self, inputs: Inputs, joints: Sequence[RecordArray]
-    ) -> tuple[list[FloatArray], dict[int, list[Callable[[], object]]]]:
-        """Return each joint temperature as logged [n], and the frames to take before a row.
+        self, inputs: Inputs, joints: Sequence[RecordArray], events: _Events
+    ) -> list[FloatArray]:
+        """Return each joint temperature as logged [n]; its frames are events.
 
         A node that restarted is not believed until it is configured, and a frame may have found no room in its record: where
         the log has another temperature than the frames, the log is right.
         """
         celsius: list[FloatArray] = []
-        happens: dict[int, list[Callable[[], object]]] = {}
-        for index, events in enumerate(inputs.temperatures):
+        for index, frames in enumerate(inputs.temperatures):
             number = next(n for n, each in enumerate(self._setup.inputs) if each.temperature == index)
-            known = (joints[number]["input_flags"] & FLAG_TEMPERATURE) != 0
+            known = (joints[number]["input_flags"] & cr.FLAG_TEMPERATURE) != 0
             celsius.append(np.where(known, joints[number]["temperature_c"], np.nan))
-            for row, frame in events:
-                happens.setdefault(row, []).append(partial(self._intake.receive_temperature, index, frame))
-        return celsius, happens
+            for row, frame in frames:
+                events[row].append(partial(self._intake.receive_temperature, index, frame))
+        return celsius
 
     def _marks(
         self, number: int, records: RecordArray, inputs: Inputs, steps: Steps, states: EstimatorStates
-    ) -> dict[int, list[Callable[[], object]]]:
-        """Apply the events of one joint before a row: continuation after a gap in the log, reset of faults, restart."""
+    ) -> Iterator[tuple[int, Callable[[], object]]]:
+        """Yield the events of one joint by row: continuation after a gap in the log, reset of faults, restart."""
         joint, each = self._joints[number], self._setup.inputs[number]
-        marks: dict[int, list[Callable[[], object]]] = {}
         for row, _ in steps.breaks:
-            found = offsets(inputs.pdos, records, each, row)
-            marks.setdefault(row, []).append(partial(self._lose, number, found))
+            yield row, partial(self._lose, number, offsets(inputs.pdos, records, each, row))
         for row, content in states.rows(records["cycle"]).items():
-            marks.setdefault(row, []).append(
-                partial(self._meet, number, int(records["cycle"][row]) - 1, content)
-            )
+            yield row, partial(self._meet, number, int(records["cycle"][row]) - 1, content)
         for row in np.flatnonzero(records["cycle_flags"] & cr.FLAG_RESET).tolist():
-            marks.setdefault(row, []).append(joint.reset_latch)
+            yield row, joint.reset_latch
         for row in steps.begins.tolist():
-            marks.setdefault(row, []).append(partial(self._begin, number))
-        return marks
+            yield row, partial(self._begin, number)
 
     def _begin(self, number: int) -> None:
         """Continue where a joint starts, so that all about it is known."""
@@ -298,22 +282,7 @@ def _joint_file(directory: Path, number: int, logged: Joint) -> Path | None:
     return path if path.is_file() and load_joint(path).name == logged.name else None
 
 
-@dataclass(frozen=True)
-class ReplayOptions:
-    """Options of a replay.
-
-    Attributes:
-        model: directory with other joint files and networks.
-        method: another method of the estimator.
-    """
-
-    model: Path | None = None
-    method: str | None = None
-
-    @property
-    def other(self) -> bool:
-        """Return whether a model differs from the logged one."""
-        return self.model is not None or self.method is not None
+# ---- results ----
 
 
 @dataclass(frozen=True)
@@ -323,8 +292,7 @@ class Result:
     Attributes:
         run: its logs and states.
         models: of each joint.
-        seconds, read_s, replay_s: length of the run; wall time of reading and of estimating.
-        lost: cycles that are missing in the middle of the logs.
+        read_s, replay_s: wall time of reading and of estimating.
         from_si: inputs whose frame was not in the log, from the SI values beside it.
         temperatures_from_log: the same of temperatures.
         identity: comparison bit for bit, with the logged models only.
@@ -334,15 +302,23 @@ class Result:
 
     run: Run
     models: Sequence[Model]
-    seconds: float
     read_s: float
     replay_s: float
-    lost: int
     from_si: int
     temperatures_from_log: int
     identity: Identity | None
     comparisons: tuple[Comparison, ...]
     joints: tuple[RecordArray, ...]
+
+    @property
+    def seconds(self) -> float:
+        """Return the length of the run."""
+        return self.run.cycles * self.run.setup.config.period_ns * 1e-9
+
+    @property
+    def lost(self) -> int:
+        """Return cycles that are missing in the middle of the logs."""
+        return lost_cycles(self.run.joints[0], self.run.setup.config)
 
     @property
     def good(self) -> bool:
@@ -359,7 +335,7 @@ def content(result: Result) -> dict[str, Any]:
     """Return a result as an object of `jtq.replay/1`."""
     same = result.identity
     cycle = result.run.joints[0]["cycle"]
-    found = {
+    plain: dict[str, Any] = {
         "logs": [str(log) for log in result.run.logs],
         "cycles": result.run.cycles,
         "first_cycle": int(cycle[0]),
@@ -373,10 +349,9 @@ def content(result: Result) -> dict[str, Any]:
         "lost_cycles": result.lost,
         "inputs_from_si": result.from_si,
         "temperatures_from_log": result.temperatures_from_log,
-        "identity": same,
-        "joints": result.comparisons,
+        "identity": msgspec.to_builtins(same),
+        "joints": msgspec.to_builtins(result.comparisons),
     }
-    plain: dict[str, Any] = msgspec.to_builtins(found)
     if same is not None:
         plain["identity"] |= {"bit_identical": same.whole, "explained": same.explained}
     return plain
@@ -391,15 +366,10 @@ def as_json(runs: Sequence[dict[str, Any]]) -> bytes:
 
 
 def replay(
-    paths: Sequence[Path], options: ReplayOptions, progress: Progress = lambda *_: None
-) -> list[Result]:
-    """As `replay_each`, all results at once."""
-    return list(replay_each(paths, options, progress))
-
-
-def replay_each(
     paths: Sequence[Path],
-    options: ReplayOptions,
+    model: Path | None = None,
+    method: str | None = None,
+    *,
     progress: Progress = lambda *_: None,
     stretch: int = STRETCH_CYCLES,
 ) -> Iterator[Result]:
@@ -408,8 +378,16 @@ def replay_each(
     A run of more than `stretch` cycles gives several results, one after the other. A caller that drops each before it asks
     for the next needs memory for one of them only.
 
+    Args:
+        paths: logs.
+        model: directory with other joint files and networks.
+        method: another method of the estimator.
+        progress: see `Progress`.
+        stretch: longest [cycles].
+
     Raises LogError, ConfigError, NetworkError: one line each; OSError.
     """
+    other = model is not None or method is not None
     with tempfile.TemporaryDirectory(prefix="jtq-replay-") as scratch:
         runs = read_runs(paths, Path(scratch), progress, stretch)
         replayers: dict[int, Replayer] = {}
@@ -422,41 +400,31 @@ def replay_each(
             run, inputs = found
             del found  # its arrays take most of the memory
             if run.number not in replayers:
-                replayers[run.number] = Replayer(run.setup, _models(run, options))
+                try:
+                    replayers[run.number] = Replayer(run.setup, models_of(run.setup, model, method))
+                except (ConfigError, NetworkError) as error:
+                    if other:
+                        raise
+                    raise LogError(f"{run.logs[0]}: its models: {error}") from None
             replayer = replayers[run.number]
-            yield _replay_run(run, inputs, replayer, options=options, progress=progress, read_s=read_s)
+            yield _replay_run(run, inputs, replayer, other=other, progress=progress, read_s=read_s)
             del run, inputs
 
 
-def _models(run: Run, options: ReplayOptions) -> list[Model]:
-    try:
-        return models_of(run.setup, options.model, options.method)
-    except (ConfigError, NetworkError) as error:
-        if options.other:
-            raise
-        raise LogError(f"{run.logs[0]}: its models: {error}") from None
-
-
 def _replay_run(
-    run: Run,
-    inputs: Inputs,
-    replayer: Replayer,
-    *,
-    options: ReplayOptions,
-    progress: Progress,
-    read_s: float,
+    run: Run, inputs: Inputs, replayer: Replayer, *, other: bool, progress: Progress, read_s: float
 ) -> Result:
-    """Replay a run, or a stretch; `replayer`: new, or as the stretch before has left it."""
+    """Replay a run, or a stretch; `replayer`: new, or as the stretch before has left it; other: than the logged models."""
     config, models = run.setup.config, replayer.models
     begun = time.perf_counter()
     steps = run.steps()
-    states = _accepted_states(run, models, options)
+    states = _accepted_states(run, models) if other else run.states
     replayed = replayer.run(
         run.joints, inputs, steps, lambda done: progress("replaying", done, run.cycles), states
     )
     replay_s = time.perf_counter() - begun
     same = None
-    if not options.other:
+    if not other:
         compared = run.joints, replayed.joints, steps
         pdos = inputs.estimate, replayed.estimate, inputs.recorded
         same = identity(*compared, pdos, replayed.states_differ)
@@ -471,10 +439,8 @@ def _replay_run(
     return Result(
         run,
         models,
-        run.cycles * config.period_ns * 1e-9,
         read_s,
         replay_s,
-        lost_cycles(run.joints[0], config),
         inputs.from_si,
         replayed.temperatures_from_log,
         same,
@@ -483,9 +449,9 @@ def _replay_run(
     )
 
 
-def _accepted_states(run: Run, models: Sequence[Model], options: ReplayOptions) -> Sequence[EstimatorStates]:
+def _accepted_states(run: Run, models: Sequence[Model]) -> Sequence[EstimatorStates]:
     """Return the states of the log for each model: none where something differs that the zeros were learned with."""
-    if not options.other or not any(len(each.cycle) for each in run.states):
+    if not any(len(each.cycle) for each in run.states):
         return run.states
     pairs = zip(run.states, models_of(run.setup), models, strict=True)
     return [states if same_past(old.estimator, new.estimator) else NO_STATES for states, old, new in pairs]

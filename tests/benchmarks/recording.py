@@ -148,7 +148,7 @@ def _library(records: list[bytes], path: Path) -> float:
         )
         writer.start("ros2")
         channels = {}
-        for topic in (messages.JOINT_1, messages.JOINT_2, messages.CAN_FRAMES):
+        for topic in (messages.JOINTS[0], messages.JOINTS[1], messages.CAN_FRAMES):
             text = messages.SCHEMAS[topic.schema].encode()
             schema = writer.register_schema(topic.schema, "ros2msg", text)
             channels[topic.number] = writer.register_channel(topic.name, "cdr", schema)

@@ -18,7 +18,7 @@ import yaml
 from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.logs import read_attachments, read_topic, read_topics, topics_of
 from jtqd.daemon.logs.read import iter_frames
-from jtqd.daemon.replay.session import ReplayOptions, replay
+from jtqd.daemon.replay.session import replay
 from jtqd.drivers import own_objects
 from jtqd.drivers.can_unix import UnixBus
 from tests.paths import ROOT
@@ -139,7 +139,7 @@ def test_a_run_and_its_log(tmp_path: Path, joints: int, sensor: bool) -> None:
         assert np.isfinite(state["sensor_torque_nm"]).any() == sensor
         assert (state["status"] == 4).mean() < 0.2
     check_frames(run, states)
-    (result,) = replay([run.log], ReplayOptions())
+    (result,) = replay([run.log])
     assert result.identity is not None
     assert result.identity.whole
     assert result.identity.pdos_equal == result.identity.pdos > 0

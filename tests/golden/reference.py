@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from jtqd.daemon.replay.session import ReplayOptions, Result, replay
+from jtqd.daemon.replay.session import Result, replay
 from jtqd.estimator.status import NAMES
 
 HERE = Path(__file__).resolve().parent
@@ -47,7 +47,7 @@ CASES = {
 
 def replayed(case: Case) -> tuple[Output, Result]:
     """Output of the estimator as it is now."""
-    (result,) = replay([HERE / f"{case.log}.mcap"], ReplayOptions(method=case.method))
+    (result,) = replay([HERE / f"{case.log}.mcap"], method=case.method)
     values = {
         f"j{n}.{name}": np.asarray(records[name], np.float64)
         for n, records in enumerate(result.joints, start=1)

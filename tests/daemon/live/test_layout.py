@@ -110,7 +110,7 @@ def test_the_scripts_give_band_residual_and_contact(shipped, joints):
 
 def test_viewers_name_status_and_kind_of_event(topics):
     assert topics.names_of_values("/joint/1/state", "status") == messages.STATUS_NAMES
-    assert topics.names_of_values("/events", "kind") == messages.EVENT_NAMES
+    assert topics.names_of_values("/events", "kind") == {kind.value: kind.name for kind in messages.EventKind}
     assert topics.names_of_values("/joint/1/state", "statusword") == {}
 
 

@@ -47,15 +47,15 @@ def of(made, topic):
 def test_one_set_of_messages_in_20_ms_with_the_bytes_of_the_log():
     made = stream().take(record_of(n) for n in range(100, 200))
     for topic, size in (
-        (messages.JOINT_1, JOINT_ESTIMATE_SIZE),
-        (messages.JOINT_2, JOINT_ESTIMATE_SIZE),
+        (messages.JOINTS[0], JOINT_ESTIMATE_SIZE),
+        (messages.JOINTS[1], JOINT_ESTIMATE_SIZE),
         (messages.CAN_FRAMES, CycleMessages(2).frames_size),
     ):
         found = of(made, topic)
         assert [len(message.payload) for message in found] == [size] * 5
         assert [each.time_ns for each in found] == [START_NS + n * 1_000_000 for n in range(100, 200, 20)]
-    name = messages.JOINT_2.schema
-    joint = Definition(name, messages.SCHEMAS[name]).decode(of(made, messages.JOINT_2)[1].payload)
+    name = messages.JOINTS[1].schema
+    joint = Definition(name, messages.SCHEMAS[name]).decode(of(made, messages.JOINTS[1])[1].payload)
     fields = dict(zip(cycle_record.JointRecord._fields, joint_values(120, 2), strict=True))
     assert {field: joint[field] for field in fields} == fields
     assert len(of(made, messages.JOINT_STATES)) == 5
@@ -72,9 +72,9 @@ def test_what_lasts_one_cycle_is_an_event_although_its_cycle_is_left_out():
     ]
     seen = [(each["kind"], each["joint"], each["before"], each["after"], each["count"]) for each in events]
     assert seen == [
-        (messages.STATUS_CHANGED, 1, 2, 4, 0),
-        (messages.STATUS_CHANGED, 1, 4, 2, 0),
-        (messages.SLOTS_MISSED, 0, 0, 0, 3),
+        (messages.EventKind.STATUS_CHANGED, 1, 2, 4, 0),
+        (messages.EventKind.STATUS_CHANGED, 1, 4, 2, 0),
+        (messages.EventKind.SLOTS_MISSED, 0, 0, 0, 3),
     ]
     assert [each["cycle"] for each in events] == [107, 108, 113]
     texts = [message.payload for message in of(stream().take(records), messages.LOG)]
@@ -159,8 +159,10 @@ def test_a_viewer_gets_the_topics_and_schemas_of_the_log_at_50_hz(memory):
             *viewer.messages
         }
         kinds = [message["kind"] for _, message in viewer.messages["/events"]]
-        assert kinds.count(messages.STATUS_CHANGED) >= 4, "each lasted one cycle"
-        notices = [m["text"].strip() for _, m in viewer.messages["/events"] if m["kind"] == messages.NOTICE]
+        assert kinds.count(messages.EventKind.STATUS_CHANGED) >= 4, "each lasted one cycle"
+        notices = [
+            m["text"].strip() for _, m in viewer.messages["/events"] if m["kind"] == messages.EventKind.NOTICE
+        ]
         assert notices == ["node 3: no heartbeat for 0.3 s"]
         names = [status["name"] for status in viewer.messages["/diagnostics"][0][1]["status"]]
         assert names[0] == "jtqd: loop"

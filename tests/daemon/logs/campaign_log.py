@@ -4,11 +4,12 @@ import math
 import struct
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 
-from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData, Span
+from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CycleMessages, EventLog, JointStateMessage, definitions
 from jtqd.daemon.recording.recorder import Recording
 from jtqd.daemon.recording.run_files import Account
@@ -39,17 +40,6 @@ class Cycle(NamedTuple):
     frames: Sequence[tuple[int, bytes]] = ()
 
 
-class _OneFile:
-    """Where the spans go."""
-
-    def __init__(self, file: McapFile) -> None:
-        self._file = file
-
-    def write(self, span: Span, at_ns: int) -> None:
-        """Append it."""
-        self._file.append(span)
-
-
 class _Together(ChunkBuilder):
     """All topics in one chunk, as the recorder wrote them before 0.2."""
 
@@ -64,15 +54,6 @@ class _Together(ChunkBuilder):
             self.add(channel, time_ns, payload, sequence)
 
 
-def builder_of(
-    schemas: Sequence[Schema], channels: Sequence[Channel], joints: int = 2, *, together: bool = False
-) -> ChunkBuilder:
-    """The recorder's builder; `together`: one that puts all topics in one chunk, as before 0.2."""
-    if together:
-        return _Together(schemas, channels, joints)
-    return ChunkBuilder(schemas, channels, CycleMessages(joints).parts, 60)
-
-
 def write_log(
     path: Path,
     cycles: Iterable[Cycle],
@@ -80,16 +61,25 @@ def write_log(
     configuration: str = "",
     *,
     together: bool = False,
+    attachments: Sequence[NamedData] = (),
+    chunk_ns: int = 500_000_000,
 ) -> Path:
-    """An MCAP file of these cycles, each of so many joints; `configuration` is attached to it."""
+    """An MCAP file of these cycles, each of so many joints; `configuration` is attached to it.
+
+    together: all topics in one chunk, as before 0.2.
+    """
     schemas, channels = definitions(joints)
-    attached = [NamedData("configuration.yaml", "application/yaml", configuration.encode())]
-    head = Head(schemas, channels, attached if configuration else [])
-    file = McapFile(path, head, {"run": "test", "part": "1"}, 1)
-    builder = builder_of(schemas, channels, joints, together=together)
+    if configuration:
+        attachments = [NamedData("configuration.yaml", "application/yaml", configuration.encode())]
+    file = McapFile(path, Head(schemas, channels, attachments), {"run": "test", "part": "1"}, 1)
+    if together:
+        builder: ChunkBuilder = _Together(schemas, channels, joints)
+    else:
+        builder = ChunkBuilder(schemas, channels, CycleMessages(joints).parts, 60)
+    sink = SimpleNamespace(write=lambda span, at_ns: file.append(span))
     overview = JointStateMessage("abcd"[:joints], (1.0,) * joints)
     events = EventLog(builder.add)
-    recording = Recording(builder, events, _OneFile(file), overview, chunk_ns=500_000_000, account=Account())
+    recording = Recording(builder, events, sink, overview, chunk_ns=chunk_ns, account=Account())
     for cycle in cycles:
         recording.add(_record(cycle))
     recording.flush()
@@ -110,23 +100,10 @@ def temperature(node: int, celsius: float) -> tuple[int, bytes]:
 def _record(cycle: Cycle) -> bytes:
     layout = cr.layout_of(len(cycle.joints))
     record = bytearray(layout.size)
-    nan = math.nan
     blocks: list[float] = []
     for joint in cycle.joints:
-        numbers = [
-            *joint[:5],
-            nan,
-            nan,
-            nan,
-            nan,
-            nan,
-            nan,
-            1e-3,
-            nan,
-            nan,
-            nan,
-            nan,
-        ]  # no temperature, no estimate
+        # no temperature, no estimate
+        numbers = [*joint[:5], *[math.nan] * 6, 1e-3, *[math.nan] * 4]
         blocks += [*numbers, joint.statusword, 0, 0, joint.input_flags]
     counts = (cycle.index % 240 + 1, len(cycle.frames), 0, 0, 0, 0, 0, 0)
     layout.head.pack_into(

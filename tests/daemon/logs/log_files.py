@@ -11,11 +11,8 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from jtqd.daemon.logs.can_io import McapCanWriter
-from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData
-from jtqd.daemon.recording.messages import EventLog, JointStateMessage, definitions
-from jtqd.daemon.recording.recorder import Recording
-from jtqd.daemon.recording.run_files import Account
-from tests.daemon.logs.campaign_log import Cycle, Joint, builder_of, write_log
+from jtqd.daemon.recording.mcap_file import NamedData
+from tests.daemon.logs.campaign_log import Cycle, Joint, write_log
 
 ATTACHMENTS = [
     NamedData("configuration.yaml", "application/yaml", b"a: 1\n" * 50),
@@ -34,24 +31,7 @@ def cycles(count, seed=1):
 
 def ours(path, count=120, chunk_ns=20_000_000, seed=1, *, together=False):
     """A log by the recorder's own code, with attachments; `together`: all topics in one chunk, as before 0.2."""
-    from tests.daemon.logs import campaign_log
-
-    schemas, channels = definitions()
-    partial = path.with_name(path.name + ".active")
-    file = McapFile(partial, Head(schemas, channels, ATTACHMENTS), {"run": "test", "part": "1"}, 1)
-
-    class OneFile:
-        def write(self, chunk, at_ns):
-            file.append(chunk)
-
-    builder = builder_of(schemas, channels, together=together)
-    overview = JointStateMessage(("a", "b"), (1.0, 1.0))
-    events = EventLog(builder.add)
-    recording = Recording(builder, events, OneFile(), overview, chunk_ns=chunk_ns, account=Account())
-    for cycle in cycles(count, seed):
-        recording.add(campaign_log._record(cycle))
-    recording.flush()
-    file.finish(path.name)
+    write_log(path, cycles(count, seed), together=together, attachments=ATTACHMENTS, chunk_ns=chunk_ns)
     return path.read_bytes()
 
 
@@ -117,16 +97,3 @@ def record_starts(data):
         found.append(at)
         at += 9 + struct.unpack_from("<Q", data, at + 1)[0]
     return [*found, at]
-
-
-__all__ = [
-    "ATTACHMENTS",
-    "by_index",
-    "cycles",
-    "foreign",
-    "in_order",
-    "logger",
-    "ours",
-    "record_starts",
-    "write_log",
-]

@@ -36,9 +36,7 @@ from jtqd.daemon.logs.export import main as export
 from jtqd.daemon.logs.log_file import ChunkError, LogFile, Source
 from jtqd.daemon.logs.read import iter_frames
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile
-from jtqd.daemon.recording.messages import SCHEMAS
 from jtqd.daemon.replay.command import main as replay
-from jtqd.daemon.replay.session import ReplayOptions
 from jtqd.daemon.replay.session import replay as replayed
 from tests.daemon.logs.log_files import ATTACHMENTS, cycles, foreign, ours, record_starts, write_log
 from tests.daemon.recording.recorder_bench import record_of as cycle_record
@@ -177,22 +175,27 @@ def test_every_kind_of_field(tmp_path):
     assert all(same(*pair) for pair in zip(found, [message for _, message in expected], strict=True))
 
 
-def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
-    """Two texts whose lengths change while the message's does not: only their length fields tell."""
-    path = tmp_path / "a.mcap"
+def by_writer(path, schema, *payloads, encoding="ros2msg", message="cdr"):
+    """A log of the library's writer: one topic /a with these messages, in plain CDR."""
     with open(path, "wb") as file:
         writer = Writer(file, compression=CompressionType.NONE)
         writer.start("ros2", "x")
-        schema = writer.register_schema("x/Two", "ros2msg", b"string a\nstring b\n")
-        channel = writer.register_channel("/two", "cdr", schema)
-        for n in range(30):
-            first, second = (b"abc\0", b"defghij\0") if n < 20 else (b"abcdefg\0", b"hij\0")
-            data = (
-                b"\0\1\0\0" + struct.pack("<I", len(first)) + first + struct.pack("<I", len(second)) + second
-            )
-            writer.add_message(channel, n, data, n)
+        number = writer.register_schema("a/A", encoding, schema)
+        channel = writer.register_channel("/a", message, number)
+        for n, payload in enumerate(payloads):
+            writer.add_message(channel, n, b"\0\1\0\0" + payload, n)
         writer.finish()
-    found = read_topic(path, "/two")
+    return path
+
+
+def test_text_of_another_length_in_the_middle_of_a_topic(tmp_path):
+    """Two texts whose lengths change while the message's does not: only their length fields tell."""
+
+    def packed(*texts):
+        return b"".join(struct.pack("<I", len(text)) + text for text in texts)
+
+    payloads = [packed(b"abc\0", b"defghij\0")] * 20 + [packed(b"abcdefg\0", b"hij\0")] * 10
+    found = read_topic(by_writer(tmp_path / "a.mcap", b"string a\nstring b\n", *payloads), "/a")
     texts = [(row.a, row.b) for row in found[[0, 19, 20, 29]]]
     assert texts == [("abc", "defghij")] * 2 + [("abcdefg", "hij")] * 2
 
@@ -372,16 +375,9 @@ def test_damage_is_one_line(log, tmp_path):
     ],
 )
 def test_schemas_and_messages_that_lie(tmp_path, schema, payload, words):
-    path = tmp_path / "a.mcap"
-    with open(path, "wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "x")
-        channel = writer.register_channel(
-            "/a", "cdr", writer.register_schema("a/A", "ros2msg", schema.encode())
-        )
-        writer.add_message(channel, 1, b"\0\1\0\0" + payload, 1)
-        writer.add_message(channel, 2, b"\0\1\0\0" + payload + b"\0", 2)  # of another length: one by one
-        writer.finish()
+    path = by_writer(
+        tmp_path / "a.mcap", schema.encode(), payload, payload + b"\0"
+    )  # two lengths: one by one
     with pytest.raises(LogError, match=words):
         read_topic(path, "/a")
 
@@ -412,21 +408,9 @@ def test_decompression_bomb_takes_no_memory(tmp_path):
 
 
 def test_other_encodings_are_named(tmp_path):
-    path = tmp_path / "a.mcap"
-    with open(path, "wb") as file:
-        writer = Writer(file)
-        writer.start("", "x")
-        channel = writer.register_channel("/a", "json", writer.register_schema("A", "jsonschema", b"{}"))
-        writer.add_message(channel, 1, b"{}", 1)
-        writer.finish()
+    path = by_writer(tmp_path / "a.mcap", b"{}", b"{}", encoding="jsonschema", message="json")
     with pytest.raises(LogError, match="found jsonschema schema, expected ros2msg"):
         read_topic(path, "/a")
-
-
-def test_all_of_our_definitions_have_a_layout_or_a_decoder(log):
-    assert set(SCHEMAS) >= {"jtqd_msgs/msg/JointEstimate"}
-    assert sum(1 for _ in cycles(3)) == 3
-    assert len(read_topic(log, "/joint_states")[0].position) == 2
 
 
 def test_without_the_decoder_one_line_names_it(tmp_path, monkeypatch):
@@ -439,18 +423,10 @@ def test_without_the_decoder_one_line_names_it(tmp_path, monkeypatch):
 
 
 def test_a_sequence_that_says_it_is_longer_than_its_message(tmp_path):
-    path = tmp_path / "a.mcap"
-    good = b"\0\1\0\0" + struct.pack("<II4s", 1, 4, b"abc\0")
+    rest = struct.pack("<I4s", 4, b"abc\0")
     for count in (1, 4_000_000_000):
-        with open(path, "wb") as file:
-            writer = Writer(file)
-            writer.start("ros2", "x")
-            channel = writer.register_channel(
-                "/a", "cdr", writer.register_schema("a/A", "ros2msg", b"string[] a\n")
-            )
-            writer.add_message(channel, 1, good, 1)
-            writer.add_message(channel, 2, good[:4] + struct.pack("<I", count) + good[8:], 2)
-            writer.finish()
+        payloads = [struct.pack("<I", number) + rest for number in (1, count)]
+        path = by_writer(tmp_path / "a.mcap", b"string[] a\n", *payloads)
         if count == 1:
             assert [row.a for row in read_topic(path, "/a")] == [["abc"], ["abc"]]
     with pytest.raises(LogError, match="/a: found a message that cannot be decoded"):
@@ -586,7 +562,7 @@ def test_what_only_looks_alike_is_kept(parts, tmp_path):
     assert len(found) == len(read_topic(GOLDEN_LOG, "/joint/1/state")) + 1
     assert np.count_nonzero(found == cycle) == 2
     with pytest.raises(LogError, match="given twice"):
-        replayed([tmp_path], ReplayOptions())
+        list(replayed([tmp_path]))
 
 
 def test_replay_of_a_directory(parts, capsys):

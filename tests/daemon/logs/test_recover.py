@@ -22,6 +22,13 @@ from tests.paths import GOLDEN, ROOT
 CHUNK, INDEX, DATA_END, ATTACHMENT, SCHEMA = 0x06, 0x07, 0x0F, 0x09, 0x03
 
 
+@pytest.fixture(autouse=True)
+def unsynced(monkeypatch):
+    """Nothing here pulls a plug: waiting for the disk is most of the time."""
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(os, name, lambda _: None)
+
+
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
     """A whole log of 120 cycles in 6 spans of 4 chunks (the last of 3), and the offset of every record in it."""

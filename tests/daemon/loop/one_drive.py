@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import struct
+from array import array
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import yaml
@@ -12,8 +14,8 @@ from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.core.input_pdos import JointInputs, drive_places, input_pdos
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.joint import JointCycle
-from jtqd.daemon.replay.session import _Counters
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
@@ -52,7 +54,10 @@ class OneDrive:
         self.intake.leave_out(3)
         inputs = JointInputs(drive_places(0, joint.tpdos, joint.objects), None, **SCALE)
         estimator = JointEstimator(load_joint(shipped("joint1.yaml")), EstimatorSettings(method="efficiency"))
-        self.cycle = JointCycle(0, inputs, estimator, intake=self.intake, snapshot=_Counters(), period_ns=MS)
+        counts = SimpleNamespace(
+            counters=array("Q", [0] * len(COUNTERS)), errors=array("d", [0.0] * 3 * cr.MOST_JOINTS)
+        )
+        self.cycle = JointCycle(0, inputs, estimator, intake=self.intake, snapshot=counts, period_ns=MS)
 
     def frames(self, k: int) -> list[bytes]:
         made = []

@@ -86,6 +86,7 @@ def test_room_for_the_summary_is_taken_before_it_is_needed(tmp_path, monkeypatch
         written.append((offset + len(data), taken[0]))
         return real_write(file, data, offset)
 
+    monkeypatch.setattr(os, "fdatasync", lambda _: None)
     monkeypatch.setattr(appender, "_STEP", 1)  # nothing is there by luck
     monkeypatch.setattr(appender, "_fallocate", take)
     monkeypatch.setattr(os, "pwrite", write)

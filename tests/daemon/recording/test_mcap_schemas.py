@@ -139,7 +139,9 @@ def test_joint_state_for_names_of_every_length(names):
 def test_event():
     texts = ["", "joint 1: VALID -> STALE", "x" * 500, "Größe"]
     payloads = [
-        messages.event(NOW, messages.STATUS_CHANGED, text, index=2**40, count=5, joint=1, change=(2, 4))
+        messages.event(
+            NOW, messages.EventKind.STATUS_CHANGED, text, index=2**40, count=5, joint=1, change=(2, 4)
+        )
         for text in texts
     ]
     assert len({len(payload) for payload in payloads}) == 1

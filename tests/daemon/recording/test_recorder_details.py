@@ -4,25 +4,21 @@ import fcntl
 import json
 import os
 
-import pytest
 import zstandard
 from mcap.reader import make_reader
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, Message, Schema
+from mcap.stream_reader import StreamReader, breakup_chunk
 
-from jtqd.daemon.config import load_config
 from jtqd.daemon.logs.recover import recover_unfinished
 from jtqd.daemon.recording import messages
-from jtqd.daemon.recording.launch import RecorderProcess, recording_request
+from jtqd.daemon.recording.launch import RecorderProcess
 from jtqd.daemon.recording.mcap_file import ChunkBuilder
-from jtqd.daemon.recording.messages import ERROR, WARN, EventLog, definitions
+from jtqd.daemon.recording.messages import ERROR, WARN, EventKind, EventLog, definitions
 from jtqd.daemon.recording.recorder import RecorderRequest, main
-from jtqd.daemon.recording.run_files import parse_part, part_files
+from jtqd.daemon.recording.run_files import part_files
 from jtqd.daemon.shared.cycle_record import Ring
 from jtqd.daemon.shared.processes import Child
 from jtqd.daemon.shared.snapshot import Snapshot
-from jtqd.daemon.supervisor.process import SupervisorError, log_directory
-from jtqd.models.files import shipped
 from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import (
     START_NS,
@@ -32,6 +28,7 @@ from tests.daemon.recording.recorder_bench import (
     put,
     record_of,
     session_on,
+    statuses_of,
 )
 
 MS = 1_000_000
@@ -60,7 +57,7 @@ def test_what_is_heard_of_late_stands_at_its_time(tmp_path):
         recording.add(record_of(n))
         if n in (60, 61):
             late_ns = START_NS + (30 - n % 2) * MS + 500
-            recording.events.note(messages.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
+            recording.events.note(EventKind.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
     recording.flush()
     sink.end()
     cycles = {topic.name for topic in (*messages.JOINTS, messages.CAN_FRAMES)}
@@ -85,7 +82,7 @@ def test_cycles_keep_their_order_when_the_clock_is_set_back(tmp_path):
     for n in range(50):
         recording.add(record_of(n, start_ns=START_NS - (3600 * 10**9 if n >= 25 else 0)))
         if n == 40:
-            recording.events.note(messages.NOTICE, "late", level=WARN, time_ns=START_NS)
+            recording.events.note(EventKind.NOTICE, "late", level=WARN, time_ns=START_NS)
     recording.flush()
     sink.end()
     assert cycles_of(path) == list(range(50))
@@ -126,8 +123,8 @@ def test_what_tells_of_loss_is_written_however_much_happens(tmp_path):
     builder = ChunkBuilder(*definitions(), [], 60)
     events = EventLog(builder.add)
     for n in range(80):
-        events.note(messages.STATUS_CHANGED, f"{n}", level=WARN)
-    events.note(messages.RECORDS_LOST, "lost", level=ERROR)
+        events.note(EventKind.STATUS_CHANGED, f"{n}", level=WARN)
+    events.note(EventKind.RECORDS_LOST, "lost", level=ERROR)
     assert events.left_out == 30
     assert builder.seal().chunks[0].counts[messages.EVENTS.number] == 51
 
@@ -182,65 +179,6 @@ def test_leftovers_that_are_being_written_or_empty(tmp_path):
     assert not empty.path.exists()
 
 
-@pytest.mark.parametrize(
-    ("name", "found"),
-    [
-        ("a-20260101T000000Z-0001.mcap", ("20260101T000000Z", 1, 1, False)),
-        ("a-20260101T000000Z_12-12345.mcap.active", ("20260101T000000Z_12", 12, 12345, True)),
-        ("a-20260101T000000Z_0-0001.mcap", None),
-        ("a-20260101T000000Z-001.mcap", None),
-        ("a-20260101T000000Z-0001.mcap.bak", None),
-        ("b-20260101T000000Z-0001.mcap", None),
-        ("a-b-20260101T000000Z-0001.mcap", None),
-        ("a-20260101T000000Z-0001-20260101T000000Z-0001.mcap", None),
-        ("a-２0260101T000000Z-0001.mcap", None),
-    ],
-)
-def test_only_names_of_exactly_our_form_are_ours(tmp_path, name, found):
-    each = parse_part("a", tmp_path / name)
-    assert (each and (each.run, each.again, each.part, each.active)) == found
-
-
-def test_two_joints_with_files_of_one_name_have_two_attachments(tmp_path):
-    for number in (1, 2):
-        (tmp_path / f"arm{number}").mkdir()
-        (tmp_path / f"arm{number}" / "joint.yaml").write_bytes(shipped(f"joint{number}.yaml").read_bytes())
-    import yaml
-
-    content = yaml.safe_load(shipped("bench.yaml").read_text())
-    content["estimator"] = {"method": "efficiency"}
-    for number in (1, 2):
-        content[f"joint_{number}"]["file"] = f"arm{number}/joint.yaml"
-    (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
-    where = {"runtime": tmp_path, "directory": tmp_path / "logs", "bus": "can0"}
-    scaling = dict.fromkeys(
-        ("motor_rad_per_count", "link_rad_per_count", "motor_rad_s_per_unit", "ampere_per_unit"), 1.0
-    )
-    nodes = {str(n): {"scaling": scaling} for n in (1, 2)}
-    request = recording_request(load_config(tmp_path / "c.yaml"), {"nodes": nodes}, **where)
-    (tmp_path / "request.json").write_text(json.dumps(request))
-    loaded = RecorderRequest.from_file(tmp_path / "request.json").load_attachments(pytest.fail)
-    files = {item.name: item.data for item in loaded}
-    assert len(files) == len(loaded)
-    provenance = json.loads(files["provenance.json"])["joints"]
-    for number in (1, 2):
-        assert files[provenance[str(number)]["file"]] == shipped(f"joint{number}.yaml").read_bytes()
-
-
-@pytest.mark.parametrize("record", ["file", "file/below", "/proc/nothing", ""])
-def test_a_path_that_can_be_no_directory_is_refused(tmp_path, monkeypatch, record):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "file").touch()
-    with pytest.raises(SupervisorError, match=r"^--record "):
-        log_directory(record)
-
-
-def test_log_directory_is_made(tmp_path):
-    assert log_directory(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
-    assert (tmp_path / "a" / "b").is_dir()
-    assert log_directory("none") is None
-
-
 def test_progress_that_cannot_be_kept_is_one_line(tmp_path, capfd):
     Ring(tmp_path / "ring", 256, rr.RECORD_SIZE)
     (tmp_path / "recorded").mkdir()
@@ -255,3 +193,55 @@ def test_progress_that_cannot_be_kept_is_one_line(tmp_path, capfd):
         os._exit(main([str(tmp_path / "request.json")]))
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 1
     assert capfd.readouterr().err == f"recorder: {tmp_path}/recorded: Is a directory\n"
+
+
+# ---- events, definitions ----
+
+
+def events(path, kind):
+    return [event for _, event in messages_of(path)["/events"] if event["kind"] == kind]
+
+
+def test_status_changes_and_missed_slots_are_events(tmp_path):
+    session = session_on(tmp_path)
+    for n, pair in enumerate([(2, 2)] * 5 + [(2, 4)] * 3 + [(6, 2)] * 4):
+        session.recording.add(record_of(n, statuses=pair, missed=7 if n < 10 else 10))
+    path = session.finish()["path"]
+    changes = events(path, EventKind.STATUS_CHANGED)
+    assert [(e["cycle"], e["joint"], e["before"], e["after"]) for e in changes] == [
+        (5, 2, 2, 4),
+        (8, 1, 2, 6),
+        (8, 2, 4, 2),
+    ]
+    assert [(e["cycle"], e["count"]) for e in events(path, EventKind.SLOTS_MISSED)] == [(10, 3)]
+    assert "joint 2: VALID -> STALE" in [line["msg"].rstrip() for _, line in messages_of(path)["/log"]]
+
+
+def test_flapping_status_is_bounded_and_counted(tmp_path):
+    session = session_on(tmp_path)
+    for n in range(1000):
+        session.recording.add(record_of(n, statuses=(2 + n % 2, 2)))
+    session.diagnose(0, 0.0)
+    path = session.finish()["path"]
+    written = len(events(path, EventKind.STATUS_CHANGED))
+    values = statuses_of(messages_of(path)["/diagnostics"][-1][1])["jtqd: recorder"][2]
+    assert 50 <= written <= 150
+    assert written + int(values["events_left_out"]) == 999
+
+
+def test_schemas_are_repeated_for_a_file_that_lost_its_head(tmp_path):
+    session = session_on(tmp_path, chunk_s=0.01)
+    for n in range(1500):
+        session.recording.add(record_of(n))
+    with open(session.finish()["path"], "rb") as file:
+        chunks = [r for r in StreamReader(file, emit_chunks=True).records if isinstance(r, Chunk)]
+    repeated, spans = [], 0
+    for chunk in chunks:
+        records = breakup_chunk(chunk)
+        kinds = [type(record) for record in records]
+        if Schema in kinds:
+            repeated.append(spans)
+            assert (kinds.count(Schema), kinds.count(Channel)) == (7, 9)
+        spans += any(isinstance(record, Message) and record.channel_id == 1 for record in records)
+    assert spans > 120
+    assert repeated == [0, 60, 120]

@@ -1,11 +1,12 @@
 """/diagnostics: one status each for loop, bus, joints, nodes, recorder and disk; of one size; levels that follow events."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 
 from jtqd.daemon.recording import diagnostics, messages
-from jtqd.daemon.recording.diagnostics import Diagnostics, Node, RecorderState
+from jtqd.daemon.recording.diagnostics import Diagnostics, Node
 from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.counters import COUNTERS
@@ -46,12 +47,15 @@ class Bench:
         joint = JointView(*[0] * len(JointView._fields))._replace(torque_nm=1.0, sensor_nm=1.1)
         joints = [joint._replace(network_nm=math.nan, status=status) for status in statuses]
         self.estimate.write(self.cycle, 1, NOW, tuple(joints))
-        state = {"mode": "recording", "obstacle": "", "backlog": 50, "cpu_percent": 1.5, "events_left_out": 0}
-        state |= {"part": 1, "part_bytes": 10**6, "total_bytes": 10**7, "free": 10**9, "reserve": 10**8}
-        state |= {"budget": -1, "memory_bytes": 0, "memory_s": 0.0}
+        rules = SimpleNamespace(reserve=10**8, budget=recorder.get("budget"))
+        parts = SimpleNamespace(
+            part=1, size=10**6, total_size=10**7, free_bytes=10**9, obstacle="", rules=rules
+        )
+        vars(parts).update({key: value for key, value in recorder.items() if key in vars(parts)})
+        figures = {"backlog": 50, "cpu_percent": recorder.get("cpu_percent", 1.5), "events_left_out": 0}
         self.conditions = conditions
         _, found = self.diagnostics.of_loop(NOW)
-        found += self.diagnostics.of_recorder(self.account, RecorderState(**state | recorder))
+        found += self.diagnostics.of_recorder(self.account, parts, recorder.get("flight"), **figures)
         payload = messages.diagnostics(NOW, found)
         self.sizes.add(len(payload))
         message = DEFINITIONS["diagnostic_msgs/msg/DiagnosticArray"].decode(payload)
@@ -155,10 +159,11 @@ def test_node_that_was_never_heard(bench):
 def test_recorder_and_disk(bench):
     bench.look()
     bench.account.overwritten = 7
-    found = bench.look(free=150_000_000, mode="waiting", obstacle="recording pauses: no room")
+    found = bench.look(free_bytes=150_000_000, obstacle="recording pauses: no room")
+    assert found["recorder"][2]["mode"] == "waiting"
     assert found["recorder"][:2] == (FAULT, "7 cycles lost since the last message")
     assert found["disk"][:2] == (FAULT, "recording pauses: no room")
-    found = bench.look(free=150_000_000, budget=5 * 10**9)
+    found = bench.look(free_bytes=150_000_000, budget=5 * 10**9)
     assert found["recorder"][:2] == (WARN, "7 cycles lost so far")
     assert found["disk"][:2] == (WARN, "little room")
     assert found["disk"][2]["budget_mb"] == "5000"
@@ -170,9 +175,8 @@ def test_one_size_for_every_content(bench):
         bench.count(name, 2**50)
     bench.account.written = 2**60
     bench.heartbeat(1, 77)
-    bench.look(
-        (15, 9), mode="in memory", obstacle="x" * 300, free=-1, budget=0, cpu_percent=1e-9, memory_s=1e9
-    )
+    flight = SimpleNamespace(saving=False, memory_bytes=10**12, memory_s=1e9)
+    bench.look((15, 9), flight=flight, obstacle="x" * 300, free_bytes=-1, budget=0, cpu_percent=1e-9)
     assert len(bench.sizes) == 1
 
 
@@ -188,7 +192,7 @@ def test_notices_of_the_supervisor_become_events_and_log_lines(tmp_path):
     texts = [
         (event["count"], event["text"].rstrip())
         for _, event in found["/events"]
-        if event["kind"] == messages.NOTICE
+        if event["kind"] == messages.EventKind.NOTICE
     ]
     assert texts == [(2, "node 2: boot-up"), (1, "node 1: EMCY 8611h following error")]
     lines = [(line["level"], line["msg"].rstrip()) for _, line in found["/log"]]

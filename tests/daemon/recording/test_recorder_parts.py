@@ -26,6 +26,13 @@ EVENT = DEFINITIONS["jtqd_msgs/msg/Event"].constants
 START = 1_700_000_000
 
 
+@pytest.fixture(autouse=True)
+def unsynced(monkeypatch):
+    """Nothing here pulls a plug: waiting for the disk is most of the time."""
+    for name in ("fsync", "fdatasync"):
+        monkeypatch.setattr(os, name, lambda _: None)
+
+
 def kinds_in(*paths):
     return [event["kind"] for _, event in messages_of(*paths)["/events"]]
 
@@ -103,22 +110,33 @@ def test_request_ends_the_part(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name",
+    ("name", "found"),
     [
-        "test-20260102T030405Z-1.mcap",
-        "test-20260102T030405Z-0001.mcap.bak",
-        "test-20260102T030405Z-0001.MCAP",
-        "test-20260102T030405Z.mcap",
-        "test-x-20260102T030405Z-0001.mcap",
-        "xtest-20260102T030405Z-0001.mcap",
-        "test-20260102T030405Z-0001_x.mcap",
-        "test-20260102T030405Z-\u0661\u0661\u0661\u0661.mcap",
-        "test-20260102T030405Z_0-0001.mcap",
-        "test-notes.txt",
+        ("20260101T000000Z-0001.mcap", ("20260101T000000Z", 1, 1, False)),
+        ("20260101T000000Z_12-12345.mcap.active", ("20260101T000000Z_12", 12, 12345, True)),
+        *(
+            (name, None)
+            for name in (
+                "20260101T000000Z_0-0001.mcap",
+                "20260101T000000Z-1.mcap",
+                "20260101T000000Z-001.mcap",
+                "20260101T000000Z-0001.mcap.bak",
+                "20260101T000000Z-0001.MCAP",
+                "20260101T000000Z.mcap",
+                "20260101T000000Z-0001_x.mcap",
+                "x-20260101T000000Z-0001.mcap",
+                "20260101T000000Z-0001-20260101T000000Z-0001.mcap",
+                "\uff120260101T000000Z-0001.mcap",
+                "20260101T000000Z-\u0661\u0661\u0661\u0661.mcap",
+                "notes.txt",
+            )
+        ),
     ],
 )
-def test_names_that_are_not_ours(name):
-    assert parse_part("test", Path(name)) is None
+def test_only_names_of_exactly_our_form_are_ours(name, found):
+    each = parse_part("test", Path(f"test-{name}"))
+    assert (each and (each.run, each.again, each.part, each.active)) == found
+    assert parse_part("test", Path(f"xtest-{name}")) is None
 
 
 def test_own_names_sort_by_run_and_part(tmp_path):

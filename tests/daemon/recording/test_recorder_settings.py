@@ -7,10 +7,12 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+import yaml
 
 from jtqd.daemon.config import RecordingSettings, load_config
 from jtqd.daemon.recording.launch import recording_request
 from jtqd.daemon.recording.recorder import RecorderRequest
+from jtqd.daemon.supervisor.process import SupervisorError, log_directory
 from jtqd.estimator.decoder import decode
 from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import shipped
@@ -57,35 +59,36 @@ def test_what_is_wrong_is_named(key, value):
     assert "\n" not in str(caught.value)
 
 
-def test_request_carries_all_that_a_log_must_hold(tmp_path):
-    """From the configuration of the paper's chain to the attachments, byte for byte; files by their hashes."""
-    config = load_config(shipped("bench_paper.yaml"))
-    nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
-    content = recording_request(
-        config,
-        {"nodes": nodes},
-        runtime=tmp_path,
-        directory=tmp_path / "logs",
-        bus="can0",
-    )
+NODES = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
+
+
+def attached(config, tmp_path):
+    """The request that the supervisor writes, and the attachments that the recorder makes of it."""
+    where = {"runtime": tmp_path, "directory": tmp_path / "logs", "bus": "can0"}
+    content = recording_request(config, {"nodes": NODES}, **where)
     (tmp_path / "request.json").write_text(json.dumps(content))
     request = RecorderRequest.from_file(tmp_path / "request.json")
-    assert (request.prefix, request.rotate_s, request.reserve_mb) == ("jtqd-can0", 600.0, 256.0)
-    assert [tuple(node) for node in request.nodes] == [(1, "drive 1"), (2, "drive 2"), (3, "torque sensor")]
     loaded = request.load_attachments(pytest.fail)
     files = {item.name: item.data for item in loaded}
     assert len(files) == len(loaded), "two attachments of one name"
+    return request, files, json.loads(files["provenance.json"])
+
+
+def test_request_carries_all_that_a_log_must_hold(tmp_path):
+    """From the configuration of the paper's chain to the attachments, byte for byte; files by their hashes."""
+    request, files, provenance = attached(load_config(shipped("bench_paper.yaml")), tmp_path)
+    assert (request.prefix, request.rotate_s, request.reserve_mb) == ("jtqd-can0", 600.0, 256.0)
+    assert [tuple(node) for node in request.nodes] == [(1, "drive 1"), (2, "drive 2"), (3, "torque sensor")]
     assert files["configuration.yaml"] == Path(shipped("bench_paper.yaml")).read_bytes()
     assert b"BO_ 385 drive_1_TPDO1" in files["bus.dbc"]
     assert {"drive.eds", "jtqd.eds", "torque_sensor.eds"} <= files.keys()
-    provenance = json.loads(files["provenance.json"])
     assert provenance["configuration"]["sha256"] == hashlib.sha256(files["configuration.yaml"]).hexdigest()
     for number in "12":
         joint = provenance["joints"][number]
         for kind in ("file", "network"):
             assert hashlib.sha256(files[joint[kind]]).hexdigest() == joint[f"{kind}_sha256"]
     assert {"jtqd", "numpy", "onnxruntime", "python"} <= provenance["versions"].keys()
-    assert provenance["nodes"] == nodes
+    assert provenance["nodes"] == NODES
 
 
 def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_path):
@@ -98,14 +101,37 @@ def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_pat
     for network in (tmp_path / "trained").glob("*.onnx"):
         network.unlink()
     (tmp_path / "bench.yaml").write_text("node_id: 1\n")
-    nodes = {str(n): {"scaling": SCALING} for n in (1, 2)} | {"3": {"scaling": {"nm_per_unit": {"1": 0.001}}}}
-    where = {"runtime": tmp_path, "directory": tmp_path / "logs", "bus": "can0"}
-    content = recording_request(config, {"nodes": nodes}, **where)
-    (tmp_path / "request.json").write_text(json.dumps(content))
-    loaded = RecorderRequest.from_file(tmp_path / "request.json").load_attachments(pytest.fail)
-    files = {item.name: item.data for item in loaded}
+    _, files, provenance = attached(config, tmp_path)
+    joint = provenance["joints"]["1"]
     assert files["joint1.yaml"] == read["joint1.yaml"]
-    joint = json.loads(files["provenance.json"])["joints"]["1"]
     assert joint["file_sha256"] == hashlib.sha256(read["joint1.yaml"]).hexdigest()
     assert files[joint["network"]] == read[joint["network"]]
     assert files["configuration.yaml"] == Path(shipped("bench_paper.yaml")).read_bytes()
+
+
+def test_two_joints_with_files_of_one_name_have_two_attachments(tmp_path):
+    content = yaml.safe_load(shipped("bench.yaml").read_text())
+    content["estimator"] = {"method": "efficiency"}
+    for number in (1, 2):
+        (tmp_path / f"arm{number}").mkdir()
+        (tmp_path / f"arm{number}" / "joint.yaml").write_bytes(shipped(f"joint{number}.yaml").read_bytes())
+        content[f"joint_{number}"]["file"] = f"arm{number}/joint.yaml"
+    (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
+    _, files, provenance = attached(load_config(tmp_path / "c.yaml"), tmp_path)
+    for number in (1, 2):
+        name = provenance["joints"][str(number)]["file"]
+        assert files[name] == shipped(f"joint{number}.yaml").read_bytes()
+
+
+@pytest.mark.parametrize("record", ["file", "file/below", "/proc/nothing", ""])
+def test_a_path_that_can_be_no_directory_is_refused(tmp_path, monkeypatch, record):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(SupervisorError, match=r"^--record "):
+        log_directory(record)
+
+
+def test_log_directory_is_made(tmp_path):
+    assert log_directory(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert (tmp_path / "a" / "b").is_dir()
+    assert log_directory("none") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import weakref
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ import pytest
 from jtqd.daemon.logs import LogError, read_topic
 from jtqd.daemon.replay import command, session
 from jtqd.daemon.replay.logged import BEGINS, LOST, Run, lost_cycles, read_runs, steps_of
-from jtqd.daemon.replay.session import ReplayOptions, Result, replay, replay_each
+from jtqd.daemon.replay.session import Result, replay
 from tests.daemon.replay.replay_helpers import CONFIG, MS, cut, cycles, records
 from tests.paths import GOLDEN
 
@@ -90,8 +91,8 @@ def parts_of(directory: Path, *ends: int) -> list[Path]:
 @pytest.mark.parametrize("name", ["network", "faults", "parts"])
 def test_stretches_give_what_the_whole_gives(name: str, tmp_path: Path) -> None:
     logs = parts_of(tmp_path, 400, 700, 1000)[::-1] if name == "parts" else [GOLDEN / f"{name}.mcap"]
-    (whole,) = replay([LOG] if name == "parts" else logs, ReplayOptions())
-    found = list(replay_each(logs, ReplayOptions(), stretch=300))
+    (whole,) = replay([LOG] if name == "parts" else logs)
+    found = list(replay(logs, stretch=300))
     assert len(found) > 2
     assert all(each.run.cycles < 600 and each.run.logs == tuple(sorted(logs)) for each in found)
     assert sum(each.run.cycles for each in found) == whole.run.cycles
@@ -120,7 +121,7 @@ def test_a_difference_in_a_later_stretch_is_found(tmp_path: Path) -> None:
         return data[: at + 5] + bytes((data[at + 5] ^ 4,)) + data[at + 6 :]
 
     spoilt = cut(LOG, tmp_path / "a.mcap", payload=payload)
-    found = list(replay_each([spoilt], ReplayOptions(), stretch=400))
+    found = list(replay([spoilt], stretch=400))
     assert sum(each.run.cycles for each in found) == len(numbers)
     assert [each.good for each in found] == [True] * (len(found) - 1) + [False]
     assert found[-1].identity is not None
@@ -142,7 +143,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
         return result
 
     monkeypatch.setattr(session, "_replay_run", counting)
-    results = replay_each([LOG], ReplayOptions(), stretch=300)
+    results = replay([LOG], stretch=300)
     while (result := next(results, None)) is not None:
         del result
     assert alive == [0, 0, 0]
@@ -151,8 +152,7 @@ def test_only_one_stretch_is_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_the_command_reports_every_stretch(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    real = session.replay_each
-    monkeypatch.setattr(command, "replay_each", lambda *given: real(*given, stretch=500))
+    monkeypatch.setattr(command, "replay", partial(session.replay, stretch=500))
     target = tmp_path / "both.mcap"
     assert command.main([str(LOG), "--json", "--out", str(target)]) == 0
     runs = json.loads(capsys.readouterr().out)["runs"]
@@ -171,7 +171,7 @@ def test_several_runs_at_once_and_one_log_twice(tmp_path: Path) -> None:
     runs = [run for run, _ in read_runs([LOG, GOLDEN / "faults.mcap"], tmp_path)]
     assert [run.number for run in runs] == [0, 1]
     with pytest.raises(LogError, match="given twice"):
-        replay([LOG, LOG], ReplayOptions())
+        list(replay([LOG, LOG]))
 
 
 def test_cycles_of_two_parts_are_taken_once_and_must_be_the_same(tmp_path: Path) -> None:
@@ -179,7 +179,7 @@ def test_cycles_of_two_parts_are_taken_once_and_must_be_the_same(tmp_path: Path)
     numbers = cycles(LOG)
     first = cut(LOG, tmp_path / "1.mcap", lambda cycle: cycle < numbers[700])
     second = cut(LOG, tmp_path / "2.mcap", lambda cycle: cycle >= numbers[650])
-    (result,) = replay([first, second], ReplayOptions())
+    (result,) = replay([first, second])
     assert result.run.cycles == len(numbers)
     assert result.good
 
@@ -189,7 +189,7 @@ def test_cycles_of_two_parts_are_taken_once_and_must_be_the_same(tmp_path: Path)
 
     other = cut(LOG, tmp_path / "3.mcap", lambda cycle: cycle >= numbers[650], payload=payload)
     with pytest.raises(LogError, match=f"/joint/2/state: found cycle {numbers[660]} .*given twice"):
-        replay([first, other], ReplayOptions())
+        list(replay([first, other]))
 
 
 # ---- logs that cannot be used ----
@@ -209,7 +209,7 @@ def test_logs_of_another_version(tmp_path: Path, old: bytes, new: bytes, found: 
     """Fields with other names and types: one line, never numbers of something else."""
     path = cut(LOG, tmp_path / "a.mcap", schema=lambda text: text.replace(old, new))
     with pytest.raises(LogError, match=found):
-        replay([path], ReplayOptions())
+        list(replay([path]))
 
 
 @pytest.mark.parametrize(
@@ -225,4 +225,4 @@ def test_logs_without_a_topic(tmp_path: Path, missing: Any, found: str) -> None:
     numbers = cycles(LOG)
     path = cut(LOG, tmp_path / "a.mcap", topics=lambda topic, cycle: missing(topic, cycle - numbers[0]))
     with pytest.raises(LogError, match=found):
-        list(replay_each([path], ReplayOptions(), stretch=200))
+        list(replay([path], stretch=200))

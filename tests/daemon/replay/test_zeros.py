@@ -27,7 +27,7 @@ from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import CycleMessages, definitions, zeros_of
 from jtqd.daemon.replay.logged import Setup, read_setup
-from jtqd.daemon.replay.session import ReplayOptions, Result, models_of, replay_each
+from jtqd.daemon.replay.session import Result, models_of, replay
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader, View
@@ -173,7 +173,7 @@ def written(path: Path, run: Recorded, first: int = 0, end: int = CYCLES, *, sta
 
 
 def replayed(path: Path, **options: Any) -> Result:
-    (result,) = replay_each([path], ReplayOptions(**options))
+    (result,) = replay([path], **options)
     return result
 
 
