@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import struct
 import zlib
-from array import array
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
@@ -260,7 +259,8 @@ def batches_of(data: bytes) -> list[Batch]:
     alone = _of_one_length(data)
     if alone is not None:
         return [alone]
-    offsets = _message_offsets(data)
+    messages = (at for opcode, at, _ in _records_in(data) if opcode == Opcode.MESSAGE)
+    offsets = np.fromiter(messages, np.int64)
     heads = pieces(data, offsets, MESSAGE_HEAD.itemsize).view(MESSAGE_HEAD)
     found = []
     channels, firsts = np.unique(heads["channel"], return_index=True)
@@ -286,11 +286,6 @@ def _of_one_length(data: bytes) -> Batch | None:
     times = np.ndarray((count,), "<u8", data, 15, (step,))
     lengths = np.full(count, length - MESSAGE_BODY, np.uint64)
     return Batch(channel, data, np.arange(0, len(data), step), times, lengths, step)
-
-
-def _message_offsets(data: bytes) -> NDArray[np.int64]:
-    offsets = array("q", (at for opcode, at, _ in _records_in(data) if opcode == Opcode.MESSAGE))
-    return np.frombuffer(offsets, np.int64) if offsets else np.empty(0, np.int64)
 
 
 def _records_in(data: bytes) -> Iterator[tuple[int, int, int]]:

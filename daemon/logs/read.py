@@ -22,7 +22,6 @@ from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pi
 from jtqd.daemon.recording.messages import FRAMES_NAMES
 from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.observer import low_pass
 
 Records = NDArray[Any]
 """Messages as rows of a structured array [n]; as an array of the decoder's objects where they have no fixed form."""
@@ -584,6 +583,8 @@ def sync_time(stamp: Records) -> FloatArray:
 
 def reference_torque(state: Records, time_s: FloatArray, bandwidth_rad_s: float) -> FloatArray:
     """Return the sensor torque [Nm] as received through the observer's low-pass; NaN where no sensor value came."""
+    from jtqd.estimator.observer import low_pass  # a third of the time that importing this module takes
+
     sensor = state["sensor_torque_nm"]
     there = np.isfinite(sensor)
     result = np.full(len(sensor), np.nan)

@@ -17,6 +17,15 @@ from jtqd.daemon.recording.messages import definitions
 from tests.daemon.recording.recorder_bench import START_NS, cycles_of, metadata_of, one_file, record_of
 
 
+def written(path, record=record_of):
+    """A file of 250 cycles."""
+    recording, sink = one_file(path)
+    for n in range(250):
+        recording.add(record(n))
+    recording.flush()
+    sink.end()
+
+
 @pytest.fixture
 def failing_disk(monkeypatch):
     """A knob: while it is set, a write takes half of what it gets and the next one fails."""
@@ -108,11 +117,7 @@ def test_file_system_without_reservation(tmp_path, monkeypatch):
         raise OSError(errno.EOPNOTSUPP, "not supported")
 
     monkeypatch.setattr(appender, "_fallocate", refuse)
-    recording, sink = one_file(tmp_path / "log.mcap")
-    for n in range(250):
-        recording.add(record_of(n))
-    recording.flush()
-    sink.end()
+    written(tmp_path / "log.mcap")
     assert cycles_of(tmp_path / "log.mcap") == list(range(250))
 
 
@@ -202,11 +207,7 @@ def test_messages_of_several_channels_are_found_by_their_index(tmp_path):
 def test_readers_get_the_messages_of_a_span_in_the_order_of_time(tmp_path, stream):
     """Its chunks lie behind one another and are of the same time; what is of one time comes in the order of the topics."""
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path)
-    for n in range(250):
-        recording.add(record_of(n))
-    recording.flush()
-    sink.end()
+    written(path)
     with open(path, "rb") as file:
         make = NonSeekingReader if stream else SeekingReader
         messages = make(file, validate_crcs=True).iter_messages()
@@ -219,11 +220,7 @@ def test_readers_get_the_messages_of_a_span_in_the_order_of_time(tmp_path, strea
 
 def test_a_joint_is_read_without_the_chunks_of_the_others(tmp_path):
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path)
-    for n in range(250):
-        recording.add(record_of(n))
-    recording.flush()
-    sink.end()
+    written(path)
     with open(path, "rb") as file:
         index = make_reader(file).get_summary().chunk_indexes
     topics = [{*each.message_index_offsets} for each in index]
@@ -233,11 +230,7 @@ def test_a_joint_is_read_without_the_chunks_of_the_others(tmp_path):
 def test_every_index_entry_points_at_its_message(tmp_path):
     """Readers that go by offset (numpy views of a chunk, seeking) rely on it; the library's reader does not."""
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path)
-    for n in range(250):
-        recording.add(record_of(n, statuses=(2 + n // 100, 2)))
-    recording.flush()
-    sink.end()
+    written(path, lambda n: record_of(n, statuses=(2 + n // 100, 2)))
     with open(path, "rb") as file:
         records = list(StreamReader(file, emit_chunks=True).records)
     entries, chunk = 0, None

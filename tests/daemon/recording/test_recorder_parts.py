@@ -211,7 +211,7 @@ def test_budget_removes_own_finished_files_only(tmp_path, keep_run):
     link = logs / "test-20200101T000000Z-0009.mcap"
     link.symlink_to(kept[-1])
     session = session_on(tmp_path, budget_mb=0.12, rotate_mb=0.03, keep_run=keep_run)
-    for n in range(6000):
+    for n in range(3000):
         session.recording.add(record_of(n))
     summary = session.finish()
     assert all(path.exists() for path in [*kept, link])
@@ -219,11 +219,11 @@ def test_budget_removes_own_finished_files_only(tmp_path, keep_run):
     parts_left = [metadata_of(path)["part"] for path in summary["paths"]]
     found = kinds_in(*summary["paths"])
     if keep_run:
-        assert cycles_of(*summary["paths"]) == list(range(6000))
+        assert cycles_of(*summary["paths"]) == list(range(3000))
         assert found.count(EVENT["FILE_RETIRED"]) == 4, "three files, and once that the budget is exceeded"
     else:
         assert parts_left[0] != "1"
-        assert cycles_of(*summary["paths"]) == list(range(6000))[-len(cycles_of(*summary["paths"])) :]
+        assert cycles_of(*summary["paths"]) == list(range(3000))[-len(cycles_of(*summary["paths"])) :]
         own = sum(Path(path).stat().st_size for path in summary["paths"])
         assert own < 120_000 + 30_000
     assert summary["lost"] == 0
