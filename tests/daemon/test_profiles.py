@@ -165,7 +165,7 @@ def test_a_profile_of_ones_own_lies_beside_the_configuration(tmp_path: Path) -> 
 def test_the_log_keeps_the_profile_and_a_replay_reads_it_as_it_was(tmp_path: Path) -> None:
     profile = own_profile(tmp_path, 0.25)
     config = load_config(configuration(tmp_path, profile="mine.yaml"))
-    attached = {name: data for name, _, data in launch._attached_files(config)}
+    attached = {name: data for name, (_, data) in launch._attached_files(config).items()}
     assert attached["mine.yaml"] == profile.read_bytes()
     factors = dict.fromkeys(
         ("motor_rad_per_count", "motor_rad_s_per_unit", "link_rad_per_count", "ampere_per_unit"), 1.0
