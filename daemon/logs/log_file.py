@@ -316,7 +316,7 @@ class LogFile:
     Attributes:
         schemas, channels: records of the library by their numbers.
         attachments: index records.
-        counts: messages of each channel; empty where the file does not tell.
+        expected: messages of each channel by the summary, as far as the file is long enough for them.
 
     Raises:
         LogError: no MCAP file, one that ends too early and is not called `.active`, or messages outside chunks.
@@ -337,7 +337,7 @@ class LogFile:
         source = self._source
         if source.read(0, len(MAGIC)) != MAGIC:
             raise self._error("its first bytes are not MCAP's")
-        self.counts: Mapping[int, int] = {}
+        self.expected: dict[int, int] = {}
         found = read_summary(source)
         if found is not None:
             summary, _ = found
@@ -345,7 +345,9 @@ class LogFile:
             self.attachments, self._chunks = summary.attachment_indexes, summary.chunk_indexes
             statistics = summary.statistics
             if statistics is not None:
-                self.counts = statistics.channel_message_counts
+                most = source.size // _MESSAGE_INDEX_ENTRY
+                counts = statistics.channel_message_counts
+                self.expected = {channel: min(count, most) for channel, count in counts.items()}
             if not self._chunks and (statistics is None or statistics.message_count):
                 raise self._error("found no index of chunks, expected every message in one (`mcap compress`)")
         elif self.path.suffix == ACTIVE:
@@ -372,12 +374,6 @@ class LogFile:
     def close(self) -> None:
         """Close the file."""
         os.close(self._descriptor)
-
-    @property
-    def expected(self) -> dict[int, int]:
-        """Channel -> messages by the summary, as far as the file is long enough for them."""
-        most = self._source.size // _MESSAGE_INDEX_ENTRY
-        return {channel: min(count, most) for channel, count in self.counts.items()}
 
     @property
     def start_ns(self) -> int:

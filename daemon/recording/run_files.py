@@ -50,13 +50,13 @@ def part_name(prefix: str, run: str, part: int) -> str:
     return f"{prefix}-{run}-{part:04d}.mcap"
 
 
-def parse_part(prefix: str, path: Path, size: int = 0) -> PartFile | None:
+def parse_part(prefix: str, path: Path) -> PartFile | None:
     """Return the part of this name; None for another file."""
     found = PART_PATTERN.fullmatch(path.name)
     if found is None or found["prefix"] != prefix:
         return None
     again, part = int(found["again"] or 1), int(found["part"])
-    return PartFile(found["stamp"], again, part, bool(found["active"]), path, found["run"], size)
+    return PartFile(found["stamp"], again, part, bool(found["active"]), path, found["run"])
 
 
 def part_files(directory: Path, prefix: str) -> list[PartFile]:

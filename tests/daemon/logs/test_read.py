@@ -598,6 +598,12 @@ def test_a_summary_that_promises_too_few_or_too_many_messages_changes_nothing(
     for n, part in enumerate(parts):
         write_log(part, list(cycles(2100, seed=n)))
     whole = read_topic(parts, "/joint/1/state")
-    monkeypatch.setattr(LogFile, "expected", dict.fromkeys(range(1, 20), promised))
+    opened = LogFile._open
+
+    def promise(log):
+        opened(log)
+        log.expected = dict.fromkeys(range(1, 20), promised)
+
+    monkeypatch.setattr(LogFile, "_open", promise)
     assert read_topic(parts, "/joint/1/state").tobytes() == whole.tobytes()
     assert len(whole) == 4200

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 from mcap.reader import make_reader
 
@@ -170,28 +171,15 @@ def statuses_of(message):
     }
 
 
-class SimpleFile:
-    """A single file as the sink of a `Recording`, as the tests of one file need it."""
-
-    def __init__(self, path, head):
-        self.path = path
-        self.file = McapFile(path, head, {"run": "test", "part": "1"}, 1)
-
-    def write(self, chunk, at_ns):
-        self.file.append(chunk)
-
-    def end(self):
-        self.file.finish(self.path.name)
-
-
 def one_file(path, chunk_ns=99_000_000):
-    """(recording, sink) into one file."""
+    """(recording into one file, that file)."""
     schema_records, channels = definitions()
-    sink = SimpleFile(path, Head(schema_records, channels, []))
+    file = McapFile(path, Head(schema_records, channels, []), {"run": "test", "part": "1"}, 1)
     builder = ChunkBuilder(schema_records, channels, CycleMessages(2).parts, 60)
     overview = JointStateMessage(("a", "b"), (1.0, 1.0))
+    sink = SimpleNamespace(write=lambda span, at_ns: file.append(span))
     events = EventLog(builder.add)
-    return Recording(builder, events, sink, overview, chunk_ns=chunk_ns, account=Account()), sink
+    return Recording(builder, events, sink, overview, chunk_ns=chunk_ns, account=Account()), file
 
 
 def session_on(directory, warn=lambda _: None, **request):

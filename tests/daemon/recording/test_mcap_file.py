@@ -19,11 +19,11 @@ from tests.daemon.recording.recorder_bench import START_NS, cycles_of, metadata_
 
 def written(path, record=record_of):
     """A file of 250 cycles."""
-    recording, sink = one_file(path)
+    recording, file = one_file(path)
     for n in range(250):
         recording.add(record(n))
     recording.flush()
-    sink.end()
+    file.finish("log.mcap")
 
 
 @pytest.fixture
@@ -47,7 +47,7 @@ def failing_disk(monkeypatch):
 def test_span_that_did_not_fit_is_taken_back(tmp_path, failing_disk):
     """The third of five spans is written by half and refused: the file is whole without it."""
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path, chunk_ns=10**9)
+    recording, file = one_file(path, chunk_ns=10**9)
     for n in range(500):
         recording.add(record_of(n))
         if n % 100 == 99:
@@ -60,7 +60,7 @@ def test_span_that_did_not_fit_is_taken_back(tmp_path, failing_disk):
                 failing_disk["full"] = False
             else:
                 recording.flush()
-    sink.end()
+    file.finish("log.mcap")
     assert cycles_of(path) == [*range(200), *range(300, 500)]
     with open(path, "rb") as file:
         summary = make_reader(file).get_summary()
@@ -69,14 +69,14 @@ def test_span_that_did_not_fit_is_taken_back(tmp_path, failing_disk):
 
 def test_disk_that_stays_full_leaves_whole_chunks(tmp_path, failing_disk):
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path)
+    recording, file = one_file(path)
     for n in range(200):
         recording.add(record_of(n))
     recording.flush()
     length = path.stat().st_size
     failing_disk["full"] = True
     with pytest.raises(OSError, match="No space"):
-        sink.end()
+        file.finish("log.mcap")
     assert path.stat().st_size == length
     with open(path, "rb") as file:
         assert any(isinstance(record, Chunk) for record in StreamReader(file, emit_chunks=True).records)
@@ -100,12 +100,12 @@ def test_room_for_the_summary_is_taken_before_it_is_needed(tmp_path, monkeypatch
     monkeypatch.setattr(appender, "_fallocate", take)
     monkeypatch.setattr(os, "pwrite", write)
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path, chunk_ns=1_000_000)  # many small chunks: the summary grows fastest
+    recording, file = one_file(path, chunk_ns=1_000_000)  # many small chunks: the summary grows fastest
     for n in range(3000):
         recording.add(record_of(n))
     recording.flush()
     monkeypatch.setattr(appender, "_fallocate", lambda *_: pytest.fail("the summary asked for more"))
-    sink.end()
+    file.finish("log.mcap")
     assert len(written) > 1000
     assert all(end <= room for end, room in written)
     # What was not used is given back.
@@ -138,24 +138,24 @@ def test_existing_file_is_not_touched(tmp_path):
 
 def test_file_is_locked_while_it_is_written(tmp_path):
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path)
+    recording, file = one_file(path)
     recording.add(record_of(0))
     recording.flush()
     with open(path, "rb") as other:
         with pytest.raises(BlockingIOError):
             fcntl.flock(other, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        sink.end()
+        file.finish("log.mcap")
         fcntl.flock(other, fcntl.LOCK_SH | fcntl.LOCK_NB)
 
 
 def test_directory_that_is_moved_meanwhile(tmp_path):
     """The file goes with its directory and gets its name there."""
     (tmp_path / "a").mkdir()
-    recording, sink = one_file(tmp_path / "a" / "log.mcap.active")
+    recording, file = one_file(tmp_path / "a" / "log.mcap.active")
     recording.add(record_of(0))
     recording.flush()
     (tmp_path / "a").rename(tmp_path / "b")
-    sink.file.finish("log.mcap")
+    file.finish("log.mcap")
     assert [path.name for path in (tmp_path / "b").iterdir()] == ["log.mcap"]
     assert cycles_of(tmp_path / "b" / "log.mcap") == [0]
 

@@ -52,14 +52,14 @@ def times_by_topic(path):
 def test_what_is_heard_of_late_stands_at_its_time(tmp_path):
     """A notice of the supervisor is 30 cycles old when it is read: it goes to its place in the chunk."""
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path, chunk_ns=10**9)
+    recording, file = one_file(path, chunk_ns=10**9)
     for n in range(100):
         recording.add(record_of(n))
         if n in (60, 61):
             late_ns = START_NS + (30 - n % 2) * MS + 500
             recording.events.note(EventKind.NOTICE, f"at {n}", level=WARN, time_ns=late_ns)
     recording.flush()
-    sink.end()
+    file.finish("log.mcap")
     cycles = {topic.name for topic in (*messages.JOINTS, messages.CAN_FRAMES)}
     assert all(times == sorted(times) for times in times_by_topic(path).values())
     others = [(topic, time) for topic, time in in_file_order(path) if topic not in cycles]
@@ -78,13 +78,13 @@ def test_what_is_heard_of_late_stands_at_its_time(tmp_path):
 
 def test_cycles_keep_their_order_when_the_clock_is_set_back(tmp_path):
     path = tmp_path / "log.mcap"
-    recording, sink = one_file(path, chunk_ns=10**9)
+    recording, file = one_file(path, chunk_ns=10**9)
     for n in range(50):
         recording.add(record_of(n, start_ns=START_NS - (3600 * 10**9 if n >= 25 else 0)))
         if n == 40:
             recording.events.note(EventKind.NOTICE, "late", level=WARN, time_ns=START_NS)
     recording.flush()
-    sink.end()
+    file.finish("log.mcap")
     assert cycles_of(path) == list(range(50))
 
 

@@ -169,7 +169,7 @@ def test_run_of_the_same_second_gets_another_name(tmp_path):
 
 
 def sized_file(name, size):
-    return parse_part("p", Path(name), size)
+    return parse_part("p", Path(name))._replace(size=size)
 
 
 def test_budget_takes_the_oldest_first_and_no_more_than_needed():
