@@ -22,8 +22,5 @@ class Plausibility:
     ) -> int: ...
 
 def detect_contacts(
-    external_nm: FloatArray,
-    motor_position_rad: FloatArray,
-    threshold_nm: float,
-    period_s: float = 0.001,
+    external_nm: FloatArray, motor_position_rad: FloatArray, threshold_nm: float, period_s: float = 0.001
 ) -> tuple[FloatArray, CodeArray]: ...

@@ -179,7 +179,6 @@ cdef int LONGEST_GAP = 50  # samples without inputs, after which the state resta
 
 
 cdef int fill_link(LinkLaw *law, joint, torsion) except -1:
-    """Set the parameters from a joint file; torsion None: no load."""
     law.used = torsion is not None
     law.inertia = joint.link_inertia_kgm2
     law.damping = torsion.damping_nms_per_rad if law.used else 0.0
@@ -187,7 +186,6 @@ cdef int fill_link(LinkLaw *law, joint, torsion) except -1:
 
 
 cdef void restart_link(LinkState *s) noexcept nogil:
-    """Restart."""
     s.samples = 0
     s.torque = s.fast = s.q = s.step = s.dt = 0.0
 
@@ -242,7 +240,6 @@ cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) exc
 
 
 cdef void restart_contact(ContactState *s) noexcept nogil:
-    """Restart: unknown until it has settled."""
     cdef int k
     s.samples = s.missed = s.active = s.blank = s.at = 0
     for k in range(CONTACT_WAVES):

@@ -220,11 +220,9 @@ cdef class JointEstimator(Estimator):
         self.reset()
 
     def reset(self):
-        """Restart at the next sample."""
         restart_guard(&self.state.guard)
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
-        """Set `out` to the estimate at this sample."""
         cdef const JointLaw *law = &self.law
         cdef Observed seen
         self.observed = observe(&law.guard, &self.state.guard, &law.observer, &self.state.observer, x, &seen)
@@ -273,7 +271,6 @@ cdef void publish_within(Values *out, double limit) noexcept nogil:
 
 
 cdef int quadrant_of(double raw, double v) noexcept nogil:
-    """Return the index into QUADRANTS by the signs of motor torque and velocity."""
     if v >= 0.0:
         return 0 if raw >= 0.0 else 2
     return 3 if raw >= 0.0 else 1
@@ -347,7 +344,6 @@ cdef class FusedEstimator(Estimator):
         self.reset()
 
     def reset(self):
-        """Restart at the next sample."""
         restart_guard(&self.state.guard)
         self.state.half = self.state.degraded_s = 0.0
         restart_offsets(&self.law.offsets, &self.state.offsets)
@@ -396,7 +392,6 @@ cdef class FusedEstimator(Estimator):
         )
 
     cdef void advance(self, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
-        """Set `out` to the estimate at this sample."""
         cdef FusedObserved seen
         cdef LinkLoad link
         cdef Sample corrected
@@ -674,7 +669,6 @@ cdef class ExtendedEstimator(Estimator):
 
     @property
     def zeros(self):
-        """As `FusedEstimator.zeros`; None with the paper's methods."""
         return getattr(self.inner, "zeros", None)
 
     cdef const void *learned(self, Learned *out, size_t *size) noexcept nogil:
@@ -682,7 +676,6 @@ cdef class ExtendedEstimator(Estimator):
         return self.inner.learned(out, size)
 
     def reset(self):
-        """Restart at the next sample."""
         self.inner.reset()
         self.corrections.restart()
         self.torque_nm = NAN

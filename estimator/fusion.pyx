@@ -139,7 +139,6 @@ def faded(half_nm, dt_s, running):
 
 
 cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1:
-    """Set the variances from section `fused.sigma` of a joint file."""
     law.current = sigma.current_nm**2
     law.viscous = sigma.viscous_nms_per_rad**2
     law.load = sigma.load**2
@@ -326,7 +325,6 @@ cdef int fill_offsets(
 
 
 cdef void restart_offsets(const OffsetLaw *law, OffsetState *s) noexcept nogil:
-    """Return to the prior: no offset is known."""
     cdef int n
     memset(s, 0, sizeof(OffsetState))
     for n in range(OFFSET_STATES):
@@ -418,7 +416,6 @@ cdef void _update(
 
 
 cdef void _forget_link(const OffsetLaw *law, double (*p)[OFFSET_STATES]) noexcept nogil:
-    """Make the link offset unknown in a covariance."""
     cdef int n
     for n in range(OFFSET_STATES):
         p[0][n] = p[n][0] = 0.0
@@ -480,7 +477,6 @@ cdef double early_factor(const OffsetLaw *law, double known) noexcept nogil:
 
 
 cdef double _uncorrected_torque(const OffsetLaw *law, const OffsetState *s) noexcept nogil:
-    """Return the estimated link offset that is not corrected, as torque [Nm]."""
     return law.stiffness * (s.x[0] - s.link_rad)
 
 
@@ -504,7 +500,6 @@ cdef void report_offsets(const OffsetLaw *law, const OffsetState *s, Learned *ou
 
 
 cdef offsets_of(const OffsetLaw *law, const OffsetState *s):
-    """Return the `Zeros` of `report_offsets`."""
     cdef Learned report
     report_offsets(law, s, &report)
     return Zeros(**report)
@@ -568,7 +563,6 @@ cdef int fill_turn(AgreementLaw *law, turn) except -1:
 
 
 cdef void restart_agreement(AgreementState *s) noexcept nogil:
-    """Return to paths that agree."""
     memset(s, 0, sizeof(AgreementState))
 
 

@@ -94,7 +94,6 @@ cdef class FrictionModel:
         return friction_torque(&self.law, velocity_rad_s)
 
     def torque_many(self, velocity_rad_s):
-        """Return the same for an array of velocities."""
         import numpy as np
 
         shape, v = _flat(velocity_rad_s)
@@ -234,7 +233,6 @@ cdef class LossModel:
         return efficiency_loss(&self.law, current_a, joint_velocity_rad_s)
 
     def loss_many(self, current_a, joint_velocity_rad_s):
-        """Return the same for two arrays of one shape."""
         import numpy as np
 
         current_a, joint_velocity_rad_s = np.broadcast_arrays(current_a, joint_velocity_rad_s)
@@ -256,7 +254,6 @@ cdef class LossModel:
 
 
 cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings) except -1:
-    """Set the parameters from joint and settings."""
     law.floor = settings.sigma_floor * joint.rated_torque_nm
     law.u_friction = settings.friction_uncertainty
     # what friction can hold is itself known to that part only

@@ -100,7 +100,6 @@ cdef inline void weigh(int count, int inputs, int outputs, const double *h, cons
 
 
 cdef double evaluate(const PerceptronLaw *law, const double *x) noexcept nogil:
-    """Return the answer for the inputs x."""
     cdef double layer[2][MOST_WIDTH]
     cdef const double *h = x
     cdef const double *numbers = &law.numbers[0]
@@ -167,7 +166,6 @@ cdef class Perceptron:
         return len(layers) <= MOST_LAYERS and max(widths) <= MOST_WIDTH and numbers <= MOST_NUMBERS
 
     def run_one(self, *x):
-        """Return the answer for one sample."""
         cdef double values[MOST_WIDTH]
         if len(x) != self.law.width[0]:
             raise ValueError(f"found {len(x)} inputs, expected {self.law.width[0]}")
@@ -176,7 +174,6 @@ cdef class Perceptron:
         return evaluate(&self.law, values)
 
     def run_many(self, features):
-        """Return the answers [n] for samples [n, inputs]."""
         cdef const double[:, ::1] x = np.ascontiguousarray(features, np.float64)
         if x.shape[1] != self.law.width[0]:
             raise ValueError(f"found features of shape {features.shape}, expected [n, {self.law.width[0]}]")
@@ -192,7 +189,6 @@ cdef class Perceptron:
 
 
 cdef int fill_trust(TrustLaw *law, low, high, double margin, double limit) except -1:
-    """Set the parameters from a network's ranges."""
     if len(low) != FEATURES or len(high) != FEATURES:
         raise ValueError(f"found ranges of {len(low)} and {len(high)} features, expected {FEATURES}")
     for n, (a, b) in enumerate(zip(low, high, strict=True)):
@@ -206,7 +202,6 @@ cdef int fill_trust(TrustLaw *law, low, high, double margin, double limit) excep
 
 
 cdef double _inside(const TrustLaw *law, const double *x) noexcept nogil:
-    """Return the weight by the features alone."""
     cdef double weight = 1.0, part
     cdef int n
     for n in range(FEATURES):
@@ -254,7 +249,6 @@ cdef double network_share(double v) noexcept nogil:
 
 
 def network_shares(velocity_rad_s):
-    """Return the fused network's shares at these speeds [n], 0 to 1."""
     cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
     out = np.empty(len(v))
     cdef double[::1] to = out
@@ -265,7 +259,6 @@ def network_shares(velocity_rad_s):
 
 
 cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1:
-    """Set the parameters from a network's envelope."""
     rows = envelope.known
     if max(len(rows), len(rows[0])) > MAX_CELLS:
         raise ValueError(f"found a map of {len(rows)} by {len(rows[0])} cells, expected at most {MAX_CELLS} each")

@@ -111,7 +111,6 @@ cdef double SETTLED = 5.0  # in 1/g: exp(-5) of the start remains
 
 
 cdef void restart_reference(Reference *r) noexcept nogil:
-    """Restart at the next value."""
     r.since = INFINITY
     r.last = r.z = r.settled = 0.0
 
@@ -174,7 +173,6 @@ cdef void _start(const ObserverLaw *law, ObserverState *s, const Sample *x, Obse
 
 
 cdef void _step(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
-    """Advance by dt > 0 to the sample."""
     cdef Hold h = _hold(law.rate, x.dt_s)
     cdef double spin = law.inertia_rate * x.motor_velocity_rad_s
     cdef double u = x.current_a * law.kt + spin
@@ -194,7 +192,6 @@ cdef void _step(const ObserverLaw *law, ObserverState *s, const Sample *x, Obser
 
 
 cdef int fill_observer(ObserverLaw *law, joint, settings) except -1:
-    """Set the parameters from joint and settings."""
     law.gear = joint.gear_ratio
     law.inverse_gear = 1.0 / joint.gear_ratio
     law.kt = joint.torque_constant_nm_per_a
@@ -445,7 +442,6 @@ def slipped(d_rad, double travel_rad):
 
 
 cdef void _set_outputs(const FusedObserverLaw *law, const FusedObserverState *s, FusedObserved *out) noexcept nogil:
-    """Set the outputs that are the filter's state itself."""
     out.joint_velocity_rad_s = s.z.v
     out.link_velocity_rad_s = s.link_velocity
     out.cos1, out.sin1 = s.z.cos1, s.z.sin1
@@ -473,7 +469,6 @@ cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const
 
 
 cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const Sample *x, FusedObserved *out) noexcept nogil:
-    """Advance by dt > 0 to the sample."""
     cdef Hold h = _hold(law.rate, x.dt_s)
     cdef Inputs now = _inputs(law, x)
     s.z.u = _filtered(&h, s.z.u, now.u, s.last.u)
@@ -582,7 +577,6 @@ cdef int _add_slip(FusedObserverLaw *law, double torque, double travel) except -
 
 
 cdef int fill_guard(GuardLaw *law, joint, settings) except -1:
-    """Set the limits from joint and settings."""
     law.max_gap = settings.max_gap_s
     law.stop = settings.standstill_velocity_rad_s
     law.leave = 2.0 * settings.standstill_velocity_rad_s
@@ -591,7 +585,6 @@ cdef int fill_guard(GuardLaw *law, joint, settings) except -1:
 
 
 cdef void restart_guard(GuardState *g) noexcept nogil:
-    """Restart at the next sample."""
     g.running = g.standing = False
     g.status = STARTING
 
@@ -606,7 +599,6 @@ cdef bint _garbage(GuardState *g, const Sample *x) noexcept nogil:
 
 
 cdef bint _starts(const GuardLaw *law, const GuardState *g, const Sample *x) noexcept nogil:
-    """Return whether the observer starts at this sample."""
     return not g.running or not 0.0 < x.dt_s <= law.max_gap
 
 

@@ -30,12 +30,7 @@ def networks() -> dict[int, bytes]:
 
 
 def configured(
-    directory: Path,
-    method: str,
-    onnx: dict[int, bytes],
-    *,
-    without_fused: tuple[int, ...] = (),
-    **joint: Any,
+    directory: Path, method: str, onnx: dict[int, bytes], *, without_fused: tuple[int, ...] = (), **joint: Any
 ) -> Path:
     """bench.yaml with this method, joint files with section `fused` and these networks; `joint` adds keys to both."""
     content = {**yaml.safe_load(shipped("bench.yaml").read_text()), "estimator": {"method": method}}

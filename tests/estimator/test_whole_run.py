@@ -148,12 +148,7 @@ def test_features_are_what_the_network_gets() -> None:
     assert joint.fused is not None
     seen = observe_run(joint, FUSED, joint.fused.torsion, *m.arrays())
     expected = np.column_stack(
-        (
-            seen.velocity_rad_s,
-            seen.raw_nm,
-            seen.torsion_nm - (seen.raw_nm - loss_nm(joint, seen)),
-            seen.waves,
-        )
+        (seen.velocity_rad_s, seen.raw_nm, seen.torsion_nm - (seen.raw_nm - loss_nm(joint, seen)), seen.waves)
     )
     assert run.features[running] == pytest.approx(expected[running], abs=1e-12)
 

@@ -141,11 +141,7 @@ LAWS: list[tuple[str, dict[str, float], Law]] = [
         lambda s: (G * KT * 0.002 * (s.temperature_c - 25.0) * s.current_a, 0),
     ),
     ("current_offset", {"offset_a": 0.05}, lambda s: (np.full(len(s.time_s), G * KT * 0.05), 0)),
-    (
-        "rotor_inertia",
-        {"rotor_inertia_kgm2": 9e-5},
-        lambda s: (G * 3e-5 * s.motor_acceleration_rad_s2, 0),
-    ),
+    ("rotor_inertia", {"rotor_inertia_kgm2": 9e-5}, lambda s: (G * 3e-5 * s.motor_acceleration_rad_s2, 0)),
     ("sensor_offset", {"offset_nm": 0.6}, lambda s: (-0.6, -0.6)),
     (
         "sensor_gain",
@@ -179,11 +175,7 @@ LAWS: list[tuple[str, dict[str, float], Law]] = [
     ),
     ("channel_delay", {"delay_s": 2e-3, "channel": 1.0}, lambda s: (-G * KT * 2e-3 * s.current_rate_a_s, 0)),
     ("channel_delay", {"delay_s": 2e-3, "channel": 2.0}, lambda s: (0, K * 2e-3 * s.link_velocity_rad_s)),
-    (
-        "gear_damping",
-        {"damping_nms_per_rad": 20.0},
-        lambda s: (0, -12.0 * s.torsion_rate_rad_s),
-    ),
+    ("gear_damping", {"damping_nms_per_rad": 20.0}, lambda s: (0, -12.0 * s.torsion_rate_rad_s)),
     (
         "link_inertia",
         {"link_inertia_kgm2": 0.04},
