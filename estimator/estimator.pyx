@@ -558,61 +558,6 @@ cdef class FusedEstimator(Estimator):
         # the friction interval is centred on the current path, not on the value
         return fmin(friction + fabs(physics.alpha * physics.difference), width)
 
-    def run_observed(self, seen):
-        """Return the estimates of an `ObservedRun` (observed with the joint's own torsion) as an `EstimateRun`.
-
-        Raises ValueError where offsets are tracked, since they correct the inputs (use `run`); and for a run without `turn`
-        where the joint file has the difference of the paths over the motor's turn.
-        """
-        if self.law.offsets.corrected:
-            raise ValueError("found an estimator that tracks zeros, expected one without, or a run of samples")
-        n = len(seen.raw_nm)
-        if self.law.agreement.with_turn and len(seen.turn) != n:
-            raise ValueError("found a run without waves of the motor's turn, expected one of `observe_run`")
-        values, features, status = np.full((7, n), NAN), np.full((n, self.width), NAN), seen.status.copy()
-        turn = seen.turn if len(seen.turn) == n else np.zeros((n, 2))
-        rows = np.column_stack(
-            (seen.raw_nm, seen.velocity_rad_s, seen.torsion_nm, seen.waves, seen.direction, seen.open_nm, seen.ahead_nm, turn)
-        )
-        cdef const double[:, ::1] row = np.ascontiguousarray(rows)
-        cdef const double[::1] dt = np.ascontiguousarray(seen.dt_s)
-        cdef const double[::1] temperature = np.ascontiguousarray(seen.temperature_c)
-        cdef double[:, ::1] to = values
-        cdef double[:, ::1] f = features
-        cdef unsigned char[::1] code = status
-        cdef FusedObserved one
-        cdef Sample sample
-        cdef Values out
-        cdef Py_ssize_t k
-        cdef int m
-        sample = Sample(NAN, NAN, NAN, NAN, NAN, NAN)
-        self.state.half = self.state.degraded_s = 0.0
-        restart_offsets(&self.law.offsets, &self.state.offsets)
-        restart_agreement(&self.state.agreement)
-        with nogil:
-            for k in range(row.shape[0]):
-                if code[k] != VALID and code[k] != STANDSTILL:
-                    self.state.half = 0.0
-                    drop_block(&self.state.offsets)
-                    restart_turn(&self.state.agreement)
-                    continue
-                one.raw_nm, one.joint_velocity_rad_s, one.torsion_nm = row[k, 0], row[k, 1], row[k, 2]
-                one.cos2, one.sin2, one.cos4, one.sin4 = row[k, 3], row[k, 4], row[k, 5], row[k, 6]
-                one.direction, one.open_nm, one.ahead_nm = row[k, 7], row[k, 8], row[k, 9]
-                one.cos1, one.sin1 = row[k, 10], row[k, 11]
-                sample.dt_s, sample.temperature_c = dt[k], temperature[k]
-                no_values(&out, code[k])
-                if self.law.offsets.estimated:
-                    self.state.observer.d = one.torsion_nm / self.law.offsets.stiffness
-                self.estimate(&one, &sample, True, &out)
-                to[0, k], to[1, k] = out.torque_nm, out.sigma_nm
-                to[2, k], to[3, k], to[4, k] = out.tob_nm, out.physics_nm, out.network_nm
-                code[k] = out.status
-                for m in range(self.width):
-                    f[k, m] = self.features[m]
-        torque, sigma, *others = values
-        return EstimateRun(torque, sigma, status, *others, features)
-
 
 def observe_run(
     joint, settings, torsion, dt_s, current_a, motor_position_rad, motor_velocity_rad_s, link_position_rad,

@@ -19,12 +19,11 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.estimator import FusedEstimator, quadrants
+from jtqd.estimator.estimator import quadrants
 from jtqd.estimator.fusion import Fusion
-from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, Torsion
+from jtqd.estimator.joint import AdditiveLoss, Envelope, FusedSigma, Joint, Torsion
 from jtqd.estimator.native_network import network_shares
 from jtqd.estimator.network import FUSED_FEATURES
-from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.text import counted
 from jtqd.sysid.fit.calibration import conformal_scale, loss_and_width
 from jtqd.sysid.fit.fused import envelope_of, folds
@@ -105,7 +104,6 @@ def judge(scores: Collection[tuple[float, float]], share: float = 1.0) -> Gate:
     return Gate(gain, network, physics, len(table), int((table[:, 0] > table[:, 1]).sum()), share)
 
 
-_SETTINGS: Final = EstimatorSettings(method="fused", track_zeros=False)
 HIDDEN: Final = (16, 16)
 _CORE: Final = 3
 """Features that set the gains (speed, motor torque, torsion less current); the others are the waves."""
@@ -118,10 +116,7 @@ _LEAST_SHARE: Final = 0.05
 class Seen:
     """A run through physics with given parameters: features [n, 7], physics and sigma [n], all of moving samples."""
 
-    def __init__(
-        self, run: RunSignals, joint: Joint, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma
-    ) -> None:
-        plain = replace(joint, effects=(), fused=Fused(loss, torsion, sigma))
+    def __init__(self, run: RunSignals, loss: AdditiveLoss, torsion: Torsion, sigma: FusedSigma) -> None:
         keep = run.moving
         torque, open_nm = torsion_torque(torsion, run)
         seen = replace(run.seen, torsion_nm=torque, open_nm=open_nm)
@@ -130,7 +125,9 @@ class Seen:
             seen.raw_nm, wide, seen.velocity_rad_s, seen.torsion_nm, seen.open_nm, loss_nm=value
         )
         self.name = run.name
-        self.features: FloatArray = FusedEstimator(plain, _SETTINGS).run_observed(seen).features[keep]
+        apart = seen.torsion_nm - (seen.raw_nm - value)
+        features = np.column_stack((seen.velocity_rad_s, seen.raw_nm, apart, seen.waves))
+        self.features: FloatArray = features[keep]
         self.waves: FloatArray = self.features[:, _CORE:] * network_shares(seen.velocity_rad_s[keep])[:, None]
         self.residual_nm: FloatArray = (run.sensor_nm - physics)[keep]
         self.sigma_nm: FloatArray = spread[keep]
@@ -157,16 +154,16 @@ def train_fused(
     fold_of: list[int] = []
     for fold, (known, judged) in enumerate(folds(runs)):
         loss, torsion = fit_loss(known, joint.friction).loss, fit_torsion(known)
-        trained = _train([Seen(run, joint, loss, torsion, fused.sigma) for run in known], schedule)
+        trained = _train([Seen(run, loss, torsion, fused.sigma) for run in known], schedule)
         for n in judged:
-            one = Seen(runs[n], joint, loss, torsion, fused.sigma)
+            one = Seen(runs[n], loss, torsion, fused.sigma)
             unseen.append((one, network_output(trained, one.features[:, :_CORE], one.waves)))
             fold_of.append(fold)
     pairs = [(one.residual_nm, correction) for one, correction in unseen]
     share = safe_share(pairs)
     errors = [residual - share * correction for residual, correction in pairs]
     scores = {one.name: score for (one, _), score in zip(unseen, judged_scores(pairs, fold_of), strict=True)}
-    blocks = [Seen(run, joint, fused.loss, fused.torsion, fused.sigma) for run in runs]
+    blocks = [Seen(run, fused.loss, fused.torsion, fused.sigma) for run in runs]
     trained = scaled(_train(blocks, schedule), share)
     features = np.concatenate([block.features for block in blocks])
     low, high = np.quantile(features, [1e-4, 1.0 - 1e-4], axis=0)

@@ -155,10 +155,6 @@ def test_without_torsion_or_where_it_is_not_wanted_there_are_none() -> None:
     rigid = replace(NARROW, fused=replace(NARROW.fused, torsion=None))  # type: ignore[type-var]
     assert FusedEstimator(rigid, ON).zeros is None
     assert FusedEstimator(NARROW, OFF).zeros is None
-    seen = observe_run(NARROW, ON, NARROW.fused.torsion, *driven(0.1)[0])  # type: ignore[union-attr]
-    with pytest.raises(ValueError, match="tracks zeros"):
-        FusedEstimator(NARROW, ON).run_observed(seen)
-    assert math.isfinite(FusedEstimator(NARROW, OFF).run_observed(seen).torque_nm[-1])
 
 
 # ---- spread of the offset over the days
@@ -647,7 +643,7 @@ def test_waves_of_another_shape_are_refused() -> None:
         turn_waves(TURN, ones, ones, ones, ones, ones, np.ones((5, 4)))
 
 
-# ---- files, runs observed before
+# ---- files
 
 
 def mapping_of(joint: Joint, path: str, value: Any) -> dict[str, Any]:
@@ -697,18 +693,6 @@ def test_values_that_cannot_be_are_refused(joint: Joint, path: str, value: Any, 
         Joint.from_mapping(mapping_of(joint, path, value), "a.yaml")
     assert str(caught.value).startswith(f"a.yaml: key 'fused.{path}': ")
     assert words in str(caught.value)
-
-
-def test_a_run_observed_before_is_estimated_alike() -> None:
-    for joint, columns in ((USUAL, driven(3.0)[0]), (joint_of(), with_wave(2, "constant_nm", 2.0))):
-        seen = observe_run(joint, OFF, joint.fused.torsion, *columns)  # type: ignore[union-attr]
-        whole, again = FusedEstimator(joint, OFF).run(*columns), FusedEstimator(joint, OFF)
-        for _ in range(2):  # the second time nothing remains of the first
-            found = again.run_observed(seen)
-            np.testing.assert_allclose(found.sigma_nm, whole.sigma_nm, rtol=1e-6, equal_nan=True)
-            assert np.array_equal(found.status, whole.status)
-    with pytest.raises(ValueError, match="waves of the motor's turn"):
-        again.run_observed(replace(seen, turn=np.zeros((0, 2))))
 
 
 # ---- the state continues in another estimator

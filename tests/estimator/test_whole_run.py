@@ -37,9 +37,7 @@ RUNNING = {st.STARTING, st.VALID, st.STANDSTILL, st.INVALID}
 def whole(
     joint: Joint, settings: EstimatorSettings, network: Any, m: Motion, temperature: FloatArray | None
 ) -> EstimateRun:
-    assert joint.fused is not None
-    seen = observe_run(joint, settings, joint.fused.torsion, *m.arrays(), temperature)
-    return FusedEstimator(joint, settings, network).run_observed(seen)
+    return FusedEstimator(joint, settings, network).run(*m.arrays(), temperature)
 
 
 def compare(  # noqa: PLR0917 - what both take, and a note
