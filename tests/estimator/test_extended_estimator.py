@@ -342,8 +342,10 @@ def test_step_by_step_is_the_whole_run(method: str, names: tuple[str, ...]) -> N
     moving = st.DEGRADED if method == "network" else st.VALID
     assert {moving, st.INVALID, st.STARTING, st.STANDSTILL} <= set(run.status.tolist())
     np.testing.assert_array_equal(run.status, [e.status for e in steps])
-    for name in ("torque_nm", "sigma_nm", "physics_nm", "network_nm"):
+    for name in ("torque_nm", "sigma_nm", "tob_nm", "physics_nm", "network_nm"):
         np.testing.assert_array_equal(getattr(run, name), [getattr(e, name) for e in steps], err_msg=name)
+    for published in (run.torque_nm, run.sigma_nm):
+        assert np.array_equal(np.isfinite(published), np.isin(run.status, list(st.PUBLISHED)))
 
 
 def test_every_effect_was_there() -> None:

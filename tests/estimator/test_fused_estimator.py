@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 
 from jtqd.estimator import status as st
-from jtqd.estimator.estimator import STANDSTILL_SIGMAS, FusedEstimator
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.estimator import STANDSTILL_SIGMAS, FusedEstimator, estimate_columns, observe_run
 from jtqd.estimator.fusion import Fusion
 from jtqd.estimator.joint import QUADRANTS, Joint, Standstill
 from jtqd.estimator.losses import AdditiveLossModel
 from jtqd.estimator.network import FusedNetwork
+from jtqd.estimator.run import JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
+from tests.estimator.estimator_helpers import Motion
 from tests.estimator.fused_helpers import (
     GAIN,
     NARROW,
@@ -29,6 +32,8 @@ from tests.estimator.fused_helpers import (
     everywhere,
     fused_joint,
     fused_network,
+    temperatures,
+    twisted,
 )
 
 FUSED = EstimatorSettings(method="fused")
@@ -407,3 +412,80 @@ def test_without_a_network_the_envelope_of_the_joint_file_lowers_the_status_and_
         assert steady(estimator(joint=light), -1.0, 1.0, -8.0).status == status
     trusted = steady(estimator(says(1.5), own), 32.0 / GAIN, 1.0)
     assert trusted.status == st.VALID, "a network has an envelope of its own"
+
+
+# ---- runs
+
+FIELDS = ("torque_nm", "sigma_nm", "status", "tob_nm", "physics_nm", "network_nm")
+
+
+def test_no_network_may_be_so_near_that_it_counts() -> None:
+    m = twisted(7)
+    run = estimator(says(1e-9), fused_joint(), network_limit=0.0).run(*m.arrays())
+    assert np.array_equal(run.torque_nm, run.physics_nm, equal_nan=True)
+
+
+def test_the_door_for_run_tables() -> None:
+    """`estimate_columns` is the same run, its steps from the time, its temperature from the table."""
+    m = twisted(12)
+    time = np.cumsum(m.dt_s)
+    temperature = temperatures("rising", 12, len(time))
+    network = FusedNetwork(fused_network(12).data)
+    inputs = m.arrays()[1:]
+    columns = JointColumns(
+        inputs[0], inputs[1], inputs[2], link_position_rad=inputs[3], temperature_c=temperature
+    )
+    joint = fused_joint(12)
+    door = estimate_columns(joint, FUSED, network, time, columns)
+    steps = replace(m, dt_s=np.diff(time, prepend=time[0]))
+    direct = FusedEstimator(joint, FUSED, network).run(*steps.arrays(), temperature)
+    for name in (*FIELDS, "features"):
+        assert np.array_equal(getattr(door, name), getattr(direct, name), equal_nan=True), name
+    with pytest.raises(
+        ValueError, match="joint joint1: the run has no motor_velocity_rad_s, link_position_rad"
+    ):
+        estimate_columns(joint, FUSED, None, time, JointColumns(inputs[0], inputs[1]))
+
+
+def test_features_are_what_the_network_gets() -> None:
+    asked: list[tuple[float, ...]] = []
+
+    def answer(*x: float) -> float:
+        asked.append(x)
+        return 0.0
+
+    m = twisted(3, 800)
+    joint = fused_joint(3)
+    e = FusedEstimator(joint, FUSED, FakeNetwork(answer))
+    for row in m.rows():
+        e.step(*row, 25.0)
+    run = FusedEstimator(joint, FUSED, None).run(*m.arrays(), None)
+    running = np.isfinite(run.physics_nm)
+    assert np.array(asked) == pytest.approx(run.features[running], abs=1e-9)
+    assert joint.fused is not None
+    seen = observe_run(joint, FUSED, joint.fused.torsion, *m.arrays())
+    expected = np.column_stack(
+        (seen.velocity_rad_s, seen.raw_nm, seen.torsion_nm - (seen.raw_nm - loss_nm(joint, seen)), seen.waves)
+    )
+    assert run.features[running] == pytest.approx(expected[running], abs=1e-12)
+
+
+def loss_nm(joint: Joint, seen: ObservedRun) -> FloatArray:
+    assert joint.fused is not None
+    unknown = np.full_like(seen.raw_nm, np.nan)
+    model = AdditiveLossModel(joint.fused.loss)
+    return model.loss_many(seen.raw_nm, seen.velocity_rad_s, unknown, seen.direction)[0]
+
+
+def test_lengths_and_emptiness() -> None:
+    joint = fused_joint()
+    empty = FusedEstimator(joint, FUSED, FusedNetwork(fused_network().data)).run(
+        *Motion(*([np.zeros(0)] * 5)).arrays(), None
+    )
+    assert all(len(getattr(empty, name)) == 0 for name in FIELDS)
+    with pytest.raises(ValueError, match="expected all of one length"):
+        observe_run(joint, FUSED, None, *([np.zeros(3)] * 4), np.zeros(4))
+    with pytest.raises(ValueError, match="expected all of one length"):
+        observe_run(joint, FUSED, None, *([np.zeros(3)] * 5), np.zeros(2))
+    with pytest.raises(ValueError, match="read-only"):
+        FusedEstimator(joint, FUSED, None).run(*twisted(1, 700).arrays(), None).torque_nm[0] = 1.0

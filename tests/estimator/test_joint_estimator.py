@@ -20,11 +20,9 @@ from jtqd.estimator.settings import METHODS as ALL_METHODS
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate
 from tests.estimator.estimator_helpers import (
-    Motion,
     first_order_hold,
     joint1,
     motion,
-    reciprocal_efficiency,
     small_network,
     with_faults,
 )
@@ -302,45 +300,7 @@ def test_without_efficiency_the_network_stands_on_friction() -> None:
     assert got.physics_nm == pytest.approx(12.4 - friction.torque(1.0), abs=1e-9)
 
 
-# ---- twin
-
-
-def compare(joint: Joint, settings: EstimatorSettings, network: Any, m: Motion, note: object) -> Any:
-    e = JointEstimator(joint, settings, network)
-    single = [e.step(*row) for row in m.rows()]
-    run = JointEstimator(joint, settings, network).run(*m.arrays())
-    for name in FIELDS:
-        expected = np.array([getattr(s, name) for s in single], np.float64)
-        assert np.asarray(getattr(run, name)) == pytest.approx(expected, abs=1e-9, nan_ok=True), (name, note)
-    for name in ("torque_nm", "sigma_nm"):
-        published = np.isin(run.status, list(st.PUBLISHED))
-        assert np.array_equal(np.isfinite(getattr(run, name)), published), (name, note)
-    return run
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_random_runs_equal_their_twin(method: str) -> None:
-    """Reversals, standstill, envelope borders, gaps, NaN, infinities, absurd jumps, negative steps."""
-    first_seed = 4100
-    seen: set[int] = set()
-    for seed in range(first_seed, first_seed + 6):
-        joint = joint1()
-        if seed % 3 == 1:
-            joint = replace(joint, efficiency=reciprocal_efficiency(joint))
-        if seed % 3 == 2 and method != "efficiency":
-            joint = replace(joint, efficiency=None)
-        network = TorqueNetwork(small_network(seed, follow=0.8 + 0.1 * (seed % 5), noise=5e-4).data)
-        m = with_faults(motion(seed), seed) if seed % 4 else motion(seed)
-        run = compare(joint, EstimatorSettings(method=method), network, m, f"seed {seed}")
-        seen |= set(run.status.tolist())
-    expected = {st.STARTING, st.VALID, st.STANDSTILL, st.INVALID}
-    assert seen == expected | ({st.DEGRADED} if method == "network" else set())
-
-
-def test_twin_with_a_network_that_gives_nonsense() -> None:
-    network = FakeNetwork(lambda *x: math.nan if x[0] > 1 else (1e6 if x[0] > 0.5 else x[5]), -150.0, 150.0)
-    run = compare(joint1(), EstimatorSettings(), network, motion(7), "nonsense")
-    assert {st.VALID, st.DEGRADED} <= set(run.status.tolist())
+# ---- runs
 
 
 def test_empty_run_and_read_only_arrays() -> None:
