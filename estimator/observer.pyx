@@ -538,18 +538,22 @@ cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, settings) ex
     law.cubic = torsion.cubic_nm_per_rad3
     law.zero = torsion.zero_rad
     law.damping = torsion.damping_nms_per_rad
-    if torsion.hysteresis_nm:
-        _add_slip(law, torsion.hysteresis_nm, torsion.hysteresis_travel_rad)
-    for torque, travel in zip(torsion.slips_nm, torsion.slips_travel_rad, strict=True):
-        _add_slip(law, torque, travel)
+    for what, given, most in (
+        ("slips", torsion.slips_nm, MOST_SLIPS - 1),
+        ("hardenings of the spring", torsion.hardening_rad, MOST_HARDENINGS),
+        ("orders of the link encoder's error", torsion.link_orders_per_rev, MOST_LINK_ORDERS),
+        ("orders of the kinematic error", torsion.orders_per_motor_rev, MOST_NODES),
+    ):
+        if len(given) > most:
+            raise ValueError(f"found {len(given)} {what}, expected at most {most}")
+    slips = [(torsion.hysteresis_nm, torsion.hysteresis_travel_rad)] if torsion.hysteresis_nm else []
+    for torque, travel in slips + list(zip(torsion.slips_nm, torsion.slips_travel_rad, strict=True)):
+        law.slip[law.slips] = Slip(0.5 * torque, 1.0 / travel)
+        law.slips += 1
     for deflection, stiffness in zip(torsion.hardening_rad, torsion.hardening_nm_per_rad, strict=True):
-        if law.hardenings == MOST_HARDENINGS:
-            raise ValueError(f"found more than {MOST_HARDENINGS} hardenings of the spring")
         law.hardening[law.hardenings] = Hardening(deflection, stiffness)
         law.hardenings += 1
     for order, c, s in zip(torsion.link_orders_per_rev, torsion.link_cos_rad, torsion.link_sin_rad, strict=True):
-        if law.link_waves == MOST_LINK_ORDERS:
-            raise ValueError(f"found more than {MOST_LINK_ORDERS} orders of the link encoder's error")
         law.link_wave[law.link_waves] = Wave(order, c, s)
         law.link_waves += 1
     for order, c, s in zip(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad, strict=True):
@@ -558,18 +562,8 @@ cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, settings) ex
         elif order == RIPPLE_ORDERS[1]:
             law.four = Wave(order, law.four.cos + c, law.four.sin + s)
         else:
-            if law.others == MOST_NODES:
-                raise ValueError(f"found more than {MOST_NODES} orders of the kinematic error")
             law.other[law.others] = Wave(order, c, s)
             law.others += 1
-    return 0
-
-
-cdef int _add_slip(FusedObserverLaw *law, double torque, double travel) except -1:
-    if law.slips == MOST_SLIPS:
-        raise ValueError(f"found more than {MOST_SLIPS} slips")
-    law.slip[law.slips] = Slip(0.5 * torque, 1.0 / travel)
-    law.slips += 1
     return 0
 
 
