@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.estimator import JointEstimator
+from jtqd.estimator.estimator import Estimator, FusedEstimator, JointEstimator
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.losses import FrictionModel, LossModel
 from jtqd.estimator.network import TorqueNetwork
@@ -26,6 +27,7 @@ from tests.estimator.estimator_helpers import (
     small_network,
     with_faults,
 )
+from tests.estimator.fused_helpers import PLAIN, K
 
 METHODS = tuple(method for method in ALL_METHODS if method != "fused")  # FusedEstimator's own
 NETWORK = TorqueNetwork(small_network().data)
@@ -171,65 +173,72 @@ def test_a_network_far_from_physics_is_refused_without_a_jump() -> None:
 # ---- statuses
 
 
-def test_first_sample_starts_and_publishes_nothing() -> None:
-    for method in METHODS:
-        e = estimator(method)
-        for got in (e.step(0.001, 2.0, 0.0, 100.0, 0.0), e.step(0.0, 2.0, 0.0, 100.0, 0.0)):
-            assert got.status == st.STARTING
-            assert all(math.isnan(x) for n, x in enumerate(got) if n != 2)
-        assert e.step(0.001, 2.0, 0.1, 100.0, 0.001).status == st.VALID
-        e.reset()
-        assert e.step(0.001, 2.0, 0.0, 100.0, 0.0).status == st.STARTING
+def of_method(method: str) -> Estimator:
+    return (
+        FusedEstimator(PLAIN, EstimatorSettings(method="fused")) if method == "fused" else estimator(method)
+    )
 
 
+@pytest.mark.parametrize("method", ALL_METHODS)
+def test_first_sample_starts_and_publishes_nothing(method: str) -> None:
+    e = of_method(method)
+    for got in (e.step(0.001, 2.0, 0.0, 100.0, 0.0), e.step(0.0, 2.0, 0.0, 100.0, 0.0)):
+        assert got.status == st.STARTING
+        assert all(math.isnan(x) for n, x in enumerate(got) if n != 2)
+    assert e.step(0.001, 2.0, 0.1, 100.0, 0.001, 25.0).status == st.VALID
+    e.reset()
+    assert e.step(0.001, 2.0, 0.0, 100.0, 0.0, 25.0).status == st.STARTING
+
+
+def assert_as_fresh(e: Estimator, method: str, dt: float = 0.001) -> None:
+    """From the next sample on, at a step of dt, nothing is known of the samples before."""
+    fresh = of_method(method)
+    rows = [
+        (2.0 + 0.1 * k, 100.0 * (0.021 + 0.001 * k + 5 / K), 100.0, 0.021 + 0.001 * k, 25.0) for k in range(3)
+    ]
+    assert e.step(dt, *rows[0]).status == fresh.step(0.001, *rows[0]).status == st.STARTING
+    for row in rows[1:]:
+        got = e.step(0.001, *row)
+        assert got == pytest.approx(fresh.step(0.001, *row), rel=0.0, abs=0.0, nan_ok=True)
+        assert got.status == st.VALID
+
+
+def moved(method: str) -> Estimator:
+    e = of_method(method)
+    for k in range(20):
+        e.step(0.001, 2.0, 100.0 * (0.001 * k + 5 / K), 100.0, 0.001 * k, 25.0)
+    return e
+
+
+@pytest.mark.parametrize("method", ALL_METHODS)
 @pytest.mark.parametrize("dt", [0.0, -0.001, 0.0501, 1.0, math.inf, -math.inf, math.nan])
-def test_a_bad_step_starts_again_from_that_sample(dt: float) -> None:
-    e = estimator("efficiency")
-    steady(e, 4.0, -2.0, 30)
-    assert e.step(dt, 2.0, 0.0, 100.0, 0.0).status == st.STARTING
-    fresh = estimator("efficiency")
-    fresh.step(0.001, 2.0, 0.0, 100.0, 0.0)
-    for i, w, q in ((2.0, 100.0, 0.001), (2.5, 90.0, 0.002)):
-        expected = fresh.step(0.001, i, 0.1, w, q)
-        assert e.step(0.001, i, 0.1, w, q) == pytest.approx(expected, rel=0.0, abs=0.0, nan_ok=True)
+def test_a_bad_step_starts_again_from_that_sample(dt: float, method: str) -> None:
+    assert_as_fresh(moved(method), method, dt)
+
+
+NOT_FINITE = [*product(range(4), (math.nan, math.inf, -math.inf))]
+ABSURD = [*product((0, 2, 3), (1e300, -1e300, 1.7e308)), (0, -1e4), (2, -1e6), (3, -1e5)]
+OF_TORSION = [(1, 1e300), (1, -1e300), (1, 1.7e308), (1, 1e6), (1, -5e3), (3, 40.0)]
+"""A motor position alone is no torque of the paper's observer."""
+
+
+@pytest.mark.parametrize("method", ALL_METHODS)
+def test_absurd_numbers_are_invalid_for_one_sample_and_leave_nothing(method: str) -> None:
+    for place, absurd in (*NOT_FINITE, *ABSURD, *(OF_TORSION if method == "fused" else ())):
+        e = moved(method)
+        inputs = [2.0, 2.0 + 100 * 5 / K, 100.0, 0.02]
+        inputs[place] = absurd
+        got = e.step(0.001, *inputs, 25.0)
+        assert got.status == st.INVALID, (place, absurd)
+        assert math.isnan(got.torque_nm)
+        assert math.isnan(got.sigma_nm)
+        assert_as_fresh(e, method)
 
 
 def test_the_longest_step_still_counts() -> None:
     e = estimator("tob")
     e.step(0.001, 2.0, 0.0, 100.0, 0.0)
     assert e.step(0.05, 2.0, 0.0, 100.0, 0.0).status == st.VALID
-
-
-@pytest.mark.parametrize("place", range(4))
-@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_garbage_is_invalid_for_one_sample_and_forgotten(place: int, bad: float) -> None:
-    for method in METHODS:
-        e = estimator(method)
-        steady(e, 2.0, 1.0, 20)
-        inputs = [2.0, 2.0, 100.0, 0.02]
-        inputs[place] = bad
-        got = e.step(0.001, *inputs)
-        assert got.status == st.INVALID
-        assert math.isnan(got.torque_nm)
-        assert math.isnan(got.sigma_nm)
-        assert e.step(0.001, 2.0, 2.1, 100.0, 0.021).status == st.STARTING
-        again = e.step(0.001, 2.0, 2.2, 100.0, 0.022)
-        assert again.status == st.VALID
-        assert again.torque_nm == pytest.approx(steady(estimator(method), 2.0, 1.0, 23).torque_nm, abs=0.3)
-
-
-def test_absurd_numbers_never_reach_the_bus_and_leave_nothing() -> None:
-    """Finite but impossible: one sample INVALID, one STARTING, then as if nothing had been."""
-    for place, absurd in ((0, 1e300), (0, -1e4), (2, 1e300), (2, -1e6), (3, 1e300), (3, -1e5)):
-        e = estimator("network")
-        steady(e, 2.0, 1.0, 20)
-        inputs = [2.0, 2.0, 100.0, 0.02]
-        inputs[place] = absurd
-        assert e.step(0.001, *inputs).status == st.INVALID
-        assert e.step(0.001, 2.0, 2.1, 100.0, 0.021).status == st.STARTING
-        got = e.step(0.001, 2.0, 2.2, 100.0, 0.022)
-        assert got.status == st.VALID
-        assert got.physics_nm == pytest.approx(steady(estimator("efficiency"), 2.0, 1.0).torque_nm, abs=1e-6)
 
 
 def test_more_than_three_times_rated_is_invalid() -> None:
