@@ -39,7 +39,7 @@ from jtqd.estimator import status as st
 from jtqd.estimator.corrections import ExtendedInputs, acting_effects, plain_joint
 from jtqd.estimator.observer import columns
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
-from jtqd.estimator.run import EstimateRun, ObservedRun
+from jtqd.estimator.run import INPUTS, EstimateRun, ObservedRun
 from jtqd.estimator.settings import METHODS
 from jtqd.estimator.status import Estimate
 from jtqd.estimator.native_network import FADE_START
@@ -679,19 +679,9 @@ def estimate_columns(joint, settings, network, time_s, columns):
 
     Raises ConfigError as `make_estimator` does, ValueError for a missing column.
     """
-    current, motor, velocity, link = _inputs(joint, columns)
-    dt_s = np.diff(time_s, prepend=time_s[0])
-    return make_estimator(joint, settings, network).run(dt_s, current, motor, velocity, link, columns.temperature_c)
-
-
-def _inputs(joint, columns):
-    """Return current, motor position, motor velocity and link position; ValueError for a missing column."""
-    needed = {
-        name: getattr(columns, name)
-        for name in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
-    }
-    missing = [name for name, column in needed.items() if column is None]
+    inputs = {name: getattr(columns, name) for name in INPUTS}
+    missing = [name for name, column in inputs.items() if column is None]
     if missing:
         raise ValueError(f"joint {joint.name}: the run has no {', '.join(missing)}")
-    current, motor, velocity, link = needed.values()
-    return current, motor, velocity, link
+    dt_s = np.diff(time_s, prepend=time_s[0])
+    return make_estimator(joint, settings, network).run(dt_s, *inputs.values(), columns.temperature_c)

@@ -97,6 +97,8 @@ class JointColumns:
         )
 
 
+INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
+"""Columns that an estimator takes, in its order, after the time step."""
 COLUMN_NAMES: Final = tuple(item.name for item in fields(JointColumns))
 """Names of a joint's columns without the prefix `jN.`."""
 
@@ -159,7 +161,7 @@ class RunTable:
         """
         columns = self.joint(number, gear_ratio)
         inputs = [self.dt_s]
-        for name in ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad"):
+        for name in INPUTS:
             column = getattr(columns, name)
             if column is None:
                 raise RunTableError(f"j{number}.{name}: missing, and no column to derive it from")
