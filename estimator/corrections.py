@@ -75,28 +75,12 @@ def plain_joint(joint: Joint) -> Joint:
     return plain
 
 
-def torsion_zero(joint: Joint) -> float:
-    """Return theta_m/G - theta_l [rad] without torque, 0 where the joint file gives none."""
-    torsion = None if joint.fused is None else joint.fused.torsion
-    return 0.0 if torsion is None else torsion.zero_rad
-
-
-def seeming_inertia_a(joint: Joint) -> float:
-    """Return Jm G / Kt: times link_rad omega_m^2 the apparent current [A] of an error of the motor's encoder."""
-    return plain_joint(joint).rotor_inertia_kgm2 * joint.gear_ratio / joint.torque_constant_nm_per_a
-
-
 class Hook(NamedTuple):
     """A hook with its parameters and its own functions."""
 
     call: Any
     p: Values
     x: Functions
-
-
-def at_motor(pairs: Pairs) -> Pairs:
-    """Return the effects that are errors of the motor's encoder."""
-    return tuple((effect, p) for effect, p in pairs if effect.at_motor_of(p))
 
 
 def hooks_of(pairs: Pairs, name: str, functions: Any) -> tuple[Hook, ...]:
@@ -109,19 +93,21 @@ class ExtendedInputs:
 
     def __init__(self, joint: Joint, settings: EstimatorSettings) -> None:
         pairs = acting_effects(joint)
+        motor = tuple((effect, p) for effect, p in pairs if effect.at_motor_of(p))
+        torsion = None if joint.fused is None else joint.fused.torsion
         self._joint: Final = replace(joint, effects=())
         self._current: Final = hooks_of(pairs, "current_a", ScalarFunctions)
-        self._motor: Final = hooks_of(at_motor(pairs), "link_rad", ScalarFunctions)
-        self._link: Final = hooks_of(
-            tuple(p for p in pairs if p not in at_motor(pairs)), "link_rad", ScalarFunctions
-        )
+        self._motor: Final = hooks_of(motor, "link_rad", ScalarFunctions)
+        self._link: Final = hooks_of(tuple(p for p in pairs if p not in motor), "link_rad", ScalarFunctions)
         self._twist: Final = hooks_of(pairs, "twist_rad", Smoothed)
         self._loss: Final = hooks_of(pairs, "loss_nm", ScalarFunctions)
         self._slips: Final = tuple(hook.x for hook in self._twist)
         self._gear: Final = 1.0 / joint.gear_ratio
         self._inverse_gain: Final = 1.0 / (joint.gear_ratio * joint.torque_constant_nm_per_a)
-        self._inertia_a: Final = seeming_inertia_a(joint)
-        self._zero: Final = torsion_zero(joint)
+        # times link_rad omega_m^2: the apparent current of an error of the motor's encoder
+        inertia = plain_joint(joint).rotor_inertia_kgm2 * joint.gear_ratio
+        self._inertia_a: Final = inertia / joint.torque_constant_nm_per_a
+        self._zero: Final = 0.0 if torsion is None else torsion.zero_rad
         self._max_gap: Final = settings.max_gap_s
         self._rate_rad_s: Final = settings.link_bandwidth_rad_s
         self._slip_rad_s: Final = settings.bandwidth_rad_s
