@@ -50,7 +50,7 @@ def interfaces() -> Iterator[None]:
 
 
 class Daemon:
-    """A bench and a jtqd on one interface, and what its estimate PDOs said."""
+    """A bench and a jtqd on one interface, and what its estimate PDOs reported."""
 
     def __init__(self, stack: ExitStack, directory: Path, interface: str, config: str) -> None:
         self.joints = JOINTS[config]

@@ -64,7 +64,7 @@ class Run:
             text=True,
         ) as process:
             try:
-                self.said = self.ask(directory, environment)
+                self.reported = self.ask(directory, environment)
             finally:  # else a failure would wait for its end for ever
                 process.terminate()
             out, error = process.communicate(timeout=60)
@@ -125,7 +125,7 @@ class Run:
 )
 def test_a_run_and_its_log(tmp_path: Path, joints: int, sensor: bool) -> None:
     run = Run(tmp_path, joints, sensor=sensor)
-    check_answers(run.said, joints, sensor=sensor)
+    check_answers(run.reported, joints, sensor=sensor)
     numbers = range(1, joints + 1)
     assert list(run.summary["rmse_nm"]) == [f"joint_{number}" for number in numbers]
     assert all((value is not None) == sensor for value in run.summary["rmse_nm"].values())
@@ -181,10 +181,10 @@ def check_frames(run: Run, states: dict[str, Any]) -> None:
                 assert torque == pytest.approx(read[f"torque_{number}"])
 
 
-def check_answers(said: dict[str, Any], joints: int, *, sensor: bool) -> None:
+def check_answers(reported: dict[str, Any], joints: int, *, sensor: bool) -> None:
     """What a master reads of the node, and `jtq status`."""
-    assert [each["joint"] for each in said["joints"]] == list(range(1, joints + 1))
-    objects = said["objects"]
+    assert [each["joint"] for each in reported["joints"]] == list(range(1, joints + 1))
+    objects = reported["objects"]
     room = 2 if joints <= 2 else 4
     assert objects["revision"] == (0x0001_0000 if room == 2 else 0x0002_0000)
     assert [each & 0x7FF for each in objects["pdos"]] == [0x1A0, 0x2A0][: room // 2]

@@ -108,13 +108,13 @@ def no_traceback(result: subprocess.CompletedProcess[str]) -> str:
 
 
 def temperatures(log: Path, number: int) -> tuple[list[float], list[float]]:
-    """Of one joint: what each cycle had, and what its drive told, frame by frame [degC]."""
+    """Of one joint: what each cycle had, and what its drive sent, frame by frame [degC]."""
     state = read_topic(log, f"/joint/{number}/state")
     assert ((state["input_flags"] & 8 != 0) == np.isfinite(state["temperature_c"])).all()
     frames = read_topic(log, "/can/frames")["frames"]
     data = frames["data"][frames["id"] == 0x380 + number]
-    told = [0.1 * struct.unpack_from("<h", bytes(each))[0] for each in data]
-    return state["temperature_c"].tolist(), told
+    sent = [0.1 * struct.unpack_from("<h", bytes(each))[0] for each in data]
+    return state["temperature_c"].tolist(), sent
 
 
 def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]) -> None:
@@ -122,8 +122,8 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
     result = run(*options, environment=environment)
     assert result.returncode == 0, result.stderr
     no_traceback(result)
-    said = [line for line in result.stderr.splitlines() if "physics only" in line]
-    assert [line.partition("joint ")[2].partition(" (")[0] for line in said] == [
+    reported = [line for line in result.stderr.splitlines() if "physics only" in line]
+    assert [line.partition("joint ")[2].partition(" (")[0] for line in reported] == [
         f"{number}: no network, physics only" for number in (1, 2)
     ]
     summary = json.loads(result.stdout)
@@ -147,11 +147,11 @@ def test_a_run_on_the_emulated_bench(tmp_path: Path, environment: dict[str, str]
     files = ("configuration.yaml", "joint1.yaml", "joint2.yaml", "bus.dbc", "provenance.json", "drive.eds")
     assert set(files) <= attachments
     for number in (1, 2):
-        values, told = temperatures(Path(recording["path"]), number)
-        assert set(values[-500:]) <= set(told), (
+        values, sent = temperatures(Path(recording["path"]), number)
+        assert set(values[-500:]) <= set(sent), (
             "known half a second after the start, by the frames of the log"
         )
-        assert 4 <= len(told) <= 7
+        assert 4 <= len(sent) <= 7
         assert f"drive_{number}_TPDO3: 2 drive_{number}" in dbc
 
 
@@ -173,8 +173,8 @@ def test_method_fused_on_the_emulated_bench(tmp_path: Path, environment: dict[st
         assert had_time.sum() > 100
         assert used[had_time].mean() > 0.9
         assert {2, 6} & set(state["status"])
-        values, told = temperatures(Path(recording["path"]), number)
-        assert set(values[-1000:]) <= set(told)
+        values, sent = temperatures(Path(recording["path"]), number)
+        assert set(values[-1000:]) <= set(sent)
         assert np.isfinite(state["physics_nm"][used]).all()
         assert not np.isfinite(state["tob_nm"]).any(), "no stage of this method"
 
@@ -435,15 +435,15 @@ def test_an_estimate_far_from_the_sensor_is_said_once_and_counted(
     assert process.stderr is not None
     assert process.stdout is not None
     warning = "jtqd: joint {}: the estimate has been more than 3 sigma away"
-    deadline, said = time.monotonic() + 60, ""
-    while warning.format(1) not in said and time.monotonic() < deadline:
-        said += process.stderr.readline()  # at least one comes every 5 s
+    deadline, reported = time.monotonic() + 60, ""
+    while warning.format(1) not in reported and time.monotonic() < deadline:
+        reported += process.stderr.readline()  # at least one comes every 5 s
     process.send_signal(signal.SIGTERM)
-    said += process.stderr.read()
+    reported += process.stderr.read()
     counted = json.loads(process.stdout.read())["deviations"]
     assert process.wait(15) == 0
     assert counted["joint_1"] >= 1
-    assert counted == {f"joint_{number}": said.count(warning.format(number)) for number in (1, 2)}
+    assert counted == {f"joint_{number}": reported.count(warning.format(number)) for number in (1, 2)}
 
 
 def test_no_process_that_stays_loads_torch_or_scipy(running: Daemon) -> None:
@@ -652,12 +652,12 @@ def test_a_processor_hog_costs_counted_cycles_and_nothing_that_is_published_is_s
     hog = subprocess.run(
         [sys.executable, "-c", HOG, str(cpu), str(HOG_S)], capture_output=True, text=True, check=False
     )
-    said = json.loads(process.communicate(timeout=60)[0])
+    reported = json.loads(process.communicate(timeout=60)[0])
     if "PermissionError" in hog.stderr:
         pytest.skip("CPU HOG NOT TESTED: no right to a real-time priority")
     began, ended, longest = map(int, hog.stdout.split())
     taken = (ended - began - 2 * longest) // (1000 * PERIOD_US) - 1
-    assert said["missed"] >= taken > 20, "what the hog took from the loop is counted"
+    assert reported["missed"] >= taken > 20, "what the hog took from the loop is counted"
     assert process.returncode == 0
     loop = read_topic(list(logs.glob("*.mcap")), "/can/frames")
     sent_ns, cycle = loop["sync_monotonic_ns"], loop["cycle"]
@@ -665,12 +665,12 @@ def test_a_processor_hog_costs_counted_cycles_and_nothing_that_is_published_is_s
     before, after = np.searchsorted(sent_ns, [began + longest, ended - longest]) - [1, 0]
     slots = round((sent_ns[after] - sent_ns[before]) / (1000 * PERIOD_US))
     assert cycle[after] - cycle[before] == slots > taken, "the grid is the same, no slot is made up"
-    counted = said["missed"] + said["counters"]["sync_gaps"]
+    counted = reported["missed"] + reported["counters"]["sync_gaps"]
     assert cycle[-1] + 1 == len(cycle) + counted, "each slot is a record or is counted"
-    assert said["cycles"] == len(cycle)
+    assert reported["cycles"] == len(cycle)
     for number in (1, 2):
         joint = read_topic(list(logs.glob("*.mcap")), f"/joint/{number}/state")
-        told = np.isin(joint["status"], tuple(PUBLISHED))
+        published = np.isin(joint["status"], tuple(PUBLISHED))
         fresh = (joint["input_flags"] & INPUTS) == INPUTS
-        assert np.all(fresh[told]), "no torque from inputs of another cycle"
-        assert np.count_nonzero(told[after : after + 200]) >= 20, "it goes on"
+        assert np.all(fresh[published]), "no torque from inputs of another cycle"
+        assert np.count_nonzero(published[after : after + 200]) >= 20, "it goes on"

@@ -52,8 +52,8 @@ def dpkg(*arguments):
 
 def installed(deb):
     dpkg("-i", deb)
-    said = run("/usr/bin/jtqd", "--version").stdout
-    assert said.startswith("jtqd "), said
+    reported = run("/usr/bin/jtqd", "--version").stdout
+    assert reported.startswith("jtqd "), reported
     assert there(TRACES) == list(TRACES)
     assert run("id", "jtqd").returncode == 0
     assert Path("/var/log/jtqd").owner() == "jtqd"
@@ -71,8 +71,8 @@ def started():
     run("systemctl", "enable", "--now", UNIT)
     assert active()
     estimates(30)
-    said = journal()
-    assert "not granted" not in said, said
+    reported = journal()
+    assert "not granted" not in reported, reported
 
 
 def upgraded(deb):

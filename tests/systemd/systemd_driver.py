@@ -157,9 +157,9 @@ def install(root, wheel, wheels):
             "--interface",
             BUS,
         )
-    said = run("/bin/sh", script, *arguments).stdout
+    reported = run("/bin/sh", script, *arguments).stdout
     seconds = time.monotonic() - began
-    assert "jtqd 0." in said, said
+    assert "jtqd 0." in reported, reported
     text = CONFIG.read_text()
     assert "period_us: 1000" in text
     text = text.replace("period_us: 1000", f"period_us: {PERIOD_US}")
@@ -190,8 +190,8 @@ def start():
     for pid in loops():
         policy[pid] = (os.sched_getscheduler(pid), os.sched_getparam(pid).sched_priority)
     assert list(policy.values()) == [(os.SCHED_FIFO, 80)], policy
-    said = journal()
-    assert "not granted" not in said, said
+    reported = journal()
+    assert "not granted" not in reported, reported
     status = show("StatusText")
     assert "joint 1: " in status, status
     reply = control("ping")
@@ -268,7 +268,7 @@ def wrong_configuration():
     run("systemctl", "start", UNIT)
     estimates(30)
     run("systemctl", "stop", UNIT)
-    return {}, {**seen, "said": line}
+    return {}, {**seen, "reported": line}
 
 
 def killed(which):
@@ -319,14 +319,14 @@ def full_disk():
         for _ in range(room // 65536 + 2):
             file.write(bytes(65536))
             file.flush()
-    said = journal()
+    reported = journal()
     matter = re.compile(r".*(?:recording pauses|MB are free|No space left).*")
 
-    def told():
-        return [line for line in journal().splitlines() if line not in said and matter.match(line)]
+    def about_the_disk():
+        return [line for line in journal().splitlines() if line not in reported and matter.match(line)]
 
-    noticed = until(told, 60, "a line about the disk")
-    line = told()[-1].partition(": ")[2]
+    noticed = until(about_the_disk, 60, "a line about the disk")
+    line = about_the_disk()[-1].partition(": ")[2]
     estimates(20)
     assert main_pid() == pid
     filler.unlink()
@@ -337,7 +337,7 @@ def full_disk():
 
     again = until(grows, 60, "the log goes on")
     return {"noticed": noticed, "log goes on": again}, {
-        "said": line,
+        "reported": line,
         "files": len(list(LOGS.glob("*.mcap*"))),
     }
 

@@ -88,11 +88,11 @@ def test_the_installer_installs_every_file_of_the_folder() -> None:
         if path.name != "install.sh":
             assert path.name in script, path.name
     subprocess.run(["sh", "-n", str(UNITS / "install.sh")], check=True)
-    told = subprocess.run(
+    shown = subprocess.run(
         ["sh", str(UNITS / "install.sh"), "--help"], capture_output=True, text=True, check=True
     ).stdout
     for option in ("--source", "--prefix", "--wheels", "--prepared", "--uninstall", "--purge"):
-        assert option in told
+        assert option in shown
     wrong = subprocess.run(
         ["sh", str(UNITS / "install.sh"), "--frobnicate"], capture_output=True, text=True, check=False
     )

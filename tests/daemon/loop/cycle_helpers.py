@@ -50,7 +50,7 @@ def frame(can_id: int, data: bytes) -> bytes:
 
 
 class ExactTime:
-    """Clock of a cycle and of its scripted bus: it goes on only when told to, whatever the machine does meanwhile."""
+    """Clock of a cycle and of its scripted bus: it goes on only by its methods, whatever the machine does meanwhile."""
 
     def __init__(self) -> None:
         self.now_ns = time.time_ns()

@@ -151,7 +151,7 @@ def test_a_node_in_doubt_is_not_used_until_it_is_configured_again(loop: Loop) ->
     for _ in range(32):
         turn(loop.cycle)
         duties()
-    assert waits(loop.cycle) == set(), "told once"
+    assert waits(loop.cycle) == set(), "once"
     assert [joint.status for joint in loop.cycle.joints] == [2, 2]
     loop.supervisor.note_doubt(3)
     loop.supervisor.note_doubt(2)
@@ -208,12 +208,12 @@ STEPS = {
 
 
 class Boot:
-    """A boot process: from its first answer on it notices a restart; what it says is what it has seen until its end."""
+    """A boot process: from its first answer on it notices a restart; it reports what it has seen until its end."""
 
     def __init__(self, events: Events) -> None:
         self.events = events
         self.running, self.heard_restart = True, False
-        self.said: dict[str, Any] | None = None
+        self.reported: dict[str, Any] | None = None
 
     def send(self, _request: object) -> None:
         pass
@@ -225,8 +225,8 @@ class Boot:
         return self.running
 
     def poll_answer(self) -> dict[str, Any] | None:
-        said, self.said = self.said, None
-        return said
+        reported, self.reported = self.reported, None
+        return reported
 
 
 class Events:
@@ -293,10 +293,10 @@ class Events:
             return
         boot.running = False
         if boot.heard_restart:
-            boot.said = {"ok": False, "error": {"message": "it restarted during boot"}}
+            boot.reported = {"ok": False, "error": {"message": "it restarted during boot"}}
         else:
             self.written = True
-            boot.said = {"ok": True, "nodes": {"1": self.node}}
+            boot.reported = {"ok": True, "nodes": {"1": self.node}}
 
     def rest(self) -> None:
         """Nothing more happens to the node: all that is left to do is done."""

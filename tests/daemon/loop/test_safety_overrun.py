@@ -330,5 +330,5 @@ def test_the_record_is_enough_to_replay_it_bit_for_bit(tmp_path: Path, clock: Ex
     seen = {int(each.status) for each in logged}
     assert {1, 3, 4, 15} <= seen
     assert any(each.input_flags & FLAG_NETWORK_SKIPPED for each in logged)
-    for n, (told, again) in enumerate(zip(logged, replay(records, clock), strict=True)):
-        assert np.array_equal(np.array(told), np.array(again), equal_nan=True), f"cycle {n}"
+    for n, (live, again) in enumerate(zip(logged, replay(records, clock), strict=True)):
+        assert np.array_equal(np.array(live), np.array(again), equal_nan=True), f"cycle {n}"

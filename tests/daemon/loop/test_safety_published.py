@@ -50,26 +50,26 @@ NAN, INF = math.nan, math.inf
 GOOD = Estimate(5.0, 0.5, VALID, 5.0, 5.0, 5.0)
 
 
-class Says:
-    """An estimator that says what it is told to: the only way to have one that is broken."""
+class Scripted:
+    """An estimator with scripted answers: the only way to have one that is broken."""
 
     with_network = True
 
-    def __init__(self, said: Iterator[Estimate]) -> None:
-        self._said = said
+    def __init__(self, reported: Iterator[Estimate]) -> None:
+        self._reported = reported
 
     def step(self, *_: Any) -> Estimate:
-        return next(self._said)
+        return next(self._reported)
 
     def reset(self) -> None:
         """Nothing to forget."""
 
 
-def checked(tmp_path: Path, said: Iterator[Estimate], latch: int = 0, script: Any = None) -> Any:
-    """A cycle in which joint 1 says what it is told and joint 2 is good; limits of the shipped joints."""
+def checked(tmp_path: Path, reported: Iterator[Estimate], latch: int = 0, script: Any = None) -> Any:
+    """A cycle in which joint 1 has scripted estimates and joint 2 is good; limits of the shipped joints."""
     settings = SafetySettings(latch=latch, plausibility=None)
     safety = [JointSafety(settings, SETTINGS, joint, 10_000_000) for joint in JOINTS]
-    estimators = [Says(said), Says(itertools.repeat(GOOD))]
+    estimators = [Scripted(reported), Scripted(itertools.repeat(GOOD))]
     return make(tmp_path, script or (lambda n: inputs()), estimators=estimators, safety=safety)
 
 
@@ -100,12 +100,12 @@ def test_a_number_that_is_none_is_invalid_named_and_counted(
     tmp_path: Path, clock: ExactTime, broken: tuple[float, float, str], status: int
 ) -> None:
     torque, sigma, name = broken
-    said = itertools.chain(
+    reported = itertools.chain(
         itertools.repeat(GOOD, 30),
         [GOOD._replace(torque_nm=torque, sigma_nm=sigma, status=status)],
         itertools.repeat(GOOD),
     )
-    cycle, socket, reader = checked(tmp_path, said)
+    cycle, socket, reader = checked(tmp_path, reported)
     clock.turn(cycle, 31)
     last = pdos(socket)[-1]
     assert (last.status, last.torque_nm[0], last.sigma_nm[0]) == ((INVALID, VALID), None, None)
@@ -120,8 +120,8 @@ def test_a_number_that_is_none_is_invalid_named_and_counted(
 
 
 def test_the_largest_torque_that_a_joint_can_have_is_published(tmp_path: Path, clock: ExactTime) -> None:
-    said = itertools.repeat(GOOD._replace(torque_nm=LIMIT_NM[0]))
-    cycle, socket, _ = checked(tmp_path, said)
+    reported = itertools.repeat(GOOD._replace(torque_nm=LIMIT_NM[0]))
+    cycle, socket, _ = checked(tmp_path, reported)
     clock.turn(cycle, 25)
     assert pdos(socket)[-1].torque_nm[0] == pytest.approx(LIMIT_NM[0])
 
@@ -187,8 +187,8 @@ def test_the_network_that_is_dropped_is_counted_by_its_reason(tmp_path: Path, cl
         "network_far": GOOD._replace(status=DEGRADED, network_nm=5.0 + limit * 1.01),
         "network_outside": GOOD._replace(status=DEGRADED, network_nm=5.1),
     }
-    said = itertools.chain(itertools.repeat(GOOD, 30), dropped.values(), itertools.repeat(GOOD))
-    cycle, socket, _ = checked(tmp_path, said)
+    reported = itertools.chain(itertools.repeat(GOOD, 30), dropped.values(), itertools.repeat(GOOD))
+    cycle, socket, _ = checked(tmp_path, reported)
     clock.turn(cycle, 41)
     counters = SnapshotReader(tmp_path / "snapshot").read().counters
     assert {name: counters[name] for name in dropped} == dict.fromkeys(dropped, 1)
@@ -198,10 +198,10 @@ def test_the_network_that_is_dropped_is_counted_by_its_reason(tmp_path: Path, cl
 
 def test_no_number_of_a_network_at_standstill_is_counted_too(tmp_path: Path, clock: ExactTime) -> None:
     """There it is not used, and the status stays 6."""
-    said = itertools.chain(itertools.repeat(GOOD._replace(status=STANDSTILL), 30), [
+    reported = itertools.chain(itertools.repeat(GOOD._replace(status=STANDSTILL), 30), [
         GOOD._replace(status=STANDSTILL, network_nm=INF)
     ], itertools.repeat(GOOD))  # fmt: skip
-    cycle, socket, _ = checked(tmp_path, said)
+    cycle, socket, _ = checked(tmp_path, reported)
     clock.turn(cycle, 31)
     assert pdos(socket)[-1].status[0] == STANDSTILL
     clock.turn(cycle, 10)
@@ -296,9 +296,9 @@ def test_too_far_from_the_sensor_for_too_long_is_latched_where_it_is_configured(
     for name, off in (("near", 0.0), ("far", 1.0)):
         directory = tmp_path / name
         directory.mkdir()
-        said = itertools.repeat(GOOD._replace(torque_nm=9.0 + 10.0 * off, sigma_nm=1.0))
+        reported = itertools.repeat(GOOD._replace(torque_nm=9.0 + 10.0 * off, sigma_nm=1.0))
         safety = [JointSafety(settings, SETTINGS, joint, 10_000_000) for joint in JOINTS]
-        estimators = [Says(said), Says(said)]
+        estimators = [Scripted(reported), Scripted(reported)]
         cycle, socket, _ = make(directory, lambda n: inputs(), estimators=estimators, safety=safety)
         clock.turn(cycle, 99)
         assert pdos(socket)[-1].status == (VALID, VALID)

@@ -352,7 +352,7 @@ def test_a_node_that_restarted_is_not_believed_until_it_is_configured(line: Line
     """Its TPDO3 may hold anything by default."""
     line.cycle(tpdo3(1, 250))
     line.cycle(frame(0x701, b"\x00"), tpdo3(1, 600))
-    assert line.value == 25.0, "what it told before is as old as it is"
+    assert line.value == 25.0, "what it sent before is as old as it is"
     line.cycle(tpdo3(1, 600), late=(tpdo3(1, 600),))
     assert line.value == 25.0
     line.intake.configured(1)

@@ -102,7 +102,7 @@ def test_the_layout_of_the_drives_takes_the_place_of_the_wanted_one(tmp_path: Pa
 
 
 @pytest.mark.parametrize(
-    ("tpdos", "more", "said"),
+    ("tpdos", "more", "reported"),
     [
         (
             SCATTERED[:2],
@@ -140,11 +140,11 @@ def test_the_layout_of_the_drives_takes_the_place_of_the_wanted_one(tmp_path: Pa
     ],
 )
 def test_a_layout_that_cannot_be_is_refused_in_one_line(
-    tmp_path: Path, tpdos: Any, more: Any, said: str
+    tmp_path: Path, tpdos: Any, more: Any, reported: str
 ) -> None:
     with pytest.raises(ConfigError) as caught:
         config_with(tmp_path, tpdos, **more)
-    assert said in str(caught.value)
+    assert reported in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -280,9 +280,9 @@ def test_after_a_restart_of_the_drive_no_velocity_is_derived_from_before_it(tmp_
 
 def test_what_a_derived_velocity_costs(tmp_path: Path) -> None:
     """The same motion with the drive's velocity and without, 1e-4 rad per count, 1 kHz (`pytest -s` prints it)."""
-    told, derived = torques(tmp_path, {}), torques(tmp_path, {"motor_velocity": False})
-    both = np.isfinite(told) & np.isfinite(derived)
-    apart = (told - derived)[both]
+    usual, derived = torques(tmp_path, {}), torques(tmp_path, {"motor_velocity": False})
+    both = np.isfinite(usual) & np.isfinite(derived)
+    apart = (usual - derived)[both]
     rms, p99 = np.sqrt(np.mean(apart**2)) / RATED, np.quantile(np.abs(apart), 0.99) / RATED
     print(
         f"\nderived velocity: {both.sum()} estimates, RMS {rms:.2%}, 99 % within {p99:.2%} of the rated torque"
@@ -292,7 +292,7 @@ def test_what_a_derived_velocity_costs(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("method", "objects", "said"),
+    ("method", "objects", "reported"),
     [
         (
             "fused",
@@ -320,14 +320,16 @@ def test_what_a_derived_velocity_costs(tmp_path: Path) -> None:
         ("efficiency", {"statusword": {"by": "608Fh"}}, "expected an object of type U16, no sign, no factor"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(tmp_path: Path, method: str, objects: Any, said: str) -> None:
+def test_what_cannot_be_is_refused_in_one_line(
+    tmp_path: Path, method: str, objects: Any, reported: str
+) -> None:
     content = shipped_bench("bench_paper.yaml")
     content["estimator"] = {"method": method}
     content["joint_1"]["objects"] = objects
     (tmp_path / "c.yaml").write_text(yaml.safe_dump(content))
     with pytest.raises(ConfigError) as caught:
         load_config(tmp_path / "c.yaml")
-    assert said in str(caught.value)
+    assert reported in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -468,7 +470,7 @@ def test_the_configuration_says_how_old(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("tpdos", "more", "said"),
+    ("tpdos", "more", "reported"),
     [
         (ACYCLIC, {}, "key 'joint_1.max_age_ms': missing, expected ms because TPDO1 has type 255"),
         (
@@ -483,7 +485,7 @@ def test_the_configuration_says_how_old(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_what_cannot_be_is_refused(tmp_path: Path, tpdos: Any, more: Any, said: str) -> None:
+def test_what_cannot_be_is_refused(tmp_path: Path, tpdos: Any, more: Any, reported: str) -> None:
     with pytest.raises(ConfigError) as caught:
         config_with(tmp_path, tpdos, **more)
-    assert said in str(caught.value)
+    assert reported in str(caught.value)
