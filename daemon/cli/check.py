@@ -84,7 +84,11 @@ def main(argv: list[str]) -> int:
     try:
         daemon = None if arguments.bus == "sim" else on_bus(find_daemons(), arguments.bus)
         path = arguments.config or (Path(daemon.about.configuration) if daemon else None)
-        config = _in_force(load_config(path), daemon)
+        config = load_config(path)
+        if (
+            daemon is not None and daemon.about.configuration_sha256 == config.sha256
+        ):  # then as its drives have it
+            config = as_booted(config, {node: {"tpdos": each} for node, each in daemon.about.tpdos.items()})
         before_s, began_s = stolen_s(), time.monotonic()
         with _bus(arguments.bus, config, daemon) as bus:
             results = list(
@@ -105,13 +109,6 @@ def main(argv: list[str]) -> int:
         seconds=arguments.seconds,
         configuration=str(config.path),
     )
-
-
-def _in_force(config: Config, daemon: Daemon | None) -> Config:
-    """Return the configuration with the TPDOs that the drives of the running jtqd have, where it is that one's own."""
-    if daemon is None or daemon.about.configuration_sha256 != config.sha256:
-        return config
-    return as_booted(config, {node: {"tpdos": tpdos} for node, tpdos in daemon.about.tpdos.items()})
 
 
 def _progress(text: str) -> None:
