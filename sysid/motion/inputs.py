@@ -71,16 +71,19 @@ class DriveInput(NodeInput):
         self.cycles = [0] * len(units.tpdos)
         self.sdo_confirmed = False
         self._inputs = inputs
-        self._velocity = units.scaling.motor_rad_s_per_unit / units.gear_ratio
-        self._motor = units.scaling.motor_rad_per_count / units.gear_ratio
-        self._link = units.scaling.link_rad_per_count
-        self._ampere = units.scaling.ampere_per_unit
+        scaling = units.scaling
+        self._velocity = scaling.motor_rad_s_per_unit / units.gear_ratio
+        self._ampere = scaling.ampere_per_unit
+        self._rad = {
+            "motor": scaling.motor_rad_per_count / units.gear_ratio,
+            "link": scaling.link_rad_per_count,
+        }
         self._last: dict[str, int] = {}  # counts of the encoders
         self._began: dict[str, int] = {}  # the same at `begin_travel`
-        self._motor_counts = self._link_counts = 0  # since `begin_travel`
-        taken = {
-            "motor_position": self._on_motor,
-            "link_position": self._on_link,
+        self._counts = dict.fromkeys(self._rad, 0)  # since `begin_travel`
+        taken: dict[str, Callable[[int], None]] = {
+            "motor_position": partial(self._on_encoder, "motor"),
+            "link_position": partial(self._on_encoder, "link"),
             "motor_velocity": self._on_velocity,
             "current": self._on_current,
             "statusword": self._on_statusword,
@@ -94,16 +97,15 @@ class DriveInput(NodeInput):
 
     def begin_travel(self) -> None:
         """Count travel from here."""
-        self._motor_counts = self._link_counts = 0
+        self._counts = dict.fromkeys(self._rad, 0)
         self._began = dict(self._last)
         self.travel_rad = 0.0
 
     @property
     def position_rad(self) -> float:
         """Position by the link's encoder, else the motor's, from its zero; a roll-over within the motion does not show."""
-        if "link" in self._last:
-            return (self._began.get("link", 0) + self._link_counts) * self._link
-        return (self._began.get("motor", 0) + self._motor_counts) * self._motor
+        which = "link" if "link" in self._last else "motor"
+        return (self._began.get(which, 0) + self._counts[which]) * self._rad[which]
 
     @property
     def handlers(self) -> dict[int, Handler]:
@@ -123,19 +125,11 @@ class DriveInput(NodeInput):
                 take(values[entry])
             self.cycles[at] = self._inputs.cycle
 
-    def _on_motor(self, counts: int) -> None:
-        self._motor_counts += _difference(counts - self._last.get("motor", counts))
-        self._last["motor"] = counts
-        self._set_travel()
-
-    def _on_link(self, counts: int) -> None:
-        self._link_counts += _difference(counts - self._last.get("link", counts))
-        self._last["link"] = counts
-        self._set_travel()
-
-    def _set_travel(self) -> None:
-        """The larger travel of both encoders counts."""
-        one, other = self._motor_counts * self._motor, self._link_counts * self._link
+    def _on_encoder(self, which: str, counts: int) -> None:
+        """Count modulo 2^32, as the counters roll over; the larger travel of both encoders counts."""
+        self._counts[which] += _difference(counts - self._last.get(which, counts))
+        self._last[which] = counts
+        one, other = (self._counts[each] * rad for each, rad in self._rad.items())
         self.travel_rad = one if abs(one) > abs(other) else other
 
     def _on_velocity(self, units: int) -> None:
@@ -278,7 +272,11 @@ class Supervision:
                     False,
                 )
             if channel.cycle < oldest:
-                return self._stale_channel(channel)
+                missing = inputs.cycle - channel.cycle
+                text = (
+                    f"torque of channel {channel.channel} missing for {missing} cycles, limit {self._stale}"
+                )
+                return Violation(f"sensor: {text}", False)
         if inputs.foreign:
             return Violation(
                 "another commander is on the bus (a heartbeat with this node-ID was received)", True
@@ -348,13 +346,6 @@ class Supervision:
         pdo, missing = drive.units.tpdos[late[-1]], self._inputs.cycle - drive.cycles[late[-1]]
         text = f"TPDO{pdo.number} ({pdo.cob_id:03X}h) missing for {missing} cycles, limit {self._stale}"
         return Violation(f"{drive.name}: {text}", max(drive.cycles) < oldest)
-
-    def _stale_channel(self, channel: ChannelInput) -> Violation:
-        missing = self._inputs.cycle - channel.cycle
-        text = (
-            f"sensor: torque of channel {channel.channel} missing for {missing} cycles, limit {self._stale}"
-        )
-        return Violation(text, False)
 
     def _temperature(self, drive: DriveInput, now_ns: int) -> Violation | None:
         age_ns = now_ns - drive.temperature_ns
