@@ -100,20 +100,14 @@ def test_a_joint_without_limits_is_not_moved_until_they_are_given(tmp_path, caps
         assert caught.value.code == 2
 
 
-ALONE = {
-    "schema": "jtq.plan/1",
-    "name": "alone",
-    "runs": [
-        {
-            "name": "a",
-            "joint": 1,
-            "segments": [
-                {"kind": "plateau", "velocity_rad_s": 0.5, "hold_s": 1.0},
-                {"kind": "rest", "hold_s": 0.5},
-            ],
-        }
-    ],
-}
+ALONE = yaml.safe_load("""
+schema: jtq.plan/1
+name: alone
+runs:
+  - name: a
+    joint: 1
+    segments: [{kind: plateau, velocity_rad_s: 0.5, hold_s: 1.0}, {kind: rest, hold_s: 0.5}]
+""")
 
 
 @pytest.mark.parametrize(

@@ -21,27 +21,21 @@ from tests.shipped_bench import shipped_bench
 pytestmark = pytest.mark.socketcan
 
 FORWARD, BACK = "forward_1", "back_1"
-PLAN = {
-    "schema": "jtq.plan/1",
-    "name": "two",
-    "runs": [
-        {
-            "name": name,
-            "velocity_joint": joint,
-            "segments": [
-                {
-                    "kind": "plateau",
-                    "velocity_rad_s": speed,
-                    "current_a": current,
-                    "hold_s": 0.8,
-                    "ramp_s": 0.4,
-                },
-                {"kind": "rest", "hold_s": 0.2, "ramp_s": 0.3},
-            ],
-        }
-        for name, joint, speed, current in ((FORWARD, 1, 0.8, 3.0), (BACK, 2, -0.8, -3.0))
-    ],
-}
+PLAN = yaml.safe_load("""
+schema: jtq.plan/1
+name: two
+runs:
+  - name: forward_1
+    velocity_joint: 1
+    segments:
+      - {kind: plateau, velocity_rad_s: 0.8, current_a: 3.0, hold_s: 0.8, ramp_s: 0.4}
+      - &end {kind: rest, hold_s: 0.2, ramp_s: 0.3}
+  - name: back_1
+    velocity_joint: 2
+    segments:
+      - {kind: plateau, velocity_rad_s: -0.8, current_a: -3.0, hold_s: 0.8, ramp_s: 0.4}
+      - *end
+""")
 
 
 @pytest.fixture

@@ -17,21 +17,15 @@ from jtqd.sysid.campaign.state import DONE, CampaignDirectory, RunState
 from jtqd.sysid.planner.campaigns import units_of
 from tests.drivers.hub_helpers import until_it_listens
 
-SMALL = {
-    "schema": "jtq.plan/1",
-    "name": "small",
-    "runs": [
-        {
-            "name": name,
-            "velocity_joint": 1,
-            "segments": [
-                {"kind": "plateau", "velocity_rad_s": 0.5, "current_a": 1.0, "hold_s": 1.0},
-                {"kind": "rest", "hold_s": 0.5},
-            ],
-        }
-        for name in ("a", "b")
-    ],
-}
+SMALL = yaml.safe_load("""
+schema: jtq.plan/1
+name: small
+runs:
+  - name: a
+    velocity_joint: 1
+    segments: &both [{kind: plateau, velocity_rad_s: 0.5, current_a: 1.0, hold_s: 1.0}, {kind: rest, hold_s: 0.5}]
+  - {name: b, velocity_joint: 1, segments: *both}
+""")
 
 
 @pytest.fixture

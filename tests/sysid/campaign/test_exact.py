@@ -17,20 +17,14 @@ from jtqd.sysid.campaign.runner import Outcome
 from jtqd.sysid.campaign.state import DONE, STATE_FILE, RunState
 from jtqd.sysid.runs.files import read_run
 
-PLAN = {
-    "schema": "jtq.plan/1",
-    "name": "small",
-    "runs": [
-        {
-            "name": "a",
-            "velocity_joint": 1,
-            "segments": [
-                {"kind": "plateau", "velocity_rad_s": 0.5, "current_a": 1.0, "hold_s": 0.5},
-                {"kind": "rest", "hold_s": 0.5},
-            ],
-        }
-    ],
-}
+PLAN = yaml.safe_load("""
+schema: jtq.plan/1
+name: small
+runs:
+  - name: a
+    velocity_joint: 1
+    segments: [{kind: plateau, velocity_rad_s: 0.5, current_a: 1.0, hold_s: 0.5}, {kind: rest, hold_s: 0.5}]
+""")
 
 
 @pytest.fixture

@@ -38,42 +38,25 @@ from jtqd.sysid.planner.plan import (
     travel_rad,
 )
 
-PLAN: dict[str, Any] = {
-    "schema": "jtq.plan/1",
-    "name": "mixed",
-    "limits": {
-        "current_a": 8.0,
-        "velocity_rad_s": 3.0,
-        "torque_nm": 50.0,
-        "travel_rad": 20.0,
-        "temperature_c": 60.0,
-    },
-    "runs": [
-        {
-            "name": "one",
-            "velocity_joint": 2,
-            "segments": [
-                {"kind": "plateau", "velocity_rad_s": -1.5, "current_a": 2.0, "hold_s": 1.0, "ramp_s": 0.5},
-                {"kind": "rest", "hold_s": 0.5, "ramp_s": 0.4},
-                {
-                    "kind": "fourier",
-                    "duration_s": 4.0,
-                    "velocity": {"omega_rad_s": 1.5, "a": [0.4, -0.1], "b": [0.2, 0.3]},
-                    "current": {"omega_rad_s": 1.1, "a": [1.0], "b": [0.5], "offset_a": 0.5},
-                },
-                {"kind": "rest", "hold_s": 0.5, "ramp_s": 0.0},
-            ],
-        },
-        {
-            "name": "two",
-            "velocity_joint": 1,
-            "segments": [
-                {"kind": "rest", "hold_s": 1.0, "ramp_s": 0.5},
-                {"kind": "power_off", "hold_s": 2.0},
-            ],
-        },
-    ],
-}
+PLAN: dict[str, Any] = yaml.safe_load("""
+schema: jtq.plan/1
+name: mixed
+limits: {current_a: 8.0, velocity_rad_s: 3.0, torque_nm: 50.0, travel_rad: 20.0, temperature_c: 60.0}
+runs:
+  - name: one
+    velocity_joint: 2
+    segments:
+      - {kind: plateau, velocity_rad_s: -1.5, current_a: 2.0, hold_s: 1.0, ramp_s: 0.5}
+      - {kind: rest, hold_s: 0.5, ramp_s: 0.4}
+      - kind: fourier
+        duration_s: 4.0
+        velocity: {omega_rad_s: 1.5, a: [0.4, -0.1], b: [0.2, 0.3]}
+        current: {omega_rad_s: 1.1, a: [1.0], b: [0.5], offset_a: 0.5}
+      - {kind: rest, hold_s: 0.5, ramp_s: 0.0}
+  - name: two
+    velocity_joint: 1
+    segments: [{kind: rest, hold_s: 1.0, ramp_s: 0.5}, {kind: power_off, hold_s: 2.0}]
+""")
 
 
 def changed(change: Callable[[dict[str, Any]], Any]) -> dict[str, Any]:
