@@ -25,7 +25,7 @@ def lock():
 
 
 def test_states_of_all_statuswords():
-    assert [state_of(word).value for word in cia402.STATUSWORDS] == list(cia402.NAMES)
+    assert [*map(state_of, cia402.STATUSWORDS), State.UNKNOWN] == list(State)
     for word in range(0x10000):
         state = state_of(word)
         assert state is state_of(word & 0x6F), "other bits do not change the state"

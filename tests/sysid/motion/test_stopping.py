@@ -51,7 +51,7 @@ def stopped_with(lock: LockStep, pattern: str, limit_ms: int = STOP_MS) -> None:
     assert re.fullmatch(pattern, result.reason), result.reason
     assert "\n" not in result.reason
     for state in lock.states:
-        assert state in (cia402.SWITCH_ON_DISABLED, cia402.FAULT), cia402.NAMES[state]
+        assert state in (cia402.SWITCH_ON_DISABLED, cia402.FAULT), state
     for can_id in (0x201, 0x202, 0x301, 0x302):
         targets = [target for _, found, target in lock.setpoints_sent(begin) if found == can_id]
         assert targets == sorted(targets, key=abs, reverse=True), f"{can_id:X}h grew again: {targets}"
