@@ -7,11 +7,10 @@ from dataclasses import replace
 import pytest
 
 from tests.paths import ROOT
-from tests.slow.faults.__main__ import line
+from tests.slow.faults.__main__ import line, play
 from tests.slow.faults.cases import CASES, ELSEWHERE, LEFT_OUT, NOT_COVERED, Case, with_library
 from tests.slow.faults.injections import Fault
 from tests.slow.faults.rig import Watcher
-from tests.slow.faults.runner import play
 from tests.slow.heard_bus import healthy, heard_of
 
 SHORT = [case for case in CASES if not case.long]

@@ -9,8 +9,7 @@ import pytest
 
 from jtqd.estimator.errors import ConfigError
 from jtqd.models.files import load_yaml
-from tests.slow.fuzz.damage import bombs
-from tests.slow.fuzz.files import fuzz_files
+from tests.slow.fuzz.files import bombs, fuzz_files
 
 
 def test_every_kind_of_file() -> None:

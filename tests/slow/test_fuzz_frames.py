@@ -12,9 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as hst
 
 from jtqd.daemon.core.cycle import Cycle
-from tests.slow.fuzz.frames import FrameReport, Oracle, fuzz_frames, make_cycle
+from tests.slow.fuzz.frames import (
+    INPUT_IDS,
+    STRICT,
+    BusInTime,
+    FrameReport,
+    Oracle,
+    Script,
+    frame,
+    fuzz_frames,
+    genuine,
+    make_cycle,
+)
 from tests.slow.fuzz.service import fuzz_service
-from tests.slow.fuzz.traffic import INPUT_IDS, STRICT, BusInTime, Script, frame, genuine
 
 MS = 1_000_000
 

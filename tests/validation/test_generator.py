@@ -27,7 +27,7 @@ from validation.generator.draw import (
     draw_many,
     follow_up,
 )
-from validation.generator.motions import Reference
+from validation.generator.plant import Reference
 
 SEED = int(np.random.default_rng().integers(10**6))
 EXTRA = (  # second parameters that carry an effect, and variants

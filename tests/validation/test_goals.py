@@ -26,7 +26,29 @@ from jtqd.sysid.planner.plan import Plateau, Rest, Run
 from tests.estimator.fused_helpers import fused
 from tests.sysid.fit.fused_signals import FUSED
 from validation.__main__ import FAILED, USAGE, main
-from validation.goals.goals import goal_rows, goal_table
+from validation.goals.goals import (
+    OWN,
+    REGRESSION,
+    TITLES,
+    ZEROS,
+    Changed,
+    Column,
+    Figure,
+    Judged,
+    Outside,
+    Result,
+    _outside,
+    _worse,
+    goal_rows,
+    goal_table,
+    interval,
+    judge,
+    judged_beyond,
+    ratio,
+    root,
+    share,
+    standstill,
+)
 from validation.goals.identify import (
     BASELINES,
     CHANGES,
@@ -41,27 +63,6 @@ from validation.goals.identify import (
     nominal_joints,
     plant_file,
     the_three,
-)
-from validation.goals.judge import (
-    OWN,
-    REGRESSION,
-    TITLES,
-    ZEROS,
-    Changed,
-    Column,
-    Figure,
-    Judged,
-    Outside,
-    Result,
-    _outside,
-    _worse,
-    interval,
-    judge,
-    judged_beyond,
-    ratio,
-    root,
-    share,
-    standstill,
 )
 from validation.goals.other_plant import figures, first_s
 from validation.goals.sources import PARTS, SOURCES, day_zeros, parts_of, true_torsion

@@ -28,7 +28,7 @@ from jtqd.sysid.runs.options import joints_of
 from jtqd.sysid.runs.run_file import RunError
 from validation.diagnosis.entries import SENSOR, Columns, Joint
 from validation.diagnosis.recorder import Recorder, csv_text, record
-from validation.generator.motions import RUN_S
+from validation.generator.plant import RUN_S
 from validation.study import Share, share
 
 REFUSED: Final = "refused"

@@ -45,7 +45,7 @@ from validation.diagnosis.scores import (
     score,
 )
 from validation.generator.draw import UNKNOWN, Case, Order, draw_many, follow_up
-from validation.generator.motions import Reference
+from validation.generator.plant import Reference
 from validation.study import ROOT, Report, Table, UsageError, in_processes, share_table
 
 KINDS: Final = ("nothing", "one", "least", "two", "unknown")

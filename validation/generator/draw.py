@@ -26,8 +26,20 @@ from validation.diagnosis.entries import (
     drawn_parameters,
     joint_columns,
 )
-from validation.generator.motions import RUN_S, STEP_S, Motion, Reference, draw_motion, driven_motion, kinds
-from validation.generator.plant import Fault, Plant, Signals, Strange, integrate
+from validation.generator.plant import (
+    RUN_S,
+    STEP_S,
+    Fault,
+    Motion,
+    Plant,
+    Reference,
+    Signals,
+    Strange,
+    draw_motion,
+    driven_motion,
+    integrate,
+    kinds,
+)
 
 RUNS: Final = 6
 _BATCH: Final = 96

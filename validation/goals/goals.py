@@ -1,5 +1,8 @@
 """The goals: three plants, our estimate and its baselines against the torque that only a plant knows, and the targets.
 
+The true torque is that of now, and as old as each estimate. Samples of a run share its day and are right or wrong together,
+so errors of figures are those of ratios over whole runs (Cochran 1977, section 6.4); both joints of a run count as one.
+
 python -m validation goals --quick                 few days: large standard errors
 python -m validation goals --json goals.json       as many days as the docs' table
 """
@@ -9,15 +12,438 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Final, NamedTuple
 
+import numpy as np
+
+from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray, StatusArray
 from jtqd.estimator.command_line import count, natural
-from jtqd.sysid.evaluate.inputs import OURS, PAPERS
-from validation.goals.identify import FIT_SEED, FULL, JUDGE_SEED, QUICK, TINY, PlantFile, Sizes, the_three
-from validation.goals.judge import OWN, REGRESSION, TITLES, Changed, Column, Figure, column
+from jtqd.estimator.estimator import estimate_columns, quadrants
+from jtqd.estimator.fusion import GAUSS
+from jtqd.estimator.joint import QUADRANTS
+from jtqd.estimator.network import load_network
+from jtqd.estimator.observer import low_pass
+from jtqd.estimator.run import JointColumns
+from jtqd.estimator.settings import EstimatorSettings, bandwidth_of, recommended
+from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
+from jtqd.sysid.evaluate.inputs import OURS, PAPERS, SETTLE_S
+from jtqd.sysid.planner.campaigns import seed_of
+from jtqd.sysid.planner.plan import Run
+from validation.goals.identify import (
+    BASELINES,
+    CHANGES,
+    FIT_SEED,
+    FULL,
+    JUDGE_SEED,
+    OF_BASELINES,
+    QUICK,
+    TINY,
+    Driven,
+    Identified,
+    PlantFile,
+    Sizes,
+    drive,
+    identify,
+    judging_runs,
+    nominal_joints,
+    observed,
+    outside,
+    the_three,
+)
 from validation.study import Report, Table, UsageError, in_processes
+
+ZEROS: Final = "ours_zeros"
+LOW_PASS: Final = "ours_low_pass"
+"""As ZEROS, but with the low pass of the torsion in place of its tracking filter: 1/800 s old."""
+TITLES: Final = {
+    OURS: "ours",
+    ZEROS: "ours, zeros tracked",
+    LOW_PASS: "ours, zeros tracked, torsion through the low pass",
+    **{name: baseline.title for name, baseline in BASELINES.items()},
+    PAPERS: "the paper's chain",
+    "efficiency": "TOB with efficiency",
+    "tob": "classical TOB, friction of the joint file",
+}
+"""Methods in the order of the table: ours, the baselines, the paper's."""
+OWN: Final = (OURS, ZEROS)
+Link = Callable[[FloatArray, FloatArray], FloatArray]
+
+
+class Result(NamedTuple):
+    """A method over a run, arrays [n]: torque, its sigma and status (None where it has none), the true torque as old."""
+
+    torque_nm: FloatArray
+    aligned_nm: FloatArray
+    sigma_nm: FloatArray | None = None
+    status: StatusArray | None = None
+
+    @property
+    def error_nm(self) -> FloatArray:
+        """Estimate less the true torque of the same age [n]."""
+        return self.torque_nm - self.aligned_nm
+
+    def inside(self, sigmas: float) -> BoolArray:
+        """Return where value +- sigmas holds the torque [n]."""
+        if self.sigma_nm is None:
+            raise ValueError("found a method without sigma")
+        result: BoolArray = np.abs(self.error_nm) <= sigmas * self.sigma_nm
+        return result
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One joint in one run, arrays [n]: moving, standing: for all methods alike; beyond: outside of what was driven."""
+
+    run: str
+    number: int
+    rated_nm: float
+    true_nm: FloatArray
+    moving: BoolArray
+    standing: BoolArray
+    beyond: BoolArray
+    quadrant: QuadrantArray
+    results: Mapping[str, Result]
+
+
+def judge(
+    run: Driven, one: Identified, link: Link | None = None, methods: tuple[str, ...] = tuple(TITLES)
+) -> Judged:
+    """Estimate one joint of a run by methods of TITLES; link: what is changed in the link's position."""
+    joint, time_s = one.joint, run.table.time_s
+    columns = _changed(run.columns(one.number, joint), link, joint.gear_ratio)
+    dt = np.diff(time_s, prepend=time_s[0])
+    true = np.ascontiguousarray(run.true_nm[:, one.number - 1])
+    seen = observed(run, columns, joint)
+    settled = time_s - time_s[0] >= SETTLE_S
+    results = {}
+    for name in methods:
+        if name in BASELINES:
+            baseline = BASELINES[name]
+            settings = OF_BASELINES
+            rate = settings.own_torsion_bandwidth_rad_s if baseline.young else settings.bandwidth_rad_s
+            torque = baseline.estimate(seen, one.baselines[name])
+            results[name] = Result(torque, low_pass(true, dt, rate))
+            continue
+        settings = settings_of(name)
+        network = load_network(PAPERS, one.network) if name == PAPERS else None
+        found = estimate_columns(joint, settings, network, time_s, columns)
+        aligned = low_pass(true, dt, bandwidth_of(joint, settings))
+        results[name] = Result(found.torque_nm, aligned, found.sigma_nm, found.status)
+    published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in results.values()])
+    return Judged(
+        run.name,
+        one.number,
+        joint.rated_torque_nm,
+        true,
+        published & (seen.status == VALID),
+        published & (seen.status == STANDSTILL),
+        _beyond(columns, true, one),
+        quadrants(seen.raw_nm, seen.velocity_rad_s),
+        results,
+    )
+
+
+def settings_of(name: str) -> EstimatorSettings:
+    """Return the settings of a new configuration for a method of the estimator."""
+    if name in (*OWN, LOW_PASS):
+        return replace(recommended(OURS), track_zeros=name != OURS, track_torsion=name != LOW_PASS)
+    return recommended(name)
+
+
+def _changed(columns: JointColumns, link: Link | None, gear_ratio: float) -> JointColumns:
+    position, motor = columns.link_position_rad, columns.motor_position_rad
+    if link is None or position is None or motor is None:
+        return columns
+    return replace(columns, link_position_rad=link(position, motor / gear_ratio))
+
+
+ROOM: Final = 1.05
+ROOM_K: Final = 5.0
+"""So far beyond the campaign's range a sample is outside of it."""
+
+
+def _beyond(columns: JointColumns, true_nm: FloatArray, one: Identified) -> BoolArray:
+    """Return which samples [n] lie beyond what the campaign has driven: true torque, speed, temperature of the housing."""
+    assert columns.motor_velocity_rad_s is not None
+    assert columns.temperature_c is not None
+    low, high = one.driven.temperature_c
+    speed = np.abs(columns.motor_velocity_rad_s) / one.joint.gear_ratio
+    result: BoolArray = (
+        (np.abs(true_nm) > ROOM * one.driven.torque_nm)
+        | (speed > ROOM * one.driven.velocity_rad_s)
+        | (columns.temperature_c > high + ROOM_K)
+        | (columns.temperature_c < low - ROOM_K)
+    )
+    return result
+
+
+def flagged(result: Result) -> BoolArray:
+    """Return where a method reports that it is degraded, or has no value [n]."""
+    if result.status is None:
+        raise ValueError("found a method without status")
+    found: BoolArray = (result.status == DEGRADED) | ~np.isfinite(result.torque_nm)
+    return found
+
+
+REGRESSION: Final = "regression"
+_FEWEST: Final = 500
+"""Samples of a cell (joint, quadrant) that a share is given for."""
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A number and its standard error; NaN where there is none."""
+
+    value: float
+    se: float = math.nan
+
+
+def ratio(parts: Iterable[tuple[str, float, float]]) -> Figure:
+    """Return the sum of the second over that of the third of (run, upper, lower), its error over whole runs."""
+    sums: dict[str, FloatArray] = {}
+    for run, upper, lower in parts:
+        sums[run] = sums.get(run, np.zeros(2)) + np.array((upper, lower))
+    if not sums:
+        return Figure(math.nan)
+    pairs = np.array(list(sums.values()))
+    upper, lower = pairs.sum(axis=0)
+    if not lower > 0.0:
+        return Figure(math.nan)
+    off = pairs[:, 0] - upper / lower * pairs[:, 1]
+    n = len(pairs)
+    se = math.sqrt(float(off @ off) * n / (n - 1)) / lower if n > 1 else math.nan
+    return Figure(float(upper / lower), float(se))
+
+
+def root(square: Figure) -> Figure:
+    """Return the root of a figure, its error to first order."""
+    value = math.sqrt(square.value) if square.value >= 0.0 else math.nan
+    return Figure(value, square.se / (2.0 * value) if value > 0.0 else math.nan)
+
+
+def share(parts: Iterable[tuple[str, BoolArray, BoolArray]]) -> Figure:
+    """Return how often (run, good [n], counted [n]) is good where it counts, in %."""
+    found = ratio(
+        (run, float(np.count_nonzero(good & counted)), float(np.count_nonzero(counted)))
+        for run, good, counted in parts
+    )
+    return Figure(100.0 * found.value, 100.0 * found.se)
+
+
+def _squares(parts: Sequence[Judged], errors: Callable[[Judged], FloatArray], relative: bool) -> Figure:
+    def each(one: Judged) -> tuple[str, float, float]:
+        error = errors(one)[one.moving] / (one.rated_nm if relative else 1.0)
+        return one.run, float(error @ error), float(len(error))
+
+    return ratio(map(each, parts))
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Share [%] of the 90 % interval that holds the true torque: lowest and highest cell (joint, quadrant), and of all."""
+
+    low: Figure
+    high: Figure
+    all: Figure
+
+
+@dataclass(frozen=True)
+class Standstill:
+    """Share [%] of the standstill interval that holds the true torque, and its mean half width [Nm]."""
+
+    inside: Figure
+    half_nm: float
+
+
+@dataclass(frozen=True)
+class Changed:
+    """One thing changed: RMSE [Nm] against the true torque as old as the estimate, share [%] inside, degraded [%]."""
+
+    rmse_nm: Figure
+    inside: Figure
+    degraded: Figure
+
+
+@dataclass(frozen=True)
+class Outside:
+    """Share [%] flagged degraded of the samples outside, by what is beyond, and of those inside of the judging runs."""
+
+    flagged: Mapping[str, Figure]
+    falsely: Figure
+
+    @property
+    def least(self) -> Figure:
+        return min(self.flagged.values(), key=lambda figure: figure.value)
+
+
+@dataclass(frozen=True)
+class Column:
+    """Every figure of one plant; by method (a name of `TITLES`), by change where there is one.
+
+    now_percent: RMSE in motion against the true torque at the same instant, % of rated; mse_nm2: against the true torque as
+    old as the estimate; better: share [%] of joints in runs in which a method's MSE is above that of least squares.
+    """
+
+    name: str
+    runs: int
+    now_percent: Mapping[str, Figure]
+    mse_nm2: Mapping[str, Figure]
+    interval: Mapping[str, Interval]
+    standstill: Mapping[str, Standstill]
+    changed: Mapping[str, Mapping[str, Changed]]
+    outside: Mapping[str, Outside]
+    worse: Mapping[str, Figure]
+    samples_outside: Mapping[str, int] = field(default_factory=dict)
+
+    def to_chain(self, method: str) -> float:
+        """Return the MSE of a method to that of the paper's chain."""
+        return self.mse_nm2[method].value / self.mse_nm2[PAPERS].value
+
+    def to_regression(self, method: str) -> float:
+        """Return the MSE of a method to that of least squares on torsion and current."""
+        return self.mse_nm2[method].value / self.mse_nm2[REGRESSION].value
+
+    def worst_change(self, method: str) -> tuple[str, Changed]:
+        """Return the change after which a method's interval holds the torque least often."""
+        return min(self.changed[method].items(), key=lambda item: item[1].inside.value)
+
+
+def column(plant: PlantFile, sizes: Sizes, fit_seed: int = FIT_SEED, seed: int = JUDGE_SEED) -> Column:
+    """Identify a plant's joints, drive the runs that judge, and return the plant's column. Raises as `identify`."""
+    models = identify(plant, sizes, fit_seed)
+    joints = nominal_joints(plant)
+    runs = judging_runs(sizes, joints, seed)
+    days = drive(plant.bench(), runs, seed)
+    judged = [judge(run, one) for run in days for one in models]
+    beyond = judged_beyond(outside(plant, sizes, joints, seed), models)
+    return Column(
+        name=plant.name,
+        runs=len(days),
+        now_percent={name: _percent(judged, name) for name in TITLES},
+        mse_nm2={
+            name: _squares(judged, lambda one, name=name: one.results[name].error_nm, False)  # type: ignore[misc]
+            for name in TITLES
+        },
+        interval={name: interval(judged, name) for name in OWN},
+        standstill={name: standstill(judged, name) for name in OWN},
+        changed=_changes(plant, models, runs, sizes, seed),
+        worse={name: _worse(judged, name) for name in OWN},
+        outside={name: _outside(judged, beyond, name) for name in OWN},
+        samples_outside={
+            kind: sum(int(np.count_nonzero(one.moving & one.beyond)) for one in parts)
+            for kind, parts in beyond.items()
+        },
+    )
+
+
+def _percent(judged: Sequence[Judged], name: str) -> Figure:
+    figure = root(_squares(judged, lambda one: one.results[name].torque_nm - one.true_nm, True))
+    return Figure(100.0 * figure.value, 100.0 * figure.se)
+
+
+def interval(judged: Sequence[Judged], method: str) -> Interval:
+    """Return the coverage of a method's 90 % interval in motion."""
+
+    def cell(number: int, quadrant: int) -> Figure | None:
+        own = [one for one in judged if one.number == number]
+        masks = [one.moving & (one.quadrant == quadrant) for one in own]
+        if sum(map(np.count_nonzero, masks)) < _FEWEST:
+            return None
+        return share(
+            (one.run, one.results[method].inside(GAUSS), mask) for one, mask in zip(own, masks, strict=True)
+        )
+
+    numbers = sorted({one.number for one in judged})
+    cells = [
+        figure
+        for number in numbers
+        for quadrant in range(len(QUADRANTS))
+        if (figure := cell(number, quadrant)) is not None
+    ]
+    overall = share((one.run, one.results[method].inside(GAUSS), one.moving) for one in judged)
+    if not cells:
+        return Interval(overall, overall, overall)
+    return Interval(
+        min(cells, key=lambda figure: figure.value), max(cells, key=lambda figure: figure.value), overall
+    )
+
+
+def standstill(judged: Sequence[Judged], method: str) -> Standstill:
+    """Return how often value +- sigma holds the true torque at rest, where the estimate is not degraded."""
+    inside, widths = [], []
+    for one in judged:
+        result = one.results[method]
+        resting = one.standing & ~flagged(result)
+        inside.append((one.run, result.inside(1.0), resting))
+        if result.sigma_nm is not None:
+            widths.append(result.sigma_nm[resting])
+    every = np.concatenate(widths)
+    return Standstill(share(inside), float(every.mean()) if len(every) else math.nan)
+
+
+def _worse(judged: Sequence[Judged], method: str) -> Figure:
+    def each(one: Judged) -> tuple[str, float, float]:
+        errors = [one.results[name].error_nm[one.moving] for name in (method, REGRESSION)]
+        ours, other = (float(error @ error) for error in errors)
+        return one.run, float(ours > 1.001 * other), 1.0
+
+    figure = ratio(map(each, judged))
+    return Figure(100.0 * figure.value, 100.0 * figure.se)
+
+
+def _changes(
+    plant: PlantFile, models: Sequence[Identified], runs: Sequence[Run], sizes: Sizes, seed: int
+) -> dict[str, dict[str, Changed]]:
+    """Judge a part of the runs, on the same days, with one thing changed."""
+    motions = [run for run in runs if run.name.startswith("variable")][: sizes.changed_runs]
+    found: dict[str, dict[str, Changed]] = {method: {} for method in (*OWN, REGRESSION)}
+    seed = seed_of("changes", 0.0, seed)
+    for change in CHANGES:
+        if not change.possible(plant):
+            continue
+        days = drive(change.bench(plant), motions, seed)
+        judged = [judge(run, one, change.link, tuple(found)) for run in days for one in models]
+        for method, row in found.items():
+            row[change.name] = Changed(
+                root(_squares(judged, lambda one, name=method: one.results[name].error_nm, False)),  # type: ignore[misc]
+                _inside(judged, method),
+                _degraded(judged, method),
+            )
+    return found
+
+
+def _inside(judged: Sequence[Judged], method: str) -> Figure:
+    if judged[0].results[method].sigma_nm is None:
+        return Figure(math.nan)
+    return share((one.run, one.results[method].inside(GAUSS), one.moving) for one in judged)
+
+
+def _degraded(judged: Sequence[Judged], method: str) -> Figure:
+    if judged[0].results[method].status is None:
+        return Figure(math.nan)
+    return share((one.run, flagged(one.results[method]), one.moving) for one in judged)
+
+
+def _outside(judged: Sequence[Judged], beyond: Mapping[str, Sequence[Judged]], method: str) -> Outside:
+    def rate(parts: Sequence[Judged], outside: bool) -> Figure:
+        return share(
+            (one.run, flagged(one.results[method]), one.moving & (one.beyond == outside)) for one in parts
+        )
+
+    return Outside({kind: rate(parts, True) for kind, parts in beyond.items()}, rate(judged, False))
+
+
+def judged_beyond(
+    driven: Mapping[str, Sequence[Driven]], models: Sequence[Identified]
+) -> dict[str, list[Judged]]:
+    """Judge the runs outside of what a campaign has driven, by what is beyond it."""
+    return {
+        kind: [judge(run, one, None, OWN) for run in runs for one in models] for kind, runs in driven.items()
+    }
+
 
 SIZES: Final = {"full": FULL, "quick": QUICK, "tiny": TINY}
 _WITH: Final = {OURS: "ours", "ours_zeros": "ours, zeros tracked"}

@@ -16,6 +16,7 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray
 from jtqd.estimator.command_line import natural
 from jtqd.estimator.fusion import GAUSS
+from validation.goals.goals import ZEROS, Judged, flagged, judge
 from validation.goals.identify import (
     FIT_SEED,
     JUDGE_SEED,
@@ -30,7 +31,6 @@ from validation.goals.identify import (
     nominal_joints,
     the_three,
 )
-from validation.goals.judge import ZEROS, Judged, flagged, judge
 from validation.study import Report, Table
 
 WITHIN_S: Final = (1.0, 3.0, 10.0)

@@ -34,6 +34,7 @@ from jtqd.sysid.fit.fused import fit_zeros
 from jtqd.sysid.fit.signals import run_signals
 from jtqd.sysid.planner.campaigns import make_plan
 from jtqd.sysid.planner.plan import Run
+from validation.goals.goals import LOW_PASS, ZEROS, Judged, judge, settings_of
 from validation.goals.identify import (
     QUICK,
     TINY,
@@ -50,7 +51,6 @@ from validation.goals.identify import (
     plant_file,
     scale_of,
 )
-from validation.goals.judge import LOW_PASS, ZEROS, Judged, judge, settings_of
 from validation.study import Report, Table, in_processes
 
 SIZES: Final = {"usual": QUICK._replace(fit_runs=16, evaluations=40, judge_runs=12), "tiny": TINY}

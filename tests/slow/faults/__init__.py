@@ -2,5 +2,5 @@
 
 `rig` is the emulated bench with a hook between its nodes and the bus, and the watcher that reads the bus and holds the
 invariants; `injections` are the kinds of fault, `listener` an independent listener and what it must have heard, `cases` the
-catalogue, `runner` plays it.
+catalogue, `__main__` plays it.
 """
