@@ -428,7 +428,7 @@ ELSEWHERE = (
     Shown(15, "echo of the own SYNC missing", "no input of the cycle is used, `sync_errors`; vcan always echoes",
           ("tests/daemon/loop/test_intake.py::test_without_the_echo_of_sync_nothing_is_used",)),
     Shown(27, "wrong device at the start", "refused with node, object, expected and found value",
-          ("tests/drivers/test_boot.py::test_wrong_identity",)),
+          ("tests/drivers/test_boot.py::test_a_wrong_value_is_named",)),
     Shown(28, "mapping or transmission type that reads back different", "refused at the boot",
           ("tests/drivers/test_boot.py::test_a_value_that_is_not_kept",)),
     Shown(31, "mode of operation display (6061h) changes",
