@@ -6,13 +6,13 @@ import argparse
 import datetime as dt
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from jtqd.estimator.command_line import check_installed, command_parser, make_directory, write_whole
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.network import NetworkError
 from jtqd.sysid.evaluate.card import (
     BASELINE,
     Card,
@@ -55,7 +55,7 @@ def main(argv: list[str]) -> int:
         findings = (
             _card(options, models, inputs) if options.card else _report(options, models, inputs, outside)
         )
-    except (ConfigError, NetworkError, RunError, ValueError, OSError) as error:
+    except (ValueError, OSError) as error:
         for line in str(error).splitlines() or [type(error).__name__]:
             print(f"{BY}: {line}", file=sys.stderr)
         return 1
@@ -132,10 +132,7 @@ def _report(
     findings = (*_unknown_training(models), *inputs.findings, *outside.findings, *result.findings)
     result = replace(result, findings=findings)
     mapping = as_mapping(result)
-    text = json.dumps(mapping, indent=1, allow_nan=False)
-    page = report_html(result, mapping, _made())
-    write_whole(options.out / "evaluation.json", f"{text}\n".encode())
-    write_whole(options.out / "evaluation.html", page.encode())
+    text = _written(options.out / "evaluation", mapping, report_html(result, mapping, _made()))
     print(text if options.json else "\n".join(text_lines(result, mapping)))
     return findings
 
@@ -162,10 +159,8 @@ def _card(
         findings.append(RunIssue("nothing_to_score", text))
     if not cards:
         raise RunError("\n".join(finding.text for finding in findings))
-    text = json.dumps(card_mapping(cards, findings), indent=1, allow_nan=False)
     page = card_html(cards, {each.number: each.files for each in models}, findings, _made())
-    write_whole(options.out / "card.json", f"{text}\n".encode())
-    write_whole(options.out / "card.html", page.encode())
+    text = _written(options.out / "card", card_mapping(cards, findings), page)
     for card in cards:
         write_png(card, options.out / f"card_joint{card.number}.png")
     lines = [line for card in cards for line in (*card_lines(card), "")]
@@ -184,6 +179,14 @@ def _unknown_training(models: tuple[JointModels, ...]) -> list[RunIssue]:
         for each in models
         for name in each.without_runs
     ]
+
+
+def _written(path: Path, mapping: Mapping[str, Any], page: str) -> str:
+    """Write path.json and path.html; return the JSON."""
+    text = json.dumps(mapping, indent=1, allow_nan=False)
+    write_whole(path.with_suffix(".json"), f"{text}\n".encode())
+    write_whole(path.with_suffix(".html"), page.encode())
+    return text
 
 
 def _made() -> str:

@@ -66,8 +66,7 @@ Held-out residuals: the error of current path and torsion path on a run that the
     error, no delay = e_tracked + (1 - alpha) (e_c - e_t')   e_t': of the tracked torsion through the motor path's filter
     more^2 = (disagreement beyond DISAGREE_SIGMAS)^2 + doubt^2
 
-With `track_zeros` the corrections of both paths are in all of them. Definitions of early, disagreement and doubt:
-fusion.pyx.
+With `track_zeros` the corrections of both paths are in all of them. early, disagreement, doubt: fusion.pyx.
 """
 
 from __future__ import annotations
@@ -141,7 +140,7 @@ class PathResiduals(NamedTuple):
 
     @property
     def difference(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
-        """What the functions of `path_difference.pyx` take of the paths' difference."""
+        """What the functions of `fusion.pyx` take of the paths' difference."""
         return self.dt_s, self.apart_nm, self.direction, self.velocity_rad_s, self.torsion_nm
 
     def with_tracked_torsion(self) -> PathResiduals:
