@@ -66,7 +66,7 @@ def error(run: EstimateRun, torque: FloatArray, last: int = 1500) -> float:
 
 
 @pytest.mark.parametrize("zero", [1e-4, -1e-3])
-def test_a_zero_of_the_link_encoder_is_taken_off_and_told(zero: float) -> None:
+def test_a_zero_of_the_link_encoder_is_taken_off_and_reported(zero: float) -> None:
     columns, torque = driven(link_zero_rad=zero)
     run, zeros = tracked(columns)
     assert zeros.link_rad == pytest.approx(zero, abs=1e-5)
@@ -95,7 +95,7 @@ def test_a_zero_that_the_files_sigma_covers_is_known_and_left_alone() -> None:
     assert 4.0 * zeros.link_sigma_rad < 4e-5
 
 
-def test_friction_is_no_zero_and_motion_one_way_tells_them_apart_not_at_all() -> None:
+def test_friction_is_no_zero_and_motion_one_way_does_not_separate_them() -> None:
     """0.3 Nm more friction than the file has: one and a half of its standard deviations."""
     one_way, _ = driven(velocity=lambda t: 1.0 + 0.3 * np.sin(2.5 * t), friction_nm=0.3)
     zeros = tracked(one_way)[1]
@@ -178,7 +178,7 @@ def test_with_the_noise_of_the_fits_days_an_ordinary_zero_is_learned_sooner() ->
     (one, slow), (other, fast) = tracked(columns, LEARNING), tracked(columns, quick)
     assert abs(fast.link_used_rad - DAYS.spread_rad) < 0.6 * abs(slow.link_used_rad - DAYS.spread_rad)
     assert other.sigma_nm[-1] < one.sigma_nm[-1]
-    # what is told, and what a joint that has changed is judged by, is as wary as before
+    # what is reported, and what a joint that has changed is judged by, is as wary as before
     assert fast.link_rad == pytest.approx(slow.link_rad, rel=0.01)
     assert fast.link_sigma_rad == pytest.approx(slow.link_sigma_rad, rel=0.01)
 
@@ -353,7 +353,7 @@ ECCENTRIC: Link = lambda t, motor, link: link + 150e-6 * np.sin(4.0 * link)  # n
 ZERO: Link = lambda t, motor, link: link + 200e-6  # noqa: E731
 
 
-def test_a_joint_as_its_file_says_has_no_doubt() -> None:
+def test_a_joint_that_is_its_file_s_has_no_mismatch() -> None:
     for settings in (ON, OFF):
         with_section, _ = judged(settings=settings)
         without, _ = judged(joint=NARROW, settings=settings)
@@ -476,7 +476,7 @@ def test_sigma_is_the_formula_of_the_levels() -> None:
 
 
 def test_of_a_gain_only_what_is_beyond_its_own_standard_deviations_is_doubt() -> None:
-    """Always driven, so that friction and a gain differ by little; `levels` says the gain that is left."""
+    """Always driven, so that friction and a gain differ by little; `levels` has the gain that remains."""
     fused = USUAL.fused
     assert fused is not None
     n = 6000
