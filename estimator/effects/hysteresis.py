@@ -14,10 +14,7 @@ class Hysteresis(Effect):
     group = "transmission"
     equation = "tau = K d + H z, dz = dd/travel within -1..1, so that twist = H/K z"
     source = "Al-Bender, Lampaert, Swevers 2005, IEEE Trans. Automatic Control 50 (one Maxwell-slip element)"
-    tell_tale = (
-        "The torsion balance changes after each reversal of the load, not of the velocity, over a fixed "
-        "travel."
-    )
+    tell_tale = "The torsion balance changes after each reversal of the load, not of the velocity, over a fixed travel."
     confused_with = {"lost_motion": "load_ramp", "nonlinear_stiffness": "load_ramp"}
     experiment = "load_ramp"
     parameters = (Parameter("torque_nm", "Nm", 0.0, 50.0), Parameter("travel_rad", "rad", 1e-06, 0.01))

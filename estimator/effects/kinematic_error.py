@@ -24,10 +24,7 @@ class KinematicError(Effect):
     source = (
         "Tuttle and Seering 1996, IEEE Trans. Robotics and Automation 12; the loss is the virtual work of tau"
     )
-    tell_tale = (
-        "A line of the torsion at 1, 2 or 4 cycles per motor revolution; in the motor balance only under "
-        "load."
-    )
+    tell_tale = "A line of the torsion at 1, 2 or 4 cycles per motor revolution; in the motor balance only under load."
     confused_with = {"torque_ripple": "full_turns"}
     experiment = "full_turns"
     parameters = (Parameter("amplitude_rad", "rad", 0.0, 0.005), order(), PHASE)

@@ -11,10 +11,7 @@ class SensorCrosstalk(Effect):
     group = "measurement"
     equation = "sensor = (A + share tau) cos(theta_c + phi), theta_c link position of joint 1"
     source = "parasitic bending moment of a torque transducer, fixed in space, first order"
-    tell_tale = (
-        "All balances of both joints swing once per revolution of the coupling; with the load where the "
-        "load bends."
-    )
+    tell_tale = "All balances of both joints swing once per revolution of the coupling; with the load where the load bends."
     confused_with = {"unbalance": "full_turns", "sensor_offset": "full_turns"}
     experiment = "full_turns"
     by_hand = {

@@ -31,10 +31,7 @@ class SensorGain(Effect):
     group = "measurement"
     equation = "tau_s = g TAU_S, so that sensor = (1 - 1/g) tau_s of the reading tau_s"
     source = "sensitivity of a torque transducer, as in DIN 51309"
-    tell_tale = (
-        "All balances of both joints are proportional to the torque by the same factor, whatever the "
-        "direction."
-    )
+    tell_tale = "All balances of both joints are proportional to the torque by the same factor, whatever the direction."
     confused_with = {"torque_constant": "load_at_both_directions"}
     experiment = "load_at_both_directions"
     parameters = (Parameter("gain", "", 0.5, 2.0, neutral=1.0),)

@@ -65,10 +65,7 @@ class _Exponential:
 class TemperatureDependentFriction(Effect):
     group = "friction"
     equation = "loss = Fv v (exp(-b (T - T0)) - 1) + Fc s (exp(-c (T - T0)) - 1)"
-    source = (
-        "Bittencourt and Gunnarsson 2012, J. Dynamic Systems, Measurement and Control 134; "
-        "Wolf and Iskandar 2018, ICRA"
-    )
+    source = "Bittencourt and Gunnarsson 2012, J. Dynamic Systems, Measurement and Control 134; Wolf and Iskandar 2018, ICRA"
     tell_tale = (
         "The slope of the motor balance over velocity falls as the joint warms up; nothing changes at rest."
     )

@@ -11,10 +11,7 @@ class TorqueConstantSaturation(Effect):
     group = "actuator"
     equation = "tau_motor = Kt i (1 - k |i|), so that loss = G Kt k i |i|"
     source = "Hanselman 2006, Brushless Permanent Magnet Motor Design (iron saturation, first order)"
-    tell_tale = (
-        "The motor balance bends with the current: nothing at small currents, odd and quadratic at large "
-        "ones."
-    )
+    tell_tale = "The motor balance bends with the current: nothing at small currents, odd and quadratic at large ones."
     confused_with = {"sensor_gain": "load_at_both_directions"}
     experiment = "load_at_both_directions"
     parameters = (Parameter("saturation_per_a", "1/A", 0.0, 0.5),)

@@ -11,10 +11,7 @@ class Unbalance(Effect):
     group = "load"
     equation = "load = U sin(theta_l + phi)"
     source = "gravity of an eccentric mass, U = m g r"
-    tell_tale = (
-        "Motor and torsion balance of one joint swing once per revolution of the link, whatever load and "
-        "speed."
-    )
+    tell_tale = "Motor and torsion balance of one joint swing once per revolution of the link, whatever load and speed."
     experiment = "full_turns"
     parameters = (Parameter("moment_nm", "Nm", 0.0, 100.0), PHASE)
     columns = (Column("moment_nm", 0.1),)
