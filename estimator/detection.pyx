@@ -177,7 +177,6 @@ cdef int LONGEST_GAP = 50  # samples without inputs, after which the state resta
 
 # The link of a joint --------------------------------------------------------------------------------------------------
 
-
 cdef int fill_link(LinkLaw *law, joint, torsion) except -1:
     law.used = torsion is not None
     law.inertia = joint.link_inertia_kgm2
@@ -226,7 +225,6 @@ cdef void update_link(
 
 
 # The detector ---------------------------------------------------------------------------------------------------------
-
 
 cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) except -1:
     """Set the parameters for samples period_s [s] apart. Raises ValueError for a threshold or period out of range."""

@@ -62,7 +62,6 @@ cdef int LEFT = st.LEFT, APART = st.APART
 
 # What all estimators share ---------------------------------------------------------------------------------------------
 
-
 cdef void no_values(Values *out, int status) noexcept nogil:
     """Set `out` to a status without any number."""
     out.torque_nm = out.sigma_nm = out.tob_nm = out.physics_nm = out.network_nm = NAN
@@ -182,7 +181,6 @@ cdef fill_network(NetworkLaw *law, network, joint):
 
 # The paper's estimator ------------------------------------------------------------------------------------------------
 
-
 cdef class JointEstimator(Estimator):
     """The paper's estimator of one joint: methods `tob`, `efficiency` and `network`.
 
@@ -268,7 +266,6 @@ cdef void publish_within(Values *out, double limit) noexcept nogil:
 
 
 # The fused estimator ----------------------------------------------------------------------------------------------------
-
 
 cdef int quadrant_of(double raw, double v) noexcept nogil:
     if v >= 0.0:
@@ -599,7 +596,6 @@ def observe_run(
 
 # Joints with effects --------------------------------------------------------------------------------------------------
 
-
 cdef class ExtendedEstimator(Estimator):
     """Estimator of a joint with effects: `ExtendedInputs` corrects the inputs of the estimator of the plain joint.
 
@@ -665,7 +661,6 @@ cdef class PythonEstimator(Estimator):
 
 
 # Estimator of a joint by method ----------------------------------------------------------------------------------------
-
 
 def make_estimator(joint, settings, network=None):
     """Return the estimator of a joint. Raises ConfigError when joint, method and network do not fit."""

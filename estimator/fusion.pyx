@@ -112,7 +112,6 @@ cdef double LEAST_VARIANCE = 0.05  # part of the torsion's variance that remains
 
 # Fusion ---------------------------------------------------------------------------------------------------------------
 
-
 cdef double fading(double half, double before, double dt) noexcept nogil:
     """Return the friction interval's half width [Nm] with that of the sample before, dt [s] ago, fading.
 
@@ -506,7 +505,6 @@ cdef offsets_of(const OffsetLaw *law, const OffsetState *s):
 
 
 # Agreement ------------------------------------------------------------------------------------------------------------
-
 
 DOWN_S: Final = 5.0
 TURNING_RAD_S: Final = 0.1

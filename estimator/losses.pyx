@@ -69,7 +69,6 @@ cdef double direction_of(double v) noexcept nogil:
 
 # Additive friction ----------------------------------------------------------------------------------------------------
 
-
 cdef double friction_torque(const FrictionLaw *law, double v) noexcept nogil:
     """Return tau_f(v) = tanh(v/w0) (Fc + Fs exp(-(v/vs)^2)) + Fv v."""
     cdef double x = v * law.inverse_stribeck
@@ -108,7 +107,6 @@ cdef class FrictionModel:
 
 
 # Four-quadrant efficiency ---------------------------------------------------------------------------------------------
-
 
 cdef double _eta(const EfficiencyLaw *law, double i, double v) noexcept nogil:
     """Return the bounded eta = tau_j/(G Kt i) of the quadrant, whatever the file's convention."""
@@ -252,7 +250,6 @@ cdef class LossModel:
 
 # Standard deviation of the paper's methods -----------------------------------------------------------------------------
 
-
 cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings) except -1:
     law.floor = settings.sigma_floor * joint.rated_torque_nm
     law.u_friction = settings.friction_uncertainty
@@ -283,7 +280,6 @@ cdef Spread standing(const UncertaintyLaw *law, const EfficiencyLaw *losses, dou
 
 
 # Loss by load, speed, direction and temperature -----------------------------------------------------------------------
-
 
 cdef double _side(const AdditiveLaw *law, const SideLaw *side, double load, double a, double stribeck, double thermal) noexcept nogil:
     """Return L_d [Nm] of one direction; stribeck: exp(-(a/vs)^2); thermal: h(T) [Nms/rad]."""

@@ -81,7 +81,6 @@ cdef inline double tanh_of(double x) noexcept nogil:
 
 # The network ----------------------------------------------------------------------------------------------------------
 
-
 cdef enum:
     AT_ONCE = 8
 
@@ -187,7 +186,6 @@ cdef class Perceptron:
 
 # Weight of the paper's network ---------------------------------------------------------------------------------------
 
-
 cdef int fill_trust(TrustLaw *law, low, high, double margin, double limit) except -1:
     if len(low) != FEATURES or len(high) != FEATURES:
         raise ValueError(f"found ranges of {len(low)} and {len(high)} features, expected {FEATURES}")
@@ -238,7 +236,6 @@ def network_weights(low, high, double margin, double limit_nm, features, differe
 
 
 # Weight of a fused network -------------------------------------------------------------------------------------------
-
 
 cdef double network_share(double v) noexcept nogil:
     """Return the fused network's share at this speed, 0 to 1."""

@@ -66,7 +66,6 @@ def columns(*arrays):
 
 # First-order hold -----------------------------------------------------------------------------------------------------
 
-
 cdef struct Hold:
     double a, b0, b1, decay  # decay: 1 - a
 
@@ -105,7 +104,6 @@ def low_pass(values, dt_s, double bandwidth_rad_s):
 
 
 # Reference torque of a sensor ----------------------------------------------------------------------------------------
-
 
 cdef double SETTLED = 5.0  # in 1/g: exp(-5) of the start remains
 
@@ -157,7 +155,6 @@ def reference_of(sensor_nm, dt_s, double bandwidth_rad_s, double max_gap_s=0.05)
 
 
 # The paper's observer -------------------------------------------------------------------------------------------------
-
 
 cdef void _start(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
     """Set the states of a joint in steady motion at this speed."""
@@ -568,7 +565,6 @@ cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, settings) ex
 
 
 # Guard ----------------------------------------------------------------------------------------------------------------
-
 
 cdef int fill_guard(GuardLaw *law, joint, settings) except -1:
     law.max_gap = settings.max_gap_s
