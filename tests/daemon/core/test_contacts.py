@@ -12,7 +12,6 @@ import pytest
 
 from jtqd.daemon.bus.own_node import OwnNode
 from jtqd.daemon.config import ContactSettings, load_config
-from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.estimate_pdo import NO_RATE, ContactPdo, decode_contact
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake
@@ -21,18 +20,17 @@ from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.replay.logged import SAMPLE
 from jtqd.daemon.replay.rows import CycleRows
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.cycle_record import Ring, RingReader
 from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
 from jtqd.drivers.object_dictionary import ObjectStore, read_eds
 from jtqd.estimator.detection import detect_contacts
-from jtqd.estimator.estimator import FusedEstimator, make_estimator
+from jtqd.estimator.estimator import Estimator, FusedEstimator, make_estimator
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import CONTACT_NONE, CONTACT_PRESENT, INVALID
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, Push, emulate
 from jtqd.sim_can.plant_source import load_any_plant
 from tests.daemon import ring_records as rr
-from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, ExactTime, ScriptedSocket, frame
+from tests.daemon.loop.cycle_helpers import ENABLED, I32, MOTION, ExactTime, ScriptedSocket, build, frame
 from tests.paths import JTQD_EDS
 
 CYCLES = 400
@@ -76,6 +74,16 @@ def counts(moves: bool = True) -> tuple[tuple[tuple[int, int, int, int], ...], .
     return tuple(tuple(tuple(each[k].tolist()) for each in found) for k in range(CYCLES))  # type: ignore[misc]
 
 
+def joints() -> list[tuple[JointInputs, Estimator]]:
+    return [
+        (
+            JointInputs(drive_places(2 * n), None, **SCALE),
+            make_estimator(load_joint(shipped(f"trained/joint{n + 1}.yaml")), SETTINGS),
+        )
+        for n in (0, 1)
+    ]
+
+
 class Loop:
     """A loop whose bus answers the emulated run; in cycle MISSING the motion of joint 1 does not come.
 
@@ -87,27 +95,9 @@ class Loop:
         self.jumps_at = CYCLES
         self.socket = ScriptedSocket(self.answers)
         self.path = directory / "snapshot"
-        self.cycle = Cycle(
-            self.socket,  # type: ignore[arg-type]
-            Intake(PDOS),
-            [
-                (
-                    JointInputs(drive_places(2 * n), None, **SCALE),
-                    make_estimator(load_joint(shipped(f"trained/joint{n + 1}.yaml")), SETTINGS),
-                )
-                for n in (0, 1)
-            ],
-            Ring(directory / "ring", 512, rr.RECORD_SIZE),
-            Snapshot(self.path, 1e-3, 0.8, 2),
-            node_id=0x20,
-            counter_overflow=240,
-            wait_ns=0,
-            deadline_ns=100_000,
-            heartbeat_cycles=1000,
-            grid=Grid(0, 1_000_000),
-            contacts=contacts,
+        self.cycle, self.ring = build(
+            directory, self.socket, Intake(PDOS), joints(), Grid(0, 1_000_000), slots=512, contacts=contacts
         )
-        self.ring = RingReader(directory / "ring", rr.RECORD_SIZE)
         self.sync = 0
 
     def answers(self, sync: int) -> list[bytes]:
@@ -178,18 +168,10 @@ def test_the_loop_says_what_the_arrays_say(tmp_path: Path, exact: ExactTime) -> 
     loads = np.full((2, CYCLES), np.nan)
     for n, states in enumerate(joints):
         used = [k for k, each in enumerate(states) if not math.isnan(each.current_a)]
-        columns = (
-            [getattr(states[k], name) for k in used]
-            for name in (
-                "dt_s",
-                "current_a",
-                "motor_position_rad",
-                "motor_velocity_rad_s",
-                "link_position_rad",
-            )
-        )
+        names = "dt_s", "current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad"
+        columns = [np.array([getattr(states[k], name) for k in used]) for name in names]
         joint = load_joint(shipped(f"trained/joint{n + 1}.yaml"))
-        loads[n, used] = FusedEstimator(joint, SETTINGS).run(*(np.array(each) for each in columns)).load_nm
+        loads[n, used] = FusedEstimator(joint, SETTINGS).run(*columns).load_nm
     angle = np.array([each.motor_position_rad for each in joints[0]])
     residual, codes = detect_contacts(loads[1] - loads[0], angle, THRESHOLD_NM)
     np.testing.assert_array_equal([each.contact_nm for each in joints[0]], residual)
@@ -223,21 +205,17 @@ def test_the_node_says_what_was_sent(tmp_path: Path, exact: ExactTime) -> None:
         assert (rate == NO_RATE) == (contact is None)
 
 
-def test_without_contacts_nothing_of_it_goes_out(tmp_path: Path, exact: ExactTime) -> None:
-    loop = Loop(tmp_path, None)
+@pytest.mark.parametrize("watched", [False, True])
+def test_nothing_goes_out_where_it_is_in_the_log_only_or_not_watched(
+    tmp_path: Path, exact: ExactTime, watched: bool
+) -> None:
+    loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2, opposed=True, sends=False) if watched else None)
     exact.turn(loop.cycle, CYCLES)
     assert loop.sent() == []
-    for record in loop.records():
-        joint = cr.joint_of(record, 1)
-        assert math.isnan(joint.contact_nm)
-        assert not joint.input_flags & (cr.FLAG_CONTACT | cr.FLAG_CONTACT_KNOWN)
-
-
-def test_in_the_log_only(tmp_path: Path, exact: ExactTime) -> None:
-    loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2, opposed=True, sends=False))
-    exact.turn(loop.cycle, CYCLES)
-    assert loop.sent() == []
-    assert any(cr.joint_of(record, 1).input_flags & cr.FLAG_CONTACT for record in loop.records())
+    first = [cr.joint_of(record, 1) for record in loop.records()]
+    assert any(each.input_flags & cr.FLAG_CONTACT for each in first) == watched
+    assert any(each.input_flags & cr.FLAG_CONTACT_KNOWN for each in first) == watched
+    assert all(math.isnan(each.contact_nm) for each in first) != watched
 
 
 def test_an_answer_that_comes_too_late_knows_of_no_contact(tmp_path: Path, exact: ExactTime) -> None:
@@ -281,16 +259,10 @@ def test_rows_of_a_log_give_the_same_bits(tmp_path: Path, exact: ExactTime) -> N
     logged = [np.array([cr.joint_of(record, n) for record in records], SAMPLE) for n in (1, 2)]
     headers = [cr.header_of(record) for record in records]
     intake = Intake(PDOS)
-    joints = [
-        JointCycle(
-            n,
-            JointInputs(drive_places(2 * n), None, **SCALE),
-            make_estimator(load_joint(shipped(f"trained/joint{n + 1}.yaml")), SETTINGS),
-            intake=intake,
-            snapshot=Snapshot(tmp_path / f"again{n}", 1e-3, 0.8, 2),
-            period_ns=1_000_000,
-        )
-        for n in (0, 1)
+    snapshot = Snapshot(tmp_path / "again", 1e-3, 0.8, 2)
+    cycles = [
+        JointCycle(n, *each, intake=intake, snapshot=snapshot, period_ns=1_000_000)
+        for n, each in enumerate(joints())
     ]
     table = np.array(counts())
     flags = [each["input_flags"] for each in logged]
@@ -299,7 +271,7 @@ def test_rows_of_a_log_give_the_same_bits(tmp_path: Path, exact: ExactTime) -> N
     word = np.full(CYCLES, ENABLED)
     rows = CycleRows(
         intake,
-        joints,
+        cycles,
         fresh=fresh,
         values=[
             part

@@ -5,14 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.estimate_pdo import decode
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, drive_places
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid
 from jtqd.daemon.shared import cycle_record as cr
-from jtqd.daemon.shared.cycle_record import Ring, RingReader
-from jtqd.daemon.shared.snapshot import Snapshot, SnapshotReader
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.drivers.own_objects import estimate_tpdos
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
@@ -26,6 +24,7 @@ from tests.daemon.loop.cycle_helpers import (
     SENSOR,
     ExactTime,
     ScriptedSocket,
+    build,
     frame,
 )
 
@@ -46,29 +45,14 @@ class Bus:
         if sensor:
             pdos.append(InputPdo(0x180 + SENSOR_NODE, 5, SENSOR, SENSOR_NODE, "sensor"))
         self.socket = ScriptedSocket(self.answers)
-        size = cr.layout_of(joints).size
         self.snapshot_path = directory / "snapshot"
         settings = EstimatorSettings(method="efficiency")
-        self.cycle = Cycle(
-            self.socket,  # type: ignore[arg-type]
-            Intake(pdos),
-            [
-                (
-                    JointInputs(drive_places(2 * n), 2 * joints if sensor else None, **SCALE),
-                    JointEstimator(load_joint(shipped("joint1.yaml")), settings),
-                )
-                for n in range(joints)
-            ],
-            Ring(directory / "ring", 64, size),
-            Snapshot(self.snapshot_path, 1e-3, 0.8, joints),
-            node_id=0x20,
-            counter_overflow=240,
-            wait_ns=0,
-            deadline_ns=100_000,
-            heartbeat_cycles=100,
-            grid=Grid(0, 1_000_000),
-        )
-        self.ring = RingReader(directory / "ring", size)
+        estimators = [JointEstimator(load_joint(shipped("joint1.yaml")), settings) for _ in self.numbers]
+        inputs = [
+            JointInputs(drive_places(2 * n), 2 * joints if sensor else None, **SCALE) for n in range(joints)
+        ]
+        pairs = list(zip(inputs, estimators, strict=True))
+        self.cycle, self.ring = build(directory, self.socket, Intake(pdos), pairs, Grid(0, 1_000_000))
 
     def answers(self, sync: int) -> list[bytes]:
         found = []

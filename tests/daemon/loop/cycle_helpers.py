@@ -17,13 +17,12 @@ from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, TemperaturePdo, d
 from jtqd.daemon.core.intake import Intake
 from jtqd.daemon.core.schedule import Grid, PythonClock
 from jtqd.daemon.core.status import JointSafety
-from jtqd.daemon.shared.cycle_record import Ring, RingReader
+from jtqd.daemon.shared.cycle_record import Ring, RingReader, layout_of
 from jtqd.daemon.shared.snapshot import Snapshot
 from jtqd.drivers.frame_socket import BusDown
 from jtqd.estimator.estimator import JointEstimator
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
-from tests.daemon import ring_records as rr
 
 I32 = struct.Struct("<ii")
 MOTION = struct.Struct("<ihH")
@@ -151,6 +150,36 @@ def moving(sync: int) -> list[bytes]:
     return frames
 
 
+def build(
+    directory: Path,
+    socket: ScriptedSocket,
+    intake: Intake,
+    joints: Sequence[tuple[JointInputs, Any]],
+    grid: Grid,
+    *,
+    slots: int = 64,
+    counter_overflow: int = 240,
+    **options: Any,
+) -> tuple[Cycle, RingReader]:
+    """A cycle on memory in this directory."""
+    size = layout_of(len(joints)).size
+    cycle = Cycle(
+        socket,  # type: ignore[arg-type]
+        intake,
+        joints,
+        Ring(directory / "ring", slots, size),
+        Snapshot(directory / "snapshot", 1e-3, 0.8, len(joints)),
+        node_id=0x20,
+        counter_overflow=counter_overflow,
+        wait_ns=0,
+        deadline_ns=100_000,
+        heartbeat_cycles=100,
+        grid=grid,
+        **options,
+    )
+    return cycle, RingReader(directory / "ring", size)
+
+
 def make(
     tmp_path: Path,
     script: Callable[[int], list[bytes]],
@@ -173,21 +202,11 @@ def make(
         )
         for n in range(2)
     ]
-    cycle = Cycle(
-        socket,  # type: ignore[arg-type]
-        Intake(PDOS, temperatures),
-        joints,
-        Ring(tmp_path / "ring", slots, rr.RECORD_SIZE),
-        Snapshot(tmp_path / "snapshot", 1e-3, 0.8),
-        safety=safety,
-        node_id=0x20,
-        counter_overflow=counter_overflow,
-        wait_ns=0,
-        deadline_ns=100_000,
-        heartbeat_cycles=100,
-        grid=Grid(time.monotonic_ns(), 10_000_000),
+    grid, intake = Grid(time.monotonic_ns(), 10_000_000), Intake(PDOS, temperatures)
+    cycle, reader = build(
+        tmp_path, socket, intake, joints, grid, slots=slots, safety=safety, counter_overflow=counter_overflow
     )
-    return cycle, socket, RingReader(tmp_path / "ring", rr.RECORD_SIZE)
+    return cycle, socket, reader
 
 
 def turn(cycle: Cycle, count: int = 1, **before: Callable[[], None]) -> None:
