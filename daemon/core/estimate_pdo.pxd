@@ -15,6 +15,4 @@ cdef bint has_torque(int status) noexcept nogil
 cdef Published field_of(double torque_nm, double sigma_nm, int status) noexcept nogil
 cdef void encode_into(uint8_t *data, const Published *one, const Published *two, int sequence) noexcept nogil
 cdef ContactField contact_field_of(double torque_rate_nm_s, double contact_nm, int state) noexcept nogil
-cdef void encode_contact_into(
-    uint8_t *data, const ContactField *one, const ContactField *two, int sequence
-) noexcept nogil
+cdef void encode_contact_into(uint8_t *data, const ContactField *one, const ContactField *two, int sequence) noexcept nogil

@@ -138,9 +138,7 @@ cdef ContactField contact_field_of(double torque_rate_nm_s, double contact_nm, i
     return ContactField(rate, code)
 
 
-cdef void encode_contact_into(
-    uint8_t *data, const ContactField *one, const ContactField *two, int sequence
-) noexcept nogil:
+cdef void encode_contact_into(uint8_t *data, const ContactField *one, const ContactField *two, int sequence) noexcept nogil:
     """Write the four bytes; `sequence` is the SYNC counter of the inputs."""
     data[0], data[1] = <uint8_t> <int8_t> one.rate, <uint8_t> <int8_t> two.rate
     data[2] = one.code | two.code << 4

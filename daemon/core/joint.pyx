@@ -16,12 +16,7 @@ from dataclasses import replace
 from typing import Final
 
 from jtqd.daemon.core.estimate_pdo cimport (
-    NO_JOINT,
-    ContactField,
-    contact_field_of,
-    encode_contact_into,
-    field_of,
-    has_torque,
+    NO_JOINT, ContactField, contact_field_of, encode_contact_into, field_of, has_torque,
 )
 from jtqd.daemon.core.input_pdos import DRIVE_FACTORS
 from jtqd.daemon.core.intake cimport Input, Intake
@@ -31,12 +26,7 @@ from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.estimator import status as st
 from jtqd.estimator.detection cimport (
-    CONTACT_PRESENT,
-    CONTACT_UNKNOWN,
-    ContactState,
-    detect_contact,
-    fill_contact,
-    restart_contact,
+    CONTACT_PRESENT, CONTACT_UNKNOWN, ContactState, detect_contact, fill_contact, restart_contact,
 )
 from jtqd.estimator.estimator cimport Estimator, Values
 from jtqd.estimator.observer cimport Sample

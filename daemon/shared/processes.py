@@ -305,13 +305,6 @@ class Notifier:
             return False
         return True
 
-    def close(self) -> None:
-        """Close the connection: nothing is sent after it."""
-        if self._socket is not None:
-            with suppress(OSError):
-                self._socket.close()
-            self._socket = None
-
 
 class LoopWatchdog:
     """Feeds systemd's watchdog from the loop: call `advanced` after some cycles; every n-th cycle sends one datagram.

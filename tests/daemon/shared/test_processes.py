@@ -1,4 +1,4 @@
-"""Words to the service manager over a real datagram socket: what is sent, when, and that nothing can hold up a loop."""
+"""Children and their answers; messages to the service manager over a real datagram socket, which hold up no loop."""
 
 import os
 import socket
@@ -8,7 +8,14 @@ from pathlib import Path
 
 import pytest
 
-from jtqd.daemon.shared.processes import LoopWatchdog, Notifier, watchdog_seconds
+from jtqd.daemon.shared.processes import (
+    Child,
+    ChildError,
+    ChildSilence,
+    LoopWatchdog,
+    Notifier,
+    watchdog_seconds,
+)
 
 
 @pytest.fixture
@@ -34,8 +41,6 @@ def test_assignments_arrive_as_one_datagram(manager: socket.socket) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname()})
     assert notifier.send("READY=1", "STATUS=joint 1: valid")
     assert words(manager) == ["READY=1\nSTATUS=joint 1: valid"]
-    notifier.close()
-    assert not notifier.send("STOPPING=1")
 
 
 def test_an_abstract_address(tmp_path: Path) -> None:
@@ -105,3 +110,38 @@ def test_without_a_watchdog_nothing_is_fed(manager: socket.socket) -> None:
 )
 def test_the_watchdogs_time(environment: dict[str, str], seconds: float | None) -> None:
     assert watchdog_seconds(environment) == seconds
+
+
+# Children
+
+
+def child(statement: str) -> Child:
+    """A process that runs one Python statement; `timeit` is a module that does that."""
+    return Child("timeit", ["-n", "1", "-r", "1", statement], name="the child")
+
+
+def test_last_words_of_a_child_that_has_ended() -> None:
+    one = child("print('{}', flush=True); import os; os._exit(3)")
+    one.process.wait(30)
+    assert one.answer(30.0) == {}
+    with pytest.raises(ChildError, match="the child ended with exit status 3"):
+        one.answer(30.0)
+
+
+def test_silence_is_not_the_end() -> None:
+    one = child("import time; time.sleep(60)")
+    with pytest.raises(ChildSilence, match=r"the child did not answer within 0\.1 s"):
+        one.answer(0.1)
+    assert one.alive()
+    assert len(one.outputs) == 1
+    one.end()
+
+
+def test_a_closed_output_is_not_spun_on() -> None:
+    one = child("import os, time; os.close(1); time.sleep(1); os._exit(0)")
+    used, begun = time.process_time(), time.monotonic()
+    with pytest.raises(ChildError, match="the child ended with exit status 0"):
+        one.answer(30.0)
+    assert one.outputs == []
+    assert time.monotonic() - begun > 0.9
+    assert time.process_time() - used < 0.1  # spinning, it would be all of the second
