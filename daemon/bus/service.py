@@ -22,13 +22,7 @@ from jtqd.daemon.shared.runtime_dir import write_whole
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers import emcy, nmt
 from jtqd.drivers.bus_socket import CanFilter, exact
-from jtqd.drivers.emcy import (
-    NO_ERROR,
-    Emergency,
-    describe,
-    name_of,
-    parse,
-)
+from jtqd.drivers.emcy import NO_ERROR, Emergency, describe, name_of, parse
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_ERR_FLAG, CAN_RTR_FLAG, FRAME, pack
 from jtqd.drivers.frame_socket import BusDown, FrameSocket
 from jtqd.drivers.object_dictionary import ObjectStore

@@ -15,14 +15,7 @@ from typing import Any, ClassVar
 import can
 
 from jtqd.drivers.frame import pack
-from tests.library_drives.nodes import (
-    MOTOR_COUNTS,
-    Cable,
-    Manners,
-    StrictDrive,
-    StrictNode,
-    StrictSensor,
-)
+from tests.library_drives.nodes import MOTOR_COUNTS, Cable, Manners, StrictDrive, StrictNode, StrictSensor
 
 _POLL_NS = 2_000_000
 _FAULT, _ENABLED = 0x1218, 0x1237

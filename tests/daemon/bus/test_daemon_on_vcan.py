@@ -99,8 +99,7 @@ def test_lengths_are_reported_per_pdo_and_never_applied(daemon: Daemon, node: An
 def test_a_second_sync_producer_makes_all_inputs_stale_and_is_8150h(daemon: Daemon) -> None:
     assert (
         daemon.until(
-            lambda: daemon.statuses[-50:].count((STALE, STALE)) >= 45,
-            do=lambda: daemon.send(0x080, b"\x07"),
+            lambda: daemon.statuses[-50:].count((STALE, STALE)) >= 45, do=lambda: daemon.send(0x080, b"\x07")
         )
         or daemon.reader.read().counters["foreign_sync"] > 0
     )

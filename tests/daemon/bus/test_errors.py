@@ -6,16 +6,7 @@ import tracemalloc
 import pytest
 
 from jtqd.daemon.bus.own_node import OwnErrors
-from jtqd.daemon.bus.service import (
-    ACTIVE,
-    BUS_OFF,
-    DOWN,
-    PASSIVE,
-    WARNING,
-    BusChange,
-    BusState,
-    EmcyLog,
-)
+from jtqd.daemon.bus.service import ACTIVE, BUS_OFF, DOWN, PASSIVE, WARNING, BusChange, BusState, EmcyLog
 from jtqd.daemon.shared.events import RateLimit
 from jtqd.drivers.emcy import Emergency, describe, name_of, parse
 from jtqd.drivers.object_dictionary import ObjectStore

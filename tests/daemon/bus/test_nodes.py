@@ -13,9 +13,7 @@ import pytest
 import yaml
 
 from jtqd.daemon.bus.boot import ReturningNodes, boot_request, gear_ratio_error
-from jtqd.daemon.bus.nodes import (
-    ACTIVE as HEARD,
-)
+from jtqd.daemon.bus.nodes import ACTIVE as HEARD
 from jtqd.daemon.bus.nodes import (
     LOST,
     WAITING,
