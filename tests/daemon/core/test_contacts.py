@@ -1,4 +1,4 @@
-"""Contacts in the loop: what goes out, what is recorded, counted and told, and that a replay says the same bit for bit."""
+"""Contacts in the loop: what goes out, what is recorded and counted, and that a replay gives the same bits."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def test_a_push_goes_out_is_recorded_and_counted(tmp_path: Path, exact: ExactTim
     assert SnapshotReader(loop.path).read().counters["contacts"] == 1
 
 
-def test_the_loop_says_what_the_arrays_say(tmp_path: Path, exact: ExactTime) -> None:
+def test_the_loop_agrees_with_the_arrays(tmp_path: Path, exact: ExactTime) -> None:
     loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2, opposed=True))
     exact.turn(loop.cycle, CYCLES)
     records = loop.records()
@@ -188,7 +188,7 @@ def test_alone_at_rest_each_joint_sees_its_half_of_the_push(tmp_path: Path, exac
     assert after == pytest.approx([1.5, -1.5], abs=0.5)
 
 
-def test_the_node_says_what_was_sent(tmp_path: Path, exact: ExactTime) -> None:
+def test_the_objects_of_the_node_are_what_was_sent(tmp_path: Path, exact: ExactTime) -> None:
     loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2, opposed=True))
     config = load_config(None)
     for contact, expected in (
@@ -233,9 +233,7 @@ def test_an_answer_that_comes_too_late_knows_of_no_contact(tmp_path: Path, exact
     assert math.isnan(cr.joint_of(record, 1).contact_nm)
 
 
-def test_an_encoder_that_is_not_believed_says_nothing_about_contacts(
-    tmp_path: Path, exact: ExactTime
-) -> None:
+def test_an_invalid_encoder_gives_no_contacts(tmp_path: Path, exact: ExactTime) -> None:
     loop = Loop(tmp_path, ContactWatch([THRESHOLD_NM] * 2))
     loop.jumps_at = PUSHED - 50
     exact.turn(loop.cycle, CYCLES)

@@ -1,4 +1,4 @@
-"""One to four joints on a bus: what goes out, what is recorded and told of each of them."""
+"""One to four joints on a bus: what goes out, what is recorded and shown of each of them."""
 
 import math
 from pathlib import Path
@@ -85,7 +85,7 @@ def exact(monkeypatch: pytest.MonkeyPatch) -> ExactTime:
 
 @pytest.mark.parametrize("sensor", [True, False])
 @pytest.mark.parametrize("joints", [1, 2, 3, 4])
-def test_every_joint_is_sent_recorded_and_told(
+def test_every_joint_is_sent_recorded_and_shown(
     tmp_path: Path, exact: ExactTime, joints: int, sensor: bool
 ) -> None:
     bus = Bus(tmp_path, joints, sensor=sensor)

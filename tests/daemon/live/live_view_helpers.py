@@ -150,7 +150,7 @@ class LiveProcess:
 
 
 class Viewer:
-    """A websocket client: knows what the server said of itself, and collects messages by topic."""
+    """A websocket client: knows the information of the server, and collects messages by topic."""
 
     def __init__(self, url, topics=None, subprotocols=(SUBPROTOCOL,), **options):
         self._connection = connect(url, subprotocols=list(subprotocols), max_size=None, **options)
@@ -169,28 +169,28 @@ class Viewer:
         self.socket.send(json.dumps(content))
 
     def take(self, timeout=0.2):
-        """One thing from the server; False where it says nothing."""
+        """One thing from the server; False where there is none."""
         try:
-            said = self.socket.recv(timeout=timeout)
+            data = self.socket.recv(timeout=timeout)
         except TimeoutError:
             return False
-        if isinstance(said, str):
-            content = json.loads(said)
+        if isinstance(data, str):
+            content = json.loads(data)
             self.texts.append(content)
             if content["op"] == "advertise":
                 self.channels |= {channel["id"]: channel for channel in content["channels"]}
             return True
-        code, number, stamp = struct.unpack_from("<BIQ", said)
+        code, number, stamp = struct.unpack_from("<BIQ", data)
         if code == _MESSAGE_DATA:
             topic = self._subscribed[number]
-            message = DEFINITIONS[TYPES[topic]].decode(said[13:])
+            message = DEFINITIONS[TYPES[topic]].decode(data[13:])
             self.messages.setdefault(topic, []).append((stamp, message))
         return True
 
     def _until(self, condition, timeout_s=10.0):
         end = time.monotonic() + timeout_s
         while not condition():
-            assert time.monotonic() < end, f"waited in vain; the server said {self.texts}"
+            assert time.monotonic() < end, f"waited in vain; the server sent {self.texts}"
             self.take()
 
     def wait_for(self, topic, count=1):

@@ -1,4 +1,4 @@
-"""The live view of a whole daemon: started, said, killed, refused; the loop goes on."""
+"""The live view of a whole daemon: started, reported, killed, refused; the loop goes on."""
 
 import json
 import os
@@ -51,7 +51,7 @@ def test_one_that_dies_again_and_again_is_left(kept, monkeypatch):
     assert len(kept.children) == started
 
 
-def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
+def test_a_port_in_use_is_reported_once(tmp_path, capfd):
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -65,7 +65,7 @@ def test_a_port_in_use_is_said_once_and_that_is_all(tmp_path, capfd):
         made.end()
 
 
-def test_an_address_that_others_reach_is_said(tmp_path, capfd, monkeypatch):
+def test_an_address_that_others_reach_is_reported(tmp_path, capfd, monkeypatch):
     monkeypatch.setattr(LiveView, "_run", lambda self: None)
     LiveView(lambda *_: None, Address("0.0.0.0")).start(load_config(None), tmp_path, "can0")
     assert (
@@ -77,9 +77,9 @@ def test_an_address_that_others_reach_is_said(tmp_path, capfd, monkeypatch):
 def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "foxglove", None)
     assert jtqd.main(["--bus", "sim", "--record", "none", "--live"]) == 1
-    said = capsys.readouterr()
-    assert said.err == "jtqd: --live needs the package foxglove-sdk: pip install 'jtqd[live]'\n"
-    assert said.out == ""
+    errors = capsys.readouterr()
+    assert errors.err == "jtqd: --live needs the package foxglove-sdk: pip install 'jtqd[live]'\n"
+    assert errors.out == ""
 
 
 def test_live_view_of_the_emulated_bench(tmp_path):
@@ -91,16 +91,16 @@ def test_live_view_of_the_emulated_bench(tmp_path):
         cwd=tmp_path,
         env=environment,
         stdout=subprocess.PIPE,
-        stderr=(tmp_path / "said").open("w"),
+        stderr=(tmp_path / "stderr").open("w"),
         text=True,
     ) as process:
-        said = tmp_path / "said"
+        errors = tmp_path / "stderr"
 
         def wait_for(pattern, timeout_s=60.0):
             end = time.monotonic() + timeout_s
-            while not (found := re.search(pattern, said.read_text())):
-                assert process.poll() is None, said.read_text()
-                assert time.monotonic() < end, said.read_text()
+            while not (found := re.search(pattern, errors.read_text())):
+                assert process.poll() is None, errors.read_text()
+                assert time.monotonic() < end, errors.read_text()
                 time.sleep(0.02)
             return found
 
@@ -121,8 +121,8 @@ def test_live_view_of_the_emulated_bench(tmp_path):
         os.kill(pid, signal.SIGKILL)
         wait_for("the live view ended with exit status -9; restarted, the loop continues")
         output, _ = process.communicate(timeout=60)
-        assert process.returncode == 0, said.read_text()
-        assert len(_LISTENING.findall(said.read_text())) == 2
+        assert process.returncode == 0, errors.read_text()
+        assert len(_LISTENING.findall(errors.read_text())) == 2
         summary = json.loads(output)
         assert summary["cycles"] + summary["missed"] >= 5900
-        assert "Traceback" not in said.read_text()
+        assert "Traceback" not in errors.read_text()

@@ -91,7 +91,7 @@ def main(domain, seconds=3600.0, xml="LOCALHOST"):
                 say(writer=each.topic_name, type=each.type_name, qos=policies, data=data)
         for name, reader in readers.items():
             for message in reader.take(100):
-                if hasattr(message, "__idl__"):  # else it says that the last writer is gone
+                if hasattr(message, "__idl__"):  # else the last writer is gone
                     say(topic=name, message=plain(message))
         time.sleep(0.005)
     del own

@@ -67,7 +67,7 @@ def test_what_did_not_come_is_not_a_number():
     assert not math.isnan(state.position[0] + state.velocity[0])
 
 
-def test_the_torque_state_says_of_which_cycle_it_is_and_how_old():
+def test_the_torque_state_has_its_cycle_and_age():
     state = messages(record_of(481, missed=4)).torque_state(481_000_000 + 2_500_000)
     assert (state.cycle, state.sync_counter, state.missed) == (481, 2, 4)
     assert state.age == pytest.approx(0.0025, abs=1e-12)
@@ -159,7 +159,7 @@ def test_a_domain_that_is_none_is_refused(text):
         launch.domain_id(None, {"ROS_DOMAIN_ID": text})
 
 
-def test_where_no_wheel_is_it_says_so():
+def test_where_there_is_no_wheel():
     assert launch.needed("x86_64") == "the package cyclonedds: pip install 'jtqd[ros2]'"
     assert "no wheel for aarch64: docs/ros2.md" in launch.needed("aarch64")
 

@@ -70,10 +70,10 @@ def test_a_reader_with_types_from_the_msg_files_gets_all_three_topics(memory):
         "rt/diagnostics": "diagnostic_msgs::msg::dds_::DiagnosticArray_",
     }
     for each in writers.values():
-        said = " ".join(each["qos"])
-        assert "Policy.Reliability.Reliable" in said
-        assert "Policy.Durability.Volatile" in said
-        assert "use_cdrv0_representation=True, use_xcdrv2_representation=False" in said
+        shown = " ".join(each["qos"])
+        assert "Policy.Reliability.Reliable" in shown
+        assert "Policy.Durability.Volatile" in shown
+        assert "use_cdrv0_representation=True, use_xcdrv2_representation=False" in shown
         assert re.fullmatch(r"typehash=RIHS01_[0-9a-f]{64};", each["data"])
 
 
@@ -85,7 +85,7 @@ def test_a_reader_with_types_from_the_msg_files_gets_all_three_topics(memory):
         pytest.param("ROS_LOCALHOST_ONLY", marks=pytest.mark.campaign),
     ],
 )
-def test_nodes_of_this_machine_find_it_whoever_is_first(memory, discovery):
+def test_nodes_of_this_machine_find_it_in_any_order(memory, discovery):
     with Reader(None, discovery) as first, Publisher(memory.directory), Reader(None, discovery) as second:
         memory.feeding(10_000)
         first.wait_for("joint_states")
@@ -204,7 +204,7 @@ def kept(tmp_path, capfd):
     made.end()
 
 
-def test_one_that_is_killed_is_told_and_started_again(kept):
+def test_one_that_is_killed_is_reported_and_started_again(kept):
     kept.until(r"jtqd: ROS 2 publisher: /joint_states, .* at 100 Hz, domain \d+, interface lo\n")
     kept.kill()
     kept.until("jtqd: the ROS 2 publisher ended with exit status -9; restarted, the loop continues\n")
@@ -224,8 +224,8 @@ def test_without_the_package_the_daemon_refuses_in_one_line(monkeypatch, capsys,
     monkeypatch.setitem(sys.modules, "cyclonedds", None)
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     assert jtqd.main(["--bus", "sim", "--record", "none", "--ros2"]) == 1
-    said = capsys.readouterr()
-    assert said.err == "jtqd: --ros2 needs the package cyclonedds: pip install 'jtqd[ros2]'\n"
+    shown = capsys.readouterr()
+    assert shown.err == "jtqd: --ros2 needs the package cyclonedds: pip install 'jtqd[ros2]'\n"
     shipped = load_config(None)
     path = tmp_path / "arm.yaml"
     text = re.sub(r"file: (\S+)", lambda found: f"file: {shipped.path.parent / found[1]}", shipped.text)

@@ -86,7 +86,7 @@ def test_a_flapping_contact_is_two_lines_in_five_seconds_and_each_loss_is_counte
     assert sum(int(line.split(", ")[1].split()[0]) if "times" in line else 1 for line in ends) == 40
 
 
-def test_what_waits_for_the_operator_is_said_again_while_it_lasts():
+def test_what_waits_for_the_operator_is_repeated_while_it_lasts():
     conditions, lines = Conditions(), []
     for second in range(200):
         conditions.update("fault_latched", JOINT, True, float(second), "position jump")

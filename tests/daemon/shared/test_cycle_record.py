@@ -70,7 +70,7 @@ def test_fields_by_name():
     assert (one.torque_rate_nm_s, one.contact_nm, two.contact_nm) == (14.5, 15.5, 4.5)
 
 
-def test_a_selection_of_fields_is_what_the_whole_record_says():
+def test_a_selection_of_fields_is_that_of_the_whole_record():
     record = sample()
     wanted = ("frame_count", "cycle", "late_ns")  # in any order: the record's own is kept
     picked = cr.selection(wanted, ("status", "age_ms"), 2).unpack_from(record)

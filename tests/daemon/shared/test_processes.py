@@ -52,7 +52,7 @@ def test_an_abstract_address(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("address", ["", "/no/such/socket", "vsock:2:1234"])
-def test_without_a_manager_nothing_is_said_and_nothing_raised(address: str) -> None:
+def test_without_a_manager_nothing_is_sent_and_nothing_raised(address: str) -> None:
     notifier = Notifier({"NOTIFY_SOCKET": address})
     assert not notifier.connected
     assert not notifier.send("READY=1")

@@ -25,7 +25,7 @@ def test_a_claimed_directory_is_private_and_refused_to_others_by_name(root):
     other, also_held = claim("vcan1")
     assert other != directory
     os.close(held)
-    assert claim("vcan0")[0] == directory, "whoever ends gives it free"
+    assert claim("vcan0")[0] == directory, "its end gives it free"
     os.close(also_held)
 
 
@@ -46,7 +46,7 @@ def test_a_refused_claim_leaves_the_holders_files(root):
     os.close(held)
 
 
-def test_a_directory_that_is_removed_while_another_process_opens_it_is_made_anew(root, monkeypatch):
+def test_a_directory_that_is_removed_while_another_process_opens_it_is_made_again(root, monkeypatch):
     """Lock of a file that has no name any more: two processes would each believe to be alone."""
     directory, held = claim("vcan0")
     real_open = os.open
@@ -99,7 +99,7 @@ def test_many_that_claim_and_remove_at_once_never_hold_it_together(root):
     assert len(done) >= 4
 
 
-def test_a_place_where_nothing_can_be_made_is_said(monkeypatch):
+def test_a_place_where_nothing_can_be_made_is_reported(monkeypatch):
     monkeypatch.setenv("RUNTIME_DIRECTORY", "/proc/nowhere")
     with pytest.raises(FileNotFoundError, match="/proc/nowhere"):
         claim("vcan0")

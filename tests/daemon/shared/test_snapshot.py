@@ -22,8 +22,8 @@ TWO = (-2.0, 0.2, -2.1, -2.2, -2.3, math.nan, 0x0F, 5, 1, 0x2403, 0x104, math.na
 
 def test_round_trip(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.848)
-    told = EstimateWriter(snapshot)
-    told.write(41, 17, 1_700_000_000_123_456_789, (ONE, TWO))
+    estimate = EstimateWriter(snapshot)
+    estimate.write(41, 17, 1_700_000_000_123_456_789, (ONE, TWO))
     for n in range(len(COUNTERS)):
         snapshot.counters[n] = n + 100
     snapshot.errors[0], snapshot.errors[1], snapshot.errors[2] = 8.0, 18.0, 2.0
@@ -53,8 +53,8 @@ def test_quantiles_are_upper_edges_of_their_bins(tmp_path: Path) -> None:
 
 def test_an_odd_sequence_is_not_taken_for_a_whole_reading(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    told = EstimateWriter(snapshot)
-    told.write(1, 1, 2, (ONE, TWO))
+    estimate = EstimateWriter(snapshot)
+    estimate.write(1, 1, 2, (ONE, TWO))
     assert snapshot.sequence[0] == 2
 
 
@@ -76,14 +76,14 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes) -> None:
         SnapshotReader(tmp_path / "none")
 
 
-def test_what_the_inputs_said_and_since_when_a_status_holds(tmp_path: Path) -> None:
+def test_inputs_and_since_when_a_status_holds(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    told = EstimateWriter(snapshot)
+    estimate = EstimateWriter(snapshot)
     assert SnapshotReader(tmp_path / "s").read().sync_monotonic_ns == 0
     measured = ((3.2, 100.0, -5.0, 1.0, 0.9, 31.0, "more", "of the sample"), (math.nan,) * 12)
-    told.write(8, 8, 1, (ONE, TWO), sync_monotonic_ns=123, measured=measured)  # type: ignore[arg-type]
-    told.write(16, 16, 2, (ONE, TWO), sync_monotonic_ns=456, measured=measured)  # type: ignore[arg-type]
-    told.write(24, 24, 3, (ONE, ONE), sync_monotonic_ns=789, measured=measured)  # type: ignore[arg-type]
+    estimate.write(8, 8, 1, (ONE, TWO), sync_monotonic_ns=123, measured=measured)  # type: ignore[arg-type]
+    estimate.write(16, 16, 2, (ONE, TWO), sync_monotonic_ns=456, measured=measured)  # type: ignore[arg-type]
+    estimate.write(24, 24, 3, (ONE, ONE), sync_monotonic_ns=789, measured=measured)  # type: ignore[arg-type]
     view = SnapshotReader(tmp_path / "s").read()
     assert view.sync_monotonic_ns == 789
     assert view.status_since == (8, 24)
@@ -129,17 +129,17 @@ def test_the_loop_tells_the_age_of_each_input_its_nodes_and_its_statuses(tmp_pat
 def test_a_reading_is_of_one_moment_while_the_loop_writes(tmp_path: Path) -> None:
     """Counters, inputs and estimate of the same cycle, however a writer in another thread interrupts the reader."""
     snapshot, bits = Snapshot(tmp_path / "s", 1e-3, 0.5), COUNTERS.index("bits_worst_case")
-    told = EstimateWriter(snapshot)
+    estimate = EstimateWriter(snapshot)
     reader, stop = SnapshotReader(tmp_path / "s"), threading.Event()
 
     def write() -> None:
         n = 0
         while not stop.is_set():
             n += 1
-            told.begin()
+            estimate.begin()
             snapshot.counters[bits] = n
             INPUT.pack_into(snapshot.inputs, 0, n, *(1,) * 11)
-            told.write(n, 1, n, (ONE, TWO), sync_monotonic_ns=n)
+            estimate.write(n, 1, n, (ONE, TWO), sync_monotonic_ns=n)
             time.sleep(1e-3)
 
     before = sys.getswitchinterval()
@@ -166,11 +166,11 @@ def test_a_reading_is_of_one_moment_while_the_loop_writes(tmp_path: Path) -> Non
 @pytest.mark.native
 def test_a_reader_waits_for_a_loop_that_was_preempted_in_its_write(tmp_path: Path) -> None:
     snapshot, bits = Snapshot(tmp_path / "s", 1e-3, 0.5), COUNTERS.index("bits_worst_case")
-    told = EstimateWriter(snapshot)
-    told.write(1, 1, 1, (ONE, TWO))
-    told.begin()
+    estimate = EstimateWriter(snapshot)
+    estimate.write(1, 1, 1, (ONE, TWO))
+    estimate.begin()
     snapshot.counters[bits] = 2
-    rest = threading.Timer(0.005, told.write, (2, 2, 2, (ONE, TWO)))
+    rest = threading.Timer(0.005, estimate.write, (2, 2, 2, (ONE, TWO)))
     rest.start()
     view = SnapshotReader(tmp_path / "s").read()
     rest.join()
@@ -179,7 +179,7 @@ def test_a_reader_waits_for_a_loop_that_was_preempted_in_its_write(tmp_path: Pat
 
 def test_what_a_loop_left_that_died_in_its_write_can_be_read(tmp_path: Path) -> None:
     snapshot = Snapshot(tmp_path / "s", 1e-3, 0.5)
-    told = EstimateWriter(snapshot)
-    told.write(7, 1, 1, (ONE, TWO))
-    told.begin()
+    estimate = EstimateWriter(snapshot)
+    estimate.write(7, 1, 1, (ONE, TWO))
+    estimate.begin()
     assert SnapshotReader(tmp_path / "s").read().cycle == 7

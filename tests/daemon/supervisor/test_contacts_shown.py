@@ -63,7 +63,7 @@ def test_jtq_status_shows_size_threshold_and_rate(
         assert wanted in shown
 
 
-def test_what_is_not_known_is_said_and_what_is_not_watched_takes_no_line(
+def test_unknown_is_shown_and_what_is_not_watched_takes_no_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, contact, expected in (("a", ContactSettings(), True), ("b", None, False)):
@@ -96,9 +96,7 @@ def test_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert [two[name] for name in names] == [None, None, 1.5, None]
 
 
-def test_a_loop_that_stands_still_says_nothing_of_contacts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_loop_that_stands_still_has_no_contacts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     still = daemon(tmp_path, monkeypatch, (QUIET, PUSHED), cycling=False)
     watch = Watch(still)
     watch.read()

@@ -53,7 +53,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
         return lambda: {"ok": True, "turns": 3} if next(count) >= 3 else None
 
     handlers: Handlers = {
-        "ping": lambda request: {"ok": True, "said": request},
+        "ping": lambda request: {"ok": True, "request": request},
         "later": later,
         "refuse": refuse,
         "long": lambda request: {"ok": True, "text": "x" * control.REPLY_BYTES},
@@ -73,7 +73,7 @@ def raw(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def test_an_order_and_its_reply(served: Served) -> None:
-    assert ask(served.path, {"verb": "ping"}, 5.0) == {"ok": True, "said": {"verb": "ping"}}
+    assert ask(served.path, {"verb": "ping"}, 5.0) == {"ok": True, "request": {"verb": "ping"}}
     assert ask(served.path, {"verb": "later"}, 5.0) == {"ok": True, "turns": 3}
     assert ask(served.path, {"verb": "refuse"}, 5.0) == {"ok": False, "error": "not today"}
     assert ask(served.path, {"verb": "long"}, 5.0) == {"ok": False, "error": "the reply is too long"}
@@ -173,13 +173,13 @@ def command(*arguments: str, directory: Path) -> subprocess.CompletedProcess[str
     )
 
 
-def test_the_command_says_where_there_is_no_daemon(tmp_path: Path) -> None:
+def test_the_command_reports_that_there_is_no_daemon(tmp_path: Path) -> None:
     done = command("ping", "--bus", "no-such-bus", directory=tmp_path)
     assert done.returncode == 1
     assert done.stderr.startswith("jtq control: ping: no jtqd runs on no-such-bus")
     assert done.stdout == ""
-    told = command("ping", "--bus", "no-such-bus", "--json", directory=tmp_path)
-    assert not json.loads(told.stdout)["ok"]
+    found = command("ping", "--bus", "no-such-bus", "--json", directory=tmp_path)
+    assert not json.loads(found.stdout)["ok"]
 
 
 def test_a_verb_that_is_none_is_a_matter_of_usage(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What is learned of the zeros is told: conditions, reasons, objects of the own node, metrics, /diagnostics, summary."""
+"""What is learned of the zeros is shown: conditions, reasons, objects of the own node, metrics, /diagnostics, summary."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ FAR = FOUND._replace(link_rad=2.31e-3, flags=FOUND.flags | status.BEYOND)
 def snapshot(tmp_path: Path) -> SnapshotReader:
     """One in which joint 1 has zeros and joint 2 none."""
     made = Snapshot(tmp_path / "snapshot", 1e-3, 0.8)
-    told = (*FOUND[:7], FOUND.flags, FOUND.jumps, 4, b"past")
-    made.learned[: LEARNED.size] = LEARNED.pack(*told)
+    values = (*FOUND[:7], FOUND.flags, FOUND.jumps, 4, b"past")
+    made.learned[: LEARNED.size] = LEARNED.pack(*values)
     EstimateWriter(made).write(8, 8, 1, (WELL, WELL))
     return SnapshotReader(tmp_path / "snapshot", supervisor=True)
 
@@ -47,7 +47,7 @@ def test_a_zero_beyond_its_limit_is_a_condition_with_its_numbers() -> None:
     assert "plausible again" in line
 
 
-def test_a_zero_that_jumps_is_told_until_it_is_known_again() -> None:
+def test_a_zero_that_jumps_is_reported_until_it_is_known_again() -> None:
     watch = Observer()
     assert watch.lines(view(8, zeros=(FOUND, NO_ZEROS)), 0.0) == []
     lost = FOUND._replace(flags=status.TRACKED, jumps=1)
@@ -60,7 +60,7 @@ def test_a_zero_that_jumps_is_told_until_it_is_known_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("flags", "said"),
+    ("flags", "reason"),
     [
         (status.BEYOND, r"zero is \+0.10 mrad, limit 2.00 mrad"),
         (status.LEFT, r"\+4 µrad of it are not yet taken off"),
@@ -68,9 +68,9 @@ def test_a_zero_that_jumps_is_told_until_it_is_known_again() -> None:
         (0, "network output is not finite"),
     ],
 )
-def test_the_reason_of_a_degraded_joint(flags: int, said: str) -> None:
+def test_the_reason_of_a_degraded_joint(flags: int, reason: str) -> None:
     seen = WELL._replace(status=DEGRADED)
-    assert re.search(said, degraded_reason(seen, 10.0, FOUND._replace(flags=FOUND.flags | flags)))
+    assert re.search(reason, degraded_reason(seen, 10.0, FOUND._replace(flags=FOUND.flags | flags)))
 
 
 def test_they_are_objects_of_the_own_node(snapshot: SnapshotReader) -> None:
