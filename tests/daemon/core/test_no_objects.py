@@ -19,7 +19,7 @@ from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.drivers.frame_socket import open_frame_socket
 from jtqd.estimator.status import PUBLISHED
 from jtqd.models.files import shipped
-from tests.benchmarks import host
+from tests.benchmarks import contender
 from tests.benchmarks.fixture import Fixture
 
 Count = Callable[[Callable[[], object]], int]
@@ -56,7 +56,7 @@ def allocations(tmp_path_factory: pytest.TempPathFactory) -> Count:
 @pytest.fixture
 def bus(tmp_path: Path) -> Iterator[str]:
     """Two drives and a sensor that answer each SYNC, in a process of their own."""
-    traffic = host.traffic(tmp_path, host.Cpus(None, None))
+    traffic = contender.traffic(tmp_path, contender.Cpus(None, None))
     yield f"unix:{tmp_path / 'bus'}"
     traffic.end()
 
