@@ -87,11 +87,45 @@ def start(tmp_path):
             daemon.process.communicate(timeout=30)
 
 
+@pytest.fixture
+def small_disk(tmp_path) -> Iterator[Path]:
+    """A file system of 12 MB."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    if os.geteuid():
+        pytest.skip("needs root to mount a file system")
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=12m", "none", str(place)], check=True)
+    yield place
+    subprocess.run(["umount", "-l", str(place)], check=True)
+
+
 def check_loop(summary) -> None:
     recording = summary["recording"]
     assert recording["written"] + recording["lost"] == recording["cycles"] == summary["cycles"]
     if EXACT:
         assert (summary["missed"], summary["stale_inputs"]) == (0, 0)
+
+
+@pytest.mark.socketcan
+@pytest.mark.campaign  # natively in test_recorder_crash and test_recorder_flight
+def test_full_disk(start, small_disk) -> None:
+    """Full for 2 s in the middle: two whole parts, what is between them is counted, the loop does not notice."""
+    daemon = start(9, small_disk / "logs", "reserve_mb: 4, chunk_s: 0.2")
+    wait_for_estimates(daemon.process, 2000)
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(8_500_000))
+    time.sleep(2)
+    filler.unlink()
+    status, summary, err = daemon.end()
+    check_loop(summary)
+    recording = summary["recording"]
+    assert status == 3
+    assert 1000 <= recording["lost"] <= 2000 + 1000
+    assert "recording pauses: " in err
+    assert "recording continues in part 2" in err
+    assert len(recording["paths"]) == 2
+    assert recording["left"] == []
+    assert len(set(cycles_of(*recording["paths"]))) == recording["written"]
 
 
 @pytest.mark.socketcan
@@ -156,3 +190,24 @@ def test_clock_is_set_back_and_forward_by_an_hour(start, tmp_path) -> None:
     steps = [round((b - a) / HOUR_NS) for a, b in pairwise(stamps) if abs(b - a) > 10**9]
     assert steps == [-1, 2, -1]
     # Nothing is said of the estimates: the emulated plant lives by the stamps of SYNC, and jumps with the clock.
+
+
+@pytest.mark.socketcan
+@pytest.mark.campaign  # natively in test_recorder_crash and test_recorder_flight
+def test_flight_recording_of_a_lost_drive(start, tmp_path) -> None:
+    """Flight recorder: the interface goes down for 2 s; what was before is in a file, and nothing else."""
+    daemon = start(14, tmp_path / "logs", "flight_recorder_s: 2")
+    wait_for_estimates(daemon.process, 3000)
+    assert not list((tmp_path / "logs").iterdir())
+    subprocess.run(["ip", "link", "set", INTERFACE, "down"], check=True)
+    time.sleep(2)
+    subprocess.run(["ip", "link", "set", INTERFACE, "up"], check=True)
+    _, summary, err = daemon.end()
+    recording = summary["recording"]
+    assert recording["written"] + recording["let_go"] == recording["cycles"] == summary["cycles"]
+    assert recording["flight_recordings"] == len(recording["paths"]) == 1
+    assert "flight recording: joint 1: STALE for more than 1 s" in err
+    found = cycles_of(*recording["paths"])
+    assert found == list(range(found[0], found[-1] + 1))
+    assert found[0] > 500
+    assert 5000 <= len(found) <= 2100 + 600 + 5600
