@@ -7,6 +7,7 @@ import sys
 
 import pytest
 
+from jtqd.drivers import boot as boot_process
 from jtqd.drivers.boot import RequestError, parse_request
 from jtqd.drivers.boot_node import BootError, BusSettings, NodeBoot, signature
 from jtqd.drivers.drive import DriveProfile, Temperature, drive_tpdo1, drive_tpdo2, drive_tpdo3
@@ -61,7 +62,8 @@ class Bench:
 
 
 @pytest.fixture
-def bench(tmp_path):
+def bench(tmp_path, monkeypatch):
+    monkeypatch.setattr(boot_process, "SYNC_LISTEN_S", 0.05)  # the nodes here send every 30 ms
     return Bench(tmp_path)
 
 
