@@ -78,21 +78,21 @@ class HeartbeatConsumer:
         if node not in self._active:
             return False
         self._active.discard(node)
-        late = {entry for entry in self._due_ns if self._store.number(_CONSUMER, entry) >> 16 & 0x7F == node}
-        for entry in late:
-            del self._due_ns[entry]
-        self._missing |= late
-        self._plan()
-        return bool(late)
+        watched = [
+            entry for entry in self._due_ns if self._store.number(_CONSUMER, entry) >> 16 & 0x7F == node
+        ]
+        return self._miss(watched)
 
     def lost(self, t_ns: int) -> bool:
         """Return True when a watched node has become missing since the last call."""
-        late = {entry for entry, due_ns in self._due_ns.items() if t_ns >= due_ns}
-        for entry in late:
+        return self._miss([entry for entry, due_ns in self._due_ns.items() if t_ns >= due_ns])
+
+    def _miss(self, entries: list[int]) -> bool:
+        for entry in entries:
             del self._due_ns[entry]  # watching starts again with its next heartbeat
-        self._missing |= late
+        self._missing.update(entries)
         self._plan()
-        return bool(late)
+        return bool(entries)
 
     def forget(self) -> None:
         """Start again after an NMT reset: no node was heard, none is missing."""

@@ -489,44 +489,43 @@ def test_sync_then_answers_in_order_of_priority():
     ]
 
 
-def test_a_frame_on_the_wire_is_not_pre_empted():
+@pytest.mark.parametrize(
+    ("steps", "sent"),
+    [
+        pytest.param(
+            [("low", HEARTBEAT, 0), 1, ("high", NMT, 1), ("low", ZEROS, 1)],
+            [("low", HEARTBEAT, 58), ("high", NMT, 111), ("low", ZEROS, 237)],
+            id="a frame on the wire is not pre-empted",
+        ),
+        pytest.param(
+            [("low", HEARTBEAT, 7 * US), 7 * US, ("high", NMT, 7 * US)],
+            [("high", NMT, 60), ("low", HEARTBEAT, 118)],
+            id="the same moment arbitrates even after advance to it",
+        ),
+        pytest.param(
+            # c was sent while BARE_SYNC was on the wire: it starts at its end, before b
+            [("a", BARE_SYNC, 0), 500 * US, ("b", HEARTBEAT, 100 * US), ("c", NMT, 20 * US)],
+            [("a", BARE_SYNC, 51), ("c", NMT, 104), ("b", HEARTBEAT, 162)],
+            id="a hub learns late of a send",
+        ),
+        pytest.param(
+            [("a", HEARTBEAT, 0), ("a", NMT, 0), ("b", ZEROS, 0)],
+            [("b", ZEROS, 126), ("a", HEARTBEAT, 184), ("a", NMT, 237)],
+            id="first in, first out within a sender even against its own priorities",
+        ),
+    ],
+)
+def test_order_on_the_wire(steps, sent):
+    """Steps: a submission (sender, frame, time), or a time to which the wire advances; sent: with the end in us."""
     wire = WireModel(1_000_000)
-    wire.submit("low", HEARTBEAT, 0)
-    wire.advance(1)
-    wire.submit("high", NMT, 1)
-    wire.submit("low", ZEROS, 1)
-    assert [(sender, end) for sender, _, end in wire.advance(10**9)] == [
-        ("low", 58 * US),
-        ("high", 111 * US),
-        ("low", 237 * US),
-    ]
-
-
-def test_same_moment_arbitrates_even_after_advance_to_it():
-    wire = WireModel(1_000_000)
-    wire.submit("low", HEARTBEAT, 7 * US)
-    wire.advance(7 * US)
-    wire.submit("high", NMT, 7 * US)
-    assert [sender for sender, _, _ in wire.advance(10**9)] == ["high", "low"]
-
-
-def test_gap_on_the_wire_and_late_news_of_a_submission():
-    """A hub learns late of a send: the frame still starts when it was sent if the wire was free."""
-    wire = WireModel(1_000_000)
-    wire.submit("a", BARE_SYNC, 0)
-    assert wire.advance(500 * US) == [("a", BARE_SYNC, 51 * US)]
-    wire.submit("b", HEARTBEAT, 100 * US)
-    assert wire.next_end() == 158 * US
-    wire.submit("c", NMT, 20 * US)  # while BARE_SYNC was on the wire: starts at its end, before b
-    assert wire.advance(500 * US) == [("c", NMT, 104 * US), ("b", HEARTBEAT, 162 * US)]
-
-
-def test_fifo_within_a_sender_even_against_its_own_priorities():
-    wire = WireModel(1_000_000)
-    wire.submit("a", HEARTBEAT, 0)
-    wire.submit("a", NMT, 0)
-    wire.submit("b", ZEROS, 0)
-    assert [frame for _, frame, _ in wire.advance(10**9)] == [ZEROS, HEARTBEAT, NMT]
+    ended = []
+    for step in steps:
+        if isinstance(step, int):
+            ended += wire.advance(step)
+        else:
+            wire.submit(*step)
+    ended += wire.advance(10**9)
+    assert ended == [(sender, frame, end * US) for sender, frame, end in sent]
 
 
 def test_queue_is_bounded():
