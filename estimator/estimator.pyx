@@ -206,7 +206,7 @@ cdef class JointEstimator(Estimator):
         fill_observer(&self.law.observer, joint, settings)
         self.law.losses = (<LossModel>losses).law
         fill_uncertainty(&self.law.uncertainty, joint, settings)
-        self.law.with_efficiency = settings.method != "tob"
+        self.law.with_efficiency = "efficiency" in METHODS[settings.method].sections
         self.law.inverse_gain = 1.0 / losses.torque_per_ampere
         self.law.limit = settings.torque_limit * joint.rated_torque_nm
         self.law.network_sigma = 0.0 if used is None else used.sigma_nm

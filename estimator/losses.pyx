@@ -25,6 +25,7 @@ from libc.math cimport NAN, exp, expm1, fabs, fmax, fmin, isnan, sqrt, tanh
 from typing import Final
 
 from jtqd.estimator.joint import MAX_NODES
+from jtqd.estimator.settings import METHODS
 
 if MAX_NODES > MOST_NODES:
     raise ImportError(f"{MAX_NODES} load nodes may be in a joint file, the compiled law has room for {MOST_NODES}")
@@ -257,7 +258,7 @@ cdef int fill_uncertainty(UncertaintyLaw *law, joint, settings) except -1:
     law.widened = 1.0 + settings.friction_uncertainty
     law.load = settings.load_uncertainty
     # without an efficiency the physics is the classical observer's whatever the method
-    law.with_efficiency = settings.method != "tob" and joint.efficiency is not None
+    law.with_efficiency = "efficiency" in METHODS[settings.method].sections and joint.efficiency is not None
     return 0
 
 

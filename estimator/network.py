@@ -539,8 +539,8 @@ def check_fit(joint: Joint, settings: EstimatorSettings, network: object, estima
     if joint.effects:
         names = ", ".join(effect.name for effect in joint.effects)
         raise error(f"found effects ({names}), which `make_estimator` applies, not this class")
-    if settings.method == "efficiency" and joint.efficiency is None:
-        raise error("found no efficiency, which method 'efficiency' needs; 'tob' does not need it")
+    if "efficiency" in method.sections and not method.network and joint.efficiency is None:
+        raise error(f"found no efficiency, which method '{settings.method}' needs; 'tob' does not need it")
     if "fused" in method.sections and joint.fused is None:
         raise error(
             f"found no section 'fused', which method '{settings.method}' needs; 'jtq fit losses' makes one, "

@@ -26,7 +26,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
-from jtqd.sysid.evaluate.inputs import TITLES, JointModels, Samples
+from jtqd.sysid.evaluate.inputs import OURS, TITLES, JointModels, Samples
 from jtqd.sysid.evaluate.report import indented_table
 from jtqd.sysid.evaluate.scores import (
     NOMINAL,
@@ -282,7 +282,7 @@ def _advice(card: Card) -> list[Advice]:
 
 
 def _method(card: Card) -> str:
-    if card.method in ("physics", "fused"):
+    if card.method in ("physics", OURS):
         return ""
     return (
         f"These files give no more than {TITLES[card.method]}, which does not know the losses of the gear by load: run "

@@ -133,8 +133,8 @@ def _hashes(value: Any) -> frozenset[str]:
 # Models ------------------------------------------------------------------------------------------------------------------
 
 _INPUTS: Final = ("current_a", "motor_position_rad", "motor_velocity_rad_s", "link_position_rad")
-_ABSENT: Final = {"efficiency": "has no efficiency", "fused": "has no section fused (jtq fit losses)"}
-"""Section of a joint file -> why a method that needs it is missing."""
+_MADE_BY: Final = {"fused": " (jtq fit losses)"}
+"""Section of a joint file -> the command that makes it."""
 
 
 @dataclass(frozen=True)
@@ -218,7 +218,7 @@ def _joint_models(path: Path, number: int) -> JointModels:
     for method, kind in METHODS.items():
         absent = [section for section in kind.sections if getattr(joint, section) is None]
         if absent:
-            missing[method] = f"{path.name} {_ABSENT[absent[0]]}"
+            missing[method] = f"{path.name} has no section {absent[0]}{_MADE_BY.get(absent[0], '')}"
             if method == OURS:
                 missing["physics"] = missing[method]
         if not kind.network:

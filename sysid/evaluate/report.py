@@ -143,6 +143,7 @@ def _group(group: list[PlateauScore], methods: Iterable[str]) -> dict[str, Any]:
 # Text --------------------------------------------------------------------------------------------------------------------
 
 _SHORT: Final = {
+    **TITLES,
     "tob": "TOB",
     "efficiency": "efficiency",
     PAPERS: "paper's",
@@ -369,6 +370,7 @@ class Style(NamedTuple):
 
 
 STYLES: Final = {
+    **dict.fromkeys(TITLES, Style(LIGHT["soft"], "-", "x")),
     "tob": Style(LIGHT["series_1"], "--", "v"),
     "efficiency": Style(LIGHT["series_2"], ":", "s"),
     PAPERS: Style(LIGHT["series_3"], "-.", "D"),

@@ -6,6 +6,8 @@ import html.parser
 import json
 import re
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -274,3 +276,22 @@ def test_the_only_run_that_cannot_be_read_is_an_error_with_its_reason(
     error = capsys.readouterr().err
     assert error.startswith(f"jtq evaluate: {tmp_path}/bad.csv: found byte 0 that is not UTF-8")
     assert error.count("\n") == 1
+
+
+_TWIN = """
+import sys
+from jtqd.estimator import settings
+settings.METHODS["twin"] = settings.Method("twin of the classical TOB", "JointEstimator")
+from jtqd.sysid.evaluate.command import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_new_entry_of_the_methods_is_evaluated_and_drawn(bench: Path, tmp_path: Path) -> None:
+    out = tmp_path / "report"
+    words = [str(bench / "runs"), "--models", str(bench / "models"), "--out", str(out)]
+    subprocess.run([sys.executable, "-c", _TWIN, *words], check=True, stdout=subprocess.DEVNULL)
+    for run in report(out)["runs"]:
+        for joint in run["joints"].values():
+            assert joint["errors"]["twin"] == joint["errors"]["tob"]
+    assert "twin of the classical TOB" in (out / "evaluation.html").read_text()
