@@ -27,12 +27,11 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
 from jtqd.models.files import load_joint, shipped
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.command import diagnosed
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Trace, to_mapping
 from jtqd.sysid.diagnosis.regressors import bin_samples, binned, run_data
-from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.report import page as parts
 from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap

@@ -8,12 +8,12 @@ from functools import cached_property
 from typing import Final
 
 from jtqd.sysid.diagnosis.case import Case, Fit
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.evidence import class_beside, equivalence_class
 from jtqd.sysid.diagnosis.findings import joint_text
 from jtqd.sysid.diagnosis.guards import nothing_of, objections
 from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
+from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.stability import stability
 from jtqd.sysid.diagnosis.unexplained import Unexplained
 

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import RELEVANT
@@ -18,6 +17,7 @@ from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums
 from jtqd.sysid.diagnosis.refine import Refined, contributions, present_effects, refine, set_torsions
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, column_moments
 from jtqd.sysid.diagnosis.search import Hypothesis, Search
+from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.unexplained import (
     Unexplained,
     events_left,

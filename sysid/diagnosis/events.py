@@ -14,9 +14,9 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.noise import past_valid, whiten
 from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.signals import Channel
 
 BLOCK_S: Final = 1.0
 _BURST_S: Final = 0.05

@@ -21,12 +21,12 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.sysid.diagnosis.angle_events import predicted_by_passes, turn_range
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.regressors import Index, RunData
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
     AxisMap,

@@ -18,13 +18,13 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import WITHIN
 from jtqd.sysid.diagnosis.findings import Cause, JointName, joint_text
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, explained
 from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.search import DEEPEST, Hypothesis, Search, friction_pairs
+from jtqd.sysid.diagnosis.signals import Channel
 
 FALL: Final = 0.05
 """Part of the squared error of every held-out run that an effect must take away."""

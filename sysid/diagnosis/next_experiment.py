@@ -1,12 +1,17 @@
-"""The next experiment, in words and as a motion: for two joints on a towing bench a plan that `jtq campaign` drives, for one
-joint a table of positions. `experiment_choice` gives the kinds, `planner.experiments` the motions.
+"""The next experiment, in words and as a motion.
+
+For two joints on a towing bench it is a plan that `jtq campaign` drives, for one joint a table of positions.
+`Effect.experiment` shows an effect; `Effect.confused_with` names what separates it from one that looks alike. At most
+MOST_KINDS are planned, those that serve most pairs first. `planner.experiments` has the motions.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
@@ -15,7 +20,6 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.experiment_choice import kinds_for
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import smooth
 from jtqd.sysid.planner.campaigns import allowed_torque, missing_limits
@@ -29,6 +33,41 @@ from jtqd.sysid.planner.experiments import (
     pair_runs,
 )
 from jtqd.sysid.planner.plan import Plan, check_plan, travel_rad
+
+MOST_KINDS: Final = 3
+_DEFAULT: Final = "excitation"
+
+PAIRS: Final = {
+    frozenset((name, other)): kind
+    for name, effect in EFFECTS.items()
+    for other, kind in effect.confused_with.items()
+}
+"""Two names -> the kind that separates them."""
+
+
+def kind_of(name: str) -> str:
+    """Return the kind of experiment that shows an effect (a name that the library does not have: the general one)."""
+    return EFFECTS[name].experiment if name in EFFECTS else _DEFAULT
+
+
+def kinds_for(classes: Iterable[Sequence[str]]) -> tuple[str, ...]:
+    """Return the kinds that separate the members of every class, and show the effect of a class of one; at most MOST_KINDS.
+
+    Kinds that serve more pairs come first; no class at all: the general excitation and its repetition, which give the
+    noise floor.
+    """
+    votes: Counter[str] = Counter()
+    for names in classes:
+        if len(names) == 1:
+            votes[kind_of(names[0])] += 1
+        for a, b in combinations(dict.fromkeys(names), 2):
+            separating = PAIRS.get(frozenset((a, b)))
+            votes.update({separating} if separating else {kind_of(a), kind_of(b)})
+    if not votes:
+        return (_DEFAULT, "repeat")
+    order = list(EXPERIMENTS)
+    return tuple(sorted(votes, key=lambda kind: (-votes[kind], order.index(kind)))[:MOST_KINDS])
+
 
 PLAN_FILE: Final = "next_experiment.plan.yaml"
 MOTION_FILE: Final = "next_experiment.motion.csv"

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.regressors import ChannelData, Index, RunData
+from jtqd.sysid.diagnosis.signals import Channel
 
 ORDER: Final = 24
 _RIDGE: Final = 1e-9

@@ -30,14 +30,13 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
 from jtqd.sysid.diagnosis.mixed_model import explained, explained_each, solve
 from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
 from jtqd.sysid.diagnosis.search import ENTER, within
-from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
 FEWEST: Final = 3
 """Recordings among which one can be odd."""

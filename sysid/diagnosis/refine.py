@@ -18,7 +18,6 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, Parameter
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.current_zero import UnpoweredColumn, unpowered, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
@@ -26,7 +25,7 @@ from jtqd.sysid.diagnosis.mixed_model import Mixed, Model
 from jtqd.sysid.diagnosis.noise import Noise, run_sums
 from jtqd.sysid.diagnosis.regressors import ChannelData, RunData, binned, contribution
 from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
 _STEPS: Final = 6
 _MOST_STEPS: Final = 24

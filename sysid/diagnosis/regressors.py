@@ -16,9 +16,8 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, ArrayFunctions, Effect, Term, Values
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
-from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, JointSignals
+from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, Channel, JointSignals, Line
 from jtqd.sysid.diagnosis.smoothing import second_difference
 
 BIN_S: Final = 0.005

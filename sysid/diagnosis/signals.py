@@ -1,6 +1,6 @@
 """What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks.
 
-The residuals are those of `jtqd.estimator.effects.effect`: what the simulation with the joint file leaves over. Derivatives
+The residuals are those of `jtqd.estimator.effects.effect`: measured less simulated with the joint file. Derivatives
 are central differences of positions (`smoothing`). All arrays are later averaged over equal bins, residual and regressors
 alike, so that noise of differences averages out and nothing is compared with something filtered in another way.
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -35,6 +35,27 @@ from jtqd.sysid.diagnosis.smoothing import (
     slow,
 )
 from jtqd.sysid.runs.bad_samples import Held
+
+
+class Channel(NamedTuple):
+    """One balance ("motor" or "torsion") of one joint."""
+
+    joint: int
+    balance: str
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line in a residual: at `order` per motor revolution, or at `order` Hz by the unit; ratio: its power
+    against the median of the neighbourhood.
+    """
+
+    channel: Channel
+    order: float
+    amplitude_nm: float
+    ratio: float
+    unit: str = "1/rev"
+
 
 _ALL_VISIBLE: Final = Smoother(1.0)
 

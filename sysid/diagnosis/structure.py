@@ -16,9 +16,9 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.events import BLOCK_S
 from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.signals import Channel, Line
 
 FLIPS: Final = 9999
 SIGNIFICANT: Final = 2e-4

@@ -11,7 +11,6 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import (
     BLOCK_S,
@@ -26,6 +25,7 @@ from jtqd.sysid.diagnosis.events import (
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.regressors import LINE, ChannelData, RunData
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
     AxisMap,

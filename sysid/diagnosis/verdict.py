@@ -16,7 +16,6 @@ from jtqd.sysid.diagnosis.case import Case, Fit
 from jtqd.sysid.diagnosis.causes import causes_of, separated_at_rest
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.evidence import candidate_table
-from jtqd.sysid.diagnosis.experiment_choice import MOST_KINDS
 from jtqd.sysid.diagnosis.fewer_runs import Names, with_fewer
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
@@ -35,7 +34,7 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
-from jtqd.sysid.diagnosis.next_experiment import next_experiment
+from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
 from jtqd.sysid.diagnosis.search import Hypothesis
 from jtqd.sysid.diagnosis.unexplained import Unexplained
 

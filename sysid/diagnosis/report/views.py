@@ -9,8 +9,7 @@ from typing import Final
 
 from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.file_values import file_values
-from jtqd.sysid.diagnosis.findings import CandidateEvidence, Cause, Findings, Gain, Gap, Place
+from jtqd.sysid.diagnosis.findings import CandidateEvidence, Cause, Findings, Gain, Gap, Place, file_values
 from jtqd.sysid.diagnosis.report.words import (
     AXES,
     balance_title,

@@ -11,12 +11,12 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import Sums
 from jtqd.sysid.diagnosis.regressors import ChannelData, EffectCandidate, RunData
 from jtqd.sysid.diagnosis.search import Search
+from jtqd.sysid.diagnosis.signals import Channel
 
 MOTOR1, TORSION1 = Channel(1, "motor"), Channel(1, "torsion")
 

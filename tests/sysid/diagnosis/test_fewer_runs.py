@@ -13,7 +13,6 @@ import pytest
 from jtqd.sysid.diagnosis import acceptance, fewer_runs
 from jtqd.sysid.diagnosis.acceptance import UNSTEADY, Found
 from jtqd.sysid.diagnosis.case import Case, Fit
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.fewer_runs import Compared, Gone, _confirmed, with_fewer
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
@@ -21,6 +20,7 @@ from jtqd.sysid.diagnosis.mixed_model import Mixed
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.stability import Stability
 from jtqd.sysid.diagnosis.unexplained import Unexplained
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, Dense, search_of

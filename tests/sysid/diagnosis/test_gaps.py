@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.events import EventLimits
 from jtqd.sysid.diagnosis.gaps import Location, explained_by_bins, locate
 from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import AxisMap, axis_maps
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 

@@ -12,9 +12,9 @@ import pytest
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import dataset as datasets
 from jtqd.sysid.diagnosis.acceptance import Found
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import unknown_lines, usable_signals
 from jtqd.sysid.diagnosis.regressors import families, run_data
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.unexplained import held_energies_nm2, held_nm
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, rigid_run

@@ -18,8 +18,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import load_plant
-from jtqd.sysid.diagnosis.experiment_choice import MOST_KINDS, PAIRS, kind_of, kinds_for
-from jtqd.sysid.diagnosis.next_experiment import next_experiment
+from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, PAIRS, kind_of, kinds_for, next_experiment
 from jtqd.sysid.planner.experiments import EXPERIMENTS, pair_range_of, pair_runs
 from jtqd.sysid.planner.plan import Plan, Plateau, Run, check_plan, expand
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.channel import Channel
 from jtqd.sysid.diagnosis.noise import (
     ORDER,
     Noise,
@@ -19,6 +18,7 @@ from jtqd.sysid.diagnosis.noise import (
     whitened_rows,
 )
 from jtqd.sysid.diagnosis.regressors import ChannelData, RunData
+from jtqd.sysid.diagnosis.signals import Channel
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 MOTOR2 = Channel(2, "motor")

@@ -11,7 +11,6 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.base_loss import BaseLoss
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.regressors import (
     BIN_S,
@@ -25,7 +24,7 @@ from jtqd.sysid.diagnosis.regressors import (
     gain_columns,
     run_data,
 )
-from jtqd.sysid.diagnosis.signals import JointSignals, joint_signals, with_one_sensor
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line, joint_signals, with_one_sensor
 from jtqd.sysid.diagnosis.smoothing import second_difference
 from tests.estimator.effects.effect_signals import PLAIN, balances, state
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, candidates, rigid_run

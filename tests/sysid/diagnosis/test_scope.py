@@ -9,8 +9,7 @@ from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.file_values import file_values
-from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED
+from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED, file_values
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
 from jtqd.sysid.runs.options import UsageError
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run

@@ -11,9 +11,9 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis import structure
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.events import Burst, EventLimits, bursts, wandering
 from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
     AxisMap,

@@ -18,7 +18,6 @@ from jtqd.sysid.diagnosis import diagnose as module
 from jtqd.sysid.diagnosis.acceptance import Found
 from jtqd.sysid.diagnosis.case import Case as Judged
 from jtqd.sysid.diagnosis.case import Fit
-from jtqd.sysid.diagnosis.channel import Channel, Line
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CAUSE, INSUFFICIENT, NO_GAP, UNEXPLAINED, Findings
@@ -26,6 +25,7 @@ from jtqd.sysid.diagnosis.leave_one_out import LeaveOneOut
 from jtqd.sysid.diagnosis.noise import Noise
 from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.search import Hypothesis
+from jtqd.sysid.diagnosis.signals import Channel, Line
 from jtqd.sysid.diagnosis.unexplained import Unexplained
 from jtqd.sysid.diagnosis.verdict import _remaining
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, search_of
