@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -51,17 +52,10 @@ def file_values(
         if listed is not None and name in listed:
             found[name] = FileValue(float(listed[name]), f"effects: {effect_name}.{name}")
         elif key:
-            found[name] = FileValue(_value(joint, key), key)
+            found[name] = FileValue(float(attrgetter(key)(joint)), key)
         else:
             found[name] = FileValue(parameter.neutral if parameter else 0.0, "")
     return found
-
-
-def _value(joint: Joint, key: str) -> float:
-    value: Any = joint
-    for part in key.split("."):
-        value = getattr(value, part)
-    return float(value)
 
 
 SCHEMA: Final = "jtq.findings/1"
