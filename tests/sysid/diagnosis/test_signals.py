@@ -208,15 +208,13 @@ def test_the_law_is_the_emulated_plants_of_the_same_file() -> None:
     table = LossTable(
         LossModel(JOINT).loss, JOINT.gear_ratio, JOINT.torque_constant_nm_per_a, side.drive.current_limit_a
     )
-    d = side.deviations
-    friction = JointFriction(
-        table, stribeck_nm=d.stribeck_nm, stribeck_velocity_rad_s=d.stribeck_velocity_rad_s
-    )
+    peak = side.deviations.stribeck
+    friction = JointFriction(table, stribeck_nm=peak.torque_nm, stribeck_velocity_rad_s=peak.velocity_rad_s)
     rng = np.random.default_rng(1)
     torque, velocity = rng.uniform(-30.0, 30.0, 200), rng.uniform(-3.0, 3.0, 200)
     velocity[:50] *= 0.03
     expected = [friction(t, v) for t, v in zip(torque, velocity, strict=True)]
-    assert d.stribeck_nm == JOINT.friction.stribeck_nm
+    assert peak.torque_nm == JOINT.friction.stribeck_nm
     assert np.abs(BASE.loss(torque, velocity)) == pytest.approx(expected, abs=1e-6)
 
 
