@@ -5,17 +5,16 @@ the same PDO can still be under way:
 
 * frames arrive in order: one before the echo of the cycle's own SYNC belongs to an earlier cycle: late, dropped, counted;
   without that echo, or with the echo of an earlier SYNC (it waited in the transmit queue), nothing is used;
-* after a cycle without its frame the PDO has a *debt*: the missing frame was lost, or it is late and will be met in a later
-  cycle, looking just like that cycle's own. While there is a debt nothing is believed. It is paid by a surplus
-  frame (two in one cycle), or written off in one of two ways:
-  - the arrivals have been so regular that their delay tells: one frame came, in the usual band, and no other until the
-    next SYNC: the missing one was lost;
-  - otherwise the loop is asked for a *gap*: slots without SYNC, in which only late frames can come, until one passes
-    without any. What has not come by then was lost.
-* a surplus frame with other bytes, when no debt was left, shows that an account was closed too early; after that, and after
-  each gap, a PDO is used again only when some cycles in a row have brought exactly one frame each.
-  A constant delay of more than one cycle thus never becomes valid, however irregular the arrivals are. This relies on the
-  frames of one PDO keeping their order, as they do in a CAN controller;
+* after a cycle without its frame the PDO has a *debt* of one: the missing frame was lost, or it is late and will arrive in a
+  later cycle, where it looks like that cycle's own. While there is a debt no frame of the PDO is used. A frame after the
+  deadline, or a second one in a cycle, pays one frame of it. Else the missing frames count as lost in one of two cases:
+  - the delays of the PDO have stayed within a narrow band, one frame came within it, and no other until the next SYNC;
+  - the delays vary more, so the loop leaves a *gap*: slots without SYNC, in which only late frames can come, until one
+    passes without any;
+* a second frame with other bytes while there is no debt shows that a late frame was taken for a lost one. After such a
+  frame, and after each gap, the PDO is in *quarantine*: it is used again after QUARANTINE cycles with one frame each. So a
+  constant delay of more than one cycle never becomes valid, however irregular the arrivals are. This relies on the frames of
+  one PDO keeping their order, as they do in a CAN controller;
 * two frames in one cycle are harmless with equal bytes and a conflict with others (one is late, or there are two senders):
   then the input is not used in that cycle;
 * a wrong length, a 29-bit identifier or a remote frame under one of our identifiers is rejected and counted;
@@ -49,7 +48,7 @@ from jtqd.drivers.pdo import SYNC_COB_ID
 
 cdef int64_t LONGEST = 10  # slots of a gap; after that SYNC goes on and the debts stay
 cdef int64_t PAUSE = 20  # cycles between two gaps: a bus that loses frames all the time must not lose its SYNC as well
-cdef int64_t QUARANTINE = 5  # cycles with exactly one frame each before a PDO is used again whose account was closed without its frame
+cdef int64_t QUARANTINE = 5  # cycles with one frame each before a PDO is used again after a gap, or after a second frame with other bytes
 cdef int64_t BAND_MARGIN_NS = 50_000  # around the learned delays: one frame of 135 bits may have been in the way less than twice
 cdef int64_t NARROW_NS = 200_000  # a band wider than this cannot tell a late frame from one in time
 cdef double BAND_LEAK = 1.0 / 1024.0  # the band shrinks towards the present delays with a time constant of about 1 s at 1 kHz

@@ -1,9 +1,10 @@
 """Events locked to the angle of the link: a range of angle that costs torque per pass (a rubbing cover, a pulling cable).
 
-Where the runs begin at different angles, often one of them only gets there, a few times; then no other run can confirm a
-map over the angle. What confirms it are the other passes: every one deviates, and the rest of the time nothing does. The
-chance of that, if the moments had nothing to do with the angle, is hypergeometric (Fisher's exact test): the time of the
-runs that get there in pieces as long as a pass, of which those of the range are the ones that deviate.
+Where the runs begin at different angles, often only one of them reaches the range, a few times; then no other run can
+confirm a map over the angle. The passes of that run confirm each other instead: every one deviates, and the rest of the
+time nothing does. The chance of this for moments that have nothing to do with the angle is hypergeometric (Fisher's exact
+test): the time of the runs that reach the range is cut into pieces as long as a pass, and the pieces that deviate are
+those of the range.
 """
 
 from __future__ import annotations

@@ -1,16 +1,15 @@
 """One-sided bounds: the upper limit of a value that cannot be negative while its best fit is zero or below. It is no cause.
 
-A friction or inertia that is far smaller than in the joint file is near the end of what is possible, and noise puts its
-best value beyond it as often as not. Such a value is never named (`guards`): the fit wants more than there can be. What
-is certain all the same is that it is smaller than in the file, and by how much at least. It is reported where the best value
-lies below zero by less than its interval, and the value of the other runs, held at zero or above, takes away
-`LARGE_FALL` of the squared error of every run left out. Source of values with such a limit: the restricted least squares
-of Judge and Takayama 1966, J. Am. Stat. Assoc. 61.
+A friction or inertia that is far smaller than in the joint file is near zero, and noise often puts its best fit below. A
+value below zero is never named (`guards`). Still it is certain that the value is smaller than in the file, and by how
+much at least. This is reported where the best fit lies below zero by less than its interval, and the value fitted to the
+other runs, held at zero or above, takes away `LARGE_FALL` of the squared error of every run left out. Source: restricted
+least squares, Judge and Takayama 1966, J. Am. Stat. Assoc. 61.
 
 An effect that a guard has refused at its limit is looked at again: the guard refuses a cause, this reports the bound.
 
-What is proven is the value at its limit, and nothing else changed. So the extended joint file takes a friction there if it
-is the only bound of a joint of which nothing is named (`in_the_file`).
+The proof holds for this value at its limit with nothing else changed. So the extended joint file sets a friction to its
+limit only if it is the only bound of a joint of which nothing is named (`in_the_file`).
 """
 
 from __future__ import annotations

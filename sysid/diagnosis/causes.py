@@ -68,7 +68,7 @@ def _names(candidate: EffectCandidate, rivals: Sequence[EffectCandidate]) -> tup
 
 def values_of(fit: Fit, k: int) -> dict[str, Value]:
     """Return the parameters of an effect with their 95 % intervals: Student's t by how much of the uncertainty is the runs'
-    own changes, no narrower than `inaccurate`, and with few runs than what the runs say one without the other.
+    own changes. They are no narrower than `inaccurate`, with few runs no narrower than what leaving out a run changes.
     """
     candidate, refined = fit.chosen[k], fit.refined
     present, runs = refined.present[k], refined.mixed.runs

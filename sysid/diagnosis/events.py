@@ -1,8 +1,8 @@
 """Events: moments at which a channel leaves its noise, and seconds whose mean deviates without a visible cause.
 
-Events are no effect of the library, and a least-squares fit gives them more weight than anything else. So they are found
-first in what the causes leave; where there are some, the search is made again without them (`Dataset.without_events`).
-Everything in Nm^2 unless a name has another unit.
+Events are no effect of the library, and a least-squares fit gives them more weight than anything else. So they are looked
+for in the residual of the causes first; where there are some, the search is made again without them
+(`Dataset.without_events`). Everything in Nm^2 unless a name has another unit.
 """
 
 from __future__ import annotations

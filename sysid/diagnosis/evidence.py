@@ -1,9 +1,9 @@
 """Evidence of every effect of the library: alone against the baseline, smallest size detectable, equivalence classes.
 
-An effect of coefficients b lowers the deviance by about b' I b, I being the information of its columns that the causes
-found and the changes from run to run leave. It is detected when that exceeds its cost in BIC plus ENTER: the minimum
-detectable effect. Where the runs' own changes are what limits it, their variance is itself estimated from few runs, and
-the same evidence needs a larger ratio: t^2 = n (exp(d/n) - 1) instead of d.
+An effect of coefficients b lowers the deviance by about d = b' I b. I is the information of its columns, less what the
+causes found and the changes from run to run take of it. The effect is detected when d exceeds its cost in BIC plus ENTER;
+this gives the minimum detectable size. Where the runs' own changes limit it, their variance is itself estimated from few
+runs, and the same evidence needs a larger ratio: t^2 = n (exp(d/n) - 1) instead of d.
 """
 
 from __future__ import annotations
@@ -121,8 +121,9 @@ def minimum_size(
 
 
 def steady_size(search: Search, best: Hypothesis, candidate: EffectCandidate) -> float:
-    """Return the leading coefficient from which a candidate would be steady over the runs (`stability`) beside the best
-    set: what it takes of the things unexplained changes by that much. For waves the worse phase; infinite for one run.
+    """Return the smallest leading coefficient of a candidate that would be stable over the runs (`stability`), fitted beside
+    the best set: the jackknife's standard error times the factor that is needed. For waves the worse phase; infinite for one
+    run.
     """
     runs = search.mixed.runs
     if runs < 2:
@@ -182,10 +183,9 @@ def equivalence_class(
 def class_beside(search: Search, best: Hypothesis, cause: EffectCandidate) -> tuple[EffectCandidate, ...]:
     """Return the candidates that could stand in the place of `cause` where a relevant residual is unexplained, best first.
 
-    The unexplained residual is no noise, so that no likelihood measures by how much one effect fits better than another.
-    An alternative
-    is ruled out when it is worse on the held-out runs by more than that differs from run to run (test of Vuong 1989,
-    Econometrica 57, for models of which none is right).
+    The unexplained residual is no noise, so no likelihood measures by how much one effect fits better than another. An
+    alternative is ruled out when it is worse on the held-out runs, by more than that difference varies from run to run (test
+    of Vuong 1989, Econometrica 57, for models of which none is right).
     """
     found = {c.key: c for c in equivalence_class(search, best, cause)}
     others = [c for c in best.chosen if c is not cause]

@@ -1,10 +1,10 @@
 """Causes that a subset of the runs supports and the full set does not: each is reported with its reason.
 
-Every recording is left out in turn and the others are searched again, by the same rules. An effect that they name and all
-runs together do not is kept where it predicts the held-out runs clearly better, each with the coefficients of the others
-(`FALL` of the squared error of all, and no run clearly worse); else a line reports that it went, and what the held-out runs
-say of it. An effect that comes and goes with single runs is unstable in the sense of Meinshausen and Buehlmann 2010,
-J. R. Stat. Soc. B 72.
+Every recording is left out in turn and the others are searched again, by the same rules. Some effects are named by such a
+subset and not by all runs together. Such an effect is kept where it predicts the held-out runs clearly better, each with
+the coefficients of the others (`FALL` of the squared error of all, and no run clearly worse). Else a line reports that it
+went, and its error on the held-out runs. An effect that comes and goes with single runs is unstable in the sense of
+Meinshausen and Buehlmann 2010, J. R. Stat. Soc. B 72.
 """
 
 from __future__ import annotations
@@ -173,8 +173,8 @@ def _same_candidates(search: Search, chosen: Sequence[EffectCandidate]) -> list[
 def _confirmed(
     found: Found, compared: Compared, tried: Sequence[tuple[Key | None, Hypothesis]]
 ) -> tuple[Hypothesis, dict[Key, str]]:
-    """Return the set that predicts the held-out runs best, what is named included, and what speaks against an effect (by its
-    key) that would have been better. in the presence of an unexplained residual all have to be as certain as any cause.
+    """Return the set that predicts the held-out runs best (the named one competes too) and, by key, the objection to an
+    effect that would have been better. In the presence of an unexplained residual all must be as certain as any cause.
     """
     kept, why = compared.named, {}
     for key, other in tried:

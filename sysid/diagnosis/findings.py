@@ -362,7 +362,7 @@ def to_mapping(
 
     The keys of the schema are always there, whatever the verdict: a program that reads `gap.rmse_nm` need not ask first.
     What has no value is null; NaN and infinity, which JSON does not have, are null as well (an unlimited interval, an
-    effect that no size would make visible). Keys beside those of the schema say more and may be ignored.
+    effect that no size would make visible). Further keys may be ignored.
 
     sha256: hash of each run's file by the run's name; files: names of what was written beside findings.json.
     """

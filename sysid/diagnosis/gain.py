@@ -218,8 +218,8 @@ def free_run(
 
         (G^2 Jm + Jl) dv/dt = G Kt I - TAU_S - load_nm - loss0 - loss_nm          v = omega_m/G
 
-    with I = i - current_a and TAU_S = tau_s - sensor_nm: the measured inputs less what the effects of the joint say about
-    them. Each window begins in the measured state and is then left alone, all of them stepped at once. The error of the
+    with I = i - current_a and TAU_S = tau_s - sensor_nm: the measured inputs less the errors that the effects of the joint
+    give them. Each window begins in the measured state and is then left alone, all of them stepped at once. The error of the
     velocity counts every newton metre that the model has wrong over the whole window, where a residual of the torque balance
     sees one sample at a time. The spring is on the other side of the measured torque, so twist_rad and link_rad have no
     part in this. Friction is implicit: its impulse within a step can stop the motor and not turn it round, so a joint
@@ -265,7 +265,7 @@ def _position_error(signals: JointSignals, joint: Joint, simulated: FloatArray, 
 
 
 def _inputs(signals: JointSignals, joint: Joint, terms: Sequence[Term]) -> tuple[FloatArray, FloatArray]:
-    """Return (G Kt I - TAU_S, TAU_S) [n, Nm]: what was measured less what the effects say about the measuring."""
+    """Return (G Kt I - TAU_S, TAU_S) [n, Nm]: what was measured less the effects' errors of measurement."""
     state = signals.state
     current, sensor = state.current_a, signals.sensor_nm
     whole = ArrayFunctions()

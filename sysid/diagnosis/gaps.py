@@ -1,14 +1,13 @@
 """How large the gap is in each balance, against the noise floor of the data, and where it lies.
 
-Where: which condition explains most of the unexplained residual, and which the rest. An axis (velocity, load, an angle, ...)
-explains a residual when the mean of a bin over the *other* runs predicts it in this run: the square error that goes
-away, summed over the leave-one-run-out (`explained_by_bins`). Noise of another run is independent however coloured
-it is, so bins that only follow the noise explain nothing or less, and more bins are no advantage; nor is a condition that
-merely goes with the run (temperature, time), because other runs do not confirm it. Events and seconds with a deviating mean
-explain only what the best axis does not predict: a bump that makes a step on every pass is the angle's, not the moments'.
-A range of the link's turn that one run alone gets to is confirmed by the passes of it (`passes`).
-The condition that explains most is the first location; what it explains is taken out, and the search is made again
-(`locate`). Energies in Nm^2.
+A condition, or axis (velocity, load, an angle, ...), explains a residual when the mean of a bin over the *other* runs
+predicts it in this run. Measured is the squared error that this takes away, summed over all runs left out
+(`explained_by_bins`). Noise of two runs is independent, however coloured, so bins that only follow the noise explain
+nothing, and more bins are no advantage. A condition that only differs from run to run (temperature, time) has no
+advantage either, because other runs do not confirm it. Events and seconds with a deviating mean explain only what the
+best axis does not predict: a bump that makes a step on every pass belongs to the angle. A range of the link's turn that
+only one run reaches is confirmed by its passes (`passes`). The condition that explains most is the first location; what
+it explains is taken out, and the search is made again (`locate`). Energies in Nm^2.
 """
 
 from __future__ import annotations

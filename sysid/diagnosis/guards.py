@@ -1,9 +1,9 @@
 """Guards: criteria by which an effect that improves the fit is not accepted as a cause.
 
-The search asks whether an effect lowers the deviance of the whitened residual. That is not all: a parameter may lie at the
-end of what is physically possible (where the fit wants more than there can be), two effects may be large and cancel each
-other, an effect may raise the plain error of the torque on runs that it was not fitted to, or its size may change from run
-to run by as much as it is itself. Each guard names what it found, one line; none means that nothing speaks against it.
+The search asks whether an effect lowers the deviance of the whitened residual. An effect that does may still be wrong: a
+parameter may lie at the end of what is physically possible, the effect may raise the plain error of the torque on runs that
+it was not fitted to, or two large effects may cancel each other. Each guard gives one line with what it found. Whether the
+size of an effect is the same in all runs is asked in `stability`.
 """
 
 from __future__ import annotations
@@ -47,10 +47,16 @@ def nothing_of(best: Hypothesis) -> list[dict[str, float]]:
 def objections(
     dataset: Dataset, best: Hypothesis, refined: Refined, *, bounds_only: bool = False
 ) -> list[tuple[int, str]]:
-    """Return causes (by place) that are none, and why: all at a bound; else the one that does most harm on held-out runs, or
-    helps least where all of them together lower the error of no balance there; else, where no torque was measured, one that
-    raises the error of the position in a free run; else the smaller of two that cancel each other. What is left must be
-    fitted again before it is asked again.
+    """Return the causes (by place) that are refused, and why. The first of four tests that refuses any decides:
+
+    1. Bounds: all causes with a parameter at a bound.
+    2. Held-out runs: the cause that helps least, if it raises the error there, or if all causes together lower the error of
+       no balance.
+    3. Free run, only where no torque was measured: of the causes that raise the error of the position, the one that helps
+       least on held-out runs.
+    4. Cancelling: the smaller of two causes that cancel each other.
+
+    The other causes must be fitted again before the next call. bounds_only: test 1 alone.
     """
     nothing = nothing_of(best)
     bound = [

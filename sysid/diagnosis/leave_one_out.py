@@ -1,12 +1,10 @@
 """Leave-one-run-out confirmation: with fewer than four runs an accepted effect must hold on each held-out run.
 
-With many runs the sum over held-out runs decides whether an effect is present. With two or three, one run can carry
-that sum,
-the runs' own changes are hardly known (their variance is little more than its prior), and what the models get wrong
-passes for an effect. So what the search found is put to a harder rule: with the coefficients of the other runs an
-effect must lower both the deviance and the plain squared error of the torque on each held-out run. Where the set as
-a whole does not pass, the search is made again by that error alone. An alternative is ruled out by being worse on
-each held-out run, not by their sum.
+With many runs the sum over held-out runs decides whether an effect is present. With two or three, one run can carry that
+sum, the variance of the runs' own changes is little more than its prior, and errors of the models pass for an effect. So the
+rule is harder: with the coefficients of the other runs an effect must lower both the deviance and the plain squared error of
+the torque on each held-out run. Where the set as a whole does not pass, the search is made again by that error alone. An
+alternative is ruled out by being worse on each held-out run, not by their sum.
 """
 
 from __future__ import annotations

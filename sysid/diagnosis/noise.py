@@ -2,8 +2,8 @@
 
 Each channel's noise is an autoregression (Yule-Walker over the valid stretches, Levinson's recursion); what is left is
 correlated between channels, because one sensor serves all of them, and is weighted by the inverse of its covariance.
-Rows where a channel is not valid are left out of that channel alone. After both, every row counts as one measurement
-of unit variance: the number of rows times the information each still has is the effective number of samples.
+Rows where a channel is not valid are left out of that channel alone. After both steps every row counts as one measurement
+of unit variance. The effective number of samples is the number of rows times the information that each still has.
 """
 
 from __future__ import annotations

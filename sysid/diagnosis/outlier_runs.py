@@ -1,21 +1,22 @@
 """Outlier runs: runs whose channels differ from those of all others in gain, offset or delay.
 
 A loose plug, a sensor zeroed again or another filter of the drive belongs to one run and to no joint. An effect of the joint
-is in all runs, a change from day to day is small; what is in one run alone and beyond any day is that run's:
+is in all runs, and changes from day to day are small. A larger deviation of one run alone is the run's own:
 
     y_r = X_r beta + Z_r u_r + w_r d_r + e          w: a unit of gain, zero or delay of one channel of run r alone
 
 1. Effects of the library and deviations of single runs are added one by one, whichever lowers the squared error most, beside
    the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by `search.ENTER`.
-2. A run is odd where a deviation was chosen and, beside the effects chosen, differs from the mean of the other runs by more
-   than FAR standard deviations: its own error, and the spread of the others with what is usual (USUAL, worth four runs). Of
-   a gain only what is beyond its `echo` counts: a channel that is all noise explains its own noise in the residual.
-3. What sets that run apart, its squared error per row above the median of the others', must be this deviation for the most
-   part (`_MOST`). A brake that drags or a cover that rubs in one run is imitated by a delay of the current, too, which
-   explains some per cent of it: such a run is no odd one, and what is in it must not go with it.
+2. A run is an outlier where a deviation was chosen and, with the chosen effects fitted too, differs from the mean of the
+   other runs by more than FAR standard deviations. These hold the run's own error and the spread of the others, mixed with
+   the usual one (USUAL, worth four runs). Of a gain only what is beyond its `echo` counts: a channel that is all noise
+   explains its own noise in the residual.
+3. The run's squared error per row exceeds the median of the others; this deviation must explain most of that excess
+   (`_MOST`). A delay of the current can imitate a brake that drags or a cover that rubs in one run, but explains only some
+   per cent: such a run is no outlier, and its disturbance must stay in the data.
 
 All effects at once would not do: with a coefficient for everything a library with temperatures and gains follows any single
-run. Two runs cannot tell which of them is odd. One run at a time is taken away, fewer than half of all (`diagnose`).
+run. Of two runs none can be called the outlier. One run at a time is taken away, fewer than half of all (`diagnose`).
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Runs that are segments of one recording: they share its offset, its friction of the day and its errors, and count once.
 
-A run left out shows nothing when another piece of the same recording is still there. Pieces are known by their names
-("a.csv (2 of 3)", as the reader takes a recording with gaps apart), or by going on where another one ends: stamps,
-positions of both sides, velocity and temperature. Stamps that begin at zero again are believed to go on only from one motion
-into the next: many runs begin and end at rest in the same place.
+A run left out shows nothing while another piece of the same recording is still there. Pieces are known by their names
+("a.csv (2 of 3)": the reader cuts a recording at its gaps), or because one begins where another ends: stamps, positions of
+both sides, velocity and temperature. Where stamps begin at zero again, two runs are one recording only if the joint moves at
+the cut: many runs begin and end at rest in the same place.
 """
 
 from __future__ import annotations

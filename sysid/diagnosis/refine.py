@@ -1,8 +1,8 @@
 """Parameters of the causes with intervals: Gauss-Newton on the mixed model, all causes and all runs at once.
 
-The search is linear in its columns; velocities, travels and reference temperatures come from grids there. Here every
-free parameter of every cause moves: the residual is taken at the present parameters, its derivatives by finite
-differences of the effects themselves, and the mixed model solved for the step.
+The search is linear in its columns and takes velocities, travels and reference temperatures from grids. Here every free
+parameter of every cause moves: the residual is computed at the present parameters, its derivatives by finite differences of
+the effects, and the mixed model is solved for the step.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """How finely a recorded channel is resolved, what that costs in an acceleration, and the filter that goes with it.
 
-Recorders keep seven significant digits, single precision, fixed decimals or counts. Of a motor position beyond 1000 rad
-seven digits leave steps of 1 mrad, whose second difference is noise of some newton metres at the joint, and which at the
-start of the run were a hundred times finer. So the steps are estimated from the values, for each magnitude by itself (the
-steps of digits and of single precision grow with the value). Where an acceleration of them would be coarse, the balance
-that holds it is looked at below a cutoff only: residual and regressors alike through the same linear filter, sample by
-sample, so that nothing is compared with something filtered in another way. The regressors of inertias are filtered further:
-noise of an acceleration that is in residual and regressor alike would be explained by itself.
+Recorders keep seven significant digits, single precision, fixed decimals or counts. A motor position beyond 1000 rad with
+seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. At the start of the
+run the steps were a hundred times finer, because steps of digits and of single precision grow with the value. So they are
+estimated from the values, for each magnitude by itself. Where the acceleration would be coarse, its balance is judged
+below a cutoff only: residual and regressors pass the same linear filter, sample by sample. The regressors of inertias are
+filtered further, because noise of an acceleration that is in residual and regressor alike would be explained by itself.
 """
 
 from __future__ import annotations
@@ -60,7 +59,7 @@ def steps_of(x: FloatArray) -> FloatArray:
 
 
 def described(x: FloatArray, unit: str) -> str:
-    """Return the steps of the values as people say it: "steps of 1e-05 rad, 0.001 rad beyond 1000 rad"; "" without steps."""
+    """Return the steps of the values in words: "steps of 1e-05 rad, 0.001 rad beyond 1000 rad"; "" without steps."""
     steps = steps_of(x)
     worst = float(np.max(steps, initial=0.0))
     if worst <= 0.0:

@@ -54,9 +54,8 @@ class Search:
     """The library's candidates on one set of runs.
 
     moments [channels, P, P]: mean products of a unit of every column, Nm^2; column_rms [P]: by them the rms in the
-    channel where it is largest, Nm; least_nm: contributions below
-    are not called effects, however certain; readings, unpowered: what the currents read without power, per run, and which
-    columns make them read that (`current_zero`).
+    channel where it is largest, Nm; least_nm: smaller contributions are not called effects, however certain; readings,
+    unpowered: what the currents read without power, per run, and which columns make them read that (`current_zero`).
     """
 
     def __init__(
@@ -147,9 +146,8 @@ class Search:
         return float(np.sqrt(max(squares.max(), 0.0)))
 
     def same_torques(self, one: Hypothesis, other: Hypothesis) -> bool:
-        """Return whether two sets differ by less than what is called an effect, at rest as in motion: one is the other
-        in other words. A wave of the sensor, as one at either joint, fits better by as much as a wave too small
-        to be named.
+        """Return whether two sets differ by less than what is called an effect, at rest as in motion, so that they explain
+        the same. A wave of the sensor instead of one at a joint fits better only by a wave too small to be named.
         """
         difference = np.zeros(len(self.column_rms))
         difference[list(one.model.columns)] += one.model.beta

@@ -4,8 +4,8 @@ The residuals are those of `jtqd.estimator.effects.effect`: measured less simula
 are central differences of positions (`smoothing`). All arrays are later averaged over equal bins, residual and regressors
 alike, so that noise of differences averages out and nothing is compared with something filtered in another way.
 
-The torsion that the effects see is tau/K, not the encoders' difference: the residual of the torsion balance is made of
-that difference, and a regressor made of it too would explain it by itself. Its rate is that of the difference, whose noise
+The torsion that the effects see is tau/K, not the encoders' difference: the residual of the torsion balance contains that
+difference, and a regressor that contains it too would explain its noise. Its rate is that of the difference, whose noise
 has no part in the noise of the difference itself.
 """
 

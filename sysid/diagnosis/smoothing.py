@@ -1,8 +1,8 @@
 """Signals and their derivatives as regressors have them: with little of the noise that the same sample has in a residual.
 
 Currents and torques are smoothed over a few milliseconds (`calm`), because their noise is also in the residual, and would be
-explained by itself at the frequencies where there is nothing else. Of samples so far apart that there is nothing to smooth
-over, each is what its neighbours say. Derivatives are central differences, which look ahead: this is for recorded runs.
+explained by itself at the frequencies where there is nothing else. Samples too far apart for smoothing are interpolated from
+their neighbours. Derivatives are central differences, which look ahead: this is for recorded runs.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
 
     Its noise is a tenth and more of its rate, and makes a delay smaller than it is, where little is smoothed: by a third on
     a bench with slow motions. Cubics through _CUBIC_S of samples take as much of the noise as `calm` does and leave 0.9 of
-    what swings at 50 Hz. Of samples that are far apart each is what its neighbours say.
+    what swings at 50 Hz. Samples that are far apart are interpolated from their neighbours.
     """
     step = float(np.median(np.diff(time)))
     if _smoothed_samples(step) < _ENOUGH:

@@ -1,12 +1,11 @@
 """Stability of an effect over operating conditions: a requirement in the presence of an unexplained residual.
 
-The unexplained residual is no noise: it is neither independent from sample to sample nor the same everywhere, and what
-an effect
-gains by imitating a part of it is not the same everywhere either. So no noise model is asked. Runs are left out one by one,
-and in each operating condition (velocity, load, current, angles, time) one of six slices that hold the same information
-on the effect; the changes of its size give a standard error (jackknife), and the size must be that many of them as
-Student's t has for so few. That a cause has one size under all conditions, and an imitation has not, is what Peters,
-Buehlmann and Meinshausen 2016, J. R. Stat. Soc. B 78, infer causes from.
+The unexplained residual is no noise: it depends on the condition and on the sample before. An effect that imitates a part of
+it therefore changes its size with the condition. No noise model is used: runs are left out one by one, and in each operating
+condition (velocity, load, current, angles, time) one of six slices that hold the same information on the effect. The changes
+of its size give a standard error (jackknife). The size must exceed it by the factor of Student's t for so few parts.
+Source: a cause has one size under all conditions, an imitation has not (Peters, Buehlmann and Meinshausen 2016, J. R. Stat.
+Soc. B 78).
 """
 
 from __future__ import annotations

@@ -52,9 +52,8 @@ _HZ_RATIO: Final = 25.0
 
 @dataclass(frozen=True)
 class Unexplained:
-    """maps: all axes of all channels; found: those whose structure is significant and large enough to be reported;
-    limits: by
-    what a channel's events are judged; worst_nm: rms of what is structure in the run that has most of it, per channel.
+    """maps: all axes of all channels; found: those whose structure is significant and large enough to be reported; limits:
+    by which a channel's events are judged; worst_nm: rms of the structure in the run that has most of it, per channel.
     """
 
     maps: tuple[AxisMap, ...]
@@ -186,10 +185,10 @@ def _held(dataset: Dataset, refined: Refined) -> dict[Channel, list[tuple[float,
 
 
 def events_left(dataset: Dataset, refined: Refined, noise: Noise) -> dict[Channel, Events]:
-    """Return rare events where the causes leave any that are large enough to matter, else nothing.
+    """Return rare events where the residual of the causes has any that are large enough to matter, else nothing.
 
-    Whether there are any is asked of what the causes leave. Where they are is asked of what no effect of the library at all
-    explains: causes that are bent by events leave others than those that are there.
+    The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
+    when they are: events bend the fitted causes, which then leave residuals at other moments.
     """
     if not _bursts(dataset, less_nuisances(dataset, refined), noise):
         return {}

@@ -139,7 +139,7 @@ def _unexplained(found: Found, left: Unexplained, share: float) -> UnexplainedRe
 
 
 def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[str]:
-    """Return what to say of effects that were found although something matters that they leave."""
+    """Return the lines about effects that were found where a relevant residual remains."""
     named = {(c.name, c.joint) for c in causes}
     others = ", ".join(
         f"{c.effect.name} of {joint_text(c.joint)}" for c in whole.chosen if c.key not in named
