@@ -17,6 +17,7 @@ from jtqd.estimator import status as st
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.corrections import ExtendedInputs, acting_effects
 from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import State
 from jtqd.estimator.estimator import (
     ExtendedEstimator,
     FusedEstimator,
@@ -30,6 +31,7 @@ from jtqd.estimator.network import AnyNetwork, load_network
 from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import METHODS, EstimatorSettings
 from tests.estimator.effects.effect_signals import PLAIN, extended
+from tests.estimator.effects.laws import ALL, IDS, LAWS, Law
 from tests.estimator.estimator_helpers import small_network, with_faults
 from tests.estimator.fused_configuration import configured, networks
 from tests.estimator.fused_helpers import fused_joint, fused_network, temperatures, twisted
@@ -41,97 +43,55 @@ WARM_C = 41.0
 
 # ---- the truth is known: constant torque and velocity, the reading that the effect would give
 
-Loss = Callable[
-    [float, float, FloatArray], Any
-]  # torque, velocity, motor angle -> what the motor loses besides
-LOSSES: list[tuple[str, dict[str, float], Loss]] = [
-    ("coulomb_friction", {"coulomb_nm": 5.5}, lambda tau, v, q: 1.5 * math.tanh(v / 0.02)),
-    ("viscous_friction", {"viscous_nms_per_rad": 4.0}, lambda tau, v, q: v),
-    (
-        "stribeck_friction",
-        {"stribeck_nm": 1.2, "stribeck_velocity_rad_s": 0.3},
-        lambda tau, v, q: 1.2 * math.exp(-((v / 0.3) ** 2)) * math.tanh(v / 0.02),
-    ),
-    (
-        "load_dependent_friction",
-        {"load_coefficient": 0.12},
-        lambda tau, v, q: 0.12 * abs(tau) * math.tanh(v / 0.02),
-    ),
-    ("friction_asymmetry", {"asymmetry_nm": 0.4}, lambda tau, v, q: 0.4 * abs(math.tanh(v / 0.02))),
-    (
-        "temperature_dependent_friction",
-        {"viscous_per_k": 0.02, "coulomb_per_k": 0.01, "reference_c": 25.0},
-        lambda tau, v, q: (
-            3.0 * v * (math.exp(-0.32) - 1.0) + 4.0 * math.tanh(v / 0.02) * (math.exp(-0.16) - 1.0)
-        ),
-    ),
-    (
-        "torque_ripple",
-        {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0, "phase_rad": 0.7},
-        lambda tau, v, q: 0.4 * np.cos(2.0 * q + 0.7),
-    ),
-    (
-        "cogging",
-        {"amplitude_nm": 0.3, "order_per_motor_rev": 12.0, "phase_rad": -0.4},
-        lambda tau, v, q: 0.3 * np.cos(12.0 * q - 0.4),
-    ),
-    (
-        "kinematic_error",
-        {"amplitude_rad": 2e-4, "order_per_motor_rev": 2.0, "phase_rad": 0.5},
-        lambda tau, v, q: tau * G * 4e-4 * np.cos(2.0 * q + 0.5),
-    ),
-]
-
-Reading = Callable[[FloatArray], Any]  # motor torque over G Kt [A] -> current that is read
-READINGS: list[tuple[str, dict[str, float], Reading]] = [
-    ("torque_constant", {"torque_constant_nm_per_a": 0.07}, lambda i: i * KT / 0.07),
-    ("current_offset", {"offset_a": 0.08}, lambda i: i + 0.08),
-    (
-        "torque_constant_temperature",
-        {"per_k": -0.002, "reference_c": 26.0},
-        lambda i: i / (1.0 - 0.002 * (WARM_C - 26.0)),
-    ),
-    (
-        "torque_constant_saturation",  # I (1 - k |I|) = i, solved for I
-        {"saturation_per_a": 0.02},
-        lambda i: np.sign(i) * (1.0 - np.sqrt(1.0 - 4.0 * 0.02 * np.abs(i))) / 0.04,
-    ),
-]
+Reading = Callable[
+    [FloatArray, FloatArray], Any
+]  # motor torque over G Kt [A], motor angle -> current that is read
 
 
-def steady(joint: Joint, tau: float, v: float, lost: Any, read: Reading) -> FloatArray:
-    """Torques [400] that `tob` estimates at constant torque and velocity, the losses being friction and `lost`."""
-    count = 400
-    q = G * v * np.arange(count) * 1e-3
-    motor = tau + FrictionModel(PLAIN.friction).torque(v) + lost(tau, v, q)
-    current = np.broadcast_to(read(np.broadcast_to(motor, count) / (G * KT)), count)
+def steady(joint: Joint, tau: float, v: float, read: Reading) -> FloatArray:
+    """Torques [400] that `tob` estimates at constant torque and velocity, the plain losses being friction alone."""
+    q = G * v * np.arange(400) * 1e-3
+    current = read(np.full(400, (tau + FrictionModel(PLAIN.friction).torque(v)) / (G * KT)), q)
     estimator = make_estimator(joint, TOB)
-    link = q / G - tau / K
-    return np.array(
-        [
-            estimator.step(1e-3, float(current[k]), q[k], G * v, link[k], WARM_C).torque_nm
-            for k in range(count)
-        ]
-    )
+    rows = zip(current.tolist(), q.tolist(), (q / G - tau / K).tolist(), strict=True)
+    return np.array([estimator.step(1e-3, i, q, G * v, link, WARM_C).torque_nm for i, q, link in rows])
 
 
-@pytest.mark.parametrize(("name", "p", "law"), LOSSES, ids=[each[0] for each in LOSSES])
+AT_MOTOR = [
+    row
+    for row in LAWS
+    if {"loss_nm", "current_a"} & set(EFFECTS[row.name].hooks)
+    and not EFFECTS[row.name].changes_joint
+    and not EFFECTS[row.name].rate_based  # nothing changes here
+]
+
+
+@pytest.mark.parametrize(("name", "p", "law"), AT_MOTOR, ids=[row.name for row in AT_MOTOR])
 @pytest.mark.parametrize(("tau", "v"), [(12.0, 0.3), (12.0, -0.3), (-20.0, 0.15), (-6.0, -0.02)])
-def test_a_loss_is_taken_off(name: str, p: dict[str, float], law: Loss, tau: float, v: float) -> None:
-    found = steady(extended(PLAIN, (name, p)), tau, v, law, lambda i: i)
+def test_the_motor_torque_is_the_true_one(
+    name: str, p: dict[str, float], law: Law, tau: float, v: float
+) -> None:
+    def read(i: FloatArray, q: FloatArray) -> Any:
+        """Solve G Kt i = G Kt i0 + what the effect leaves in the motor balance at i."""
+        s = State(
+            direction=np.full(400, math.tanh(v / 0.02)),
+            link_position_rad=q / G - tau / K,
+            motor_position_rad=q,
+            temperature_c=np.full(400, WARM_C),
+            time_s=np.arange(400) * 1e-3,
+            torque_nm=np.full(400, tau),
+            torsion_rad=np.full(400, tau / K),
+            velocity_rad_s=np.full(400, v),
+        )
+        s.current_a = i
+        for _ in range(60):
+            s.current_a = i + law(p, s, PLAIN)[0] / (G * KT)
+        return s.current_a
+
+    found = steady(extended(PLAIN, (name, p)), tau, v, read)
     assert np.isnan(found[0])  # starts
     assert found[-100:] == pytest.approx(tau, abs=1e-6)
-    plain = steady(PLAIN, tau, v, law, lambda i: i)
-    assert float(np.abs(plain[-100:] - tau).max()) > 0.01
-
-
-@pytest.mark.parametrize(("name", "p", "read"), READINGS, ids=[each[0] for each in READINGS])
-@pytest.mark.parametrize(("tau", "v"), [(12.0, 0.3), (-20.0, 0.15), (7.0, -0.2)])
-def test_the_motor_torque_is_the_true_one(
-    name: str, p: dict[str, float], read: Reading, tau: float, v: float
-) -> None:
-    found = steady(extended(PLAIN, (name, p)), tau, v, lambda *_: 0.0, read)
-    assert found[-100:] == pytest.approx(tau, abs=1e-9)
+    assert float(np.abs(steady(PLAIN, tau, v, read)[-100:] - tau).max()) > 0.01
 
 
 def test_without_an_estimate_the_torque_is_the_motors() -> None:
@@ -152,10 +112,11 @@ def test_several_effects_at_once() -> None:
         ("torque_ripple", {"amplitude_nm": 0.3, "order_per_motor_rev": 2.0, "phase_rad": 1.0}),
     )
 
-    def lost(tau: float, v: float, q: FloatArray) -> Any:
-        return 0.1 * abs(tau) * math.tanh(v / 0.02) + 0.2 * np.cos(q) + 0.3 * np.cos(2.0 * q + 1.0)
+    def read(i: FloatArray, q: FloatArray) -> Any:
+        lost = 0.1 * 15.0 * math.tanh(0.3 / 0.02) + 0.2 * np.cos(q) + 0.3 * np.cos(2.0 * q + 1.0)
+        return (i + lost / (G * KT)) * KT / 0.084 + 0.05
 
-    found = steady(joint, -15.0, 0.3, lost, lambda i: i * KT / 0.084 + 0.05)
+    found = steady(joint, -15.0, 0.3, read)
     assert found[-100:] == pytest.approx(-15.0, abs=1e-6)
 
 
@@ -274,38 +235,11 @@ def test_a_late_current_is_brought_forward() -> None:
 
 
 SEED, COUNT = 31, 1500
-ALL: dict[str, dict[str, float]] = {
-    **{name: p for name, p, _ in (*LOSSES, *READINGS)},
-    "nonlinear_stiffness": {"stiffness_nm_per_rad": 13000.0, "cubic_nm_per_rad3": 2e8},
-    "hysteresis": {"torque_nm": 1.5, "travel_rad": 2e-4},
-    "lost_motion": {"width_rad": 2e-4},
-    "encoder_eccentricity": {"amplitude_rad": 1e-4, "phase_rad": 0.3},
-    "channel_delay": {"delay_s": 2e-3, "channel": 1.0},
-    "rotor_inertia": {"rotor_inertia_kgm2": 9e-5},
-    "link_inertia": {"link_inertia_kgm2": 0.1},
-    "gear_damping": {"damping_nms_per_rad": 20.0},
-    "unbalance": {"moment_nm": 1.0},
-    "sensor_offset": {"offset_nm": 1.0},
-    "sensor_gain": {"gain": 1.1},
-    "sensor_drift": {"rate_nm_per_s": 0.01},
-    "sensor_crosstalk": {"amplitude_nm": 0.3},
-}
-
-
-MOTOR_SIDE = "encoder_eccentricity of the motor"
-ENTRIES = {
-    **{name: (name, p) for name, p in ALL.items()},
-    MOTOR_SIDE: ("encoder_eccentricity", {"amplitude_rad": 5e-3, "phase_rad": 0.3, "motor_side": 1.0}),
-}
 
 
 def network_for(method: str) -> AnyNetwork | None:
     data = {"network": small_network().data, "fused": fused_network().data}.get(method)
     return None if data is None else load_network(method, data)
-
-
-def len_or_name(names: tuple[str, ...]) -> str:
-    return names[0] if len(names) == 1 else f"{len(names)} effects"
 
 
 def faulty_run(seed: int, count: int) -> tuple[FloatArray, JointColumns]:
@@ -318,13 +252,13 @@ def faulty_run(seed: int, count: int) -> tuple[FloatArray, JointColumns]:
     return time_s, JointColumns(*inputs, temperature_c=temperatures("gaps", seed, count))
 
 
-SETS = [*((name,) for name in sorted(ENTRIES)), tuple(sorted(ALL))]
+SETS = [*([(row.name, row.parameters)] for row in LAWS), list(ALL.items())]
 
 
 @pytest.mark.parametrize("method", METHODS)
-@pytest.mark.parametrize("names", SETS, ids=len_or_name)
-def test_step_by_step_is_the_whole_run(method: str, names: tuple[str, ...]) -> None:
-    joint = extended(fused_joint(), *(ENTRIES[name] for name in names))
+@pytest.mark.parametrize("entries", SETS, ids=[*IDS, "all"])
+def test_step_by_step_is_the_whole_run(method: str, entries: list[tuple[str, dict[str, float]]]) -> None:
+    joint = extended(fused_joint(), *entries)
     network, settings = network_for(method), EstimatorSettings(method=method)
     time_s, columns = faulty_run(SEED, COUNT)
     estimator = make_estimator(joint, settings, network)
@@ -346,10 +280,6 @@ def test_step_by_step_is_the_whole_run(method: str, names: tuple[str, ...]) -> N
         np.testing.assert_array_equal(getattr(run, name), [getattr(e, name) for e in steps], err_msg=name)
     for published in (run.torque_nm, run.sigma_nm):
         assert np.array_equal(np.isfinite(published), np.isin(run.status, list(st.PUBLISHED)))
-
-
-def test_every_effect_was_there() -> None:
-    assert set(ALL) == set(EFFECTS)
 
 
 # ---- what costs nothing, what is forgotten, what never raises
@@ -390,7 +320,7 @@ def test_reset_forgets_the_torque_and_the_filters() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 def test_no_float_raises(method: str) -> None:
-    joint = extended(fused_joint(), *((name, p) for name, p in ALL.items()))
+    joint = extended(fused_joint(), *ALL.items())
     estimator = make_estimator(joint, EstimatorSettings(method=method), network_for(method))
     rng = np.random.default_rng(5)
     values = np.array(

@@ -1,5 +1,5 @@
-"""Every effect of the library in the emulated plant: its hooks, asked on the true signals, say what both balances of
-estimator/effects/effect.py leave over; and files with it load."""
+"""Every effect of the library in the emulated plant leaves in both balances of estimator/effects/effect.py what its law
+gives on the true signals; and files with it load."""
 
 import json
 from dataclasses import replace
@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from jtqd.estimator.effects import EFFECTS, checked_parameters
-from jtqd.estimator.effects.effect import ArrayFunctions, State
+from jtqd.estimator.effects.effect import State
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can import bench
@@ -26,50 +26,10 @@ from jtqd.sim_can.plant_file import (
 )
 from jtqd.sim_can.plant_source import PlantSource
 from jtqd.sim_can.source import CURRENT, VELOCITY
+from tests.estimator.effects.laws import ALL, IDS, LAWS
 
 JOINT = replace(load_joint(shipped("joint1.yaml")), efficiency=None)  # Table I loses nothing in places
 G, KT, K, D = JOINT.gear_ratio, JOINT.torque_constant_nm_per_a, JOINT.stiffness_nm_per_rad, 8.0
-
-# name -> parameters, and which balances it must show in: m motor, t torsion
-CASES = [
-    ("coulomb_friction", {"coulomb_nm": 4.5}, "m"),
-    ("viscous_friction", {"viscous_nms_per_rad": 3.5}, "m"),
-    ("stribeck_friction", {"stribeck_nm": 3.0, "stribeck_velocity_rad_s": 0.15}, "m"),
-    ("load_dependent_friction", {"load_coefficient": 0.1}, "m"),
-    ("friction_asymmetry", {"asymmetry_nm": 0.8}, "m"),
-    (
-        "temperature_dependent_friction",
-        {"viscous_per_k": 0.03, "coulomb_per_k": 0.01, "reference_c": 10.0},
-        "m",
-    ),
-    ("torque_ripple", {"amplitude_nm": 0.6, "order_per_motor_rev": 2.0, "phase_rad": 0.4}, "m"),
-    ("kinematic_error", {"amplitude_rad": 1e-4, "order_per_motor_rev": 2.0, "phase_rad": 0.9}, "mt"),
-    ("nonlinear_stiffness", {"stiffness_nm_per_rad": 1.1 * K, "cubic_nm_per_rad3": 3e8}, "t"),
-    ("hysteresis", {"torque_nm": 2.0, "travel_rad": 1.5e-4}, "t"),
-    ("lost_motion", {"width_rad": 2e-4}, "t"),
-    ("torque_constant", {"torque_constant_nm_per_a": 1.05 * KT}, "m"),
-    ("torque_constant_saturation", {"saturation_per_a": 0.02}, "m"),
-    ("torque_constant_temperature", {"per_k": -0.002, "reference_c": 10.0}, "m"),
-    ("cogging", {"amplitude_nm": 0.5, "order_per_motor_rev": 12.0, "phase_rad": 1.0}, "m"),
-    ("current_offset", {"offset_a": 0.08}, "m"),
-    ("rotor_inertia", {"rotor_inertia_kgm2": 1.2 * JOINT.rotor_inertia_kgm2}, "m"),
-    ("sensor_offset", {"offset_nm": 0.7}, "mt"),
-    ("sensor_gain", {"gain": 1.08}, "mt"),
-    ("sensor_drift", {"rate_nm_per_s": 0.5, "per_k_nm": 0.05, "reference_c": 10.0}, "mt"),
-    ("sensor_crosstalk", {"amplitude_nm": 0.4, "share": 0.05, "phase_rad": 0.6}, "mt"),
-    ("encoder_eccentricity", {"amplitude_rad": 1e-4, "phase_rad": 0.7}, "t"),
-    ("encoder_eccentricity", {"amplitude_rad": 5e-3, "phase_rad": 0.7, "motor_side": 1.0}, "t"),
-    ("link_inertia", {"link_inertia_kgm2": 2.5 * JOINT.link_inertia_kgm2}, "mt"),
-    ("gear_damping", {"damping_nms_per_rad": 3.0 * D}, "t"),
-    ("unbalance", {"moment_nm": 1.5, "phase_rad": 0.5}, "mt"),
-    ("channel_delay", {"delay_s": 0.002, "channel": 0.0}, "mt"),
-    ("channel_delay", {"delay_s": 0.002, "channel": 1.0}, "m"),
-    ("channel_delay", {"delay_s": 0.002, "channel": 2.0}, "t"),
-]
-
-
-def test_cases_are_the_whole_library():
-    assert {name for name, _, _ in CASES} == set(EFFECTS)
 
 
 def bench_with(name, parameters, joint):
@@ -140,12 +100,12 @@ def both_balances(rows, h):
     return motor - JOINT.link_inertia_kgm2 * alpha_l, torsion - JOINT.link_inertia_kgm2 * alpha_l
 
 
-def hooks(name, parameters, rows, number, h):
-    """Every hook of the effect, as arrays, on the true signals (readings where effect.py says "as measured")."""
+def left_by(row, rows, number, h):
+    """What the law leaves in both balances, on the true signals (readings where effect.py says "as measured")."""
+    effect = EFFECTS[row.name]
     angle, speed, link, link_speed, tau, _, truth, *_ = rows[:, :-1]
-    true_current = rows[7, 1:]
     state = State(
-        current_a=true_current,
+        current_a=rows[7, 1:],
         current_rate_a_s=np.gradient(rows[7], h)[1:],
         velocity_rad_s=speed / G,
         direction=np.sign(speed),
@@ -155,45 +115,37 @@ def hooks(name, parameters, rows, number, h):
         link_velocity_rad_s=link_speed,
         link_acceleration_rad_s2=np.diff(rows[3]) / h,
         coupling_position_rad=link if number == 1 else -link,
-        torque_nm=tau,
+        torque_nm=rows[11, :-1] if effect.at_sensor else tau,
         torque_rate_nm_s=np.gradient(truth, h),
         torsion_rad=angle / G - link,
         torsion_rate_rad_s=speed / G - link_speed,
         temperature_c=np.full_like(tau, 22.0),
         time_s=rows[12, :-1],
     )
-    effect, values = EFFECTS[name], checked_parameters(name, parameters)
-    out = {}
-    for hook in effect.hooks:
-        state.torque_nm = rows[11, :-1] if hook == "sensor_nm" else tau
-        out[hook] = np.broadcast_to(getattr(effect, hook)(values, state, JOINT, ArrayFunctions()), tau.shape)
-    return out
+    motor, torsion = row.law(checked_parameters(row.name, row.parameters), state, JOINT)
+    if effect.geometric:  # the spring's damping sees the twist's rate too
+        torsion = torsion + D / K * np.gradient(torsion, h)
+    return np.broadcast_to(motor, tau.shape), np.broadcast_to(torsion, tau.shape)
 
 
 def rms(values):
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+AT_ONCE = [row for row in LAWS if row.name != "channel_delay"]
+
+
 @pytest.mark.parametrize("number", [1, 2])
-@pytest.mark.parametrize(
-    ("name", "parameters", "shows"), [case for case in CASES if case[0] != "channel_delay"]
-)
-def test_hooks_explain_both_balances(name, parameters, shows, number):
-    h, rows = record(bench_with(name, parameters, number), number)
-    motor, torsion = both_balances(rows, h)
-    told = hooks(name, parameters, rows, number, h)
-    common = told.get("load_nm", 0.0) - told.get("sensor_nm", 0.0)
-    twist = told.get("twist_rad", np.zeros_like(motor))
-    told_motor = G * KT * told.get("current_a", 0.0) + told.get("loss_nm", 0.0) + common
-    told_torsion = -K * (twist + told.get("link_rad", 0.0)) + common
-    if name == "kinematic_error":  # the spring's damping sees the twist's rate too
-        told_torsion = told_torsion - D * np.gradient(twist, h)
-    told_motor, told_torsion = (np.broadcast_to(told, motor.shape) for told in (told_motor, told_torsion))
+@pytest.mark.parametrize("row", AT_ONCE, ids=[row.name for row in AT_ONCE])
+def test_laws_explain_both_balances(row, number):
+    h, rows = record(bench_with(row.name, row.parameters, number), number)
     moving = np.abs(rows[1, :-1]) / G > 0.05
-    for balance, key, sum_ in ((motor, "m", told_motor), (torsion, "t", told_torsion)):
-        size, rest = rms(sum_[moving]), rms((balance - sum_)[moving])
-        assert size > 0.02 if key in shows else size == 0.0
-        assert rest < 0.02 * size + 0.004, (key, size, rest)
+    laws = left_by(row, rows, number, h)
+    for balance, explained in zip(both_balances(rows, h), laws, strict=True):
+        size, rest = rms(explained[moving]), rms((balance - explained)[moving])
+        assert size > 0.02 or not np.any(explained)
+        assert rest < 0.02 * size + 0.004, (size, rest)
+    assert max(rms(each) for each in laws) > 0.02
 
 
 def delayed(truth, reading, rate, h):
@@ -220,10 +172,10 @@ def test_what_is_late_reads_the_past_and_nothing_else_is_touched(channel, number
             assert reading == pytest.approx(truth, abs=2e-7)  # the link encoder's count
 
 
-@pytest.mark.parametrize(("name", "parameters", "shows"), CASES)
-def test_a_joint_file_with_it_is_a_plant(tmp_path, name, parameters, shows):
+@pytest.mark.parametrize("row", LAWS, ids=IDS)
+def test_a_joint_file_with_it_is_a_plant(tmp_path, row):
     path = tmp_path / "extended.joint.yaml"
-    mapping = JOINT.to_mapping() | {"effects": [{"name": name, "parameters": parameters}]}
+    mapping = JOINT.to_mapping() | {"effects": [{"name": row.name, "parameters": row.parameters}]}
     path.write_text(yaml.safe_dump(mapping))
     source = PlantSource(load_plant(path))
     source.advance(0.0)
@@ -235,9 +187,8 @@ def test_a_joint_file_with_it_is_a_plant(tmp_path, name, parameters, shows):
 
 def test_jtq_sim_takes_a_file_with_every_effect(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(bench, "measure", partial(bench.measure, cycles=50))
-    every = {name: parameters for name, parameters, _ in CASES}
     path = tmp_path / "extended.joint.yaml"
-    effects = [{"name": name, "parameters": parameters} for name, parameters in every.items()]
+    effects = [{"name": name, "parameters": parameters} for name, parameters in ALL.items()]
     path.write_text(yaml.safe_dump(JOINT.to_mapping() | {"effects": effects}))
     assert main(["--cost", "--json", "--plant", str(path)]) == 0
     cost = json.loads(capsys.readouterr().out)

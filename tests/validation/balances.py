@@ -1,6 +1,6 @@
 """Balances of motor and torsion for tests of the benches: residuals from columns, and what each effect must leave in them.
 
-Written from the table of effects, as formulas over the signals of a run without noise; nothing of a bench is used.
+From the table of laws (tests/estimator/effects/laws.py) over the signals of a run without noise; nothing of a bench is used.
 """
 
 from __future__ import annotations
@@ -10,6 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from jtqd.estimator.effects import EFFECTS, checked_parameters
+from jtqd.estimator.effects.effect import State
+from jtqd.estimator.joint import Joint
+from tests.estimator.effects.laws import LAW_OF
 
 Array = np.ndarray
 
@@ -106,95 +111,37 @@ def expected(
     name: str, p: Mapping[str, float], s: Signals, joint: Mapping[str, Any], first_c: Array
 ) -> tuple[Array, Array]:
     """Return what the effect leaves in the motor and in the torsion balance; first_c: temperature of joint 1."""
-    zero = np.zeros_like(s.v)
-    G, K, Kt = joint["gear_ratio"], joint["stiffness_nm_per_rad"], joint["torque_constant_nm_per_a"]
-    loss, twist, load, current, link, sensor, damped = (zero for _ in range(7))
-    friction = joint["friction"]
-    if name == "coulomb_friction":
-        loss = (p["coulomb_nm"] - friction["coulomb_nm"]) * s.side
-    elif name == "viscous_friction":
-        loss = (p["viscous_nms_per_rad"] - friction["viscous_nms_per_rad"]) * s.v
-    elif name == "stribeck_friction":
-        loss = p["stribeck_nm"] * np.exp(-((s.v / p["stribeck_velocity_rad_s"]) ** 2)) * s.side
-    elif name == "load_dependent_friction":
-        loss = p["load_coefficient"] * np.abs(s.tau) * s.side
-    elif name == "friction_asymmetry":
-        loss = p["asymmetry_nm"] * np.abs(s.side)
-    elif name == "temperature_dependent_friction":
-        above = s.temperature_c - p["reference_c"]
-        loss = friction["viscous_nms_per_rad"] * s.v * np.expm1(-p.get("viscous_per_k", 0.0) * above)
-        loss = loss + friction["coulomb_nm"] * s.side * np.expm1(-p.get("coulomb_per_k", 0.0) * above)
-    elif name in ("torque_ripple", "cogging"):
-        loss = p["amplitude_nm"] * np.cos(p["order_per_motor_rev"] * s.motor_rad + p["phase_rad"])
-    elif name == "kinematic_error":
-        angle = p["order_per_motor_rev"] * s.motor_rad + p["phase_rad"]
-        twist = p["amplitude_rad"] * np.sin(angle)
-        damped = joint["damping_nms_per_rad"] * slope(twist, s.time_s)  # the damper sees what the spring sees
-        loss = s.tau * G * p["amplitude_rad"] * p["order_per_motor_rev"] * np.cos(angle)
-    elif name == "nonlinear_stiffness":
-        d = s.twist_rad
-        twist = (p.get("stiffness_nm_per_rad", K) / K - 1.0) * d + p.get("cubic_nm_per_rad3", 0.0) / K * d**3
-    elif name == "hysteresis":
-        twist = p["torque_nm"] / K * _slip(s.twist_rad, p["travel_rad"])
-    elif name == "lost_motion":
-        twist = -np.clip(s.twist_rad, -p["width_rad"] / 2, p["width_rad"] / 2)
-    elif name == "gear_damping":
-        damped = (p["damping_nms_per_rad"] - joint["damping_nms_per_rad"]) * slope(s.twist_rad, s.time_s)
-    elif name == "torque_constant":
-        loss = -G * (p["torque_constant_nm_per_a"] - Kt) * s.current_a
-    elif name == "torque_constant_saturation":
-        loss = G * Kt * p["saturation_per_a"] * s.current_a * np.abs(s.current_a)
-    elif name == "torque_constant_temperature":
-        loss = -G * Kt * p["per_k"] * (s.temperature_c - p["reference_c"]) * s.current_a
-    elif name == "current_offset":
-        current = zero + p["offset_a"]
-    elif name == "rotor_inertia":
-        loss = G**2 * (p["rotor_inertia_kgm2"] - joint["rotor_inertia_kgm2"]) * s.alpha
-    elif name == "sensor_offset":
-        sensor = zero + p["offset_nm"]
-    elif name == "sensor_gain":
-        sensor = (1.0 - 1.0 / p["gain"]) * s.sensor_nm
-    elif name == "sensor_drift":
-        sensor = p.get("rate_nm_per_s", 0.0) * s.time_s
-        sensor = sensor + p.get("per_k_nm", 0.0) * (first_c - p["reference_c"])
-    elif name == "sensor_crosstalk":
-        turn = np.cos(s.coupling_rad + p["phase_rad"])
-        sensor = (p.get("amplitude_nm", 0.0) + p.get("share", 0.0) * s.sensor_nm) * turn
-    elif name == "encoder_eccentricity":
-        if p.get("motor_side", 0.0):
-            error = p["amplitude_rad"] / G * np.sin(s.motor_rad + p["phase_rad"])
-            link = -error
-            damped = -joint["damping_nms_per_rad"] * slope(error, s.time_s)
-            rate = slope(error, s.time_s)  # the motor's own speed and acceleration are misread too
-            loss = -joint["rotor_inertia_kgm2"] * G**2 * slope(rate, s.time_s)
-            loss = loss - friction["viscous_nms_per_rad"] * rate
-        else:
-            link = p["amplitude_rad"] * np.sin(s.link_rad + p["phase_rad"])
-    elif name == "channel_delay":
-        if p["channel"] == 0:
-            sensor = _late(s.sensor_nm, s.time_s, p["delay_s"])
-        elif p["channel"] == 1:
-            current = _late(s.current_a, s.time_s, p["delay_s"])
-        else:
-            link = _late(s.link_rad, s.time_s, p["delay_s"])
-    elif name == "link_inertia":
-        load = (p["link_inertia_kgm2"] - joint["link_inertia_kgm2"]) * s.link_alpha
-    elif name == "unbalance":
-        load = p["moment_nm"] * np.sin(s.link_rad + p["phase_rad"])
-    else:
-        raise ValueError(f"no formula for {name}")
-    return G * Kt * current + loss + load - sensor, -K * (twist + link) - damped + load - sensor
+    effect, values, file = EFFECTS[name], checked_parameters(name, p), Joint.from_mapping(joint, "joint")
+    age = effect.age_s(values)
 
+    def rate(x: Array) -> Array:
+        """Return the derivative; of a channel that is late the mean of the time in between."""
+        late: Array = (np.interp(s.time_s + age, s.time_s, x) - x) / age if age else slope(x, s.time_s)
+        return late
 
-def _late(x: Array, t: Array, delay_s: float) -> Array:
-    """Return reading less truth of a channel that is late: to first order -delay dx/dt."""
-    late: Array = x - np.interp(t + delay_s, t, x)
-    return late
-
-
-def _slip(d: Array, travel: float) -> Array:
-    """Return the Maxwell state along d, from 0."""
-    z = np.zeros_like(d)
-    for k in range(1, len(d)):
-        z[k] = min(1.0, max(-1.0, z[k - 1] + (d[k] - d[k - 1]) / travel))
-    return z
+    state = State(
+        coupling_position_rad=s.coupling_rad,
+        current_a=s.current_a,
+        current_rate_a_s=rate(s.current_a),
+        direction=s.side,
+        link_acceleration_rad_s2=s.link_alpha,
+        link_position_rad=s.link_rad,
+        link_velocity_rad_s=rate(s.link_rad),
+        motor_acceleration_rad_s2=file.gear_ratio * s.alpha,
+        motor_position_rad=s.motor_rad,
+        temperature_c=first_c if effect.at_sensor else s.temperature_c,
+        time_s=s.time_s,
+        torque_nm=s.sensor_nm if effect.at_sensor else s.tau,
+        torque_rate_nm_s=rate(s.sensor_nm),
+        torsion_rad=s.twist_rad,
+        torsion_rate_rad_s=slope(s.twist_rad, s.time_s),
+        velocity_rad_s=s.v,
+    )
+    motor, torsion = (each + np.zeros_like(s.v) for each in LAW_OF[name](values, state, file))
+    if effect.geometric or effect.at_motor_of(values):  # the damper sees what the spring sees
+        error = slope(torsion / file.stiffness_nm_per_rad, s.time_s)
+        torsion = torsion + file.damping_nms_per_rad * error
+        if effect.at_motor_of(values):  # the motor's own speed and acceleration are misread too
+            motor = motor - file.rotor_inertia_kgm2 * file.gear_ratio**2 * slope(error, s.time_s)
+            motor = motor - file.friction.viscous_nms_per_rad * error
+    return motor, torsion

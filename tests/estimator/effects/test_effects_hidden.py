@@ -28,13 +28,12 @@ from validation.generator.draw import Case, Order, draw_many
 
 SEED = 8
 DURATION_S = 6.0
-AT_SENSOR = {"sensor_offset", "sensor_gain", "sensor_drift", "sensor_crosstalk"}
 FIXED: dict[str, tuple[dict[str, float], ...]] = {
     "channel_delay": ({"channel": 0.0}, {"channel": 1.0}, {"channel": 2.0}),
     "encoder_eccentricity": ({"motor_side": 0.0}, {"motor_side": 1.0}),
 }
 HIDDEN = [
-    Hidden(name, "sensor" if name in AT_SENSOR or fixed.get("channel") == 0.0 else 1, None, fixed)
+    Hidden(name, "sensor" if EFFECTS[name].at_sensor_of(fixed) else 1, None, fixed)
     for name in sorted(EFFECTS)
     for fixed in FIXED.get(name, ({},))
 ]
