@@ -396,6 +396,75 @@ class Scene(NamedTuple):
     rng: np.random.Generator
 
 
+def _set(**keys: str) -> Callable[[JointPlant, Mapping[str, float]], None]:
+    def put(plant: JointPlant, p: Mapping[str, float]) -> None:
+        for attribute, parameter in keys.items():
+            setattr(plant, attribute, p[parameter])
+
+    return put
+
+
+def _inertia(plant: JointPlant, p: Mapping[str, float]) -> None:
+    plant.inertia = p["rotor_inertia_kgm2"] * plant.ratio**2
+
+
+def _wave(plant: JointPlant, p: Mapping[str, float]) -> None:
+    plant.waves.append(Wave(p["amplitude_nm"], p["order_per_motor_rev"], p["phase_rad"]))
+
+
+def _kinematic(plant: JointPlant, p: Mapping[str, float]) -> None:
+    plant.kinematic = Wave(p["amplitude_rad"], p["order_per_motor_rev"], p["phase_rad"])
+
+
+_PLANT: Final[dict[str, Callable[[JointPlant, Mapping[str, float]], None]]] = {
+    "coulomb_friction": _set(coulomb="coulomb_nm"),
+    "viscous_friction": _set(viscous="viscous_nms_per_rad"),
+    "stribeck_friction": _set(stribeck="stribeck_nm", stribeck_velocity="stribeck_velocity_rad_s"),
+    "load_dependent_friction": _set(load_coefficient="load_coefficient"),
+    "friction_asymmetry": _set(asymmetry="asymmetry_nm"),
+    "temperature_dependent_friction": _set(viscous_per_k="viscous_per_k"),
+    "torque_ripple": _wave,
+    "cogging": _wave,
+    "kinematic_error": _kinematic,
+    "nonlinear_stiffness": _set(cubic="cubic_nm_per_rad3"),
+    "hysteresis": _set(hysteresis_nm="torque_nm", hysteresis_rad="travel_rad"),
+    "lost_motion": _set(play_rad="width_rad"),
+    "gear_damping": _set(damping="damping_nms_per_rad"),
+    "torque_constant": _set(kt="torque_constant_nm_per_a"),
+    "torque_constant_saturation": _set(saturation="saturation_per_a"),
+    "torque_constant_temperature": _set(kt_per_k="per_k"),
+    "rotor_inertia": _inertia,
+    "link_inertia": _set(link_inertia="link_inertia_kgm2"),
+    "unbalance": _set(unbalance_nm="moment_nm", unbalance_phase="phase_rad"),
+}
+
+
+def _delay(c: Instruments, j: int, p: Mapping[str, float]) -> None:
+    if p["channel"] == 0.0:
+        c.sensor_delay = p["delay_s"]
+    elif p["channel"] == 1.0:
+        c.current_delay[j] = p["delay_s"]
+    else:
+        c.link_delay[j] = p["delay_s"]
+
+
+def _put(attribute: str, parameter: str) -> Callable[[Instruments, int, Mapping[str, float]], None]:
+    return lambda c, j, p: setattr(c, attribute, p[parameter])
+
+
+_INSTRUMENT: Final[dict[str, Callable[[Instruments, int, Mapping[str, float]], None]]] = {
+    "current_offset": lambda c, j, p: c.current_offset.__setitem__(j, p["offset_a"]),
+    "sensor_offset": _put("sensor_offset", "offset_nm"),
+    "sensor_gain": _put("sensor_gain", "gain"),
+    "sensor_drift": _put("sensor_per_k", "per_k_nm"),
+    "sensor_crosstalk": lambda c, j, p: setattr(c, "crosstalk", (p["amplitude_nm"], p["phase_rad"])),
+    "encoder_eccentricity": lambda c, j, p: c.eccentricity.__setitem__(
+        j, (p["amplitude_rad"], p["phase_rad"])
+    ),
+    "channel_delay": _delay,
+}
+
+
 class MujocoBench(Bench):
     """The bench; fewer and shorter runs for tests of the bench itself."""
 
@@ -534,75 +603,6 @@ def _hide(s: Scene) -> Truth:
         for run in s.plants:
             _PLANT[item.name](run[j], p)
     return {"name": item.name, "joint": joint, "parameters": p, "size": item.size}
-
-
-def _set(**keys: str) -> Callable[[JointPlant, Mapping[str, float]], None]:
-    def put(plant: JointPlant, p: Mapping[str, float]) -> None:
-        for attribute, parameter in keys.items():
-            setattr(plant, attribute, p[parameter])
-
-    return put
-
-
-def _inertia(plant: JointPlant, p: Mapping[str, float]) -> None:
-    plant.inertia = p["rotor_inertia_kgm2"] * plant.ratio**2
-
-
-def _wave(plant: JointPlant, p: Mapping[str, float]) -> None:
-    plant.waves.append(Wave(p["amplitude_nm"], p["order_per_motor_rev"], p["phase_rad"]))
-
-
-def _kinematic(plant: JointPlant, p: Mapping[str, float]) -> None:
-    plant.kinematic = Wave(p["amplitude_rad"], p["order_per_motor_rev"], p["phase_rad"])
-
-
-_PLANT: Final[dict[str, Callable[[JointPlant, Mapping[str, float]], None]]] = {
-    "coulomb_friction": _set(coulomb="coulomb_nm"),
-    "viscous_friction": _set(viscous="viscous_nms_per_rad"),
-    "stribeck_friction": _set(stribeck="stribeck_nm", stribeck_velocity="stribeck_velocity_rad_s"),
-    "load_dependent_friction": _set(load_coefficient="load_coefficient"),
-    "friction_asymmetry": _set(asymmetry="asymmetry_nm"),
-    "temperature_dependent_friction": _set(viscous_per_k="viscous_per_k"),
-    "torque_ripple": _wave,
-    "cogging": _wave,
-    "kinematic_error": _kinematic,
-    "nonlinear_stiffness": _set(cubic="cubic_nm_per_rad3"),
-    "hysteresis": _set(hysteresis_nm="torque_nm", hysteresis_rad="travel_rad"),
-    "lost_motion": _set(play_rad="width_rad"),
-    "gear_damping": _set(damping="damping_nms_per_rad"),
-    "torque_constant": _set(kt="torque_constant_nm_per_a"),
-    "torque_constant_saturation": _set(saturation="saturation_per_a"),
-    "torque_constant_temperature": _set(kt_per_k="per_k"),
-    "rotor_inertia": _inertia,
-    "link_inertia": _set(link_inertia="link_inertia_kgm2"),
-    "unbalance": _set(unbalance_nm="moment_nm", unbalance_phase="phase_rad"),
-}
-
-
-def _delay(c: Instruments, j: int, p: Mapping[str, float]) -> None:
-    if p["channel"] == 0.0:
-        c.sensor_delay = p["delay_s"]
-    elif p["channel"] == 1.0:
-        c.current_delay[j] = p["delay_s"]
-    else:
-        c.link_delay[j] = p["delay_s"]
-
-
-def _put(attribute: str, parameter: str) -> Callable[[Instruments, int, Mapping[str, float]], None]:
-    return lambda c, j, p: setattr(c, attribute, p[parameter])
-
-
-_INSTRUMENT: Final[dict[str, Callable[[Instruments, int, Mapping[str, float]], None]]] = {
-    "current_offset": lambda c, j, p: c.current_offset.__setitem__(j, p["offset_a"]),
-    "sensor_offset": _put("sensor_offset", "offset_nm"),
-    "sensor_gain": _put("sensor_gain", "gain"),
-    "sensor_drift": _put("sensor_per_k", "per_k_nm"),
-    "sensor_crosstalk": lambda c, j, p: setattr(c, "crosstalk", (p["amplitude_nm"], p["phase_rad"])),
-    "encoder_eccentricity": lambda c, j, p: c.eccentricity.__setitem__(
-        j, (p["amplitude_rad"], p["phase_rad"])
-    ),
-    "channel_delay": _delay,
-}
 
 
 def _measured(  # noqa: PLR0917
