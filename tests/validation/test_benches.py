@@ -45,7 +45,9 @@ def test_both_joints_carry_the_same_torque_face_to_face(plain: Set) -> None:
         assert np.max(np.abs(run["j1.link_position_rad"] + run["j2.link_position_rad"])) < 2e-6
 
 
-@pytest.mark.parametrize(("name", "variant"), [(n, v) for n in ENTRIES for v in MujocoBench(1).variants(n)])
+@pytest.mark.parametrize(
+    ("name", "variant"), [(n, v) for n in MujocoBench.effects for v in MujocoBench(1).variants(n)]
+)
 def test_an_effect_moves_the_balances_by_its_equation(
     name: str, variant: str, mujoco_bench: MujocoBench
 ) -> None:
