@@ -154,7 +154,7 @@ def test_the_slip_remembers_in_the_loop_and_bears_gaps() -> None:
 @pytest.mark.parametrize(
     ("name", "given", "message"),
     [
-        ("magic", {}, "found 'magic', expected one of channel_delay"),
+        ("magic", {}, f"found 'magic', expected one of {', '.join(EFFECTS)}"),
         ("cogging", {"amplitude_nm": 0.1}, "order_per_motor_rev: missing, expected a number in 1/rev"),
         (
             "cogging",
