@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from jtqd.estimator.effects import EFFECTS
 from tests.paths import ROOT
 
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -53,6 +54,18 @@ def test_every_link_ends_at_a_heading(page: Path) -> None:
         if anchor and anchor[1:] not in anchors(page.parent / link if link else page)
     ]
     assert not broken
+
+
+def test_the_table_of_effects_is_the_library() -> None:
+    text = (ROOT / "docs" / "diagnosis.md").read_text().partition("## Effects")[2]
+    rows = {
+        group: re.findall(r"`(\w+)`", cell)
+        for group, cell in re.findall(r"^\| (\w+) \| (`.*) \|$", text, re.MULTILINE)
+    }
+    groups: dict[str, set[str]] = {}
+    for effect in EFFECTS.values():
+        groups.setdefault(effect.group, set()).add(effect.name)
+    assert {group: set(names) for group, names in rows.items()} == groups, "docs/diagnosis.md, Effects"
 
 
 def test_the_documentation_is_short() -> None:
