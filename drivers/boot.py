@@ -104,8 +104,16 @@ class DriveNode(_Node, frozen=True, kw_only=True, tag="drive"):
             found = self.torque_constant_nm_per_a
             raise ValueError(f"torque_constant_nm_per_a: found {found}, expected a number above 0")
         maps = tuple(map_of(self.node, each, self.objects) for each in self.tpdos)
-        options = self.temperature, self.objects, maps, self.torque_constant_nm_per_a, self.acyclic
-        return DriveProfile(self.node, self.identity, self.given_values, *options)
+        return DriveProfile(
+            self.node,
+            self.identity,
+            self.given_values,
+            self.temperature,
+            self.objects,
+            maps,
+            self.torque_constant_nm_per_a,
+            self.acyclic,
+        )
 
 
 class SensorNode(_Node, frozen=True, kw_only=True, tag="sensor"):

@@ -277,6 +277,9 @@ class BootedNode:
 
 # TPDOs
 
+_INHIBIT_TIME, _EVENT_TIMER = 3, 5
+"""Subindices of the communication parameter."""
+
 _Row = tuple[Key, int, int, str]
 """An object of a TPDO: key, wanted value, size, name in words."""
 
@@ -288,17 +291,6 @@ def _mapping_rows(pdo: PdoMap, transmission_type: int) -> list[_Row]:
         ((mapping, 0), len(pdo.words), 1, "number of mapped objects"),
         *(((mapping, entry), word, 4, "mapping entry") for entry, word in enumerate(pdo.words, 1)),
         ((communication, 2), transmission_type, 1, "transmission type"),
-    ]
-
-
-def _timer_rows(pdo: PdoMap) -> list[_Row]:
-    """Return inhibit time and event timer of the temperature's TPDO; the others have none."""
-    if not _is_temperature(pdo):
-        return []
-    communication = tpdo_parameters(pdo.number)[0]
-    return [
-        ((communication, 3), 10 * EVENT_MS, 2, "inhibit time in 100 us"),
-        ((communication, 5), EVENT_MS, 2, "event timer in ms"),
     ]
 
 
@@ -347,9 +339,10 @@ class TpdoSetup:
     def _timers_as_wanted(self, pdo: PdoMap) -> bool:
         if not _is_temperature(pdo):
             return True
-        (inhibit, due, _, _), (timer, period, _, _) = _timer_rows(pdo)
-        found = self._objects.optional_number(inhibit, 2)
-        return self._objects.optional_number(timer, 2) == period and found in (None, due)
+        communication = tpdo_parameters(pdo.number)[0]
+        inhibit = self._objects.optional_number((communication, _INHIBIT_TIME), 2)
+        timer = self._objects.optional_number((communication, _EVENT_TIMER), 2)
+        return inhibit in (None, 10 * EVENT_MS) and timer == EVENT_MS
 
     def _write(self, pdo: PdoMap) -> None:
         """Map a TPDO; `_as_wanted` has read its COB-ID."""
@@ -357,14 +350,12 @@ class TpdoSetup:
         cob_id = objects.values[communication, 1]
         self._change((communication, 1), cob_id | INVALID, 4)
         self._change((mapping, 0), 0, 1)
-        count, *entries, kind = _mapping_rows(pdo, pdo.transmission_type)
-        for key, value, size, _ in (*entries, count, kind):
-            self._change(key, value, size)
-        for at, (key, value, size, name) in enumerate(_timer_rows(pdo)):
-            if at == 0 and objects.read(key) is None:
-                continue  # a node need not have an inhibit time; with one, a value that flickers does not fill the bus
-            self._change(key, value, size)
-            objects.require(key, value, size, name)
+        for entry, word in enumerate(pdo.words, 1):
+            self._change((mapping, entry), word, 4)
+        self._change((mapping, 0), len(pdo.words), 1)
+        self._change((communication, 2), pdo.transmission_type, 1)
+        if _is_temperature(pdo):
+            self._set_timers(communication)
         # the device's own RTR bit is kept: some accept one value only
         valid = cob_id & NO_RTR | pdo.cob_id
         self._change((communication, 1), valid, 4)
@@ -373,6 +364,15 @@ class TpdoSetup:
             objects.values.pop((mapping, entry), None)  # not part of this mapping
         self._require_mapping(pdo, pdo.transmission_type)
         objects.require((communication, 1), valid, 4, "COB-ID")
+
+    def _set_timers(self, communication: int) -> None:
+        """Set the event timer, and the inhibit time where the node has one: a value that flickers does not fill the bus."""
+        inhibit, timer = (communication, _INHIBIT_TIME), (communication, _EVENT_TIMER)
+        if self._objects.read(inhibit) is not None:
+            self._change(inhibit, 10 * EVENT_MS, 2)
+            self._objects.require(inhibit, 10 * EVENT_MS, 2, "inhibit time in 100 us")
+        self._change(timer, EVENT_MS, 2)
+        self._objects.require(timer, EVENT_MS, 2, "event timer in ms")
 
     def _require_mapping(self, pdo: PdoMap, transmission_type: int) -> None:
         """Read mapping and transmission type back."""
@@ -543,8 +543,19 @@ class NodeBoot:
         sha256 = configuration_sha256(objects.values)
         signed = self.sign(sha256)
         name = printable(objects.best_effort((0x1008, 0)) or b"")
-        ids, found = (self._node, name, device_type, serial), (scaling, gear_ratio, tpdos)
-        return BootedNode(*ids, *found, sha256, signed, watched, tuple(self._notes))
+        return BootedNode(
+            node_id=self._node,
+            name=name,
+            device_type=device_type,
+            serial=serial,
+            scaling=scaling,
+            gear_ratio=gear_ratio,
+            tpdos=tpdos,
+            configuration_sha256=sha256,
+            signed=signed,
+            watched=watched,
+            notes=tuple(self._notes),
+        )
 
     def check_device_type(self) -> int:
         """Check 1000h, whose low word is the number of the device profile (402, 404), and return it."""

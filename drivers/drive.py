@@ -408,8 +408,15 @@ def _layout_error(objects: DriveObjects, missing: set[str], maps: Sequence[PdoMa
 
 def tpdos_as_json(maps: Iterable[PdoMap]) -> list[dict[str, Any]]:
     """Return the TPDOs for a request or a report."""
-    names = "number", "cob_id", "transmission_type"
-    return [{name: getattr(pdo, name) for name in names} | {"words": list(pdo.words)} for pdo in maps]
+    return [
+        {
+            "number": pdo.number,
+            "cob_id": pdo.cob_id,
+            "transmission_type": pdo.transmission_type,
+            "words": list(pdo.words),
+        }
+        for pdo in maps
+    ]
 
 
 def maps_of_json(node: int, tpdos: Iterable[Mapping[str, Any]], objects: DriveObjects) -> tuple[PdoMap, ...]:

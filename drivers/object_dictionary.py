@@ -40,7 +40,17 @@ from jtqd.drivers.sdo import (
 
 # Data types (CiA 301, 7.4.7)
 BOOLEAN, REAL32, VISIBLE_STRING, REAL64 = 0x01, 0x08, 0x09, 0x11
-_INTEGERS = {BOOLEAN: "B", 2: "b", 3: "h", 4: "i", 5: "B", 6: "H", 7: "I", 0x15: "q", 0x1B: "Q"}
+_INTEGERS = {
+    BOOLEAN: "B",
+    0x02: "b",
+    0x03: "h",
+    0x04: "i",
+    0x05: "B",
+    0x06: "H",
+    0x07: "I",
+    0x15: "q",
+    0x1B: "Q",
+}
 """Struct letters; a BOOLEAN takes a byte in an SDO."""
 _LETTERS = {**_INTEGERS, REAL32: "f", REAL64: "d"}
 _LAYOUTS = {data_type: struct.Struct("<" + letter) for data_type, letter in _LETTERS.items()}
