@@ -12,7 +12,6 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -102,25 +101,45 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add("plan", metavar="PLAN", help="efficiency, excitation, validate, or a plan file (jtq.plan/1)")
-    where = (
-        "can0, unix:PATH, sim (the emulated bench), sim:BUS (the same on that bus), or exact (the same in exact time, "
-        "however busy this machine is)"
+    add(
+        "--bus",
+        help="can0, unix:PATH, sim (the emulated bench), sim:BUS (the same on that bus), or exact (the same in exact time, "
+        "however busy this machine is)",
     )
-    add("--bus", help=where)
     add("--out", type=Path, metavar="DIR", help="the campaign's directory; created if missing")
     add("--dry-run", action="store_true", help="print the plan, its length and the bus load, without motion")
-    files = "configuration of jtqd: nodes and joint files (default: the shipped bench)"
-    add("--config", "--joint-config", type=Path, metavar="FILE", help=files)
-    several = partial(add, action="append", default=[])
-    names = f"another limit than the plan's: {', '.join(LIMIT_NAMES)} (temperature_c=none: not supervised)"
-    several("--limit", type=_limit, metavar="NAME=VALUE", help=names)
-    alone = (
-        "where joint N (default: each) may go when it is moved alone: travel_rad=LOW:HIGH, velocity_rad_s, "
-        "acceleration_rad_s2, torque_nm (default: motion_limits of the joint file)"
+    add(
+        "--config",
+        "--joint-config",
+        type=Path,
+        metavar="FILE",
+        help="configuration of jtqd: nodes and joint files (default: the shipped bench)",
     )
-    several("--limits", type=_motion_limits, metavar="[N:]NAME=VALUE,...", help=alone)
-    pair = "joints A and B are coupled on a towing bench (default: those that share a channel of the torque sensor)"
-    several("--towing", type=_pair, metavar="A,B", help=pair)
+    add(
+        "--limit",
+        action="append",
+        type=_limit,
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"another limit than the plan's: {', '.join(LIMIT_NAMES)} (temperature_c=none: not supervised)",
+    )
+    add(
+        "--limits",
+        action="append",
+        type=_motion_limits,
+        default=[],
+        metavar="[N:]NAME=VALUE,...",
+        help="where joint N (default: each) may go when it is moved alone: travel_rad=LOW:HIGH, velocity_rad_s, "
+        "acceleration_rad_s2, torque_nm (default: motion_limits of the joint file)",
+    )
+    add(
+        "--towing",
+        action="append",
+        type=_pair,
+        default=[],
+        metavar="A,B",
+        help="joints A and B are coupled on a towing bench (default: those that share a channel of the torque sensor)",
+    )
     add("--keep-going", action="store_true", help="continue with the next run after a limit was exceeded")
     add("--json", action="store_true", help="print the result (or the plan) as JSON")
     add("--plant", type=Path, metavar="FILE", help=f"with --bus sim: bench to emulate (default {PLANT})")
@@ -129,8 +148,9 @@ def parser() -> argparse.ArgumentParser:
     size("--runs", type=count, metavar="N", help="Fourier runs (default 24)")
     size("--seconds", type=seconds, metavar="S", help="length of a Fourier run (default 24; validate 12)")
     size("--hold", dest="hold_s", type=seconds, metavar="S", help="hold of a constant point (default 2.1)")
-    seed = "of trajectories and emulated bench (default 0)"
-    size("--seed", type=natural, default=0, metavar="N", help=seed)
+    size(
+        "--seed", type=natural, default=0, metavar="N", help="of trajectories and emulated bench (default 0)"
+    )
     size("--evaluations", type=count, metavar="N", help="motions evaluated by each search, per trajectory")
     return made
 
@@ -210,7 +230,8 @@ def _bench_of(options: argparse.Namespace) -> tuple[BenchConfig, tuple[Unit, ...
     for number, given in options.limits:
         if number is not None and number > len(joints):
             raise ConfigError(f"--limits {number}: found no joint {number} in {config.path}")
-        joints = [with_limits(x, given) if number in (None, n) else x for n, x in enumerate(joints, 1)]
+        for place in range(len(joints)) if number is None else (number - 1,):
+            joints[place] = with_limits(joints[place], given)
     units = units_of(config.channels, config.sensor is not None, options.towing)
     return replace(config, joints=tuple(joints)), units
 
@@ -311,11 +332,17 @@ def dry_run_content(
 
 def dry_run_text(content: Mapping[str, Any], limits: Limits, load: BusLoad) -> str:
     """Return `dry_run_content` for people."""
-    cells = "{run}|{velocity_joint}{alone}|{segments}|{seconds:.1f}|"
-    cells += "{peak_velocity_rad_s:.2f}|{peak_current_a:.2f}|{travel_rad:.1f}"
     table = [["run", "velocity joint", "segments", "seconds", "peak rad/s", "peak A", "travel rad"]]
     table += [
-        cells.format(**row, alone=" alone" if row["current_joint"] is None else "").split("|")
+        [
+            row["run"],
+            f"{row['velocity_joint']}{' alone' if row['current_joint'] is None else ''}",
+            str(row["segments"]),
+            f"{row['seconds']:.1f}",
+            f"{row['peak_velocity_rad_s']:.2f}",
+            f"{row['peak_current_a']:.2f}",
+            f"{row['travel_rad']:.1f}",
+        ]
         for row in content["runs"]
     ]
     warmest = f"{limits.temperature_c:g} °C" if math.isfinite(limits.temperature_c) else "not supervised"

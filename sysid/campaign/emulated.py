@@ -99,10 +99,18 @@ def main(arguments: list[str] | None = None) -> int:
     add("--quick", action="store_true", help="a small campaign of the kind")
     add("--seed", type=natural, default=0, help="of trajectories and days (default 0)")
     options = parser.parse_args(arguments)
-    size = (options.runs, options.seconds, options.hold, options.seed, options.evaluations, options.quick)
     joints = (load_joint(shipped("joint1.yaml")), load_joint(shipped("joint2.yaml")))
     try:
-        plan = make_plan(options.kind, Scale(*size, joints=joints))
+        scale = Scale(
+            runs=options.runs,
+            seconds=options.seconds,
+            hold_s=options.hold,
+            seed=options.seed,
+            evaluations=options.evaluations,
+            quick=options.quick,
+            joints=joints,
+        )
+        plan = make_plan(options.kind, scale)
         load_any_plant(options.plant)
         _claim(options.out, plan, options.plant, options.seed)
         _emulate(options.out, plan, options.plant, options.seed)

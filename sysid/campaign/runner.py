@@ -254,7 +254,7 @@ def _recorded(run: Run, setpoints: Setpoints, config: BenchConfig, log: Sequence
     longest_gap_s = LONGEST_GAP * config.period_s
     time_s = logged.table.time_s
     gaps = [
-        [round(float(t), 6) for t in time_s[place : place + 2]]
+        [round(float(time_s[place]), 6), round(float(time_s[place + 1]), 6)]
         for place in np.flatnonzero(np.diff(time_s) > longest_gap_s)
     ]
     logged, interpolated = interpolate_gaps(logged, longest_gap_s, config.period_s)
@@ -534,31 +534,32 @@ def _attempts(
     run: Run, setpoints: Setpoints, reporter: Reporter, attempt_run: AttemptRun
 ) -> tuple[Attempt, RunState]:
     """Return the last attempt and the run's state."""
-    number = 0
-
-    def repeated(run: Run, setpoints: Setpoints, most: int) -> Attempt:
-        nonlocal number
-        for k in range(1, most + 1):
-            number += 1
-            last = attempt_run(run, setpoints)
-            if last.state.status == DONE or not last.again or k == most:
-                break
-            reporter.write_line(f"{run.name}: attempt {k}: {last.state.reason}; repeated")
-        return last
-
     parts = partial_runs(run)
-    last = repeated(run, setpoints, ATTEMPTS if len(parts) == 1 else 1)
+    number, last = _repeated(run, setpoints, reporter, attempt_run, ATTEMPTS if len(parts) == 1 else 1)
     state = last.state
     if len(parts) > 1 and last.again and last.begun and state.status != DONE:
         reporter.write_line(f"{run.name}: {state.reason}; repeated in {len(parts)} pieces")
         states = []
         for part in parts:
-            last = repeated(part, expand(part), ATTEMPTS)
+            attempts, last = _repeated(part, expand(part), reporter, attempt_run, ATTEMPTS)
+            number += attempts
             states.append(last.state)
             if last.state.status != DONE:
                 break
         state = _joined(parts, states)
     return last, replace(state, attempts=number)
+
+
+def _repeated(
+    run: Run, setpoints: Setpoints, reporter: Reporter, attempt_run: AttemptRun, most: int
+) -> tuple[int, Attempt]:
+    """Return the number of attempts, and the last of them."""
+    for number in range(1, most + 1):
+        last = attempt_run(run, setpoints)
+        if last.state.status == DONE or not last.again or number == most:
+            break
+        reporter.write_line(f"{run.name}: attempt {number}: {last.state.reason}; repeated")
+    return number, last
 
 
 def _joined(parts: Sequence[Run], states: Sequence[RunState]) -> RunState:
@@ -568,15 +569,20 @@ def _joined(parts: Sequence[Run], states: Sequence[RunState]) -> RunState:
     incomplete_by: Counter[str] = Counter()
     for state in states:
         incomplete_by.update(state.incomplete_by)
-    names = [part.name for part in parts[: len(states)]]
-    each = zip(names, states, strict=True)
-    sums = ("played_s", "rows", "missed", "incomplete", "interpolated")
     return RunState(
         status=last.status,
-        reason="" if done else f"{names[-1]}: {last.reason}",
+        reason="" if done else f"{parts[len(states) - 1].name}: {last.reason}",
+        played_s=sum(state.played_s for state in states),
+        rows=sum(state.rows for state in states),
+        missed=sum(state.missed for state in states),
+        incomplete=sum(state.incomplete for state in states),
         incomplete_by=dict(incomplete_by),
-        findings=tuple(f"{name}: {finding}" for name, state in each for finding in state.findings),
+        findings=tuple(
+            f"{part.name}: {finding}"
+            for part, state in zip(parts, states, strict=False)
+            for finding in state.findings
+        ),
         sha256=" ".join(state.sha256 for state in states) if done else "",
+        interpolated=sum(state.interpolated for state in states),
         pieces=len(parts) if done else 1,
-        **{field: sum(getattr(state, field) for state in states) for field in sums},
     )
