@@ -48,14 +48,14 @@ class RecorderProcess:
         self._child: Child | None = None
         self._starts: list[float] = []
         self._waits = False
-        self._files: tuple[Path, str, str] | None = None
-        """Directory, prefix and run."""
+        self._directory: Path | None = None
+        self._prefix = self._run_name = ""
         self._result: dict[str, Any] | None = None
 
     def start(self, request: dict[str, Any]) -> None:
         """Start the recorder with the request of `recording_request`. Raises OSError."""
-        directory, prefix = Path(request["directory"]), str(request["prefix"])
-        self._files = directory, prefix, free_run(directory, prefix, time.time_ns())
+        self._directory, self._prefix = Path(request["directory"]), str(request["prefix"])
+        self._run_name = free_run(self._directory, self._prefix, time.time_ns())
         self.progress.unlink(missing_ok=True)
         self._write(request)
         self._run()
@@ -85,9 +85,8 @@ class RecorderProcess:
             self._child.process.send_signal(signal.SIGHUP)
 
     def _write(self, request: dict[str, Any]) -> None:
-        assert self._files is not None
         temporary = self._request.with_name(self._request.name + ".new")
-        temporary.write_text(json.dumps(request | {"run": self._files[2]}), encoding="utf-8")
+        temporary.write_text(json.dumps(request | {"run": self._run_name}), encoding="utf-8")
         temporary.replace(self._request)
 
     def watch(self) -> None:
@@ -155,10 +154,10 @@ class RecorderProcess:
 
     def _unfinished(self) -> list[str]:
         """Return unfinished files of this run left by killed recorders."""
-        if self._files is None:
+        if self._directory is None:
             return []
-        directory, prefix, run = self._files
-        return [str(each.path) for each in part_files(directory, prefix) if each.active and each.run == run]
+        files = part_files(self._directory, self._prefix)
+        return [str(each.path) for each in files if each.active and each.run == self._run_name]
 
 
 # ---- request ----

@@ -409,7 +409,10 @@ class Session:
         self.events.note(EventKind.RECORDER_STOPPED, text, level=INFO, time_ns=time.time_ns())
         self._read_notices()
         self.recording.flush()
-        (flight or self.parts).end()
+        if flight is None:
+            self.parts.end()
+        else:
+            flight.end()
         if self._repair is not None:
             self._repair.process.kill()  # it may be interrupted anywhere, and goes on at the next start
             self._repair.process.wait()
@@ -436,7 +439,10 @@ class Session:
         if self._notices is None and self._request.notices is not None:
             with suppress(SharedMemoryError):
                 self._notices = NoticesReader(self._request.notices)
-        for each in () if self._notices is None else self._notices.read()[0]:
+        if self._notices is None:
+            return
+        news, _ = self._notices.read()
+        for each in news:
             self.events.note(
                 EventKind.NOTICE, each.text, level=each.level, time_ns=each.realtime_ns, count=each.node
             )

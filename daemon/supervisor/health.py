@@ -109,17 +109,19 @@ class PdoWatch:
     def observe(self, inputs: Sequence[InputView], absent: Collection[int], now_s: float) -> None:
         """Take a reading; PDOs of `absent` nodes (optional ones) do not time out."""
         for pdo, seen in zip(self._pdos, inputs, strict=False):
-            last = self._last.get(pdo.name, InputView(*(0,) * 12)._replace(missed=seen.missed))
+            last = self._last.get(pdo.name)
             self._last[pdo.name] = seen
-            lost, expected = seen.missed - last.missed, pdo.node not in absent
+            expected = pdo.node not in absent
             timed_out = expected and seen.in_a_row >= TIMEOUT_CYCLES
-            # A loss between two readings, over by now, counts too, with what the last reading saw of it.
-            over = lost and not timed_out and lost + last.in_a_row - seen.in_a_row >= TIMEOUT_CYCLES
-            for present in (True, False) if expected and over else (timed_out,):
-                self._conditions.update("pdo_timeout", pdo, present, now_s, str(TIMEOUT_CYCLES))
+            if last is not None and seen.missed != last.missed:
+                # A loss between two readings, over by now, counts too, with what the last reading saw of it.
+                over = seen.missed - last.missed + last.in_a_row - seen.in_a_row
+                if expected and over >= TIMEOUT_CYCLES and not timed_out:
+                    self._conditions.update("pdo_timeout", pdo, True, now_s, str(TIMEOUT_CYCLES))
+            self._conditions.update("pdo_timeout", pdo, timed_out, now_s, str(TIMEOUT_CYCLES))
             for name, count, before in (
-                ("pdo_short", seen.short, last.short),
-                ("pdo_long", seen.long, last.long),
+                ("pdo_short", seen.short, 0 if last is None else last.short),
+                ("pdo_long", seen.long, 0 if last is None else last.long),
             ):
                 if count != before:
                     self._until_s[name, pdo.name] = now_s + LENGTH_S

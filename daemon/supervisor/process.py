@@ -396,7 +396,10 @@ class Supervisor:
         request = recording_request(
             self._config, report, runtime=self._directory, directory=self._log_directory, bus=self._instance
         )
-        (self._recorder.renew if again else self._recorder.start)(request)
+        if again:
+            self._recorder.renew(request)
+        else:
+            self._recorder.start(request)
 
     def _child(self, module: str, arguments: list[str], name: str) -> Child:
         child = Child(module, arguments, name=name)
