@@ -354,9 +354,13 @@ class NodeCare:
 
     def sdo_counts(self, node: int) -> dict[str, int]:
         """Return the counts of SDO requests repeated, unanswered and refused, and of unrelated answers."""
-        q = self._queues[node]
-        counts = q.repeats, q.timeouts, q.refusals, q.ignored
-        return dict(zip(("repeats", "silences", "refusals", "ignored"), counts, strict=True))
+        queue = self._queues[node]
+        return {
+            "repeats": queue.repeats,
+            "silences": queue.timeouts,
+            "refusals": queue.refusals,
+            "ignored": queue.ignored,
+        }
 
     def _watch_nodes(self, view: View, now_s: float) -> None:
         """Boot nodes that need it, poll their presence, and check the configuration of the others."""

@@ -16,7 +16,7 @@ import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
@@ -60,8 +60,11 @@ _QUEUE = 100
 _BUS_STATE_COUNTS = ("error_warning", "error_passive", "bus_off")
 _DROP_COUNTS = ("rx_dropped", "tx_dropped", "rx_over_errors", "tx_errors", "rx_errors")
 _UNITS = (
-    *("/etc/systemd/system", "/run/systemd/system", "/usr/local/lib/systemd/system"),
-    *("/usr/lib/systemd/system", "/lib/systemd/system"),
+    "/etc/systemd/system",
+    "/run/systemd/system",
+    "/usr/local/lib/systemd/system",
+    "/usr/lib/systemd/system",
+    "/lib/systemd/system",
 )
 _UNIT = "jtqd@.service"
 _USUAL_LOGS = Path("/var/log/jtqd")
@@ -129,9 +132,10 @@ def check_kernel(wanted: Realtime, *, can: bool) -> Iterator[CheckResult]:
     yield _timers()
     yield _clocksource()
     yield _can_sockets(required=can)
-    checks: tuple[Callable[[Realtime], CheckResult], ...] = (_priority, _throttling, _memory, _cpu)
-    for check in checks:
-        yield check(wanted)
+    yield _priority(wanted)
+    yield _throttling(wanted)
+    yield _memory(wanted)
+    yield _cpu(wanted)
     yield _governor()
 
 
@@ -455,7 +459,7 @@ def _remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
         str(path)
         for directory in sorted(directories)
         for path in sorted(directory.glob("*.mcap.active"))
-        if not path.name.startswith(growing or "\n")
+        if not path.name.startswith(growing)  # an empty tuple is the start of no name
     ]
     text = ", ".join(files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")
     yield judge("unfinished logs", text or "none", (files, WARN, "of a crash: jtq recover FILE"))

@@ -196,6 +196,15 @@ def content(survey: Survey, problems: list[str], family: Family | None = None) -
     }
 
 
+def _object(key: Key, value: str) -> str:
+    return f"  {label(*key):<8} {value:<12} {_NAMES.get(key, '')}".rstrip()
+
+
+def _value(key: Key, value: int) -> str:
+    """Return a number; a code in hexadecimal."""
+    return f"{value:0{_CODES[key[0]]}X}h" if key[0] in _CODES else str(value)
+
+
 def text(
     survey: Survey,
     problems: list[str],
@@ -207,10 +216,8 @@ def text(
     lines = [f"node {survey.node}: {description(survey)}"]
     if family is not None:
         lines.append(f"profile {family.name}: {family.title} (docs/bus.md)")
-    for key, value in (*sorted(survey.numbers.items()), *((each, None) for each in sorted(survey.missing))):
-        shown = f"{value:0{_CODES[key[0]]}X}h" if value is not None and key[0] in _CODES else value
-        shown = "not there" if value is None else shown
-        lines.append(f"  {label(*key):<8} {shown!s:<12} {_NAMES.get(key, '')}".rstrip())
+    lines += [_object(key, _value(key, value)) for key, value in sorted(survey.numbers.items())]
+    lines += [_object(key, "not there") for key in sorted(survey.missing)]
     lines.append("TPDOs as they are now (jtqd writes its own mapping at its start, where the drive lets it)")
     for each in survey.tpdos:
         kind = f"type {each.transmission_type}" if each.on else "off"

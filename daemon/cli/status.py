@@ -301,9 +301,16 @@ def content(reading: Reading) -> dict[str, Any]:
         }
         for node, what in sorted(about.nodes.items())
     ]
-    notices = [{**each._asdict(), "node": each.node or None} for each in reading.notices]
-    for each in notices:
-        del each["number"]
+    notices = [
+        {
+            "realtime_ns": each.realtime_ns,
+            "level": each.level,
+            "node": each.node or None,
+            "topic": each.topic,
+            "text": each.text,
+        }
+        for each in reading.notices
+    ]
     conditions = [
         {
             "name": each.name,
@@ -401,7 +408,9 @@ class StatusView:
             [_line(heading, text, _style_of(level)) for heading, text, level in conditions],
             [_line(heading, text, _style_of(level)) for heading, text, level in notices],
         ):
-            yield from ("", *section) if section else ()
+            if section:
+                yield ""
+                yield from section
 
 
 def _title(about: About, view: View | None) -> Text:

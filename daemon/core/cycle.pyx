@@ -275,15 +275,19 @@ cdef class SnapshotWriter:
 
 def frame_counts(Intake intake):
     """Return late, lost, duplicate and rejected frames by PDO name; for a temperature, how often it became unknown."""
-    kinds = "late", "lost", "duplicate", "rejected"
-    rows = [
-        (pdo.name, (intake.inputs[n].late, intake.inputs[n].lost, intake.inputs[n].duplicates, intake.inputs[n].rejected))
+    counts = {
+        pdo.name: {
+            "late": intake.inputs[n].late,
+            "lost": intake.inputs[n].lost,
+            "duplicate": intake.inputs[n].duplicates,
+            "rejected": intake.inputs[n].rejected,
+        }
         for n, pdo in enumerate(intake.pdos)
-    ] + [
-        (each.name, (0, intake.celsius[n].lost, 0, intake.celsius[n].rejected))
-        for n, each in enumerate(intake.temperatures)
-    ]
-    return {name: dict(zip(kinds, counts, strict=True)) for name, counts in rows}
+    }
+    for n, each in enumerate(intake.temperatures):
+        lost, rejected = intake.celsius[n].lost, intake.celsius[n].rejected
+        counts[each.name] = {"late": 0, "lost": lost, "duplicate": 0, "rejected": rejected}
+    return counts
 
 
 # The cycle ------------------------------------------------------------------------------------------------------------

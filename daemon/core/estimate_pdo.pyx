@@ -35,7 +35,8 @@ SIGMA_UNKNOWN = 255
 PUBLISHED_STATUSES = frozenset(st.PUBLISHED)
 
 cdef int NONE = NO_TORQUE, UNKNOWN = SIGMA_UNKNOWN, INVALID = st.INVALID
-cdef double LARGEST = 32767.0, WIDEST_NM = 12.7
+cdef double LARGEST = 32767.0  # counts of an I16
+cdef double WIDEST_NM = 12.7  # 254 steps of sigma; 255 is SIGMA_UNKNOWN
 cdef double PER_NM = round(1.0 / TORQUE_UNIT_NM), STEPS_PER_NM = round(1.0 / SIGMA_UNIT_NM)
 cdef bint HAS_TORQUE[16]
 HAS_TORQUE[:] = [code in PUBLISHED_STATUSES for code in range(16)]

@@ -62,7 +62,8 @@ cdef int WORST = len(_ORDER)
 cdef int STANDS = RANKS[st.STANDSTILL]
 cdef int WITH_NUMBER = RANKS[st.DEGRADED]  # up to this rank a torque is published
 cdef int RANK_INVALID = RANKS[st.INVALID]
-cdef int64_t RELAPSE = 10, MOST = 4
+cdef int64_t RELAPSE = 10  # times the cycles waited: a fall within these is a relapse and doubles the wait
+cdef int64_t MOST = 4  # times the cycles of NEEDED: the longest wait
 
 cdef int FAULT_NOT_FINITE = faults.NOT_FINITE, FAULT_OUT_OF_RANGE = faults.OUT_OF_RANGE
 cdef int FAULT_DEVIATION = faults.DEVIATION, FAULT_DRIVE = faults.DRIVE_FAULT, FAULT_STALE = faults.STALE

@@ -15,7 +15,6 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext, suppress
-from itertools import chain
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -516,11 +515,17 @@ def write_parquet(path: Path, blocks: Iterable[Columns]) -> TableSize:
 def _gathered(blocks: Iterable[Columns]) -> Iterator[Columns]:
     """Yield blocks of at least `_GROUP_ROWS`, but for the last: Parquet packs each on its own."""
     kept: list[Columns] = []
-    for block in chain(blocks, [None]):
-        kept += [] if block is None else [block]
-        if kept and (block is None or sum(map(_length, kept)) >= _GROUP_ROWS):
-            yield {name: np.concatenate([each[name] for each in kept]) for name in kept[0]}
+    for block in blocks:
+        kept.append(block)
+        if sum(map(_length, kept)) >= _GROUP_ROWS:
+            yield _joined(kept)
             kept = []
+    if kept:
+        yield _joined(kept)
+
+
+def _joined(blocks: list[Columns]) -> Columns:
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
 def _length(block: Columns) -> int:

@@ -17,6 +17,7 @@ import json
 import os
 import sys
 from bisect import bisect
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -127,7 +128,11 @@ def recover(
     finally:
         os.close(descriptor)
     start_ns, end_ns = _times(found)
-    lost_s = None if lossy and not torn else _lost_s(found) if changed else 0.0
+    lost_s: float | None = 0.0
+    if lossy and not torn:
+        lost_s = None
+    elif changed:
+        lost_s = _lost_s(found)
     return Recovery(
         path=path if dry_run else final,
         changed=changed,
@@ -180,6 +185,11 @@ def _missing(found: Contents) -> int:
     return 0 if statistics is None else statistics.message_count - sum(found.counts.values())
 
 
+def _zeros(source: Source, start: int, end: int) -> bool:
+    """Return whether these bytes are zeros."""
+    return not any(any(source.read(at, min(end - at, _MB))) for at in range(start, end, _MB))
+
+
 def _findings(source: Source, found: Contents) -> list[str]:
     """Return the findings about a file that must be rewritten, one line each."""
     lines = []
@@ -187,7 +197,7 @@ def _findings(source: Source, found: Contents) -> list[str]:
         size = gap.end - gap.start
         if gap.end < found.end or found.tail is not None:
             what = f"bytes {gap.start} to {gap.end} cannot be read{' (a chunk)' if gap.is_chunk else ''}"
-        elif not any(any(source.read(at, min(gap.end - at, _MB))) for at in range(gap.start, gap.end, _MB)):
+        elif _zeros(source, gap.start, gap.end):
             what = f"{counted(size, 'byte')} of zeros at the end"
         else:
             what = f"truncated at byte {gap.start}: the last {counted(size, 'byte')} cannot be read"
@@ -389,15 +399,9 @@ def main(argv: list[str] | None = None) -> int:
     for path in options.logs:
         if not path.is_dir() and not path.name.endswith(_ENDINGS):
             parser().error(f"found {path}, expected a directory or a file named *.mcap or *.mcap{ACTIVE}")
-    files = [
-        (each, path.is_dir())
-        for path in options.logs
-        for each in (sorted(path.iterdir()) if path.is_dir() else [path])
-        if not path.is_dir() or (each.is_file() and each.name.endswith(_ENDINGS))
-    ]
     results: list[Recovery] = []
     failures: list[dict[str, str]] = []
-    for path, in_directory in files:
+    for path, in_directory in _files(options.logs):
         try:
             found = recover(path, dry_run=in_directory or options.dry_run)
             if in_directory and not (found.changed or found.renamed):
@@ -420,6 +424,17 @@ def main(argv: list[str] | None = None) -> int:
     if failures:
         return 1
     return 3 if any(each.lossy for each in results) else 0
+
+
+def _files(paths: Sequence[Path]) -> Iterator[tuple[Path, bool]]:
+    """Yield every file, and whether it was named by its directory only."""
+    for path in paths:
+        if not path.is_dir():
+            yield path, False
+            continue
+        for each in sorted(path.iterdir()):
+            if each.is_file() and each.name.endswith(_ENDINGS):
+                yield each, True
 
 
 def _text(result: Recovery, dry_run: bool) -> str:

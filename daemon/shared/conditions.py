@@ -360,10 +360,15 @@ class Conditions:
     def present(self) -> list[Condition]:
         """Return every present condition, the worst first, then the oldest."""
         found = [
-            Condition(d.name, state.subject.name, d.severity, state.text, round(state.since_s * 1e9))
+            Condition(
+                state.definition.name,
+                state.subject.name,
+                state.definition.severity,
+                state.text,
+                round(state.since_s * 1e9),
+            )
             for state in self._states.values()
             if state.present
-            for d in (state.definition,)
         ]
         return sorted(found, key=lambda each: (-each.severity, each.since_ns))
 
@@ -375,10 +380,15 @@ class Conditions:
     def history(self, now_s: float) -> list[Occurrences]:
         """Return every condition that was present at any time, in the order of the first time."""
         found = [
-            Occurrences(name, subject, state.count, state.total_s + lasts_s, state.first_s)
+            Occurrences(
+                name,
+                subject,
+                state.count,
+                state.total_s + (now_s - state.since_s if state.present else 0.0),
+                state.first_s,
+            )
             for (name, subject), state in self._states.items()
             if state.count
-            for lasts_s in (now_s - state.since_s if state.present else 0.0,)
         ]
         return sorted(found, key=lambda each: each.first_s)
 

@@ -20,7 +20,7 @@ from contextlib import suppress
 from enum import IntEnum
 from math import inf
 from pathlib import Path
-from typing import Any, NamedTuple, TextIO
+from typing import NamedTuple, TextIO
 
 from jtqd.daemon.shared.cycle_record import Ring, RingReader
 
@@ -72,14 +72,18 @@ class NoticesReader:
     def read(self) -> tuple[list[Notice], int]:
         """Return (notices since the last call, number of notices overwritten before they could be read)."""
         batch = self._ring.read()
-        return [_notice(*_NOTICE.unpack(record)) for record in batch.records], batch.lost
+        return [_notice(record) for record in batch.records], batch.lost
 
 
-def _notice(number: int, realtime_ns: int, level: int, node: int, *rest: Any) -> Notice:
-    topic_length, text_length, topic, text, _ = rest
-    name, line = topic[:topic_length], text[:text_length]
+def _notice(record: bytes) -> Notice:
+    number, realtime_ns, level, node, topic_length, text_length, topic, text, _ = _NOTICE.unpack(record)
     return Notice(
-        number, realtime_ns, level, node, name.decode(errors="replace"), line.decode(errors="replace")
+        number=number,
+        realtime_ns=realtime_ns,
+        level=level,
+        node=node,
+        topic=topic[:topic_length].decode(errors="replace"),
+        text=text[:text_length].decode(errors="replace"),
     )
 
 
