@@ -161,8 +161,8 @@ cdef class Estimator:
                 if self.observed:
                     for m in range(self.width):
                         f[k, m] = self.features[m]
-        torque, sigma, *others = values
-        return EstimateRun(torque, sigma, status, *others, features)
+        torque, sigma, tob, physics, network, rate, load = values
+        return EstimateRun(torque, sigma, status, tob, physics, network, rate, load, features)
 
 
 cdef fill_network(NetworkLaw *law, network, joint):
@@ -665,7 +665,8 @@ cdef class PythonEstimator(Estimator):
 def make_estimator(joint, settings, network=None):
     """Return the estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
     plain = plain_joint(joint)
-    inner = globals()[METHODS[settings.method].estimator](plain, settings, network)
+    kinds = {"JointEstimator": JointEstimator, "FusedEstimator": FusedEstimator}
+    inner = kinds[METHODS[settings.method].estimator](plain, settings, network)
     return ExtendedEstimator(joint, settings, inner) if acting_effects(joint) else inner
 
 

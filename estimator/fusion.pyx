@@ -518,7 +518,8 @@ EVERY: Final = 4
 TURN_BLOCK: Final = 16
 """Every fourth sample counts; after TURN_BLOCK of them the waves are compared with the file's: 64 ms at 1 kHz."""
 
-cdef double INVERSE_TREND = 1.0 / 0.1, INVERSE_UP = 1.0 / 0.15, INVERSE_DOWN = 1.0 / DOWN_S  # TREND_S, UP_S
+cdef double TREND_S = 0.1, UP_S = 0.15
+cdef double INVERSE_TREND = 1.0 / TREND_S, INVERSE_UP = 1.0 / UP_S, INVERSE_DOWN = 1.0 / DOWN_S
 # the status is degraded by a mismatch of so many sigmas of the estimate, squared, and this part of the rated torque
 cdef double LOWER_SQUARE = 4.0**2, LEAST_SHARE = 0.02
 cdef double SURE_SIGMAS = 2.0  # standard deviations of a gain that do not count for the status

@@ -456,8 +456,13 @@ class TorqueNetwork(Network):
     features = FEATURES
     keys = ("envelope_low", "envelope_high", "sigma_nm", "joint", "data_sha256")
 
-    def __init__(self, *source: Any, **options: Any) -> None:
-        super().__init__(*source, **options)
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None = None,
+        check: RuntimeCheck | None = None,
+    ) -> None:
+        super().__init__(source, sha256, check)
         self.envelope_low: Final = self.numbers("envelope_low", len(FEATURES))
         self.envelope_high: Final = self.numbers("envelope_high", len(FEATURES))
         sigma = self.metadata["sigma_nm"]
@@ -478,8 +483,13 @@ class FusedNetwork(Network):
     features = FUSED_FEATURES
     keys = ("input_low", "input_high", "envelope", "sigma_scale", "joint", "data_sha256")
 
-    def __init__(self, *source: Any, **options: Any) -> None:
-        super().__init__(*source, **options)
+    def __init__(
+        self,
+        source: bytes | str | os.PathLike[str],
+        sha256: str | None = None,
+        check: RuntimeCheck | None = None,
+    ) -> None:
+        super().__init__(source, sha256, check)
         try:
             self.envelope: Final = read(Envelope, self.metadata["envelope"])
         except FieldError as error:

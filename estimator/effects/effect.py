@@ -458,11 +458,9 @@ class Effect:
 
     def joint(self, p: Values, joint: AnyJoint) -> AnyJoint:
         """Return the joint with the values that the effect replaces (`changes_joint`)."""
-        return (
-            replace(joint, **{each.key: p[each.name] for each in self.parameters})
-            if self.changes_joint
-            else joint
-        )
+        if not self.changes_joint:
+            return joint
+        return replace(joint, **{each.key: p[each.name] for each in self.parameters})
 
     def at_sensor_of(self, p: Values) -> bool:
         """Return whether it belongs to the coupling's sensor with these parameters (see `at_sensor`)."""
@@ -499,8 +497,8 @@ class Effect:
         """Way to look for a wave of `order` per motor revolution; None for other effects."""
         if not self.is_wave:
             return None
-        name, step, *_ = self.columns[0]
-        return Wave(name, step, {"order_per_motor_rev": float(order)}).term()
+        column = self.columns[0]
+        return Wave(column.name, column.step, {"order_per_motor_rev": float(order)}).term()
 
     @property
     def is_wave(self) -> bool:
