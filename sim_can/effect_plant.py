@@ -373,6 +373,20 @@ class _Truth(NamedTuple):
     torque_nm: float
 
 
+def _between(early: _Truth, late: _Truth, time_s: float) -> _Truth:
+    share = (time_s - early.time_s) / (late.time_s - early.time_s)
+
+    def mix(a: float, b: float) -> float:
+        return a + share * (b - a)
+
+    return _Truth(
+        time_s,
+        (mix(early.currents[0], late.currents[0]), mix(early.currents[1], late.currents[1])),
+        mix(early.link_rad, late.link_rad),
+        mix(early.torque_nm, late.torque_nm),
+    )
+
+
 class _Past:
     """Samples of the truth over the last `span_s`; before the first one it was as in the first one."""
 
@@ -398,15 +412,7 @@ class _Past:
             return samples[0]._replace(time_s=time_s)
         for k in range(len(samples) - 2, -1, -1):
             if samples[k].time_s <= time_s:
-                early, late = samples[k], samples[k + 1]
-                share = (time_s - early.time_s) / (late.time_s - early.time_s)
-                (i1, i2), link, torque = early.currents, early.link_rad, early.torque_nm
-                i1, i2 = i1 + share * (late.currents[0] - i1), i2 + share * (late.currents[1] - i2)
-                link, torque = (
-                    link + share * (late.link_rad - link),
-                    torque + share * (late.torque_nm - torque),
-                )
-                return _Truth(time_s, (i1, i2), link, torque)
+                return _between(samples[k], samples[k + 1], time_s)
         raise AssertionError("the first sample is earlier")
 
 

@@ -163,4 +163,12 @@ def _columns(signals: FloatArray, torque: FloatArray, ratings: DriveRatings) -> 
     i, motor_rad, motor_rad_s, link_rad, celsius = (
         np.round(signals[:, k] / unit) * unit for k, unit in enumerate(units)
     )
-    return JointColumns(i, motor_rad, motor_rad_s, link_rad, None, torque, celsius)
+    return JointColumns(
+        current_a=i,
+        motor_position_rad=motor_rad,
+        motor_velocity_rad_s=motor_rad_s,
+        link_position_rad=link_rad,
+        link_velocity_rad_s=None,
+        torque_nm=torque,
+        temperature_c=celsius,
+    )

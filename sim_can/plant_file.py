@@ -59,12 +59,21 @@ def uses_temperature(joint: Joint) -> bool:
 
 def probe_state(position_rad: float, torsion_rad: float = 0.0) -> State:
     """Return a state in which everything that the inner loop knows is a number."""
-    state = State(motor_position_rad=position_rad, torsion_rad=torsion_rad, temperature_c=30.0)
-    state.current_a = state.direction = state.torque_nm = state.time_s = 1.0
-    state.velocity_rad_s = state.link_velocity_rad_s = 0.5
-    state.link_position_rad = state.coupling_position_rad = 0.1
-    state.motor_acceleration_rad_s2 = state.link_acceleration_rad_s2 = 0.0
-    return state
+    return State(
+        current_a=1.0,
+        velocity_rad_s=0.5,
+        direction=1.0,
+        motor_position_rad=position_rad,
+        motor_acceleration_rad_s2=0.0,
+        link_position_rad=0.1,
+        link_velocity_rad_s=0.5,
+        link_acceleration_rad_s2=0.0,
+        coupling_position_rad=0.1,
+        torque_nm=1.0,
+        torsion_rad=torsion_rad,
+        temperature_c=30.0,
+        time_s=1.0,
+    )
 
 
 # Plant files

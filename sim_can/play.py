@@ -76,11 +76,19 @@ class PlaySource(Source):
     def _show(self, row: int) -> None:
         """Set the signals to a row of the run."""
         self.row = row
-        values = iter(self._rows[row])
-        for drive, channel in zip(self.drives, self.channels, strict=True):
-            drive.current_a, drive.motor_position_rad = next(values), next(values)
-            drive.motor_velocity_rad_s, drive.link_position_rad = next(values), next(values)
-            channel.torque_nm = next(values)
+        first, second = self.drives
+        (
+            first.current_a,
+            first.motor_position_rad,
+            first.motor_velocity_rad_s,
+            first.link_position_rad,
+            self.channels[0].torque_nm,
+            second.current_a,
+            second.motor_position_rad,
+            second.motor_velocity_rad_s,
+            second.link_position_rad,
+            self.channels[1].torque_nm,
+        ) = self._rows[row]
 
 
 def columns_beside(run_path: Path | str) -> Path | None:

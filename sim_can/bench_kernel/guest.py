@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import IO, Self
 
 from jtqd.sim_can.bench_kernel import build
 
@@ -52,16 +52,22 @@ class Result:
 def run(
     command: Sequence[str],
     *,
+    time_travel: bool = False,
     timeout_s: float | None = None,
+    out_dir: str | os.PathLike[str] | None = None,
+    env: Mapping[str, str] | None = None,
+    memory: str = "2G",
     sinks: tuple[IO[bytes], IO[bytes]] | None = None,
-    **options: Any,
+    systemd: bool = False,
 ) -> Result:
-    """Run `command` in a guest of its own and return its result; `options` as in Guest.
+    """Run `command` in a guest of its own and return its result; arguments as in Guest.
 
     `sinks` receives standard output and standard error while the command runs.
     Raises GuestTimeoutError, GuestError, build.BuildError, build.MissingPackagesError.
     """
-    with Guest(command, **options) as guest:
+    with Guest(
+        command, time_travel=time_travel, out_dir=out_dir, env=env, memory=memory, systemd=systemd
+    ) as guest:
         return guest.wait(timeout_s, sinks)
 
 
