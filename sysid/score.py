@@ -191,12 +191,12 @@ def table_lines(rows: Sequence[Row], files: Sequence[str]) -> list[str]:
     """Return the table as lines of text."""
     two = len(files) > 1
     names = ["before", "after"] if two else ["rmse"]
-    lines = [["error, rms", "run", *names, "unit", *["change"] * two]]
+    lines = [["error, rms", "run", *names, "unit", *(["change"] if two else [])]]
     for row in rows:
         what = row.what if row.run == "all" else ""
         errors = [f"{error:.4g}" if math.isfinite(error) else "-" for error in row.errors]
         change = f"{100.0 * row.change:+.0f} %" if math.isfinite(row.change) else "-"
-        lines.append([what, row.run, *errors, row.unit, *[change] * two])
+        lines.append([what, row.run, *errors, row.unit, *([change] if two else [])])
     return aligned(lines, (0, 1, len(names) + 2), rule=True)
 
 

@@ -509,7 +509,8 @@ def figures_of(command: str, row: Row) -> Figures | None:
     """Return the figures of what `jtq COMMAND --json` printed, None for a failed group."""
     if row.content is None:
         return None
-    return (_diagnosis_figures if command == DIAGNOSE else _replay_figures)(row.content["result"])
+    result = row.content["result"]
+    return _diagnosis_figures(result) if command == DIAGNOSE else _replay_figures(result)
 
 
 def _nm(value: float | None) -> str:

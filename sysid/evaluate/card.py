@@ -22,7 +22,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
@@ -252,7 +252,11 @@ def _speed_limit(samples: Sequence[Samples], joint: Joint) -> tuple[float, bool]
 def _within(samples: Sequence[Samples], axis: Axis, edges: tuple[float, float]) -> list[Samples]:
     """Return the samples, of which those in a bin are scored."""
     low, high = edges
-    return [each.where((low <= (value := axis.value(each))) & (value < high)) for each in samples]
+
+    def inside(value: FloatArray) -> BoolArray:
+        return (value >= low) & (value < high)
+
+    return [each.where(inside(axis.value(each))) for each in samples]
 
 
 def _seconds(samples: Sequence[Samples]) -> float:

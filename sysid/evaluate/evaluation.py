@@ -407,11 +407,16 @@ def _target(  # noqa: PLR0917
     details: Iterable[str] = (),
 ) -> Target:
     """Return a row: `form` of what was found (a text: why it is unknown), reached where all lies within the limits."""
-    ours, reached = str(found or _UNKNOWN), None
-    if found is not None and not isinstance(found, str):
+    reached = None
+    if found is None:
+        ours = _UNKNOWN
+    elif isinstance(found, str):
+        ours = found
+    else:
         values = found if isinstance(found, tuple) else (found,)
         ours = form.format(*values)
-        reached = None if limits is None else all(limits[0] <= value <= limits[1] for value in values)
+        if limits is not None:
+            reached = all(limits[0] <= value <= limits[1] for value in values)
     return Target(key, figure, paper, goal, ours, reached, tuple(details))
 
 
@@ -455,10 +460,15 @@ def _error_targets(e: Evaluation) -> Iterator[Target]:
     pairs, worse = against_physics(e.run_scores)
     # a network of share 0 is no network: that ours is not worse then means nothing
     distinct = any(ours != physics for _, _, ours, physics in pairs)
+    found: float | str | None = None
+    if distinct:
+        found = len(worse)
+    elif pairs:
+        found = "none: they are one number"
     yield _target(
         "every_run",
         "runs in which ours is worse than its physics",
-        len(worse) if distinct else "none: they are one number" if pairs else None,
+        found,
         f"{{}} of {len(pairs)}",
         (0, 0),
         "none" if distinct else "-",
@@ -512,10 +522,15 @@ def _coverage(intervals: Mapping[str, IntervalTables]) -> Target:
 
 def _outside(found: Sequence[Outside]) -> Iterator[Target]:
     ratios = [each.ours.rmse_nm / each.physics.rmse_nm for each in found if each.physics is not None]
+    largest: float | str = _NOT_EVALUATED
+    if ratios:
+        largest = max(ratios)
+    elif found:
+        largest = "no network: ours is its physics"
     yield _target(
         "outside_rmse",
         "RMSE ours : physics, outside the envelope",
-        max(ratios) if ratios else "no network: ours is its physics" if found else _NOT_EVALUATED,
+        largest,
         "{:.4f}",
         _up_to(_NO_WORSE),
         f"at most {_NO_WORSE:g}",

@@ -8,7 +8,6 @@ import difflib
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -158,10 +157,13 @@ def _plateau_options(parser: argparse.ArgumentParser) -> None:
 
 def _positive(text: str) -> float:
     """argparse type: a finite number > 0."""
-    with suppress(ValueError):
-        if 0.0 < (value := float(text)) < float("inf"):
-            return value
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected a number > 0")
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a number > 0")
+    return value
 
 
 def _fitted(

@@ -292,25 +292,33 @@ def efficiency_findings(points: Sequence[EtaPoint], joint: Joint) -> list[RunIss
     ]
     if against:
         return [_against_current(against, points)]
-    kinds = [[p for p in points if p.driving is driving] for driving in (True, False)]
-    gaining = [[p for p in own if p.loss_nm < -_reach(p.loss_se, offset_nm)] for own in kinds]
+    kinds = {driving: [p for p in points if p.driving is driving] for driving in (True, False)}
+    gaining = {
+        driving: [p for p in own if p.loss_nm < -_reach(p.loss_se, offset_nm)]
+        for driving, own in kinds.items()
+    }
     # More than half of both: then it is not a scale, which moves eta of both kinds the same way.
-    mirrored = all(2 * len(gain) > len(own) for gain, own in zip(gaining, kinds, strict=True))
+    mirrored = all(2 * len(gaining[driving]) > len(own) for driving, own in kinds.items())
     found = []
-    for own, gain, (kind, expected, size, reading, sign) in zip(kinds, gaining, _GAINING, strict=True):
-        if gain:
-            worst = max(gain, key=lambda p: sign * p.ratio)
-            excess = 100.0 * (worst.ratio**sign - 1.0)
-            cause = _MIRRORED if mirrored else _SCALE.format(size, excess, reading)
-            found.append(_finding(kind, gain, own, worst, expected=expected, cause=cause))
+    if gaining[True]:
+        worst = max(gaining[True], key=lambda p: p.ratio)
+        cause = _MIRRORED if mirrored else _SCALE.format("small", 100.0 * (worst.ratio - 1.0), "much")
+        expected = "at most 1 when driving"
+        found.append(
+            _finding("eta_above_1_driving", gaining[True], kinds[True], worst, expected=expected, cause=cause)
+        )
+    if gaining[False]:
+        worst = min(gaining[False], key=lambda p: p.ratio)
+        cause = _MIRRORED if mirrored else _SCALE.format("large", 100.0 * (1.0 / worst.ratio - 1.0), "little")
+        expected = "at least 1 when back-driven"
+        found.append(
+            _finding(
+                "eta_below_1_back_driven", gaining[False], kinds[False], worst, expected=expected, cause=cause
+            )
+        )
     return found
 
 
-_GAINING: Final = (
-    ("eta_above_1_driving", "at most 1 when driving", "small", "much", 1),
-    ("eta_below_1_back_driven", "at least 1 when back-driven", "large", "little", -1),
-)
-"""Plateaus that gain energy: kind of the finding, expected, size of G Kt, reading of the torque, sign of the excess."""
 _MIRRORED: Final = (
     "swapped sign of the velocity (or of current and torque together), or torque and motor torque exchanged, as eta in "
     "the wrong convention would be"
@@ -467,28 +475,28 @@ def _measured_lines(result: EfficiencyResult) -> list[str]:
     rows = [["quadrant", "plateaus", "tau_j/(G Kt i)", "G Kt i/tau_j"]]
     for name in QUADRANTS:
         own = in_quadrant(result.points, name)
-        cells = ["none", "none"]
-        if own:
-            cells = [
-                f"{min(p.eta(c) for p in own):.3f} to {max(p.eta(c) for p in own):.3f} "
-                f"+- {max(p.eta_se(c) for p in own):.3f}"
-                for c in CONVENTIONS
-            ]
+        cells = []
+        for convention in CONVENTIONS:
+            etas = [point.eta(convention) for point in own]
+            errors = [point.eta_se(convention) for point in own]
+            cells.append(f"{min(etas):.3f} to {max(etas):.3f} +- {max(errors):.3f}" if own else "none")
         rows.append([QUADRANT_TITLES[name], str(len(own)), *cells])
     return table_lines(rows)
 
 
 def _summary_lines(fit: EfficiencyFit) -> list[str]:
     """Return one line per quadrant, with the paper's RMSE where the convention is Table I's."""
-    paper = fit.convention == TABLE_I.convention
-    rows = [["quadrant", "plateaus", "distinct", "RMSE", *["paper"] * paper, "RMSE Nm", "condition"]]
+    like_paper = fit.convention == TABLE_I.convention
+    paper = ["paper"] if like_paper else []
+    rows = [["quadrant", "plateaus", "distinct", "RMSE", *paper, "RMSE Nm", "condition"]]
     for name, quadrant in fit.quadrants.items():
-        rmse = [quadrant.rmse, *[getattr(TABLE_I, name).rmse] * paper]
         rows.append(
             [
                 QUADRANT_TITLES[name],
-                *map(str, (quadrant.plateaus, quadrant.distinct)),
-                *(f"{each:.4f}" for each in rmse),
+                str(quadrant.plateaus),
+                str(quadrant.distinct),
+                f"{quadrant.rmse:.4f}",
+                *([f"{getattr(TABLE_I, name).rmse:.4f}"] if like_paper else []),
                 f"{quadrant.rmse_nm:.3f}",
                 f"{quadrant.condition:.0f}",
             ]
@@ -498,16 +506,16 @@ def _summary_lines(fit: EfficiencyFit) -> list[str]:
 
 def _coefficient_lines(fit: EfficiencyFit, points: Sequence[EtaPoint]) -> list[str]:
     """Coefficients with standard errors, beside Table I where the convention is the table's."""
-    paper = fit.convention == TABLE_I.convention
+    like_paper = fit.convention == TABLE_I.convention
     lines = []
     for name, quadrant in fit.quadrants.items():
-        rows = [["", "fitted", "std err", *["Table I", "difference"] * paper]]
+        rows = [["", "fitted", "std err", *(["Table I", "difference"] if like_paper else [])]]
         for key in COEFFICIENTS:
             value, table = getattr(quadrant.polynomial, key), getattr(getattr(TABLE_I, name), key)
-            cells = [value, quadrant.errors[key], *[table, value - table] * paper]
-            rows.append([key, *(f"{cell:.4f}" for cell in cells)])
+            beside = [f"{table:.4f}", f"{value - table:.4f}"] if like_paper else []
+            rows.append([key, f"{value:.4f}", f"{quadrant.errors[key]:.4f}", *beside])
         lines += [QUADRANT_TITLES[name], *_indented(table_lines(rows))]
-        if paper:
+        if like_paper:
             off = difference_from_table(points, name, quadrant.polynomial)
             lines.append(
                 f"  eta against Table I at these points: {float(np.sqrt(np.mean(off**2))):.4f} RMS, "

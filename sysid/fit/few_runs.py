@@ -55,6 +55,8 @@ _GAIN: Final = 0.05
 """Catalogues allow 5 to 10 % on the torque constant."""
 _INERTIA_SHARE: Final = 0.3
 _OFFSET_RATED: Final = 0.01
+_ZERO_RATED: Final = 0.01
+"""Of a run's own offset, beside the common one."""
 _OTHER_WAY_RATED: Final = 0.005
 """Of the constant part at no load, one direction against the other."""
 _CURVED_RATED: Final = 0.01
@@ -260,7 +262,7 @@ def _before(joint: Joint) -> _Before:
     b = _mixing(rated)
     covariance = b @ np.diag(sigmas**2) @ b.T + np.diag(own**2)
     precision = np.asarray(np.linalg.inv(covariance), np.float64)
-    return _Before(b @ means, covariance, precision, _OFFSET_RATED * rated)
+    return _Before(b @ means, covariance, precision, _ZERO_RATED * rated)
 
 
 def _solve(

@@ -41,6 +41,7 @@ from jtqd.sysid.planner.plan import (
     BETWEEN_S,
     DEFAULT_LIMITS,
     EDGE_S,
+    Fourier,
     Off,
     Plan,
     Plateau,
@@ -72,7 +73,7 @@ class Unit:
     @property
     def name(self) -> str:
         """Of its runs: "joint_3", "joints_3_4"."""
-        return self.title.replace(" and ", "_").replace(" ", "_")
+        return f"joint{'s' if len(self.joints) > 1 else ''}_{'_'.join(map(str, self.joints))}"
 
     def refusal(self, kind: str) -> str:
         """Return why a campaign of this kind has no runs of these joints; "" where it has."""
@@ -320,22 +321,20 @@ def excitation_runs(
     duration_s = _trajectory_s(run_s, (2.0 * EDGE_S + BETWEEN_S), 2)
     # the second level changes after each pair of runs, so that either joint is the velocity joint at every level
     levels = [FULL_RAD_S] * count + [_SECOND_LEVELS[k // 2 % len(_SECOND_LEVELS)] for k in range(count)]
-    of_level = {
-        level: iter(
-            design(
-                _design_limits(limits, level),
-                count=levels.count(level),
-                duration_s=duration_s,
-                harmonics=HARMONICS,
-                seed=seed_of("excitation", level, seed),
-                evaluations=evaluations,
-                joints=joints,
-                on_progress=on_progress,
-            )
+    fourier: dict[int, Fourier] = {}  # by place in `levels`
+    for level in dict.fromkeys(levels):
+        places = [k for k, each in enumerate(levels) if each == level]
+        made = design(
+            _design_limits(limits, level),
+            count=len(places),
+            duration_s=duration_s,
+            harmonics=HARMONICS,
+            seed=seed_of("excitation", level, seed),
+            evaluations=evaluations,
+            joints=joints,
+            on_progress=on_progress,
         )
-        for level in dict.fromkeys(levels)
-    }
-    fourier = [next(of_level[level]).segment for level in levels]
+        fourier.update(zip(places, (one.segment for one in made), strict=True))
     return tuple(
         trajectory_run(f"excitation_{k + 1:02d}", 1 + k % 2, fourier[k], fourier[count + k])
         for k in range(count)
@@ -653,12 +652,14 @@ def make_plan(kind: str, scale: Scale, on_progress: OnTried | None = None) -> Pl
         velocities = _QUICK_VELOCITIES if scale.quick else VELOCITIES_RAD_S
         currents = _QUICK_CURRENTS if scale.quick else None
         return Plan(kind, limits, efficiency_runs(velocities, hold_s, currents, limits.travel_rad))
-    size = limits, scale.value("runs"), scale.value("seconds", kind)
+    count, seconds = scale.value("runs"), scale.value("seconds", kind)
     if kind == "validate":
-        drawn = variable_runs(*size, seed=scale.seed, joints=scale.joints)
+        drawn = variable_runs(limits, count, seconds, seed=scale.seed, joints=scale.joints)
         return Plan(kind, limits, validation_runs(hold_s) + drawn)
     runs = excitation_runs(
-        *size,
+        limits,
+        count,
+        seconds,
         seed=scale.seed,
         evaluations=scale.value("evaluations"),
         joints=scale.joints,
@@ -685,11 +686,12 @@ def make_plan_of(
     runs: list[Run] = []
     limits: dict[int, Limits] = {}
     for unit in able:
-        number, *other = unit.joints
-        if other:
-            of_pair = replace(scale, joints=(joints[number - 1], joints[other[0] - 1]))
+        if len(unit.joints) == 2:
+            one, two = unit.joints
+            of_pair = replace(scale, joints=(joints[one - 1], joints[two - 1]))
             runs += [_driven_by(run, unit) for run in make_plan(kind, of_pair, on_progress).runs]
             continue
+        [number] = unit.joints
         motion = range_of(number, joints[number - 1], scale.limits)
         limits[number] = motion.limits
         runs += [replace(run, name=f"{unit.name}_{run.name}") for run in _alone(kind, number, motion, scale)]
@@ -721,7 +723,8 @@ def _alone(kind: str, number: int, motion: MotionRange, scale: Scale) -> tuple[R
     evaluations = scale.value("evaluations")
     made = trajectories(motion, levels, duration_s, seed=seed, evaluations=evaluations)
     plateaus = joint_plateau_run(number, motion, "plateaus", QUICK_LADDER if scale.quick else LADDER)
-    pairs = enumerate(zip(made[:count], made[count:], strict=True), 1)
-    return plateaus, *(
-        trajectory_run(f"excitation_{k:02d}", number, *pair, current_joint=None) for k, pair in pairs
-    )
+    runs = [
+        trajectory_run(f"excitation_{k + 1:02d}", number, made[k], made[count + k], current_joint=None)
+        for k in range(count)
+    ]
+    return plateaus, *runs

@@ -113,8 +113,8 @@ class Bench:
 class Motion(NamedTuple):
     """Scaled candidates over the grid: every array [m, n].
 
-    velocity, acceleration of the velocity joint; current of the driving joint; torque between the joints [Nm], positive
-    along the positive current of either; factors of the genome's amplitudes [m, 1].
+    velocity, acceleration of the velocity joint [rad/s, rad/s^2]; current of the driving joint [A]; torque between the
+    joints [Nm], positive along the positive current of either; factors of the genome's amplitudes [m, 1].
     """
 
     velocity: FloatArray

@@ -167,11 +167,13 @@ def _fourier(reach: PairRange, count: int, purpose: str) -> list[tuple[Segment, 
 
 
 def _pair_excitation(reach: PairRange, role: int) -> Runs:
-    return dict(zip("12", _fourier(reach, 4, "diagnosis excitation")[2 * (role - 1) :], strict=False))
+    first, second = _fourier(reach, 4, "diagnosis excitation")[2 * (role - 1) : 2 * role]
+    return {"1": first, "2": second}
 
 
 def _pair_repeat(reach: PairRange, role: int) -> Runs:
-    return dict.fromkeys("123", _fourier(reach, 2, "diagnosis repeat")[role - 1])
+    motion = _fourier(reach, 2, "diagnosis repeat")[role - 1]
+    return {"1": motion, "2": motion, "3": motion}
 
 
 def _both_ways(reach: PairRange, speeds: Sequence[float], load: float) -> Runs:
@@ -268,7 +270,7 @@ def _pair_zero_reading(reach: PairRange, role: int) -> Runs:
     segments: list[Segment] = [Rest(EDGE_S, 0.0), Off(_OFF_S)]
     for s in (1.0, -1.0) * 3:
         segments += [Plateau(s * speed, 0.0, 2.0, ramp_s), Rest(0.5, ramp_s), Off(_OFF_S)]
-    return dict.fromkeys("12", tuple(segments))
+    return {"1": tuple(segments), "2": tuple(segments)}
 
 
 # One joint ------------------------------------------------------------------------------------------------------
@@ -385,7 +387,8 @@ def _joint_excitation(joint: JointRange) -> Motions:
 
 
 def _joint_repeat(joint: JointRange) -> Motions:
-    return dict.fromkeys("1234", ("the same motion again", _ladder(joint, (0.2, 0.5, 1.0))))
+    moves = _ladder(joint, (0.2, 0.5, 1.0))
+    return {str(k): ("the same motion again", moves) for k in (1, 2, 3, 4)}
 
 
 def _both_payloads(shares: Sequence[float]) -> Callable[[JointRange], Motions]:
@@ -418,7 +421,8 @@ def _joint_warm_up(joint: JointRange) -> Motions:
     check = _ladder(joint, (0.1, 0.3, 1.0))
     a = joint.acceleration_rad_s2
     work: list[Move] = [(q, joint.velocity_rad_s, a, 0.0) for q in (joint.low_rad, joint.high_rad)] * 30
-    return dict.fromkeys("12", ("from cold, without a break", (check + work) * 4 + check))
+    moves = (check + work) * 4 + check
+    return dict.fromkeys(("1", "2"), ("from cold, without a break", moves))
 
 
 def _joint_zero_reading(joint: JointRange) -> Motions:
@@ -429,7 +433,7 @@ def _joint_zero_reading(joint: JointRange) -> Motions:
         for k, s in enumerate((1.0, 0.5, -1.0, -0.5) * 2)
     ]
     what = "in each stop of 5 s: brake on, power stage off, recorded as jN.enabled 0"
-    return dict.fromkeys("12", (what, moves))
+    return {"1": (what, moves), "2": (what, moves)}
 
 
 # Kinds of experiment --------------------------------------------------------------------------------------------

@@ -99,8 +99,11 @@ class Series:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the series as it stands in a plan, in Python's own numbers; the duration belongs to the segment."""
-        values = {each.name: getattr(self, each.name) for each in fields(self) if each.name != "duration_s"}
-        return {k: list(map(float, v)) if isinstance(v, tuple) else float(v) for k, v in values.items()}
+        return {
+            "omega_rad_s": float(self.omega_rad_s),
+            "a": [float(x) for x in self.a],
+            "b": [float(x) for x in self.b],
+        }
 
 
 class FourierTrajectory(Series):
@@ -171,6 +174,10 @@ class FourierSeries(Series):
             phase = k * self.omega_rad_s * t
             series = series + (a * np.cos(phase) + b * np.sin(phase))
         return np.asarray(series * smooth_step(x))
+
+    def to_mapping(self) -> dict[str, Any]:
+        """As of `Series`, with the constant current."""
+        return super().to_mapping() | {"offset_a": float(self.offset_a)}
 
 
 def smooth_step(x: FloatArray) -> FloatArray:
@@ -431,7 +438,8 @@ def _run(mapping: Mapping[str, Any]) -> Run:
             segments.append(each)
     if isinstance(file, _AloneRun):
         return Run(file.name, file.joint, tuple(segments), None)
-    return Run(file.name, file.velocity_joint, tuple(segments), file.current_joint or OTHER_ONE)
+    other = OTHER_ONE if file.current_joint is None else file.current_joint
+    return Run(file.name, file.velocity_joint, tuple(segments), other)
 
 
 # Plans ----------------------------------------------------------------------------------------------------------
@@ -557,8 +565,15 @@ class _PlanFile:
                 runs.append(run)
         celsius = math.inf if self.limits.temperature_c is None else self.limits.temperature_c
         alone = {
-            joint: Limits(current, velocity, torque, high - low, celsius, (low, high))
-            for joint, current, velocity, torque, (low, high) in (vars(each).values() for each in self.alone)
+            each.joint: Limits(
+                current_a=each.current_a,
+                velocity_rad_s=each.velocity_rad_s,
+                torque_nm=each.torque_nm,
+                travel_rad=each.travel_rad[1] - each.travel_rad[0],
+                temperature_c=celsius,
+                position_rad=each.travel_rad,
+            )
+            for each in self.alone
         }
         return Plan(self.name, Limits(**vars(self.limits) | {"temperature_c": celsius}), tuple(runs), alone)
 
@@ -612,8 +627,14 @@ def expand(run: Run) -> Setpoints:
             velocity, current = target
     if run.current_joint is None:
         marks = [replace(mark, current_a=None) for mark in marks]
-    series = np.concatenate(velocities), np.concatenate(currents)
-    return Setpoints(run.velocity_joint, *series, tuple(marks), tuple(off), run.current_joint)
+    return Setpoints(
+        run.velocity_joint,
+        np.concatenate(velocities),
+        np.concatenate(currents),
+        tuple(marks),
+        tuple(off),
+        run.current_joint,
+    )
 
 
 def samples(duration_s: float) -> int:

@@ -242,7 +242,8 @@ def _train_joint(
         result = train_paper(blocks, joint, hashes, schedule)
         claimed = split_by_sample(blocks, schedule) if options.show_leakage else None
     count, share = len(result.held_out), result.metadata.get("share", 1.0)
-    network, physics = (sum(each) / count for each in zip(*result.held_out.values(), strict=True))
+    network = sum(score for score, _ in result.held_out.values()) / max(count, 1)
+    physics = sum(score for _, score in result.held_out.values()) / max(count, 1)
     path = options.out / f"{joint.name}{'.fused' if ours else ''}.onnx"
     digest = None
     if gate is not None and not gate.passed:

@@ -87,7 +87,14 @@ class Gate:
 
     def to_mapping(self) -> dict[str, Any]:
         """Plain values for JSON and for the metadata of a network."""
-        return {"passed": self.passed} | {key: each for key, each in vars(self).items() if key != "share"}
+        return {
+            "passed": self.passed,
+            "gain": self.gain,
+            "network_rmse_nm": self.network_rmse_nm,
+            "physics_rmse_nm": self.physics_rmse_nm,
+            "runs": self.runs,
+            "worse": self.worse,
+        }
 
 
 def judge(scores: Collection[tuple[float, float]], share: float = 1.0) -> Gate:
