@@ -220,7 +220,8 @@ def fit_friction(time_s: FloatArray, run: JointColumns, joint: Joint) -> Frictio
     """
     current, omega_m, torque = run.current_a, run.motor_velocity_rad_s, run.torque_nm
     if current is None or omega_m is None or torque is None:
-        raise FitError("found a run without current, velocity or torque_nm, expected all of them")
+        missing = [n for n in ("current_a", "motor_velocity_rad_s", "torque_nm") if getattr(run, n) is None]
+        raise FitError(f"found no {', '.join(missing)}, expected current, motor velocity and measured torque")
     dt_s = np.diff(time_s, prepend=time_s[0])
     speed = omega_m / joint.gear_ratio
     moving = np.abs(speed) > _STANDSTILL_RAD_S
