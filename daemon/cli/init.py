@@ -85,13 +85,21 @@ def _positive(text: str) -> float:
     raise argparse.ArgumentTypeError(f"found {text!r}, expected a number above 0")
 
 
+def _count(text: str) -> int:
+    """Return a whole number that fits an object of 32 bits."""
+    number = count(text)
+    if number >= 2**31:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected a whole number below {2**31}")
+    return number
+
+
 _VALUES: Mapping[str, tuple[Callable[[str], float], str, str]] = {
     "gear_ratio": (_positive, "G", "motor revolutions per joint revolution"),
     "rated_torque_nm": (_positive, "NM", "rated torque of the joint [Nm]"),
     "torque_constant_nm_per_a": (_positive, "KT", "of the motor [Nm/A]"),
     "rated_current_a": (_positive, "A", "of the motor [A], for 6075h"),
-    "encoder_counts": (count, "N", "counts per revolution of the motor, all edges"),
-    "link_encoder_counts": (count, "N", "counts per revolution of the joint, at the link"),
+    "encoder_counts": (_count, "N", "counts per revolution of the motor, all edges"),
+    "link_encoder_counts": (_count, "N", "counts per revolution of the joint, at the link"),
 }
 """Field of `Wanted` -> type, metavar and help of its option."""
 _OF_JOINT_FILE = ("rated_torque_nm", "torque_constant_nm_per_a")
@@ -118,7 +126,7 @@ def parser() -> argparse.ArgumentParser:
     add("--sensor-joint", type=int, action="append", metavar="J", help=of_sensor)
     add_values(made, action="append")
     bitrate = "of the bus [bit/s] (default 1000000)"
-    add("--bitrate", type=count, default=1_000_000, metavar="B", help=bitrate)
+    add("--bitrate", type=_count, default=1_000_000, metavar="B", help=bitrate)
     add(
         "--name",
         type=_name,
@@ -336,6 +344,7 @@ def _joints(options: argparse.Namespace, found: _Devices) -> list[JointProposal]
 
 def _answer(why: str, field: str) -> float:
     """Ask until a number comes. Raises UsageError at the end of input."""
+    kind, _, _ = _VALUES[field]
     print(why, file=sys.stderr)
     while True:
         question = OPTIONS[field].removeprefix("--").replace("-", " ")
@@ -344,7 +353,7 @@ def _answer(why: str, field: str) -> float:
         if not line:
             raise UsageError(f"no answer: give {OPTIONS[field]}")
         try:
-            return _VALUES[field][0](line.strip())
+            return kind(line.strip())
         except argparse.ArgumentTypeError as error:
             print(error, file=sys.stderr)
 

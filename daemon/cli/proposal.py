@@ -425,8 +425,14 @@ def kept_tpdos(node: int, survey: Survey | None, objects: DriveObjects) -> KeptT
             )
             return KeptTpdos(problems=(problem,))
     why = "their mapping is fixed, by the EDS" if fixed else f"as they are, by {survey.source}"
-    longest_ms = max((each.timer_ms for each in acyclic), default=0)
-    return KeptTpdos(used, (min(1000, longest_ms * 3 // 2) or _AGE_MS) if acyclic else None, why)
+    return KeptTpdos(used, _age_ms(acyclic), why)
+
+
+def _age_ms(acyclic: Sequence[Tpdo]) -> int | None:
+    """Return for how long a frame counts that the drive sends by itself: 1.5 times its timer, at most 1 s."""
+    if not acyclic:
+        return None
+    return min(1000, max(each.timer_ms for each in acyclic) * 3 // 2) or _AGE_MS
 
 
 def _is_acyclic(pdo: Tpdo) -> bool:

@@ -209,8 +209,10 @@ class Traffic:
             return
         if pdo.age_ns:
             pdo.last_ns = stamp_ns
-        pdo.in_cycle += self._sync_ns > 0
-        if pdo.age_ns or not self._sync_ns:
+        if not self._sync_ns:
+            return
+        pdo.in_cycle += 1
+        if pdo.age_ns:
             return
         delay_ns = stamp_ns - self._sync_ns
         pdo.delays.add(delay_ns)

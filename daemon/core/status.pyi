@@ -8,7 +8,11 @@ from jtqd.estimator.settings import EstimatorSettings
 NEEDED: Final[dict[int, int]]
 
 class JointCounts(Protocol):
-    """Where a joint counts: the loop's snapshot, or two arrays of its layout in a replay."""
+    """Where a joint counts: the loop's snapshot, or two arrays of its layout in a replay.
+
+    counters: unsigned 64-bit words in the order of `counters.COUNTERS`; errors: of each joint two sums of squared errors
+    [Nm^2] and the number of samples, float64.
+    """
 
     counters: Any
     errors: Any

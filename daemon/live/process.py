@@ -89,8 +89,9 @@ class LiveStream:
             if slot == self._slot:
                 continue
             self._slot = slot
-            counts = {"flags": flags, "sync_counter": counter, "frames": count}
-            block = self._cycles.block(record, index, realtime, **counts)
+            block = self._cycles.block(
+                record, index, realtime, flags=flags, sync_counter=counter, frames=count
+            )
             for topic, payload in self._cycles.payloads(block):
                 self.add(topic, realtime, payload)
             self.add(messages.JOINT_STATES.number, realtime, self._overview.payload(record, realtime))
@@ -307,8 +308,13 @@ class Source:
         stream, now_ns = self._stream, time.time_ns()
         made = stream.take(self._loop.ring.read().records)
         for notice in () if self._notices is None else self._notices.read()[0]:
-            what, level, at_ns = notice.text, notice.level, notice.realtime_ns
-            stream.events.note(EventKind.NOTICE, what, level=level, time_ns=at_ns, count=notice.node)
+            stream.events.note(
+                EventKind.NOTICE,
+                notice.text,
+                level=notice.level,
+                time_ns=notice.realtime_ns,
+                count=notice.node,
+            )
         found = self._loop.diagnosis(time.monotonic_ns(), now_ns)
         if found is not None:
             view, statuses = found
