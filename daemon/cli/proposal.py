@@ -561,9 +561,8 @@ class JointProposal:
         """Return the values that a profile leaves to drive and operator, by key. Raises MissingValueError."""
         options: dict[str, float] = {}
         if self._wanted.gear_ratio is not None:
-            options["gear_ratio_numerator"], options["gear_ratio_denominator"] = _ratio(
-                self._wanted.gear_ratio
-            )
+            numerator, denominator = _ratio(self._wanted.gear_ratio)
+            options = {"gear_ratio_numerator": numerator, "gear_ratio_denominator": denominator}
         for name in ("encoder_counts", "link_encoder_counts"):
             if (counts := getattr(self._wanted, name)) is not None:
                 options[name] = counts

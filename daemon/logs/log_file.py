@@ -511,7 +511,8 @@ class Contents:
         """Definitions that no CRC covers."""
         self._rebuilt_to = 0
         """Message indexes before this offset are rebuilt from the chunk before them."""
-        self._limit, self._places = source.size, list[int]()
+        self._limit = source.size
+        self._places: list[int] = []
         if self.tail is not None:
             summary, self._limit = self.tail
             self.schemas, self.channels = dict(summary.schemas), dict(summary.channels)

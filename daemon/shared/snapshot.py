@@ -80,7 +80,7 @@ class InputView(NamedTuple):
     """Frames of a wrong length (8210h, 8220h); both are among the rejected."""
 
 
-NOT_MEASURED = Measured(*(nan,) * 6)
+NOT_MEASURED = Measured(nan, nan, nan, nan, nan, nan)
 NO_ZEROS = Zeros(*(0.0,) * 7, 0, 0)
 """Of an estimator that learns nothing."""
 

@@ -487,7 +487,7 @@ def _back_drive(plateaus: Sequence[PlateauScore]) -> Target:
     return _target(
         "back_drive",
         "worst error at 2.5 rad/s, 30 Nm, back drive",
-        ours and ours[0],
+        None if ours is None else ours[0],
         "{:.2f} % of rated",
         _up_to(BACK_DRIVE_PERCENT),
         f"at most {BACK_DRIVE_PERCENT:g} % of rated",

@@ -325,7 +325,8 @@ def _fit_losses(joint: Joint, number: int, runs: list[RunFile], options: argpars
     if not two and len(runs) <= MOST_RUNS:
         few = fit_few_runs(signals, joint)
         lines, log = _few_lines(few), [ONE_ENCODER, FEW_RUNS]
-        new, unseen, sigma_per_k, samples = few.joint, [few.held_out_nm], PER_K_PRIOR[1], few.samples
+        new, unseen = few.joint, [few.held_out_nm]
+        sigma_per_k, samples = PER_K_PRIOR[1], few.samples
         notes: dict[str, Any] = {"few_runs": few.lines(), "rotor_inertia_kgm2": "fitted, too"}
         more = {
             "effective_samples": few.effective,

@@ -178,10 +178,11 @@ def _pair_repeat(reach: PairRange, role: int) -> Runs:
 
 def _both_ways(reach: PairRange, speeds: Sequence[float], load: float) -> Runs:
     """Each speed in both directions, without load and with one of either sign."""
-    return {
-        name: _over(reach, [(s * v, i, 1.5) for v in speeds for s in (1.0, -1.0)])
-        for name, i in (("idle", 0.0), ("pull", load), ("push", -load))
-    }
+    runs = {}
+    for name, current in (("idle", 0.0), ("pull", load), ("push", -load)):
+        points = [(s * v, current, 1.5) for v in speeds for s in (1.0, -1.0)]
+        runs[name] = _over(reach, points)
+    return runs
 
 
 def _pair_speed_ladder(reach: PairRange, role: int) -> Runs:
