@@ -111,6 +111,9 @@ def expected(
     name: str, p: Mapping[str, float], s: Signals, joint: Mapping[str, Any], first_c: Array
 ) -> tuple[Array, Array]:
     """Return what the effect leaves in the motor and in the torsion balance; first_c: temperature of joint 1."""
+    assert name in LAW_OF, (
+        f"tests/estimator/effects/laws.py: found no row for {name}, expected one per effect"
+    )
     effect, values, file = EFFECTS[name], checked_parameters(name, p), Joint.from_mapping(joint, "joint")
     age = effect.age_s(values)
 
