@@ -23,6 +23,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.command_line import make_directory
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable, RunTableError
@@ -207,7 +208,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--json", action="store_true", help="print the findings of all joints as JSON")
     options = parser.parse_args(arguments)
     try:
-        options.out.mkdir(parents=True, exist_ok=True)
+        make_directory(options.out)
         sha256 = {run.name: run.sha256 for run in measured_runs()}
         results = diagnose_all()
         write(options.out, results, sha256)

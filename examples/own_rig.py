@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -20,6 +21,8 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.command_line import make_directory
+from jtqd.estimator.errors import ConfigError
 
 MASS_KG: Final = 1.2
 LEVER_M: Final = 0.15
@@ -109,13 +112,20 @@ motion_limits: {{travel_rad: [-1.2, 1.2], velocity_rad_s: 2.0, torque_nm: 3.0}}
 
 def main(argv: list[str] | None = None) -> int:
     """Write recordings, column map and joint file."""
-    parser = argparse.ArgumentParser(description="Record a made-up test rig in a layout of its own.")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+    parser = argparse.ArgumentParser(
+        prog="python -m examples.own_rig", description="Record a made-up test rig in a layout of its own."
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="directory of the recordings")
     parser.add_argument("--upright", action="store_true", help="axis upright: no torque of the weight")
     options = parser.parse_args(argv)
     out: Path = options.out
+    try:
+        make_directory(out)
+    except ConfigError as error:
+        print(f"own_rig: {error}", file=sys.stderr)
+        return 1
     for folder, seeds in (("runs", range(1, 7)), ("new", range(7, 9))):
-        (out / folder).mkdir(parents=True, exist_ok=True)
+        (out / folder).mkdir(exist_ok=True)
         for seed in seeds:
             table = recorded(TRUE, seed, upright=options.upright)
             if seed == 3:

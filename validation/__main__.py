@@ -75,7 +75,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"{name}: {error}", file=sys.stderr)
         return USAGE
     except (ValueError, RuntimeError, OSError, ModuleNotFoundError) as error:
-        print(f"{name}: {error}", file=sys.stderr)
+        text = (
+            f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
+        )
+        print(f"{name}: {text}", file=sys.stderr)
         return FAILED
     print(text_of(report))
     return DONE if report.reached else MISSED

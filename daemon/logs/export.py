@@ -118,7 +118,7 @@ def _check_usage(command: argparse.ArgumentParser, options: argparse.Namespace) 
     """Exit with status 2 where the combination of options cannot be meant."""
     what, logs, out = options.what, options.logs, options.out
     if (what == "dbc" and options.config is not None) == bool(logs):
-        command.error("expected a log" + (" or --config" if what == "dbc" else "") + ", and not both")
+        command.error("expected a log or --config, and not both" if what == "dbc" else "expected a log")
     if what in ("csv", "parquet") and out is None:
         command.error("expected --out FILE")
     if out is None and options.json:

@@ -358,7 +358,7 @@ class LogFile:
         else:
             ended = source.read(source.size - len(MAGIC), len(MAGIC)) == MAGIC
             what = "its summary is damaged" if ended else "it ends too early"
-            raise self._error(f"{what} (`jtq recover` repairs it)")
+            raise self._error(f"{what} (`jtq recover` saves what is intact)")
 
     def _error(self, what: str) -> LogError:
         return LogError(f"{self.path}: not a readable MCAP file: {what}")
@@ -419,7 +419,7 @@ class LogFile:
                 raise ChunkError("its lengths do not agree")
             return batches_of(self._source.unpack(chunk))
         except ChunkError as error:
-            raise self._error(f"chunk at byte {at}: {error} (`jtq recover` repairs it)") from None
+            raise self._error(f"chunk at byte {at}: {error} (`jtq recover` saves what is intact)") from None
 
     def attachment(self, index: AttachmentIndex) -> bytes:
         """Return the content of an attachment. Raises LogError where it is damaged."""
