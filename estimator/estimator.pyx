@@ -665,8 +665,7 @@ cdef class PythonEstimator(Estimator):
 def make_estimator(joint, settings, network=None):
     """Return the estimator of a joint. Raises ConfigError when joint, method and network do not fit."""
     plain = plain_joint(joint)
-    kinds = {"JointEstimator": JointEstimator, "FusedEstimator": FusedEstimator}
-    inner = kinds[METHODS[settings.method].estimator](plain, settings, network)
+    inner = globals()[METHODS[settings.method].estimator](plain, settings, network)  # a class of this module
     return ExtendedEstimator(joint, settings, inner) if acting_effects(joint) else inner
 
 

@@ -19,7 +19,8 @@ CONTACT_THRESHOLD: Final = 0.05
 
 @dataclass(frozen=True)
 class Method:
-    """One estimation method: what the product asks of it. A new method is a new entry of METHODS.
+    """One estimation method: what the product asks of it. A new method is a new entry of METHODS
+    and, where no estimator serves it, a class.
 
     title: in tables; estimator: name of its class in `jtqd.estimator.estimator`; sections: of the joint file that a
     configuration with it must have; network: name of its class in `jtqd.estimator.network`, "" where it uses none;
