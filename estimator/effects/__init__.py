@@ -1,7 +1,7 @@
 """Effect library: physical deviations of a joint from the rigid textbook, one file each, for estimator, plant and diagnosis.
 
 EFFECTS has all effects by name. A new effect is a new file of this folder: a subclass of `effect.Effect` registers itself.
-Trials hide it by an entry of validation/diagnosis/entries.py; tests have its law a second time in tests/estimator/effects/laws.py.
+Trials hide it by an entry of `validation/diagnosis/entries.py`; `tests/estimator/effects/laws.py` has its law a second time.
 """
 
 from __future__ import annotations
