@@ -36,13 +36,12 @@ from jtqd.estimator.settings import METHODS, bandwidth_of, recommended
 from jtqd.estimator.text import finite
 from jtqd.estimator.text import table_lines as aligned
 from jtqd.models.files import load_joint
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import without_known_effects
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.gain import free_run
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
-from jtqd.sysid.diagnosis.resolution import Smoother
-from jtqd.sysid.diagnosis.signals import SignalsError, about_zero, joint_signals
+from jtqd.sysid.diagnosis.signals import BaseLoss, SignalsError, about_zero, joint_signals
+from jtqd.sysid.diagnosis.smoothing import Smoother
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap

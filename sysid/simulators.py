@@ -27,8 +27,8 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.diagnose import with_effects_applied
+from jtqd.sysid.diagnosis.signals import BaseLoss
 
 BY: Final = "jtq export-model"
 _SPEEDS_RAD_S: Final = np.linspace(0.05, 2.0, 200)

@@ -19,7 +19,6 @@ from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.current_zero import Readings, readings
 from jtqd.sysid.diagnosis.events import Events
 from jtqd.sysid.diagnosis.findings import JointName
@@ -37,6 +36,7 @@ from jtqd.sysid.diagnosis.regressors import (
 )
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import (
+    BaseLoss,
     Channel,
     JointSignals,
     Line,

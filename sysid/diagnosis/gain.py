@@ -15,12 +15,11 @@ from jtqd.estimator.effects.effect import ArrayFunctions, Effect, State, Values
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gain, RunGain, shows_at
 from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, solve
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals
+from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
 
 _BOOTSTRAPS: Final = 2000
 

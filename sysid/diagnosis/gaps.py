@@ -1,7 +1,7 @@
 """How large the gap is in each balance, against the noise floor of the data, and where it lies.
 
 A condition, or axis (velocity, load, an angle, ...), explains a residual when the mean of a bin over the *other* runs
-predicts it in this run. Measured is the squared error that this takes away, summed over all runs left out
+predicts it in this run. Measured is the squared error that this takes away, summed over all held-out runs
 (`explained_by_bins`). Noise of two runs is independent, however coloured, so bins that only follow the noise explain
 nothing, and more bins are no advantage. A condition that only differs from run to run (temperature, time) has no
 advantage either, because other runs do not confirm it. Events and seconds with a deviating mean explain only what the

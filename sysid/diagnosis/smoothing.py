@@ -3,17 +3,27 @@
 Currents and torques are smoothed over a few milliseconds (`calm`), because their noise is also in the residual, and would be
 explained by itself at the frequencies where there is nothing else. Samples too far apart for smoothing are interpolated from
 their neighbours. Derivatives are central differences, which look ahead: this is for recorded runs.
+
+**Resolution.** Recorders keep seven significant digits, single precision, fixed decimals or counts. A motor position beyond
+1000 rad with seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. At the
+start of the run the steps were a hundred times finer, because steps of digits and of single precision grow with the value.
+So they are estimated from the values, for each magnitude by itself. Where the acceleration would be coarse, its balance is
+judged below a cutoff only: residual and regressors pass the same linear filter, sample by sample. The regressors of
+inertias are filtered further, because noise of an acceleration that is in residual and regressor alike would be explained
+by itself.
 """
 
 from __future__ import annotations
 
 import functools
+import math
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from scipy import signal
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 
 _SMOOTH_S: Final = 0.005
 _RATE_SMOOTH: Final = 0.4
@@ -143,3 +153,188 @@ def first_difference(x: FloatArray, time: FloatArray) -> FloatArray:
         return np.asarray(np.gradient(x, time))
     inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
     return np.pad(inner, 2, mode="edge")
+
+
+_FEWEST: Final = 200
+"""Samples from which steps of a binade are estimated; with fewer it has those of the next."""
+_SAME: Final = 1e-8
+"""Values closer than this part of the largest are one: double precision, or twelve digits of a count."""
+_DIGITS: Final = 9
+"""Significant digits from which a decimal is as good as none."""
+_ON_GRID: Final = 0.95
+"""Part of the small distances between values that are whole multiples of the least, on a grid."""
+_SIXTH: Final = math.sqrt(924.0)
+"""Rms of a sixth difference of white noise: binomials of six, squared and summed."""
+_ORDER: Final = 3
+_SLOWEST_HZ: Final = 8.0
+"""No cutoff is lower: there is the motion itself."""
+_LITTLE: Final = 0.3
+"""Part of a run that may be finer than the rest without bins as short as its own."""
+_STEP: Final = 1.25
+"""Cutoffs that differ by less are one."""
+
+
+def steps_of(x: FloatArray) -> FloatArray:
+    """Return the steps of the values near each sample [n], in units of x; 0 where they are finer than shows.
+
+    Decimals (fixed, or significant digits), single precision, or counts of any size.
+    """
+    out = np.zeros(len(x))
+    for there in _magnitudes(x):
+        values = np.unique(x[there])
+        if len(values) <= 8:  # at rest or commanded: they show no step
+            continue
+        largest = max(float(np.max(np.abs(values))), 1e-12)
+        out[there] = max(
+            _decimal(values, largest),
+            _single(values),
+            _counts(values, largest, again=len(values) < 0.8 * there.sum()),
+        )
+    return out
+
+
+def described(x: FloatArray, unit: str) -> str:
+    """Return the steps of the values in words: "steps of 1e-05 rad, 0.001 rad beyond 1000 rad"; "" without steps."""
+    steps = steps_of(x)
+    worst = float(np.max(steps, initial=0.0))
+    if worst <= 0.0:
+        return ""
+    finest = float(np.min(steps))
+    if finest > 0.7 * worst:
+        return f"steps of {worst:.2g} {unit}"
+    beyond = float(np.min(np.abs(x[steps > 0.7 * worst])))
+    return f"steps of {worst:.2g} {unit} beyond {beyond:.3g} {unit}, finer ones below"
+
+
+def noise_of(x: FloatArray) -> FloatArray:
+    """Return the standard deviation of the white noise near each sample [n]: of the steps, or what is quicker than any
+    motion (sixth differences), whichever is more.
+    """
+    steps = steps_of(x)
+    out = np.asarray(steps / math.sqrt(12.0))
+    if len(x) < 7:
+        return out
+    quick = np.pad(np.abs(np.diff(x, 6)), 3, mode="edge") / (_SIXTH * 0.6745)
+    for there in _magnitudes(x):
+        out[there] = np.maximum(out[there], np.median(quick[there]))
+    return out
+
+
+def _magnitudes(x: FloatArray) -> list[BoolArray]:
+    """Return masks of samples between powers of 2 and of 10; one of few samples joins the next larger, the last the one
+    before.
+    """
+    size = np.abs(x)
+    order = np.frexp(size)[1].astype(np.int64) * 100 + np.floor(np.log10(np.maximum(size, 1e-30))).astype(
+        np.int64
+    )
+    out: list[BoolArray] = []
+    waiting = np.zeros(len(x), bool)
+    for e in np.unique(order):
+        waiting |= order == e
+        if waiting.sum() >= _FEWEST:
+            out.append(waiting)
+            waiting = np.zeros(len(x), bool)
+    if waiting.any():
+        out.append(waiting if not out else out.pop() | waiting)
+    return out
+
+
+def _decimal(values: FloatArray, largest: float) -> float:
+    """Return the power of ten of which all values are multiples, 0 where they have more digits than _DIGITS."""
+    place = math.floor(math.log10(largest)) - _DIGITS
+    for k in range(place, place + _DIGITS + 2):
+        scaled = values * 10.0 ** (-k)
+        if np.max(np.abs(scaled - np.round(scaled))) > 1e-6 * max(1.0, 10.0 ** (_DIGITS - 9)):
+            return 10.0 ** (k - 1) if k > place else 0.0
+    return 0.0
+
+
+def _single(values: FloatArray) -> float:
+    """Return the step of single precision where that is what they have, else 0."""
+    short = values.astype(np.float32)
+    return float(np.spacing(np.max(np.abs(short)))) if np.array_equal(short, values) else 0.0
+
+
+def _counts(values: FloatArray, largest: float, *, again: bool) -> float:
+    """Return the step of values on a grid, 0 where they are on none or too far apart to show it; again: values came more
+    than once. Of a steady motion all distances are alike, too.
+    """
+    apart = np.diff(values)
+    apart = apart[apart > _SAME * largest]
+    if len(apart) < 8:
+        return 0.0
+    step = float(apart.min())
+    near = apart[apart < 20.0 * step] / step
+    on = np.abs(near - np.round(near)) < 0.02
+    grid = len(near) >= 8 and float(on.mean()) >= _ON_GRID and (again or len(np.unique(np.round(near))) > 2)
+    return step if grid else 0.0
+
+
+def acceleration_noise(
+    sigma: FloatArray | float, step_s: float, hz: float, *, of_velocity: bool
+) -> FloatArray:
+    """Return the rms, below `hz`, of the acceleration taken from samples every step_s with white noise sigma: of a position,
+    or of a velocity.
+    """
+    density = 2.0 * np.asarray(sigma, np.float64) ** 2 * step_s
+    power, turn = (3, (2.0 * math.pi) ** 2) if of_velocity else (5, (2.0 * math.pi) ** 4)
+    return np.sqrt(density * turn * hz**power / power)
+
+
+def cutoff_hz(sigma: FloatArray, step_s: float, most: float, *, of_velocity: bool) -> FloatArray:
+    """Return below which frequency the acceleration's noise is `most` [n]; at least _SLOWEST_HZ, inf without noise."""
+    one = acceleration_noise(sigma, step_s, 1.0, of_velocity=of_velocity)
+    power = 1.5 if of_velocity else 2.5
+    with np.errstate(divide="ignore"):
+        hz = (most / one) ** (1.0 / power)
+    return np.maximum(hz, _SLOWEST_HZ)
+
+
+@functools.lru_cache(maxsize=64)
+def _low_pass(part: float) -> FloatArray:
+    """Return the sections of a Butterworth low-pass; part: of the sampling rate."""
+    return np.asarray(signal.butter(_ORDER, part, fs=1.0, output="sos"))
+
+
+@dataclass(frozen=True)
+class Smoother:
+    """A low-pass without delay whose cutoff depends on the sample: (cutoff [Hz], where it holds [n]) in `parts`; elsewhere
+    the signal as it is. Linear, so the same for residuals and for what explains them.
+    """
+
+    step_s: float
+    parts: tuple[tuple[float, BoolArray], ...] = ()
+
+    @staticmethod
+    def of(hz: FloatArray, step_s: float, finest_hz: float) -> Smoother:
+        """Return the smoother of these cutoffs [n]; those above finest_hz are none."""
+        finest = min(finest_hz, 0.45 / step_s)
+        level = np.where(hz < finest, np.floor(np.log(np.minimum(hz, 1e9)) / math.log(_STEP)), np.inf)
+        parts = [(_STEP ** float(k), np.asarray(level == k)) for k in np.unique(level[np.isfinite(level)])]
+        return Smoother(step_s, tuple((f, there) for f, there in parts))
+
+    @property
+    def slowest_hz(self) -> float:
+        """The lowest cutoff, inf without any."""
+        return min((hz for hz, _ in self.parts), default=math.inf)
+
+    @property
+    def highest_hz(self) -> float:
+        """The highest cutoff; inf where a part is not filtered that is more than _LITTLE."""
+        if not self.parts:
+            return math.inf
+        count = sum(int(there.sum()) for _, there in self.parts)
+        whole = len(self.parts[0][1])
+        return max(hz for hz, _ in self.parts) if whole - count <= _LITTLE * whole else math.inf
+
+    def __call__(self, x: FloatArray) -> FloatArray:
+        """Return x [.., n] filtered, rows one by one."""
+        if not self.parts:
+            return x
+        out = np.array(x, np.float64)
+        for hz, there in self.parts:
+            sections = _low_pass(hz * self.step_s)
+            reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * self.step_s))))
+            out[..., there] = signal.sosfiltfilt(sections, x, padlen=reach)[..., there]
+        return out

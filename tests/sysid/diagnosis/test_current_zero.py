@@ -8,7 +8,6 @@ import pytest
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTable
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.current_zero import (
     DRIFT,
     Reading,
@@ -20,7 +19,7 @@ from jtqd.sysid.diagnosis.current_zero import (
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause
 from jtqd.sysid.diagnosis.noise import Sums
-from jtqd.sysid.diagnosis.signals import JointSignals, joint_signals
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from tests.estimator.effects import effect_signals
 from tests.sysid.diagnosis.diagnose_core_helpers import candidates, rigid_run
 

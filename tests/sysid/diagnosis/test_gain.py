@@ -13,9 +13,8 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.gain import free_run
-from jtqd.sysid.diagnosis.signals import JointSignals, joint_signals
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 
 RATE_HZ = 1000.0
 INERTIA = (

@@ -16,7 +16,6 @@ from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis import guards
 from jtqd.sysid.diagnosis import refine as refine_module
 from jtqd.sysid.diagnosis import regressors as columns_module
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.case import Fit
 from jtqd.sysid.diagnosis.causes import _normal_phase, values_of
 from jtqd.sysid.diagnosis.current_zero import RestCurrent, offset_at_rest, rest_current
@@ -39,7 +38,7 @@ from jtqd.sysid.diagnosis.refine import (
 )
 from jtqd.sysid.diagnosis.regressors import contribution, families
 from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.signals import JointSignals, joint_signals
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from tests.estimator.effects.effect_signals import PLAIN, extended
 from tests.estimator.effects.effect_signals import state as made_up_state
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, candidates, rigid_run, run_data

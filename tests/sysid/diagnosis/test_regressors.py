@@ -10,7 +10,6 @@ import pytest
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.regressors import (
     BIN_S,
@@ -24,7 +23,7 @@ from jtqd.sysid.diagnosis.regressors import (
     gain_columns,
     run_data,
 )
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line, joint_signals, with_one_sensor
+from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals, Line, joint_signals, with_one_sensor
 from jtqd.sysid.diagnosis.smoothing import second_difference
 from tests.estimator.effects.effect_signals import PLAIN, balances, state
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, candidates, rigid_run

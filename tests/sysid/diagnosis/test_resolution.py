@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.resolution import (
+from jtqd.sysid.diagnosis.smoothing import (
     Smoother,
     acceleration_noise,
     cutoff_hz,

@@ -10,12 +10,11 @@ import pytest
 
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.diagnosis.base_loss import BaseLoss
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.noise import ORDER, Noise, noise_model
 from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, refine
 from jtqd.sysid.diagnosis.regressors import bin_samples, families, run_data
-from jtqd.sysid.diagnosis.signals import joint_signals
+from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
 from jtqd.sysid.diagnosis.smoothing import calm, current_rate, mean_ahead, smooth
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, rich_run
