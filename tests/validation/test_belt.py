@@ -167,7 +167,7 @@ def test_same_seed_same_runs() -> None:
 
 
 @pytest.mark.parametrize("name", EFFECTS)
-def test_effect_leaves_what_its_law_says(name: str) -> None:
+def test_effect_leaves_what_its_law_gives(name: str) -> None:
     """With the file of the healthy plant, by the laws of tests/estimator/effects/laws.py."""
     assert name in LIBRARY
     plant = plain_plant()
