@@ -26,7 +26,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import cache
 from types import NoneType, UnionType
 from typing import Annotated, Any, Final, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -89,15 +89,36 @@ class FieldError(ConfigError):
     """A value of a dataclass cannot be used: key (dotted below the dataclass), what was found, what was expected.
 
     where: name of the dataclass in the message; `decode` puts file and path in its place. found MISSING: the key is
-    not there. problem: what is wrong in other words.
+    not there. problem: what is wrong in other words. also: further keys that are not there, and what is expected of each.
     """
 
-    def __init__(self, where: str, key: str, found: object, expected: str, problem: str = "") -> None:
+    def __init__(
+        self,
+        where: str,
+        key: str,
+        found: object,
+        expected: str,
+        problem: str = "",
+        *,
+        also: tuple[tuple[str, str], ...] = (),
+    ) -> None:
         if not problem:
             problem = "missing" if found is MISSING else f"found {shown(found)}"
             problem += f", expected {expected}"
-        super().__init__(f"{where}.{key}: {problem}")
         self.where, self.key, self.found, self.expected, self.problem = where, key, found, expected, problem
+        self.also = also
+        super().__init__(f"{where}.{key}: {problem}{self.others}")
+
+    @property
+    def others(self) -> str:
+        """Return the further keys that are not there, for the end of a message."""
+        return "".join(f"; key '{key}': missing, expected {expected}" for key, expected in self.also)
+
+    def below(self, key: str, where: str = "") -> FieldError:
+        """Return the error with a key before its own; where: name of what that key belongs to."""
+        also = tuple((_joined(key, other), expected) for other, expected in self.also)
+        path = _joined(key, self.key)
+        return FieldError(where or self.where, path, self.found, self.expected, self.problem, also=also)
 
     def __reduce__(self) -> tuple[type[ConfigError], tuple[str]]:
         """Reach another process as a plain ConfigError."""
@@ -110,8 +131,7 @@ def below(key: str, where: str = "") -> Iterator[None]:
     try:
         yield
     except FieldError as error:
-        path = _joined(key, error.key)
-        raise FieldError(where or error.where, path, error.found, error.expected, error.problem) from None
+        raise error.below(key, where) from None
 
 
 @contextmanager
@@ -120,31 +140,43 @@ def in_file(where: str, path: str = "") -> Iterator[None]:
     try:
         yield
     except FieldError as error:
-        key = _joined(path, error.key)
-        at = f"key '{key}': " if key else ""
-        raise ConfigError(f"{where}: {at}{error.problem}") from None
+        error = error.below(path)
+        at = f"key '{error.key}': " if error.key else ""
+        raise ConfigError(f"{where}: {at}{error.problem}{error.others}") from None
 
 
 def _joined(path: str, key: str) -> str:
     return f"{path}.{key}" if path and key else path or key
 
 
-def decode(kind: type[T], mapping: object, where: str, path: str = "", **given: Any) -> T:
+def decode(
+    kind: type[T],
+    mapping: object,
+    where: str,
+    path: str = "",
+    *,
+    required: Iterable[str] = (),
+    **given: Any,
+) -> T:
     """Return the dataclass `kind` with the values of a section; `given` are fields that are no keys of it.
 
-    mapping: as the parser returned it; where: name of the file; path: dotted key of the section in it.
-    Raises ConfigError naming file, key, what was found and what was expected, for an unknown or missing key, a wrong
-    type, a number that is not finite or out of range, and what the dataclass itself refuses by FieldError.
+    mapping: as the parser returned it; where: name of the file; path: dotted key of the section in it; required: keys that
+    must be there although their fields have a default. Raises ConfigError naming file, key, what was found and what was
+    expected, for an unknown key, all missing keys, a wrong type, a number that is not finite or out of range, and what the
+    dataclass itself refuses by FieldError.
     """
     with in_file(where, path):
-        return read(kind, mapping, **given)
+        return read(kind, mapping, required=required, **given)
 
 
-def read(kind: type[T], mapping: object, **given: Any) -> T:
+def read(kind: type[T], mapping: object, *, required: Iterable[str] = (), **given: Any) -> T:
     """Return the dataclass as `decode` does. Raises FieldError with the key below this section."""
     schema: Any = kind
     section = _section(mapping)
-    values = given | read_values([each for each in _fields_of(schema) if each.name not in given], section)
+    known = [each for each in _fields_of(schema) if each.name not in given]
+    if required:
+        known = [replace(each, optional=False) if each.name in required else each for each in known]
+    values = given | read_values(known, section)
     try:
         return kind(**values)
     except FieldError as error:
@@ -161,11 +193,29 @@ def split(section: Mapping[str, Any], key: str, hint: Any) -> tuple[Any, dict[st
 
 
 def read_values(known: Iterable[Field], mapping: object) -> dict[str, Any]:
-    """Return the values of a section's keys by name, without those left out that are optional. Raises FieldError."""
+    """Return the values of a section's keys by name, without those left out that are optional.
+
+    Raises FieldError for the first key that cannot be used; where it is missing, with all others that are.
+    """
     section, known = _section(mapping), tuple(known)
     _check_known(section, [each.name for each in known])
-    values = ((each.name, each.read(section)) for each in known)
-    return {name: value for name, value in values if value is not MISSING}
+    values: dict[str, Any] = {}
+    errors: list[FieldError] = []
+    for each in known:
+        try:
+            values[each.name] = each.read(section)
+        except FieldError as error:
+            errors.append(error)
+    if errors:
+        first, *others = errors
+        if first.found is not MISSING:
+            raise first
+        missing = [each for each in others if each.found is MISSING]
+        also = tuple(pair for each in missing for pair in ((each.key, each.expected), *each.also))
+        raise FieldError(
+            first.where, first.key, MISSING, first.expected, first.problem, also=(*first.also, *also)
+        )
+    return {name: value for name, value in values.items() if value is not MISSING}
 
 
 def _section(value: object) -> Mapping[str, Any]:
@@ -224,6 +274,8 @@ class Field:
     parse: Callable[[Any], Any] | None = None
     none_by_false: bool = False
     """Whether `false` in the file is None."""
+    unknown: bool = False
+    """Whether the default is NaN: not known."""
 
     def read(self, section: Mapping[str, Any]) -> Any:
         """Return the value of the section's key; MISSING: the field takes its default. Raises FieldError."""
@@ -235,8 +287,17 @@ class Field:
         if (value is None and self.nullable) or (value is False and self.none_by_false):
             return None
         if value is MISSING:
-            raise FieldError("", self.name, MISSING, self.expected)
+            raise FieldError("", self.name, MISSING, self.expected + self._least())
         return self.convert(self.name, value) if self.form == "value" else self._nested(value)
+
+    def _least(self) -> str:
+        """Return the keys that a section must have, for messages."""
+        keys = (
+            [each.name for each in _fields_of(self.inner) if not each.optional]
+            if self.form == "section"
+            else []
+        )
+        return f" ({', '.join(keys)})" if keys else ""
 
     def _nested(self, value: object) -> Any:
         """Return the section, list of sections or mapping. Raises FieldError."""
@@ -263,9 +324,7 @@ class Field:
                 if _finite(converted):
                     return converted
         except FieldError as error:
-            raise FieldError(
-                "", _joined(key, error.key), error.found, error.expected, error.problem
-            ) from None
+            raise error.below(key) from None
         except ValueError:  # of msgspec as well
             pass
         found, expected = value, self.expected
@@ -284,6 +343,8 @@ class Field:
             return self.nullable
         if self.choices:
             return value in self.choices
+        if self.unknown and math.isnan(value):
+            return True
         whole = isinstance(node, inspect.IntType)
         return (
             isinstance(value, int if whole else int | float)
@@ -326,11 +387,14 @@ def _fields_of(kind: Any) -> tuple[Field, ...]:
     """Return how the fields of a dataclass are read, in its order."""
     hints = get_type_hints(kind, include_extras=True)
     return tuple(
-        field_of(
-            each.name,
-            hints[each.name],
-            optional=(each.default, each.default_factory) != (MISSING, MISSING),
-            none_by_false=each.default is not None,
+        replace(
+            field_of(
+                each.name,
+                hints[each.name],
+                optional=(each.default, each.default_factory) != (MISSING, MISSING),
+                none_by_false=each.default is not None,
+            ),
+            unknown=isinstance(each.default, float) and math.isnan(each.default),
         )
         for each in fields(kind)
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import partial
 from itertools import pairwise
 from types import MappingProxyType
 from typing import Annotated, Any, Final
@@ -492,20 +493,25 @@ class Effect:
         return Effect, (self.name, dict(self.parameters))
 
 
-@dataclass(frozen=True, slots=True)
+ELASTIC: Final = ("stiffness_nm_per_rad", "damping_nms_per_rad", "link_inertia_kgm2")
+"""Keys that only the torsion between two encoders, and a plant, need."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Joint:
     """One joint: `joint.yaml` as values. Numbers out of range raise ConfigError (replace() too).
 
-    `effects` add to what the other sections say; an effect that replaces one of their values may be there once.
+    `effects` add to what the other sections say; an effect that replaces one of their values may be there once. Stiffness
+    and damping of a joint with one encoder may be NaN: not known.
     """
 
     name: Text
     gear_ratio: Annotated[float, limits(gt=0.0)]
     torque_constant_nm_per_a: Annotated[float, limits("Nm/A", gt=0.0)]
     rotor_inertia_kgm2: Annotated[float, limits("kg m2", gt=0.0)]
-    stiffness_nm_per_rad: Annotated[float, limits("Nm/rad", gt=0.0)]
-    damping_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)]
-    link_inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)]
+    stiffness_nm_per_rad: Annotated[float, limits("Nm/rad", gt=0.0)] = math.nan
+    damping_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)] = math.nan
+    link_inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)] = 0.0
     rated_torque_nm: Annotated[float, limits("Nm", gt=0.0)]
     friction: Friction
     efficiency: Efficiency | None = None
@@ -520,12 +526,10 @@ class Joint:
         self._check_effects()
         object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
 
-    def __reduce__(self) -> tuple[type[Joint], tuple[Any, ...]]:
+    def __reduce__(self) -> tuple[partial[Joint], tuple[()]]:
         """Copy and pickle through plain dicts: a mapping proxy can do neither."""
-        return Joint, tuple(
-            dict(self.provenance) if item.name == "provenance" else getattr(self, item.name)
-            for item in fields(self)
-        )
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return partial(Joint, **{**values, "provenance": dict(self.provenance)}), ()
 
     def _check_effects(self) -> None:
         """Refuse two right values for one key."""
@@ -538,9 +542,12 @@ class Joint:
                 seen.add(effect.name)
 
     @classmethod
-    def from_mapping(cls, mapping: object, where: str) -> Joint:
-        """Build from what a YAML parser gave; `where` names the file in messages. Raises ConfigError."""
-        return decode(cls, mapping, where)
+    def from_mapping(cls, mapping: object, where: str, *, elastic: bool = True) -> Joint:
+        """Build from what a YAML parser gave; `where` names the file in messages. Raises ConfigError.
+
+        elastic: the keys ELASTIC must be there; otherwise they may.
+        """
+        return decode(cls, mapping, where, required=ELASTIC if elastic else ())
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain dicts and lists in file order; `from_mapping` of it gives an equal joint."""
@@ -548,8 +555,12 @@ class Joint:
         return result
 
 
+def _unknown(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
 def _plain(value: Any) -> Any:
-    """Return the plain form of a section; what is None, and what a torsion may leave out, is not written."""
+    """Return the plain form of a section; what is None or NaN, and what a torsion may leave out, is not written."""
     if is_dataclass(value):
         items = {each.name: getattr(value, each.name) for each in fields(value)}
         if isinstance(value, Envelope):
@@ -558,7 +569,8 @@ def _plain(value: Any) -> Any:
             items = {name: None if item == () else item for name, item in items.items()}
             if value.zero_limit_rad == ZERO_LIMIT_RAD:
                 del items["zero_limit_rad"]
-        return {name: _plain(item) for name, item in items.items() if item is not None}
+        known = {name: item for name, item in items.items() if item is not None and not _unknown(item)}
+        return {name: _plain(item) for name, item in known.items()}
     if isinstance(value, tuple):
         return [_plain(each) for each in value]
     return dict(value) if isinstance(value, Mapping) else value

@@ -494,7 +494,7 @@ class FusedNetwork(Network):
             self.envelope: Final = read(Envelope, self.metadata["envelope"])
         except FieldError as error:
             raise self.error(
-                f"metadata 'envelope': {f'{error.key}: ' if error.key else ''}{error.problem}"
+                f"metadata 'envelope': {f'{error.key}: ' if error.key else ''}{error.problem}{error.others}"
             ) from None
         a, b, c, d = self.numbers("sigma_scale", 4)
         if min(a, b, c, d) <= 0.0:

@@ -180,10 +180,13 @@ def _marked(error: yaml.MarkedYAMLError) -> str:
     return f"{at} not YAML: {' '.join(text.split())}"
 
 
-def load_joint(path: str | os.PathLike[str]) -> Joint:
-    """Return the joint of a joint file. Raises ConfigError naming file, key, found and expected."""
+def load_joint(path: str | os.PathLike[str], *, elastic: bool = True) -> Joint:
+    """Return the joint of a joint file. Raises ConfigError naming file, key, found and expected; all missing keys at once.
+
+    elastic: stiffness, damping and link inertia must be there.
+    """
     mapping = load_yaml(path)
-    return Joint.from_mapping(mapping, os.fspath(path))
+    return Joint.from_mapping(mapping, os.fspath(path), elastic=elastic)
 
 
 def shipped(name: str) -> Path:

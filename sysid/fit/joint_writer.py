@@ -91,7 +91,7 @@ def write_joint(path: Path | str, joint: Joint, title: str) -> None:
         ConfigError: it cannot be written, or what was written does not read back as this joint.
     """
     path, data = Path(path), joint_text(joint, title).encode()
-    if Joint.from_mapping(parse_yaml(data, str(path)), str(path)) != joint:
+    if Joint.from_mapping(parse_yaml(data, str(path)), str(path), elastic=False) != joint:
         raise ConfigError(f"{path}: the written file reads back differently from the joint {joint.name}")
     try:
         write_whole(path, data)

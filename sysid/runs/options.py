@@ -63,24 +63,36 @@ def only(option: int | None) -> list[int] | None:
 
 
 def check_joint_files(files: Mapping[int, Path]) -> None:
-    """Load all joint files, before the runs are read. Raises ConfigError."""
+    """Load all joint files, before the runs are read; whether they need a stiffness, the runs show. Raises ConfigError."""
     for path in files.values():
-        load_joint(path)
+        load_joint(path, elastic=False)
 
 
 def joints_of(files: Mapping[int, Path], runs: Sequence[RunFile]) -> dict[int, Joint]:
-    """Load the joint files of the joints that the runs have. Raises ConfigError, also for a joint that no run has."""
+    """Load the joint files of the joints that the runs have; with two encoders they need a stiffness. Raises ConfigError,
+    also for a joint that no run has.
+    """
     there = sorted({number for run in runs for number in run.table.joints})
     if ALL_JOINTS in files:
-        joint = load_joint(files[ALL_JOINTS])
-        return dict.fromkeys(there, joint)
+        return {number: joint_for_runs(files[ALL_JOINTS], runs, number) for number in there}
     have = ", ".join(f"j{number}" for number in there)
     for number, path in files.items():
         if number not in there:
             raise ConfigError(
                 f"--joint {number}={path}: found no columns of j{number} in the runs, which have {have}"
             )
-    return {number: load_joint(path) for number, path in sorted(files.items())}
+    return {number: joint_for_runs(path, runs, number) for number, path in sorted(files.items())}
+
+
+def joint_for_runs(path: Path, runs: Sequence[RunFile], number: int) -> Joint:
+    """Load the joint file of a joint of the runs. Raises ConfigError, also for a stiffness, damping or link inertia that is
+    missing where a run has both encoders.
+    """
+    joint = load_joint(path, elastic=False)
+    columns = [run.table.joints[number] for run in runs if number in run.table.joints]
+    if any(each.two_encoders(joint.gear_ratio) for each in columns):
+        return load_joint(path)
+    return joint
 
 
 def joint_number(option: int | None, joint: Joint, runs: Sequence[RunFile]) -> int:
