@@ -19,7 +19,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -36,18 +36,23 @@ from jtqd.estimator.settings import METHODS, bandwidth_of, recommended
 from jtqd.estimator.text import finite
 from jtqd.estimator.text import table_lines as aligned
 from jtqd.models.files import load_joint
-from jtqd.sysid.diagnosis.dataset import without_known_effects
-from jtqd.sysid.diagnosis.diagnose import with_effects_applied
-from jtqd.sysid.diagnosis.gain import free_run
-from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
-from jtqd.sysid.diagnosis.signals import BaseLoss, SignalsError, about_zero, joint_signals
-from jtqd.sysid.diagnosis.smoothing import Smoother
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.checks import check_run
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.options import add_columns, add_number, add_runs, joint_number, only, with_joint
+from jtqd.sysid.runs.options import (
+    add_columns,
+    add_number,
+    add_runs,
+    joint_for_runs,
+    joint_number,
+    only,
+    with_joint,
+)
 from jtqd.sysid.runs.run_file import RunError, RunFile
+
+if TYPE_CHECKING:  # scipy, which --help does not need
+    from jtqd.sysid.diagnosis.smoothing import Smoother
 
 SCHEMA: Final = "jtq.score/1"
 MOTOR: Final = "simulation, motor balance"
@@ -92,6 +97,8 @@ class Row:
 
 def visible_on(name: str, table: RunTable, number: int, joint: Joint) -> Smoother:
     """Return what of a balance of this joint the resolution of a run lets through. Raises SignalsError."""
+    from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
+
     return joint_signals(name, table, number, joint, BaseLoss(joint)).visible
 
 
@@ -104,6 +111,12 @@ def errors_on(
 
     Raises SignalsError for a run without what a simulation needs, ConfigError for a joint file that an estimator refuses.
     """
+    from jtqd.sysid.diagnosis.dataset import without_known_effects
+    from jtqd.sysid.diagnosis.diagnose import with_effects_applied
+    from jtqd.sysid.diagnosis.gain import free_run
+    from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
+    from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
+
     plain = with_effects_applied(joint)
     base = BaseLoss(plain)
     raw = joint_signals(name, table, number, plain, base)
@@ -219,7 +232,7 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     files = [options.joint, *([options.after] if options.after else [])]
     try:
-        joints = [load_joint(path) for path in files]
+        joints = [load_joint(path, elastic=False) for path in files]
         if len(joints) > 1 and joints[0].gear_ratio != joints[1].gear_ratio:
             raise ConfigError(
                 f"--after {options.after}: found gear_ratio {joints[1].gear_ratio:g}, expected "
@@ -229,6 +242,7 @@ def main(argv: list[str]) -> int:
         runs = read_runs(options.runs, columns, segments=True, joints=only(options.number))
         number = joint_number(options.number, joints[0], runs)
         runs = with_joint(runs, number)
+        joints = [joint_for_runs(path, runs, number) for path in files]
         notes = [f"{run.name}: {note}" for run in runs for note in run.notes]
         scored, refused, less = _scored(runs, number, joints)
         notes += less
@@ -272,7 +286,7 @@ def _scored(
         try:
             visible = visible_on(run.name, checked.table, number, joints[0])
             errors = [errors_on(run.name, checked.table, number, joint, visible) for joint in joints]
-        except (SignalsError, ValueError) as error:
+        except ValueError as error:  # of signals that are missing, too
             refused.append(str(error))
             continue
         for each, one in zip(scored, errors, strict=True):

@@ -27,8 +27,6 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
-from jtqd.sysid.diagnosis.diagnose import with_effects_applied
-from jtqd.sysid.diagnosis.signals import BaseLoss
 
 BY: Final = "jtq export-model"
 _SPEEDS_RAD_S: Final = np.linspace(0.05, 2.0, 200)
@@ -76,6 +74,8 @@ class JointModel:
 
 def model_of(joint: Joint) -> JointModel:
     """Return the joint with its effects as far as other simulators can express it."""
+    from jtqd.sysid.diagnosis.diagnose import with_effects_applied  # scipy, which --help does not need
+
     plain = with_effects_applied(joint)
     coulomb, viscous, left_out = _friction(plain)
     for effect in plain.effects:
@@ -95,6 +95,8 @@ def _friction(joint: Joint) -> tuple[float, float, list[str]]:
         )
         left_out = [peak] if friction.stribeck_nm else []
         return friction.coulomb_nm, friction.viscous_nms_per_rad, left_out
+    from jtqd.sysid.diagnosis.signals import BaseLoss
+
     v = _SPEEDS_RAD_S
     loss = BaseLoss(joint).loss(np.zeros_like(v), v)
     slope, level = np.polyfit(v, loss, 1)
@@ -234,7 +236,7 @@ def main(argv: list[str]) -> int:
     try:
         if options.out is not None:
             check_output(options.out)
-        model = model_of(load_joint(options.joint))
+        model = model_of(load_joint(options.joint, elastic=options.flexible))
         text = mjcf(model, flexible=options.flexible) if options.format == "mjcf" else urdf(model)
         if options.out is None:
             print(text, end="")

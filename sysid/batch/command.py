@@ -41,7 +41,6 @@ from jtqd.estimator.command_line import check_installed, command_parser, count, 
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.settings import METHODS
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.report.words import BADGES, effect_title, place
 from jtqd.sysid.progress import bar
 from jtqd.sysid.report import page
 from jtqd.sysid.runs.column_map import ColumnMap
@@ -518,6 +517,12 @@ def _nm(value: float | None) -> str:
 
 
 def _diagnosis_figures(result: Mapping[str, Any]) -> Figures:
+    from jtqd.sysid.diagnosis.report.words import (  # scipy, which --help does not need
+        BADGES,
+        effect_title,
+        place,
+    )
+
     gap, gain, verdict = result["gap"], result["gain"], str(result["verdict"])
     causes = [
         f"{' or '.join(effect_title(name) for name in each['class'])} ({place(each['joint'])})"

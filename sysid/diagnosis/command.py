@@ -20,16 +20,8 @@ from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.estimator.text import counted
-from jtqd.sysid.campaign.bench import BenchConfig
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.next_experiment import (
-    CONFIG,
-    MOTION_FILE,
-    PLAN_FILE,
-    campaign_command,
-    joint_motion_file,
-)
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
@@ -45,12 +37,6 @@ _NEEDED: Final = ("matplotlib", "jinja2", "scipy")
 FINDINGS: Final = "findings.json"
 REPORT: Final = "report.html"
 _JOINTS: Final = range(1, 8)
-_OWN: Final = (
-    *(FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, FILE),
-    *(f"extended.joint{n}.yaml" for n in _JOINTS),
-    *(joint_motion_file(n) for n in _JOINTS),
-)
-"""All names that a diagnosis may write."""
 
 
 def main(argv: list[str]) -> int:
@@ -95,6 +81,15 @@ def main(argv: list[str]) -> int:
     return 0 if findings.verdict == NO_GAP else 3
 
 
+def _own() -> tuple[str, ...]:
+    """Return all names that a diagnosis may write."""
+    from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
+
+    names = (FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, FILE)
+    of_joints = (name for n in _JOINTS for name in (f"extended.joint{n}.yaml", joint_motion_file(n)))
+    return (*names, *of_joints)
+
+
 def _with_command(
     options: argparse.Namespace, findings: Findings, joints: Mapping[int, Joint]
 ) -> dict[str, Any] | None:
@@ -102,6 +97,8 @@ def _with_command(
     experiment = findings.next_experiment
     if experiment is None or not experiment.get("plan"):
         return None if experiment is None else dict(experiment)
+    from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
+
     plan = shlex.quote(str(options.out / PLAN_FILE))
     config = "" if _of_shipped_bench(joints) else CONFIG
     if options.config is not None:
@@ -127,6 +124,7 @@ def _with_limits_noted(
 
 def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:
     """Return whether the joints may be those of the bench that `jtq campaign` takes without --config."""
+    from jtqd.sysid.campaign.bench import BenchConfig
 
     def known_by(joint: Joint) -> tuple[float, float, float]:
         return joint.gear_ratio, joint.torque_constant_nm_per_a, joint.rated_torque_nm
@@ -184,7 +182,7 @@ def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, .
 
 
 def parser() -> argparse.ArgumentParser:
-    """Return the arguments of `jtq diagnose`."""
+    """Return the arguments of `jtq diagnose`; nothing that it loads needs scipy."""
     parser = argparse.ArgumentParser(
         prog=BY,
         description="Measure the error of a joint file's simulation on recorded runs and name its cause.\n"
@@ -197,8 +195,8 @@ def parser() -> argparse.ArgumentParser:
             "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
             "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
             f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
-            f"DIR/{PLAN_FILE}, when there is one, is for `jtq campaign`, DIR/{MOTION_FILE} for the controller\n"
-            "of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage."
+            "DIR/next_experiment.plan.yaml, when there is one, is for `jtq campaign`, DIR/next_experiment.motion.csv\n"
+            "for the controller of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage."
         ),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -287,7 +285,7 @@ def _percent(text: str) -> float:
 def _check_out(directory: Path, force: bool) -> None:
     """Make DIR before minutes of work, and refuse to overwrite. Raises ConfigError."""
     make_directory(directory)
-    there = [name for name in _OWN if (directory / name).exists()]
+    there = [name for name in _own() if (directory / name).exists()]
     if there and not force:
         raise ConfigError(
             f"--out {directory}: found {', '.join(there)} in it, expected a directory without a diagnosis, or --force"
@@ -302,6 +300,7 @@ def _write(
     They are made in a directory beside first: what fails on the way leaves the earlier results as they were. Then what
     an earlier diagnosis wrote goes, so that no plan or joint file of it stays beside the new findings.
     """
+    from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
     from jtqd.sysid.diagnosis.report.page import render
 
     date = dt.datetime.now().astimezone().date().isoformat()
@@ -324,7 +323,7 @@ def _write(
         mapping = to_mapping(findings, sha256=sha256, files=names)
         text = json.dumps(mapping, indent=1, allow_nan=False)
         (fresh / FINDINGS).write_text(f"{text}\n", encoding="utf-8")
-        for name in _OWN:
+        for name in _own():
             (directory / name).unlink(missing_ok=True)
         for name in (*names, FINDINGS):
             os.replace(fresh / name, directory / name)

@@ -76,8 +76,6 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
-from scipy.special import chdtri, ndtri, stdtrit
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.estimator import SLOPE_NM, quadrants
@@ -353,6 +351,8 @@ def fit_sigma(runs: Sequence[PathResiduals], *, with_torsion: bool = True) -> Fu
 
     Raises ValueError for fewer than three runs with samples, or none above 0.1 rad/s.
     """
+    from scipy.optimize import nnls
+
     runs = [run for run in runs if len(run.raw_nm)]
     if len(runs) < 3:
         raise ValueError(f"found {len(runs)} held-out runs with motion, expected at least 3")
@@ -409,6 +409,8 @@ def fit_tracking(runs: Sequence[PathResiduals], fused: Fused) -> Tracking | None
 
 def tracking_section(excess_nm2: FloatArray, velocity_rad_s: FloatArray) -> Tracking:
     """Return the section from e_undelayed^2 - e^2 [n] at speeds [n]."""
+    from scipy.optimize import nnls
+
     found: list[tuple[float, Tracking]] = []
     for saturation in SATURATION_RAD_S:
         columns = np.column_stack(
@@ -465,6 +467,8 @@ def standing_errors(run: PathResiduals, advance_nm: FloatArray, fused: Fused) ->
 
 def normal_bound(n: int) -> float:
     """Return b_n: half an interval in RMS of n normal errors that holds COVERAGE_AT_REST of others, COVERAGE at least."""
+    from scipy.special import chdtri, ndtri, stdtrit
+
     student = stdtrit(n, 0.5 * (1.0 + COVERAGE_AT_REST))
     tolerance = ndtri(0.5 * (1.0 + COVERAGE)) * np.sqrt(n / chdtri(n, CONFIDENCE))
     return float(max(student, tolerance))
@@ -472,6 +476,8 @@ def normal_bound(n: int) -> float:
 
 def fit_standstill(runs: Sequence[Standing], reference_nm: float = 0.0) -> Standstill | None:
     """Return the section; None for too few runs that came to rest. reference_nm: of the sensor's offset from run to run."""
+    from scipy.special import ndtri
+
     errors, offsets = [], []
     for run in runs:
         if np.count_nonzero(run.known) >= FEWEST:
@@ -569,6 +575,8 @@ def _beyond(
     runs: Sequence[FusedErrors], offsets: FloatArray, doubt_nm: float, tracking: Tracking | None
 ) -> list[FloatArray]:
     """Return what of the errors of runs, against the torque, the spread has to cover [Nm]."""
+    from scipy.special import ndtri
+
     normal = ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
     normal *= doubt_nm / np.sqrt(np.mean(normal**2))
     beyond = []

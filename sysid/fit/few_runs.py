@@ -28,7 +28,6 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
-from scipy.optimize import nnls
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.estimator import quadrants
@@ -332,6 +331,8 @@ def _sigma(
     w: FloatArray, covariance: FloatArray, residual_nm: float, rated: float, speed: float
 ) -> FusedSigma:
     """Return sigma of the current path on another day, over loads up to the rated one and speeds up to the fastest."""
+    from scipy.optimize import nnls
+
     slow = min(_SLOW_RAD_S, speed)
     speeds = np.linspace(2.0 * slow if speed > 2.0 * slow else slow, speed, 8)
     raw, v = (each.ravel() for each in np.meshgrid(np.linspace(-rated, rated, 21), np.r_[-speeds, speeds]))

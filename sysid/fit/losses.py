@@ -18,8 +18,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
-from scipy.optimize import lsq_linear
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import AdditiveLoss, Friction, LossSide
@@ -212,6 +210,9 @@ def _solve(
 
 def bounded(left: FloatArray, right: FloatArray, signed: NDArray[np.intp] | slice) -> FloatArray:
     """Return the most probable values, none in `signed` below 0: bounded least squares (Stark and Parker 1995)."""
+    from scipy.linalg import solve_triangular
+    from scipy.optimize import lsq_linear
+
     root = np.linalg.cholesky(left)
     lowest = np.full(len(left), -np.inf)
     lowest[signed] = 0.0
