@@ -1,6 +1,7 @@
 """Run tables as files: CSV, gzipped CSV and Parquet are read, CSV and gzipped CSV are written.
 
-A table has one header row, UTF-8, cells between commas, semicolons or tabs. pyarrow is imported when a Parquet file is read.
+A table has one header row, UTF-8, cells between commas, semicolons or tabs; lines of comment (#) may stand above it.
+pyarrow is imported when a Parquet file is read.
 The true torques of an emulated run, which no instrument measures, are NAME.truth.npz beside NAME.csv.gz.
 """
 
@@ -14,8 +15,9 @@ import io
 import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 from zipfile import BadZipFile
@@ -29,34 +31,21 @@ from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import TIME, Column, ColumnMap, Expression, ExpressionError, targets
 from jtqd.sysid.runs.run_file import Content, RunError, file_bytes, header_place
 
-_BLANK: Final = ("", "nan")
+_BLANK: Final = ("", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "na", "n/a")
+"""What recorders write for no value, in lower case."""
 
 
 def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
     """Read a table; blanks: rows with a blank cell are left out, and so is a last row that was cut; else refused."""
     data, sha256 = file_bytes(path)
-    text = _text(path, data)
-    separator = _separator(text)
-    text, notes = _without_cut_row(text, separator) if blanks else (text, ())
-    rows = _rows(text, separator, path)
-    header = [name.strip() for name in next(rows, (1, []))[1]]
-    twice = next((name for k, name in enumerate(header) if name and name in header[:k]), None)
-    if twice is not None:
-        raise RunError(f"{path}: line 1: found column {twice!r} twice, expected every name once")
+    header, rows, notes = _table(path, data, cut=blanks)
     wanted = _Wanted.of(header, path, columns)
     source = {name: header.index(name) for name in wanted.names}
     cells: dict[str, list[float]] = {name: [] for name in source}
     lines: list[int] = []
     for line, row in rows:
-        if not row:
-            continue
-        if len(row) != len(header):
-            raise RunError(f"{path}: line {line}: found {counted(len(row), 'cell')}, expected {len(header)}")
         for name, index in source.items():
-            try:
-                value = float(row[index])
-            except ValueError:
-                value = math.nan
+            value = _number(row[index])
             if not math.isfinite(value) and not (blanks and row[index].strip().lower() in _BLANK):
                 comma = " with a decimal point" if "," in row[index] else ""
                 raise RunError(
@@ -70,27 +59,64 @@ def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> 
     return wanted.content("csv", sha256, arrays, lines, notes)
 
 
+def read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, str]]:
+    """Return all columns of a table by name: numbers [n], NaN where blank, and the first text of those that hold text.
+
+    Raises RunError.
+    """
+    data, _ = file_bytes(path)
+    numbers: dict[str, FloatArray] = {}
+    texts: dict[str, str] = {}
+    if path.name.endswith(".parquet"):
+        with _parquet(path, data) as file:
+            table = file.read()
+        cells = {name: table.column(name).to_pylist() for name in table.column_names}
+    else:
+        header, rows, _ = _table(path, data, cut=True)
+        columns = zip(*(row for _, row in rows), strict=True)
+        cells = {name: list(column) for name, column in zip(header, columns, strict=False) if name}
+    for name, column in cells.items():
+        shown = ["" if cell is None else str(cell).strip() for cell in column]
+        values = np.array([_number(cell) for cell in shown])
+        wrong = next((k for k in np.flatnonzero(np.isnan(values)) if shown[k].lower() not in _BLANK), None)
+        if wrong is None:
+            numbers[name] = values
+        else:
+            texts[name] = shown[wrong][:40]
+    if not cells or len(next(iter(cells.values()))) < 2:
+        raise RunError(f"{path}: found fewer than 2 rows below the header, expected a recording")
+    if not numbers:
+        raise RunError(f"{path}: found no column of numbers, expected a table of a recording")
+    return numbers, texts
+
+
 def read_parquet(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
     """Read a table; blanks: rows with a blank cell are left out, else refused."""
     data, sha256 = file_bytes(path)
+    with _parquet(path, data) as file:
+        wanted = _Wanted.of(list(file.schema_arrow.names), path, columns)
+        table = file.read(columns=wanted.names)
+    cells = {
+        name: _numbers(path, name, table.column(name).to_numpy(), blanks=blanks)
+        for name in table.column_names
+    }
+    return wanted.content("parquet", sha256, cells)
+
+
+@contextmanager
+def _parquet(path: Path, data: bytes) -> Iterator[Any]:
+    """Give the open Parquet file; what pyarrow cannot read is a RunError."""
     if importlib.util.find_spec("pyarrow") is None:
         raise RunError(f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow")
     import pyarrow as pa  # type: ignore[import-not-found,import-untyped,unused-ignore]
     import pyarrow.parquet as pq  # type: ignore[import-not-found,import-untyped,unused-ignore]
 
     try:
-        file = pq.ParquetFile(pa.BufferReader(data))
-        wanted = _Wanted.of(list(file.schema_arrow.names), path, columns)
-        table = file.read(columns=wanted.names)
+        yield pq.ParquetFile(pa.BufferReader(data))
     except RunError:
         raise
     except (pa.ArrowException, OSError, ValueError) as error:
         raise RunError(f"{path}: not a readable Parquet file: {' '.join(str(error).split())}") from None
-    cells = {
-        name: _numbers(path, name, table.column(name).to_numpy(), blanks=blanks)
-        for name in table.column_names
-    }
-    return wanted.content("parquet", sha256, cells)
 
 
 @dataclass(frozen=True)
@@ -185,6 +211,64 @@ def _text(path: Path, data: bytes) -> str:
     if not text.strip():
         raise RunError(f"{path}: found an empty file, expected a header row and samples")
     return text
+
+
+def _table(
+    path: Path, data: bytes, *, cut: bool
+) -> tuple[list[str], Iterator[tuple[int, list[str]]], tuple[str, ...]]:
+    """Return the header of a table, its rows with the line of each, and notes; cut: a last row that was cut is left out.
+
+    Raises RunError, also for a header of numbers, a name given twice, and a row of another length.
+    """
+    text = _text(path, data)
+    above, text = _comments(text)
+    separator = _separator(text)
+    text, notes = _without_cut_row(text, separator) if cut else (text, ())
+    rows = _rows(text, separator, path)
+    line, names = next(rows, (1, []))
+    header = [name.strip() for name in names]
+    counting = header == [str(k) for k in range(len(header))]  # names that some libraries give
+    if header and not counting and all(math.isfinite(_number(name)) for name in header):
+        last = above[-1].lstrip("# \t") if above else ""
+        named = [name.strip() for name in last.split(separator)]
+        if len(named) != len(header) or not any(named):
+            raise RunError(
+                f"{path}: line {line + len(above)}: found numbers, expected a header row with the name of every column"
+            )
+        header, rows = named, chain([(line, names)], rows)  # as numpy.savetxt writes it: "# t,position"
+    twice = next((name for k, name in enumerate(header) if name and name in header[:k]), None)
+    if twice is not None:
+        raise RunError(
+            f"{path}: line {line + len(above)}: found column {twice!r} twice, expected every name once"
+        )
+
+    def whole() -> Iterator[tuple[int, list[str]]]:
+        for number, row in rows:
+            if row and len(row) != len(header):
+                raise RunError(
+                    f"{path}: line {number + len(above)}: found {counted(len(row), 'cell')}, expected {len(header)}"
+                )
+            if row:
+                yield number + len(above), row
+
+    return header, whole(), notes
+
+
+def _comments(text: str) -> tuple[list[str], str]:
+    """Return the lines of comment and the blank lines above the header, and the text below them."""
+    above: list[str] = []
+    while text.startswith("#") or (text and not text.split("\n", 1)[0].strip()):
+        line, _, text = text.partition("\n")
+        above.append(line.strip())
+    return above, text
+
+
+def _number(cell: str) -> float:
+    """Return the number of a cell; NaN for anything else."""
+    try:
+        return float(cell)
+    except ValueError:
+        return math.nan
 
 
 def _separator(text: str) -> str:
