@@ -64,6 +64,9 @@ GROUPS = {
 }
 """Heading -> subcommand -> (module, one line of help)."""
 
+FORMS = {("init", "--from-csv"): "jtqd.sysid.runs.from_csv"}
+"""Subcommand and the option with which another module is called."""
+
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
@@ -98,7 +101,11 @@ def main(argv: list[str] | None = None) -> int:
         hint = f"; did you mean {near[0]!r}?" if near else ""
         print(f"jtq: no command {name!r}{hint} (jtq --help lists them)", file=sys.stderr)
         return 2
-    return _run(name, command[0], arguments[1:])
+    given = {each.partition("=")[0] for each in arguments[1:]}
+    module = next(
+        (module for (of, option), module in FORMS.items() if of == name and option in given), command[0]
+    )
+    return _run(name, module, arguments[1:])
 
 
 def _open_streams() -> None:

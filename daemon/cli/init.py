@@ -51,6 +51,7 @@ _EXAMPLES = """examples:
   jtq init --bus can0 --out arm --node 5 --gear-ratio 101 --rated-torque 28
   jtq init --from-eds drive.eds --node 5 --node 6 --gear-ratio 101 --out arm     before the bus is there
   jtq init --bus can0 --out arm --gear-ratio 101 --gear-ratio 51                 one value for each joint
+  jtq init --from-csv swing_*.csv                      no bus: column map and joint file for jtq diagnose
 
 Options about joints may be given once for all joints, or once for each in the order of --node.
 Nothing is written to a device. A bus with SYNC is refused: its master reads by SDO, too.
@@ -114,6 +115,8 @@ def parser() -> argparse.ArgumentParser:
     )
     add = made.add_argument
     add("--bus", metavar="BUS", help="look at the devices on this bus: can0, or unix:PATH")
+    tables = "no bus: propose a column map and joint files for these tables (its own options: --from-csv FILE --help)"
+    add("--from-csv", type=Path, nargs="+", metavar="FILE", help=tables)
     eds = "EDS of the drives (one for all, or one for each)"
     add("--from-eds", type=Path, action="append", metavar="FILE", help=eds)
     node = (
@@ -155,6 +158,8 @@ def main(argv: list[str]) -> int:
     """Write the files; returns the exit status."""
     options = parser().parse_args(argv)
     try:
+        if options.from_csv:  # `jtq` calls another module for it
+            raise UsageError("--from-csv: write it in full, without options of a bus")
         return _run(options)
     except (UsageError, MissingValueError) as error:
         print(f"jtq init: {error}", file=sys.stderr)
