@@ -97,6 +97,7 @@ def read_name(column: str) -> Name:
     match = re.fullmatch(r"(.*?)\s*[\[(]\s*([^\[\]()]*?)\s*[\])]\s*", text)
     if match and not match[2].isdigit():
         text, bracket = match[1], match[2].lower().replace(" ", "")
+    text = re.sub(r"(?i)\bi_q", "iq", text)
     tokens = [
         each.lower() for each in re.findall(r"[^\W\d_]+|\d+", re.sub(r"(?<=[a-z])(?=[A-Z])", " ", text))
     ]

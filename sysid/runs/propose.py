@@ -110,6 +110,16 @@ class Guess:
         return self.values[np.isfinite(self.values)]
 
     @property
+    def unrolled(self) -> FloatArray:
+        """Values [n] without the jumps of a roll-over; a blank cell stays blank."""
+        if not self.period:
+            return self.values
+        rows = np.isfinite(self.values)
+        unrolled = np.full(len(rows), np.nan)
+        unrolled[rows] = np.unwrap(self.values[rows], period=self.period)
+        return unrolled
+
+    @property
     def text(self) -> str:
         """Source in the column map: a column or an expression."""
         x = plain = quoted(self.column)
@@ -321,9 +331,7 @@ class _Joint:
         x = guess.values
         if guess.kind == SPEED:
             return self._blocks(0.5 * (x[1:] + x[:-1]) * self.step)
-        return self._blocks(
-            np.diff(np.unwrap(x, period=guess.period) if guess.period else x) + 0.0 * self.step
-        )
+        return self._blocks(np.diff(guess.unrolled) + 0.0 * self.step)
 
     def _blocks(self, x: FloatArray) -> FloatArray:
         """Return the sum of each block of rows [n]."""
@@ -353,11 +361,14 @@ class _Joint:
                 ratio = abs(self._factor(position, speed))
                 if math.isfinite(ratio) and {position.side, speed.side} != {"motor", "link"}:
                     _units_by_ratio(position, speed, ratio)
-        for each in positions:
-            if not each.unit:
-                large = float(np.max(np.abs(each.finite))) > _LARGEST_RAD and each.side != "motor"
-                by = "by its size" if large else "taken as rad"
-                each.take(*(("deg", _ANGLES["deg"]) if large else ("rad", 1.0)), f"no unit in its name: {by}")
+        bare = [each for each in positions if not each.unit]
+        sizes = [float(np.max(np.abs(each.finite))) for each in bare if each.side != "motor"]
+        large = (
+            min(sizes, default=0.0) > _LARGEST_RAD
+        )  # of two positions without a unit the slower one shows it
+        for each in bare:
+            unit, by = ("deg", "by its size") if large else ("rad", "taken as rad")
+            each.take(unit, _ANGLES[unit], f"no unit in its name: {by}")
         for each in speeds:
             if not each.known:
                 unit = "deg/s" if any(position.unit == "deg" for position in positions) else "rad/s"
@@ -375,7 +386,7 @@ class _Joint:
                     each.why.append(f"the {'faster' if faster else 'slower'} of two positions")
         for each in positions:
             if not each.side:
-                turns = float(np.ptp(each.finite)) * each.factor / _TURN
+                turns = float(np.ptp(each.unrolled[np.isfinite(each.values)])) * each.factor / _TURN
                 each.side = "link" if turns <= _LINK_TURNS else "motor"
                 by = f"it travels {turns:.2g} turns" if each.known else "it counts"
                 each.why.append(f"taken as that of the {'joint' if each.side == 'link' else 'motor'}: {by}")

@@ -36,6 +36,38 @@ def test_an_unknown_command_is_answered_with_its_neighbour(capsys):
     assert jtq.main([]) == 2
 
 
+HELP = """
+import contextlib, importlib, io, sys
+import jtqd.daemon.jtq as jtq
+heavy = {"scipy", "matplotlib", "torch", "onnxruntime", "pyarrow", "jinja2", "distributed", "foxglove", "cyclonedds"}
+for name, (module, _) in [*jtq.COMMANDS.items(), *((form, (module, "")) for form, module in jtq.FORMS.items())]:
+    with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):
+        importlib.import_module(module).main(["--help"])
+    if not out.getvalue().startswith("usage: jtq ") or heavy & set(sys.modules):
+        sys.exit(f"{name}: {heavy & set(sys.modules)}")
+"""
+
+
+def test_no_help_loads_a_large_library():
+    """They take a second of processor; arguments are parsed before what needs them is imported."""
+    done = subprocess.run(
+        [sys.executable, "-c", HELP], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_an_option_can_have_a_module_of_its_own(capsys):
+    for arguments, words in (
+        (["--help"], "--bus BUS"),
+        (["--from-csv", "x", "--help"], "usage: jtq init --from-csv"),
+    ):
+        with pytest.raises(SystemExit):
+            jtq.main(["init", *arguments])
+        assert words in capsys.readouterr().out
+    assert jtq.main(["init", "--from-c", "x", "--out", "y"]) == 2
+    assert "--from-csv: write it in full" in capsys.readouterr().err
+
+
 def test_a_missing_extra_is_one_line_and_a_missing_module_of_ours_is_not(monkeypatch, capsys):
     monkeypatch.setitem(jtq.COMMANDS, "fit", ("no_such_package.command", ""))
     assert jtq.main(["fit"]) == 1

@@ -123,6 +123,45 @@ def test_an_unknown_key_is_named_before_the_one_that_is_missing_for_it() -> None
         decode(Outer, {"nam": "n", "inner": {"gain": 1}}, "f.yaml")
 
 
+def test_all_missing_keys_are_in_one_error() -> None:
+    with pytest.raises(ConfigError) as caught:
+        decode(Outer, {"other": {}, "each": [{"gain": 1}, {}], "units": {"any": -1}}, "f.yaml", "top")
+    assert str(caught.value) == (
+        "f.yaml: key 'top.name': missing, expected a text of printable characters that is not empty; "
+        "key 'top.inner': missing, expected a mapping of keys to values (gain); "
+        "key 'top.other.gain': missing, expected a number > 0; "
+        "key 'top.each[1].gain': missing, expected a number > 0"
+    )
+
+
+def test_a_wrong_value_above_the_missing_keys_comes_first() -> None:
+    with pytest.raises(ConfigError, match=r"'name': found 3, expected a text of [^;]*$"):
+        decode(Outer, {"name": 3}, "f.yaml")
+
+
+def test_a_key_with_a_default_can_be_required() -> None:
+    with pytest.raises(ConfigError, match=r"'mode': missing, expected one of [^;]*; key 'on': missing"):
+        decode(Outer, LEAST, "f.yaml", required=("on", "mode"))
+    assert decode(Outer, {**LEAST, "on": True}, "f.yaml", required=("on",)).on
+
+
+@dataclass(frozen=True)
+class Unknown:
+    stiffness: Annotated[float, limits("Nm/rad", gt=0.0)] = math.nan
+
+    def __post_init__(self) -> None:
+        check(self, "unknown")
+
+
+def test_nan_is_a_value_only_as_a_default() -> None:
+    assert math.isnan(decode(Unknown, {}, "f.yaml").stiffness)
+    assert math.isnan(replace(Unknown(3.0), stiffness=math.nan).stiffness)
+    with pytest.raises(ConfigError, match="found nan"):
+        decode(Unknown, {"stiffness": math.nan}, "f.yaml")
+    with pytest.raises(ConfigError, match="found -1"):
+        Unknown(-1.0)
+
+
 def test_given_values_are_no_keys() -> None:
     mapping = {"inner": {"gain": 1}}
     assert decode(Outer, mapping, "f.yaml", name="given").name == "given"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,10 +15,11 @@ import pytest
 
 from jtqd.daemon.config import load_config
 from jtqd.estimator.errors import ConfigError, range_text
-from jtqd.estimator.joint import Effect, Friction, Joint
+from jtqd.estimator.joint import ELASTIC, Effect, Friction, Joint
 from jtqd.models.files import load_joint, load_yaml, read_yaml, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.efficiency import TABLE_I
+from jtqd.sysid.fit.joint_writer import write_joint
 
 # Table I as printed: one row per coefficient, columns i>0 w>0 | i<0 w<0 | i<0 w>0 | i>0 w<0
 PRINTED = """
@@ -124,6 +126,38 @@ def test_every_key_but_the_optional_ones_must_be_there() -> None:
             Joint.from_mapping(change, "my.yaml")
         else:
             assert refused(change).startswith(f"my.yaml: key '{key}': missing")
+
+
+def test_all_missing_keys_are_in_one_error() -> None:
+    keys = re.findall(r"key '(\w+)': missing", refused({"name": "joint"}))
+    assert keys == [
+        *(
+            "gear_ratio",
+            "torque_constant_nm_per_a",
+            "rotor_inertia_kgm2",
+            *ELASTIC,
+            "rated_torque_nm",
+            "friction",
+        )
+    ]
+
+
+def test_a_joint_with_one_encoder_needs_no_stiffness(tmp_path: Path) -> None:
+    change = {key: value for key, value in mapping().items() if key not in ELASTIC}
+    joint = Joint.from_mapping(change, "my.yaml", elastic=False)
+    assert np.isnan([joint.stiffness_nm_per_rad, joint.damping_nms_per_rad]).all()
+    assert set(joint.to_mapping()) & set(ELASTIC) == {"link_inertia_kgm2"}
+    assert (
+        pickle.loads(pickle.dumps(joint)).to_mapping()
+        == copy.deepcopy(joint).to_mapping()
+        == joint.to_mapping()
+    )
+    write_joint(tmp_path / "a.yaml", joint, "one encoder")
+    assert load_joint(tmp_path / "a.yaml", elastic=False) == joint
+    with pytest.raises(
+        ConfigError, match=r"'stiffness_nm_per_rad': missing, .*; key 'damping_nms_per_rad': missing"
+    ):
+        load_joint(tmp_path / "a.yaml")
 
 
 def test_efficiency_without_convention_names_both_choices() -> None:

@@ -17,6 +17,7 @@ from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import VERDICTS
+from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.plan import load_plan
 from jtqd.sysid.runs.tables import write_run
@@ -371,6 +372,15 @@ def test_usage_of_argparse(arguments: list[str], capsys: pytest.CaptureFixture[s
         main(arguments)
     assert caught.value.code == 2
     capsys.readouterr()
+
+
+def test_the_help_names_the_files_of_the_next_experiment(capsys: pytest.CaptureFixture[str]) -> None:
+    """Written out there: the module that has the names needs scipy."""
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    out = capsys.readouterr().out
+    assert PLAN_FILE in out
+    assert MOTION_FILE in out
 
 
 def joint_text(**changes: object) -> str:

@@ -17,6 +17,7 @@ from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.models.files import shipped
 from jtqd.sysid import runs
 from jtqd.sysid.diagnosis import command as diagnose
+from jtqd.sysid.runs import column_names
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_run, read_runs, same_run, windows
 from jtqd.sysid.runs.run_file import RunError
@@ -571,6 +572,36 @@ def test_a_table_of_all_cycles_is_the_same_run_without_its_blank_cells(tmp_path)
         read_runs([LOG, table], segments=True)
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        "# recorded 2026-01-01\n\n# rig 3\n" + GOOD,
+        "# rig 3\n# " + GOOD,
+        GOOD + "0.003,-nan(ind),-5\n0.004,3.5,N/A\n",
+    ],
+)
+def test_comments_above_the_header_and_words_for_a_blank_cell(tmp_path, text):
+    [run] = read_runs([_file(tmp_path, text)], segments=True)
+    assert run.table.time_s.tolist() == [0.0, 0.001, 0.002]
+    assert column(run.table, "torque_nm").tolist() == [-2.0, -3.0, -4.0]
+
+
+def test_lines_are_counted_with_the_comments(tmp_path):
+    with pytest.raises(RunError, match=r"line 5, column 'j1.current_a': found 'x'"):
+        read_run(_file(tmp_path, "# rig 3\n\n" + GOOD.replace("2.5", "x")))
+
+
+@pytest.mark.parametrize("text", ["0.0,1.5\n0.1,2.5\n", "# a rig\n0.0,1.5\n0.1,2.5\n"])
+def test_a_header_of_numbers_is_refused_as_such(tmp_path, text):
+    with pytest.raises(RunError, match=r"line [12]: found numbers, expected a header row"):
+        read_run(_file(tmp_path, text), _map(time_s="0", j1__current_a="1"))
+
+
+def test_columns_that_are_counted_are_names(tmp_path):
+    run = read_run(_file(tmp_path, "0,1\n0.0,1.5\n0.1,2.5\n"), _map(time_s="0", j1__current_a="1"))
+    assert column(run.table, "current_a").tolist() == [1.5, 2.5]
+
+
 def test_two_runs_are_read(tmp_path):
     for seed in (1, 2):
         write_run(tmp_path / f"{seed}.csv", swung(seed, rows=3000))
@@ -578,7 +609,7 @@ def test_two_runs_are_read(tmp_path):
 
 
 def test_the_examples_in_the_docstrings_hold():
-    for module in (runs, text):
+    for module in (runs, text, column_names):
         result = doctest.testmod(module)
         assert result.attempted
         assert not result.failed
