@@ -166,17 +166,21 @@ def decode(
     dataclass itself refuses by FieldError.
     """
     with in_file(where, path):
-        return read(kind, mapping, required=required, **given)
+        return _read(kind, mapping, required, given)
 
 
-def read(kind: type[T], mapping: object, *, required: Iterable[str] = (), **given: Any) -> T:
+def read(kind: type[T], mapping: object, **given: Any) -> T:
     """Return the dataclass as `decode` does. Raises FieldError with the key below this section."""
+    return _read(kind, mapping, (), given)
+
+
+def _read(kind: type[T], mapping: object, required: Iterable[str], given: Mapping[str, Any]) -> T:
     schema: Any = kind
     section = _section(mapping)
     known = [each for each in _fields_of(schema) if each.name not in given]
     if required:
         known = [replace(each, optional=False) if each.name in required else each for each in known]
-    values = given | read_values(known, section)
+    values = {**given, **read_values(known, section)}
     try:
         return kind(**values)
     except FieldError as error:

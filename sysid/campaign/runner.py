@@ -18,13 +18,12 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from jtqd.daemon.logs import LogError
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
@@ -33,9 +32,9 @@ from jtqd.sysid.campaign.bench import Bench, BenchConfig, Interrupted, Jtqd, Pla
 from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, STATUSES, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints
 from jtqd.sysid.planner.plan import Plan, Run, expand, marks_of, partial_runs
-from jtqd.sysid.runs.checks import check_run
-from jtqd.sysid.runs.logs import LoggedRun, log_to_run
-from jtqd.sysid.runs.tables import write_run
+
+if TYPE_CHECKING:  # readers of logs, which --help does not need
+    from jtqd.sysid.runs.logs import LoggedRun
 
 # The run table of a motion --------------------------------------------------------------------------------------
 
@@ -106,6 +105,8 @@ def findings(
 
     joints: of jtqd's configuration, 1, 2, ...; measured: numbers of those with a channel of the torque sensor.
     """
+    from jtqd.sysid.runs.checks import check_run
+
     by_number = {number: joints[number - 1] for number in setpoints.joints}
     lines = []
     if logged.lost_share > _LOST_SHARE:
@@ -239,6 +240,10 @@ def stopped(result: MotionResult) -> Attempt:
 
 def _recorded(run: Run, setpoints: Setpoints, config: BenchConfig, log: Sequence[Path], out: Path) -> Attempt:
     """Write table and marks of a motion that was played to its end, if its log is usable."""
+    from jtqd.daemon.logs import LogError
+    from jtqd.sysid.runs.logs import log_to_run
+    from jtqd.sysid.runs.tables import write_run
+
     try:
         logged = log_to_run(
             log,
