@@ -35,6 +35,10 @@ STUDIES: Final = {
     "benches": ("validation.diagnosis.benches", "diagnosis: effects hidden in MuJoCo and in measured runs"),
     "oracle": ("validation.diagnosis.oracle", "size from which an effect is visible, or would be reported"),
     "more_data": ("validation.diagnosis.more_data", "diagnosis: what one more run changes"),
+    "open_questions": (
+        "validation.diagnosis.open_questions",
+        "diagnosis: open questions of other projects, rebuilt in MuJoCo",
+    ),
     "frozen": ("validation.frozen", "results that a restructuring must not change, beside the stored ones"),
 }
 """Study -> (module, one line of help)."""
