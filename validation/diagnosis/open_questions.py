@@ -41,9 +41,8 @@ from validation.diagnosis.mujoco_bench import SHAPES
 from validation.study import Report, Table, in_processes
 
 STEP_S: Final = 1e-3
-DT_S: Final = STEP_S / 2
+DT_S: Final = STEP_S / 4  # a target that moves once per STEP_S puts steps into the current
 GRAVITY: Final = 9.80665
-Draw = Callable[[np.random.Generator, int], "Setup"]
 Motion = Callable[[np.random.Generator, Array], Array]
 """Times [n] at 1 kHz -> angles [n]."""
 
@@ -112,9 +111,7 @@ def integrate(rig: Rig, target_rad: Array) -> Columns:
     inertia, omega = rig.reflected + rig.link_inertia + rig.load_inertia, 2.0 * math.pi * 4.0
     kd = 1.4 * inertia * omega / (rig.ratio * rig.torque_constant)
     kp, limit = kd * omega / 1.4, 1.5 * rig.rated_a
-    fine = np.arange(
-        0.0, len(target_rad), 0.5
-    )  # a target that moves in steps is as many steps in the current
+    fine = np.arange(0.0, len(target_rad), DT_S / STEP_S)
     wanted = np.interp(fine, np.arange(len(target_rad)), target_rad)
     rates = np.gradient(wanted, DT_S).tolist()
     out = np.empty((len(fine), 4))
@@ -127,7 +124,7 @@ def integrate(rig: Rig, target_rad: Array) -> Columns:
         loss[0] = rig.coulomb + rig.load_coefficient * abs(gear_nm)
         mujoco.mj_step(model, data)  # qacc is of the moment before it, as the rest
         out[k] = current, q, link, gear_nm - rig.link_inertia * float(qacc[1])
-    columns = zip(("current_a", "motor_rad", "link_rad", "load_nm"), out[::2].T, strict=True)
+    columns = zip(("current_a", "motor_rad", "link_rad", "load_nm"), out[::4].T, strict=True)
     return {"time_s": STEP_S * np.arange(len(target_rad)), **dict(columns)}
 
 
@@ -152,8 +149,8 @@ def chirp(rng: np.random.Generator, t: Array) -> Array:
 
 
 def stairs(rng: np.random.Generator, t: Array) -> Array:
-    """Constant velocities up to 1.5 to 3 rad/s in both directions."""
-    return np.cumsum(rng.uniform(1.5, 3.0) * SHAPES["stairs"](rng, t) * np.clip(t / 0.5, 0.0, 1.0)) * STEP_S
+    """Constant velocities up to 0.4 to 0.8 rad/s in both directions."""
+    return np.cumsum(rng.uniform(0.4, 0.8) * SHAPES["stairs"](rng, t) * np.clip(t / 0.5, 0.0, 1.0)) * STEP_S
 
 
 PENDULUM: Final = (swings(1.4, 9.0, 3.0), swings(1.2, 4.0, 1.5))
@@ -222,7 +219,7 @@ def _rig(rng: np.random.Generator, mu: tuple[float, float], *, weight: bool = Tr
         coulomb=_four(rated * rng.uniform(0.03, 0.08)),
         viscous=_four(rated * rng.uniform(0.02, 0.06)),
         load_coefficient=_four(rng.uniform(*mu)),
-        load_inertia=_four(1.03 * mass * lever**2 if weight else rated * rng.uniform(3e-4, 1e-3)),
+        load_inertia=_four(1.03 * mass * lever**2 if weight else rated * rng.uniform(0.004, 0.006)),
         mass_kg=mass,
         lever_m=lever,
     )
@@ -282,10 +279,10 @@ def _inertials(rng: np.random.Generator, number: int) -> Setup:
 
 
 def _no_load(rng: np.random.Generator, number: int) -> Setup:
-    """A free joint at constant velocities and in swings; its friction under load, 0.1 to 0.25, is not in the file."""
+    """A free joint, moved gently: its friction under load is not in the file, and below 0.1 % of the rated torque."""
     off = {"load_coefficient": 0.0, "coulomb": _off(rng, 0.2, 0.5), "viscous": _off(rng, 0.2, 0.5)}
-    rig = _rig(rng, (0.1, 0.25), weight=False)
-    return replace(_set(rng, rig, (stairs, swings(1.5, 8.0, 2.0)), **off), two_encoders=False)
+    rig = _rig(rng, (0.08, 0.15), weight=False)
+    return replace(_set(rng, rig, (stairs, swings(0.8, 9.0, 5.0)), **off), two_encoders=False)
 
 
 # What a user has: recordings, column map, joint file.
@@ -348,7 +345,7 @@ def diagnosed(folder: Path) -> Mapping[str, Any]:
     return {"refused": " ".join(lines[-2:]).strip() or f"exit status {status}"}
 
 
-# The answer, and what is right.
+# The answer.
 
 
 class Entry(NamedTuple):
@@ -428,7 +425,7 @@ class Question:
     """
 
     thread: str
-    draw: Draw
+    draw: Callable[[np.random.Generator, int], Setup]
     reply: str
     wanted: Sequence[str] = ()
     largest: str = ""
@@ -453,17 +450,17 @@ QUESTIONS: Final = {
     "load_friction": Question(
         "https://github.com/google-deepmind/mujoco/issues/3528",
         _load_friction,
-        "In {sets} simulated gears, driving and back-driving, friction under load was the largest cause, with its true value "
-        "inside, in {right}. {inside} intervals hold the true value; the error on held-out runs falls by {gain}.",
+        "In {sets} simulated gears, driving and back-driving, friction under load was the largest cause, with the truth "
+        "inside, in {right}. {inside} intervals hold the truth; the held-out error falls by {gain}.",
         wanted=(LOAD,),
         largest=LOAD,
     ),
     "compliant_gear": Question(
         "https://github.com/leggedrobotics/pace-sim2real/issues/19",
         _compliant,
-        "With encoders on both sides of a gear that rings at 5 to 15 Hz, spring and damper were found, viscous friction left "
-        "as it is, in {right} of {sets} simulated joints. {inside} intervals hold the true value; the error on "
-        "held-out runs falls by {gain}.",
+        "With encoders on both sides of a gear that rings at 5 to 15 Hz, spring and damper were found, viscous friction "
+        "left as it is, in {right} of {sets} simulated joints. {inside} intervals hold the truth; the held-out error falls "
+        "by {gain}.",
         wanted=("nonlinear_stiffness", "gear_damping"),
         unchanged=("viscous_friction",),
     ),
@@ -476,9 +473,9 @@ QUESTIONS: Final = {
     "another_unit": Question(
         "https://github.com/Rhoban/bam/issues/17",
         _another_unit,
-        "With another unit's parameters, two or three of them 5 to 30 % off, exactly those were found, with true values in "
-        "their intervals, in {right} of {sets} simulated servos; something wrong was certain in {wrong}. {inside} intervals "
-        "hold the true value; the error on held-out runs falls by {gain}.",
+        "With another unit's parameters, two or three of them 5 to 30 % off, exactly those were found, the truth inside, in "
+        "{right} of {sets} simulated servos; something wrong was certain in {wrong}. {inside} intervals hold the truth; the "
+        "held-out error falls by {gain}.",
         wanted=ALL,
         harmless=True,
     ),
