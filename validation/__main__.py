@@ -39,6 +39,10 @@ STUDIES: Final = {
         "validation.diagnosis.open_questions",
         "diagnosis: open questions of other projects, rebuilt in MuJoCo",
     ),
+    "person": (
+        "validation.diagnosis.person",
+        "diagnosis: data as a person has them, several wrong values at once",
+    ),
     "frozen": ("validation.frozen", "results that a restructuring must not change, beside the stored ones"),
 }
 """Study -> (module, one line of help)."""

@@ -134,7 +134,7 @@ def _polled(run: Columns, recorder: Recorder, rng: np.random.Generator) -> Colum
     for name, x in run.items():
         if name == TIME:
             continue
-        quantity = name.split(".", 1)[1]
+        quantity = name.rpartition(".")[2]
         values = x
         if recorder.velocity_filter_s and quantity.endswith("velocity_rad_s"):
             values = low_pass(x, recorder.velocity_filter_s, source)

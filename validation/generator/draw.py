@@ -385,6 +385,22 @@ def _speed_load(c: Scene) -> Oddity:
     )
 
 
+def _smooth_friction(c: Scene) -> Oddity:
+    """Friction that is a random smooth function of speed, load and link angle; size: about its largest part, Nm."""
+    top = max(float(np.max(np.abs(m.velocity_rad_s))) for m in c.motions)
+    speed, angle, load = c.size * c.rng.dirichlet((1.0, 1.0, 1.0)) * c.rng.choice([-1.0, 1.0], 3)
+    numbers = {
+        "band_nm": float(speed),
+        "band_at_rad_s": float(c.rng.uniform(0.2, 0.9)) * top,
+        "band_width_rad_s": float(c.rng.uniform(0.25, 0.5)) * top,
+        "bump_nm": float(angle),
+        "bump_at_rad": float(c.rng.uniform(-np.pi, np.pi)),
+        "bump_width_rad": float(c.rng.uniform(0.6, 1.5)),
+        "speed_load": float(load) / (top**2 * 0.5 * float(c.nominal["rated_torque_nm"])),
+    }
+    return Oddity(numbers=numbers)
+
+
 UNKNOWN: Final[dict[str, Unknown]] = {
     "coupling_slip": Unknown(_coupling_slip, 1.5, 4.0, "Nm"),
     "local_damage": Unknown(_local_damage, 1.5, 4.0, "Nm"),
@@ -395,6 +411,7 @@ UNKNOWN: Final[dict[str, Unknown]] = {
     "friction_bursts": Unknown(_friction_bursts, 1.5, 4.0, "Nm"),
     "speed_band": Unknown(_speed_band, 1.5, 4.0, "Nm"),
     "speed_load": Unknown(_speed_load, 0.1, 0.3, "", resembling=True),
+    "smooth_friction": Unknown(_smooth_friction, 0.2, 1.0, "Nm", resembling=True),
 }
 
 
