@@ -258,6 +258,12 @@ def test_a_wrong_certain_name_counts_and_a_missing_and_a_right_one_count_as_they
     assert found["2 of those with an interval: it holds the truth"] == (1.0, 1)
     assert found["3 settled by the oracle alone: graded certain"] == (1.0, 1)
     assert found["4 something hidden: held-out error at most the ladder's"] == (0.0, 1)
+    assert found["4 something hidden: at most the ladder's, or as the oracle's"] == (0.0, 1)
+    error = {"oracle": 1.3, "tool": 1.31, "ladder": 1.2}
+    (as_good,) = (
+        r.value for r in person.shares([line("cause", [], error_nm=error)]) if r and "as the oracle" in r.what
+    )
+    assert as_good == 1.0
     figures = {row.what: row.value for row in person.figures([line("cause", [RIGHT, WRONG])])}
     assert figures["3 settled: width of the interval over the oracle's, median"] == pytest.approx(0.3 / 0.196)
     assert figures["4 held-out error over the oracle's, median"] == 1.5
@@ -288,20 +294,38 @@ def test_both_forms_of_findings_are_read() -> None:
         "causes": [{**RIGHT, "class": ["coulomb_friction", "stribeck_friction"]}, WRONG],
     }
     first, second = person.reported(today)
-    assert (first["grade"], first["rivals"], second["grade"]) == ("one_of", ["stribeck_friction"], "certain")
+    assert (first["grade"], first["rivals"], second["grade"]) == (
+        "one_of",
+        [["stribeck_friction", 1]],
+        "certain",
+    )
     assert first["parameters"]["coulomb_nm"] == pytest.approx([4.05, 3.75, 4.35])
     coming = {
         "verdict": "cause",
         "causes": [{**WRONG, "grade": "effective", "rivals": ["coulomb_friction"], "share": 0.4}],
     }
     (only,) = person.reported(coming)
-    assert (only["grade"], only["rivals"], only["share"]) == ("effective", ["coulomb_friction"], 0.4)
+    assert (only["grade"], only["rivals"], only["share"]) == ("effective", [["coulomb_friction", 1]], 0.4)
     counted = line("cause", coming["causes"])
     rows = {row.what: row for row in person.shares([counted]) if row is not None}
     assert rows["1 wrong certain: sets with something hidden"].value == 0.0, "effective is not certain"
     assert rows["2 wrong values beyond 3 oracle sigma: reported at any grade"].value == 0.5, (
         "a rival is reported"
     )
+
+
+def test_a_rival_of_another_joint_is_not_the_value_that_is_wrong() -> None:
+    what = "2 wrong values beyond 3 oracle sigma: reported at any grade"
+    for rival, found in (
+        ("torque_constant of joint 2", 0.5),
+        ("torque_constant of joint 1", 1.0),
+        ("torque_constant", 1.0),
+    ):
+        causes = [RIGHT, {**WRONG, "class": ["hysteresis", rival, "sensor_gain of the sensor"]}]
+        counted = line("ambiguous", causes)
+        assert ["sensor_gain", SENSOR] in counted["reported"][1]["rivals"]
+        rows = {row.what: row for row in person.shares([counted]) if row is not None}
+        assert rows[what].value == found
 
 
 def test_nothing_hidden_and_foreign_kinds_have_rows_of_their_own() -> None:
