@@ -395,42 +395,70 @@ def _replaced(joint: Any, key: str, value: float) -> Any:
     return replace(joint, **{head: replace(getattr(joint, head), **{tail: value}) if tail else value})
 
 
-_FADE: Final = 1e-4
-"""Standard deviation of a parameter that the runs do not show: a hundred times its scale."""
+_FADE: Final = 1e-2
+"""What a parameter that the runs do not show stays with: a standard deviation of a hundred times its scale, at the truth."""
+_TURNS: Final = 6
 
 
 def fit(views: Sequence[View], truth: Truth, nominal: Mapping[int, Any]) -> Fit:
     """Return the true set fitted by Gauss-Newton from the truth on: ordinary least squares, then weighted.
 
     Weights: noise as sums over a second show it, and offset, Coulomb and viscous friction of each run's own, with the spread
-    that the residuals of the first fit have.
+    that the residuals of the first fit have. A step that does not lower the sum of squares is halved.
     """
-    theta = np.array([q.true for q in truth.free])
+    start = np.array([q.true for q in truth.free])
     scale = np.array([q.scale for q in truth.free])
-    whiten: Any = None
-    for turn in range(3):
-        base = _all_errors(views, truth.files(theta), nominal)
-        slopes = [
-            _all_errors(views, truth.files(theta + 1e-3 * scale * row), nominal, only=q, base=base)
-            for q, row in zip(truth.free, np.eye(len(theta)), strict=True)
-        ]
-        if turn == 1:
-            whiten = _whitener(views, base)
-        stack = whiten if whiten is not None else _stacked
+
+    def at(moved: Array) -> list[dict[str, Array]]:
+        return _all_errors(views, truth.files(start + scale * moved), nominal)
+
+    moved, base = np.zeros(len(start)), at(np.zeros(len(start)))
+    stack: Any = _stacked
+    for weighted in (False, True):
+        if weighted:
+            stack = _whitener(views, base)
         e = stack(base)
-        j = np.array([(stack(x) - e) / 1e-3 for x in slopes]).T.reshape(len(e), len(theta))
-        step, *_ = np.linalg.lstsq(
-            np.vstack((j, np.diag(_FADE * np.ones(len(theta))))),
-            -np.concatenate((e, np.zeros(len(theta)))),
-            rcond=None,
-        )
-        theta = theta + scale * np.clip(step, -3.0, 3.0)
-    normal = j.T @ j + _FADE**2 * np.eye(len(theta))
-    runs = len({v.run for v in views})
-    wider = _student(max(runs - 1, 1)) / Z95
+        for _ in range(_TURNS):
+            j = _jacobian(views, truth, nominal, start + scale * moved, scale, base, stack)
+            left, rows = np.concatenate((e, _FADE * moved)), np.vstack((j, _FADE * np.eye(len(start))))
+            step = np.linalg.lstsq(rows, -left, rcond=None)[0]
+            cost = float(left @ left)
+            for _ in range(8):
+                tried = at(moved + step)
+                ahead = stack(tried)
+                gained = cost - float(ahead @ ahead) - _FADE**2 * float((moved + step) @ (moved + step))
+                if gained > 0.0:
+                    break
+                step = 0.5 * step
+            if not gained > 0.0:
+                break
+            moved, base, e = moved + step, tried, ahead
+            if gained < 1e-3 * cost / len(e):
+                break
+    j = _jacobian(views, truth, nominal, start + scale * moved, scale, base, stack)
+    normal = j.T @ j + _FADE**2 * np.eye(len(start))
+    wider = _student(max(len({v.run for v in views}) - 1, 1)) / Z95
     sigma = scale * wider * np.sqrt(np.diag(np.linalg.inv(normal)))
-    files = truth.files(theta)
-    return Fit(theta, sigma, files, j, whiten, _all_errors(views, files, nominal))
+    values = start + scale * moved
+    return Fit(values, sigma, truth.files(values), j, stack, base)
+
+
+def _jacobian(  # noqa: PLR0917
+    views: Sequence[View],
+    truth: Truth,
+    nominal: Mapping[int, Any],
+    values: Array,
+    scale: Array,
+    base: Sequence[dict[str, Array]],
+    stack: Any,
+) -> Array:
+    """Return the slopes of the stacked errors over the scaled parameters [m, p], by differences."""
+    e = stack(base)
+    columns = [
+        stack(_all_errors(views, truth.files(values + 1e-3 * scale * row), nominal, only=q, base=base)) - e
+        for q, row in zip(truth.free, np.eye(len(values)), strict=True)
+    ]
+    return np.array(columns).reshape(len(values), len(e)).T / 1e-3
 
 
 def _student(freedom: int) -> float:

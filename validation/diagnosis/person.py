@@ -17,8 +17,9 @@ The tool runs as a user calls it, in a process of its own; its answer is finding
 An entry of the findings is certain (`grade`; where there is none: its class has its name alone), else "one_of". Beside it:
 - the oracle (`balance.fit`): all wrong values and all structural effects that are there, fitted to the same runs;
 - the ladder (`balance.ladder`): ordinary least squares.
-An entry is settled by the oracle alone if its 3 sigma interval excludes the file's value and no single other effect, all
-other true entries being refitted, comes within 6 in 2 log-likelihood (`balance.settled`, linearised). All files are judged
+A value is beyond 3 oracle sigma if both the truth and the oracle's value are that far from the file's: a rest can hide it.
+Such an entry is settled by the oracle alone if no single other effect, all other true entries being refitted, comes within 6
+in 2 log-likelihood (`balance.settled`, linearised). All files are judged
 by `balance.errors`. A cause is there if it is a wrong value or an effect of that joint, or has the same law as one
 (`ALIASES`, of the same order).
 
@@ -343,8 +344,8 @@ def judge(p: Plan, drawn: Drawn, paths: Mapping[str, Any], answer: Answer | None
                 "file": q.file,
                 "value": float(value),
                 "sigma": float(sigma),
-                "beyond": bool(abs(q.true - q.file) > 3.0 * sigma),
-                "alone": bool(alone[q.entry] and abs(value - q.file) > 3.0 * sigma),
+                "beyond": (beyond := bool(min(abs(q.true - q.file), abs(value - q.file)) > 3.0 * sigma)),
+                "alone": beyond and alone[q.entry],
             }
             for q, value, sigma in zip(free, found.values, found.sigma, strict=True)
             for entry in [drawn.entries[q.entry]]
