@@ -15,7 +15,17 @@ from jtqd.estimator.run import JointColumns, RunTable
 from validation.diagnosis import balance, person, person_sets
 from validation.diagnosis.entries import SENSOR
 
-TRUE = Joint("j", 100.0, 0.1, 6e-5, 16000.0, 8.0, 0.1, 40.0, Friction(4.0, 3.0))
+TRUE = Joint(
+    name="j",
+    gear_ratio=100.0,
+    torque_constant_nm_per_a=0.1,
+    rotor_inertia_kgm2=6e-5,
+    stiffness_nm_per_rad=16000.0,
+    damping_nms_per_rad=8.0,
+    link_inertia_kgm2=0.1,
+    rated_torque_nm=40.0,
+    friction=Friction(coulomb_nm=4.0, viscous_nms_per_rad=3.0),
+)
 """The plant of `run`, with a load friction of LOAD besides."""
 LOAD = 0.1
 LOADED = (EFFECTS["load_dependent_friction"], {"load_coefficient": LOAD})
@@ -74,7 +84,7 @@ def test_a_derivative_is_that_of_the_function() -> None:
 def test_the_true_file_misses_nothing_and_a_wrong_one_what_it_is_wrong_by(views: list[balance.View]) -> None:
     nothing, _ = balance.combined_nm(views, {1: balance.File(TRUE, [LOADED])}, {1: TRUE})
     assert nothing < 0.02
-    wrong = replace(TRUE, friction=Friction(5.0, 3.0))
+    wrong = replace(TRUE, friction=Friction(coulomb_nm=5.0, viscous_nms_per_rad=3.0))
     e = [balance.errors(v, balance.File(wrong, [LOADED]), TRUE) for v in views]
     motor = np.concatenate([x[balance.MOTOR] for x in e])
     assert abs(np.sqrt(np.mean(motor**2)) - 1.0) < 0.02, (
@@ -92,7 +102,7 @@ def test_the_true_file_misses_nothing_and_a_wrong_one_what_it_is_wrong_by(views:
 @pytest.mark.parametrize("factor", [0.5, 0.1])
 def test_scaling_a_whole_balance_gains_nothing(views: list[balance.View], factor: float) -> None:
     """Torque constant, inertias, friction, stiffness smaller, a sensor that reads too much: `factor` times the balance."""
-    wrong = replace(TRUE, friction=Friction(5.0, 3.0))
+    wrong = replace(TRUE, friction=Friction(coulomb_nm=5.0, viscous_nms_per_rad=3.0))
     small = replace(
         wrong,
         torque_constant_nm_per_a=factor * wrong.torque_constant_nm_per_a,
@@ -100,7 +110,7 @@ def test_scaling_a_whole_balance_gains_nothing(views: list[balance.View], factor
         link_inertia_kgm2=factor * wrong.link_inertia_kgm2,
         stiffness_nm_per_rad=factor * wrong.stiffness_nm_per_rad,
         damping_nms_per_rad=factor * wrong.damping_nms_per_rad,
-        friction=Friction(factor * 5.0, factor * 3.0),
+        friction=Friction(coulomb_nm=factor * 5.0, viscous_nms_per_rad=factor * 3.0),
     )
     gain = (EFFECTS["sensor_gain"], {"gain": 1.0 / factor})
     one, _ = balance.combined_nm(views, {1: balance.File(wrong, [LOADED])}, {1: TRUE})
@@ -110,7 +120,9 @@ def test_scaling_a_whole_balance_gains_nothing(views: list[balance.View], factor
 
 
 def test_the_oracle_recovers_the_truth_from_afar(views: list[balance.View]) -> None:
-    start = replace(TRUE, torque_constant_nm_per_a=0.11, friction=Friction(5.5, 3.0))
+    start = replace(
+        TRUE, torque_constant_nm_per_a=0.11, friction=Friction(coulomb_nm=5.5, viscous_nms_per_rad=3.0)
+    )
     free = [
         balance.Parameter(0, 1, "torque_constant_nm_per_a", 0.11, 0.11, 0.01),
         balance.Parameter(1, 1, "friction.coulomb_nm", 5.5, 5.5, 3.0),
