@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Friction, Joint
@@ -355,6 +356,32 @@ def test_an_error_is_raised_only_beyond_its_scatter_over_runs() -> None:
     assert person.raised([1.0, 1.1, 0.9, 1.0], [1.2, 1.3, 1.1, 1.25])
     assert not person.raised([1.0, 1.1, 0.9, 1.0], [1.2, 0.9, 0.8, 1.1])
     assert not person.raised([1.0, 1.1], [1.0, 1.1])
+
+
+FAKE = """
+import json, sys
+from pathlib import Path
+out = Path(sys.argv[sys.argv.index("--out") + 1])
+out.mkdir()
+(out / "findings.json").write_text(json.dumps({"verdict": "cause", "causes": []}))
+Path(sys.argv[1]).write_text("[3, 1.5, 80.0]")
+"""
+
+
+@pytest.mark.parametrize("usable", [True, False])
+def test_the_answer_is_what_the_tool_wrote_and_an_unusable_file_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, usable: bool
+) -> None:
+    mapping = TRUE.to_mapping() if usable else {"name": "half a file"}
+    extended = f"(out / 'extended.joint.yaml').write_text({yaml.safe_dump(mapping)!r})"
+    monkeypatch.setattr(person, "_CALL", f"{FAKE}{extended}")
+    given = tmp_path / "joint1.yaml"
+    wrong = replace(TRUE, torque_constant_nm_per_a=0.11)
+    given.write_text(yaml.safe_dump(wrong.to_mapping()), encoding="utf-8")
+    answer = person.ask(tmp_path, [], {1: given}, None)
+    assert answer.findings.get("verdict") == ("cause" if usable else None)
+    assert answer.files[1] == (TRUE if usable else wrong)
+    assert (answer.status == "3") is usable
 
 
 def test_a_generator_that_is_not_there_is_left_out_loudly(capsys: pytest.CaptureFixture[str]) -> None:

@@ -49,6 +49,7 @@ import yaml
 
 from jtqd.estimator.command_line import count, natural
 from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.runs.files import read_runs
 from validation.diagnosis import balance
@@ -133,7 +134,10 @@ def ask(folder: Path, runs: Sequence[Path], joints: Mapping[int, Path], columns:
         own = out / f"extended.joint{number}.yaml"
         path = own if own.exists() else out / "extended.joint.yaml"
         if path.exists() and (len(joints) == 1 or path == own):
-            files[number] = Joint.from_mapping(_yaml(path), path.name)
+            try:
+                files[number] = Joint.from_mapping(_yaml(path), path.name)
+            except (ConfigError, yaml.YAMLError) as error:  # a file that nobody can use is no answer
+                return Answer(f"{path.name}: {error}", {}, given)
     findings = json.loads((out / "findings.json").read_text())
     return Answer(str(status), findings, files, cpu_s, memory_mb)
 
