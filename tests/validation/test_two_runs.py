@@ -81,7 +81,17 @@ def test_an_emulated_joint_is_known_by_two_windows() -> None:
 
 # Friction of one run.
 
-JOINT = Joint("test", 100.0, 0.09, 4e-5, 1e4, 10.0, 1.0, 32.0, Friction(1.0, 1.0))
+JOINT = Joint(
+    name="test",
+    gear_ratio=100.0,
+    torque_constant_nm_per_a=0.09,
+    rotor_inertia_kgm2=4e-5,
+    stiffness_nm_per_rad=1e4,
+    damping_nms_per_rad=10.0,
+    link_inertia_kgm2=1.0,
+    rated_torque_nm=32.0,
+    friction=Friction(1.0, 1.0),
+)
 TIME_S = 1e-3 * np.arange(8000)
 SWING, LOAD = np.sin(2.0 * TIME_S) + 0.4 * np.sin(5.0 * TIME_S), 20.0 * np.cos(3.3 * TIME_S)
 

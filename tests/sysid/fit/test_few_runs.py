@@ -19,7 +19,17 @@ from jtqd.sysid.fit.few_runs import FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.losses import LossFitError
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 
-JOINT = Joint("a1", 100.0, 0.06, 7.0e-5, 12000.0, 8.0, 0.008, 40.0, Friction(3.0, 2.0))
+JOINT = Joint(
+    name="a1",
+    gear_ratio=100.0,
+    torque_constant_nm_per_a=0.06,
+    rotor_inertia_kgm2=7.0e-5,
+    stiffness_nm_per_rad=12000.0,
+    damping_nms_per_rad=8.0,
+    link_inertia_kgm2=0.008,
+    rated_torque_nm=40.0,
+    friction=Friction(3.0, 2.0),
+)
 TRUE = {"coulomb": 2.2, "load": 0.09, "viscous": 2.8, "offset": 0.3, "gain": 0.03, "inertia": 0.9}
 
 
