@@ -110,8 +110,7 @@ def table_lines(results: Sequence[Diagnosed]) -> list[str]:
 def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
     """Return the error on each run of the extended file, beside least squares fitted on the other run.
 
-    Regressors: offset, Coulomb, viscous, inertia, friction by load. The extended file of a joint without causes is the file,
-    or the file with a value at its bound.
+    Regressors: offset, Coulomb, viscous, inertia, friction by load. The extended file of a joint without a gain is the file.
     """
     runs = measured_runs()
     lines = [
@@ -126,18 +125,13 @@ def ladder_lines(results: Sequence[Diagnosed]) -> list[str]:
         samples = bin_samples(s for run in signals for s in run)
         parts = [_ladder(run, samples) for run in signals]
         after = {} if one.findings.gain is None else {g.run: g.rmse_after_nm for g in one.findings.gain.runs}
-        bounds = [bound for bound in one.findings.bounded if bound.in_file]
-        after |= {run.run: run.rmse_after_nm for bound in bounds for run in bound.runs}
         for (x, y, name), (fitted_x, fitted_y, _) in zip(parts, parts[::-1], strict=True):
             size = np.sqrt(np.mean(fitted_x**2, axis=0))
             found = np.linalg.lstsq(fitted_x / size, fitted_y, rcond=1e-3)[0] / size
             file, ladder = (float(np.sqrt(np.mean(error**2))) for error in (y, y - x @ found))
             own = after.get(name, file)
             holds = "yes" if own < ladder + 0.005 else "no"
-            bound = " (bound)" if bounds else ""
-            lines.append(
-                f"| {one.number} | {name} | {file:.2f} | {ladder:.2f} | {own:.2f}{bound} | {holds} |"
-            )
+            lines.append(f"| {one.number} | {name} | {file:.2f} | {ladder:.2f} | {own:.2f} | {holds} |")
     return lines
 
 

@@ -3,7 +3,7 @@
     simulation  residuals of the motor and the torsion balance with all effects of the file, averaged over
                 5 ms and without what the resolution of the positions makes of the acceleration, both as in a diagnosis,
                 rms in motion; the torsion's without its mean in each run, whose zero differs
-    free run    error of the simulated velocity and position in half a second alone (`jtqd.sysid.diagnosis.gain.free_run`)
+    free run    error of the simulated velocity and position in half a second alone (`sysid.diagnosis.free_run`)
     estimators  estimate less sensor, the sensor passed through the same low-pass, rms over the samples in motion
 
 Nothing is fitted. A method that needs what a joint file does not have (efficiency, section `fused`), or a run does not
@@ -16,6 +16,7 @@ import argparse
 import json
 import math
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,11 +73,11 @@ SETTLE_S: Final = 0.1
 
 @dataclass(frozen=True)
 class RunErrors:
-    """Rms errors of one joint file on one run by what is wrong (NaN: not measurable), and the samples in motion."""
+    """Rms errors of one joint file on one run by what is wrong (NaN: not measurable), and the time in motion."""
 
     run: str
     errors: Mapping[str, float]
-    samples: int
+    moving_s: float
 
 
 @dataclass(frozen=True)
@@ -112,10 +113,10 @@ def errors_on(
     Raises SignalsError for a run without what a simulation needs, ConfigError for a joint file that an estimator refuses.
     """
     from jtqd.sysid.diagnosis.dataset import without_known_effects
-    from jtqd.sysid.diagnosis.diagnose import with_effects_applied
-    from jtqd.sysid.diagnosis.gain import free_run
+    from jtqd.sysid.diagnosis.free_run import free_run
     from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
     from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
+    from jtqd.sysid.diagnosis.solution import with_effects_applied
 
     plain = with_effects_applied(joint)
     base = BaseLoss(plain)
@@ -154,7 +155,7 @@ def errors_on(
         estimate = estimate_columns(joint, settings, None, table.time_s, columns).torque_nm
         sensor = low_pass(columns.torque_nm, dt, bandwidth_of(joint, settings))
         errors[title] = _rms((estimate - sensor)[settled])
-    return RunErrors(name, errors, int(np.count_nonzero(moving)))
+    return RunErrors(name, errors, int(np.count_nonzero(moving)) * signals.step_s)
 
 
 def needs_torsion(table: RunTable, number: int, joint: Joint) -> bool:
@@ -166,7 +167,7 @@ def needs_torsion(table: RunTable, number: int, joint: Joint) -> bool:
 def rows_of(scored: Sequence[Sequence[RunErrors]]) -> list[Row]:
     """Return the table of [file][run]: for each row that every file has all runs together, then each run.
 
-    All runs together: root of the mean square, weighted by the samples in motion.
+    All runs together: root of the mean square, weighted by the time in motion.
     """
     rows = []
     for what in (MOTOR, TORSION, FREE, FREE_POSITION, *ESTIMATORS.values()):
@@ -174,7 +175,7 @@ def rows_of(scored: Sequence[Sequence[RunErrors]]) -> list[Row]:
         if not any(math.isfinite(error) for errors in each for error in errors):
             continue
         unit = UNITS.get(what, "Nm")
-        weights = np.array([run.samples for run in scored[0]], np.float64)
+        weights = np.array([run.moving_s for run in scored[0]], np.float64)
         rows.append(Row(what, "all", tuple(_together(np.array(errors), weights) for errors in each), unit))
         rows += [
             Row(what, run.run, tuple(errors[k] for errors in each), unit) for k, run in enumerate(scored[0])
@@ -229,6 +230,11 @@ BY: Final = "jtq score"
 
 def main(argv: list[str]) -> int:
     """Score; exit status 0 done, 1 failure, 2 usage, 3 done, but a run or joint could not be used."""
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of NumPy, not for a user
+        return _main(argv)
+
+
+def _main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     files = [options.joint, *([options.after] if options.after else [])]
     try:
@@ -273,7 +279,9 @@ def _scored(
     refused: list[str] = []
     less: list[str] = []
     for run in progress(runs, "scoring"):
-        checked = check_run(run.table, {number: joints[0]}, run.name, thorough=True)
+        checked = check_run(
+            run.table, {number: joints[0]}, run.name, thorough=True, known_loads=run.known_loads
+        )
         refused += [issue.text for issue in checked.refused]
         if checked.table is None:
             if not checked.refused:

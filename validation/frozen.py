@@ -32,10 +32,10 @@ STORED: Final = Path(__file__).with_name("frozen.txt")
 SEEDS: Final = (3301, 3302, 3303)
 """Of the trials on the generator with equations of its own."""
 MUJOCO_SEED: Final = 3304
-NAMES: Final = frozenset({"schema", "verdict", "name", "joint", "axis", "unit", "class", "effect", "balance"})
+NAMES: Final = frozenset(
+    {"schema", "verdict", "name", "joint", "axis", "unit", "class", "effect", "balance", "grade"}
+)
 """Keys of findings.json whose texts are results; any other text is a sentence."""
-PLAIN: Final = frozenset({"unexplained", "outlier_runs", "stability"})
-"""Keys that repeat another one under the standard term."""
 
 
 def called(*arguments: str, allowed: tuple[int, ...] = (0, 3), cwd: Path | None = None) -> str:
@@ -61,8 +61,7 @@ def numbers(value: Any, path: str = "", key: str = "") -> Iterator[str]:
     """Yield `path value` of each number, truth value and name of a JSON document, in its order."""
     if isinstance(value, dict):
         for name, each in value.items():
-            if name not in PLAIN:
-                yield from numbers(each, f"{path}.{name}", name)
+            yield from numbers(each, f"{path}.{name}", name)
     elif isinstance(value, list):
         for index, each in enumerate(value):
             yield from numbers(each, f"{path}[{index}]", key)

@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import argparse
 import datetime as dt
+import hashlib
 import json
 import math
 import os
 import shlex
 import sys
 import tempfile
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from jtqd import __version__
 from jtqd.estimator.command_line import check_installed, make_directory
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
-from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, summary_lines, to_mapping
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of
+from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, Provenance, to_mapping
+from jtqd.sysid.diagnosis.limits import RELEVANCE
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of, trusted
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
 from jtqd.sysid.progress import waiting
@@ -41,6 +45,11 @@ _JOINTS: Final = range(1, 8)
 
 def main(argv: list[str]) -> int:
     """Diagnose and write; exit status 0 no gap, 3 any other verdict, 1 failure, 2 usage."""
+    with warnings.catch_warnings(action="ignore", category=RuntimeWarning):  # of NumPy, not for a user
+        return _main(argv)
+
+
+def _main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
@@ -53,6 +62,7 @@ def main(argv: list[str]) -> int:
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
         scope = scope_of(options.without, options.given, joints, known)
+        trust = trusted(options.trust, joints)
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
@@ -61,9 +71,17 @@ def main(argv: list[str]) -> int:
             {number: with_limits(joint, options.limits) for number, joint in joints.items()},
             scope,
             options.relevance,
+            trust,
         )
         experiment = _with_limits_noted(_with_command(options, findings, joints), options, joints)
-        findings = replace(findings, joint_files=joints, next_experiment=experiment)
+        findings = replace(
+            findings,
+            joint_files=joints,
+            next_experiment=experiment,
+            relevance=RELEVANCE if options.relevance is None else options.relevance,
+            trust=trust,
+            provenance=_provenance(argv, runs, files, options.columns),
+        )
         mapping = _write(options.out, findings, joints, {run.name: run.sha256 for run in runs})
     except UsageError as error:
         print(f"{BY}: {error}", file=sys.stderr)
@@ -74,11 +92,16 @@ def main(argv: list[str]) -> int:
     except OSError as error:
         print(f"{BY}: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
         return 1
-    print(
-        json.dumps(mapping, indent=1, allow_nan=False) if options.json else "\n".join(summary_lines(findings))
-    )
+    print(json.dumps(mapping, indent=1, allow_nan=False) if options.json else _summary(findings))
     print(f"{BY}: wrote {options.out / REPORT}", file=sys.stderr)
     return 0 if findings.verdict == NO_GAP else 3
+
+
+def _summary(findings: Findings) -> str:
+    """Return what the terminal shows."""
+    from jtqd.sysid.diagnosis.report.words import terminal_lines
+
+    return "\n".join(terminal_lines(findings))
 
 
 def _own() -> tuple[str, ...]:
@@ -88,6 +111,17 @@ def _own() -> tuple[str, ...]:
     names = (FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, FILE)
     of_joints = (name for n in _JOINTS for name in (f"extended.joint{n}.yaml", joint_motion_file(n)))
     return (*names, *of_joints)
+
+
+def _provenance(
+    argv: Sequence[str], runs: Sequence[RunFile], files: Mapping[int, Path], columns: Path | None
+) -> Provenance:
+    """Return when and by what the findings were made, and of what; a joint file of several joints is named once."""
+    inputs = {run.name: run.sha256 for run in runs}
+    for path in dict.fromkeys([*files.values(), *([columns] if columns else [])]):
+        inputs[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
+    date = dt.datetime.now().astimezone().date().isoformat()
+    return Provenance(date, __version__, shlex.join([*BY.split(), *argv]), inputs)
 
 
 def _with_command(
@@ -138,9 +172,10 @@ def diagnosed(
     joints: Mapping[int, Joint],
     scope: Scope = EVERYTHING,
     relevance: float | None = None,
+    trust: Mapping[str, float] | None = None,
 ) -> Findings:
-    """Check the channels and diagnose what may be used; the findings list what may not. relevance: see `diagnose`."""
-    checked = check_runs([(run.name, run.table) for run in runs], joints)
+    """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`."""
+    checked = check_runs([(run.name, run.table) for run in runs], joints, scope.known_references)
     for line in (*checked.refused, *checked.notes):
         print(f"{BY}: {line}", file=sys.stderr)
     reader = [f"{run.name}: {note}" for run in runs for note in run.notes]
@@ -157,7 +192,8 @@ def diagnosed(
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
-        given = {} if relevance is None else {"relevance": relevance}
+        given: dict[str, Any] = {} if relevance is None else {"relevance": relevance}
+        given |= {"trust": trust} if trust else {}
         findings = diagnose(checked.runs, left, scope, **given)
     return _with_channels(findings, checked, notes)
 
@@ -235,6 +271,14 @@ def parser() -> argparse.ArgumentParser:
         help="an effect that is known: as the joint file has it, not questioned; may be given again",
     )
     parser.add_argument(
+        "--trust",
+        action="append",
+        default=[],
+        metavar="NAME=SIZE",
+        help="how far a value may be off, one standard deviation: sensor_gain=5%%, coulomb_friction=2Nm, channel_delay=5ms "
+        "(defaults: priors in the report); may be given again",
+    )
+    parser.add_argument(
         "--limits",
         type=motion_limits,
         metavar="NAME=VALUE,...",
@@ -254,7 +298,7 @@ def parser() -> argparse.ArgumentParser:
         "--relevance",
         type=_percent,
         metavar="PERCENT",
-        help="of the rated torque, rms over a run: the unexplained residual matters from here on (default 0.5)",
+        help="of the rated torque, rms: entries and what remains matter from here on (default 0.5)",
     )
     parser.add_argument(
         "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
@@ -303,7 +347,7 @@ def _write(
     from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
     from jtqd.sysid.diagnosis.report.page import render
 
-    date = dt.datetime.now().astimezone().date().isoformat()
+    date = findings.provenance.date if findings.provenance else ""
     with tempfile.TemporaryDirectory(prefix=".diagnosis.", dir=directory) as made:
         fresh = Path(made)
         names = write_extended(fresh, joints, findings, sha256=sha256, date=date)

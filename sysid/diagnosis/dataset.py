@@ -7,7 +7,7 @@ everything of it that the search, the refinement and the maps share.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -33,6 +33,7 @@ from jtqd.sysid.diagnosis.regressors import (
     families,
     gain_columns,
     run_data,
+    samples_in,
 )
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import (
@@ -53,7 +54,6 @@ from jtqd.sysid.runs.channels import Channels
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0
 SLOWEST_HZ: Final = 50.0
-SAME_RATE: Final = 0.05
 COGGING_ORDERS: Final = np.arange(5.0, 101.0)
 """Per motor revolution, where cogging is looked for."""
 ORDER_STEP_S: Final = 0.002
@@ -62,6 +62,8 @@ _SIDELOBES: Final = 0.25
 _LOWEST_ORDER: Final = 0.7
 _MOST_LINES: Final = 4
 _SAME_HZ: Final = 0.3
+_DRAWS: Final = 6
+"""Fixed-point steps to the current that a file with effects draws."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,7 @@ class Dataset:
     """All runs of one diagnosis.
 
     Attributes:
-        signals: [run][joint]. runs: the same binned, `samples` to a bin of step_s seconds.
+        signals: [run][joint]. runs: the same binned, each at its own rate, to bins of step_s seconds.
         candidates: of the library, columns numbered. unexplained: what none of them explains, per channel and run [n].
         families: of nuisances. unknown_lines: those among them at orders or frequencies of no effect.
         readings: per run what the current reads without power.
@@ -81,7 +83,6 @@ class Dataset:
     signals: list[list[JointSignals]]
     runs: list[RunData]
     candidates: list[EffectCandidate]
-    samples: int
     step_s: float
     unexplained: dict[Channel, list[FloatArray]]
     families: list[Family]
@@ -90,11 +91,18 @@ class Dataset:
     pieces: Sequence[int] | None = None
     events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
     no_torque: bool = False
+    disturbed: Sequence[list[JointSignals]] = ()
+    trust: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def joints(self) -> dict[int, Joint]:
         """The joint files by number, their own effects taken off the residuals already."""
         return {s.number: s.joint for s in self.signals[0]}
+
+    @property
+    def recordings(self) -> Sequence[int]:
+        """Number of the recording that each run is a piece of."""
+        return range(len(self.runs)) if self.pieces is None else self.pieces
 
     @property
     def rated_torque_nm(self) -> float:
@@ -137,37 +145,37 @@ class Dataset:
 
 
 def usable_signals(
-    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], numbers: Sequence[int]
+    runs: Sequence[tuple[str, RunTable]],
+    joints: Mapping[int, Joint],
+    numbers: Sequence[int],
+    known_loads: Collection[int] = (),
 ) -> tuple[list[list[JointSignals]], list[str]]:
-    """Return the signals [run][joint] of the usable runs, and why others cannot be used."""
+    """Return the signals [run][joint] of the usable runs, and why others cannot be used. known_loads: joints whose torque is
+    computed and no sensor's.
+    """
     if not numbers:
         return [], ["found no joint that is in both the runs and the joint files"]
     out: list[list[JointSignals]] = []
     reasons: list[str] = []
     bases = {n: BaseLoss(joints[n]) for n in numbers}
-    limits = saturation_limits((table for _, table in runs), {n: joints[n] for n in numbers})
-    rates = [1.0 / float(np.median(np.diff(table.time_s))) for _, table in runs]
-    usual = float(np.median(rates))
-    for (name, table), rate in zip(runs, rates, strict=True):
+    limits = saturation_limits((table for _, table in runs), {n: joints[n] for n in numbers}, known_loads)
+    for name, table in runs:
+        rate = 1.0 / float(np.median(np.diff(table.time_s)))
         if rate < SLOWEST_HZ:
             reasons.append(f"{name}: found {rate:.3g} samples per second, expected at least {SLOWEST_HZ:.0f}")
-            continue
-        if abs(rate / usual - 1.0) > SAME_RATE:  # bins of another length have another noise
-            reasons.append(
-                f"{name}: found {rate:.0f} samples per second, expected {usual:.0f} as in the others"
-            )
             continue
         mine = []
         for n in numbers:
             if n not in table.joints:
                 continue
             try:
-                held = held_values(Channels(table.time_s, table.joints[n], joints[n], name), limits[n])
-                mine.append(without_held(joint_signals(name, table, n, joints[n], bases[n]), held))
+                c = Channels(table.time_s, table.joints[n], joints[n], name, n in known_loads)
+                signals = joint_signals(name, table, n, joints[n], bases[n])
+                mine.append(without_held(signals, held_values(c, limits[n])))
             except SignalsError as error:
                 reasons.append(str(error))
         if mine:
-            out.append([without_known_effects(s) for s in about_zero(mine, bases)])
+            out.append([with_demand(without_known_effects(s)) for s in about_zero(mine, bases)])
     out, apart = with_the_same_joints(out)
     reasons += apart
     _same_balances(out)
@@ -248,11 +256,23 @@ def _same_balances(runs: list[list[JointSignals]]) -> None:
         run[:] = [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
 
 
+def with_demand(s: JointSignals) -> JointSignals:
+    """Return the signals with the current that effects see as the joint file's simulation draws it."""
+    s.state.current_a = s.demand_nm / (s.joint.gear_ratio * s.joint.torque_constant_nm_per_a)
+    return s
+
+
 def without_known_effects(s: JointSignals) -> JointSignals:
-    """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw."""
+    """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw and the
+    current that the simulation with them draws.
+    """
     motor, torsion, usual = s.motor_nm, s.torsion_nm, s.state.torsion_rad
     if s.twist_rad is not None:
         s.state.torsion_rad = s.twist_rad
+    scale, demand = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a, s.demand_nm
+    for _ in range(_DRAWS if s.joint.effects else 0):
+        known = [contribution(EFFECTS[e.name], e.parameters, s).get("motor", 0.0) for e in s.joint.effects]
+        s.state.current_a = (demand + sum(known)) / scale
     for item in s.joint.effects:
         found = contribution(EFFECTS[item.name], item.parameters, s)
         motor = motor - found.get("motor", 0.0)
@@ -266,15 +286,15 @@ def build_dataset(
     signals: list[list[JointSignals]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
 ) -> Dataset:
     """Return binned residuals, candidates, unknown lines and zero readings of these runs [run][joint]."""
-    samples = bin_samples(s for run in signals for s in run)
-    step = samples * float(np.median(np.diff(signals[0][0].time_s)))
+    every = [s for run in signals for s in run]
+    step = bin_samples(every) * max(s.step_s for s in every)
     candidates = library_candidates(signals, joints, scope)
     candidates += _cogging_orders(signals, joints, candidates, scope)
-    lines = unknown_lines(signals, candidates, samples, step)
+    lines = unknown_lines(signals, candidates, step)
     groups = families(signals, lines)
     if scope.known_references & set(joints):  # a known load has no zero that differs from run to run
         groups = [group for group in groups if group.name != "zero"]
-    runs = [run_data(run, candidates, samples, groups) for run in signals]
+    runs = [run_data(run, candidates, samples_in(step, run), groups) for run in signals]
     leave = gain_columns(candidates)
     unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
     pieces = recordings(signals)
@@ -282,7 +302,6 @@ def build_dataset(
         signals,
         runs,
         candidates,
-        samples,
         step,
         unexplained,
         groups,
@@ -339,10 +358,9 @@ def _cogging_orders(
     """Return cogging at integer orders that stand out of the residual's order spectrum."""
     first = candidates[-1].columns.stop if candidates else 0
     out: list[EffectCandidate] = []
-    step = float(np.median(np.diff(signals[0][0].time_s)))
-    every = max(1, round(ORDER_STEP_S / step))
-    step *= every
-    bare = [run_data(run, [], every) for run in signals]
+    coarsest = max(s.step_s for run in signals for s in run)
+    step = coarsest * max(1, round(ORDER_STEP_S / coarsest))
+    bare = [run_data(run, [], samples_in(step, run)) for run in signals]
     for s in signals[0]:
         if not scope.looks_for("cogging", s.number, s.number):
             continue
@@ -368,11 +386,10 @@ def _cogging_orders(
 def unknown_lines(
     signals: Sequence[Sequence[JointSignals]],
     candidates: Sequence[EffectCandidate],
-    samples: int,
     step_s: float,
 ) -> list[Line]:
     """Return strong lines of the residuals at orders and frequencies that no candidate has; no sidelobes of others."""
-    bare = [run_data(run, [], samples) for run in signals]
+    bare = [run_data(run, [], samples_in(step_s, run)) for run in signals]
     residuals = {c: saturated_residuals(bare, c) for c in bare[0].channels}
     known = {
         (c.joint, float(c.term.basis[0]["order_per_motor_rev"]))

@@ -9,15 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
-from jtqd.sysid.diagnosis.acceptance import named_in
-from jtqd.sysid.diagnosis.case import search_case
 from jtqd.sysid.diagnosis.dataset import (
     Dataset,
     build_dataset,
@@ -35,14 +34,17 @@ from jtqd.sysid.diagnosis.findings import (
     OutlierRun,
     shows_at,
 )
+from jtqd.sysid.diagnosis.limits import RELEVANCE
+from jtqd.sysid.diagnosis.model import Solution, solve
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.outlier_runs import outlier_run
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
-from jtqd.sysid.diagnosis.refine import set_torsion
-from jtqd.sysid.diagnosis.regressors import EffectCandidate
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import JointSignals
-from jtqd.sysid.diagnosis.verdict import RELEVANCE, conclude
+from jtqd.sysid.diagnosis.smoothing import noise_of
+from jtqd.sysid.diagnosis.solution import remaining, with_effects_applied
+from jtqd.sysid.diagnosis.unexplained import events_left
+from jtqd.sysid.diagnosis.verdict import conclude, present_of
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)
 
@@ -53,6 +55,7 @@ def diagnose(
     scope: Scope = EVERYTHING,
     *,
     relevance: float = RELEVANCE,
+    trust: Mapping[str, float] = MappingProxyType({}),
 ) -> Findings:
     """Return what the joint files' simulation gets wrong in these runs.
 
@@ -64,29 +67,32 @@ def diagnose(
     """
     numbers = tuple(sorted(n for n in joints if any(n in table.joints for _, table in runs)))
     if len(numbers) > 1 and not one_sensor(runs, numbers):
-        return combined([diagnose(runs, {n: joints[n]}, scope, relevance=relevance) for n in numbers])
+        return combined(
+            [diagnose(runs, {n: joints[n]}, scope, relevance=relevance, trust=trust) for n in numbers]
+        )
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
-    findings = _diagnosed(runs, applied, numbers, scope, relevance)
+    findings = _diagnosed(runs, applied, numbers, scope, relevance, trust)
     for n in numbers:
         new = {c.name for c in findings.causes if shows_at(c.joint, n)}
         kept = tuple(e for e in applied[n].effects if e.name not in new)
         if len(kept) < len(applied[n].effects):
             applied[n] = replace(applied[n], effects=kept)
     if any(len(with_effects_applied(joints[n]).effects) > len(applied[n].effects) for n in numbers):
-        whole = _diagnosed(runs, applied, numbers, scope, relevance)
+        whole = _diagnosed(runs, applied, numbers, scope, relevance, trust)
         findings = replace(whole, gaps=findings.gaps)
     return findings
 
 
-def _diagnosed(
+def _diagnosed(  # noqa: PLR0917
     runs: Sequence[tuple[str, RunTable]],
     joints: Mapping[int, Joint],
     numbers: tuple[int, ...],
     scope: Scope,
     relevance: float,
+    trust: Mapping[str, float],
 ) -> Findings:
     names = tuple(name for name, _ in runs)
-    usable, reasons = usable_signals(runs, joints, numbers)
+    usable, reasons = usable_signals(runs, joints, numbers, scope.known_references)
     few = too_little(usable) if usable else None
     reasons += [few] if few else []
     if not usable or few:
@@ -96,16 +102,9 @@ def _diagnosed(
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     judged = tuple(s.number for s in usable[0])
     usable, dataset, odd = without_outlier_runs(usable, joints, scope)
-    case, fit = search_case(dataset, relevance)
-    pieces = recordings(usable)
-
-    def names_without(number: int) -> Sequence[EffectCandidate]:
-        part = [run for run, piece in zip(usable, pieces, strict=True) if piece != number]
-        for s in (joint for run in part for joint in run):
-            set_torsion(s, ())  # it is as the last fit left it
-        return named_in(*search_case(build_dataset(part, joints, scope), relevance))
-
-    findings = conclude(case, fit, names, judged, names_without)
+    dataset = replace(dataset, disturbed=disturbed_signals(runs, joints, numbers, usable, scope))
+    solution = without_events(solve(dataset))
+    findings, _ = conclude(solution, names, scope, relevance)
     notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
     left_out = tuple(f"joint {n}: left out" for n in numbers if n not in judged)
     unjudged = [line for line in reasons if line.startswith(left_out)]
@@ -116,6 +115,66 @@ def _diagnosed(
         findings = replace(findings, reasons=(*findings.reasons, *scope.note))
     used = tuple(run[0].run for run in usable)
     return replace(findings, channel_notes=notes, outlier_runs=tuple(odd), used=used)
+
+
+def without_events(solution: Solution) -> Solution:
+    """Return the solution again without the events that no effect makes, where there are any: they shall bend none."""
+    left = remaining(solution.dataset, *present_of(solution))
+    events = events_left(solution.dataset, left, solution.noise)
+    return solve(solution.dataset.without_events(events)) if events else solution
+
+
+def disturbed_signals(
+    runs: Sequence[tuple[str, RunTable]],
+    joints: Mapping[int, Joint],
+    numbers: Sequence[int],
+    usable: Sequence[Sequence[JointSignals]],
+    scope: Scope = EVERYTHING,
+    *,
+    seed: int = 0,
+) -> list[list[JointSignals]]:
+    """Return the signals of the usable runs with as much noise again on torques and positions as they have."""
+    rng = np.random.default_rng(seed)
+    there = {run[0].run for run in usable}
+    noisy = [(name, disturbed(table, joints, rng)) for name, table in runs if name in there]
+    again, _ = usable_signals(noisy, joints, numbers, scope.known_references)
+    numbers_used = {s.number for s in usable[0]}
+    return [
+        [s for s in run if s.number in numbers_used]
+        for run in again
+        if run[0].run in there and numbers_used <= {s.number for s in run}
+    ]
+
+
+def disturbed(table: RunTable, files: Mapping[int, Joint], rng: np.random.Generator) -> RunTable:
+    """Return the table with as much white noise again on torques and on the motor's motion as they have; one sensor has one
+    noise. The acceleration's noise is in the response and in the inertia's column, as the torque's is in the load's: were
+    one of them alone taken out, a smaller balance would have more evidence. Of a link with an encoder of its own, that as
+    well.
+    """
+    known: list[tuple[FloatArray, FloatArray]] = []
+    joints = {}
+    for n, columns in table.joints.items():
+        new = {}
+        both = n in files and columns.two_encoders(files[n].gear_ratio)
+        own = columns.motor_position_rad is not None and not both  # the link's position is the motor's
+        link = () if own else ("link_position_rad",)
+        for name in ("torque_nm", "motor_position_rad", "motor_velocity_rad_s", *link):
+            x = getattr(columns, name)
+            if x is None:
+                continue
+            noise = next(
+                (f * e for y, e in known for f in (1.0, -1.0) if np.array_equal(x, f * y)),
+                None,
+            )
+            if noise is None:
+                noise = rng.normal(size=len(x)) * noise_of(x)
+                known.append((x, noise))
+            new[name] = x + noise
+        if own:
+            new["link_position_rad"] = None
+        joints[n] = replace(columns, **new)
+    return replace(table, joints=joints)
 
 
 def without_outlier_runs(
@@ -156,7 +215,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
     """
     verdict = min((f.verdict for f in parts), key=_WORST_FIRST.index)
     with_gain = [f for f in parts if f.gain is not None]
-    leading = max(with_gain, key=lambda f: f.causes[0].rms_nm) if with_gain else None
+    leading = max(with_gain, key=_fall_nm, default=None)
     plans = {f.joints[0]: f.next_experiment for f in parts if f.joints and f.next_experiment is not None}
     return Findings(
         verdict,
@@ -177,34 +236,13 @@ def combined(parts: Sequence[Findings]) -> Findings:
             default=None,
         ),
         outlier_runs=tuple(odd for f in parts for odd in f.outlier_runs),
-        bounded=tuple(b for f in parts for b in f.bounded),
+        too_small=tuple(c for f in parts for c in f.too_small),
+        cannot_be_told=tuple(u for f in parts for u in f.cannot_be_told),
+        predicts=tuple(p for f in parts for p in f.predicts),
         used=tuple(name for name in parts[0].runs if any(name in f.used_runs for f in parts)),
     )
 
 
-def with_effects_applied(joint: Joint) -> Joint:
-    """Return the joint with every effect put into the file's values where all its given parameters have a key for it: the
-    same joint in other words.
-
-    With an efficiency in the file the losses are the table's: there another friction or torque constant in the file is not
-    the effect that bears its name, which is what is lost beside the table. Such an effect stays an effect.
-    """
-    kept = []
-    for item in joint.effects:
-        effect = EFFECTS[item.name]
-        keys = {p.name: p.key for p in effect.parameters}
-        beside_table = joint.efficiency is not None and "loss_nm" in effect.hooks and not effect.changes_joint
-        if beside_table or not all(keys[name] for name in item.parameters):
-            kept.append(item)
-            continue
-        for name, value in item.parameters.items():
-            joint = _with_value(joint, keys[name].split("."), value)
-    return replace(joint, effects=tuple(kept))
-
-
-def _with_value(joint: Joint, path: list[str], value: float) -> Joint:
-    if len(path) == 1:
-        changed: dict[str, Any] = {path[0]: value}
-        return replace(joint, **changed)
-    inner: dict[str, Any] = {path[1]: value}
-    return replace(joint, friction=replace(joint.friction, **inner))
+def _fall_nm(findings: Findings) -> float:
+    gain = findings.gain
+    return 0.0 if gain is None else gain.rmse_before_nm - gain.rmse_after_nm

@@ -1,8 +1,8 @@
 """The extended joint file: a joint with the effects found and their values, intervals in its provenance.
 
 An effect that the joint file has already is replaced by the cause of the same name, so that diagnosing with the extended
-file again does not add the same thing twice. A bound that is proven by itself (`bounded`) is taken at its limit and marked.
-Effects of the torque sensor go into every joint's file. All of it is pure but `write_extended`.
+file again does not add the same thing twice. Effects of the torque sensor go into every joint's file. All of it is pure but
+`write_extended`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.sysid.diagnosis.findings import BoundedValue, Cause, Findings, Value, shows_at
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Value, shows_at
+from jtqd.sysid.diagnosis.solution import with_effects_applied
 from jtqd.sysid.fit.joint_writer import write_joint
 
 FILE: Final = "extended.joint.yaml"
@@ -31,31 +32,26 @@ def extended(
     date: str,
     by: str = "jtq diagnose",
 ) -> Joint:
-    """Return the joint with the causes of joint `number` and of the sensor among its effects.
+    """Return the joint with what predicts: values of the file replaced, effects of joint `number` and of the sensor among
+    its effects, which are relative to the values replaced.
 
     sha256: hash of each run's file by name, those that were used are kept; date: ISO 8601. What an effect of a whole
     class is written as is the first of its class, and the provenance states it: on these runs all of the class fit alike,
-    elsewhere they may not.
+    elsewhere they may not. What only makes the prediction better, and is no entry found, is listed by name.
 
     Raises ConfigError for an effect or a value that joint files do not allow.
     """
-    causes = [cause for cause in findings.causes if shows_at(cause.joint, number)]
-    bounds = _bounds(findings, number)
-    replaced = {cause.name for cause in causes} | {bound.name for bound in bounds}
+    causes = [c for c in (*findings.causes, *findings.too_small) if shows_at(c.joint, number)]
+    found = [p for p in findings.predicts if shows_at(p.joint, number)]
+    replaced = {p.name for p in found}
     effects = [effect for effect in joint.effects if effect.name not in replaced]
-    effects += [
-        Effect(cause.name, {name: _rounded(each.value) for name, each in cause.parameters.items()})
-        for cause in causes
-    ]
-    effects += [Effect(bound.name, {bound.parameter: _rounded(bound.value)}) for bound in bounds]
+    effects += [Effect(p.name, {name: _rounded(value) for name, value in p.values.items()}) for p in found]
     record: dict[str, Any] = {"by": by, "date": date, "verdict": findings.verdict}
     if causes:
         record["effects"] = [_record(cause) for cause in causes]
-    if bounds:
-        record["at_their_bound"] = [
-            {"name": b.name, "joint": b.joint, b.parameter: [_rounded(b.value), _rounded(b.at_most)]}
-            for b in bounds
-        ]
+    only = replaced - {cause.name for cause in causes}
+    if only:
+        record["better_prediction_only"] = sorted(only)
     gain = findings.gain
     if causes and gain is not None and math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
         record["gain"] = {
@@ -64,7 +60,8 @@ def extended(
             "split": gain.split,
         }
     record["sha256"] = {name: sha256[name] for name in findings.used_runs if name in sha256}
-    return replace(joint, effects=tuple(effects), provenance={**joint.provenance, "diagnosis": record})
+    whole = replace(joint, effects=tuple(effects), provenance={**joint.provenance, "diagnosis": record})
+    return with_effects_applied(whole)
 
 
 def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
@@ -85,10 +82,6 @@ def title(number: int, findings: Findings) -> str:
     """First line of an extended joint file."""
     names = [cause.name for cause in findings.causes if shows_at(cause.joint, number)]
     what = f"found {', '.join(names)}" if names else "found no effect of this joint to add"
-    what += "".join(
-        f", took {bound.name} at its bound ({bound.value:.3g}, at most {bound.at_most:.2g} {bound.unit})"
-        for bound in _bounds(findings, number)
-    )
     return f"Written by jtq diagnose from {findings.runs_text}: {what} (verdict {findings.verdict})."
 
 
@@ -106,17 +99,13 @@ def write_extended(
     return list(names)
 
 
-def _bounds(findings: Findings, number: int) -> list[BoundedValue]:
-    return [bound for bound in findings.bounded if bound.in_file and bound.joint == number]
-
-
 def _first(numbers: Sequence[int], findings: Findings) -> int:
     named = [cause.joint for cause in findings.causes] + [gap.joint for gap in findings.gaps]
     return next((int(number) for number in named if number in numbers), numbers[0])
 
 
 def _record(cause: Cause) -> dict[str, Any]:
-    record: dict[str, Any] = {"name": cause.name, "joint": cause.joint}
+    record: dict[str, Any] = {"name": cause.name, "joint": cause.joint, "grade": cause.grade}
     if len(cause.names) > 1:
         record["cannot_be_told_from"] = [name for name in cause.names if name != cause.name]
     record["ci95"] = {name: _interval(each) for name, each in cause.parameters.items()}

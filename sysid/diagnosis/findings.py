@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -14,6 +15,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
+from jtqd.sysid.diagnosis.limits import PRIORS, RELEVANCE
 
 
 class FileValue(NamedTuple):
@@ -66,6 +68,11 @@ UNEXPLAINED: Final = "unexplained"
 INSUFFICIENT: Final = "insufficient_data"
 VERDICTS: Final = (NO_GAP, CAUSE, AMBIGUOUS, UNEXPLAINED, INSUFFICIENT)
 
+CERTAIN: Final = "certain"
+ONE_OF: Final = "one_of"
+EFFECTIVE: Final = "effective"
+GRADES: Final = (CERTAIN, ONE_OF, EFFECTIVE)
+
 SENSOR: Final = "sensor"
 JointName = int | str
 """1 to 7, or SENSOR."""
@@ -92,18 +99,48 @@ class Value:
 
 @dataclass(frozen=True)
 class Cause:
-    """One effect present. names: its class, itself first: what these runs cannot distinguish it from."""
+    """One entry of the set: a value of the file that is wrong, or an effect that is present.
+
+    names: its class, itself first: what these runs cannot distinguish it from. grade: certain, one_of or effective; rivals:
+    of one_of; given: what certainty rests on, the priors of its kind in words.
+    """
 
     name: str
     joint: JointName
     names: tuple[str, ...]
     parameters: Mapping[str, Value]
-    delta_bic: float
-    held_out_gain: float  # share of the held-out residual energy that it takes away
+    delta_evidence: float  # twice the log evidence that the best set without it lacks
+    held_out_gain: float  # share of the held-out squared error that it takes away
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
     balance: str  # "motor" or "torsion": where it is largest
     explained_share: float = math.nan  # of all that is structure in these runs, as squares
-    stability: float = math.nan  # its size in standard errors where it is least certain (`stability.py`)
+    grade: str = CERTAIN
+    rivals: tuple[str, ...] = ()
+    given: tuple[str, ...] = ()
+    matters: bool = True  # above the relevance
+
+    @property
+    def key(self) -> tuple[object, ...]:
+        """Effect, joint, and what tells several of one effect apart."""
+        return self.name, self.joint, *(v.value for n, v in self.parameters.items() if v.ci95[0] == v.ci95[1])
+
+
+class Present(NamedTuple):
+    """An effect of the extended model: the set and all values of the file, with the values that predict."""
+
+    name: str
+    joint: JointName
+    values: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Untold:
+    """What these runs cannot tell: why, and the kind of motion that would (`planner.experiments.EXPERIMENTS`)."""
+
+    name: str
+    joint: JointName
+    why: str
+    experiment: str
 
 
 @dataclass(frozen=True)
@@ -162,37 +199,26 @@ class RunGain(NamedTuple):
 
 @dataclass(frozen=True)
 class Gain:
-    """Held-out error before and after, leave-one-run-out; ci95: of rmse_before - rmse_after [Nm].
-
-    plain_nm: the errors with all that each run has of its own, where they do not fall; the others are then beside it.
+    """Held-out error before and after, leave-one-run-out; ci95: of rmse_before - rmse_after [Nm]; joint, balance: whose
+    error it is (0, "": not stated).
     """
 
     rmse_before_nm: float
     rmse_after_nm: float
     split: str
     ci95: tuple[float, float]
-    free_run_before: float = math.nan  # rad/s, joint side
-    free_run_after: float = math.nan
     runs: tuple[RunGain, ...] = ()
-    free_run_position_before: float = math.nan  # rad, joint side
-    free_run_position_after: float = math.nan
-    plain_nm: tuple[float, float] | None = None
-
-    @property
-    def judged_beside(self) -> str:
-        """Note on an error judged without run-to-run variation; "" for the plain error."""
-        if self.plain_nm is None:
-            return ""
-        before, after = self.plain_nm
-        return (
-            "without run-to-run variation (offset and friction of the day), which is most of the error: with it "
-            f"{before:.3g} -> {after:.3g} Nm rms"
-        )
+    joint: int = 0
+    balance: str = ""
 
 
 @dataclass(frozen=True)
 class Trace:
-    """For plots: one run, one joint, one balance, binned; arrays [n]."""
+    """For plots: one run, one joint, one balance, binned; arrays [n].
+
+    before_nm, after_nm: measured less simulated, by the joint file and with the entries found; measured_nm: motor torque
+    G Kt i at the joint (motor), or the torque that the twist makes (torsion); velocity_rad_s, torque_nm: of the joint.
+    """
 
     run: str
     joint: int
@@ -202,13 +228,13 @@ class Trace:
     after_nm: FloatArray
     velocity_rad_s: FloatArray
     torque_nm: FloatArray
+    measured_nm: FloatArray
 
 
 @dataclass(frozen=True)
 class UnexplainedResidual:
-    """What the causes leave that is structure, in the balance and run where it is most: rms [Nm], part of the rated torque,
-    share of all structure; where it matters, what all effects found leave, named or not. From `relevant_nm` on it matters,
-    unless it is a small share or (`unconfirmed`) effects that few runs show and do not confirm explain it.
+    """What the entries leave that is structure, in the balance and run where it is most: rms [Nm], part of the rated torque,
+    share of all structure; from `relevant_nm` on it matters.
     """
 
     joint: int
@@ -218,53 +244,6 @@ class UnexplainedResidual:
     share: float
     relevant_nm: float
     matters: bool
-    unconfirmed: bool = False
-
-    def limit(self, relevant: str) -> str:
-        """Return from where on it matters, or why it does not although it is as large; relevant: `relevant_nm`."""
-        if self.matters or self.rms_nm <= self.relevant_nm:
-            return f"from {relevant} on it matters"
-        why = (
-            "effects that are not confirmed explain it"
-            if self.unconfirmed
-            else f"{self.share:.1%} of the gap"
-        )
-        return f"more than {relevant}, but {why}"
-
-
-@dataclass(frozen=True)
-class BoundedValue:
-    """A value of a joint file that the runs put below the zero that it cannot pass: no cause, but at most `at_most` (end of
-    its 95 % interval), where the file has `file_value`. best: without that limit; runs: error of each run left out with
-    what is named, and with the value of the other runs beside, zero where they say less. in_file: the extended joint file
-    takes `value`.
-    """
-
-    name: str
-    joint: JointName
-    parameter: str
-    unit: str
-    file_value: float
-    best: float
-    at_most: float
-    runs: tuple[RunGain, ...]
-    in_file: bool = False
-
-    @property
-    def value(self) -> float:
-        """The best value that is possible."""
-        return max(self.best, 0.0)
-
-    @property
-    def text(self) -> str:
-        """One line for people."""
-        taken = f"; the extended joint file takes {self.value:.3g}" if self.in_file else ""
-        errors = ", ".join(f"{r.rmse_after_nm:.2f} instead of {r.rmse_before_nm:.2f}" for r in self.runs)
-        return (
-            f"{self.name} of {joint_text(self.joint)}: at most {self.at_most:.2g} {self.unit} by these runs, "
-            f"{self.file_value:.3g} in the joint file; not named as a cause, because its best value, {self.best:.2g}, is "
-            f"below zero, which is not possible; kept at zero or above it leaves {errors} Nm rms in the held-out runs{taken}"
-        )
 
 
 @dataclass(frozen=True)
@@ -311,9 +290,44 @@ class OutlierRun:
 
 
 @dataclass(frozen=True)
+class Provenance:
+    """When, by what and of what: date ISO 8601, command line, sha256 by name of the inputs (runs, joint files, map)."""
+
+    date: str
+    version: str
+    command: str
+    inputs: Mapping[str, str]
+
+
+class PriorRow(NamedTuple):
+    """Prior of an entry: standard deviation for people, and whether the user set it."""
+
+    name: str
+    size: str
+    set_by_user: bool
+
+
+def priors(trust: Mapping[str, float]) -> list[PriorRow]:
+    """Return the priors in force; trust: factor on the size by name."""
+    return [
+        PriorRow(name, scaled_text(prior.text, trust.get(name, 1.0)), name in trust)
+        for name, prior in PRIORS.items()
+    ]
+
+
+def scaled_text(text: str, factor: float) -> str:
+    """Return the size of a prior in words times a factor: "10 %" by 0.5 is "5 %"."""
+    found = re.match(r"[\d.]+", text)
+    if factor == 1.0 or found is None:
+        return text if factor == 1.0 else f"{factor:.3g} times {text}"
+    return f"{float(found[0]) * factor:.3g}{text[found.end() :]}"
+
+
+@dataclass(frozen=True)
 class Findings:
     """All of it. runs: all that were given; used: those of them that anything was found in, empty for all; gaps: largest
-    excess first; causes: largest first; reasons: lines for people.
+    excess first; causes: entries that matter, largest first; too_small: the others; reasons: lines for people; trust:
+    factors on the sizes of priors that the user set.
     """
 
     verdict: str
@@ -331,8 +345,13 @@ class Findings:
     explained_share: float = math.nan
     unexplained: UnexplainedResidual | None = None
     outlier_runs: tuple[OutlierRun, ...] = ()
-    bounded: tuple[BoundedValue, ...] = ()
+    too_small: tuple[Cause, ...] = ()
+    cannot_be_told: tuple[Untold, ...] = ()
+    predicts: tuple[Present, ...] = ()
     used: tuple[str, ...] = ()
+    relevance: float = RELEVANCE
+    trust: Mapping[str, float] = field(default_factory=dict)
+    provenance: Provenance | None = None
 
     @property
     def used_runs(self) -> tuple[str, ...]:
@@ -352,6 +371,14 @@ _NO_GAP_MEASURED: Final[dict[str, Any]] = {
     "noise_floor_nm": None,
     "localisation": [],
 }
+_NOT_MEASURED: Final = (
+    "plain_nm",
+    "free_run_before_rad_s",
+    "free_run_after_rad_s",
+    "free_run_position_before_rad",
+    "free_run_position_after_rad",
+)
+"""Keys of the gain that are null."""
 _NO_GAIN_MEASURED: Final = {"rmse_before_nm": None, "rmse_after_nm": None, "split": None, "ci95": None}
 
 
@@ -374,12 +401,11 @@ def to_mapping(
         "gain": _NO_GAIN_MEASURED if findings.gain is None else _gain(findings.gain),
         "explained_share": findings.explained_share,
         "unexplained": None if findings.unexplained is None else _unexplained(findings.unexplained),
-        "left_over": None if findings.unexplained is None else _unexplained(findings.unexplained),
         "next_experiment": _without_table(findings.next_experiment),
         "reasons": findings.reasons,
         "outlier_runs": [_outlier_run(each) for each in findings.outlier_runs],
-        "odd_runs": [_outlier_run(each) for each in findings.outlier_runs],
-        "bounded": [_bounded(each) for each in findings.bounded],
+        "too_small": [_cause(each, findings.joint_files) for each in findings.too_small],
+        "cannot_be_told": [vars(each) for each in findings.cannot_be_told],
         "joints": findings.joints,
         "runs": [
             {"name": name, "sha256": (sha256 or {}).get(name), "used": name in findings.used_runs}
@@ -388,6 +414,9 @@ def to_mapping(
         "gaps": [_gap(each) for each in findings.gaps],
         "candidates": [_candidate(each) for each in findings.candidates],
         "channel_notes": findings.channel_notes,
+        "relevance": findings.relevance,
+        "priors": [each._asdict() for each in priors(findings.trust)],
+        "provenance": None if findings.provenance is None else vars(findings.provenance),
         "files": list(files),
     }
     result: dict[str, Any] = plain(mapping)
@@ -410,11 +439,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, Iterable):
         return [plain(item) for item in value]
     raise TypeError(f"found {type(value).__name__} in findings, expected plain values")
-
-
-def _bounded(bounded: BoundedValue) -> dict[str, Any]:
-    runs = [each._asdict() for each in bounded.runs]
-    return {key: value for key, value in vars(bounded).items() if key != "runs"} | {"runs": runs}
 
 
 def _gap(gap: Gap) -> dict[str, Any]:
@@ -451,9 +475,11 @@ def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
         "joint": cause.joint,
         "class": list(cause.names),
         "parameters": _values(cause, joints),
-        "evidence": {"delta_bic": cause.delta_bic, "held_out_gain": cause.held_out_gain},
-        "stability": cause.stability,
-        "steadiness": cause.stability,
+        "grade": cause.grade,
+        "matters": cause.matters,
+        "rivals": list(cause.rivals),
+        "given": list(cause.given),
+        "evidence": {"delta_bic": cause.delta_evidence, "held_out_gain": cause.held_out_gain},
         "rms_nm": cause.rms_nm,
         "balance": cause.balance,
         "explained_share": cause.explained_share,
@@ -517,90 +543,8 @@ def _gain(gain: Gain) -> dict[str, Any]:
         "rmse_after_nm": gain.rmse_after_nm,
         "split": gain.split,
         "ci95": gain.ci95,
-        "plain_nm": gain.plain_nm,
-        "free_run_before_rad_s": gain.free_run_before,
-        "free_run_after_rad_s": gain.free_run_after,
-        "free_run_position_before_rad": gain.free_run_position_before,
-        "free_run_position_after_rad": gain.free_run_position_after,
+        "joint": gain.joint or None,
+        "balance": gain.balance or None,
+        **dict.fromkeys(_NOT_MEASURED),
         "runs": [each._asdict() for each in gain.runs],
     }
-
-
-_VERDICTS_IN_WORDS: Final = {
-    NO_GAP: "the simulation agrees with these runs up to their noise",
-    CAUSE: "these runs identify the cause of the gap",
-    AMBIGUOUS: "these runs cannot distinguish the possible causes of the gap",
-    UNEXPLAINED: "there is a gap that no effect of the library explains",
-    INSUFFICIENT: "these runs are not sufficient",
-}
-
-
-def summary_lines(findings: Findings) -> list[str]:
-    """Return verdict, gap, causes with intervals, gain, next experiment for a terminal: one line each."""
-    lines = [f"{findings.verdict}: {_VERDICTS_IN_WORDS.get(findings.verdict, '')}"]
-    lines += [f"  {reason}" for reason in findings.reasons]
-    lines += [f"outlier run: {odd.text}" for odd in findings.outlier_runs]
-    for gap in findings.gaps[:1]:
-        lines.append(
-            f"gap: joint {gap.joint}, {gap.balance} balance: {gap.rmse_nm:.3g} Nm rms, "
-            f"noise {gap.noise_floor_nm:.3g} Nm ({gap.floor_from})"
-        )
-        if findings.verdict != NO_GAP:
-            lines += [f"  {each.share:4.0%} of it {_where(each)}" for each in gap.localisation[:3]]
-    lines += [_summary_cause(each, findings.joint_files) for each in findings.causes]
-    left = findings.unexplained
-    if left is not None and (findings.causes or left.matters):
-        lines.append(
-            f"unexplained: {left.rms_nm:.3g} Nm rms ({left.of_rated:.2%} of rated) at joint {left.joint}, {left.balance} "
-            f"balance; {left.limit(f'{left.relevant_nm:.3g} Nm')}"
-        )
-    gain = findings.gain
-    if gain is not None and math.isfinite(gain.rmse_before_nm):
-        low, high = gain.ci95
-        lines.append(
-            f"gain on held-out runs: {gain.rmse_before_nm:.3g} -> {gain.rmse_after_nm:.3g} Nm rms "
-            f"(reduced by {low:.3g} to {high:.3g} Nm, 95 % interval)"
-            + (f", {gain.judged_beside}" if gain.judged_beside else "")
-        )
-    if gain is not None and math.isfinite(gain.free_run_position_before):
-        lines.append(
-            f"free run of half a second on held-out runs: position {gain.free_run_position_before:.3g} -> "
-            f"{gain.free_run_position_after:.3g} rad rms"
-        )
-    if findings.next_experiment:
-        lines.append(f"next experiment: {findings.next_experiment['why']}")
-        if findings.next_experiment.get("command"):
-            lines.append(f"run it: {findings.next_experiment['command']}")
-    return lines
-
-
-def _where(place: Place) -> str:
-    """Return where a place is: "at load 2 to 3 Nm", "in events: run1 3.2 s, ...", "at order 2.47 per motor revolution"."""
-    if place.axis == "time" and ":" in place.bin:
-        return f"in {place.bin}"
-    if place.axis == "frequency":
-        return f"at {place.bin}"
-    return f"at {place.axis.replace('_', ' ')} {place.bin}"
-
-
-def _summary_cause(cause: Cause, joints: Mapping[int, Joint]) -> str:
-    at = joint_text(cause.joint)
-    known = file_values(cause.name, cause.joint, cause.parameters, joints)
-    values = ", ".join(_value(name, each, known.get(name)) for name, each in cause.parameters.items())
-    others = [name for name in cause.names if name != cause.name]
-    either = f"; these runs cannot distinguish it from {', '.join(others)}" if others else ""
-    return f"cause: {cause.name} of {at}: {values} ({cause.rms_nm:.3g} Nm rms){either}"
-
-
-def _value(name: str, value: Value, known: FileValue | None) -> str:
-    """Return "coulomb_nm 3.5 -> 4.4 [4.3, 4.5] Nm (+26 %)"; without the file's value just what was found."""
-    low, high = value.ci95
-    unit = f" {value.unit}" if value.unit else ""
-    before = after = ""
-    if known is not None and known.value is not None:
-        before = f"{known.value:.4g} -> "
-        change = known.change(value.value)
-        after = "" if change is None else f" ({100.0 * change:+.3g} %)"
-    if not math.isfinite(low + high) or low == high:
-        return f"{name} {before}{value.value:.4g}{unit}{after}"
-    return f"{name} {before}{value.value:.4g} [{low:.4g}, {high:.4g}]{unit}{after}"

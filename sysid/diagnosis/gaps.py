@@ -19,13 +19,14 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.angle_events import predicted_by_passes, turn_range
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.events import BLOCK_S, Burst, EventLimits, block_means, events, wandering
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
-from jtqd.sysid.diagnosis.refine import Refined
-from jtqd.sysid.diagnosis.regressors import Index, RunData
-from jtqd.sysid.diagnosis.signals import Channel, Line
+from jtqd.sysid.diagnosis.regressors import Index, RunData, binned
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals, Line
+from jtqd.sysid.diagnosis.solution import Remaining
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
     AxisMap,
@@ -71,7 +72,7 @@ class Location:
     line: Line | None = None
 
 
-def channel_gaps(dataset: Dataset, refined: Refined, left: Unexplained | None) -> tuple[Gap, ...]:
+def channel_gaps(dataset: Dataset, refined: Remaining, left: Unexplained | None) -> tuple[Gap, ...]:
     """Return the gaps of all channels, largest excess over the floor first; places of the unexplained residual where `left`
     is given (nothing named), else of the whole gap.
     """
@@ -115,7 +116,7 @@ def _raw(dataset: Dataset) -> dict[Channel, list[FloatArray]]:
     return out
 
 
-def _floor(dataset: Dataset, refined: Refined, channel: Channel) -> tuple[float, str]:
+def _floor(dataset: Dataset, refined: Remaining, channel: Channel) -> tuple[float, str]:
     """Return the noise floor [Nm] and where it was taken from."""
     repeats = _repeats(dataset, channel)
     if repeats is not None:
@@ -437,7 +438,7 @@ def _binned(runs: Sequence[RunData], channel: Channel, axis: str, edges: FloatAr
     return [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2) for v in values]
 
 
-def _causes(dataset: Dataset, refined: Refined, channel: Channel) -> list[FloatArray]:
+def _causes(dataset: Dataset, refined: Remaining, channel: Channel) -> list[FloatArray]:
     """Return what the causes explain, per run [n]: before less after, the runs' own changes in neither."""
     return [
         run.channels[channel].residual - left.channels[channel].residual
@@ -445,7 +446,7 @@ def _causes(dataset: Dataset, refined: Refined, channel: Channel) -> list[FloatA
     ]
 
 
-def _after(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
+def _after(dataset: Dataset, refined: Remaining) -> dict[Channel, list[FloatArray]]:
     """Return what the causes leave, less what each run has of its own where that makes it smaller [run][n]: fitted to the
     whitened residual of few seconds it need not.
     """
@@ -458,21 +459,23 @@ def _after(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]
     return out
 
 
-def _before(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
+def _before(dataset: Dataset, refined: Remaining) -> dict[Channel, list[FloatArray]]:
     """Return the residual with the joint files, less what each run has of its own [run][n]."""
     after = _after(dataset, refined)
     return {c: [a + b for a, b in zip(after[c], _causes(dataset, refined, c), strict=True)] for c in after}
 
 
-def traces(dataset: Dataset, refined: Refined) -> tuple[Trace, ...]:
-    """Return the residual before and after for plots, thinned, one per run and channel."""
+def traces(dataset: Dataset, refined: Remaining) -> tuple[Trace, ...]:
+    """Return measurement and residual before and after for plots, thinned, one per run and channel."""
     out = []
     after = _after(dataset, refined)
     raw = _before(dataset, refined)
     for r, run in enumerate(dataset.runs):
+        signals = {s.number: s for s in dataset.signals[r]}
         for channel in run.channels:
             every = max(1, len(run.time_s) // _TRACE_POINTS)
             axes = run.axes[channel.joint]
+            measured = binned(_measured(signals[channel.joint], channel.balance), run.samples)
             out.append(
                 Trace(
                     run.name,
@@ -483,6 +486,15 @@ def traces(dataset: Dataset, refined: Refined) -> tuple[Trace, ...]:
                     after[channel][r][::every],
                     axes["velocity"][::every],
                     axes["load"][::every],
+                    measured[::every],
                 )
             )
     return tuple(out)
+
+
+def _measured(s: JointSignals, balance: str) -> FloatArray:
+    """Return what a balance measures [n], Nm joint side: G Kt i of the motor, or the torque of the encoders' twist."""
+    if balance == TORSION:
+        return np.asarray(s.sensor_nm if s.torsion_nm is None else s.torsion_nm + s.sensor_nm)
+    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
+    return np.asarray(s.seen(balance, scale * s.current_a))

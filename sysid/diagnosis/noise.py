@@ -141,6 +141,21 @@ def noise_model(
     return Noise(channels, ar, sigma, correlation, _inflation(white, sigma, max(1, round(_BLOCK_S / step_s))))
 
 
+def white_noise(
+    runs: Sequence[RunData], residuals: Mapping[Channel, list[FloatArray]], step_s: float
+) -> Noise:
+    """Return all that residuals [run][n] hold as white noise, with what their means over seconds scatter more: too much is
+    harmless as a first noise, too little is not.
+    """
+    channels = tuple(residuals)
+    sigma = np.array(
+        [max(float(np.sqrt(np.nanmean(np.concatenate(residuals[c]) ** 2))), 1e-12) for c in channels]
+    )
+    white = [residuals[c] for c in channels]
+    inflation = _inflation(white, sigma, max(1, round(_BLOCK_S / step_s)))
+    return Noise(channels, {c: np.zeros(ORDER) for c in channels}, sigma, np.eye(len(channels)), inflation)
+
+
 def _definite(correlation: FloatArray) -> FloatArray:
     """Return the nearest correlation matrix with eigenvalues of at least 1e-3: pairs come from different rows."""
     values, vectors = np.linalg.eigh(correlation)
@@ -186,21 +201,6 @@ def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
         places = [_places(run.channels[c], columns, width) for c in there]
         gram += _pattern_gram(white, places, weight, width)
     return Sums(gram / noise.inflation, rows)
-
-
-def whitened_rows(run: RunData, noise: Noise, columns: int, nuisances: int) -> tuple[FloatArray, Index]:
-    """Return independent rows [m, P + Q + 1] of which `run_sums` is the sum of the products, and the bin of each [m]."""
-    width = columns + nuisances + 1
-    blocks, bins = [np.empty((0, width))], [np.empty(0, np.intp)]
-    for at, there, white, weight in _whitened(run, noise):
-        factor = np.linalg.cholesky(weight) / np.sqrt(noise.inflation)
-        for k in range(len(there)):
-            block = np.zeros((len(at), width))
-            for c, x, w in zip(there, white, factor[:, k], strict=True):
-                block[:, _places(run.channels[c], columns, width)] += w * x
-            blocks.append(block)
-            bins.append(at)
-    return np.vstack(blocks), np.concatenate(bins)
 
 
 def _whitened(

@@ -33,12 +33,13 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
-from jtqd.sysid.diagnosis.mixed_model import explained, explained_each, solve
 from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
-from jtqd.sysid.diagnosis.search import ENTER, within
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
+ENTER: Final = 10.0
+"""BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
+_RIDGE: Final = 1e-10
 FEWEST: Final = 3
 """Recordings among which one can be odd."""
 FAR: Final = 5.0
@@ -82,8 +83,8 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
     sigma = np.array([family.sigma for family in dataset.families])
     echoes = np.zeros((count, len(kinds)))
-    for place, signals in zip(pieces, dataset.signals, strict=True):
-        mine = [echo(kind, signals, dataset.samples) for kind in kinds]
+    for place, run, signals in zip(pieces, dataset.runs, dataset.signals, strict=True):
+        mine = [echo(kind, signals, run.samples) for kind in kinds]
         echoes[place] = np.maximum(echoes[place], mine)
     leave = gain_columns(dataset.candidates)
     for _ in range(_PASSES):
@@ -115,7 +116,7 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     )
     places = [int(p) for p in np.flatnonzero(pieces == r)]
     kind, name = kinds[k], dataset.runs[places[0]].name
-    if kind.what == "gain":
+    if kind.what == "gain" and kind.channel == "torque_nm":
         apart = of_truth(apart)
     return places, OutlierRun(name, kind.what, kind.channel, kind.joint, apart, spread, kind.unit, others)
 
@@ -255,7 +256,7 @@ def column(kind: Deviation, s: JointSignals, balance: str) -> FloatArray | None:
     return np.asarray(made[kind.what] * (s.per_torque if balance == MOTOR else 1.0))
 
 
-def echo(kind: Deviation, signals: Sequence[JointSignals], samples: int) -> float:
+def echo(kind: Deviation, signals: Sequence[JointSignals], samples: float) -> float:
     """Return the gain that a channel's own noise makes in a run: its part of what the channel shows, in bins."""
     if kind.what != "gain":
         return 0.0
@@ -277,7 +278,7 @@ def _with_columns(
                 continue
             d = channels[channel]
             made = [(len(dataset.families) + k, column(kind, s, balance)) for k, kind in enumerate(kinds)]
-            there = [(k, binned(s.seen(balance, c), dataset.samples)) for k, c in made if c is not None]
+            there = [(k, binned(s.seen(balance, c), run.samples)) for k, c in made if c is not None]
             channels[channel] = replace(
                 d,
                 nuisances=np.column_stack((d.nuisances, *(c for _, c in there))),
@@ -326,3 +327,47 @@ def apart_from_others(own: FloatArray, r: int, usual: float) -> tuple[float, flo
     others = np.delete(own, r)
     squares = float(np.sum((others - others.mean()) ** 2)) + _USUAL_RUNS * usual**2
     return float(own[r] - others.mean()), float(np.sqrt(squares / (len(others) + _USUAL_RUNS)))
+
+
+def solve(total: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
+    """Return least squares of the first k columns for the last, and its covariance."""
+    covariance = _inverses(total[None, :k, :k])[0]
+    return covariance @ total[:k, k], covariance
+
+
+def _inverses(grams: FloatArray) -> FloatArray:
+    """Return the inverse of each of these normal equations [m, k, k], with a little of their diagonals added."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(grams, axis1=1, axis2=2), 1e-30))
+    scaled = grams * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(grams.shape[1])
+    inverses: FloatArray = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
+    return inverses
+
+
+def explained(total: FloatArray, chosen: Sequence[int], extra: Sequence[int]) -> float:
+    """Return by how much the columns `extra` lower the sum of squares beyond `chosen` (last row: residual)."""
+    return explained_each(total, chosen, [extra])[0]
+
+
+def explained_each(total: FloatArray, chosen: Sequence[int], extras: Sequence[Sequence[int]]) -> list[float]:
+    """Return `explained` of each of `extras`; those of one length are solved together, which is several times faster."""
+    [before] = _lowered(total, [list(chosen)])
+    after = [0.0] * len(extras)
+    for length in {len(extra) for extra in extras}:
+        mine = [n for n, extra in enumerate(extras) if len(extra) == length]
+        for n, square in zip(mine, _lowered(total, [[*chosen, *extras[n]] for n in mine]), strict=True):
+            after[n] = square
+    return [square - before for square in after]
+
+
+def _lowered(total: FloatArray, sets: Sequence[Sequence[int]]) -> list[float]:
+    """Return by how much each of these sets of columns, all of one length, lowers the sum of squares."""
+    places = np.array(sets, np.intp)
+    rights = total[places, -1]
+    covariances = _inverses(total[places[:, :, None], places[:, None, :]])
+    return [float((c @ right) @ right) for c, right in zip(covariances, rights, strict=True)]
+
+
+def within(candidate: EffectCandidate, coefficients: Sequence[float]) -> bool:
+    """Return whether the parameters of these coefficients are plausible."""
+    values = candidate.term.combine(coefficients)
+    return all(p.low <= values[p.name] <= p.high for p in candidate.effect.parameters if p.name in values)

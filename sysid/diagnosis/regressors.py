@@ -15,12 +15,24 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.effects.effect import MOTOR, TORSION, ArrayFunctions, Effect, Term, Values
+from jtqd.estimator.effects.effect import (
+    MOTOR,
+    TORSION,
+    ArrayFunctions,
+    Effect,
+    ScalarFunctions,
+    State,
+    Term,
+    Values,
+)
+from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, Channel, JointSignals, Line
 from jtqd.sysid.diagnosis.smoothing import second_difference
 
 BIN_S: Final = 0.005
+SAME_RATE: Final = 0.05
+"""Part of a sample by which bins of two runs may differ: stamps are no better, and whole samples have one noise."""
 LONG_S: Final = 600.0
 """Of all runs and joints together; beyond, bins grow so that memory does not."""
 
@@ -56,6 +68,8 @@ class EffectCandidate:
 def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
     """Return what the effect with parameters p leaves in each balance of this joint [n], Nm; absent: nothing."""
     joint, state, x = s.joint, s.state_of(effect, p), ArrayFunctions()
+    replaces = any(q.key and q.name in p for q in effect.parameters)
+    own = joint if replaces or not s.believed else s.believed[0]  # what the effect is relative to
     out: dict[str, FloatArray] = {}
 
     def add(balance: str, value: FloatArray) -> None:
@@ -66,19 +80,19 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
         order = p.get("order_per_motor_rev", 0.0)
         add(
             MOTOR,
-            effect.loss_nm(p, state, joint, x) * s.visible_share_of(order),
+            effect.loss_nm(p, state, own, x) * s.visible_share_of(order),
         )
     if "current_a" in hooks:
         scale = joint.gear_ratio * joint.torque_constant_nm_per_a
-        add(MOTOR, scale * effect.current_a(p, state, joint, x))
+        add(MOTOR, scale * effect.current_a(p, state, own, x))
     for hook, sign in (("load_nm", 1.0), ("sensor_nm", -1.0)):
         if hook in hooks:
-            value = sign * getattr(effect, hook)(p, state, joint, x)
+            value = sign * getattr(effect, hook)(p, state, own, x)
             add(MOTOR, s.per_torque * value)
             add(TORSION, value)
     for hook in ("twist_rad", "link_rad"):
         if hook in hooks:
-            angle = getattr(effect, hook)(p, state, joint, x)
+            angle = getattr(effect, hook)(p, state, own, x)
             add(TORSION, -joint.stiffness_nm_per_rad * angle)
             if hook == "link_rad" or effect.geometric:
                 add(TORSION, -joint.damping_nms_per_rad * np.gradient(angle, s.time_s))
@@ -103,6 +117,26 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
     return {k: np.broadcast_to(np.asarray(v, np.float64), (count,)) for k, v in out.items()}
 
 
+def fields_used(effect: Effect, p: Values, joint: Joint) -> frozenset[str]:
+    """Return the fields of the state that the hooks of an effect use, and "joint" where a value of the file is one."""
+    seen: set[str] = set()
+
+    class Recorder:
+        def __getattr__(self, name: str) -> float:
+            seen.add(name)
+            return 0.5
+
+    class File:
+        def __getattr__(self, name: str) -> object:
+            if name not in ("gear_ratio", "rated_torque_nm"):
+                seen.add("joint")
+            return getattr(joint, name)
+
+    for hook in effect.hooks:
+        getattr(effect, hook)(p, Recorder(), File(), ScalarFunctions())
+    return frozenset(seen & {*State.__slots__, "joint"})
+
+
 def bin_samples(signals: Iterable[JointSignals]) -> int:
     """Return how many samples make a bin: where all is filtered, bins of what the highest cutoff leaves, because whitening
     would raise again what no filter has let through.
@@ -110,23 +144,47 @@ def bin_samples(signals: Iterable[JointSignals]) -> int:
     total, step, highest = 0.0, 0.0, 0.0
     for s in signals:
         total += float(s.time_s[-1] - s.time_s[0])
-        step = max(step, float(np.median(np.diff(s.time_s))))
+        step = max(step, s.step_s)
         highest = max(highest, s.visible.highest_hz)
     width = max(BIN_S * max(1.0, total / LONG_S), 0.5 / highest)
     return max(1, round(width / step))
 
 
-def binned(x: FloatArray, samples: int) -> FloatArray:
-    """Return means over whole bins [n // samples]."""
-    count = len(x) // samples
-    result: FloatArray = x[: count * samples].reshape(count, samples).mean(axis=1)
+def samples_in(seconds: float, run: Sequence[JointSignals]) -> float:
+    """Return how many samples of a run make a bin of so many seconds; a whole number where its rate allows."""
+    samples = seconds / run[0].step_s
+    whole = max(1, round(samples))
+    return float(whole) if abs(samples - whole) <= SAME_RATE * whole else samples
+
+
+def binned(x: FloatArray, samples: float) -> FloatArray:
+    """Return means over whole bins [n // samples]; a sample that two bins share counts in each by its part."""
+    count = int(len(x) / samples)
+    if samples == int(samples):
+        whole: FloatArray = x[: count * int(samples)].reshape(count, int(samples)).mean(axis=1)
+        return whole
+    middle = float(np.mean(x))
+    sums = np.concatenate(([0.0], np.cumsum(x - middle)))
+    result: FloatArray = (
+        middle + np.diff(np.interp(_edges(count, samples), np.arange(len(sums)), sums)) / samples
+    )
     return result
 
 
-def all_in_bin(good: BoolArray, samples: int) -> BoolArray:
-    """Return whether every sample of the bin is good [n // samples]."""
-    count = len(good) // samples
-    return np.asarray(good[: count * samples].reshape(count, samples).all(axis=1), np.bool_)
+def all_in_bin(good: BoolArray, samples: float) -> BoolArray:
+    """Return whether every sample of the bin is good [n // samples], those that it shares with another too."""
+    count = int(len(good) / samples)
+    bad = np.concatenate(([0], np.cumsum(~good)))
+    edges = _edges(count, samples)
+    first, end = np.floor(edges[:-1]).astype(np.intp), np.ceil(edges[1:]).astype(np.intp)
+    return np.asarray(bad[np.minimum(end, len(good))] == bad[first], np.bool_)
+
+
+def _edges(count: int, samples: float) -> FloatArray:
+    """Return the ends of bins in samples [count + 1]; those that are whole but for rounding are whole."""
+    edges = samples * np.arange(count + 1)
+    near = np.round(edges)
+    return np.where(np.abs(edges - near) < 1e-6, near, edges)
 
 
 Index = np.ndarray[tuple[int], np.dtype[np.intp]]
@@ -152,12 +210,13 @@ class ChannelData:
 
 @dataclass
 class RunData:
-    """One run: its channels, and what the maps need per joint, binned [n]."""
+    """One run: its channels, and what the maps need per joint, binned [n]; samples: of this run to a bin."""
 
     name: str
     time_s: FloatArray
     channels: dict[Channel, ChannelData]
     axes: dict[int, dict[str, FloatArray]]
+    samples: float = 1.0
 
 
 class Family(NamedTuple):
@@ -246,7 +305,7 @@ def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | Non
 def run_data(
     run: Sequence[JointSignals],
     candidates: Sequence[EffectCandidate],
-    samples: int,
+    samples: float,
     groups: Sequence[Family] = (),
 ) -> RunData:
     """Return one run's binned residuals and regressors; `run`: its joints; groups: nuisances, the usual ones if empty."""
@@ -272,10 +331,10 @@ def run_data(
             )
     _fill(channels, run, candidates, samples)
     axes = {s.number: _axes(s, samples) for s in run}
-    return RunData(run[0].run, binned(run[0].time_s, samples), channels, axes)
+    return RunData(run[0].run, binned(run[0].time_s, samples), channels, axes, samples)
 
 
-def _held_at_rest(s: JointSignals, balance: str, samples: int) -> FloatArray:
+def _held_at_rest(s: JointSignals, balance: str, samples: float) -> FloatArray:
     """Return what `ChannelData.at_rest_nm` is."""
     if balance not in s.held_nm:
         return np.empty(0)
@@ -287,7 +346,7 @@ def _fill(
     channels: dict[Channel, ChannelData],
     run: Sequence[JointSignals],
     candidates: Sequence[EffectCandidate],
-    samples: int,
+    samples: float,
 ) -> None:
     """Put the regressors of all candidates into the channels."""
     found: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in channels}
@@ -305,7 +364,7 @@ def _fill(
             channels[channel].regressors = np.column_stack([c for _, c in columns])
 
 
-def _axes(s: JointSignals, samples: int) -> dict[str, FloatArray]:
+def _axes(s: JointSignals, samples: float) -> dict[str, FloatArray]:
     """Return what the maps are drawn over, binned; angles unwrapped."""
     state = s.state
     return {
@@ -322,24 +381,3 @@ def _axes(s: JointSignals, samples: int) -> dict[str, FloatArray]:
 def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
     """Return the columns of the torque sensor's gain (see `noise.saturated_residuals`)."""
     return {k for c in candidates if c.effect.scales_all for k in c.columns}
-
-
-def column_moments(runs: Sequence[RunData], columns: int) -> FloatArray:
-    """Return the mean products of all columns [channels, columns, columns] over valid bins of all runs; in a torsion balance
-    without their means, which the run's own zero takes.
-    """
-    out = np.zeros((len(runs[0].channels), columns, columns))
-    for place, channel in zip(out, runs[0].channels, strict=True):
-        parts = [
-            (r.channels[channel].regressors, r.channels[channel].valid) for r in runs if channel in r.channels
-        ]
-        index = runs[0].channels[channel].index
-        products, count = np.zeros((len(index), len(index))), 0
-        for x, valid in parts:
-            good = x[valid]
-            if channel.balance == TORSION and len(good):
-                good = good - good.mean(axis=0)
-            products += good.T @ good
-            count += len(good)
-        place[np.ix_(index, index)] = products / max(count, 1)
-    return out

@@ -1,7 +1,8 @@
-"""Scope of a diagnosis: effects that the user excludes or declares as present, and references that are no sensor."""
+"""What the user knows: effects that are absent or given, how far values may be off, and references that are no sensor."""
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -10,9 +11,16 @@ from typing import Final
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.findings import SENSOR, JointName
+from jtqd.sysid.diagnosis.limits import PRIORS, Usage
 from jtqd.sysid.runs.options import UsageError
 
 _ITEM: Final = re.compile(r"(?:(?P<joint>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
+
+_SIZE: Final = re.compile(r"(?P<value>[\d.]+(?:e[+-]?\d+)?) *(?P<unit>.*)", re.IGNORECASE)
+_PERCENT: Final = re.compile(r"([\d.]+) %")
+_PREFIXES: Final = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6}
+_USAGES: Final = (Usage(0.1, 5.0), Usage(3.0, 50.0))
+"""Two very different ways to use a joint: a prior whose size differs between them has no size in its unit."""
 
 
 @dataclass(frozen=True)
@@ -98,3 +106,69 @@ def _check_given(text: str, name: str, where: JointName | None, joints: Mapping[
             f"--given {text}: found no effect {name} in {files}, expected it under `effects` with its parameters "
             f"(or --without {text} for an effect that is absent)"
         )
+
+
+def trusted(items: Iterable[str], joints: Mapping[int, Joint]) -> dict[str, float]:
+    """Return the factor on the default size of a prior that option --trust asks for, by the prior's name (`limits.PRIORS`).
+
+    Items are "NAME=SIZE": how far a value may be off, as a standard deviation. SIZE is in percent where the prior is
+    ("sensor_gain=5%": five times the default of 1 %), of the same thing as the prior, or in the unit of the effect's leading
+    parameter ("coulomb_friction=2Nm", "channel_delay=5ms"), where all joints then have one factor. Raises UsageError.
+    """
+    found: dict[str, float] = {}
+    for text in items:
+        name, _, asked = text.partition("=")
+        if name not in PRIORS:
+            raise UsageError(
+                f"--trust {text}: found {name!r}, expected NAME=SIZE with one of {', '.join(sorted(PRIORS))}"
+            )
+        if name in found:
+            raise UsageError(f"--trust {text}: found {name} twice, expected one size")
+        size = _SIZE.fullmatch(asked.strip())
+        value = _positive(size["value"]) if size else 0.0
+        if size is None or not value:
+            raise UsageError(
+                f"--trust {text}: found {asked!r}, expected a number above 0 with a unit: {_expected(name)}"
+            )
+        found[name] = _factor(text, name, value, size["unit"].strip(), joints)
+    return found
+
+
+def _positive(text: str) -> float:
+    """Return the number, 0 for what is none or not above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        return 0.0
+    return value if 0.0 < value < math.inf else 0.0
+
+
+def _unit(name: str) -> str:
+    """Return the unit of the parameter that a prior is of, without spaces."""
+    effect, _, parameter = name.partition(".")
+    first, *others = EFFECTS[effect].parameters
+    return next((p.unit for p in others if p.name == parameter), first.unit).replace(" ", "")
+
+
+def _expected(name: str) -> str:
+    """Return the units that fit, and the default."""
+    unit = _unit(name)
+    units = [*(["%"] if _PERCENT.match(PRIORS[name].text) else []), *([unit] if unit else [])]
+    return f"{' or '.join(units)} (default {PRIORS[name].text})"
+
+
+def _factor(text: str, name: str, value: float, unit: str, joints: Mapping[int, Joint]) -> float:
+    prior, own = PRIORS[name], _unit(name)
+    default = _PERCENT.match(prior.text)
+    if unit == "%" and default:
+        return value / float(default[1])
+    unit = unit.replace(" ", "")
+    scale = _PREFIXES.get(unit.removesuffix(own)) if own and unit.endswith(own) else None
+    if scale is None:
+        raise UsageError(f"--trust {text}: found {unit or 'no unit'!r}, expected {_expected(name)}")
+    sizes = [prior.size(joint, use) for joint in joints.values() for use in _USAGES]
+    if not sizes or max(sizes) > (1.0 + 1e-9) * min(sizes):
+        raise UsageError(
+            f"--trust {text}: found {unit}, expected %: the default ({prior.text}) is not one size in {own} for these joints"
+        )
+    return value * scale / sizes[0]

@@ -28,6 +28,7 @@ from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.diagnosis.smoothing import (
     Smoother,
     acceleration_noise,
+    below,
     calm,
     current_rate,
     cutoff_hz,
@@ -37,7 +38,6 @@ from jtqd.sysid.diagnosis.smoothing import (
     noise_of,
     reach_of_calm,
     second_difference,
-    sensor_rate,
     slow,
 )
 from jtqd.sysid.runs.bad_samples import Held
@@ -133,6 +133,11 @@ class Line:
     unit: str = "1/rev"
 
 
+RATE_HZ: Final = 60.0
+VALUES_HZ: Final = 120.0
+"""The same where the set is known and only its values are asked for."""
+TORQUE_HZ: Final = 12.0
+"""Torques in regressors are known below this: what is quicker is noise, which the residual has too."""
 _ALL_VISIBLE: Final = Smoother(1.0)
 
 
@@ -140,16 +145,18 @@ SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
 _AFTER_REST_S: Final = 0.03
 """So long after (and before) such a velocity the transients of sticking are still in the torque."""
-_COARSE: Final = 3.0
-"""A position whose difference is noisier by this factor than the velocity channel is not used for it."""
 _VISIBLE: Final = 1e-3
 """Part of the rated torque (rms) that the noise of an acceleration may be worth; beyond, the balance is filtered."""
 _SHARED: Final = 2e-4
 """The same in the regressor of an inertia, where the noise of the residual is once more."""
 _REMEMBERED: Final = 1.2
 """Periods of its cutoff after which a filter has forgotten a standstill."""
-_FINE_HZ: Final = 15.0
-"""A position whose acceleration is known up to here needs no velocity channel, whose filter and delay nobody knows."""
+_SHOWN_HZ: Final = 10.0
+"""Below it a velocity channel is compared with the derivative of the position."""
+_SAME: Final = 0.02, 1e-3
+"""Gain and delay, s, of a velocity channel that do no harm."""
+_SURELY: Final = 3.0
+"""Standard deviations."""
 _FINEST_HZ: Final = 80.0
 """Averages over bins do the rest above it."""
 
@@ -173,6 +180,9 @@ class JointSignals:
     torsion_nm: FloatArray | None
     moving: BoolArray
     sensor_nm: FloatArray
+    current_a: FloatArray
+    shared_nm: FloatArray
+    gear_nm: FloatArray
     per_torque: FloatArray | float = 1.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
     off: BoolArray | None = None
@@ -186,7 +196,28 @@ class JointSignals:
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE
+    believed: list[Joint] = field(
+        default_factory=list
+    )  # file with the values found; what effects are relative to
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
+
+    @cached_property
+    def step_s(self) -> float:
+        """Usual step of this run."""
+        return float(np.median(np.diff(self.time_s)))
+
+    @property
+    def demand_nm(self) -> FloatArray:
+        """Motor torque that the joint file's simulation needs for this motion and load [n], Nm joint side."""
+        scale = self.joint.gear_ratio * self.joint.torque_constant_nm_per_a
+        quick = self.state.torque_nm - self.gear_nm
+        return np.asarray(scale * self.current_a - self.motor_nm + self.shared_nm + quick)
+
+    def know_torque(self, torque_hz: float, rate_hz: float) -> None:
+        """Let the torques that effects see be known below torque_hz, their rate below rate_hz."""
+        step = float(np.median(np.diff(self.time_s)))
+        self.state.torque_nm = below(self.gear_nm, step, torque_hz)
+        self.state.torque_rate_nm_s = first_difference(below(self.sensor_nm, step, rate_hz), self.time_s)
 
     def seen(self, balance: str, x: FloatArray) -> FloatArray:
         """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
@@ -222,6 +253,8 @@ class JointSignals:
         other: dict[str, FloatArray] = {}
         if self.sensor_temperature_c is not None and effect.at_sensor_of(p):
             other["temperature_c"] = self.sensor_temperature_c
+        if effect.follows_torsion and self.twist_rad is not None:
+            other["torsion_rad"] = self.twist_rad
         if age := effect.age_s(p):
             other |= {name: mean_ahead(self.time_s, getattr(self.state, name), age) for name in _RATES}
         if not other:
@@ -320,19 +353,61 @@ class _Motion:
 
 
 def _motion(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint) -> _Motion:
-    speed = _motor_speed(time, raw, columns, joint)
-    position = columns.motor_position_rad
-    if position is None:
-        position = np.concatenate(([0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]) * np.diff(time))))
-    of_position = raw.motor_position_rad is not None and speed is not raw.motor_velocity_rad_s
-    # of the position where the velocity is that of the position too
-    whole = second_difference(position, time) if of_position else np.gradient(speed, time)
-    known = position if of_position else speed
-    noise = noise_of(known)
+    """Return the motion by the channel whose acceleration is known best, position or velocity, of the motor's side or, with
+    one encoder, of the link's.
+
+    A velocity channel may be filtered, late or of another scale: beside a position it is taken only where that shows none of
+    it.
+    """
+    ratio, one = joint.gear_ratio, not raw.two_encoders(joint.gear_ratio)
+    position, speed = raw.motor_position_rad, raw.motor_velocity_rad_s
+    if position is None and speed is None and raw.link_position_rad is not None:
+        position = ratio * raw.link_position_rad
+    if speed is None and one and raw.link_velocity_rad_s is not None:
+        speed = ratio * raw.link_velocity_rad_s
+    by_position = None if position is None else _known(time, position, joint, of_position=True)
+    by_speed = None if speed is None else _known(time, speed, joint, of_position=False)
+    found = by_position or by_speed
+    assert found is not None
+    if by_position is not None and by_speed is not None and _better(time, by_speed, by_position):
+        found = by_speed
+    there = columns.motor_position_rad
+    if there is None:
+        v = found.speed
+        there = np.concatenate(([0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(time))))
+    return replace(found, position=there)
+
+
+def _known(time: FloatArray, x: FloatArray, joint: Joint, *, of_position: bool) -> _Motion:
+    """Return the motion by one channel."""
+    whole = second_difference(x, time) if of_position else np.gradient(x, time)
+    noise = noise_of(x)
     visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
     shared = _smoother(joint, time, noise, _SHARED, of_position=of_position)(whole)
-    coarse = _cost(joint, time, known, noise, visible, of_position=of_position)
-    return _Motion(position, speed, whole, visible(whole), shared, visible, of_position, coarse)
+    coarse = _cost(joint, time, x, noise, visible, of_position=of_position)
+    speed = np.asarray(np.gradient(x, time)) if of_position else x
+    return _Motion(x, speed, whole, visible(whole), shared, visible, of_position, coarse)
+
+
+def _better(time: FloatArray, speed: _Motion, position: _Motion) -> bool:
+    """Return whether the acceleration of the velocity channel is known further than the position's, and it agrees with it.
+
+    Of the slow part, derivative of the position = gain v + late dv/dt, by least squares: gain 1 and late 0 but for what
+    the position's noise, in as many samples as this bandwidth has, may make of them.
+    """
+    if speed.visible.slowest_hz <= position.visible.slowest_hz:
+        return False
+    step = float(np.median(np.diff(time)))
+    wide = max(1, round(_REMEMBERED / _SHOWN_HZ / step))
+    if len(time) < 4 * wide:
+        return False
+    y, *x = (below(each, step, _SHOWN_HZ)[wide:-wide] for each in (position.speed, speed.speed, speed.whole))
+    columns = np.column_stack(x)
+    found, *_ = np.linalg.lstsq(columns, y, rcond=None)
+    share = 1.0 / max(1.0, 2.0 * _SHOWN_HZ * step * len(y)) * float(np.mean((y - columns @ found) ** 2))
+    sigma = np.sqrt(share * np.diag(np.linalg.pinv(columns.T @ columns / len(y))))
+    off = np.abs(found - np.array([1.0, 0.0]))
+    return bool(np.all(off <= np.maximum(np.array(_SAME), _SURELY * sigma)))
 
 
 def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: BaseLoss) -> JointSignals:
@@ -361,10 +436,14 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
-    calm_torque, calm_current = calm(gear_torque, step), calm(columns.current_a, step)
+    slow_torque = below(gear_torque, step, TORQUE_HZ)
+    scale = joint.gear_ratio * joint.torque_constant_nm_per_a
+    loss = base.loss(gear_torque, velocity)
+    reflected = joint.gear_ratio * joint.rotor_inertia_kgm2
+    demand = (slow_torque + loss + reflected * motion.shared) / scale
     state = State(
-        current_a=calm_current,
-        current_rate_a_s=current_rate(columns.current_a, time),
+        current_a=demand,
+        current_rate_a_s=current_rate(demand, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
         link_acceleration_rad_s2=link_acceleration + (motion.shared - motion.acceleration) / joint.gear_ratio,
         link_position_rad=link,
@@ -373,9 +452,9 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         motor_position_rad=motion.position,
         temperature_c=_or_nan(columns.temperature_c, len(time)),
         time_s=time - time[0],
-        torque_nm=calm_torque,
-        torque_rate_nm_s=sensor_rate(sensor, time),
-        torsion_rad=calm_torque / joint.stiffness_nm_per_rad,
+        torque_nm=slow_torque,
+        torque_rate_nm_s=first_difference(below(sensor, step, RATE_HZ), time),
+        torsion_rad=slow_torque / joint.stiffness_nm_per_rad,
         torsion_rate_rad_s=np.full(len(time), np.nan),
         velocity_rad_s=velocity,
         coupling_position_rad=link if number != 2 else -link,
@@ -387,9 +466,9 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     if both:
         twist = motion.position / joint.gear_ratio - link
         rate = velocity - np.gradient(link, time)
-        zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, calm_torque)
+        zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, gear_torque)
         torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate - gear_torque
-        bent = calm(twist - zero, step)
+        bent = calm(twist - zero, step) + (gear_torque - calm(gear_torque, step)) / joint.stiffness_nm_per_rad
         state.torsion_rate_rad_s = first_difference(bent, time)
     return JointSignals(
         run,
@@ -397,10 +476,13 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
         joint,
         time,
         state,
-        motor_torque - base.loss(gear_torque, velocity) - gear_torque,
+        motor_torque - loss - gear_torque,
         torsion,
         _moving(time, velocity, motion.visible.slowest_hz),
         sensor,
+        columns.current_a,
+        reflected * (motion.shared - motion.whole),
+        gear_torque,
         twist_rad=bent,
         off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
         of_position=motion.of_position,
@@ -456,21 +538,6 @@ def _zero(apart: FloatArray, torque: FloatArray) -> float:
 
 def _or_nan(column: FloatArray | None, count: int) -> FloatArray:
     return np.full(count, np.nan) if column is None else column
-
-
-def _motor_speed(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint) -> FloatArray:
-    """Return the velocity of the motor [rad/s]: of its position where that is fine enough, else the channel itself."""
-    assert columns.motor_velocity_rad_s is not None
-    if raw.motor_position_rad is None:
-        return columns.motor_velocity_rad_s
-    derived: FloatArray = np.gradient(raw.motor_position_rad, time)
-    if raw.motor_velocity_rad_s is None:
-        return derived
-    steps = noise_of(raw.motor_position_rad)
-    if _smoother(joint, time, steps, _VISIBLE, of_position=True).slowest_hz >= _FINE_HZ:
-        return derived
-    noise = [float(np.std(np.diff(v, 2))) for v in (derived, raw.motor_velocity_rad_s)]
-    return derived if noise[0] <= _COARSE * max(noise[1], 1e-9) else raw.motor_velocity_rad_s
 
 
 def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolArray:

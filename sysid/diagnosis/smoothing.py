@@ -26,8 +26,6 @@ from scipy import signal
 from jtqd.estimator.arrays import BoolArray, FloatArray
 
 _SMOOTH_S: Final = 0.005
-_RATE_SMOOTH: Final = 0.4
-"""Part of _SMOOTH_S over which a torque is smoothed before its rate is taken."""
 _CUBIC_S: Final = 0.014
 """So long is the part of a current that is taken for a cubic before its rate is taken."""
 _ENOUGH: Final = 5
@@ -54,6 +52,14 @@ def calm(x: FloatArray, step_s: float) -> FloatArray:
     return result
 
 
+def below(x: FloatArray, step_s: float, hz: float) -> FloatArray:
+    """Return x [n] without what is quicker than hz, without delay."""
+    sections = _low_pass(min(hz * step_s, 0.45))
+    return np.asarray(
+        signal.sosfiltfilt(sections, x, padlen=min(len(x) - 1, max(12, round(1.0 / (hz * step_s)))))
+    )
+
+
 def reach_of_calm(step_s: float) -> float:
     """Return how far away samples are, s, of which `calm` makes one."""
     return _SMOOTH_S if _smoothed_samples(step_s) >= _ENOUGH else max(_NEAR_S, 2.0 * step_s)
@@ -71,17 +77,6 @@ def _neighbours(reach: int) -> FloatArray:
     weights = np.zeros(len(at))
     weights[at != 0] = np.linalg.pinv(np.vander(others / reach, 4, increasing=True))[0]
     return weights
-
-
-def sensor_rate(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative [n] of the sensor's torque as regressors have it.
-
-    The noise of a difference has little part in that of the same sample, so less is smoothed than in the signal itself
-    (`calm`), which has 0.8 of what swings at 50 Hz: a delay would be found larger by as much. Samples that are too far apart
-    for that are not smoothed at all; a difference of second order over 8 ms would have 0.84 of 40 Hz.
-    """
-    wide = _smoothed_samples(float(np.median(np.diff(time))))
-    return first_difference(smooth(x, round(_RATE_SMOOTH * wide)) if wide >= _ENOUGH else x, time)
 
 
 def current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
@@ -165,6 +160,8 @@ _ON_GRID: Final = 0.95
 """Part of the small distances between values that are whole multiples of the least, on a grid."""
 _SIXTH: Final = math.sqrt(924.0)
 """Rms of a sixth difference of white noise: binomials of six, squared and summed."""
+_OUTLYING: Final = 6.0
+"""Of the median of sixth differences: more is no noise."""
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0
 """No cutoff is lower: there is the motion itself."""
@@ -214,9 +211,11 @@ def noise_of(x: FloatArray) -> FloatArray:
     out = np.asarray(steps / math.sqrt(12.0))
     if len(x) < 7:
         return out
-    quick = np.pad(np.abs(np.diff(x, 6)), 3, mode="edge") / (_SIXTH * 0.6745)
+    quick = np.pad(np.abs(np.diff(x, 6)), 3, mode="edge") / _SIXTH
     for there in _magnitudes(x):
-        out[there] = np.maximum(out[there], np.median(quick[there]))
+        usual = quick[there]
+        usual = usual[usual <= _OUTLYING * np.median(usual)]
+        out[there] = np.maximum(out[there], np.sqrt(np.mean(usual**2)))
     return out
 
 

@@ -23,9 +23,9 @@ from jtqd.sysid.diagnosis.events import (
     wandering,
 )
 from jtqd.sysid.diagnosis.noise import Noise
-from jtqd.sysid.diagnosis.refine import Refined
 from jtqd.sysid.diagnosis.regressors import LINE, ChannelData, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
+from jtqd.sysid.diagnosis.solution import Remaining
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
     AxisMap,
@@ -122,14 +122,14 @@ class Unexplained:
         return out
 
 
-def own_changes(dataset: Dataset, refined: Refined) -> FloatArray:
+def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
     """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
     differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
     unexplained where no cause covers it.
     """
     changes = np.array(refined.nuisances)
     changes[:, [g.name == LINE for g in dataset.families]] = 0.0
-    pieces = np.array(refined.mixed.pieces)
+    pieces = np.array(refined.pieces)
     runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
     sigma = np.array([np.inf if g.name not in _OF_A_DAY else g.sigma for g in dataset.families])
     shared = runs.mean(axis=0)
@@ -137,7 +137,7 @@ def own_changes(dataset: Dataset, refined: Refined) -> FloatArray:
     return np.asarray(changes - shared)
 
 
-def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[FloatArray]]:
+def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, list[FloatArray]]:
     """Return what the causes leave, less the runs' own changes but not less strange lines, events with it [run][n]."""
     out: dict[Channel, list[FloatArray]] = {}
     for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
@@ -147,7 +147,7 @@ def less_nuisances(dataset: Dataset, refined: Refined) -> dict[Channel, list[Flo
     return out
 
 
-def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
+def held_nm(dataset: Dataset, refined: Remaining) -> dict[Channel, float]:
     """Return what the rows of held channels are wrong by: rms over the run that has most of it [Nm], beyond
     what is usual in the others; at rest, where the balance is not known, against a straight line between the rows around
     them. Channels without such rows are left out.
@@ -155,20 +155,11 @@ def held_nm(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
     return {c: max(e / n for e, n in runs) ** 0.5 for c, runs in _held(dataset, refined).items()}
 
 
-def held_energies_nm2(dataset: Dataset, refined: Refined) -> dict[Channel, float]:
-    """Return the same as energy over all runs [Nm^2], as that of all other structure."""
-    return {
-        c: sum(e for e, _ in runs)
-        / sum(int(np.sum(_measured_or_held(run.channels[c]))) for run in dataset.runs)
-        for c, runs in _held(dataset, refined).items()
-    }
-
-
 def _measured_or_held(d: ChannelData) -> BoolArray:
     return d.valid if d.held is None else d.valid | d.held
 
 
-def _held(dataset: Dataset, refined: Refined) -> dict[Channel, list[tuple[float, int]]]:
+def _held(dataset: Dataset, refined: Remaining) -> dict[Channel, list[tuple[float, int]]]:
     """Return (sum of squares [Nm^2], samples held or valid) of the runs with held rows, by channel."""
     out: dict[Channel, list[tuple[float, int]]] = {}
     for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):
@@ -184,7 +175,7 @@ def _held(dataset: Dataset, refined: Refined) -> dict[Channel, list[tuple[float,
     return out
 
 
-def events_left(dataset: Dataset, refined: Refined, noise: Noise) -> dict[Channel, Events]:
+def events_left(dataset: Dataset, refined: Remaining, noise: Noise) -> dict[Channel, Events]:
     """Return rare events where the residual of the causes has any that are large enough to matter, else nothing.
 
     The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
@@ -213,7 +204,7 @@ def _least(joint: Joint) -> float:
     return (_RELEVANT * joint.rated_torque_nm) ** 2
 
 
-def unexplained_residual(dataset: Dataset, refined: Refined, noise: Noise) -> Unexplained:
+def unexplained_residual(dataset: Dataset, refined: Remaining, noise: Noise) -> Unexplained:
     """Return the unexplained residual when causes and the runs' own changes are taken out."""
     joints = dataset.joints
     whole = less_nuisances(dataset, refined)

@@ -1,225 +1,497 @@
-"""Verdict of a diagnosis: what was found as findings, with reasons in words and the experiment that would decide."""
+"""Verdict: the entries of the set with grade, interval and size, what remains, and what these runs cannot tell.
+
+An entry is *certain* where no rival set has nearly as much evidence, also with a discrepancy ROBUST times as large and with
+the noise of the channels another by NOISE_KNOWN, and its interval excludes the value without it; *one of* where a set
+without it has nearly as much evidence; else *effective*: it predicts, and what it stands for is not settled. One relevance
+decides the verdict, for entries and for what remains alike.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.acceptance import Found, found_in
-from jtqd.sysid.diagnosis.bounded import bounded_values, in_the_file
-from jtqd.sysid.diagnosis.case import Case, Fit
-from jtqd.sysid.diagnosis.causes import causes_of, separated_at_rest
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import Effect
+from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.evidence import candidate_table
-from jtqd.sysid.diagnosis.fewer_runs import Names, with_fewer
+from jtqd.sysid.diagnosis.entries import Entry
+from jtqd.sysid.diagnosis.evidence import Set, Sets
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
-    INSUFFICIENT,
+    CERTAIN,
+    EFFECTIVE,
     NO_GAP,
+    ONE_OF,
     UNEXPLAINED,
-    BoundedValue,
     CandidateEvidence,
     Cause,
     Findings,
-    Gap,
     JointName,
+    Present,
     UnexplainedResidual,
+    Untold,
+    Value,
     joint_text,
 )
-from jtqd.sysid.diagnosis.gain import held_out_gain
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
-from jtqd.sysid.diagnosis.next_experiment import MOST_KINDS, next_experiment
-from jtqd.sysid.diagnosis.search import Hypothesis
-from jtqd.sysid.diagnosis.unexplained import Unexplained
+from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
+from jtqd.sysid.diagnosis.model import Solution
+from jtqd.sysid.diagnosis.next_experiment import kind_of, next_experiment
+from jtqd.sysid.diagnosis.scope import Scope
+from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, present_effects, remaining
+from jtqd.sysid.diagnosis.unexplained import Unexplained, held_nm, unexplained_residual
 
-RELEVANCE: Final = 0.005
-"""Part of the rated torque, rms over a run, from which what the causes leave matters; the user may set another."""
+_Z95: Final = 1.96
+_RIVAL_STEPS: Final = 12
+_IMPROVEMENTS: Final = 3
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
+    without them lacks, with the discrepancy as estimated and ROBUST times as large, that best set's entries instead, and
+    deviations of the coefficients [z] from none.
+    """
+
+    members: tuple[int, ...]
+    present: PresentEffect
+    rms_nm: Mapping[Channel, float]
+    delta: float
+    robust: float
+    rivals: tuple[Entry, ...]
+    rival: Set
+    z: float
+
+
+def improved(solution: Solution) -> Solution:
+    """Return the solution with the set that searches for rivals of its entries end in, where one has more evidence; and
+    without entries that others of the set nearly replace, which then have the whole size.
+    """
+    sets, chosen = solution.sets, solution.chosen
+    for _ in range(_IMPROVEMENTS):
+        others = [_without(sets, chosen, m) for m in _members(sets, chosen)]
+        best = max(others, key=lambda s: sets.fit(s).evidence, default=chosen)
+        if sets.fit(best).evidence <= sets.fit(chosen).evidence:
+            break
+        chosen = sets.search(best)
+    while True:
+        less = [chosen - set(m) for m in _members(sets, chosen)]
+        best = max(less, key=lambda s: sets.fit(s).evidence, default=chosen)
+        if not less or 2.0 * (sets.fit(chosen).evidence - sets.fit(best).evidence) > limits.RIVAL:
+            break
+        chosen = best
+    return replace(solution, chosen=chosen)
+
+
+def _members(sets: Sets, chosen: Set) -> list[tuple[int, ...]]:
+    """Return the entries of a set, those that are one effect together."""
+    out: dict[tuple[object, ...], list[int]] = {}
+    for k in sorted(chosen):
+        e = sets.entries[k]
+        out.setdefault((*e.key, e.slot[-1]), []).append(k)
+    return [tuple(members) for members in out.values()]
+
+
+def _without(sets: Sets, chosen: Set, members: Sequence[int]) -> Set:
+    """Return the set of most evidence without an effect."""
+    key = sets.entries[members[0]].key
+    same = frozenset(
+        k
+        for k, e in enumerate(sets.entries)
+        if e.key == key and e.slot[-1] == sets.entries[members[0]].slot[-1]
+    )
+    return sets.search(chosen - same, banned=same, steps=_RIVAL_STEPS)
+
+
+def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
+    """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
+    mean = solution.values.fit(solution.chosen).mean
+    places = solution.values.places(solution.chosen)
+    found = [(solution.entries[k], mean[places[k]]) for k in sorted(solution.chosen)]
+    return present_effects(found), np.array([u[: len(solution.dataset.families)] for u in solution.own_means])
+
+
+def judged(solution: Solution) -> list[Judged]:
+    """Return the effects of the set."""
+    sets, chosen = solution.sets, solution.chosen
+    large = solution.equations.sets(
+        {
+            g: v * (limits.ROBUST if isinstance(g, tuple) and g[0] in ("discrepancy", "shared") else 1.0)
+            for g, v in solution.variances.items()
+        }
+    )
+    fit, values = sets.fit(chosen), solution.values.fit(chosen)
+    places = solution.values.places(chosen)
+    out = []
+    for members in _members(sets, chosen):
+        found = [(solution.entries[k], values.mean[places[k]]) for k in members]
+        [present] = present_effects(found)
+        rival = _without(sets, chosen, members)
+        without = chosen - set(members)
+        robust = large.fit(chosen).evidence - max(large.fit(without).evidence, large.fit(rival).evidence)
+        at = np.concatenate([np.arange(places[k].start, places[k].stop) for k in members])
+        mean = values.mean[at]
+        z2 = float(mean @ np.linalg.solve(values.covariance[np.ix_(at, at)], mean))
+        out.append(
+            Judged(
+                members,
+                present,
+                _rms(solution, present),
+                2.0 * (fit.evidence - sets.fit(rival).evidence),
+                2.0 * robust - limits.NOISE_KNOWN * abs(sets.noise(chosen) - sets.noise(rival)),
+                tuple(sets.entries[k] for k in rival - chosen),
+                rival,
+                math.sqrt(max(z2, 0.0)),
+            )
+        )
+    return out
+
+
+def _rms(solution: Solution, present: PresentEffect) -> dict[Channel, float]:
+    """Return the rms of an effect per channel over valid bins of all runs, a constant in torsion taken off."""
+    squares: dict[Channel, list[FloatArray]] = {}
+    for run, found in zip(solution.dataset.runs, contributions(solution.dataset, present), strict=True):
+        for channel, value in found.items():
+            part = value[run.channels[channel].valid]
+            if channel.balance == "torsion" and len(part):
+                part = part - part.mean()
+            squares.setdefault(channel, []).append(part * part)
+    return {
+        c: float(np.sqrt(np.mean(np.concatenate(x)))) if sum(map(len, x)) else 0.0 for c, x in squares.items()
+    }
+
+
+def grade_of(j: Judged, *, vetoed: bool, hidden: bool) -> str:
+    """Return the grade of an effect; see the module. hidden: what remains in its balance is larger than itself."""
+    if j.delta <= limits.RIVAL and j.rivals:
+        return ONE_OF
+    sure = not hidden and j.delta > limits.RIVAL and j.robust > limits.RIVAL and j.z > _Z95 and not vetoed
+    return CERTAIN if sure else EFFECTIVE
 
 
 def conclude(
-    case: Case, fit: Fit, names: tuple[str, ...], numbers: tuple[int, ...], names_without: Names
-) -> Findings:
-    """Return the findings of one diagnosis.
-
-    fit: of what the search found; names, numbers: of all runs and joints asked about; names_without: what is reported
-    without a recording.
-    """
-    found, became = with_fewer(found_in(case, fit), names_without)
-    bounded = bounded_values(found)
-    gain = held_out_gain(case.dataset, found.named.refined)
-    named, classes = separated_at_rest(case, found.named, found.classes)
-    left, shown = _remaining(found, named)
-    explained = sum(case.energies_nm2(named))
-    remains = found.remains_nm2(left)
-    total = max(max(explained, sum(case.energies_nm2(shown))) + remains, 1e-30)
-    causes = causes_of(case, named, classes, total)
-    bounded = in_the_file(bounded, causes)
-    unsure, doubt = [], ""
-    if found.few is not None:
-        unsure = found.few.unsure(found.whole.hypothesis, named.hypothesis, classes, causes)
-        doubt = found.few.doubt(unsure) if unsure else ""
-    rivals = {r.key: c.effect.name for c, others in zip(named.chosen, classes, strict=True) for r in others}
-    table = candidate_table(case.search, named.hypothesis, rivals, unexplained=found.beside)
-    reasons: list[str] = []
-    if found.matters:
+    solution: Solution,
+    names: tuple[str, ...],
+    scope: Scope,
+    relevance: float,
+) -> tuple[Findings, Prediction]:
+    """Return the findings of one diagnosis, without what was noted on its runs before, and the model that predicts."""
+    solution = improved(solution)
+    dataset = solution.dataset
+    prediction = predict(solution)
+    effects = judged(solution)
+    rated = {n: joint.rated_torque_nm for n, joint in dataset.joints.items()}
+    limits_nm = {c: relevance * rated[c.joint] for c in dataset.runs[0].channels}
+    left = remaining(dataset, *present_of(solution))
+    rest = unexplained_residual(dataset, left, solution.noise)
+    if (
+        _largest(rest, limits_nm) > 1.0
+    ):  # the discrepancy has a part in the set's values, and none in those that predict
+        other = remaining(dataset, extended_effects(solution, prediction), _own(solution, prediction))
+        less = unexplained_residual(dataset, other, solution.noise)
+        if _largest(less, limits_nm) < _largest(rest, limits_nm):
+            left, rest = other, less
+    held = held_nm(dataset, left)
+    total = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
+    spread = averaged(solution, effects)
+    causes = sorted(
+        (_cause(solution, j, prediction, total, rest, spread) for j in effects), key=lambda c: -c.rms_nm
+    )
+    matter = [c for c in causes if c.rms_nm >= limits_nm[_channel(c, dataset)]]
+    listed = [c for c in causes if c.rms_nm >= limits.LISTED * limits_nm[_channel(c, dataset)]]
+    listed = [c if c in matter else replace(c, matters=False) for c in listed]
+    small = [replace(c, matters=False) for c in causes if all(c.key != x.key for x in listed)]
+    unexplained = _unexplained(rest, held, limits_nm, rated, total)
+    if unexplained.matters:
         verdict = UNEXPLAINED
-        reasons = [
-            f"joint {c.joint}, {c.balance} balance: {nm:.3g} Nm rms of the worst run where a channel is held"
-            for c, nm in found.held_nm.items()
-        ]
-        if found.left_matters:
-            reasons += [*_closest(found.whole.hypothesis, causes, found.share), *left.reasons]
-        reasons += _detectable_range(table, case.dataset.rated_torque_nm) if found.beside else []
-    elif causes:
-        verdict = CAUSE if all(len(c.names) == 1 for c in causes) and not doubt else AMBIGUOUS
+    elif matter:
+        verdict = CAUSE if all(c.grade == CERTAIN for c in matter) else AMBIGUOUS
     else:
-        verdict = INSUFFICIENT if doubt else NO_GAP
-        reasons = [doubt] if doubt else []
-    causes.sort(key=lambda c: -c.rms_nm)
-    gaps = channel_gaps(case.dataset, shown.refined, left if found.left_matters else None)
-    gaps = _below_bounds(gaps, bounded)
-    bounds = tuple(f"{b.name} of {joint_text(b.joint)} " for b in bounded)  # once, as a bound
-    refused = [line for line in found.refused if not line.startswith(bounds)]
-    if not reasons:
-        reasons = [s for s in (_reason(verdict, causes, gaps), doubt) if s]
-    return Findings(
+        verdict = NO_GAP
+    table, untold = entry_table(solution, causes, scope)
+    gaps = channel_gaps(dataset, left, rest if unexplained.matters else None)
+    reasons = rest.reasons if unexplained.matters else []
+    gain = gain_of(solution, prediction) if prediction.chosen else None
+    findings = Findings(
         verdict,
-        (*reasons, *(b.text for b in bounded), *refused, *became),
+        tuple(reasons),
         names,
-        numbers,
+        tuple(sorted(dataset.joints)),
         gaps,
-        tuple(causes),
+        tuple(listed),
         table,
-        gain if causes else None,
-        next_experiment=_settling_experiment(verdict, causes, unsure, case.dataset),
-        traces=traces(case.dataset, shown.refined),
-        explained_share=explained / total if causes else math.nan,
-        unexplained=_unexplained(found, left, remains / total),
-        bounded=tuple(bounded),
+        gain,
+        traces=traces(dataset, left),
+        explained_share=1.0 - rest.energy_nm2() / max(total, 1e-30) if causes else math.nan,
+        unexplained=unexplained,
+        too_small=tuple(small),
+        cannot_be_told=untold,
+        predicts=tuple(
+            Present(p.effect.name, p.joint, p.values) for p in extended_effects(solution, prediction)
+        ),
+        next_experiment=_next(verdict, matter, untold, dataset),
+    )
+    return findings, prediction
+
+
+def _largest(rest: Unexplained, limits_nm: Mapping[Channel, float]) -> float:
+    """Return the largest of what remains in parts of its limit."""
+    return max((rest.worst_nm.get(c, 0.0) / max(nm, 1e-12) for c, nm in limits_nm.items()), default=0.0)
+
+
+def _channel(cause: Cause, dataset: Dataset) -> Channel:
+    number = cause.joint if isinstance(cause.joint, int) else next(iter(dataset.joints))
+    return Channel(number, cause.balance)
+
+
+def _own(solution: Solution, prediction: Prediction) -> FloatArray:
+    """Return what each recording has of its own beside the extended model, without discrepancy [r, q]."""
+    return solution.own(prediction.mean, prediction.chosen)[:, : len(solution.dataset.families)]
+
+
+def _cause(  # noqa: PLR0917
+    solution: Solution,
+    j: Judged,
+    prediction: Prediction,
+    total_nm2: float,
+    rest: Unexplained,
+    spread: Mapping[int, FloatArray],
+) -> Cause:
+    channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
+    remains = math.sqrt(rest.by_channel().get(channel, 0.0))
+    grade = grade_of(j, vetoed=bool(prediction.vetoed & set(j.members)), hidden=remains > j.rms_nm[channel])
+    rivals = tuple(
+        dict.fromkeys(
+            e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != j.present.joint else "")
+            for e in j.rivals
+        )
+    )
+    name = j.present.effect.name
+    squares = sum(r * r for r in j.rms_nm.values())
+    return Cause(
+        name,
+        j.present.joint,
+        (name, *(r for r in rivals if r != name)) if grade == ONE_OF else (name,),
+        values_of(solution, j, spread),
+        j.delta,
+        math.nan,
+        j.rms_nm[channel],
+        channel.balance,
+        explained_share=squares / max(total_nm2, 1e-30),
+        grade=grade,
+        rivals=rivals if grade == ONE_OF else (),
+        given=tuple(dict.fromkeys(solution.entries[k].prior.text for k in j.members)),
     )
 
 
-def _below_bounds(gaps: Sequence[Gap], bounded: Sequence[BoundedValue]) -> tuple[Gap, ...]:
-    """Return the gaps with no noise floor above what a bounded value leaves on the held-out runs: where nothing is named,
-    the runs' own changes hold what all of them lack of it, and that is no noise.
+def averaged(solution: Solution, effects: Sequence[Judged]) -> dict[int, FloatArray]:
+    """Return by how much the coefficients of each entry differ between the set and the rival sets [m, m]: their mean square
+    by the sets' evidence (Bayesian model averaging: Hoeting et al. 1999, Statistical Science 14).
     """
-    return tuple(_below(gap, [b for b in bounded if b.joint == gap.joint]) for gap in gaps)
+    sets, chosen = solution.sets, solution.chosen
+    rivals = {j.rival: math.exp(-0.5 * max(j.delta, 0.0)) for j in effects}
+    total = 1.0 + sum(rivals.values())
+    places, mean = sets.places(chosen), sets.fit(chosen).mean
+    out = {k: np.zeros((sets.entries[k].size,) * 2) for k in chosen}
+    for rival, weight in rivals.items():
+        there = sets.places(rival)
+        for k in chosen & rival:
+            apart = sets.fit(rival).mean[there[k]] - mean[places[k]]
+            out[k] += weight / total * np.outer(apart, apart)
+    return out
 
 
-def _below(gap: Gap, bounded: Sequence[BoundedValue]) -> Gap:
-    left = [math.sqrt(float(np.mean([r.rmse_after_nm**2 for r in b.runs]))) for b in bounded]
-    lower = min(left, default=math.inf)
-    if gap.balance != MOTOR or lower >= gap.noise_floor_nm:
-        return gap
-    return replace(gap, noise_floor_nm=lower, floor_from="what a bounded value leaves on held-out runs")
-
-
-def _unexplained(found: Found, left: Unexplained, share: float) -> UnexplainedResidual:
-    """Return the unexplained residual in the channel where it is most, against its limit; share: of all structure, as
-    energy.
+def values_of(solution: Solution, j: Judged, spread: Mapping[int, FloatArray]) -> dict[str, Value]:
+    """Return the parameters of an effect with 95 % intervals, as wide as the rival sets make them (`averaged`), no narrower
+    than what the equations simplify.
     """
-    sizes = {c: max(left.worst_nm.get(c, 0.0), found.held_nm.get(c, 0.0)) for c in found.limits}
-    worst = max(sizes, key=lambda c: sizes[c] / found.limits[c] if found.limits[c] > 0.0 else sizes[c])
+    fit = solution.values.fit(solution.chosen)
+    places = solution.values.places(solution.chosen)
+    half: dict[str, float] = dict.fromkeys(j.present.values, 0.0)
+    none: dict[str, float] = {}
+    for k in j.members:
+        e, at = solution.entries[k], places[k]
+        mean, covariance = fit.mean[at], fit.covariance[at, at].copy()
+        covariance[: len(spread[k]), : len(spread[k])] += spread[k]
+        here = e.values(mean)
+        none |= {n: v for n, v in e.candidate.term.combine([0.0] * e.candidate.size).items() if n not in none}
+        for name in here:
+            slope = np.array([_slope(e, mean, i, name) for i in range(e.size)])
+            half[name] = max(half[name], _Z95 * math.sqrt(max(float(slope @ covariance @ slope), 0.0)))
+    out: dict[str, Value] = {}
+    for p in j.present.effect.parameters:
+        value = j.present.values.get(p.name)
+        if value is None:
+            continue
+        if half[p.name] <= 0.0:
+            if p.fixed:
+                out[p.name] = Value(value, (value, value), p.unit)
+            continue
+        size = (
+            1.0
+            if p.name == "phase_rad"
+            else abs(value - (0.0 if p.name.startswith("reference") else none.get(p.name, 0.0)))
+        )
+        wide = math.hypot(half[p.name], inaccurate(j.present.effect) * size)
+        low, high = value - wide, value + wide
+        if p.name != "phase_rad":
+            low, high = max(low, p.low), min(high, p.high)
+        out[p.name] = Value(value, (low, high), p.unit)
+    return out
+
+
+def _slope(e: Entry, mean: FloatArray, i: int, name: str) -> float:
+    step = 1e-4 * max(abs(float(mean[i])), 1e-3)
+    up, down = mean.copy(), mean.copy()
+    up[i] += step
+    down[i] -= step
+    change = float(e.values(up)[name] - e.values(down)[name])
+    if name == "phase_rad":
+        change = float(np.angle(np.exp(1j * change)))
+    return change / (2.0 * step)
+
+
+def inaccurate(effect: Effect) -> float:
+    """Return the least half width of a 95 % interval, as part of the effect's size."""
+    if effect.follows_torsion or effect.geometric:
+        return limits.INACCURATE_TWIST
+    return limits.INACCURATE_RATE if effect.rate_based else limits.INACCURATE
+
+
+def _unexplained(
+    rest: Unexplained,
+    held: Mapping[Channel, float],
+    limits_nm: Mapping[Channel, float],
+    rated: Mapping[int, float],
+    total_nm2: float,
+) -> UnexplainedResidual:
+    """Return what remains in the channel where it is most, against its limit."""
+    sizes = {c: max(rest.worst_nm.get(c, 0.0), held.get(c, 0.0)) for c in limits_nm}
+    worst = max(sizes, key=lambda c: sizes[c] / limits_nm[c] if limits_nm[c] > 0.0 else sizes[c])
     return UnexplainedResidual(
         worst.joint,
         worst.balance,
         sizes[worst],
-        sizes[worst] / found.case.dataset.joints[worst.joint].rated_torque_nm,
-        share,
-        found.limits[worst],
-        found.matters,
-        unconfirmed=not found.matters and left is not found.left,
+        sizes[worst] / rated[worst.joint],
+        rest.energy_nm2() / max(total_nm2, 1e-30),
+        limits_nm[worst],
+        sizes[worst] > limits_nm[worst],
     )
 
 
-def _closest(whole: Hypothesis, causes: Sequence[Cause], share: float) -> list[str]:
-    """Return the lines about effects that were found where a relevant residual remains."""
-    named = {(c.name, c.joint) for c in causes}
-    others = ", ".join(
-        f"{c.effect.name} of {joint_text(c.joint)}" for c in whole.chosen if c.key not in named
+def entry_table(
+    solution: Solution, causes: Sequence[Cause], scope: Scope
+) -> tuple[tuple[CandidateEvidence, ...], tuple[Untold, ...]]:
+    """Return one row per effect and joint: in the set, or why not, and the smallest size that would be; and what these runs
+    cannot tell.
+    """
+    sets, chosen = solution.sets, solution.chosen
+    gains = sets.gains(chosen)
+    untold = set(sets.untold(chosen)) | set(solution.equations.noisy)
+    there = {(c.name, c.joint): c for c in causes}
+    of: dict[tuple[str, JointName], list[int]] = {}
+    for k, e in enumerate(sets.entries):
+        of.setdefault(e.key, []).append(k)
+    rows, lost = [], []
+    for (name, joint), members in of.items():
+        cause = there.get((name, joint))
+        best = max(members, key=lambda k: gains[k])
+        smallest = min((_smallest(sets, chosen, k) for k in members if k not in untold), default=math.inf)
+        if cause is not None:
+            reason = f"in the set, {cause.grade}"
+        elif all(k in untold for k in members):
+            reason = "cannot be told from these runs"
+            lost.append(Untold(name, joint, reason, kind_of(name)))
+        else:
+            reason = "no evidence beyond the set"
+        rows.append(
+            CandidateEvidence(
+                name,
+                joint,
+                cause.delta_evidence if cause else 2.0 * float(gains[best]),
+                math.nan,
+                math.nan,
+                _minimum(sets.entries[best], smallest),
+                reason,
+            )
+        )
+    seen = {(name, joint) for name, joint in of}
+    for name in EFFECTS:
+        if not any(name == n for n, _ in seen):
+            asked = any(name == n for _, n in scope.out)
+            reason = (
+                "not looked for, as asked"
+                if asked
+                else "these runs have no channel or no variation that shows it"
+            )
+            if not asked:
+                lost.append(Untold(name, min(solution.dataset.joints), reason, kind_of(name)))
+            rows.append(
+                CandidateEvidence(
+                    name, min(solution.dataset.joints), math.nan, math.nan, math.nan, {}, reason
+                )
+            )
+    return tuple(sorted(rows, key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)), tuple(
+        lost
     )
-    if not others:
-        return []
-    one = len(whole.chosen) - len(named) == 1
-    effects, are = ("effect", "it is") if one else ("effects", "they are")
-    return [
-        f"the closest {effects} of the library ({others}) would leave {share:.0%} of the structured gap, "
-        f"so {are} not named as its cause"
-    ]
 
 
-def _detectable_range(table: Sequence[CandidateEvidence], rated_nm: float) -> list[str]:
-    """Return how large an effect must be to be distinguished in the presence of an unexplained residual; none is
-    larger than the rated torque.
-    """
-    seen = sorted((c.minimum_rms_nm, c.name) for c in table if c.minimum_rms_nm < rated_nm)
-    if not seen:
-        return []
-    (low, easiest), (high, hardest) = seen[0], seen[-1]
-    return [
-        f"on these runs an effect below {low:.2g} Nm rms ({easiest.replace('_', ' ')}) to {high:.2g} Nm rms"
-        f" ({hardest.replace('_', ' ')}) cannot be distinguished from the unexplained residual"
-    ]
+def _smallest(sets: Sets, chosen: Set, k: int) -> float:
+    """Return the coefficient of a single-column entry at which its evidence would be RIVAL / 2 beyond nothing."""
+    e = sets.entries[k]
+    at = sets.columns(chosen - {k})
+    s = sets.slices[k][0]
+    fit = sets.fit(chosen - {k})
+    inner = float(sets.gram[s, s] - sets.gram[s, at] @ fit.covariance @ sets.gram[at, s])
+    if inner <= 0.0:
+        return math.inf
+    needed = 0.5 * limits.RIVAL - e.odds + 0.5 * e.size * math.log(inner + 1.0)
+    return math.sqrt(2.0 * max(needed, 0.0) * (inner + 1.0)) / inner
 
 
-def _remaining(found: Found, named: Fit) -> tuple[Unexplained, Fit]:
-    """Return what findings and report show as unexplained, and the fit that leaves it: that of the causes. Where something
-    matters that all effects found leave, that of all of them, or of none where that leaves less: a fit that is bent leaves
-    more than there was, and in other places.
-    """
-    case, whole = found.case, found.whole
-    if not found.left_matters:
-        if named.hypothesis is whole.hypothesis:
-            return found.left, named
-        return case.unexplained(named), named
-    if whole.chosen:
-        bare = case.fit(case.search.hypothesis(()))
-        without = case.unexplained(bare)
-        if without.energy_nm2() <= found.left.energy_nm2():
-            return without, bare
-    return found.left, whole
+def _minimum(e: Entry, smallest: float) -> dict[str, Value]:
+    """Return the leading parameter at its smallest size."""
+    if not math.isfinite(smallest):
+        return {}
+    scaled = np.zeros(e.size)
+    scaled[0] = smallest
+    values = e.values(scaled)
+    none = e.candidate.term.combine([0.0] * e.candidate.size)
+    unit = {p.name: p.unit for p in e.effect.parameters}
+    return {
+        n: Value(abs(v - none.get(n, 0.0)), (math.nan, math.nan), unit[n])
+        for n, v in values.items()
+        if v != none.get(n) and n != "phase_rad"
+    }
 
 
-def _settling_experiment(
-    verdict: str, causes: Sequence[Cause], unsure: Sequence[tuple[str, JointName]], dataset: Dataset
+def extended_effects(solution: Solution, prediction: Prediction) -> list[PresentEffect]:
+    """Return the effects of the extended model with the values that predict."""
+    first, found = 0, []
+    for k in sorted(prediction.chosen):
+        e = solution.entries[k]
+        found.append((e, prediction.mean[first : first + e.size]))
+        first += e.size
+    return present_effects(found)
+
+
+def _next(
+    verdict: str, causes: Sequence[Cause], untold: Sequence[Untold], dataset: Dataset
 ) -> dict[str, Any] | None:
-    """Return the experiment that would settle an ambiguous verdict, a class in the presence of an unexplained
-    residual, or one of too few runs; unsure: what does not hold on every held-out run.
-    """
-    in_class = any(len(c.names) > 1 for c in causes)
-    if verdict not in (AMBIGUOUS, INSUFFICIENT) and not (verdict == UNEXPLAINED and in_class):
-        return None
+    """Return the experiment that would settle what is one of several."""
     classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
+    if not classes:
+        return None
+    text = "; ".join(f"{' and '.join(names)} fit these runs equally well" for names in classes)
     warm = bool(np.isfinite(dataset.signals[0][0].state.temperature_c).any())
-    reasons = [f"{' and '.join(names)} fit these runs equally well" for names in classes]
-    alone = tuple(dict.fromkeys(name for name, _ in unsure))[:MOST_KINDS]
-    if alone:
-        reasons.append(
-            f"{', '.join(alone)}: indicated by all runs together, but not confirmed on every held-out run"
-        )
-    text = "; ".join(reasons)
-    classes += [(name,) for name in alone]
-    seen = [run[0] for run in dataset.signals]
-    return next_experiment(classes, dataset.joints, text, temperature=warm, signals=seen)
-
-
-def _reason(verdict: str, causes: Sequence[Cause], gaps: Sequence[Gap]) -> str:
-    if verdict == NO_GAP:
-        worst = gaps[0]
-        return (
-            f"the simulation agrees with the runs: {worst.rmse_nm:.3g} Nm rms at joint {worst.joint} "
-            f"({worst.balance} balance), of which noise and run-to-run variation are {worst.noise_floor_nm:.3g} Nm"
-        )
-    parts = []
-    for c in causes:
-        text = c.name.replace("_", " ")
-        if len(c.names) > 1:
-            text += " (or " + ", ".join(n.replace("_", " ") for n in c.names[1:]) + ")"
-        parts.append(f"{text} of {joint_text(c.joint)}, {c.rms_nm:.3g} Nm rms")
-    return "the simulation lacks " + "; ".join(parts)
+    return next_experiment(
+        classes, dataset.joints, text, temperature=warm, signals=[run[0] for run in dataset.signals]
+    )

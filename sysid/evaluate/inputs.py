@@ -499,5 +499,6 @@ def _check(name: str, file: RunFile, number: int, joint: Joint) -> list[RunIssue
         return [RunIssue("dead_channel", f"{name}: {note}: j{number} not scored") for note in dead]
     if missing:
         return [RunIssue("missing_columns", f"{where}: found no {', '.join(missing)}: not scored")]
-    found = check_channels(Channels(file.table.time_s, columns, joint, where))
+    known = number in file.known_loads
+    found = check_channels(Channels(file.table.time_s, columns, joint, where, known))
     return [RunIssue(item.kind, f"{item.text}: j{number} not scored") for item in found]

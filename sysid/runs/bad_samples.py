@@ -135,13 +135,16 @@ class Held:
         return np.asarray(self.saturated | self.stuck, np.bool_)
 
 
-def saturation_limits(tables: Iterable[RunTable], joints: Mapping[int, Joint]) -> dict[int, Limits]:
+def saturation_limits(
+    tables: Iterable[RunTable], joints: Mapping[int, Joint], known_loads: Collection[int] = ()
+) -> dict[int, Limits]:
     """Return by joint where channels saturate in any of these runs; a limit of the torque column is one of all joints."""
     out: dict[int, dict[str, set[float]]] = {number: {} for number in joints}
     for table in tables:
         for number in set(joints) & set(table.joints):
             run = table.joints[number]
-            for name, held in held_values(Channels(table.time_s, run, joints[number], "")).items():
+            c = Channels(table.time_s, run, joints[number], "", number in known_loads)
+            for name, held in held_values(c).items():
                 values = np.unique(np.abs(getattr(run, name)[held.saturated])).tolist()
                 for each in joints if name == "torque_nm" else (number,):
                     out[each].setdefault(name, set()).update(values)
@@ -149,7 +152,7 @@ def saturation_limits(tables: Iterable[RunTable], joints: Mapping[int, Joint]) -
 
 
 def held_values(c: Channels, limits: Limits | None = None) -> dict[str, Held]:
-    """Return the held rows by column; columns without any are left out. limits: those of other runs."""
+    """Return the held rows by column; columns without any are left out, and a known load. limits: those of other runs."""
     torque, current, motor_nm = c.run.torque_nm, c.run.current_a, c.motor_nm
     if c.speed is None or torque is None or current is None or motor_nm is None:
         return {}
@@ -161,6 +164,8 @@ def held_values(c: Channels, limits: Limits | None = None) -> dict[str, Held]:
         ("torque_nm", torque, motor_nm, np.ones_like(c.moving)),
         ("current_a", current, torque, powered),
     ):
+        if name == "torque_nm" and c.known_load:
+            continue
         stuck, saturated = _while_partner_moves(c, values, partner, _MOVED[name] * c.joint.rated_torque_nm)
         for limit in (limits or {}).get(name, ()):
             saturated |= np.abs(values) == limit
@@ -210,7 +215,7 @@ def _while_partner_moves(
     limits = set()
     for start, end in _stretches(values):
         value = float(values[start])
-        if value in at_limit:
+        if value in at_limit and (value != 0.0 or moving[start]):  # a load may be exactly zero at rest
             at_limit[value].append((start, end))
         if not moving[start] or not moving[end - 1]:
             continue

@@ -56,7 +56,11 @@ SENSOR_MOVED: Final = 0.5
 RATIO_TOLERANCE: Final = 0.01
 """Gear ratio from the positions against the joint file."""
 TWIST_RAD: Final = 3e-3
-"""Of a harmonic drive at rated torque, by catalogues: a ratio from a swing of this size is off by as much."""
+"""Play and hysteresis of a gear, beside the twist that the joint file states: a ratio from a swing of this size is off by as
+much.
+"""
+_SOFTER: Final = 2.0
+"""Times the twist of the joint file's stiffness: a gear, and a belt more so, is softer than its file."""
 VELOCITY_TOLERANCE: Final = 0.05
 """Motor velocity against the derivative of the motor's position."""
 TURNED_RAD: Final = 0.5
@@ -65,6 +69,8 @@ _BLOCK_S: Final = 0.05
 _SPIKE: Final = 12.0
 """Times the usual step of the channel from row to row, and more than _SPIKE_RATED of rated torque."""
 _SPIKE_RATED: Final = 0.1
+_MOST_OF_IT: Final = 0.5
+"""Part of the motor's torque from which on a known load shows whether the signs agree."""
 _ENERGY: Final = -0.3
 """Losses below this part of the file's friction power mean that motion and torque have not the same sign."""
 MOTION: Final = ("motor_position_rad", "motor_velocity_rad_s", "link_position_rad", "link_velocity_rad_s")
@@ -82,13 +88,15 @@ class RunIssue(NamedTuple):
 class Channels:
     """Columns of one joint as recorded in one run, not derived (a derived position agrees with itself), and its joint file.
 
-    where: run and joint in messages. Columns that are absent are not checked.
+    where: run and joint in messages. known_load: the torque is a known load's or a model's and no sensor's: it may be
+    constant, zero or small beside the motor's. Columns that are absent are not checked.
     """
 
     time_s: FloatArray
     run: JointColumns
     joint: Joint
     where: str
+    known_load: bool = False
 
     @cached_property
     def motor_velocity(self) -> FloatArray | None:
@@ -132,13 +140,14 @@ class Channels:
     def gear_ratio(self) -> float | None:
         """Motor turns per link turn by the two positions, signed; None where one of them moved too little.
 
-        The median over blocks of 0.2 s in which the link turned: a position that rolls over spoils single blocks only.
+        The median over blocks of 0.2 s in which the link turned much, as little travel shows the twist and not the ratio: a
+        position that rolls over spoils single blocks only.
         """
         if self.run.motor_position_rad is None or self.run.link_position_rad is None:
             return None
         step = self.rows(0.2)
         motor, link = (np.diff(x[::step]) for x in (self.run.motor_position_rad, self.run.link_position_rad))
-        turned = np.abs(link) > 2e-3
+        turned = np.abs(link) > max(2e-3, 0.2 * float(np.quantile(np.abs(link), 0.9)))
         if float(np.sum(np.abs(link[turned]))) < TURNED_RAD:
             return None
         return float(np.median(motor[turned] / link[turned])) or None
@@ -156,7 +165,8 @@ def check_channels(c: Channels) -> list[RunIssue]:
     issues += _positions(c)
     torque, motor_nm = c.run.torque_nm, c.motor_nm
     if c.speed is not None and motor_nm is not None and torque is not None:
-        issues += _constant(c, "torque_nm", motor_nm, PARTNER_MOVED * c.joint.rated_torque_nm)
+        if not c.known_load:
+            issues += _constant(c, "torque_nm", motor_nm, PARTNER_MOVED * c.joint.rated_torque_nm)
         issues += _constant(c, "current_a", torque, SENSOR_MOVED * c.joint.rated_torque_nm)
         if not issues:
             issues += _signs(c, c.speed, motor_nm, torque)
@@ -179,7 +189,7 @@ def _dead(c: Channels) -> Iterator[RunIssue]:
         )
 
     torque, current, velocity = c.run.torque_nm, c.run.current_a, c.run.motor_velocity_rad_s
-    if torque is not None and not np.any(torque):
+    if torque is not None and not np.any(torque) and not c.known_load:
         yield dead("torque_nm", "the torque of the motor's current")
     loaded = torque is not None and float(np.max(np.abs(torque))) > 0.5 * c.joint.rated_torque_nm
     if current is not None and not np.any(current) and loaded:
@@ -224,7 +234,9 @@ def _positions(c: Channels) -> Iterator[RunIssue]:
         yield c.issue("link_position_rad", "sign", text)
     # in a small swing the twist of the gear looks like another ratio
     swing = 0.0 if link is None else float(np.ptp(link))
-    tolerance = max(RATIO_TOLERANCE, TWIST_RAD / swing if swing > 0.0 else math.inf)
+    loads = [float(np.ptp(x)) for x in (c.run.torque_nm, c.motor_nm) if x is not None]
+    twist = TWIST_RAD + _SOFTER * min(loads, default=0.0) / c.joint.stiffness_nm_per_rad
+    tolerance = max(RATIO_TOLERANCE, twist / swing if swing > 0.0 else math.inf)
     if ratio is not None and abs(abs(ratio) / gear - 1.0) > tolerance:
         text = (
             f"{c.where}: found {abs(ratio):.5g} motor turns per turn of the link, expected gear_ratio {gear:g} of "
@@ -283,6 +295,8 @@ def _constant(c: Channels, name: str, partner_nm: FloatArray, moved_nm: float) -
 
 def _signs(c: Channels, speed: FloatArray, motor_nm: FloatArray, torque: FloatArray) -> Iterator[RunIssue]:
     """Torque against current where the motor carries more than twice its friction; the energy shows which is inverted."""
+    if c.known_load and _peak(torque) < _MOST_OF_IT * _peak(motor_nm):
+        return  # the motor turns little but its own rotor
     loaded = (np.abs(motor_nm) > 2.0 * static_friction(c.joint.friction)) & c.moving
     if np.count_nonzero(loaded) < 20 or float(np.mean(motor_nm[loaded] * torque[loaded] > 0.0)) > 0.2:
         return
@@ -327,7 +341,7 @@ def constant_channels(run: JointColumns, where: str) -> Iterator[RunIssue]:
 
 def check_spikes(c: Channels) -> Iterator[RunIssue]:
     """Jumps of the sensor from one row to the next: a spike or a drop-out is two of them."""
-    if c.run.torque_nm is None:
+    if c.run.torque_nm is None or c.known_load:
         return
     steps = np.abs(np.diff(c.run.torque_nm))
     limit = max(_SPIKE * float(np.median(steps)), _SPIKE_RATED * c.joint.rated_torque_nm)
@@ -465,8 +479,16 @@ _SLOPE: Final = (0.2, 5.0)
 _STIFFNESS: Final = 10.0
 """A joint file's stiffness is not wrong by more than this factor."""
 _FASTEST_MOTOR_RAD_S: Final = 1000.0
+"""Slower motors are not judged by their speed."""
+_FASTEST_RAD_S: Final = 30.0
+"""Joint side: no joint behind a gear is faster, in degrees most are. Motors of small servos reach 5000 rad/s."""
 _PEAK: Final = 10.0
 """Times rated torque; joints are overloaded two- or threefold."""
+_OVER: Final = 3.0
+"""Times the speed limit of the joint file: a limit of planned motions is no limit of the joint."""
+_ANY_RAD_S: Final = 1e3
+_OWN: Final = 1e-6
+"""Part of a column that is its own, beyond rounding."""
 _HOTTEST_C: Final = 150.0
 _STEP_K, _WARMING_K_PER_S = 2.0, 1.0  # between two samples: resolution, and more than any joint warms
 _TURN: Final = 1.0 / (2.0 * math.pi)
@@ -554,6 +576,8 @@ def _angles(c: Channels) -> RunIssue | None:
         return None
     turns, gear = abs(c.gear_ratio), c.joint.gear_ratio
     off = turns / gear
+    if _near(off, 1.0):  # a direct drive too: both sides are one
+        return None
     found = f"found {turns:.5g} motor turns per turn of the link, gear_ratio of {c.joint.name} is {gear:g}"
     for channel, value in (("motor_position_rad", off), ("link_position_rad", 1.0 / off)):
         for unit, factor in _ANGLES.items():
@@ -566,20 +590,45 @@ def _angles(c: Channels) -> RunIssue | None:
 
 
 def _motor_speed(c: Channels) -> RunIssue | None:
-    """Return an issue for a motor faster than motors are: all angles are in degrees or counts."""
+    """Return an issue for a joint faster than joints are, or than its torque allows: angles are in degrees or counts."""
     if c.motor_velocity is None:
         return None
-    top = float(np.quantile(np.abs(c.motor_velocity), 0.99))
+    top, gear = _peak(c.motor_velocity), c.joint.gear_ratio
     if top < _FASTEST_MOTOR_RAD_S:
+        return None
+    limits = c.joint.motion_limits
+    allowed = (
+        _FASTEST_RAD_S
+        if limits is None
+        else max(_FASTEST_RAD_S, _OVER * min(limits.velocity_rad_s, _ANY_RAD_S))
+    )
+    needed, had = (
+        _needed_nm(c),
+        max((_peak(x) for x in (c.motor_nm, c.run.torque_nm) if x is not None), default=math.inf),
+    )
+    if top / gear < allowed and needed < _PEAK * had:
         return None
     position = c.run.link_position_rad if c.run.motor_position_rad is None else c.run.motor_position_rad
     whole = position is not None and bool(np.all(position == np.round(position)))
     text = (
-        f"{c.where}: found a motor speed of {top:.4g} rad/s ({top / c.joint.gear_ratio:.4g} rad/s of the joint), expected "
-        f"less than {_FASTEST_MOTOR_RAD_S:g} rad/s: {'encoder counts' if whole or top > 1e5 else 'degrees'} suspected in "
+        f"{c.where}: found a motor speed of {top:.4g} rad/s ({top / gear:.4g} rad/s of the joint), which needs "
+        f"{needed:.3g} Nm by {c.joint.name}, expected less than {allowed:g} rad/s of the joint, and torques like "
+        f"those recorded ({had:.3g} Nm): {'encoder counts' if whole or top > 1e5 else 'degrees'} suspected in "
         "positions and velocities, expected rad and rad/s"
     )
     return RunIssue("motor_velocity_rad_s_unit", text)
+
+
+def _needed_nm(c: Channels) -> float:
+    """Return the torque that the file's rotor and viscous friction need for the motion (99 % quantile), joint side."""
+    assert c.speed is not None
+    step = c.rows(_BLOCK_S)
+    whole = len(c.speed) // step * step
+    v = c.speed[:whole].reshape(-1, step).mean(axis=1)
+    if len(v) < 2:
+        return 0.0
+    inertia = c.joint.gear_ratio**2 * c.joint.rotor_inertia_kgm2
+    return _peak(inertia * np.gradient(v, _BLOCK_S)) + c.joint.friction.viscous_nms_per_rad * _peak(v)
 
 
 def _torque_and_current(c: Channels) -> RunIssue | None:
@@ -589,7 +638,9 @@ def _torque_and_current(c: Channels) -> RunIssue | None:
         return None
     rated = c.joint.rated_torque_nm
     sizes = {"torque_nm": _peak(torque) / rated, "current_a": _peak(motor) / rated}
-    slope = _slope(c, torque, motor)
+    slope = _slope(c)
+    if c.known_load and slope is not None and abs(slope) < 1.0:
+        slope = None if sizes["current_a"] < _PEAK else slope  # rotor and friction may need all the current
     if slope is None or _SLOPE[0] < abs(slope) < _SLOPE[1]:
         if max(sizes.values()) < _PEAK:
             return None
@@ -622,28 +673,42 @@ def _torque_and_current(c: Channels) -> RunIssue | None:
     return c.issue(channel, "unit", text)
 
 
-def _slope(c: Channels, torque: FloatArray, motor_nm: FloatArray) -> float | None:
-    """Return d(sensor)/d(motor torque) in motion, with friction's sign, velocity and a constant; None: not excited."""
-    moving = c.moving
-    if c.speed is None or np.count_nonzero(moving) < 100:
+def _slope(c: Channels) -> float | None:
+    """Return d(sensor)/d(motor torque) in motion; None: friction or inertia, not load, makes most of the current.
+
+    Friction's sign, velocity and a constant are fitted beside it, and the acceleration: a light joint whose motor turns
+    little but its own rotor has a sensor torque of a small part. A torque larger than the motor's is no inertia's.
+    """
+    signals = _signals(c)
+    if signals is None:
         return None
-    scale = float(np.std(motor_nm[moving]))
-    if scale == 0.0:
+    motor, sensor, v, acceleration = _in_motion(signals, c.joint)
+    friction = np.column_stack((np.sign(v), v, np.ones_like(v)))
+    with_inertia = _partial_slope(motor, sensor, np.column_stack((friction, acceleration)))
+    if with_inertia is not None:
+        return with_inertia
+    plain = _partial_slope(motor, sensor, friction)
+    return plain if plain is not None and abs(plain) > 1.0 else None
+
+
+def _partial_slope(x: FloatArray, y: FloatArray, others: FloatArray) -> float | None:
+    """Return d y / d x beside other columns; None where what of x is its own explains less of y than remains."""
+    q, _ = np.linalg.qr(others / np.maximum(np.linalg.norm(others, axis=0), 1e-30))
+    own, rest = x - q @ (q.T @ x), y - q @ (q.T @ y)
+    energy = float(own @ own)
+    if energy <= _OWN**2 * float(x @ x):
         return None
-    v = c.speed[moving] / float(np.max(np.abs(c.speed)))
-    x = np.column_stack((motor_nm[moving] / scale, np.sign(v), v, np.ones(len(v))))
-    solution, *_ = np.linalg.lstsq(x, torque[moving], rcond=None)
-    residual = torque[moving] - x @ solution
-    if float(np.std(x[:, 0] * solution[0])) < 2.0 * float(np.std(residual)):
-        return None  # friction, not load, makes most of the current
-    return float(solution[0]) / scale
+    slope = float(own @ rest) / energy
+    return slope if float(np.std(slope * own)) >= 2.0 * float(np.std(rest - slope * own)) else None
 
 
 def _torsion(c: Channels) -> RunIssue | None:
     """Sensor torque against the torsion between both encoders: the absolute scale of both angles."""
     motor, link, torque = c.run.motor_position_rad, c.run.link_position_rad, c.run.torque_nm
-    if motor is None or link is None or torque is None:
+    if motor is None or link is None or torque is None or not c.run.two_encoders(c.joint.gear_ratio):
         return None
+    if c.gear_ratio is not None and not _near(abs(c.gear_ratio) / c.joint.gear_ratio, 1.0):
+        return None  # another ratio turns more than any spring
     twist = motor / c.joint.gear_ratio - link
     twist, torque = twist - np.mean(twist), torque - np.mean(torque)
     energy = float(twist @ twist) * float(torque @ torque)

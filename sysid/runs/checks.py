@@ -14,7 +14,7 @@ Time base of a run for a diagnosis: sample rate, resampling of uneven steps, unw
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -277,29 +277,36 @@ def check_run(
     *,
     thorough: bool = False,
     limits: Mapping[int, Limits] | None = None,
+    known_loads: Collection[int] = (),
 ) -> CheckedRun:
     """Check the joints of one run that have a joint file; `name` begins every line. limits: where channels saturate in
-    other runs.
+    other runs. known_loads: joints whose torque is computed and no sensor's (`RunFile.known_loads`).
 
     thorough: as a diagnosis needs it; only then are columns changed (rows with an outlier left out, positions that roll
     over unwrapped, uneven steps resampled, faulty channels that are not needed left out).
     """
     if thorough:
-        return _thorough(table, joints, name, limits or {})
+        return _thorough(table, joints, name, limits or {}, known_loads)
     refused: list[RunIssue] = []
     usable: dict[int, JointColumns] = {}
     for number in sorted(set(joints) & set(table.joints)):
-        issues = check_channels(_channels(table, number, joints, name))
+        issues = check_channels(_channels(table, number, joints, name, known_loads))
         refused += issues
         if not issues:
             usable[number] = table.joints[number]
     return CheckedRun(RunTable(table.time_s, usable) if usable else None, tuple(refused))
 
 
-def check_runs(runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint]) -> CheckedRuns:
-    """Return what of the runs can be used for a diagnosis of `joints` (joint file by number)."""
-    limits = saturation_limits((without_outliers(table, joints, name)[0] for name, table in runs), joints)
-    each = [(name, check_run(table, joints, name, thorough=True, limits=limits)) for name, table in runs]
+def check_runs(
+    runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], known_loads: Collection[int] = ()
+) -> CheckedRuns:
+    """Return what of the runs can be used for a diagnosis of `joints` (joint file by number); known_loads as `check_run`."""
+    clean = (without_outliers(table, joints, name)[0] for name, table in runs)
+    limits = saturation_limits(clean, joints, known_loads)
+    each = [
+        (name, check_run(table, joints, name, thorough=True, limits=limits, known_loads=known_loads))
+        for name, table in runs
+    ]
     usable = tuple((name, run.table) for name, run in each if run.table is not None)
     left = {number for _, table in usable for number in table.joints}
     recorded = {number for _, table in runs for number in table.joints}
@@ -318,17 +325,23 @@ def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list
         issues += [
             RunIssue("dead_channel", f"{run.name}: {note}") for note in run.notes if f"j{number}." in note
         ]
-        issues += check_run(run.table, {number: joint}, run.name).refused
+        issues += check_run(run.table, {number: joint}, run.name, known_loads=run.known_loads).refused
     return issues
 
 
-def _channels(table: RunTable, number: int, joints: Mapping[int, Joint], name: str) -> Channels:
+def _channels(
+    table: RunTable, number: int, joints: Mapping[int, Joint], name: str, known_loads: Collection[int]
+) -> Channels:
     where = f"{name}: j{number}" if name else f"j{number}"
-    return Channels(table.time_s, table.joints[number], joints[number], where)
+    return Channels(table.time_s, table.joints[number], joints[number], where, number in known_loads)
 
 
 def _thorough(
-    table: RunTable, joints: Mapping[int, Joint], name: str, limits: Mapping[int, Limits]
+    table: RunTable,
+    joints: Mapping[int, Joint],
+    name: str,
+    limits: Mapping[int, Limits],
+    known_loads: Collection[int],
 ) -> CheckedRun:
     unfit = _too_short(table, name) or check_rate(table.time_s, name)
     if unfit:
@@ -349,12 +362,14 @@ def _thorough(
     swapped = {number for a, b, _ in exchanged for number in (a, b)}
     usable: dict[int, JointColumns] = {}
     for number in sorted(set(joints) & set(table.joints) - swapped):
-        columns, why, odd = _checked_joint(table, number, joints, name, limits.get(number))
+        c = _channels(table, number, joints, name, known_loads)
+        columns, why, odd = _checked_joint(c, limits.get(number))
         notes += odd
         refused += why
         if columns is not None:
             usable[number] = columns
-    if opposite := _opposite_sensors(usable, name):
+    sensors = {number: columns for number, columns in usable.items() if number not in known_loads}
+    if opposite := _opposite_sensors(sensors, name):
         refused += opposite
         del usable[2]
     return CheckedRun(RunTable(table.time_s, usable) if usable else None, tuple(refused), tuple(notes))
@@ -370,10 +385,9 @@ def _too_short(table: RunTable, name: str) -> list[RunIssue]:
 
 
 def _checked_joint(
-    table: RunTable, number: int, joints: Mapping[int, Joint], name: str, limits: Limits | None
+    c: Channels, limits: Limits | None
 ) -> tuple[JointColumns | None, list[RunIssue], list[RunIssue]]:
     """Return columns that may be used (None: the joint is left out of this run), why not, and notes."""
-    c = _channels(table, number, joints, name)
     if missing := _missing(c):
         return None, [missing], []
     notes: list[RunIssue] = []
@@ -393,7 +407,7 @@ def _checked_joint(
     notes += [*short, *check_spikes(c)]
     if refusing:
         return None, refusing, notes
-    late = skew_s(RunTable(table.time_s, {**table.joints, number: c.run}), number, joints[number])
+    late = None if c.known_load else skew_s(RunTable(c.time_s, {1: c.run}), 1, c.joint)
     if late is not None and abs(late) >= SKEW_NOTED_S:
         side = "behind" if late > 0.0 else "ahead of"
         text = f"found it {abs(late):.3g} s {side} current and motion, expected channels in step: skew"
@@ -407,14 +421,14 @@ def _checked_joint(
 def _missing(c: Channels) -> RunIssue | None:
     """Return the first column that is missing or dead and without which a joint cannot be diagnosed."""
     torque = c.run.torque_nm
-    if torque is None or not np.any(torque):
+    if torque is None or not (np.any(torque) or c.known_load):
         text = (
             "found no valid torque sensor channel, expected the reference of a diagnosis: a sensor, or a known load or a "
             "model's torque (jN.load of a column map)"
         )
         return c.issue("torque_nm", "missing", text)
     motion = [column for name in MOTION if (column := getattr(c.run, name)) is not None]
-    if np.ptp(torque) == 0.0 and any(np.ptp(column) > 0.0 for column in motion):
+    if not c.known_load and np.ptp(torque) == 0.0 and any(np.ptp(column) > 0.0 for column in motion):
         text = (
             f"found {torque[0]:.4g} Nm in the whole run while the joint moves, expected a measurement that changes: dead "
             "channel"

@@ -27,7 +27,8 @@ class RunError(ValueError):
 @dataclass(frozen=True)
 class RunFile:
     """A run as read: name for messages, unique among the runs read together; file, its kind ("csv", "parquet", "mcap") and
-    SHA-256 (hex); columns (the segments of one recording keep its time); what is suspicious, one line each.
+    SHA-256 (hex); columns (the segments of one recording keep its time); what is suspicious, one line each; joints whose
+    torque is a known load's or a model's, and no sensor's.
     """
 
     name: str
@@ -36,6 +37,7 @@ class RunFile:
     sha256: str
     table: RunTable
     notes: tuple[str, ...] = ()
+    known_loads: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ DEAD_ROWS: Final = 100
 def runs_of(content: Content, *, whole: bool) -> list[RunFile]:
     """Check time and columns of a file and make its run table, or one for each of its segments. Raises RunError."""
     if not whole:
-        content = _with_spread_stamps(_without_repeated_rows(content))
+        content = _with_spread_stamps(_with_even_stamps(_without_repeated_rows(content)))
     time_s, path = content.values[TIME], content.path
     if len(time_s) < 2:
         raise RunError(f"{path}: found {counted(len(time_s), 'sample')}, expected at least 2")
@@ -150,6 +152,100 @@ def _without_repeated_rows(content: Content) -> Content:
     note = f"{int(again.sum())} of {counted(len(again), 'row')} left out: they are the row before once more"
     values = {key: value[~again] for key, value in content.values.items()}
     return replace(content, values=values, lines=lines, notes=(*content.notes, note))
+
+
+def _with_even_stamps(content: Content) -> Content:
+    """Return the content with the stamps between two gaps on the equal steps that they are rounded from (`even_stamps`), and
+    a note where that moves one by a part of a step.
+    """
+    time_s = content.values[TIME].copy()
+    if len(time_s) < 2:
+        return content
+    steps = np.diff(time_s)
+    cuts = np.flatnonzero((steps > _longest_step(steps)) | (steps <= -SHORTEST_SEGMENT_S)) + 1
+    moved, worst = 0.0, 0.0
+    for a, b in pairwise([0, *(int(cut) for cut in cuts), len(time_s)]):
+        even = even_stamps(time_s[a:b])
+        if even is None:
+            continue
+        off = float(np.max(np.abs(even - time_s[a:b])))
+        part = off / float(np.min(np.diff(even)))
+        if part > _STAMP_CHANGES:
+            moved, worst = max(moved, part), max(worst, off)
+            time_s[a:b] = even
+    if moved > _STAMP_MATTERS:
+        note = f"stamps are those of equal steps as printed, off by up to {worst:.2g} s: equal steps used"
+        content = replace(content, notes=(*content.notes, note))
+    return replace(content, values={**content.values, TIME: time_s})
+
+
+_STAMP_CHANGES, _STAMP_MATTERS = 1e-6, 0.01
+"""Parts of a step: less is none; a note."""
+_FEWEST_STAMPS: Final = 20
+_MOST_DECIMALS: Final = 9
+_NOMINAL_DIGITS: Final = 7
+_SLIPS: Final = 5
+"""Of steps that are a lost row or a slip of the last digit fewer are lost rows; so many are slips where a rate has them."""
+_PRINTED: Final = 0.6
+"""Of the last printed digit, by which a stamp may be off: half by rounding, and what a fit is off."""
+
+
+def even_stamps(time_s: FloatArray) -> FloatArray | None:
+    """Return the equal steps [n] t0 + k T that these stamps [n], not falling, are rounded from to their printed digits; None
+    where no such steps are within the digits of every stamp. Lost rows are steps of several T.
+
+    Digits are those of the stamps of one power of ten: fixed decimals, or significant digits. Of all T within them the one
+    with fewest digits, as a rate or as a period, is taken.
+    """
+    steps = np.diff(time_s)
+    if len(time_s) < _FEWEST_STAMPS or np.any(steps < 0.0):
+        return None
+    digit = _last_digit(time_s)
+    if digit is None:
+        return None
+    most = np.maximum(digit[1:], digit[:-1])
+    usual = float(np.mean(steps[steps <= 3.0 * np.median(steps) + 2.0 * most]))
+    if not usual > 0.0:
+        return None
+    cycles = np.maximum(np.round(steps / usual), 1.0)
+    surely = np.where(steps > GAP_NOTED * usual + most, cycles, 1.0)
+    ways = [cycles, surely]
+    if np.count_nonzero(cycles != surely) >= _SLIPS:  # the rate is not quite that of the digits
+        ways.reverse()
+    for each in ways:
+        k = np.concatenate(([0.0], np.cumsum(each)))
+        step = float(np.polyfit(k, time_s, 1, w=1.0 / digit)[0])
+        for candidate in _nominal(step):
+            apart = time_s - candidate * k
+            low, high = float(np.max(apart - _PRINTED * digit)), float(np.min(apart + _PRINTED * digit))
+            if low <= high:
+                return np.asarray(0.5 * (low + high) + candidate * k)
+    return None
+
+
+def _nominal(step: float) -> list[float]:
+    """Return steps near this one, those of few digits first, as rates and as periods; itself last."""
+    digits = range(1, _NOMINAL_DIGITS + 1)
+    return [s for n in digits for s in (1.0 / float(f"{1.0 / step:.{n}g}"), float(f"{step:.{n}g}"))] + [step]
+
+
+def _last_digit(time_s: FloatArray) -> FloatArray | None:
+    """Return the size of the last digit of each stamp [n], that of all of its power of ten; None: too many digits."""
+    power = np.floor(np.log10(np.maximum(np.abs(time_s), 1e-12)))
+    out = np.zeros(len(time_s))
+    for each in np.unique(power):
+        there = power == each
+        for decimals in range(_MOST_DECIMALS + 1):
+            scaled = time_s[there] * 10.0**decimals
+            rounding = 4.0 * float(np.finfo(np.float64).eps) * float(np.max(np.abs(scaled)))
+            if rounding > 0.1:
+                return None
+            if np.all(np.abs(scaled - np.round(scaled)) <= 1e-3 + rounding):
+                out[there] = 10.0**-decimals
+                break
+        else:
+            return None
+    return out
 
 
 def _with_spread_stamps(content: Content) -> Content:
@@ -218,6 +314,7 @@ def _check_time(content: Content, run: slice, *, whole: bool) -> list[str]:
 def _segment(content: Content, cut: slice, name: str, notes: Sequence[str]) -> RunFile:
     """Return the run table of the rows of one segment."""
     path, notes = content.path, list(notes)
+    known_loads = () if content.columns is None else content.columns.known_loads
     values = {key: value[cut] for key, value in content.values.items()}
     if content.columns is not None:
         values = content.columns.completed(values)
@@ -227,7 +324,8 @@ def _segment(content: Content, cut: slice, name: str, notes: Sequence[str]) -> R
         if all(column is None for column in columns.values()):
             continue
         torque = columns["torque_nm"]
-        if torque is not None and len(torque) >= DEAD_ROWS and not np.any(torque):
+        zero = torque is not None and len(torque) >= DEAD_ROWS and not np.any(torque)
+        if torque is not None and zero and joint not in known_loads:
             notes.append(
                 f"j{joint}.torque_nm is exactly zero in all {len(torque)} rows: dead channel, not used"
             )
@@ -241,4 +339,4 @@ def _segment(content: Content, cut: slice, name: str, notes: Sequence[str]) -> R
         table = RunTable(time_s=values[TIME], joints=joints)
     except RunTableError as error:  # a scale of the column map that leaves the range of a float
         raise RunError(f"{path}: {error}") from None
-    return RunFile(name, path, content.source, content.sha256, table, tuple(notes))
+    return RunFile(name, path, content.source, content.sha256, table, tuple(notes), known_loads)

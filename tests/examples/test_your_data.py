@@ -115,14 +115,17 @@ def test_the_rig_is_found_as_it_is(place: Path) -> None:
     assert any("taken as true" in note for note in found["channel_notes"])
 
 
-def test_with_no_torque_known_the_target_is_the_position_in_a_free_run(place: Path) -> None:
+def test_with_no_torque_known_the_values_are_found_as_they_are(place: Path) -> None:
     found = json.loads((place / "flat" / "diagnosis" / "findings.json").read_text())
     assert found["verdict"] == "cause"
-    for cause, attribute in zip(found["causes"], ("coulomb", "viscous"), strict=True):
-        (each,) = cause["parameters"].values()
-        assert each["ci95"][0] <= getattr(TRUE, attribute) <= each["ci95"][1]
+    causes = [cause for cause in found["causes"] if cause["matters"]]
+    assert not any(cause["joint"] == "sensor" for cause in causes), "no torque was measured"
+    values = {name: each for cause in causes for name, each in cause["parameters"].items()}
+    for key, attribute in (("coulomb_nm", "coulomb"), ("viscous_nms_per_rad", "viscous")):
+        assert values[key]["ci95"][0] <= getattr(TRUE, attribute) <= values[key]["ci95"][1]
+    assert len(causes) == 2, [cause["name"] for cause in causes]
     gain = found["gain"]
-    assert gain["free_run_position_after_rad"] < 0.01 * gain["free_run_position_before_rad"]
+    assert gain["rmse_after_nm"] < 0.1 * gain["rmse_before_nm"]
 
 
 def test_the_gain_is_there_on_new_runs_in_our_simulation_and_in_mujoco(

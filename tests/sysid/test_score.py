@@ -103,13 +103,16 @@ def test_an_effect_that_no_value_stands_for_is_simulated_too():
     assert found.errors[MOTOR] == pytest.approx(0.5 / math.sqrt(2.0), rel=0.15)
 
 
-def test_all_runs_together_are_weighted_by_their_samples():
-    short, long = swing(0.3, 3.0), swing(1.1, 9.0)
+def test_all_runs_together_are_weighted_by_their_time_in_motion_whatever_their_rates():
+    short, whole = swing(0.3, 3.0), swing(1.1, 9.0)
+    half = {n: c.map(lambda _, x: x[::2]) for n, c in whole.joints.items()}
+    long = RunTable(whole.time_s[::2], half)
     scored = [[errors_on(name, table, 1, WRONG) for name, table in (("a", short), ("b", long))]]
     rows = [row for row in rows_of(scored) if row.what == MOTOR]
     assert [row.run for row in rows] == ["all", "a", "b"]
-    squares = [scored[0][k].samples * rows[1 + k].errors[0] ** 2 for k in (0, 1)]
-    expected = math.sqrt(sum(squares) / sum(run.samples for run in scored[0]))
+    squares = [scored[0][k].moving_s * rows[1 + k].errors[0] ** 2 for k in (0, 1)]
+    expected = math.sqrt(sum(squares) / sum(run.moving_s for run in scored[0]))
+    assert scored[0][1].moving_s == pytest.approx(3.0 * scored[0][0].moving_s, rel=0.1)
     assert rows[0].errors[0] == pytest.approx(expected)
     assert math.isnan(rows[0].change)
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Place, Value
+from jtqd.sysid.diagnosis.findings import CERTAIN, ONE_OF, Cause, Findings, Gap, Place, Value
 from validation.diagnosis.scores import (
     Outcome,
     bench_shares,
@@ -32,7 +32,8 @@ PLAN = {"why": "", "plan": {}}
 
 def cause(name: str, joint: int | str, *others: str, **values: tuple[float, float, float]) -> Cause:
     parameters = {k: Value(v, (low, high), "") for k, (v, low, high) in values.items()}
-    return Cause(name, joint, (name, *others), parameters, 50.0, 0.5, 0.3, "motor")
+    grade = ONE_OF if others else CERTAIN
+    return Cause(name, joint, (name, *others), parameters, 50.0, 0.5, 0.3, "motor", grade=grade)
 
 
 def findings(verdict: str, *causes: Cause, **more: Any) -> Findings:
@@ -58,12 +59,13 @@ def test_name_beside_the_right_one_is_wrong() -> None:
     ("names", "plan", "found"),
     [
         (("sensor_gain", "torque_constant"), PLAN, True),
-        (("sensor_gain", "torque_constant"), None, False),
+        (("sensor_gain", "torque_constant"), None, True),
         (("torque_constant", "sensor_gain"), PLAN, False),  # of joint 1, which has no such effect
         (("torque_constant", "sensor_gain of joint 2"), PLAN, False),
         (("torque_constant", "sensor_gain of the sensor"), PLAN, True),
         (("torque_constant", "sensor_gain of the sensor", "hysteresis"), PLAN, True),
-        (("sensor_gain", "a", "b", "c"), PLAN, False),
+        (("sensor_gain", "a", "b", "c"), PLAN, True),
+        (("torque_constant", "sensor_gain of the sensor", "a", "b"), PLAN, False),
         (("torque_constant", "hysteresis"), PLAN, False),
     ],
 )
@@ -74,7 +76,7 @@ def test_small_class_counts_with_an_experiment(names: tuple[str, ...], plan: Any
     )
     assert outcome.found == (found,)
     assert not outcome.wrong
-    assert replace(outcome, settled=False).found == (False,)
+    assert replace(outcome, settled=False).found == (names[0] == "sensor_gain",)
     assert replace(outcome, settled=True).found == (found,)
 
 
@@ -213,11 +215,11 @@ def test_the_generators_table_counts() -> None:
     assert by_name["hidden effect at 3x its minimum"].value == 0.5
     assert by_name["hidden effect at 3x its minimum"].trials == 2
     assert by_name["hidden effect at 3x its minimum"].reached is False
-    assert by_name["wrong single name"].value == 0.5
+    assert by_name["certain and wrong"].value == 0.5
     assert by_name["nothing hidden"].value == 0.5
     assert by_name["95 % intervals of parameters cover the truth"].value == 1.0
     assert by_name["gain, as share of what the true model would gain"].value == pytest.approx(1.0)
-    assert by_name["wrong single name"].target == "at most 2 %"
+    assert by_name["certain and wrong"].target == "at most 2 %"
 
 
 def outcome(kind: str, **values: Any) -> Outcome:
@@ -235,16 +237,16 @@ def test_the_benches_table_counts_what_the_targets_ask() -> None:
         row.what: row
         for row in bench_shares([found, missed, wrong, outcome("nothing", verdict="unexplained"), refused])
     }
-    assert rows["single, three times visible: named, or class of at most 3"].value == 0.5
+    assert rows["single, three times visible: a cause, or class of at most 3"].value == 0.5
     assert rows["half of that size"].value == 1.0
-    assert rows["a wrong name"].value == pytest.approx(1 / 4)
-    assert rows["nothing hidden: a name, or unexplained"].value == 1.0
+    assert rows["certain and wrong"].value == pytest.approx(1 / 4)
+    assert rows["nothing hidden: a cause, or unexplained"].value == 1.0
     assert rows["foreign: refused and placed"].reached
     assert rows["foreign worth more than the relevance called no_gap"].reached
     beside = outcome("beside", named=(True,), classed=(False,), wrong=("cogging of 1",))
     with_it = {f.what: f for f in bench_shares([found, beside])}
-    assert with_it["a wrong name"].value == 0.5
-    assert with_it["cause beside a foreign effect: named"].value == 1.0
+    assert with_it["certain and wrong"].value == 0.5
+    assert with_it["cause beside a foreign effect: found"].value == 1.0
     assert failures([found, beside])[0].startswith("beside")
     gone = outcome("foreign", verdict="no_gap", place=False)
     row = "foreign worth more than the relevance called no_gap"
@@ -257,8 +259,8 @@ def test_a_set_of_a_real_bench_counts_beside_the_one_that_hides_nothing() -> Non
     same = outcome("single", named=(True,), classed=(False,), wrong=("cogging of 1",))
     new = outcome("single", named=(True,), classed=(False,), wrong=("unbalance of 1",))
     both = {row.what: row for row in bench_shares([plain, same, new], real=True)}
-    assert both["a wrong name"].value == pytest.approx(1 / 3)
-    assert both["single, three times visible: named, or class of at most 3"].trials == 2
+    assert both["certain and wrong"].value == pytest.approx(1 / 3)
+    assert both["single, three times visible: a cause, or class of at most 3"].trials == 2
     named = outcome("nothing", causes=(("torque_ripple", 1, ("torque_ripple",)),))
     assert not any(row.what.startswith("single") for row in bench_shares([named, same], real=True))
     assert not any(row.what.startswith("single") for row in bench_shares([same], real=True))

@@ -16,7 +16,7 @@ can be confused with is not in it either.
 
 --reported: from which size the diagnosis would report each effect on runs in which nothing is hidden, beside the unexplained
 residual that these runs have. Of each effect the smallest size of the sets' findings (`minimum` of `candidates` in
-findings.json) as its leading parameter and as torque in percent of the rated.
+findings.json) as its leading parameter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ import numpy as np
 
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
 from validation.diagnosis.benches import FILE, bench_option, key, made, sizes
-from validation.diagnosis.entries import ENTRIES, Array, Bench, Columns, Hidden, Joint, Set, rated_nm
+from validation.diagnosis.entries import ENTRIES, Array, Bench, Columns, Hidden, Joint, Set
 from validation.diagnosis.recorder import PRESETS
 from validation.diagnosis.scores import judged
 from validation.study import Report, Table
@@ -176,16 +176,15 @@ def _scale(joints: Mapping[int, Joint]) -> float:
     return min(float(j["rated_torque_nm"]) for j in joints.values())
 
 
-def reported_sizes(found: Findings, joints: Mapping[int, Joint]) -> dict[str, tuple[float, float]]:
-    """Return per effect its smallest size relative to the joint (`entries.OnBench`) and in percent of rated torque, of the
-    joint where it is least; infinite where no size shows.
+def reported_sizes(found: Findings, joints: Mapping[int, Joint]) -> dict[str, float]:
+    """Return per effect its smallest size relative to the joint (`entries.OnBench`), of the joint where it is least;
+    infinite where no size shows.
     """
-    out: dict[str, tuple[float, float]] = {}
+    out: dict[str, float] = {}
     for c in found.candidates:
         joint = joints[c.joint if isinstance(c.joint, int) else min(joints)]
         if c.name in ENTRIES:
-            new = (_size(c) / ENTRIES[c.name].bench.unit(joint), 100.0 * c.minimum_rms_nm / rated_nm(joint))
-            out[c.name] = min(out.get(c.name, (math.inf, math.inf)), new, key=lambda row: row[1])
+            out[c.name] = min(out.get(c.name, math.inf), _size(c) / ENTRIES[c.name].bench.unit(joint))
     return out
 
 
@@ -227,26 +226,23 @@ def _visible(bench: Bench, options: argparse.Namespace) -> Report:
 
 
 def _reported(bench: Bench, count: int, seed: int) -> Report:
-    found: dict[str, list[tuple[float, float]]] = defaultdict(list)
+    found: dict[str, list[float]] = defaultdict(list)
     left = []
     for k in range(count):
         drawn = bench.draw(1000 * seed + k)
         findings = judged(drawn.runs, drawn.joints, PRESETS["full"], k)
-        for name, row in reported_sizes(findings, drawn.joints).items():
-            found[name].append(row)
+        for name, size in reported_sizes(findings, drawn.joints).items():
+            found[name].append(size)
         if findings.unexplained is not None:
             left.append(100.0 * findings.unexplained.of_rated)
     visible = sizes(bench.name)
-    medians = {
-        name: tuple(float(np.median(column)) for column in zip(*rows, strict=True))
-        for name, rows in found.items()
-    }
+    medians = {name: float(np.median(sizes_found)) for name, sizes_found in found.items()}
     rows = []
-    for name, (size, torque) in sorted(medians.items(), key=lambda item: item[1][1]):
+    for name, size in sorted(medians.items()):
         seen = ", ".join(f"{x:.2g}" for k, x in visible.items() if k.split()[0] == name) or "-"
-        text = [f"{x:.2g}" if math.isfinite(x) else "-" for x in (size, torque)]
-        rows.append((name, *text, seen, f"{ENTRIES[name].bench.largest:g}"))
-    head = ("effect", "smallest size reported", "as torque, % of rated rms", "visible from", "largest hidden")
+        text = f"{size:.2g}" if math.isfinite(size) else "-"
+        rows.append((name, text, seen, f"{ENTRIES[name].bench.largest:g}"))
+    head = ("effect", "smallest size reported", "visible from", "largest hidden")
     note = f"unexplained residual, worst run: median {np.median(left):.2g} % of rated"
     title = f"bench {bench.name}, {count} sets with nothing hidden"
     return Report([Table(head, rows, title)], {"seed": seed}, [note], medians)

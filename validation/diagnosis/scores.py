@@ -1,7 +1,7 @@
 """Was the diagnosis right? Runs to findings through files, findings against what was hidden, the tables that count it.
 
-`Outcome` is one set of runs. An effect counts as found when a cause names it alone, or when it is in an equivalence class of
-at most three that comes with a next experiment.
+`Outcome` is one set of runs. An effect counts as found when it is among the causes, or when it is a rival in a class of at
+most three that comes with a next experiment. Wrong is a cause of grade certain that matters and is not there.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import yaml
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.run import RunTableError
 from jtqd.sysid.diagnosis.command import diagnosed
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gap, Place
+from jtqd.sysid.diagnosis.findings import CERTAIN, Cause, Findings, Gap, Place
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import joints_of
 from jtqd.sysid.runs.run_file import RunError
@@ -76,10 +76,10 @@ def judged(runs: Sequence[Columns], joints: Mapping[int, Joint], recorder: Recor
 
 @dataclass(frozen=True)
 class Outcome:
-    """kind: nothing, one, least (one at its minimum), two, unknown. wanted: (name, joint) hidden; per item found alone,
-    in a class, not at all; wrong: single names of causes that are not there; inside: per parameter whether its interval
-    holds the truth; gain_share: part of the true model's gain; settled: the next experiment made the class one (None:
-    not needed or not run); place: whether the map is right.
+    """kind: nothing, one, least (one at its minimum), two, unknown. wanted: (name, joint) hidden; causes: those that matter;
+    named, classed: per hidden effect whether it is a cause, or a rival of one; wrong: certain names of what is not there;
+    inside: per parameter whether its interval holds the truth; gain_share: part of the true model's gain; settled: the next
+    experiment made the class one (None: not needed or not run); place: whether the map is right.
     """
 
     kind: str
@@ -100,7 +100,7 @@ class Outcome:
 
     @property
     def found(self) -> tuple[bool, ...]:
-        """Per hidden effect: named alone, or in a class that the next experiment settles where that was run."""
+        """Per hidden effect: among the causes, or in a class that the next experiment settles where that was run."""
         late = self.settled is not False
         return tuple(n or (c and late) for n, c in zip(self.named, self.classed, strict=True))
 
@@ -124,13 +124,16 @@ def score(
         seed=seed,
         wanted=wanted,
         verdict=findings.verdict,
-        causes=tuple((c.name, c.joint, c.names) for c in findings.causes),
-        named=tuple(_alone(t, findings.causes) is not None for t in library),
+        causes=tuple((c.name, c.joint, c.names) for c in findings.causes if c.matters),
+        named=tuple(_among(t, findings.causes) for t in library),
         classed=tuple(_classed(t, findings) for t in library),
         wrong=tuple(
             f"{c.name} of {c.joint}"
             for c in findings.causes
-            if len(c.names) == 1 and (c.name, c.joint) not in wanted and c.name not in not_wrong
+            if c.grade == CERTAIN
+            and c.matters
+            and (c.name, c.joint) not in wanted
+            and c.name not in not_wrong
         ),
         inside=tuple(item for t in library for item in intervals(t, findings.causes)),
         shown=tuple(
@@ -144,11 +147,8 @@ def score(
     )
 
 
-def _alone(truth: Truth, causes: Sequence[Cause]) -> Cause | None:
-    for c in causes:
-        if c.name == truth["name"] and c.joint == truth["joint"] and len(c.names) == 1:
-            return c
-    return None
+def _among(truth: Truth, causes: Sequence[Cause]) -> bool:
+    return any((c.name, c.joint) == (truth["name"], truth["joint"]) for c in causes)
 
 
 def members(cause: Cause) -> set[tuple[str, Any]]:
@@ -290,15 +290,15 @@ def generator_shares(outcomes: Sequence[Outcome]) -> list[Share]:
     classed = sum(not all(o.named) and all(o.found) for o in one)
     rows = [
         share(
-            "hidden effect at 3x its minimum: named, or in a class of at most 3",
+            "hidden effect at 3x its minimum: a cause, or in a class of at most 3",
             _found(one),
             0.95,
             f"{classed} in a class, {len(of['one']) - len(one)} not visible in their runs",
         ),
-        share("the same at 1x its minimum (no target)", _found(least), None, "named or classed"),
-        share("wrong single name", [bool(o.wrong) for o in hidden], -0.02),
+        share("the same at 1x its minimum (no target)", _found(least), None, "a cause or in a class"),
+        share("certain and wrong", [bool(o.wrong) for o in hidden], -0.02),
         share(
-            "nothing hidden: anything named",
+            "nothing hidden: a cause that matters",
             [bool(o.causes) for o in of["nothing"]],
             -0.01,
             f"else than no_gap: {sum(o.verdict != 'no_gap' for o in of['nothing'])}",
@@ -323,7 +323,7 @@ def bench_shares(outcomes: Sequence[Outcome], real: bool = False) -> list[Share]
     named, foreign = [*known, *of["beside"]], of["foreign"]
     rows = [
         share(
-            "single, three times visible: named, or class of at most 3",
+            "single, three times visible: a cause, or class of at most 3",
             _found(of["single"]),
             0.98,
             _alone_text(of["single"]),
@@ -331,10 +331,13 @@ def bench_shares(outcomes: Sequence[Outcome], real: bool = False) -> list[Share]
         share("half of that size", _found(of["half"]), 0.92, _alone_text(of["half"])),
         share("pairs: both", _found(of["pair"]), 0.90, _alone_text(of["pair"])),
         share(
-            "a wrong name", [bool(o.wrong) for o in named], -0.02, _most(n for o in named for n in o.wrong)
+            "certain and wrong",
+            [bool(o.wrong) for o in named],
+            -0.02,
+            _most(n for o in named for n in o.wrong),
         ),
         share(
-            "nothing hidden: a name, or unexplained",
+            "nothing hidden: a cause, or unexplained",
             [bool(o.causes) or o.verdict == "unexplained" for o in of["nothing"]],
             -0.01,
             _verdicts(of["nothing"]),
@@ -346,7 +349,7 @@ def bench_shares(outcomes: Sequence[Outcome], real: bool = False) -> list[Share]
             -0.0,
             f"{sum(o.slight for o in foreign)} worth less",
         ),
-        share("cause beside a foreign effect: named", _found(of["beside"]), 0.80, _verdicts(of["beside"])),
+        share("cause beside a foreign effect: found", _found(of["beside"]), 0.80, _verdicts(of["beside"])),
         _covered_share("95 % intervals hold the truth", known, 0.93, 0.97),
     ]
     return [row for row in rows if row is not None]
@@ -431,7 +434,7 @@ def _found(outcomes: Sequence[Outcome]) -> list[bool]:
 
 
 def _alone_text(outcomes: Sequence[Outcome]) -> str:
-    return f"{sum(all(o.named) for o in outcomes)} named alone"
+    return f"{sum(all(o.named) for o in outcomes)} among the causes"
 
 
 def _verdicts(outcomes: Sequence[Outcome]) -> str:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import subprocess
 import sys
 import tempfile
@@ -32,6 +31,7 @@ from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
+from jtqd.sysid.diagnosis.solution import PresentEffect, set_state
 from jtqd.sysid.planner.plan import Plan, check_plan
 from validation.diagnosis.entries import ENTRIES, SENSOR, Array, Columns, Hidden, base_value, scaled
 from validation.diagnosis.recorder import PRESETS, Recorder
@@ -50,7 +50,6 @@ from validation.study import ROOT, Report, Table, UsageError, in_processes, shar
 KINDS: Final = ("nothing", "one", "least", "two", "unknown")
 FACTOR: Final = 3.0
 UNLIKE: Final = tuple(name for name, entry in UNKNOWN.items() if not entry.resembling)
-_WHERE: Final = re.compile(r"(motor|torsion) balance of joint (\d)")
 
 
 def trial(
@@ -146,9 +145,6 @@ def _pick(
 
 def minima(row: CandidateEvidence, plain: Case) -> list[Mapping[str, float]]:
     """Return the parameters at the minimum detectable size, one entry per way of looking, absolute as in a joint file."""
-    complete = getattr(row, "at_minimum", ())
-    if complete:
-        return [dict(values) for values in complete if _plausible(row.name, values)]
     nominal = plain.joints[row.joint if isinstance(row.joint, int) else 1]
     entry = ENTRIES[row.name]
     out: list[Mapping[str, float]] = []
@@ -159,18 +155,6 @@ def minima(row: CandidateEvidence, plain: Case) -> list[Mapping[str, float]]:
                 values["channel"] = 0.0 if row.joint == SENSOR else 1.0
             out.append(values)
     return out
-
-
-def _plausible(name: str, values: Mapping[str, float]) -> bool:
-    """Return whether the parameters are within the ranges of the library at three times the size."""
-    ranges = {p.name: p for p in EFFECTS[name].parameters}
-    entry = ENTRIES[name]
-    for key in (entry.parameter, entry.second):
-        if key in values and not entry.key and key != "stiffness_nm_per_rad":
-            away = entry.neutral if key == entry.parameter else 0.0
-            if abs(FACTOR * (values[key] - away)) > max(abs(ranges[key].low), abs(ranges[key].high)):
-                return False
-    return True
 
 
 def _sized(
@@ -210,10 +194,9 @@ def joint_files(case: Case, hidden: bool = False) -> dict[int, Joint]:
 def gains(case: Case, findings: Findings) -> tuple[float, float, float] | None:
     """Return rms before, after, and after with the true model, in the balance that the findings' gain is measured in."""
     gain = findings.gain
-    where = _WHERE.search(gain.split) if gain is not None else None
-    if gain is None or where is None:
+    if gain is None or not gain.balance:
         return None
-    return gain.rmse_before_nm, gain.rmse_after_nm, _true_rms(case, where[1], int(where[2]))
+    return gain.rmse_before_nm, gain.rmse_after_nm, _true_rms(case, gain.balance, gain.joint)
 
 
 def _true_rms(case: Case, balance: str, number: int) -> float:
@@ -227,12 +210,14 @@ def unexplained(
     joint: Joint, number: int, run: str, table: RunTable, balance: str, *, visible: bool = False
 ) -> Array | None:
     """Return what a joint file with its effects leaves of a balance of a run, in means over bins, the torsion's less their
-    mean; None where the run has not that balance. visible: only where the recording shows it.
+    mean; None where the run has not that balance. visible: only where the recording shows it. Current and torsion are those
+    of a simulation with these effects, so that what remains is an error of the current, as torque, and of the twist.
     """
     s = joint_signals(run, table, number, joint, BaseLoss(joint))
     residual = s.motor_nm if balance == "motor" else s.torsion_nm
     if residual is None:
         return None
+    set_state(s, [PresentEffect(EFFECTS[e.name], number, e.parameters) for e in joint.effects])
     for effect in joint.effects:
         there = contribution(EFFECTS[effect.name], effect.parameters, s)
         residual = residual - there.get(balance, 0.0)

@@ -1,7 +1,7 @@
 """HTML report of a diagnosis: one self-contained page, made from the findings alone.
 
-In: `findings.Findings`. Out: HTML. Modules: `page` (the content), `views` (rows and bars), `words` (sentences), `pictures`.
-Imports sysid.report, the effect library, and sysid.campaign for the length of a plan.
+In: `findings.Findings`. Out: HTML. Modules: `words` (what is stated, in the terminal too), `pictures` (over time), `page`.
+Imports sysid.report, and the planner for the length of a plan.
 """
 
 from jtqd.sysid.diagnosis.report.page import render

@@ -2,107 +2,170 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import yaml
 
-from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.errors import ConfigError
-from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, INSUFFICIENT, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gap, Place, priors
 from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, campaign_command, joint_motion_file
-from jtqd.sysid.diagnosis.report import views
-from jtqd.sysid.diagnosis.report.pictures import pictures, trace_rows
-from jtqd.sysid.diagnosis.report.views import gap_views
-from jtqd.sysid.diagnosis.report.words import BADGES, gain_sentence, listed, verdict_sentence
+from jtqd.sysid.diagnosis.report.pictures import pictures
+from jtqd.sysid.diagnosis.report.words import (
+    BADGES,
+    balance_title,
+    bin_name,
+    effect_title,
+    in_words,
+    listed,
+    parameter_title,
+    place,
+    provenance_text,
+    summary,
+)
 from jtqd.sysid.report import page
-from jtqd.sysid.report.numbers import number
+from jtqd.sysid.report.numbers import DASH, number, percent, unit_name, with_unit
 
 TEMPLATE: Final = "report.html.j2"
+_HOT: Final = 2.0
+"""A bin with this many times its even share of the gap is marked."""
+_EVEN: Final = 1.5
+"""An axis without a bin above this many even shares is not shown."""
 
 
-def render(findings: Findings, made: str = "", effects: Mapping[str, Effect] | None = None) -> str:
-    """Return the page. The same findings give the same text.
-
-    Args:
-        findings: all that is shown.
-        made: when and by what, one line for the foot of the page.
-        effects: the library, for equations and tell-tales; default: the one that ships.
-
-    Needs jinja2 and matplotlib (ImportError without them).
-    """
+def render(findings: Findings) -> str:
+    """Return the page. The same findings give the same text. Needs jinja2 and matplotlib (ImportError without them)."""
     colour, badge = BADGES[findings.verdict]
-    drawn = pictures(findings)
-    evidence = views.evidence_views(findings.candidates)
     content = {
         "f": findings,
-        "made": made,
+        "made": provenance_text(findings.provenance, most=len(findings.runs) + 8),
         "badge": badge,
         "badge_colour": colour,
-        "sentence": verdict_sentence(findings),
-        "gain_sentence": gain_sentence(findings),
         "scope": _scope(findings),
-        "has_gap": findings.verdict in {CAUSE, AMBIGUOUS, UNEXPLAINED},
-        "reasons_first": findings.verdict in {UNEXPLAINED, INSUFFICIENT},
-        "causes": views.cause_views(findings, library() if effects is None else effects),
-        "gaps": gap_views(findings.gaps),
-        "left": views.left_view(findings),
-        "evidence": evidence,
-        "shown": max(views.SHOWN, sum(1 for row in evidence if row.state)),
-        "gains": views.gain_views(findings.gain),
-        "reasons": [views.reason_in_words(each) for each in findings.reasons],
-        "pictures": drawn,
-        "closed": sum(1 for each in drawn if not each.opened),
-        "traces": trace_rows(findings),
+        "s": summary(findings),
+        "looked_at": [candidate_row(each) for each in findings.candidates],
+        "gaps": [
+            (
+                f"Joint {gap.joint}, {balance_title(gap.balance)}: {number(gap.rmse_nm)} Nm rms, noise "
+                f"{number(gap.noise_floor_nm)} Nm (from {gap.floor_from})",
+                gap_axes(gap),
+            )
+            for gap in findings.gaps
+        ],
+        "priors": [(effect_title(p.name), p.size, p.set_by_user) for p in priors(findings.trust)],
+        "runs": _run_rows(findings),
+        "pictures": pictures(findings),
         "next": _next(findings),
     }
     return page.render("jtqd.sysid.diagnosis.report", TEMPLATE, content)
 
 
-def library() -> Mapping[str, Effect]:
-    """Return the effects that ship, by name."""
-    from jtqd.estimator.effects import EFFECTS
-
-    return EFFECTS
-
-
 def _scope(findings: Findings) -> str:
     """Return what was looked at, e.g. "6 runs, joints 1 and 2"."""
-    runs = findings.runs_text
     if not findings.joints:
-        return runs
+        return findings.runs_text
     names = listed([str(j) for j in findings.joints])
-    return f"{runs}, joint{'s' if len(findings.joints) > 1 else ''} {names}"
+    return f"{findings.runs_text}, joint{'s' if len(findings.joints) > 1 else ''} {names}"
+
+
+def candidate_row(each: CandidateEvidence) -> tuple[str, str, str, str]:
+    """Return name, place, why it is or is not in the set, and the smallest size that would be."""
+    texts = []
+    for name, value in each.minimum.items():
+        if math.isfinite(value.value) and value.value > 0.0:
+            size = with_unit(value.value, value.unit, 2)
+            texts.append(size if len(each.minimum) == 1 else f"{size} {parameter_title(name)}")
+    return effect_title(each.name), place(each.joint), in_words(each.reason), ", ".join(texts) or DASH
+
+
+def _run_rows(findings: Findings) -> list[tuple[str, str, str, str]]:
+    """Return every run: name, whether it was used, held-out error before and after ("" where it was not measured)."""
+    gains = {g.run: g for g in findings.gain.runs} if findings.gain else {}
+    rows = []
+    for name in findings.runs:
+        gain = gains.get(name)
+        errors = (number(gain.rmse_before_nm), number(gain.rmse_after_nm)) if gain else ("", "")
+        rows.append((name, "" if name in findings.used_runs else "not used", *errors))
+    return rows
+
+
+class Bar(NamedTuple):
+    """One bin: height (1: the largest of all axes of the gap), whether it is marked, all of it as a text."""
+
+    height: float
+    hot: bool
+    text: str
+
+
+class Axis(NamedTuple):
+    """The gap over one operating condition; uneven: largest share in units of an even one; even: height of an even share;
+    ends: of the axis.
+    """
+
+    title: str
+    bars: tuple[Bar, ...]
+    ends: tuple[str, str]
+    peak: str
+    uneven: float
+    even: float
+
+
+def gap_axes(gap: Gap) -> list[Axis]:
+    """Return the axes over which a gap is uneven, the most uneven first; one at least, where there is a map."""
+    axes: dict[str, list[Place]] = {}
+    for each in gap.map:
+        axes.setdefault(each.axis, []).append(each)
+    # where the gap is small beside the noise, the excess of some bins is larger than that of all
+    whole = {name: max(1.0, sum(max(p.share, 0.0) for p in places)) for name, places in axes.items()}
+    even = [p.share / whole[name] * len(places) for name, places in axes.items() for p in places]
+    found = [_axis(name, places, whole[name], max([_HOT, *even])) for name, places in axes.items()]
+    found.sort(key=lambda axis: -axis.uneven)
+    return [axis for k, axis in enumerate(found) if axis.uneven > _EVEN or k == 0]
+
+
+def _axis(name: str, places: Sequence[Place], whole: float, highest: float) -> Axis:
+    """Return one axis; whole: what its shares are parts of; highest: full height, in units of an even share."""
+    ordered, count = sorted(places, key=lambda each: (each.low, each.high)), len(places)
+    shares = [each.share / whole for each in ordered]
+    texts = [
+        f"{bin_name(p)}: {percent(share)}{f', {number(p.rms_nm)} Nm rms' if math.isfinite(p.rms_nm) else ''}"
+        for p, share in zip(ordered, shares, strict=True)
+    ]
+    top = max(range(count), key=shares.__getitem__)
+    ends = ordered[0].low, ordered[-1].high
+    named = name == "quadrant" or not all(map(math.isfinite, ends))
+    unit = unit_name(ordered[top].unit)
+    low, high = (bin_name(ordered[k]) if named else f"{number(ends[k])} {unit}".rstrip() for k in (0, -1))
+    bars = tuple(
+        Bar(max(s, 0.0) * count / highest, s * count > _HOT, text)
+        for s, text in zip(shares, texts, strict=True)
+    )
+    peak = f"{percent(shares[top])} at {bin_name(ordered[top])}"
+    return Axis(name.replace("_", " "), bars, (low, high), peak, shares[top] * count, 1.0 / highest)
 
 
 def _next(findings: Findings) -> dict[str, Any] | None:
     """Why, the plan as YAML, and what it amounts to."""
-    if findings.next_experiment is None:
+    experiment = findings.next_experiment
+    if experiment is None:
         return None
-    plan = findings.next_experiment.get("plan")
-    made = _motions(findings.next_experiment)
+    plan = experiment.get("plan")
+    made = [(MOTION_FILE, experiment.get("motion"))]
+    made += [(joint_motion_file(each["joint"]), each["motion"]) for each in experiment.get("joints", ())]
+    motions = [(file, motion["runs"]) for file, motion in made if motion]
+    seconds = [run["duration_s"] for _, runs in motions for run in runs]
     return {
-        "why": findings.next_experiment["why"],
+        "why": in_words(experiment["why"]),
         "file": PLAN_FILE,
-        "command": findings.next_experiment.get("command") or campaign_command(),
-        "motions": [(file, _runs_of(motion)) for file, motion in made],
-        "amount": plan_amount(plan)
-        if plan is not None
-        else _runs_text([run["duration_s"] for _, motion in made for run in motion["runs"]]),
+        "command": experiment.get("command") or campaign_command(),
+        "motions": [
+            (file, [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in runs])
+            for file, runs in motions
+        ],
+        "amount": plan_amount(plan) if plan is not None else _runs_text(seconds),
         "yaml": "" if plan is None else yaml.safe_dump(plan, sort_keys=False, allow_unicode=True),
     }
-
-
-def _motions(experiment: Mapping[str, Any]) -> list[tuple[str, Mapping[str, Any]]]:
-    """File and content of every motion of a joint alone."""
-    found = [(MOTION_FILE, experiment.get("motion"))]
-    found += [(joint_motion_file(each["joint"]), each["motion"]) for each in experiment.get("joints", ())]
-    return [(file, motion) for file, motion in found if motion]
-
-
-def _runs_of(motion: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """Name, what is done beside it, and length of every run of one joint."""
-    return [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in motion["runs"]]
 
 
 def plan_amount(plan: Mapping[str, Any]) -> str:

@@ -1,10 +1,9 @@
-"""Figures of the residual over time, before and after, and which runs are drawn."""
+"""Figures over time: simulation against measurement, before and after, their difference, and which runs are drawn."""
 
 from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -12,46 +11,51 @@ from typing import Any, Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.findings import Findings, Trace
+from jtqd.sysid.diagnosis.findings import Findings, JointName, Trace
 from jtqd.sysid.diagnosis.report.words import balance_title
 from jtqd.sysid.report.numbers import number
 from jtqd.sysid.report.page import LIGHT, page_svg, thinned
 
-MOST: Final = 6
-"""Figures on a page; the other runs are in its table."""
-FIRST: Final = 2
-"""Of them, shown without a click."""
+MOST: Final = 4
+"""Figures on a page."""
 WIDE_IN: Final = 9.2
 NARROW_IN: Final = 4.4
 _BUCKETS: Final = {WIDE_IN: 360, NARROW_IN: 160}
-_VISIBLE_GAIN: Final = 0.1
-"""Least part of the residual's energy that the causes remove in a figure shown without a click."""
 _FLOOR_SIGMAS: Final = 2.0
-
-
-@dataclass(frozen=True)
-class TraceRow:
-    """One run, joint and balance in the table: root mean squares [Nm]."""
-
-    run: str
-    joint: int
-    balance: str
-    before: str
-    after: str
+_BEFORE, _AFTER = "simulation as it is", "with the entries found"
+_TORQUE: Final = {"motor": "motor torque G Kt i", "torsion": "torque by the twist"}
 
 
 @dataclass(frozen=True)
 class Picture:
-    """One trace as SVG, wide and narrow; text: its alternative text; opened: shown without a click; data: the curves as
-    JSON for `traces.js`.
-    """
+    """One trace as SVG, wide and narrow; text: its alternative text; data: the curves as JSON for `traces.js`."""
 
     title: str
     text: str
     wide: str
     narrow: str
-    opened: bool
     data: str
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve of a panel; role: its colour; curve, less: which arrays of the data it is the first of, less the second."""
+
+    role: str
+    title: str
+    curve: str
+    less: str = ""
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves on one scale [unit]; residual: about zero, with the band of the noise."""
+
+    title: str
+    unit: str
+    height: float
+    lines: tuple[Line, ...]
+    residual: bool = False
 
 
 def rms(x: Any) -> float:
@@ -60,156 +64,130 @@ def rms(x: Any) -> float:
     return float(np.sqrt(np.mean(np.square(x[good])))) if good.any() else float("nan")
 
 
-def trace_rows(findings: Findings) -> list[TraceRow]:
-    """Return the table of all traces."""
-    return [
-        TraceRow(t.run, t.joint, balance_title(t.balance), number(rms(t.before_nm)), number(rms(t.after_nm)))
-        for t in findings.traces
-    ]
-
-
 def chosen_traces(findings: Findings) -> list[Trace]:
-    """Return the traces to draw: one run of each balance, then another of each, at most MOST.
-
-    Balances come in the order of the gaps. With causes the first run of a balance is the one whose energy they reduce by
-    the median share; without causes it is the one with most energy.
+    """Return the traces to draw, one per balance, at most MOST: first the balance that the gain is of (not stated: that of
+    the largest entry) with the run on which the extended model errs most; of the others the run with most error before.
     """
-    groups: dict[tuple[int, str], list[Trace]] = {(g.joint, g.balance): [] for g in findings.gaps}
-    for trace in findings.traces:
-        groups.setdefault((trace.joint, trace.balance), []).append(trace)
-    ranked = [_ranked(group, bool(findings.causes)) for group in groups.values()]
-    most = max((len(group) for group in ranked), default=0)
-    rounds = [group[k] for k in range(most) for group in ranked if k < len(group)]
-    return rounds[:MOST]
+    held = held_out(findings)
+    order = [*held, *((c.joint, c.balance) for c in findings.causes[:1])]
+    order += [(g.joint, g.balance) for g in findings.gaps] + [(t.joint, t.balance) for t in findings.traces]
+    chosen = []
+    for channel in dict.fromkeys(order):
+        errors = held.get(channel, {})
+        group = [t for t in findings.traces if (t.joint, t.balance) == channel]
+        size = [(errors.get(t.run, 0.0), float(np.nansum(t.before_nm**2))) for t in group]
+        chosen += [group[size.index(max(size))]] if group else []
+    return chosen[:MOST]
 
 
-def _ranked(group: Sequence[Trace], both: bool) -> list[Trace]:
-    if not both:
-        return sorted(group, key=lambda t: -_energy(t.before_nm))
-    ordered = sorted(group, key=lambda t: -_removed_share(t))
-    middle = (len(ordered) - 1) // 2
-    return ordered[middle : middle + 1] + ordered[:middle] + ordered[middle + 1 :]
-
-
-def _energy(values: Any) -> float:
-    return float(np.sum(np.nan_to_num(values) ** 2))
-
-
-def _removed_share(trace: Trace) -> float:
-    """Return the part of the residual's energy that the causes remove."""
-    there = _energy(trace.before_nm)
-    return 1.0 - _energy(trace.after_nm) / there if there > 0.0 else 0.0
+def held_out(findings: Findings) -> dict[tuple[JointName, str], dict[str, float]]:
+    """Return the extended model's error [Nm] on each held-out run, of the balance that the gain is of."""
+    gain = findings.gain
+    if gain is None or not gain.joint:
+        return {}
+    return {(gain.joint, gain.balance): {g.run: g.rmse_after_nm for g in gain.runs}}
 
 
 def pictures(findings: Findings) -> list[Picture]:
     """Return the figures, in the order of `chosen_traces`. Raises ImportError without matplotlib."""
     floors = {(g.joint, g.balance): g.noise_floor_nm for g in findings.gaps}
-    both = bool(findings.causes)
-    traces = chosen_traces(findings)
-    first = {(t.joint, t.balance): k for k, t in reversed(list(enumerate(traces)))}
-    visible = [k for k in sorted(first.values()) if both and _removed_share(traces[k]) > _VISIBLE_GAIN]
-    opened = visible[:FIRST] or [0]
-    return [_picture(trace, k, floors, both, k in opened) for k, trace in enumerate(traces)]
+    both = bool(findings.causes or findings.too_small)
+    held, drawn = held_out(findings), []
+    for k, trace in enumerate(chosen_traces(findings)):
+        floor = floors.get((trace.joint, trace.balance), float("nan"))
+        title = f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}"
+        text = (
+            f"Measured and simulated torque of {title}, over {number(trace.time_s[-1])} s: the difference is "
+            f"{number(rms(trace.before_nm))} Nm rms"
+        )
+        text += f" before, {number(rms(trace.after_nm))} Nm rms with the entries found." if both else "."
+        if trace.run in held.get((trace.joint, trace.balance), {}):
+            title += ": the worst held-out run"
+        wide, narrow = (
+            page_svg(partial(_figure, trace, width, floor, both), f"p{k}{name}")
+            for width, name in ((WIDE_IN, "w"), (NARROW_IN, "n"))
+        )
+        drawn.append(Picture(title, text, wide, narrow, _data(trace, floor, both)))
+    return drawn
 
 
-def _picture(
-    trace: Trace, place: int, floors: Mapping[tuple[int, str], float], both: bool, opened: bool
-) -> Picture:
-    floor = floors.get((trace.joint, trace.balance), float("nan"))
-    text = (
-        f"Residual of joint {trace.joint}, {balance_title(trace.balance)}, over {number(trace.time_s[-1])} s of run "
-        f"{trace.run}: {number(rms(trace.before_nm))} Nm rms"
-    )
-    text += (
-        f" before, {number(rms(trace.after_nm))} Nm rms with the causes in the simulation." if both else "."
-    )
-    wide, narrow = (
-        page_svg(partial(_figure, trace, width, floor, both), f"p{place}{name}")
-        for width, name in ((WIDE_IN, "w"), (NARROW_IN, "n"))
-    )
-    title = f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}"
-    return Picture(title, text, wide, narrow, opened, _data(trace, floor, both))
+def panels(trace: Trace, both: bool) -> list[Panel]:
+    """Return the panels of a figure, from above; both: with what the entries change."""
+    measured = Line("ink", "measured", "measured")
+    sides = [("before", _BEFORE), ("after", _AFTER)] if both else [("before", _BEFORE)]
+    torque = _TORQUE.get(trace.balance, "torque")
+    return [
+        *(Panel(torque, "Nm", 2.6, (measured, Line(s, title, "measured", s))) for s, title in sides),
+        Panel("measured less simulated", "Nm", 2.6, tuple(Line(s, t, s) for s, t in sides), residual=True),
+        Panel("velocity", "rad/s", 1.1, (Line("soft", "velocity", "velocity"),)),
+    ]
+
+
+def _curves(trace: Trace, both: bool) -> dict[str, FloatArray]:
+    found = {"measured": trace.measured_nm, "before": trace.before_nm, "velocity": trace.velocity_rad_s}
+    return {**found, "after": trace.after_nm} if both else found
 
 
 def _data(trace: Trace, floor: float, both: bool) -> str:
     """Return the curves of a figure as JSON: 16 bits a value, base64, which is finer than any screen."""
-    curves = [_curve("before", "simulation as it is", "before", trace.before_nm, "Nm", tall=True)]
-    if both:
-        curves.append(_curve("after", "with the causes", "after", trace.after_nm, "Nm", tall=True))
-    curves.append(_curve("soft", "velocity [rad/s]", "velocity", trace.velocity_rad_s, "rad/s"))
-    curves.append(_curve("soft", "torque [Nm]", "torque", trace.torque_nm, "Nm"))
     step = float(np.median(np.diff(trace.time_s))) if len(trace.time_s) > 1 else 1.0
     content = {
         "start_s": round(float(trace.time_s[0]), 6),
         "step_s": float(f"{step:.9g}"),
         "floor_nm": float(f"{floor:.4g}") if np.isfinite(floor) else None,
-        "curves": curves,
+        "curves": {name: _coded(values) for name, values in _curves(trace, both).items()},
+        "panels": [{**vars(p), "lines": [vars(line) for line in p.lines]} for p in panels(trace, both)],
     }
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
 
-def _curve(
-    role: str, title: str, short: str, values: FloatArray, unit: str, *, tall: bool = False
-) -> dict[str, Any]:
+def _coded(values: FloatArray) -> dict[str, Any]:
     good = np.isfinite(values)
     largest = float(np.max(np.abs(values[good]))) if good.any() else 0.0
     scale = largest / 32767.0 or 1.0
     whole = np.where(good, np.round(np.where(good, values, 0.0) / scale), -32768.0).astype("<i2")
     text = base64.b64encode(whole.tobytes()).decode("ascii")
-    named = {"role": role, "title": title, "short": short, "unit": unit, "tall": tall}
-    return {**named, "scale": float(f"{scale:.6g}"), "values": text}
+    return {"scale": float(f"{scale:.6g}"), "values": text}
 
 
 def _figure(trace: Trace, width: float, floor: float, both: bool) -> Any:
-    """Panels over time: residual before, after on the same scale, velocity, sensor torque."""
-    curves = [("before", "simulation as it is", trace.before_nm)]
-    if both:
-        curves.append(("after", "with the causes", trace.after_nm))
-    figure, axes = _panels(len(curves), width)
-    top = _limit([values for _, _, values in curves], floor)
-    buckets = _BUCKETS[width]
-    for axis, (role, title, values) in zip(axes, curves, strict=False):
-        if np.isfinite(floor):
-            sigma = _FLOOR_SIGMAS * floor
-            axis.axhspan(-sigma, sigma, color=LIGHT["noise"], linewidth=0.0, zorder=0)
-        (line,) = axis.plot(*thinned(trace.time_s, values, buckets), color=LIGHT[role], linewidth=0.8)
-        line.set_gid(role)
-        axis.set_ylim(-top, top)
-        axis.set_ylabel("[Nm]")
-        axis.set_title(f"{title}: {number(rms(values))} Nm rms", loc="left", fontsize=9.5, color=LIGHT[role])
-    for axis, name, values in zip(
-        axes[len(curves) :],
-        ("velocity [rad/s]", "torque [Nm]"),
-        (trace.velocity_rad_s, trace.torque_nm),
-        strict=True,
-    ):
-        axis.plot(*thinned(trace.time_s, values, buckets // 2), color=LIGHT["soft"], linewidth=0.8)
-        axis.set_title(name, loc="left", fontsize=8.5, color=LIGHT["soft"], pad=2)
-        axis.locator_params(axis="y", nbins=3)
+    """Panels over time, as `panels` has them."""
+    from matplotlib import pyplot as plt
+
+    shown, curves, buckets = panels(trace, both), _curves(trace, both), _BUCKETS[width]
+    heights = [p.height for p in shown]
+    height = 0.9 + 0.48 * sum(heights)
+    figure, axes = plt.subplots(len(heights), 1, sharex=True, figsize=(width, height), height_ratios=heights)
+    # margins in inches; a layout engine would draw everything twice
+    edges = {"left": 0.62 / width, "right": 1.0 - 0.12 / width, "top": 1.0 - 0.28 / height}
+    figure.subplots_adjust(**edges, bottom=0.45 / height, hspace=0.4)
+    for k, (axis, panel) in enumerate(zip(axes, shown, strict=True)):
+        for line in panel.lines:
+            values = curves[line.curve] - curves[line.less] if line.less else curves[line.curve]
+            title = f"{number(rms(values))} Nm rms" if panel.residual else line.title
+            (drawn,) = axis.plot(
+                *thinned(trace.time_s, values, buckets), color=LIGHT[line.role], linewidth=0.8, label=title
+            )
+            drawn.set_gid(f"{line.role}_{k}")
+        if panel.residual:
+            top = _limit([curves[line.curve] for line in panel.lines], floor)
+            axis.set_ylim(-top, top)
+            if np.isfinite(floor):
+                sigma = _FLOOR_SIGMAS * floor
+                axis.axhspan(-sigma, sigma, color=LIGHT["noise"], linewidth=0.0, zorder=0)
+        axis.set_title(panel.title, loc="right", fontsize=8.0, color=LIGHT["soft"], pad=3)
+        axis.set_ylabel(f"[{panel.unit}]")
+        axis.locator_params(axis="y", nbins=4)
+        if len(panel.lines) > 1:
+            place = {"loc": "lower left", "bbox_to_anchor": (-0.02, 1.0), "ncols": 2, "borderaxespad": 0.0}
+            look = {"fontsize": 8.0, "frameon": False, "labelcolor": "linecolor"}
+            axis.legend(**place, **look, handlelength=0.7, columnspacing=0.9)
     axes[-1].set_xlabel("time [s]")
     axes[-1].set_xlim(trace.time_s[0], trace.time_s[-1])
     return figure
 
 
-def _panels(curves: int, width: float) -> tuple[Any, Any]:
-    """Return figure and axes: `curves` tall ones, two low ones."""
-    from matplotlib import pyplot as plt
-
-    heights = [3.0] * curves + [1.2, 1.2]
-    height = 0.9 + 0.43 * sum(heights)
-    figure, axes = plt.subplots(len(heights), 1, sharex=True, figsize=(width, height), height_ratios=heights)
-    # margins in inches; a layout engine would draw everything twice
-    figure.subplots_adjust(
-        left=0.62 / width,
-        right=1.0 - 0.12 / width,
-        top=1.0 - 0.24 / height,
-        bottom=0.45 / height,
-        hspace=0.45,
-    )
-    return figure, axes
-
-
-def _limit(curves: Sequence[Any], floor: float) -> float:
+def _limit(curves: list[FloatArray], floor: float) -> float:
     """Half the height of the residual's axes: all of every curve, the noise band too."""
     heights = [float(np.nanmax(np.abs(c))) for c in curves if np.isfinite(c).any()]
     if np.isfinite(floor):

@@ -37,8 +37,11 @@
       this.start = data.start_s;
       this.step = data.step_s;
       this.floor = data.floor_nm;
-      this.curves = data.curves.map((c) => ({ ...c, values: decode(c.values, c.scale) }));
-      this.count = this.curves[0].values.length;
+      const curves = {};
+      for (const name in data.curves) curves[name] = decode(data.curves[name].values, data.curves[name].scale);
+      this.panels = data.panels.map((p) => ({ ...p, lines: p.lines.map((l) => (
+        { ...l, values: l.less ? curves[l.curve].map((v, k) => v - curves[l.less][k]) : curves[l.curve] })) }));
+      this.count = curves.measured.length;
       this.all();
       this.box = document.createElement("div");
       this.box.className = "zoom";
@@ -99,7 +102,9 @@
     read(place) {
       const k = Math.round(place);
       if (k < this.from || k >= this.to) return;
-      const values = this.curves.map((c) => `${c.short} ${Number.isNaN(c.values[k]) ? "–" : c.values[k].toPrecision(3)} ${c.unit}`);
+      const named = new Map();
+      for (const p of this.panels) for (const l of p.lines) named.set((p.residual ? "difference " : "") + l.title, [l.values[k], p.unit]);
+      const values = [...named].map(([name, [v, unit]]) => `${name} ${Number.isNaN(v) ? "–" : v.toPrecision(3)} ${unit}`);
       this.readout.textContent = `${(this.start + k * this.step).toFixed(3)} s: ${values.join(", ")}`;
     }
     path(values, x, y) {
@@ -123,38 +128,43 @@
     }
     draw() {
       this.width = Math.max(this.box.clientWidth, 280);
-      const tall = this.width < 560 ? 110 : 150, low = 60, heights = this.curves.map((c) => (c.tall ? tall : low));
+      const part = this.width < 560 ? 42 : 54, heights = this.panels.map((p) => part * p.height);
       this.height = heights.reduce((a, b) => a + b + TOP, 0) + AXIS;
       this.svg.replaceChildren();
       this.svg.setAttribute("viewBox", `0 0 ${this.width} ${this.height}`);
       const x = (k) => LEFT + (k - this.from) / (this.to - this.from) * (this.width - LEFT - RIGHT);
       const t0 = this.start + this.from * this.step, t1 = this.start + this.to * this.step;
       const [times, digits] = ticks(t0, t1, this.width / 90);
-      let shared = 0;
-      for (const c of this.curves) if (c.tall) for (let k = this.from; k < this.to; k++) if (Math.abs(c.values[k]) > shared) shared = Math.abs(c.values[k]);
-      if (this.floor) shared = Math.max(shared, 2.6 * this.floor);
-      let top = 0;
-      this.curves.forEach((c, place) => {
-        top += TOP;
-        const height = heights[place];
-        let least = -1.05 * shared || -1, most = 1.05 * shared || 1;
-        if (!c.tall) {
-          least = Infinity; most = -Infinity;
-          for (let k = this.from; k < this.to; k++) { if (c.values[k] < least) least = c.values[k]; if (c.values[k] > most) most = c.values[k]; }
-          if (!(most > least)) { least = (least === Infinity ? 0 : least) - 1; most = least + 2; }
-          const pad = 0.06 * (most - least); least -= pad; most += pad;
+      const range = (panels) => {
+        let least = Infinity, most = -Infinity;
+        for (const p of panels) for (const l of p.lines) for (let k = this.from; k < this.to; k++) {
+          if (l.values[k] < least) least = l.values[k];
+          if (l.values[k] > most) most = l.values[k];
         }
-        const base = top, y = (v) => base + (most - v) / (most - least) * height;
-        if (c.tall && this.floor) make(this.svg, "rect", { x: LEFT, width: this.width - LEFT - RIGHT, y: y(2 * this.floor), height: y(-2 * this.floor) - y(2 * this.floor), class: "floor" });
+        if (!(most > least)) { least = (least === Infinity ? 0 : least) - 1; most = least + 2; }
+        return [least - 0.06 * (most - least), most + 0.06 * (most - least)];
+      };
+      const torque = range(this.panels.filter((p) => p.unit === "Nm" && !p.residual));
+      let top = 0;
+      this.panels.forEach((p, place) => {
+        top += TOP;
+        const height = heights[place], base = top;
+        let [least, most] = p.residual || p.unit !== "Nm" ? range([p]) : torque;
+        if (p.residual) { most = Math.max(-least, most, 2.6 * (this.floor || 0)); least = -most; }
+        const y = (v) => base + (most - v) / (most - least) * height;
+        if (p.residual && this.floor) make(this.svg, "rect", { x: LEFT, width: this.width - LEFT - RIGHT, y: y(2 * this.floor), height: y(-2 * this.floor) - y(2 * this.floor), class: "floor" });
         const [levels, places] = ticks(least, most, Math.max(height / 34, 2.5));
         for (const v of levels) {
           make(this.svg, "line", { x1: LEFT, x2: this.width - RIGHT, y1: y(v), y2: y(v), class: "grid" });
           make(this.svg, "text", { x: LEFT - 6, y: y(v) + 4, "text-anchor": "end" }, v.toFixed(places));
         }
         for (const t of times) make(this.svg, "line", { x1: x((t - this.start) / this.step), x2: x((t - this.start) / this.step), y1: top, y2: top + height, class: "grid" });
-        make(this.svg, "path", { d: this.path(c.values, x, y), style: `stroke:var(--${c.role})` });
-        const part = c.tall ? `: ${rms(c.values, this.from, this.to).toPrecision(3)} Nm rms` : "";
-        make(this.svg, "text", { x: LEFT, y: top - 6, style: `fill:var(--${c.role})`, class: "title" }, `${c.title}${part}`);
+        const title = make(this.svg, "text", { x: LEFT, y: top - 6, class: "title" }, `${p.title} [${p.unit}]`);
+        for (const l of p.lines) {
+          make(this.svg, "path", { d: this.path(l.values, x, y), style: `stroke:var(--${l.role})` });
+          const size = p.residual ? ` ${rms(l.values, this.from, this.to).toPrecision(3)} Nm rms` : "";
+          if (p.lines.length > 1) make(title, "tspan", { dx: 14, style: `fill:var(--${l.role})` }, `${l.title}${size}`);
+        }
         top += height;
       });
       for (const t of times) make(this.svg, "text", { x: x((t - this.start) / this.step), y: top + 16, "text-anchor": "middle" }, t.toFixed(digits));

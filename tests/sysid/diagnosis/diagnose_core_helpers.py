@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,76 +11,10 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.findings import JointName
-from jtqd.sysid.diagnosis.mixed_model import Mixed
-from jtqd.sysid.diagnosis.noise import Sums
 from jtqd.sysid.diagnosis.regressors import ChannelData, EffectCandidate, RunData
-from jtqd.sysid.diagnosis.search import Search
 from jtqd.sysid.diagnosis.signals import Channel
 
 MOTOR1, TORSION1 = Channel(1, "motor"), Channel(1, "torsion")
-
-
-@dataclass(frozen=True)
-class Dense:
-    """y = X beta + Z u + e of some runs, sample by sample: x [run][n, p], z [run][n, q], y [run][n]; e of unit variance."""
-
-    x: list[FloatArray]
-    z: list[FloatArray]
-    y: list[FloatArray]
-
-    def mixed(self, prior_sigma: Sequence[float]) -> Mixed:
-        return Mixed(self.sums(), self.x[0].shape[1], np.array(prior_sigma))
-
-    def sums(self) -> list[Sums]:
-        parts = [np.column_stack(part) for part in zip(self.x, self.z, self.y, strict=True)]
-        return [Sums(m.T @ m, len(m)) for m in parts]
-
-    def covariances(self, variances: FloatArray) -> list[FloatArray]:
-        """Of y of each run [n, n]."""
-        return [np.eye(len(z)) + (z * variances) @ z.T for z in self.z]
-
-    def deviance(self, beta: FloatArray, variances: FloatArray, columns: Sequence[int]) -> float:
-        """-2 log of the normal density of all y, less its constant."""
-        out = 0.0
-        for x, y, c in zip(self.x, self.y, self.covariances(variances), strict=True):
-            rest = y - x[:, columns] @ beta
-            out += float(rest @ np.linalg.solve(c, rest)) + float(np.linalg.slogdet(c)[1])
-        return out
-
-    def least_squares(
-        self, variances: FloatArray, columns: Sequence[int], leave: int | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Generalised least squares of the runs but `leave`: coefficients and covariance."""
-        gram, right = np.zeros((len(columns), len(columns))), np.zeros(len(columns))
-        for k, c in enumerate(self.covariances(variances)):
-            if k != leave:
-                x = self.x[k][:, columns]
-                gram += x.T @ np.linalg.solve(c, x)
-                right += x.T @ np.linalg.solve(c, self.y[k])
-        inverse = np.asarray(np.linalg.inv(gram), np.float64)
-        return inverse @ right, inverse
-
-
-def dense(
-    seed: int,
-    beta: Sequence[float],
-    sigma: Sequence[float],
-    *,
-    runs: int = 5,
-    count: int = 60,
-    columns: FloatArray | None = None,
-) -> Dense:
-    """Runs with coefficients beta [p] of random columns (or `columns` [runs, n, p]) and nuisances of spread sigma [q]: a
-    constant first, then random columns.
-    """
-    rng = np.random.default_rng(seed)
-    p, q = len(beta), len(sigma)
-    x = rng.normal(size=(runs, count, p)) if columns is None else columns
-    z = rng.normal(size=(runs, count, q))
-    z[:, :, 0] = 1.0
-    u = rng.normal(size=(runs, q)) * np.array(sigma)
-    y = x @ np.array(beta, np.float64) + np.einsum("rnq,rq->rn", z, u) + rng.normal(size=(runs, count))
-    return Dense(list(x), list(z), list(y))
 
 
 def candidates(joint: Joint, *wanted: tuple[str, JointName, int]) -> list[EffectCandidate]:
@@ -93,15 +26,6 @@ def candidates(joint: Joint, *wanted: tuple[str, JointName, int]) -> list[Effect
         out.append(EffectCandidate(EFFECTS[name], where, term, first))
         first += len(term.basis)
     return out
-
-
-def search_of(
-    problem: Dense, found: Sequence[EffectCandidate], least_nm: float = 0.005, sigma: float = 0.1
-) -> Search:
-    """A search over these candidates; every nuisance has the prior spread sigma."""
-    q = problem.z[0].shape[1]
-    rows = float(sum(len(y) for y in problem.y))
-    return Search(problem.mixed([sigma] * q), found, rows, np.eye(problem.x[0].shape[1])[None], least_nm)
 
 
 def run_data(

@@ -18,7 +18,7 @@ from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, Gap, Place, Value
+from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, Gap, Place, Present, Value
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.runs.tables import write_run
 
@@ -77,7 +77,10 @@ def findings(verdict: str = "cause", causes: tuple[Cause, ...] = (), **parts: An
         "joints": (1, 2),
         "gaps": (Gap(2, "motor", 0.8, 0.2, "repeated runs", (place,)),),
         "causes": causes,
-        "gain": Gain(0.8, 0.2, "leave one run out", (0.6, 0.8), math.nan, math.nan),
+        "predicts": tuple(
+            Present(c.name, c.joint, {name: v.value for name, v in c.parameters.items()}) for c in causes
+        ),
+        "gain": Gain(0.8, 0.2, "leave one run out", (0.6, 0.8)),
     }
     return Findings(**(given | parts))
 
@@ -102,10 +105,16 @@ class Core:
         self.answer: Findings = findings(causes=(COULOMB,))
         self.scopes: list[Scope] = []
         self.asked: list[tuple[list[tuple[str, RunTable]], dict[int, Joint]]] = []
+        self.options: list[dict[str, Any]] = []
 
     def diagnose(
-        self, runs: Sequence[tuple[str, RunTable]], joints: Mapping[int, Joint], scope: Scope = EVERYTHING
+        self,
+        runs: Sequence[tuple[str, RunTable]],
+        joints: Mapping[int, Joint],
+        scope: Scope = EVERYTHING,
+        **options: Any,
     ) -> Findings:
+        self.options.append(options)
         self.scopes.append(scope)
         self.asked.append((list(runs), dict(joints)))
         return replace(self.answer, runs=tuple(name for name, _ in runs), joints=tuple(joints))

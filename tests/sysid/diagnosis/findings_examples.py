@@ -8,7 +8,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, OutlierRun, UnexplainedResidual
+from jtqd.sysid.diagnosis.findings import (
+    Cause,
+    Findings,
+    Gain,
+    OutlierRun,
+    Provenance,
+    RunGain,
+    UnexplainedResidual,
+    Untold,
+)
 from tests.sysid.diagnosis.findings_parts import (
     GAIN,
     INFINITY,
@@ -29,6 +38,11 @@ def _runs(count: int) -> tuple[str, ...]:
     return tuple(f"excitation_{k:02d}.csv.gz" for k in range(1, count + 1))
 
 
+def _held(count: int, before: float, after: float) -> tuple[RunGain, ...]:
+    """Held-out errors; the third run is the worst."""
+    return tuple(RunGain(run, before, after * (1.2 if k == 2 else 0.9)) for k, run in enumerate(_runs(count)))
+
+
 def one_cause() -> Findings:
     """Torque ripple in joint 1, one joint recorded."""
     ripple = {
@@ -38,6 +52,7 @@ def one_cause() -> Findings:
     }
     return Findings(
         verdict="cause",
+        provenance=Provenance("2026-11-26", "0.2.0", "jtq diagnose runs --out d", {"joint1.yaml": "ab" * 32}),
         reasons=("the gap is 2.3 times the noise floor of 3 repeated runs",),
         runs=_runs(6),
         joints=(1,),
@@ -51,8 +66,16 @@ def one_cause() -> Findings:
             ),
             gap(1, "torsion", 0.152, 0.149, {}),
         ),
-        causes=(
-            Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor", 0.94, 57.0),
+        causes=(Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor", 0.94),),
+        too_small=(
+            Cause(
+                *("current_offset", 1, ("current_offset",), {"offset_a": value(0.0123, 0.001, "A")}),
+                *(40.0, NAN, 0.03, "motor", 0.01),
+            ),
+        ),
+        cannot_be_told=(
+            Untold("gear_damping", 1, "these runs have no variation that shows it", "quick_changes"),
+            Untold("sensor_drift", "sensor", "cannot be told from these runs", "warm_up"),
         ),
         explained_share=0.94,
         unexplained=UnexplainedResidual(1, "motor", 0.072, 0.0018, 0.06, 0.2, matters=False),
@@ -71,12 +94,14 @@ def one_cause() -> Findings:
         candidates=candidates(
             (1,),
             {
-                ("torque_ripple", 1): (4312.0, 0.81, "chosen"),
-                ("cogging", 1): (212.0, 0.05, "explained by torque_ripple"),
-                ("kinematic_error", 1): (94.0, 0.03, "explained by torque_ripple"),
+                ("torque_ripple", 1): (4312.0, 0.81, "in the set, certain"),
+                ("cogging", 1): (212.0, 0.05, "no evidence beyond the set"),
+                ("kinematic_error", 1): (94.0, 0.03, "no evidence beyond the set"),
             },
         ),
-        gain=Gain(0.343, 0.151, "6 runs, each left out once", (0.185, 0.198), 0.0412, 0.0187),
+        gain=Gain(
+            0.343, 0.151, "6 runs, each left out once", (0.185, 0.198), _held(6, 0.343, 0.151), 1, "motor"
+        ),
         traces=tuple(
             trace(run, 1, balance, RIPPLE if balance == "motor" else NOTHING, seed=k)
             for k, run in enumerate(_runs(6))
@@ -124,18 +149,30 @@ def two_causes() -> Findings:
             gap(2, "torsion", 0.211, 0.21, {}),
         ),
         causes=(
-            Cause("viscous_friction", 1, ("viscous_friction",), viscous, 8210.0, 0.77, 0.81, "motor"),
+            Cause("viscous_friction", 1, ("viscous_friction",), viscous, 8210.0, NAN, 0.81, "motor", 0.91),
             Cause(
-                "link_inertia", 1, ("link_inertia", "channel_delay"), inertia, 133.0, 0.09, 0.22, "torsion"
+                *(
+                    "link_inertia",
+                    1,
+                    ("link_inertia", "channel_delay"),
+                    inertia,
+                    4.0,
+                    NAN,
+                    0.22,
+                    "torsion",
+                    0.08,
+                ),
+                grade="one_of",
+                rivals=("channel_delay",),
             ),
         ),
         candidates=candidates(
             (1, 2),
             {
-                ("viscous_friction", 1): (8210.0, 0.77, "chosen"),
-                ("link_inertia", 1): (133.0, 0.09, "chosen"),
-                ("channel_delay", 1): (129.4, 0.088, "class of link_inertia"),
-                ("torque_constant", 1): (1204.0, 0.11, "explained by viscous_friction"),
+                ("viscous_friction", 1): (8210.0, 0.77, "in the set, certain"),
+                ("link_inertia", 1): (133.0, 0.09, "in the set, certain"),
+                ("channel_delay", 1): (129.4, 0.088, "no evidence beyond the set"),
+                ("torque_constant", 1): (1204.0, 0.11, "no evidence beyond the set"),
             },
         ),
         gain=Gain(0.912, 0.238, "6 runs, each left out once", (0.629, 0.711)),
@@ -159,6 +196,8 @@ def no_gap() -> Findings:
         reasons=("no effect of the library and no map stands out of the noise",),
         runs=_runs(6),
         joints=(1, 2),
+        too_small=one_cause().too_small,
+        unexplained=UnexplainedResidual(1, "motor", 0.0, 0.0, 0.0, 0.2, matters=False),
         gaps=tuple(gap(j, b, 0.154 + 0.001 * j, 0.153, {}) for j in (1, 2) for b in ("motor", "torsion")),
         candidates=candidates((1, 2), {}),
         traces=tuple(trace(run, 1, "motor", NOTHING, seed=k) for k, run in enumerate(_runs(2))),
@@ -176,9 +215,8 @@ def unexplained() -> Findings:
         runs=_runs(4),
         joints=(1,),
         gaps=(gap(1, "motor", 0.61, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.2}}),),
-        candidates=candidates(
-            (1,), {("stribeck_friction", 1): (38.0, 0.04, "does not hold on held-out runs")}
-        ),
+        candidates=candidates((1,), {("stribeck_friction", 1): (38.0, 0.04, "no evidence beyond the set")}),
+        unexplained=UnexplainedResidual(1, "motor", 0.58, 0.0145, 1.0, 0.2, matters=True),
         channel_notes=("excitation_03.csv.gz: j1.temperature_c is constant (25.0): not used",),
         traces=tuple(trace(run, 1, "motor", SLIP, seed=k) for k, run in enumerate(_runs(4))),
     )
@@ -200,7 +238,7 @@ def insufficient() -> Findings:
                 c,
                 delta_bic=NAN,
                 held_out_gain=NAN,
-                reason="invisible in these runs",
+                reason="cannot be told from these runs",
                 minimum={k: replace(v, value=INFINITY) for k, v in c.minimum.items()},
             )
             for c in candidates((1,), {})
@@ -232,17 +270,18 @@ def sensor() -> Findings:
                 ("sensor_gain",),
                 {"gain": value(1.0481, 0.0017, "1")},
                 5120.0,
-                0.92,
+                NAN,
                 0.79,
                 "motor",
+                0.97,
             ),
         ),
         candidates=candidates(
             (1, 2),
             {
-                ("sensor_gain", "sensor"): (5120.0, 0.92, "chosen"),
-                ("torque_constant", 1): (2230.0, 0.44, "explained by sensor_gain"),
-                ("torque_constant", 2): (2190.0, 0.43, "explained by sensor_gain"),
+                ("sensor_gain", "sensor"): (5120.0, 0.92, "in the set, certain"),
+                ("torque_constant", 1): (2230.0, 0.44, "no evidence beyond the set"),
+                ("torque_constant", 2): (2190.0, 0.43, "no evidence beyond the set"),
             },
         ),
         gain=Gain(0.82, 0.214, "6 runs, each left out once", (0.582, 0.623)),

@@ -55,7 +55,7 @@ def given(number: float, unit: str = "") -> Value:
 def candidates(
     joints: tuple[int, ...], chosen: Mapping[tuple[str, int | str], tuple[float, float, str]]
 ) -> tuple[CandidateEvidence, ...]:
-    """All of the library for these joints; chosen: ΔBIC, held-out gain and reason of those that stand out."""
+    """All of the library for these joints; chosen: evidence, held-out gain and reason of those that stand out."""
     keys: list[tuple[str, int | str]] = [(name, j) for j in joints for name in JOINT_EFFECTS]
     keys += [(name, "sensor") for name in SENSOR_EFFECTS]
     random = np.random.default_rng(4)
@@ -65,7 +65,7 @@ def candidates(
         minimum = {parameter: Value(size, (size, size), unit)}
         bic, held, reason = chosen.get(
             (name, joint),
-            (float(random.uniform(-9, 4)), float(random.uniform(-0.01, 0.006)), "below threshold"),
+            (float(random.uniform(-9, 4)), float(random.uniform(-0.01, 0.006)), "no evidence beyond the set"),
         )
         if (name, joint) not in chosen and "temperature" in name:
             bic, held, reason = NAN, NAN, "needs temperature_c"
@@ -73,7 +73,9 @@ def candidates(
             reason = "invisible in these runs"
         shared = float(random.uniform(0, 0.3)) if chosen and np.isfinite(bic) else NAN
         rows.append(
-            CandidateEvidence(name, joint, bic, held, 1.0 if reason == "chosen" else shared, minimum, reason)
+            CandidateEvidence(
+                name, joint, bic, held, 1.0 if reason.startswith("in the set") else shared, minimum, reason
+            )
         )
     return tuple(rows)
 
@@ -139,4 +141,5 @@ def trace(run: str, joint: int, balance: str, gone: Gone, *, seconds: float = 60
     noise = random.normal(0.0, 0.1, len(time))
     slow = np.convolve(random.normal(0.0, 1.0, len(time)), np.ones(60) / 60, "same")
     after = noise + 0.9 * slow
-    return Trace(run, joint, balance, time, after + gone(velocity, torque, angle), after, velocity, torque)
+    before = after + gone(velocity, torque, angle)
+    return Trace(run, joint, balance, time, before, after, velocity, torque, torque + before)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib.util
 import json
 from collections.abc import Callable
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 
+from jtqd import __version__
 from jtqd.estimator.run import RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
@@ -79,9 +81,11 @@ def test_status_and_files_by_verdict(
     assert run(tmp_path, "--joint", JOINT_FILE, "--out", out) == (0 if verdict == "no_gap" else 3)
     text, _ = capsys.readouterr()
     assert text.startswith(f"{verdict}: ")
-    assert ("coulomb_friction of joint 2: coulomb_nm 3 -> 4.4 [4.3, 4.5] Nm (+46.7 %)" in text) == (
-        verdict == "cause"
-    )
+    row = "joint 2        Coulomb friction  3.00 -> 4.40 Nm  [4.30, 4.50]"
+    assert (row in text) == (verdict == "cause")
+    last = text.splitlines()[-1]
+    assert f"sha256 of a.csv {made_in(out)['runs'][0]['sha256'][:12]}, b.csv.gz" in last
+    assert last.endswith(f": jtq diagnose {tmp_path} --joint {JOINT_FILE} --out {out}")
     made = made_in(out)
     assert made["verdict"] == verdict
     assert [each["name"] for each in made["runs"]] == ["a.csv", "b.csv.gz", "c.csv"]
@@ -92,6 +96,27 @@ def test_status_and_files_by_verdict(
     assert (out / "report.html").read_text() == f"<html>{verdict}</html>"
     effects = [effect.name for effect in load_joint(out / "extended.joint.yaml").effects]
     assert effects == (["coulomb_friction", "sensor_offset"] if verdict == "cause" else [])
+
+
+def test_the_findings_hold_what_they_were_made_of(tmp_path: Path, core: Core) -> None:
+    write_runs(tmp_path, numbers=(1,))
+    columns = ("time_s", "j1.current_a", "j1.motor_position_rad", "j1.link_position_rad", "j1.torque_nm")
+    (tmp_path / "map.yaml").write_text(yaml.safe_dump({name: name for name in columns}))
+    (tmp_path / "j.yaml").write_text(joint_text())
+    files = ("--columns", tmp_path / "map.yaml", "--joint", tmp_path / "j.yaml")
+    trust = ("--trust", "sensor_gain=5%", "--relevance", "2")
+    run(tmp_path / "a.csv", *files, "--out", tmp_path / "o", *trust)
+    made = made_in(tmp_path / "o")
+    origin = made["provenance"]
+    assert list(origin["inputs"]) == ["a.csv", str(tmp_path / "j.yaml"), str(tmp_path / "map.yaml")]
+    for path in (tmp_path / "j.yaml", tmp_path / "map.yaml"):
+        assert origin["inputs"][str(path)] == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert origin["inputs"]["a.csv"] == made["runs"][0]["sha256"]
+    assert origin["version"] == __version__
+    assert origin["command"].startswith(f"jtq diagnose {tmp_path / 'a.csv'} --columns")
+    assert made["relevance"] == 0.02
+    assert [each["name"] for each in made["priors"] if each["set_by_user"]] == ["sensor_gain"]
+    assert core.options == [{"relevance": 0.02, "trust": {"sensor_gain": 5.0}}]
 
 
 def test_json_on_standard_output_is_the_file(
@@ -264,6 +289,9 @@ def test_options_reach_the_diagnosis(tmp_path: Path, core: Core, capsys: pytest.
     assert load_joint(tmp_path / "o" / "extended.joint.yaml").motion_limits is None  # not of the joint
     assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--without", "gravity") == 2
     assert "--without gravity: found no effect of that name" in capsys.readouterr().err
+    for wrong in ("sensor_gain", "sensor_gain=5Nm", "gravity=5%"):
+        assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--trust", wrong) == 2
+        assert f"--trust {wrong}: found " in said(capsys)
     for wrong in ("speed=1", "travel_rad=1", "travel_rad=1:-1", "velocity_rad_s=fast", "torque_nm=0"):
         with pytest.raises(SystemExit) as caught:
             run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p", "--limits", wrong)

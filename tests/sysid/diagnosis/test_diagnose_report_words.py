@@ -1,13 +1,15 @@
-"""What the report of a diagnosis says in words, numbers and bars, against what the findings hold. No page is made here."""
+"""What report and terminal state of a diagnosis: numbers, names and order against what the findings hold."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
+from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.findings import (
     CandidateEvidence,
     Findings,
@@ -15,166 +17,271 @@ from jtqd.sysid.diagnosis.findings import (
     Gap,
     Place,
     UnexplainedResidual,
+    Untold,
     Value,
-    summary_lines,
+    priors,
     to_mapping,
 )
-from jtqd.sysid.diagnosis.report.views import evidence_views, gain_views, gap_views
-from jtqd.sysid.diagnosis.report.words import effect_title, gain_sentence, parameter_title, verdict_sentence
+from jtqd.sysid.diagnosis.report.page import candidate_row, gap_axes
+from jtqd.sysid.diagnosis.report.words import (
+    MOST_ROWS,
+    effect_title,
+    headline,
+    in_words,
+    parameter_title,
+    provenance_text,
+    short,
+    summary,
+    terminal_lines,
+)
 from tests.sysid.diagnosis import findings_examples as examples
-from tests.sysid.diagnosis.findings_parts import gap
+from tests.sysid.diagnosis.findings_parts import gap, value
 
-PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")
+JOINT = load_joint(shipped("joint1.yaml"))
+NARROW = "\u00a0"
+INTERVAL = re.compile(r"\[(\S+), (\S+)\]")
+
+
+def with_value(name: str, parameter: str, found: Value) -> Findings:
+    """One cause with one parameter, beside the joint file that ships."""
+    base = examples.one_cause()
+    one = replace(base.causes[0], name=name, names=(name,), parameters={parameter: found})
+    return replace(base, causes=(one,), joint_files={1: JOINT}, too_small=())
+
+
+def test_the_terminal_shows_this() -> None:
+    """One page as a whole: a change of it is to be looked at."""
+    assert terminal_lines(examples.one_cause()) == [
+        "cause: Torque ripple of joint 1 explains 94 % of the gap: 0.42 Nm (certain). The extended model errs by 0.15 "
+        "instead of 0.34 Nm on held-out runs.",
+        f"  outlier run: {examples.one_cause().outlier_runs[0].text}",
+        "  place    entry          file -> found  95 % interval   share  grade",
+        "  joint 1  torque ripple  0.418 Nm       [0.397, 0.439]  94 %   certain (order 2 per revolution, phase 0.71 rad)",
+        "too small to matter: current offset of joint 1 12 mA",
+        "certain: given torque ripple ± 1 % of rated.",
+        "remains: 0.072 Nm rms (0.18 % of rated) at joint 1, motor balance; it would matter from 0.20 Nm",
+        "these runs cannot tell: gear damping (would take quick changes); sensor drift (would take warm up)",
+        "2026-11-26, jtqd 0.2.0, sha256 of joint1.yaml abababababab: jtq diagnose runs --out d",
+    ]
+
+
+@pytest.mark.parametrize("make", examples.EXAMPLES.values())
+def test_a_person_reads_few_lines_and_no_evidence(make: Callable[[], Findings]) -> None:
+    found = make()
+    s, lines = summary(found), terminal_lines(found)
+    assert 1 <= len(s.headline) <= 2
+    assert all(sentence.endswith(".") for sentence in s.headline)
+    shown = [*s.headline, *s.rows, s.also, s.small, s.foot, s.remains, s.next, s.untold]
+    assert sum(1 for each in shown if each) <= 10  # with badge and head of the table 12
+    assert not re.search(r"\b(nan|inf|None|BIC)\b", "\n".join(lines))
+    for cause in found.causes:
+        assert f"{cause.delta_evidence:.0f}" not in re.findall(r"\d+", "\n".join(lines))
 
 
 @pytest.mark.parametrize(
-    ("make", "said"),
+    ("name", "parameter", "found", "row", "first"),
     [
-        (examples.one_cause, "Cause of the simulation error: torque ripple of joint 1."),
+        ("coulomb_friction", "coulomb_nm", value(4.4, 0.1, "Nm"), "3.00 -> 4.40 Nm", "3.0 -> 4.4 Nm"),
         (
-            examples.two_causes,
-            "Cause of the simulation error: viscous friction of joint 1 and either link inertia or channel delay "
-            "(joint 1); these runs cannot distinguish the alternatives.",
+            "coulomb_friction",
+            "coulomb_nm",
+            value(3.004, 0.001, "Nm"),
+            "3.0000 -> 3.0040 Nm",
+            "3.000 -> 3.004 Nm",
         ),
         (
-            examples.no_gap,
-            "The simulation explains these runs; the remaining error of 0.155 Nm is noise (0.153 Nm).",
+            *("rotor_inertia", "rotor_inertia_kgm2", value(1.2e-5, 1e-6, "kg m2")),
+            *("7.00e-05 -> 1.20e-05 kg m²", "7.0e-05 -> 1.2e-05 kg m²"),
         ),
-        (
-            examples.unexplained,
-            "The simulation has a gap that no effect of the library explains: joint 1, residual 0.610 Nm, "
-            "noise floor 0.200 Nm; 52 % of it at link angle 1.18 to 1.57 rad.",
-        ),
-        (examples.insufficient, "These runs are not sufficient to assess the simulation."),
-        (examples.sensor, "Cause of the simulation error: sensor gain."),
+        ("current_offset", "offset_a", value(0.0123, 0.001, "A"), "12.3 mA", "12 mA"),
+        ("sensor_gain", "gain", value(1.0481, 0.0017, ""), "1.0000 -> 1.0481", "1.00 -> 1.05"),
+        ("hysteresis", "torque_nm", Value(1.5, (-math.inf, math.inf), "Nm"), "1.50 Nm", "1.5 Nm"),
     ],
 )
-def test_the_verdict_is_one_sentence(make: Callable[[], Findings], said: str) -> None:
-    assert verdict_sentence(make()).translate(PLAIN_SPACE) == said
+def test_values_of_file_and_found_have_one_power_of_ten(
+    name: str, parameter: str, found: Value, row: str, first: str
+) -> None:
+    s = summary(with_value(name, parameter, found))
+    assert s.rows[0].found.replace(NARROW, " ") == row
+    assert first in s.headline[0].replace(NARROW, " ")
+    ends = INTERVAL.fullmatch(s.rows[0].interval)
+    assert (ends is None) == (not math.isfinite(found.ci95[0]))
+    if ends is not None:
+        powers = {
+            text.partition("e")[2] for text in (*ends.groups(), row.rpartition("> ")[2].partition(" ")[0])
+        }
+        assert len(powers) == 1
+        scale = 1e3 if "mA" in row else 1.0
+        assert [float(x) for x in ends.groups()] == pytest.approx([scale * x for x in found.ci95], rel=0.02)
 
 
-def test_a_line_and_bursts_are_said_as_what_they_are() -> None:
+def test_a_value_at_its_bound_is_zero_and_what_differs_is_seen_to_differ() -> None:
+    at_bound = Value(1e-9, (1e-9, 1.04e-5), "kg m2")
+    (row,) = summary(with_value("rotor_inertia", "rotor_inertia_kgm2", at_bound)).rows
+    assert (row.found.replace(NARROW, " "), row.interval) == ("7.00e-05 -> 0 kg m²", "[0, 1.04e-05]")
+    wide = value(1.23, 0.4, "Nm")
+    joint = replace(JOINT, friction=replace(JOINT.friction, coulomb_nm=0.001))
+    made = replace(with_value("coulomb_friction", "coulomb_nm", wide), joint_files={1: joint})
+    assert summary(made).rows[0].found == "0.001 -> 1.23 Nm"
+    assert [short(x) for x in (0.0123, 5.7, 1.0, 123.4, 0.0)] == ["0.012", "5.7", "1.0", "123", "0"]
+
+
+def test_one_of_several_is_named_with_its_rivals() -> None:
+    base = examples.two_causes()
+    inertia = replace(
+        base.causes[1], explained_share=0.95, rivals=("channel_delay", "sensor_offset of the sensor")
+    )
+    found = replace(base, causes=(base.causes[0], inertia))
+    first = headline(found)[0].replace(NARROW, " ")
+    assert first.startswith(
+        "Link inertia of joint 1, its channel delay or sensor offset explains 95 % of the gap"
+    )
+    assert "(0.21 kg m² if it is link inertia)" in first
+    assert "; viscous friction of joint 1 91 % (certain)." in first
+    assert summary(found).rows[0].grade == "one of 3: or its channel delay, sensor offset"
+    assert "one of:" in summary(found).foot
+
+
+def test_entries_without_a_row_are_listed_and_counted() -> None:
+    base = examples.one_cause()
+    causes = tuple(replace(base.causes[0], joint=k, explained_share=0.3 - 0.01 * k) for k in range(1, 7))
+    found = replace(base, causes=causes, joints=tuple(range(1, 7)))
+    s = summary(found)
+    assert [row.place for row in s.rows] == [f"joint {k}" for k in range(1, MOST_ROWS + 1)]
+    assert all(f"torque ripple of joint {k} 0.42 Nm (certain)" in s.also for k in range(MOST_ROWS + 1, 7))
+    assert "and 4 smaller entries." in s.headline[0]
+
+
+def test_an_entry_below_the_relevance_has_no_row() -> None:
+    base = examples.one_cause()
+    small = replace(base.causes[0], joint=2, rms_nm=0.05, matters=False)
+    s = summary(replace(base, causes=(*base.causes, small)))
+    assert [row.place for row in s.rows] == ["joint 1"]
+    assert s.small == "torque ripple of joint 2 0.42 Nm, current offset of joint 1 12 mA"
+    assert "joint 2" not in s.headline[0]
+
+
+def test_unexplained_has_entries_and_gain_first_then_what_remains() -> None:
+    left = UnexplainedResidual(1, "motor", 0.61, 0.015, 0.3, 0.2, matters=True)
+    found = replace(examples.one_cause(), verdict="unexplained", unexplained=left)
+    first, second = headline(found)
+    assert first.startswith("Torque ripple of joint 1 explains 94 % of the gap")
+    assert second == (
+        "The extended model errs by 0.15 instead of 0.34 Nm on held-out runs, but 0.61 Nm rms at joint 1 remain unexplained."
+    )
+    assert summary(found).remains.endswith("it matters from 0.20 Nm")
+    assert (
+        "21 % of it at motor angle" in summary(found).remains
+        or "22 % of it at motor angle" in summary(found).remains
+    )
+    assert headline(replace(found, gain=None))[1] == "0.61 Nm rms at joint 1 remain unexplained."
+    assert headline(examples.unexplained())[0].startswith(
+        "No entry explains the gap: 0.58 Nm rms at joint 1, 52 % of it at "
+    )
+
+
+def test_no_gap_and_too_little_are_one_sentence() -> None:
+    found = examples.no_gap()
+    (only,) = headline(replace(found, relevance=0.01))
+    assert "below 1 % of rated torque" in only
+    assert "1 entry is too small to matter" in only
+    assert "too small" not in headline(replace(found, too_small=()))[0]
+    (only,) = headline(examples.insufficient())
+    assert examples.insufficient().reasons[0] in only
+
+
+def test_a_gain_that_is_a_loss_is_stated_as_one() -> None:
+    worse = replace(examples.one_cause(), gain=Gain(0.2, 0.4, "split", (-0.3, -0.1)))
+    assert "errs by 0.40 Nm on held-out runs, no less than the joint file" in headline(worse)[1]
+    close = replace(worse, gain=Gain(0.2049, 0.2041, "split", (0.0, 0.1)))
+    assert "by 0.2041 instead of 0.2049 Nm" in headline(close)[1]
+    unknown = replace(worse, gain=Gain(math.nan, math.nan, "split", (math.nan, math.nan)))
+    assert len(headline(unknown)) == 1
+
+
+def test_the_priors_that_a_certain_entry_rests_on_are_stated_as_set() -> None:
+    found = examples.sensor()
+    assert "sensor gain ± 1 %" in summary(found).foot
+    assert "torque constant ± 10 %" in summary(found).foot  # what it would otherwise be
+    set_ = replace(found, trust={"sensor_gain": 5.0})
+    assert "sensor gain ± 5 % (as set)" in summary(set_).foot
+    rows = {row.name: row for row in priors(set_.trust)}
+    assert (rows["sensor_gain"].size, rows["sensor_gain"].set_by_user) == ("5 %", True)
+    assert (rows["torque_constant"].size, rows["torque_constant"].set_by_user) == ("10 %", False)
+    mapping = to_mapping(set_)
+    assert {"name": "sensor_gain", "size": "5 %", "set_by_user": True} in mapping["priors"]
+    assert mapping["relevance"] == 0.005
+
+
+def test_what_these_runs_cannot_tell_is_grouped_by_the_motion_that_would() -> None:
+    lost = (
+        Untold("lost_motion", 1, "w", "load_ramp"),
+        Untold("lost_motion", 2, "w", "load_ramp"),
+        Untold("hysteresis", 2, "w", "load_ramp"),
+        Untold("sensor_drift", "sensor", "w", "warm_up"),
+    )
+    text = summary(replace(examples.two_causes(), cannot_be_told=lost)).untold
+    assert text == (
+        "lost motion of joints 1 and 2, hysteresis of joint 2 (would take load ramp); sensor drift (would take warm up)"
+    )
+
+
+def test_a_line_and_bursts_are_stated_as_what_they_are() -> None:
     base = examples.unexplained()
 
-    def said(place: Place) -> str:
-        gaps = (replace(base.gaps[0], localisation=(place,)),)
-        return verdict_sentence(replace(base, gaps=gaps)).translate(PLAIN_SPACE)
+    def first(place: Place) -> str:
+        return headline(replace(base, gaps=(replace(base.gaps[0], localisation=(place,)),)))[0]
 
     line = Place("motor_angle", "order 3.57 per motor revolution", 1.0, 3.57, 3.57, "1/rev")
-    assert said(line).endswith("; 100 % of it in a line at order 3.57 per motor revolution.")
+    assert first(line).endswith(", 100 % of it in a line at order 3.57 per motor revolution.")
     burst = Place("time", "events: run1 3.2 s, run4 0.7 s", 0.8, 3.2, 3.3, "s")
-    assert said(burst).endswith(
-        "; 80 % of it in events that noise does not explain, the strongest run1 3.2 s."
+    assert first(burst).endswith(
+        ", 80 % of it in events that noise does not explain, the strongest run1 3.2 s."
     )
 
 
-def test_classes_of_any_size_are_said_whole() -> None:
-    base = examples.two_causes()
-    (viscous, inertia) = base.causes
-    three = replace(inertia, names=("link_inertia", "channel_delay", "rotor_inertia"))
-    assert "one of link inertia, channel delay or rotor inertia (joint 1)" in verdict_sentence(
-        replace(base, causes=(viscous, three))
+def test_the_kinds_of_motion_of_the_next_experiment_come_first() -> None:
+    why = "unbalance and sensor_offset fit alike. Proposed: full_turns: a. zero_reading: b. Joint 1 alone."
+    found = replace(
+        examples.two_causes(), next_experiment={"why": why, "plan": None, "command": "jtq campaign p"}
     )
-    other = replace(
-        inertia, name="coulomb_friction", names=("coulomb_friction", "coulomb_friction of joint 2")
-    )
-    assert "either Coulomb friction or Coulomb friction of joint 2 (joint 1)" in verdict_sentence(
-        replace(base, causes=(other,))
-    )
+    assert summary(found).next == "full turns and zero reading, because unbalance and sensor offset fit alike"
+    assert "run it: jtq campaign p" in terminal_lines(found)
 
 
-def test_the_same_effect_in_both_joints_is_said_once() -> None:
-    base = examples.one_cause()
-    (ripple,) = base.causes
-    both = (
-        ripple,
-        replace(ripple, name="torque_constant", names=("torque_constant",)),
-        replace(ripple, joint=2),
-    )
-    assert verdict_sentence(replace(base, causes=both)) == (
-        "Cause of the simulation error: torque ripple of joints 1 and 2 and torque constant of joint 1."
-    )
-
-
-def test_the_gain_is_said_with_its_interval_which_is_in_newton_metres() -> None:
-    gain = Gain(0.8, 0.2, "split", (0.56, 0.64))
-    findings = replace(examples.one_cause(), gain=gain)
-    assert gain_sentence(findings).translate(PLAIN_SPACE) == (
-        "With it, the error on held-out runs falls from 0.800 to 0.200 Nm, by 0.600 Nm (95 % interval 0.560 to 0.640)."
-    )
-    (bar,) = gain_views(gain)
-    assert (bar.before_width, bar.after_width) == (100.0, 25.0)
-    assert bar.whisker == pytest.approx((20.0, 30.0))
-    assert gain_sentence(replace(findings, causes=())) == ""
-
-
-def test_a_gain_beside_what_runs_have_of_their_own_is_said_with_the_plain_errors() -> None:
-    gain = Gain(0.2, 0.1, "split; without run-to-run variation", (0.08, 0.12), plain_nm=(0.141, 0.142))
-    findings = replace(examples.one_cause(), gain=gain)
-    beside = (
-        "without run-to-run variation (offset and friction of the day), which is most of the error: with it "
-        "0.141 -> 0.142 Nm rms"
-    )
+def test_provenance_has_twelve_digits_of_every_hash() -> None:
+    made = examples.one_cause().provenance
+    assert made is not None
+    many = replace(made, inputs={f"r{k}.csv": f"{k}" * 64 for k in range(9)})
+    assert "r8.csv" not in provenance_text(many)
+    assert "and 3 more" in provenance_text(many)
+    assert "r8.csv 888888888888:" in provenance_text(many, most=9)
+    assert provenance_text(None) == ""
     assert (
-        gain_sentence(findings).translate(PLAIN_SPACE).endswith(f"(95 % interval 0.080 to 0.120), {beside}.")
+        to_mapping(replace(examples.one_cause(), provenance=many))["provenance"]["inputs"]["r8.csv"]
+        == "8" * 64
     )
-    (line,) = [line for line in summary_lines(findings) if line.startswith("gain on held-out runs")]
-    assert line.endswith(f"95 % interval), {beside}")
-    assert to_mapping(findings)["gain"]["plain_nm"] == [0.141, 0.142]
-
-
-def test_a_gain_that_is_a_loss_fits_its_bars() -> None:
-    (bar,) = gain_views(Gain(0.2, 0.4, "split", (-0.3, -0.1)))
-    assert bar.after_width / bar.before_width == pytest.approx(2.0)
-    assert bar.whisker is not None
-    assert max(bar.before_width, bar.after_width, *bar.whisker) == pytest.approx(100.0)
-    (unknown,) = gain_views(Gain(math.nan, math.nan, "split", (math.nan, math.nan)))
-    assert (unknown.before, unknown.whisker) == ("–\u00a0Nm", None)
-
-
-def test_a_size_that_no_run_would_show_is_called_invisible() -> None:
-    row = CandidateEvidence("unbalance", 1, math.nan, math.nan, math.nan, {}, "needs link_position_rad")
-    seen = {"moment_nm": Value(0.05, (0.05, 0.05), "Nm")}
-    never = {"moment_nm": Value(math.inf, (math.inf, math.inf), "Nm")}
-    none = {"moment_nm": Value(0.0, (0.0, 0.0), "Nm")}
-    texts = [
-        evidence_views([replace(row, minimum=each)])[0].minimum.translate(PLAIN_SPACE)
-        for each in ({}, seen, never, none)
-    ]
-    assert texts == ["–", "0.050 Nm", "invisible", "–"]
 
 
 def test_the_map_puts_axes_by_unevenness_and_marks_what_stands_out() -> None:
-    (view,) = gap_views([gap(1, "motor", 0.6, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.3}})])
-    assert [a.title for a in view.uneven_axes][:2] == ["link angle", "velocity"]
-    assert {a.title for a in view.uneven_axes}.isdisjoint({a.title for a in view.even_axes})
-    assert len(view.uneven_axes) + len(view.even_axes) == 8
-    link = view.uneven_axes[0]
-    assert [k for k, b in enumerate(link.bins) if b.hot] == [3, 4]
-    assert link.bins[3].height == pytest.approx(1.0)
-    assert link.bins[4].height == pytest.approx(0.21 / 0.52)
+    axes = gap_axes(gap(1, "motor", 0.6, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.3}}))
+    assert [a.title for a in axes] == ["link angle", "velocity"]  # the others are even
+    link, velocity = axes
+    assert [k for k, b in enumerate(link.bars) if b.hot] == [3, 4]
+    assert link.bars[3].height == pytest.approx(1.0)
+    assert link.bars[4].height == pytest.approx(0.21 / 0.52)
     # one scale for all axes: equal density is equal height
-    assert view.uneven_axes[1].bins[6].height == pytest.approx((0.3 * 12) / (0.52 * 16))
+    assert velocity.bars[6].height == pytest.approx((0.3 * 12) / (0.52 * 16))
     assert link.even == pytest.approx(1.0 / (0.52 * 16))
-    assert view.floor == pytest.approx(1.0 / 3.0)
+    assert link.ends == ("0 rad", "6.28 rad")
 
 
 def test_shares_of_one_axis_are_never_more_than_the_whole() -> None:
     """Where the gap is small beside the noise, the excess of a bin can be larger than that of all."""
     bins = tuple(Place("load", f"bin {k}", 1.0, float(k), k + 1.0, "Nm") for k in range(4))
-    (view,) = gap_views([Gap(1, "motor", 0.21, 0.2, "repeated runs", (), bins)])
-    assert [b.text.translate(PLAIN_SPACE) for b in view.even_axes[0].bins] == [
-        f"bin {k}: 25 %" for k in range(4)
-    ]
-
-
-def test_a_gap_without_a_map_still_says_where() -> None:
-    base = gap(1, "motor", 0.6, 0.2, {"velocity": {6: 0.3}})
-    (view,) = gap_views([replace(base, map=())])
-    assert (view.uneven_axes, view.even_axes) == ((), ())
-    assert [p.where.translate(PLAIN_SPACE) for p in view.places] == ["at velocity 0 to 0.3 rad/s"]
-    (empty,) = gap_views([Gap(1, "motor", 0.0, 0.0, "repeated runs", ())])
-    assert empty.floor == 1.0
+    (axis,) = gap_axes(Gap(1, "motor", 0.21, 0.2, "repeated runs", (), bins))
+    assert [b.text.replace(NARROW, " ") for b in axis.bars] == [f"bin {k}: 25 %" for k in range(4)]
+    assert gap_axes(Gap(1, "motor", 0.21, 0.2, "repeated runs", ())) == []
 
 
 def test_names_are_words() -> None:
@@ -182,19 +289,17 @@ def test_names_are_words() -> None:
         "Stribeck friction",
         "torque ripple",
     ]
-    assert [parameter_title(n) for n in ("amplitude_nm", "viscous_nms_per_rad", "gain", "offset_a")] == [
-        "amplitude",
-        "viscous",
-        "gain",
-        "offset",
-    ]
-
-
-def test_what_is_as_large_as_what_matters_and_does_not_is_explained() -> None:
-    left = UnexplainedResidual(1, "motor", 0.3, 0.003, 0.04, 0.2, matters=False)
-    assert left.limit("0.2 Nm") == "more than 0.2 Nm, but 4.0% of the gap"
-    assert (
-        replace(left, unconfirmed=True).limit("0.2 Nm").endswith("effects that are not confirmed explain it")
+    names = ("amplitude_nm", "viscous_nms_per_rad", "gain", "offset_a", "order_per_motor_rev")
+    assert [parameter_title(n) for n in names] == ["amplitude", "viscous", "gain", "offset", "order"]
+    assert in_words("b.csv: j1.torque_nm and link_inertia, sensor_gain;") == (
+        "b.csv: j1.torque_nm and link inertia, sensor gain;"
     )
-    assert replace(left, matters=True).limit("0.2 Nm") == "from 0.2 Nm on it matters"
-    assert replace(left, rms_nm=0.1).limit("0.2 Nm") == "from 0.2 Nm on it matters"
+
+
+def test_a_row_of_every_entry_has_its_smallest_size() -> None:
+    row = CandidateEvidence("unbalance", 1, 5e6, math.nan, math.nan, {}, "cannot be told from these runs")
+    seen = {"moment_nm": Value(0.05, (math.nan, math.nan), "Nm")}
+    never = {"moment_nm": Value(math.inf, (math.inf, math.inf), "Nm")}
+    texts = [candidate_row(replace(row, minimum=each)) for each in ({}, seen, never)]
+    assert [each[3].replace(NARROW, " ") for each in texts] == ["–", "0.050 Nm", "–"]
+    assert texts[0][:3] == ("unbalance", "joint 1", "cannot be told from these runs")

@@ -17,13 +17,14 @@ from jtqd.sysid.diagnosis.extended_joint import extended, files, title, write_ex
 from jtqd.sysid.diagnosis.findings import (
     INSUFFICIENT,
     NO_GAP,
-    UNEXPLAINED,
-    BoundedValue,
     CandidateEvidence,
+    Present,
+    Untold,
     Value,
     plain,
     to_mapping,
 )
+from jtqd.sysid.diagnosis.limits import PRIORS
 from tests.sysid.diagnosis.diagnose_helpers import COULOMB, JOINT, OFFSET, RIPPLE, cause, findings, value
 
 ORIGIN = {"sha256": {"a.csv": "aa", "b.csv.gz": "bb", "other": "cc"}, "date": "2026-11-21"}
@@ -43,15 +44,14 @@ def test_the_contract_s_keys_are_there_in_every_verdict() -> None:
         assert mapping["schema"] == "jtq.findings/1"
         assert mapping["verdict"] == made.verdict
         assert {"joint", "rmse_nm", "noise_floor_nm", "localisation"} <= set(mapping["gap"])
-        assert {"rmse_before_nm", "rmse_after_nm", "split", "ci95"} == {
-            key
-            for key in mapping["gain"]
-            if not key.startswith("free_run") and key not in {"runs", "plain_nm"}
-        }
+        assert {"rmse_before_nm", "rmse_after_nm", "split", "ci95"} <= set(mapping["gain"])
+        assert {"too_small", "cannot_be_told", "priors", "relevance", "provenance"} <= set(mapping)
         assert "next_experiment" in mapping
         assert len(mapping["causes"]) == len(made.causes)
         for each in mapping["causes"]:
-            assert {"name", "joint", "class", "parameters", "evidence"} <= set(each)
+            assert {"name", "joint", "class", "parameters", "evidence", "grade", "rivals", "given"} <= set(
+                each
+            )
             assert set(each["evidence"]) == {"delta_bic", "held_out_gain"}
             assert all(set(p) == {"value", "ci95", "unit"} for p in each["parameters"].values())
 
@@ -65,6 +65,8 @@ def test_values_are_those_of_the_findings_and_what_is_not_finite_is_null() -> No
             ),
         ),
         next_experiment={"why": "because", "plan": {"schema": "jtq.plan/1"}},
+        too_small=(COULOMB,),
+        cannot_be_told=(Untold("lost_motion", 1, "no channel", "load_ramp"),),
     )
     mapping = to_mapping(made, sha256={"a.csv": "aa"}, files=["report.html"])
     text = as_json(mapping)
@@ -77,7 +79,13 @@ def test_values_are_those_of_the_findings_and_what_is_not_finite_is_null() -> No
     assert first["parameters"]["amplitude_nm"] == {"value": 0.5, "ci95": [0.48, 0.52], "unit": "Nm"}
     assert first["parameters"]["phase_rad"]["ci95"] == [None, None]
     assert second["joint"] == "sensor"
-    assert mapping["gain"]["free_run_before_rad_s"] is None
+    assert mapping["gain"]["free_run_before_rad_s"] is None  # a key of version 0.2
+    assert [each["name"] for each in mapping["too_small"]] == ["coulomb_friction"]
+    assert mapping["cannot_be_told"] == [
+        {"name": "lost_motion", "joint": 1, "why": "no channel", "experiment": "load_ramp"}
+    ]
+    assert {each["name"] for each in mapping["priors"]} == set(PRIORS)
+    assert not {"left_over", "odd_runs", "steadiness"} & set(mapping)
     assert mapping["candidates"][0]["minimum"]["torque_nm"]["value"] is None
     assert mapping["candidates"][0]["evidence"]["held_out_gain"] is None
     assert mapping["next_experiment"] == {"why": "because", "plan": {"schema": "jtq.plan/1"}}
@@ -190,26 +198,31 @@ def test_files_read_back_as_the_joints_meant(tmp_path: Path) -> None:
     assert "torque_ripple, sensor_offset" in text.splitlines()[0]
 
 
-def test_a_bound_is_in_the_file_and_marked() -> None:
-    bound = BoundedValue("viscous_friction", 1, "viscous_nms_per_rad", "Nms/rad", 2.0, -0.1, 0.68, ())
-    joint = replace(JOINT, effects=(Effect("viscous_friction", {"viscous_nms_per_rad": 3.0}),))
-    made = replace(findings(UNEXPLAINED), bounded=(replace(bound, in_file=True),))
-    with_it = extended(joint, 1, made, **ORIGIN)
-    assert [(e.name, e.parameters) for e in with_it.effects] == [
-        ("viscous_friction", {"viscous_nms_per_rad": 0.0})
+def test_what_predicts_is_in_the_file_and_what_was_found_in_its_provenance() -> None:
+    made = findings(
+        causes=(COULOMB,),
+        too_small=(OFFSET,),
+        predicts=(
+            Present("coulomb_friction", 2, {"coulomb_nm": 4.5}),
+            Present("sensor_offset", "sensor", {"offset_nm": 0.3}),
+            Present("viscous_friction", 2, {"viscous_nms_per_rad": 2.1}),
+            Present("viscous_friction", 1, {"viscous_nms_per_rad": 1.9}),
+        ),
+    )
+    two = extended(JOINT, 2, made, **ORIGIN)
+    assert [(e.name, *e.parameters.values()) for e in two.effects] == [
+        ("coulomb_friction", 4.5),
+        ("sensor_offset", 0.3),
+        ("viscous_friction", 2.1),
     ]
-    assert with_it.provenance["diagnosis"]["at_their_bound"] == [
-        {"name": "viscous_friction", "joint": 1, "viscous_nms_per_rad": [0.0, 0.68]}
+    record = two.provenance["diagnosis"]
+    assert [(each["name"], each["grade"]) for each in record["effects"]] == [
+        ("coulomb_friction", "certain"),
+        ("sensor_offset", "certain"),
     ]
-    assert "effects" not in with_it.provenance["diagnosis"]
-    assert "took viscous_friction at its bound (0, at most 0.68 Nms/rad)" in title(1, made)
-    assert to_mapping(made)["bounded"][0]["in_file"] is True
-    for other in (
-        extended(joint, 2, made, **ORIGIN),
-        extended(joint, 1, replace(made, bounded=(bound,)), **ORIGIN),
-    ):
-        assert other.effects == joint.effects
-        assert "at_their_bound" not in other.provenance["diagnosis"]
+    assert record["better_prediction_only"] == ["viscous_friction"]
+    alone = extended(JOINT, 2, findings(causes=(COULOMB,)), **ORIGIN)
+    assert "better_prediction_only" not in alone.provenance["diagnosis"]
 
 
 def test_a_file_says_how_many_runs_were_used() -> None:

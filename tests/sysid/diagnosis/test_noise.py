@@ -15,7 +15,6 @@ from jtqd.sysid.diagnosis.noise import (
     run_sums,
     saturated_residuals,
     whiten,
-    whitened_rows,
 )
 from jtqd.sysid.diagnosis.regressors import ChannelData, RunData
 from jtqd.sysid.diagnosis.signals import Channel
@@ -141,15 +140,6 @@ def test_a_row_that_is_not_valid_is_left_out_of_its_own_channel_alone() -> None:
     sums = run_sums(run, NOISE, COLUMNS, NUISANCES)
     assert sums.gram == pytest.approx(direct, rel=1e-8, abs=1e-8)
     assert sums.rows == int(good.sum()) == 3 * (COUNT - ORDER) - (ORDER + 1) - 10
-
-
-def test_whitened_rows_are_independent_measurements_of_their_bins() -> None:
-    run = small_run({MOTOR1: [40], TORSION1: [80, 81]})
-    rows, bins = whitened_rows(run, NOISE, COLUMNS, NUISANCES)
-    sums = run_sums(run, NOISE, COLUMNS, NUISANCES)
-    assert rows.T @ rows == pytest.approx(sums.gram, rel=1e-8, abs=1e-8)
-    assert len(rows) == len(bins) == sums.rows
-    assert np.bincount(bins, minlength=COUNT)[[ORDER, 40, 70, 80]].tolist() == [3, 2, 3, 2]
 
 
 def test_a_channel_that_a_run_has_not_is_not_missed() -> None:

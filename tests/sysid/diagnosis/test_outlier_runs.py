@@ -13,7 +13,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.findings import Findings, OutlierRun, summary_lines, to_mapping
+from jtqd.sysid.diagnosis.findings import Findings, OutlierRun, to_mapping
 from jtqd.sysid.diagnosis.outlier_runs import (
     Comparison,
     Deviation,
@@ -87,15 +87,14 @@ def test_one_run_is_named_and_the_joint_is_not(
     assert abs(odd.value) == pytest.approx(size, rel=0.15)
     assert findings.causes == (), "nothing is wrong with the joint"
     assert findings.verdict == "no_gap"
-    assert any(line.startswith("outlier run: run2: ") for line in summary_lines(findings))
-    (found,) = to_mapping(findings)["odd_runs"]
+    (found,) = to_mapping(findings)["outlier_runs"]
     assert (found["run"], found["what"], found["joint"]) == ("run2", what, odd.joint)
     assert odd.text in findings.channel_notes
     assert findings.used_runs == tuple(name for name in findings.runs if name != "run2")
 
 
 def test_a_gain_is_a_part_of_the_true_value_and_the_other_direction_is_said() -> None:
-    """What is regressed on is what was read: 8 % too much is 7.4 % of it, the other direction twice of it."""
+    """A torque is regressed on what was read, of which the other direction is twice; a current on what the motion needs."""
     (more,) = diagnose(changed(runs(), [2], current_gain), {1: PLAIN}).outlier_runs
     assert more.value == pytest.approx(0.08, abs=0.003)
     (back,) = diagnose(changed(runs(), [2], backward_sensor), {1: PLAIN}).outlier_runs
@@ -167,10 +166,9 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
     table = dict(idle)["run2"]
     (signals,), _ = usable_signals([("run2", table)], {1: PLAIN}, (1,))
     gain, zero = Deviation("gain", "current_a", 1, 0.01, ""), Deviation("zero", "current_a", 1, 0.004, "")
-    assert 0.5 < echo(gain, signals, 5) < 2.0
     assert echo(zero, signals, 5) == 0.0
     (driven,), _ = usable_signals([("run1", dict(runs())["run1"])], {1: PLAIN}, (1,))
-    assert echo(gain, driven, 5) < 1e-3
+    assert echo(gain, driven, 5) < 1e-3 < echo(gain, signals, 5)
     rng = np.random.default_rng(4)
     rows = [rng.normal(size=(2000, 3)) for _ in range(5)]
     rows[2][:, 2] += rows[2][:, 1]

@@ -6,15 +6,14 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT
-from jtqd.sysid.diagnosis.mixed_model import Mixed
-from jtqd.sysid.diagnosis.noise import Sums
+from jtqd.sysid.diagnosis.held_out import predict
+from jtqd.sysid.diagnosis.model import solve
 from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.runs.files import read_runs
@@ -101,18 +100,14 @@ def test_pieces_of_one_recording_are_no_two_runs() -> None:
     assert "found 1 usable run in pieces of one recording, expected at least 2" in findings.reasons[-1]
 
 
-def test_pieces_share_their_nuisances_and_are_left_out_together() -> None:
-    rng = np.random.default_rng(0)
-    sums = []
-    for _ in range(4):
-        x = rng.normal(size=(50, 3))
-        sums.append(Sums(x.T @ x, 50))
-    apart, together = Mixed(sums, 1, np.ones(1)), Mixed(sums, 1, np.ones(1), [0, 0, 1, 2])
-    assert (apart.runs, together.runs) == (4, 3)
-    assert together.grams[0] == pytest.approx(sums[0].gram + sums[1].gram)
-    found = together.fit([0]).nuisances
-    assert len(found) == 4, "one row per piece"
-    assert found[0] == pytest.approx(found[1])
+def test_pieces_share_what_a_run_has_of_its_own_and_are_held_out_together() -> None:
+    whole = bench_run(seconds=6.0)
+    found = signals(("a", cut(whole, slice(0, HALF))), ("b", cut(whole, slice(HALF, None))))
+    solution = solve(build_dataset([list(run) for run in found], JOINTS))
+    assert len(solution.runs) == 3
+    assert len(solution.equations.grams) == len(solution.own_means) == 2
+    (squares, *_) = predict(solution).squares.values()
+    assert len(squares) == 2
 
 
 def test_a_dataset_knows_its_pieces() -> None:

@@ -17,7 +17,6 @@ from jtqd.sysid.diagnosis.regressors import (
     all_in_bin,
     bin_samples,
     binned,
-    column_moments,
     contribution,
     families,
     gain_columns,
@@ -35,7 +34,18 @@ def made_up(joint: Joint, seed: int = 1, number: int = 1, both: bool = True) -> 
     s = state(seed)
     nothing = np.zeros(len(s.time_s))
     return JointSignals(
-        "run", number, joint, s.time_s, s, nothing, nothing if both else None, nothing == 0.0, s.torque_nm
+        run="run",
+        number=number,
+        joint=joint,
+        time_s=s.time_s,
+        state=s,
+        motor_nm=nothing,
+        torsion_nm=nothing if both else None,
+        moving=nothing == 0.0,
+        sensor_nm=s.torque_nm,
+        current_a=s.current_a,
+        shared_nm=nothing,
+        gear_nm=s.torque_nm,
     )
 
 
@@ -278,20 +288,3 @@ def test_a_diagnosis_gives_the_sensor_the_temperature_of_the_first_joint() -> No
     for run in usable:
         at_sensor = [s.state_of(EFFECTS["sensor_drift"], {}).temperature_c[0] for s in run]
         assert (at_sensor, [s.state.temperature_c[0] for s in run]) == ([31.0, 31.0], [31.0, 20.0])
-
-
-def test_the_size_of_a_column_is_its_rms_where_it_is_largest() -> None:
-    s = joint_signals("run", rigid_run(PLAIN), 1, PLAIN, BaseLoss(PLAIN))
-    found = candidates(PLAIN, ("sensor_gain", "sensor", 0), ("sensor_offset", "sensor", 0))
-    run = run_data([s], found, 5)
-    run.channels[TORSION1].regressors[:, 1] += 5.0
-    moments = column_moments([run, run], 3)
-    rms = np.sqrt(np.diagonal(moments, axis1=1, axis2=2).max(axis=0))
-    motor, torsion = run.channels[MOTOR1], run.channels[TORSION1]
-    bent = torsion.regressors[:, 0] - torsion.regressors[:, 0].mean()
-    by_hand = [np.sqrt(np.mean(x**2)) for x in (motor.regressors[motor.valid, 0], bent)]
-    assert rms[0] == pytest.approx(max(by_hand))
-    assert rms[1] == pytest.approx(0.1), "a constant counts in the motor balance alone"
-    assert rms[2] == 0.0
-    together = np.mean(motor.regressors[motor.valid, 0] * motor.regressors[motor.valid, 1])
-    assert moments[list(run.channels).index(MOTOR1), 0, 1] == pytest.approx(together)

@@ -16,10 +16,10 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.diagnose import with_effects_applied
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, SignalsError, about_zero, joint_signals
 from jtqd.sysid.diagnosis.smoothing import second_difference, smooth
+from jtqd.sysid.diagnosis.solution import PresentEffect, set_state, with_effects_applied
 from jtqd.sysid.runs.checks import on_even_steps
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
@@ -107,9 +107,7 @@ def test_what_is_wrong_in_the_file_is_what_its_effect_leaves(
     truth = replace(PLAIN, **values)  # type: ignore[arg-type]
     damping = truth.damping_nms_per_rad if effect == "gear_damping" else 0.0
     s = signals(rigid_run(truth, damping_nms_per_rad=damping))
-    s.state.torsion_rad = (
-        s.state.torque_nm / truth.stiffness_nm_per_rad
-    )  # what the spring really does (`refine`)
+    set_state(s, [PresentEffect(EFFECTS[effect], 1, parameters)])
     made = contribution(EFFECTS[effect], parameters, s)
     assert s.torsion_nm is not None
     motor, torsion = s.motor_nm[s.moving], s.torsion_nm - np.median(s.torsion_nm)
@@ -198,7 +196,18 @@ def zero_signals(true_nm: np.ndarray, velocity: np.ndarray, zero_nm: float) -> J
     )
     residual = BASE.loss(true_nm, velocity) + true_nm - BASE.loss(measured, velocity) - measured
     return JointSignals(
-        "run", 1, JOINT, np.arange(n) * 1e-3, state, residual, None, np.ones(n, bool), measured
+        run="run",
+        number=1,
+        joint=JOINT,
+        time_s=np.arange(n) * 1e-3,
+        state=state,
+        motor_nm=residual,
+        torsion_nm=None,
+        moving=np.ones(n, bool),
+        sensor_nm=measured,
+        current_a=state.current_a,
+        shared_nm=np.zeros(n),
+        gear_nm=measured,
     )
 
 

@@ -2,6 +2,7 @@
 
 import doctest
 import gzip
+import math
 import os
 import random
 import shutil
@@ -186,8 +187,10 @@ def test_rows_written_twice_are_left_out_with_a_note(tmp_path):
 
 
 def test_stamps_that_were_rounded_to_the_same_number_are_spread(tmp_path):
-    """1 kHz and up to 0.7 ms late, rounded to ms: no row is too many, and the stamps then jitter."""
-    late = 1e-3 * np.random.default_rng(1).uniform(-0.1, 0.7, 3000)
+    """1 kHz of a clock that goes to and fro, rounded to ms: no row is too many, and the stamps then jitter."""
+    late = 4e-3 * np.sin(4.0 * math.pi * np.arange(3000) / 3000) + 1e-3 * np.random.default_rng(1).uniform(
+        -0.1, 0.7, 3000
+    )
     t = np.round(0.001 * np.arange(3000.0) + late, 3)
     assert np.any(np.diff(t) == 0.0)
     [run] = read_runs(

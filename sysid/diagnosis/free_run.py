@@ -1,10 +1,9 @@
-"""Gain of the extended model on held-out runs: error of its torque, and of a free run of the motor."""
+"""A joint that simulates alone: its velocity in windows of half a second, from the measured current and torque."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -12,166 +11,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import ArrayFunctions, Effect, State, Values
-from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.joint import Effect as Effect_parameters
 from jtqd.estimator.joint import Joint
-from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import Gain, RunGain, shows_at
-from jtqd.sysid.diagnosis.mixed_model import ENOUGH_RUNS, solve
-from jtqd.sysid.diagnosis.refine import PresentEffect, Refined, places
-from jtqd.sysid.diagnosis.signals import BaseLoss, Channel, JointSignals
-
-_BOOTSTRAPS: Final = 2000
-
-
-def held_out_gain(dataset: Dataset, refined: Refined, seed: int = 0) -> Gain:
-    """Return the error of the simulation's torque before and after, each run with the parameters of all others.
-
-    In the balance where most goes away; the run's own zero and friction of the day stay in, as in service, if the error
-    falls with them (`judged_squares`). ci95: of rmse_before - rmse_after [Nm], bootstrap over runs.
-    """
-    steps = left_out_steps(refined)
-    pieces = refined.mixed.pieces
-    squares, plain = judged_squares(dataset, refined, steps)
-    drops = falls_nm(squares)
-    channel = max(drops, key=lambda c: drops[c])
-    table = squares[channel]
-    names = [dataset.runs[int(np.argmax(pieces == r))].name for r in range(len(table))]
-    rng = np.random.default_rng(seed)
-    picks = rng.integers(0, len(table), size=(_BOOTSTRAPS, len(table)))
-    sums = table[picks].sum(axis=1)
-    drawn = np.sqrt(sums[:, 0] / sums[:, 2]) - np.sqrt(sums[:, 1] / sums[:, 2])
-    low, high = np.percentile(drawn, (2.5, 97.5))
-    velocity, position = free_run_errors(dataset, refined, steps)
-    return Gain(
-        _rms(table, 0),
-        _rms(table, 1),
-        f"each of {len(table)} runs held out once; {channel.balance} balance of joint {channel.joint}"
-        + ("; without run-to-run variation" if plain else ""),
-        (float(low), float(high)),
-        *velocity,
-        tuple(
-            RunGain(name, _rms(row, 0), _rms(row, 1))
-            for name, row in zip(names, table[:, None, :], strict=True)
-            if row[0, 2] > 0.0
-        ),
-        *position,
-        plain_nm=(_rms(plain[channel], 0), _rms(plain[channel], 1)) if plain else None,
-    )
-
-
-Squares = dict[Channel, FloatArray]
-"""Per channel and recording the sums of squares before and after [Nm^2], and the count of bins: [r, 3]."""
-
-
-def judged_squares(
-    dataset: Dataset, refined: Refined, steps: Sequence[FloatArray]
-) -> tuple[Squares, Squares]:
-    """Return the squares by which the gain is judged, and the plain ones where it is not by those, else nothing.
-
-    What a run has of its own can be several times all causes together, and in the mean of a few runs lie against them by
-    chance: then the plain error falls in no balance, whatever the causes are worth. With ENOUGH_RUNS to know how large it
-    usually is, it counts as little as it is usual (`squares_beside`); with fewer the plain error decides.
-    """
-    plain = left_out_squares(dataset, refined, steps)
-    if refined.mixed.runs < ENOUGH_RUNS or max(falls_nm(plain).values()) > 0.0:
-        return plain, {}
-    return left_out_squares(dataset, refined, steps, beside_own=True), plain
-
-
-def left_out_squares(
-    dataset: Dataset, refined: Refined, steps: Sequence[FloatArray], *, beside_own: bool = False
-) -> Squares:
-    """Return the squares of each run with the parameters of all others (steps: `left_out_steps`); beside_own: with what the
-    run has of its own counted as little as it is usual.
-    """
-    squares: Squares = {}
-    floor = noise_squares(dataset)
-    for place, run, left, step in zip(refined.mixed.pieces, dataset.runs, refined.runs, steps, strict=True):
-        for channel, d in left.channels.items():
-            before = run.channels[channel].residual[d.valid]
-            after = (d.residual - d.regressors @ step[d.index])[d.valid]
-            if channel.balance == "torsion" and len(before):
-                before, after = before - before.mean(), after - after.mean()
-            rows = squares.setdefault(channel, np.zeros((refined.mixed.runs, 3)))
-            both = np.column_stack((before, after))
-            own = d.nuisances[d.valid] if beside_own else np.empty((len(both), 0))
-            weights = floor[channel] / refined.variances[d.families] if beside_own else np.empty(0)
-            rows[place] += (*squares_beside(both, own, weights).tolist(), len(before))
-    return squares
-
-
-def noise_squares(dataset: Dataset) -> dict[Channel, float]:
-    """Return per channel the mean square of what no effect explains [Nm^2]."""
-    return {c: float(np.nanmean(np.concatenate(x) ** 2)) for c, x in dataset.unexplained.items()}
-
-
-def squares_beside(columns: FloatArray, own: FloatArray, weights: FloatArray) -> FloatArray:
-    """Return x' (1 + Z V Z'/s2)^-1 x of each column x [n, k], Nm^2: its square where what the run has of its own counts as
-    little as it is usual. own: Z [n, q]; weights: s2 / V [q], of noise and of the runs' own changes.
-    """
-    common = own.T @ columns
-    explained = np.sum(common * np.linalg.solve(own.T @ own + np.diag(weights), common), axis=0)
-    return np.asarray(np.sum(columns**2, axis=0) - explained)
-
-
-def falls_nm(squares: Mapping[Channel, FloatArray]) -> dict[Channel, float]:
-    """Return per channel by how much the rms of all recordings falls [Nm]; squares: of `left_out_squares`."""
-    return {c: _rms(s, 0) - _rms(s, 1) for c, s in squares.items()}
-
-
-Before = tuple[float, float]
-"""Without and with; NaN where there is nothing to simulate."""
-
-
-def free_run_errors(
-    dataset: Dataset, refined: Refined, steps: Sequence[FloatArray], cause: int | None = None
-) -> tuple[Before, Before]:
-    """Return the rms errors of the simulation running free, of its velocity [rad/s] and its position [rad], joint side: over
-    all joints and runs, each run with the parameters of all others (steps: `left_out_steps`). cause: without and with
-    this one beside the others; None: without and with all of them.
-    """
-    squares = np.zeros((2, 2))
-    count = 0
-    mine = places(refined.present)
-    for run, step in zip(dataset.signals, steps, strict=True):
-        causes = [p.moved(step[own].tolist()) for p, own in zip(refined.present, mine, strict=True)]
-        for s in run:
-            there = [k for k, p in enumerate(causes) if shows_at(p.joint, s.number)]
-            asked = there if cause is None else [cause]
-            if not set(asked) & set(there):
-                continue
-            try:
-                after = free_run(s, _extended(s.joint, [causes[k] for k in there]))
-                rest = [causes[k] for k in there if k not in asked]
-                before = free_run(s, _extended(s.joint, rest))
-            except ConfigError:
-                continue  # a run left out can take a parameter out of its range
-            squares += [[r.rmse_rad_s**2 for r in (before, after)], [r.rmse_rad**2 for r in (before, after)]]
-            count += 1
-    if not count:
-        return (math.nan, math.nan), (math.nan, math.nan)
-    velocity, position = np.sqrt(squares / count).tolist()
-    return (velocity[0], velocity[1]), (position[0], position[1])
-
-
-def _extended(joint: Joint, causes: Sequence[PresentEffect]) -> Joint:
-    effects = [*joint.effects, *(Effect_parameters(p.effect.name, dict(p.values)) for p in causes)]
-    return replace(joint, effects=tuple(effects))
-
-
-def _rms(table: FloatArray, column: int) -> float:
-    return float(np.sqrt(table[:, column].sum() / max(table[:, 2].sum(), 1.0)))
-
-
-def left_out_steps(refined: Refined) -> list[FloatArray]:
-    """Return per piece of a run the change of the free parameters when the run is left out."""
-    marginals, _ = refined.mixed.marginal_runs(refined.variances)
-    total = marginals.sum(axis=0)
-    k = refined.mixed.columns
-    of_runs = [solve(total - m, k)[0] for m in marginals]
-    return [of_runs[r] for r in refined.mixed.pieces]
-
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals
 
 WINDOW_S: Final = 0.5
 _MEASURED: Final = (
@@ -266,7 +107,7 @@ def _position_error(signals: JointSignals, joint: Joint, simulated: FloatArray, 
 def _inputs(signals: JointSignals, joint: Joint, terms: Sequence[Term]) -> tuple[FloatArray, FloatArray]:
     """Return (G Kt I - TAU_S, TAU_S) [n, Nm]: what was measured less the effects' errors of measurement."""
     state = signals.state
-    current, sensor = state.current_a, signals.sensor_nm
+    current, sensor = signals.current_a, signals.sensor_nm
     whole = ArrayFunctions()
     for effect, p in terms:
         if "current_a" in effect.hooks:

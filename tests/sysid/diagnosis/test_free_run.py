@@ -13,7 +13,7 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.gain import free_run
+from jtqd.sysid.diagnosis.free_run import free_run
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 
 RATE_HZ = 1000.0
@@ -68,7 +68,20 @@ def signals_of(
         coupling_position_rad=link if number == 1 else -link,
     )
     zero = np.zeros(n)
-    return JointSignals("run", number, joint, time, state, zero, None, np.ones(n, bool), sensor)
+    return JointSignals(
+        run="run",
+        number=number,
+        joint=joint,
+        time_s=time,
+        state=state,
+        motor_nm=zero,
+        torsion_nm=None,
+        moving=np.ones(n, bool),
+        sensor_nm=sensor,
+        current_a=current,
+        shared_nm=zero,
+        gear_nm=gear,
+    )
 
 
 def test_viscous_friction_lets_the_velocity_decay_as_the_closed_form_says() -> None:

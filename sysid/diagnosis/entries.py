@@ -1,0 +1,200 @@
+"""Entries: everything that may be wrong, one value or effect each, with its prior; what competes by evidence.
+
+An entry is a term of an effect of the library (`regressors.EffectCandidate`) whose columns are scaled by its prior's size,
+so that every coefficient is N(0, 1) where the entry is in a set.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import SPAN_K, Effect, Term, Values
+from jtqd.estimator.joint import Joint
+from jtqd.sysid.diagnosis import limits
+from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.limits import Prior, Usage
+from jtqd.sysid.diagnosis.regressors import EffectCandidate
+from jtqd.sysid.diagnosis.signals import JointSignals
+
+_KINDS: Final = ("order_per_motor_rev", "channel", "motor_side")
+"""Parameters of which several values may be present at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class Entry:
+    """One value or effect.
+
+    candidate: its term, with the numbers of its columns in the library; weights [columns, m]: of its scaled coefficients;
+    tangents: further columns, one per shape in `shapes`, of a change by its prior's deviation; prior; odds: log prior odds
+    of being in a set; slot: at most one entry of a slot is in a set; low, high: bounds of a single coefficient.
+    """
+
+    candidate: EffectCandidate
+    kind: str
+    prior: Prior
+    weights: FloatArray = field(repr=False)
+    odds: float
+    slot: tuple[object, ...]
+    low: float = -math.inf
+    high: float = math.inf
+    shapes: tuple[str, ...] = ()
+    tangents: tuple[int, ...] = ()
+    amplitude: tuple[float, ...] = ()
+
+    @property
+    def bounded(self) -> bool:
+        """Whether its first coefficient has bounds."""
+        return self.candidate.size == 1
+
+    @property
+    def effect(self) -> Effect:
+        """The effect of the library."""
+        return self.candidate.effect
+
+    @property
+    def joint(self) -> JointName:
+        """Joint, or the sensor."""
+        return self.candidate.joint
+
+    @property
+    def key(self) -> tuple[str, JointName]:
+        """Effect and joint, whatever the term."""
+        return self.candidate.key
+
+    @property
+    def columns(self) -> tuple[int, ...]:
+        """Numbers of its columns in the library, tangents last."""
+        return (*self.candidate.columns, *self.tangents)
+
+    @property
+    def size(self) -> int:
+        """Number of scaled coefficients, tangents included."""
+        return int(self.weights.shape[1])
+
+    def coefficients(self, scaled: FloatArray) -> FloatArray:
+        """Return the coefficients of the term's own columns of scaled ones."""
+        return np.asarray((self.weights @ scaled)[: self.candidate.size])
+
+    def values(self, scaled: FloatArray) -> dict[str, float]:
+        """Return the parameters at scaled coefficients; a shape moves by its tangent, at most by half of itself."""
+        values: dict[str, float] = dict(self.candidate.term.combine(self.coefficients(scaled)))
+        own = self.candidate.term.basis[0]
+        for name, c in zip(self.shapes, scaled[self.size - len(self.shapes) :], strict=True):
+            values[name] = own[name] * (1.0 + float(np.clip(limits.SHAPE * c, -0.4, 0.6)))
+        return values
+
+
+def kind_of(effect: Effect, p: Values) -> str:
+    """Return which of an effect's priors a term has: its name, or with a suffix."""
+    name = effect.name
+    if name == "nonlinear_stiffness" and not p.get("cubic_nm_per_rad3"):
+        return "stiffness"
+    for suffix in ("share", "per_k_nm"):
+        if p.get(suffix):
+            return f"{name}.{suffix}"
+    return f"{name}.motor" if p.get("motor_side") else name
+
+
+def shapes_of(effect: Effect, term: Term) -> tuple[str, ...]:
+    """Return the parameters of a term that no coefficient changes and a fit may move: a travel, a Stribeck speed."""
+    some, more = (term.combine([size] * len(term.basis)) for size in (1.0, 2.0))
+    return tuple(
+        p.name
+        for p in effect.parameters
+        if not (
+            p.fixed
+            or p.key == p.name
+            or (p.unit in ("rad", "°C") and p.name.startswith(("phase", "reference")))
+        )
+        and p.name in some
+        and some[p.name] == more[p.name] != 0.0
+    )
+
+
+def entries_of(
+    candidates: Sequence[EffectCandidate],
+    signals: Sequence[Sequence[JointSignals]],
+    trust: Mapping[str, float] = MappingProxyType({}),
+) -> list[Entry]:
+    """Return the entries of all candidates that these runs can show; trust: factors of priors by their name in limits."""
+    joints = {s.number: s.joint for s in signals[0]}
+    of = {n: [s for run in signals for s in run if s.number == n] for n in joints}
+    use = {n: usage(mine) for n, mine in of.items()}
+    terms: dict[tuple[str, JointName], int] = {}
+    for c in candidates:
+        terms[c.key] = terms.get(c.key, 0) + 1
+    out = []
+    for c in candidates:
+        n = c.joint if isinstance(c.joint, int) else min(joints)
+        entry = entry_of(c, joints[n], use[n], terms[c.key], trust)
+        if entry is not None:
+            out.append(entry)
+    return out
+
+
+def usage(signals: Sequence[JointSignals]) -> Usage:
+    """Return what the runs of one joint are like."""
+    speed = math.sqrt(float(np.mean(np.concatenate([s.state.velocity_rad_s**2 for s in signals]))))
+    warm = np.concatenate([s.state.temperature_c for s in signals])
+    warm = warm[np.isfinite(warm)]
+    return Usage(speed, float(np.ptp(warm)) if len(warm) else 0.0)
+
+
+_WARMS_K: Final = 1.0
+
+
+def entry_of(
+    c: EffectCandidate, joint: Joint, use: Usage, terms: int, trust: Mapping[str, float]
+) -> Entry | None:
+    """Return the entry of a candidate, None where it is one of another's or its condition does not vary."""
+    effect, p = c.effect, c.term.basis[0]
+    kind = kind_of(effect, p)
+    prior = limits.PRIORS.get(kind, limits.OTHER)
+    nothing = c.term.combine([0.0] * c.size)
+    lead = lead_of(c)
+    if kind in ("stiffness", "nonlinear_stiffness") and c.size == 2:
+        return None
+    if ("temperature_c" in effect.needs or p.get("per_k_nm")) and use.warming_k < _WARMS_K:
+        return None
+    if effect.name == "temperature_dependent_friction" and (p.get("viscous_per_k") or 0.015) != 0.015:
+        return None
+    step = p[lead] - (nothing[lead] if c.size == 1 or "phase_rad" not in p else 0.0)
+    if "reference_c" in p and c.size == 2:
+        step = p[lead]
+    size = trust.get(kind, 1.0) * prior.size(joint, use) / step
+    weights = np.eye(c.size) * size
+    if "reference_c" in p and c.size == 2:
+        part = limits.REFERENCE_K / SPAN_K
+        weights = np.array([[1.0, -part], [0.0, part]]) * size
+    chance = limits.P_FILE if prior.file else limits.P_EFFECT / terms
+    detail = tuple((k, p[k]) for k in _KINDS if k in p)
+    low, high = -math.inf, math.inf
+    if c.size == 1:
+        q = next(x for x in effect.parameters if x.name == lead)
+        ends = sorted(
+            (
+                (q.low - nothing[lead]) / (step * weights[0, 0]),
+                (q.high - nothing[lead]) / (step * weights[0, 0]),
+            )
+        )
+        low, high = ends
+        if effect.scales_balance or effect.scales_all:
+            around = sorted((f - 1.0) * nothing[lead] / (step * weights[0, 0]) for f in limits.SCALES)
+            low, high = (max(low, around[0]), min(high, around[1])) if nothing[lead] else (low, high)
+    return Entry(
+        c, kind, prior, weights, math.log(chance / (1.0 - chance)), (kind, c.joint, detail), low, high
+    )
+
+
+def lead_of(c: EffectCandidate) -> str:
+    """Return the name of the parameter that carries the size of a candidate."""
+    one = c.term.combine([1.0] * c.size)
+    two = c.term.combine([2.0] * c.size)
+    return str(next(name for name in one if one[name] != two[name] and name != "phase_rad"))

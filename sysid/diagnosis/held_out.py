@@ -1,0 +1,206 @@
+"""The extended model that predicts, and its gain on held-out runs.
+
+Evidence distinguishes sets; what predicts is another estimate: the set and all values of the file that these runs can tell,
+by least squares in Nm under the same priors. The response of each balance has weight one, so an error is that of the
+current that the simulation needs (as torque, G Kt i) and of the twist.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import TORSION
+from jtqd.sysid.diagnosis import limits
+from jtqd.sysid.diagnosis.evidence import Set, Sets
+from jtqd.sysid.diagnosis.findings import Gain, RunGain
+from jtqd.sysid.diagnosis.model import Solution
+from jtqd.sysid.diagnosis.regressors import Index, RunData
+from jtqd.sysid.diagnosis.signals import Channel
+
+_BOOTSTRAPS: Final = 2000
+_ROUNDS: Final = 6
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The set that predicts: entries, their scaled coefficients, and per channel and recording the sums of squares before
+    and after [Nm^2], each recording with the coefficients of all others, and the count of bins [r, 3].
+    """
+
+    chosen: Set
+    mean: FloatArray
+    squares: dict[Channel, FloatArray]
+    vetoed: Set
+
+
+def predict(solution: Solution) -> Prediction:
+    """Return the set that predicts: without entries that raise the error on held-out runs beyond its scatter."""
+    grams, counts = _grams(solution)
+    seconds = sum(float(s.time_s[-1] - s.time_s[0]) for run in solution.dataset.signals for s in run)
+    values = {k for k, e in enumerate(solution.entries) if e.prior.file}
+    slots = {solution.entries[k].slot for k in solution.chosen}
+    more = {k for k in values - solution.equations.noisy if solution.entries[k].slot not in slots}
+    chosen: Set = solution.chosen | more
+    weight = _weight(solution, grams, counts, chosen, seconds)
+    vetoed: set[int] = set()
+    while True:
+        each = _held_out(solution, grams, chosen, weight)
+        worse = _worst(solution, grams, chosen, weight, each)
+        if worse is None:
+            break
+        vetoed.add(worse)
+        chosen -= {worse}
+    total = weight * np.sum([g for run in grams for g in run.values()], axis=0)
+    sets = Sets(solution.entries, total)
+    chosen = _worth(sets, chosen, solution.chosen)
+    each = _held_out(solution, grams, chosen, weight)
+    mean = sets.fit(chosen).mean
+    squares = {
+        c: np.array([(run[c][-1, -1], each[r][c], counts[r][c]) for r, run in enumerate(grams) if c in run])
+        for c in grams[0]
+    }
+    return Prediction(chosen, mean, squares, frozenset(vetoed))
+
+
+def _worth(sets: Sets, chosen: Set, found: Set) -> Set:
+    """Return the set without values of the file that change by less than their deviation, and are no entry found."""
+    fit, places = sets.fit(chosen), sets.places(chosen)
+    small = {
+        k
+        for k, at in places.items()
+        if k not in found and bool(np.all(np.abs(fit.mean[at]) < np.sqrt(np.diag(fit.covariance)[at])))
+    }
+    return chosen - small
+
+
+def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:
+    """Return per recording and channel the normal equations over [entries, response] in Nm, less what noise of torques puts
+    into the columns, and the count of bins.
+    """
+    weights = solution.transform()
+    pieces = solution.dataset.recordings
+    channels = list(solution.runs[0].channels)
+    grams = [{c: np.zeros((weights.shape[1] + 1,) * 2) for c in channels} for _ in range(max(pieces) + 1)]
+    counts = [dict.fromkeys(channels, 0) for _ in grams]
+    noisy = {run.name: run for run in solution.disturbed}
+    for r, run in enumerate(solution.runs):
+        for c in channels:
+            x = _rows(run, c, weights)
+            counts[pieces[r]][c] += len(x)
+            grams[pieces[r]][c] += x.T @ x
+            if run.name in noisy:
+                noise = _rows(noisy[run.name], c, weights, run) - x
+                extra = noise.T @ noise
+                extra[-1, -1] = 0.0
+                grams[pieces[r]][c] -= extra
+    return grams, counts
+
+
+def _rows(run: RunData, channel: Channel, weights: FloatArray, valid_of: RunData | None = None) -> FloatArray:
+    d = run.channels[channel]
+    valid = (valid_of or run).channels[channel].valid
+    x = np.column_stack(((d.regressors @ weights[d.index])[valid], d.residual[valid]))
+    return np.asarray(x - x.mean(axis=0) if channel.balance == TORSION and len(x) else x)
+
+
+def _weight(
+    solution: Solution,
+    grams: Sequence[dict[Channel, FloatArray]],
+    counts: Sequence[dict[Channel, int]],
+    chosen: Set,
+    seconds: float,
+) -> float:
+    """Return the weight of a bin's square against the priors: what is left is the noise, so many samples of it a second are
+    independent.
+    """
+    total = np.sum([g for run in grams for g in run.values()], axis=0)
+    count = sum(n for run in counts for n in run.values())
+    left = 0.1 * float(total[-1, -1]) / max(count, 1)
+    weight = 1.0
+    for _ in range(_ROUNDS):
+        weight = limits.INDEPENDENT_HZ * seconds / max(count, 1) / max(left, 1e-12)
+        sets = Sets(solution.entries, weight * total)
+        left = _square(total, sets.columns(chosen), sets.fit(chosen).mean) / max(count, 1)
+    return weight
+
+
+def _square(gram: FloatArray, at: Index, mean: FloatArray) -> float:
+    """Return the sum of squares that coefficients leave."""
+    return float(gram[-1, -1] - 2.0 * mean @ gram[at, -1] + mean @ gram[np.ix_(at, at)] @ mean)
+
+
+def _held_out(
+    solution: Solution, grams: Sequence[dict[Channel, FloatArray]], chosen: Set, weight: float
+) -> list[dict[Channel, float]]:
+    """Return per recording the squares with the coefficients of all others."""
+    total = weight * np.sum([g for run in grams for g in run.values()], axis=0)
+    out = []
+    for run in grams:
+        others = total - weight * np.sum(list(run.values()), axis=0) if len(grams) > 1 else total
+        sets = Sets(solution.entries, others)
+        at, mean = sets.columns(chosen), sets.fit(chosen).mean
+        out.append({c: max(_square(g, at, mean), 0.0) for c, g in run.items()})
+    return out
+
+
+def _worst(
+    solution: Solution,
+    grams: Sequence[dict[Channel, FloatArray]],
+    chosen: Set,
+    weight: float,
+    each: Sequence[dict[Channel, float]],
+) -> int | None:
+    """Return the structural entry whose removal lowers the held-out error most, beyond the scatter over recordings."""
+    if len(grams) < limits.FEWEST_VETO:
+        return None
+    now = np.array([sum(run.values()) for run in each])
+    best, found = 0.0, None
+    for k in sorted(chosen):
+        if solution.entries[k].prior.file:
+            continue
+        without = _held_out(solution, grams, chosen - {k}, weight)
+        gain = now - np.array([sum(run.values()) for run in without])
+        scatter = float(np.std(gain, ddof=1)) / np.sqrt(len(gain))
+        if float(np.mean(gain)) > max(limits.VETO * scatter, best):
+            best, found = float(np.mean(gain)), k
+    return found
+
+
+def gain_of(solution: Solution, prediction: Prediction, seed: int = 0) -> Gain:
+    """Return the error of the simulation's torque before and after, in the balance where most goes away.
+
+    The run's own zero and friction of the day stay in, as in service. ci95: of rmse_before - rmse_after [Nm], bootstrap over
+    recordings.
+    """
+    squares = prediction.squares
+    channel = max(squares, key=lambda c: _rms(squares[c], 0) - _rms(squares[c], 1))
+    table = squares[channel]
+    rng = np.random.default_rng(seed)
+    picks = rng.integers(0, len(table), size=(_BOOTSTRAPS, len(table)))
+    sums = table[picks].sum(axis=1)
+    drawn = np.sqrt(sums[:, 0] / sums[:, 2]) - np.sqrt(sums[:, 1] / sums[:, 2])
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    pieces = list(solution.dataset.recordings)
+    names = [solution.dataset.runs[pieces.index(r)].name for r in range(len(table))]
+    return Gain(
+        _rms(table, 0),
+        _rms(table, 1),
+        f"each of {len(table)} runs held out once; {channel.balance} balance of joint {channel.joint}",
+        (float(low), float(high)),
+        joint=channel.joint,
+        balance=channel.balance,
+        runs=tuple(
+            RunGain(name, _rms(row, 0), _rms(row, 1))
+            for name, row in zip(names, table[:, None, :], strict=True)
+            if row[0, 2] > 0.0
+        ),
+    )
+
+
+def _rms(table: FloatArray, column: int) -> float:
+    return float(np.sqrt(table[:, column].sum() / max(table[:, 2].sum(), 1.0)))

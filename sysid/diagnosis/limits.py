@@ -1,0 +1,144 @@
+"""All numeric limits of the diagnosis's decisions: what data sheets and calibrations are off by, and from where on sets
+differ.
+
+Priors are physical sizes: the standard deviation of what a value of a joint file, a calibration or an effect may be off by.
+They are shown in the report, and the user may set them (`--trust`). Everything else that decides is in `DECISIONS`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from jtqd.estimator.joint import Joint
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What the runs of a joint are like: rms speed [rad/s, joint side], range of temperature [K]."""
+
+    speed_rad_s: float
+    warming_k: float
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of the leading parameter of an entry.
+
+    size: standard deviation [SI] for a joint as it is used; text: the same for people; file: a value of the joint file or a
+    zero, which is usually a little wrong, and no structural effect.
+    """
+
+    size: Callable[[Joint, Usage], float]
+    text: str
+    file: bool = False
+
+
+def _rated_a(joint: Joint) -> float:
+    return joint.rated_torque_nm / (joint.gear_ratio * joint.torque_constant_nm_per_a)
+
+
+def _coulomb(joint: Joint) -> float:
+    return max(joint.friction.coulomb_nm, 0.0125 * joint.rated_torque_nm)
+
+
+def _viscous(joint: Joint, use: Usage) -> float:
+    return max(joint.friction.viscous_nms_per_rad, 0.01 * joint.rated_torque_nm / max(use.speed_rad_s, 0.03))
+
+
+def _reflected(joint: Joint) -> float:
+    return joint.gear_ratio**2 * joint.rotor_inertia_kgm2
+
+
+def _twist(joint: Joint) -> float:
+    return joint.rated_torque_nm / joint.stiffness_nm_per_rad
+
+
+PRIORS: Final[Mapping[str, Prior]] = {
+    "torque_constant": Prior(lambda j, u: 0.10 * j.torque_constant_nm_per_a, "10 %", file=True),
+    "coulomb_friction": Prior(lambda j, u: _coulomb(j), "100 %", file=True),
+    "viscous_friction": Prior(_viscous, "100 %", file=True),
+    "load_dependent_friction": Prior(lambda j, u: 0.10, "10 % of the load", file=True),
+    "rotor_inertia": Prior(lambda j, u: 0.20 * j.rotor_inertia_kgm2, "20 %", file=True),
+    "link_inertia": Prior(
+        lambda j, u: max(0.2 * j.link_inertia_kgm2, 0.05 * _reflected(j)), "20 %", file=True
+    ),
+    "stiffness": Prior(lambda j, u: 0.30 * j.stiffness_nm_per_rad, "30 %", file=True),
+    "gear_damping": Prior(
+        lambda j, u: max(j.damping_nms_per_rad, 1e-3 * j.stiffness_nm_per_rad), "100 %", file=True
+    ),
+    "sensor_offset": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated", file=True),
+    "current_offset": Prior(lambda j, u: 0.01 * _rated_a(j), "1 % of rated", file=True),
+    "sensor_gain": Prior(lambda j, u: 0.01, "1 %"),
+    "sensor_crosstalk": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated"),
+    "sensor_crosstalk.share": Prior(lambda j, u: 0.01, "1 %"),
+    "sensor_drift": Prior(lambda j, u: 1e-4 * j.rated_torque_nm, "0.01 % of rated per second"),
+    "sensor_drift.per_k_nm": Prior(lambda j, u: 1e-3 * j.rated_torque_nm, "0.1 % of rated per kelvin"),
+    "stribeck_friction": Prior(lambda j, u: 0.5 * _coulomb(j), "half of Coulomb friction"),
+    "friction_asymmetry": Prior(lambda j, u: 0.2 * _coulomb(j), "a fifth of Coulomb friction"),
+    "temperature_dependent_friction": Prior(lambda j, u: 0.02, "2 % per kelvin"),
+    "torque_constant_temperature": Prior(lambda j, u: 0.002, "0.2 % per kelvin"),
+    "torque_constant_saturation": Prior(lambda j, u: 0.05 / _rated_a(j), "5 % at rated current"),
+    "torque_ripple": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated"),
+    "cogging": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated"),
+    "kinematic_error": Prior(lambda j, u: 2e-4, "0.2 mrad"),
+    "encoder_eccentricity": Prior(lambda j, u: 3e-4, "0.3 mrad"),
+    "encoder_eccentricity.motor": Prior(lambda j, u: 5e-3, "5 mrad"),
+    "nonlinear_stiffness": Prior(
+        lambda j, u: 0.3 * j.stiffness_nm_per_rad / _twist(j) ** 2, "30 % at rated torque"
+    ),
+    "hysteresis": Prior(lambda j, u: 0.05 * j.rated_torque_nm, "5 % of rated"),
+    "lost_motion": Prior(lambda j, u: 3e-4, "0.3 mrad"),
+    "channel_delay": Prior(lambda j, u: 3e-3, "3 ms"),
+    "unbalance": Prior(lambda j, u: 0.02 * j.rated_torque_nm, "2 % of rated"),
+}
+"""By effect; with a suffix for a kind of it that is another value of the file or of another size."""
+OTHER: Final = Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated")
+"""Of an effect that has no row: by the torque that its columns make."""
+
+SCALES: Final = (0.5, 2.0)
+"""Factors within which what scales a balance may be off: more is another unit."""
+P_FILE: Final = 0.3
+"""Prior probability that a value of the file is off by more than does not matter."""
+P_EFFECT: Final = 0.05
+"""Prior probability that a structural effect is there, shared by its terms."""
+SHAPE: Final = 0.4
+"""Prior standard deviation of a shape (travel, Stribeck speed), as part of it: half of the distance of the grid."""
+REFERENCE_K: Final = 3.0
+"""The same of the temperature at which the file's values hold."""
+FEATURES: Final = 12
+"""Random Fourier features of a balance's discrepancy, plain; as many in the direction of motion."""
+LENGTH: Final = 1.0
+"""Their length scale, in standard deviations of the operating conditions."""
+FLOOR: Final = 1e-3
+"""Prior size of the discrepancy, part of the rated torque, worth FLOOR_COUNT features."""
+FLOOR_COUNT: Final = 2.0
+RUNS_COUNT: Final = 4.0
+"""Runs that the prior of a run-to-run variation is worth."""
+CAP: Final = 0.3
+"""Largest part of the gap (rms) that may be discrepancy."""
+RIVAL: Final = 6.0
+"""Twice the log evidence within which another set is a rival."""
+ROBUST: Final = 9.0
+"""Factor of the discrepancy's variance that a certain entry must survive."""
+NOISE_KNOWN: Final = 0.1
+"""Part to which the size of a channel's noise is known: a certain entry must not rest on it."""
+UNTOLD: Final = 0.7
+"""Posterior over prior deviation above which these runs cannot tell a value."""
+LISTED: Final = 0.2
+"""Part of the relevance from which an entry is listed as a cause; smaller ones are listed as too small to matter."""
+RELEVANCE: Final = 0.005
+"""Part of the rated torque, rms, from which an entry or an unexplained residual matters; the user may set another."""
+INDEPENDENT_HZ: Final = 2.0
+"""Independent samples a second of what an incomplete model leaves."""
+FEWEST_VETO: Final = 3
+"""Recordings from which held-out runs may veto an entry."""
+VETO: Final = 2.0
+"""Standard errors over recordings by which an entry must raise the error on held-out runs to be vetoed."""
+INACCURATE: Final = 0.025
+"""Half width of a 95 % interval, as part of an effect's size, for what the equations simplify: no interval is narrower."""
+INACCURATE_RATE: Final = 0.04
+"""The same of what is known by a derivative of measured angles or torques."""
+INACCURATE_TWIST: Final = 0.05
+"""The same of what teeth or torsion do within a few tens of microradians, where encoders round."""

@@ -1,0 +1,483 @@
+"""The model of all runs: columns of all entries at the present solution, noise, the set of most evidence, its shapes.
+
+1. What the values of the file and the waves of the library leave, under their priors, is the first noise.
+2. The set of most evidence is searched from nothing and from all values of the file, with variances of its own.
+3. Currents and torsions are what the simulation with this set has; shapes move to where the set wants them; noise is what
+the
+   set leaves. Then again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import Linear
+from jtqd.sysid.diagnosis import limits
+from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
+from jtqd.sysid.diagnosis.dataset import Dataset
+from jtqd.sysid.diagnosis.discrepancy import features
+from jtqd.sysid.diagnosis.entries import Entry, entries_of, shapes_of
+from jtqd.sysid.diagnosis.evidence import Equations, Set, Sets
+from jtqd.sysid.diagnosis.findings import shows_at
+from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums, white_noise
+from jtqd.sysid.diagnosis.regressors import (
+    ChannelData,
+    Index,
+    RunData,
+    binned,
+    contribution,
+    fields_used,
+    run_data,
+    samples_in,
+)
+from jtqd.sysid.diagnosis.signals import RATE_HZ, TORQUE_HZ, VALUES_HZ, Channel, JointSignals
+from jtqd.sysid.diagnosis.solution import present_effects, set_state
+
+_TURNS: Final = 4
+_ROUNDS: Final = 3
+_STATES: Final = frozenset({"current_a", "current_rate_a_s", "torsion_rad", "torsion_rate_rad_s", "joint"})
+"""What effects use that follows from the solution."""
+_SETTLING: Final = 6
+_SETTLED: Final = 0.1
+"""Standard deviations: smaller changes of a coefficient are none."""
+_TORQUES: Final = frozenset({"torque_nm", "torque_rate_nm_s"})
+_STEP: Final = 0.02
+_RATES_PER_K: Final = (0.003, 0.06)
+_LEAST_SECANT: Final = 1e-3
+"""Of the prior's size: less has no secant."""
+
+
+@dataclass
+class Solution:
+    """A set with its posterior.
+
+    entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence; values: the
+    same with all that the torques hold, for the values of the set; noise; runs, disturbed: binned, with discrepancy among
+    the nuisances; own_means: of what each recording has of its own; own: the same for a set with given coefficients.
+    """
+
+    dataset: Dataset
+    entries: list[Entry]
+    chosen: Set
+    equations: Equations
+    variances: Mapping[object, float]
+    noise: Noise
+    runs: list[RunData]
+    disturbed: list[RunData]
+    own_means: list[FloatArray]
+    sets: Sets
+    values: Sets
+    own: Callable[[FloatArray, Set], FloatArray]
+    columns: int
+
+    def transform(self) -> FloatArray:
+        """Return the weights of scaled coefficients in the library's columns [P, E]."""
+        return transform_of(self.entries, self.columns)
+
+
+def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
+    """Return the weights of scaled coefficients of entries in the library's columns [P, E]."""
+    out = np.zeros((columns, sum(e.size for e in entries)))
+    first = 0
+    for e in entries:
+        out[np.ix_(list(e.columns), range(first, first + e.size))] = e.weights
+        first += e.size
+    return out
+
+
+Means = tuple[FloatArray, FloatArray, list[FloatArray]]
+"""Of coefficients, shared discrepancy, and what each recording has of its own."""
+
+
+class _End(NamedTuple):
+    """Where a search ended: -2 log marginal likelihood, set, variances, means."""
+
+    score: float
+    chosen: Set
+    variances: Mapping[object, float]
+    means: Means
+
+
+def solve(dataset: Dataset, seed: int = 0) -> Solution:
+    """Return the set of entries with most evidence on these runs."""
+    work = _Work(dataset, seed)
+    residuals = work.first_residuals()
+    best: _End | None = None
+    for turn in range(_TURNS):
+        noise = (white_noise if turn == 0 else noise_model)(work.runs, residuals, dataset.step_s)
+        equations = work.equations(noise)
+        begin = {(best.chosen if best else work.file_values()) - equations.noisy}
+        starts = begin | ({frozenset[int]()} if turn < 2 else set())
+        ends: list[_End] = []
+        for start in starts:
+            now, variances, last = start, equations.first(), None
+            for _ in range(_ROUNDS):
+                variances, _, _ = equations.expected(now, variances, 4)
+                sets = equations.sets(variances)
+                ends_of = {sets.search(s) for s in {now, *starts}}
+                ends_of |= {
+                    # a gain scales all balances: from it no single exchange leads to what else may be wrong
+                    sets.search(sets.search(s - work.scales, banned=work.gains))
+                    for s in ends_of
+                    if s & work.gains
+                }
+                now = max(ends_of, key=lambda s: sets.fit(s).evidence)
+                if now == last:
+                    break
+                last = now
+            _, score, means = equations.expected(now, variances, 0)
+            ends.append(_End(score, now, variances, means))
+        best = min(ends, key=lambda end: end.score)
+        chosen, variances, means = best.chosen, dict(best.variances), best.means
+        if turn + 1 < _TURNS:
+            residuals = work.left(chosen, means)
+            work.settle(chosen, means[0], noise, variances)
+    assert best is not None
+    sets = equations.sets(variances)
+    means, wide, found = work.values(chosen, means, noise, variances)
+    return Solution(
+        dataset,
+        work.entries,
+        chosen,
+        equations,
+        variances,
+        noise,
+        work.runs,
+        work.disturbed,
+        means[2],
+        sets,
+        wide.sets(found),
+        lambda mean, which: wide.own(which, mean, found),
+        work.columns,
+    )
+
+
+class _Work:
+    """Binned columns of runs and disturbed runs at the present solution."""
+
+    def __init__(self, dataset: Dataset, seed: int) -> None:
+        self.dataset = dataset
+        self.entries = entries_of(dataset.candidates, dataset.signals, dataset.trust)
+        self.families = len(dataset.families)
+        self.columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
+        rng = np.random.default_rng(seed)
+        for s in (s for run in (*dataset.signals, *dataset.disturbed) for s in run):
+            s.know_torque(TORQUE_HZ, RATE_HZ)  # as the runs were binned, whatever was solved since
+            set_state(s, ())
+        self.runs = [replace(run, channels=dict(run.channels)) for run in dataset.runs]
+        self.disturbed = [
+            run_data(run, dataset.candidates, samples_in(dataset.step_s, run), dataset.families)
+            for run in dataset.disturbed
+        ]
+        names = [run.name for run in self.runs]
+        self.disturbed_of = [names.index(run.name) for run in self.disturbed]
+        self.groups: list[object] = [("family", k) for k in range(self.families)]
+        rated = dataset.rated_torque_nm
+        self.start: dict[object, tuple[float, float]] = {
+            ("family", k): (f.sigma**2, limits.RUNS_COUNT) for k, f in enumerate(dataset.families)
+        }
+        self.most: dict[object, float] = {}
+        shared: list[int] = []
+        for channel in dataset.runs[0].channels:
+            made = features(dataset.runs, channel, rng)
+            first, count = len(self.groups), made[0].shape[1]
+            group = ("discrepancy", channel)
+            self.groups += [group] * count
+            self.start[group] = ((limits.FLOOR * rated) ** 2, limits.FLOOR_COUNT)
+            gap = np.concatenate(
+                [r.channels[channel].residual[r.channels[channel].valid] for r in dataset.runs]
+            )
+            self.most[group] = limits.CAP**2 * float(np.mean(gap**2)) if len(gap) else 1.0
+            shared += range(first, first + count)
+            for r, run in enumerate(self.runs):
+                d = run.channels[channel]
+                run.channels[channel] = replace(
+                    d,
+                    nuisances=np.hstack((d.nuisances, made[r])),
+                    families=np.concatenate((d.families, np.arange(first, first + count))).astype(np.intp),
+                )
+        self.shared = np.array(shared, np.intp)
+        self.gains = frozenset(k for k, e in enumerate(self.entries) if e.effect.scales_all)
+        self.scales = self.gains | {k for k, e in enumerate(self.entries) if e.effect.scales_balance}
+        joint = next(iter(dataset.joints.values()))
+        self._used = {
+            k: fields_used(e.effect, e.candidate.term.basis[0], joint) for k, e in enumerate(self.entries)
+        }
+
+    def file_values(self) -> Set:
+        """Return the set of all values of the file, one of each slot."""
+        taken: dict[object, int] = {}
+        for k, e in enumerate(self.entries):
+            if e.prior.file:
+                taken.setdefault(e.slot, k)
+        return frozenset(taken.values())
+
+    def transform(self) -> FloatArray:
+        return transform_of(self.entries, self.columns)
+
+    def equations(self, noise: Noise, entries: Sequence[Entry] | None = None) -> Equations:
+        """Return the whitened normal equations of all recordings, over all entries or these."""
+        entries = self.entries if entries is None else entries
+        P, N = self.columns, len(self.groups)
+        weights = transform_of(entries, P)
+        used = np.flatnonzero(np.any(weights != 0.0, axis=1)) if entries is not self.entries else None
+        E = weights.shape[1]
+        full = np.zeros((P + N + 1, E + N + 1))
+        full[:P, :E] = weights
+        full[P:, E:] = np.eye(N + 1)
+        sums = [run_sums(_only(run, used), noise, P, N) for run in self.runs]
+        sums = with_readings(
+            sums,
+            self.dataset.readings,
+            unpowered_columns([e.candidate for e in entries], self.dataset.joints),
+        )
+        pieces = self.dataset.recordings
+        grams = np.zeros((max(pieces) + 1, E + N + 1, E + N + 1))
+        extra = np.zeros_like(grams)
+        for place, s in zip(pieces, sums, strict=True):
+            grams[place] += full.T @ s.gram @ full
+        for place, other in zip(self.disturbed_of, self.disturbed, strict=True):
+            gram = run_sums(_only(_difference(other, self.runs[place]), used), noise, P, N).gram
+            extra[pieces[place]] += full.T @ gram @ full
+        lacking = set(range(len(grams))) - {pieces[place] for place in self.disturbed_of}
+        for p in lacking if self.disturbed else ():  # as the others have
+            extra[p] = extra.sum(axis=0) / (len(grams) - len(lacking))
+        return Equations(entries, grams, extra, self.groups, self.shared, self.start, self.most)
+
+    def first_residuals(self) -> dict[Channel, list[FloatArray]]:
+        """Return what the values of the file, the waves and the runs' own changes leave under their priors, per run [n].
+
+        Not what everything could explain: the residual is a sum of measured terms, and with a column for each of them all of
+        it is explained by taking everything away.
+        """
+        usual = list(range(len(self.entries)))
+        weights = self.transform()
+        ends = np.cumsum([0, *(e.size for e in self.entries)])
+        at = (
+            np.concatenate([np.arange(ends[k], ends[k + 1]) for k in usual]).astype(int)
+            if usual
+            else np.empty(0, int)
+        )
+        weights = weights[:, at]
+        sigma = np.array([f.sigma for f in self.dataset.families])
+        E, Q, R = weights.shape[1], self.families, len(self.runs)
+        gram, right, parts, noise = np.zeros((E + R * Q,) * 2), np.zeros(E + R * Q), [], 0.0
+        for r, run in enumerate(self.runs):
+            for c, d in run.channels.items():
+                own = d.families < Q
+                x = np.hstack((d.regressors @ weights[d.index], d.nuisances[:, own] * sigma[d.families[own]]))
+                place = np.concatenate((np.arange(E), E + r * Q + d.families[own])).astype(int)
+                gram[np.ix_(place, place)] += x[d.valid].T @ x[d.valid]
+                right[place] += x[d.valid].T @ d.residual[d.valid]
+                parts.append((c, d, x, place))
+                if d.valid.any():
+                    noise = max(noise, float(np.var(d.residual[d.valid])))
+        rest: list[tuple[Channel, FloatArray]] = []
+        for _ in range(4):
+            theta = np.linalg.solve(gram + noise * np.eye(len(gram)), right)
+            rest = [(c, np.where(d.valid, d.residual - x @ theta[place], np.nan)) for c, d, x, place in parts]
+            noise = float(np.nanmean(np.concatenate([x for _, x in rest]) ** 2))
+        return {c: [x for k, x in rest if k == c] for c in self.runs[0].channels}
+
+    def left(self, chosen: Set, means: Means) -> dict[Channel, list[FloatArray]]:
+        """Return what set, discrepancy and the runs' own changes leave, per channel and run [n], NaN where not valid."""
+        beta, w, us = means
+        ends = np.cumsum([0, *(e.size for e in self.entries)])
+        full = np.zeros(ends[-1])
+        at = [j for k in sorted(chosen) for j in range(ends[k], ends[k + 1])]
+        full[at] = beta
+        library = self.transform() @ full
+        pieces = self.dataset.recordings
+        out: dict[Channel, list[FloatArray]] = {c: [] for c in self.runs[0].channels}
+        for run, place in zip(self.runs, pieces, strict=True):
+            total = us[place].copy()
+            total[self.shared] += w
+            for c, d in run.channels.items():
+                rest = d.residual - d.regressors @ library[d.index] - d.nuisances @ total[d.families]
+                out[c].append(np.where(d.valid, rest, np.nan))
+        return out
+
+    def values(
+        self,
+        chosen: Set,
+        means: Means,
+        noise: Noise,
+        variances: Mapping[object, float],
+    ) -> tuple[Means, Equations, Mapping[object, float]]:
+        """Return means and sets where the torques in the regressors hold all that the response holds: a set is found with
+        less of their noise, its values with more of what they say.
+        """
+        for s in (s for run in (*self.dataset.signals, *self.dataset.disturbed) for s in run):
+            s.know_torque(VALUES_HZ, VALUES_HZ)
+        self.settle(chosen, means[0], noise, variances, _STATES | _TORQUES)
+        equations = self.equations(noise)
+        found, _, means = equations.expected(chosen, variances, 2)
+        return means, equations, found
+
+    def settle(
+        self,
+        chosen: Set,
+        mean: FloatArray,
+        noise: Noise,
+        variances: Mapping[object, float],
+        changed: frozenset[str] = _STATES,
+    ) -> None:
+        """Move to the solution; again with the coefficients there, where the current that effects see depends on the set."""
+        self.move(chosen, mean, changed)
+        acting = any("current_a" in self._used[k] for k in chosen)
+        for _ in range(_SETTLING if acting else 0):
+            few = [self.entries[k] for k in sorted(chosen)]
+            sets = self.equations(noise, few).sets(variances)
+            fit = sets.fit(frozenset(range(len(few))))
+            now = fit.mean
+            settled = len(now) == len(mean) and bool(
+                np.all(np.abs(now - mean) <= _SETTLED * np.sqrt(np.diag(fit.covariance)))
+            )
+            mean = now
+            self.move(chosen, mean)
+            if settled:
+                return
+
+    def move(self, chosen: Set, mean: FloatArray, changed: frozenset[str] = _STATES) -> None:
+        """Set states and shapes to the solution, and make the columns again that depend on them."""
+        ends, again = 0, set()
+        present = []
+        for k in sorted(chosen):
+            e = self.entries[k]
+            scaled = mean[ends : ends + e.size]
+            ends += e.size
+            moved = self._shaped(e, scaled)
+            if moved is not e:
+                self.entries[k] = moved
+                again.add(k)
+            present.append((e, scaled))
+        effects = present_effects(present)
+        for s in (s for run in (*self.dataset.signals, *self.dataset.disturbed) for s in run):
+            set_state(s, effects)
+        again |= {
+            k
+            for k, used in self._used.items()
+            if used & changed and not (self.entries[k].effect.follows_torsion and k not in chosen)
+        }
+        for signals, run in zip(
+            (*self.dataset.signals, *self.dataset.disturbed), (*self.runs, *self.disturbed), strict=True
+        ):
+            self._columns_again(signals, run, again)
+
+    def _shaped(self, e: Entry, scaled: FloatArray) -> Entry:
+        """Return the entry with its shapes where the coefficients have them, and tangents of each."""
+        names = shapes_of(e.effect, e.candidate.term)
+        values = e.values(scaled)
+        combine = e.candidate.term.combine
+        if names:
+            combine = replace(combine, fixed={**combine.fixed, **{n: values[n] for n in names}})
+        elif isinstance(combine, Linear) and combine.base == (0.0,):
+            # the secant at the present size: a delay and a play are not linear
+            [name], [step] = combine.names, combine.step
+            size = values[name]
+            if abs(size) < _LEAST_SECANT * abs(step * e.weights[0, 0]):
+                return e
+            combine = replace(combine, step=(size,))
+            e = replace(e, weights=e.weights * step / size)
+        elif hasattr(combine, "rate"):  # an exponential, straight at the present rate
+            rate = float(np.clip(abs(values[combine.name]), *_RATES_PER_K))
+            e = replace(e, weights=e.weights * combine.rate / rate)
+            combine = replace(combine, rate=rate)
+        else:
+            return e
+        candidate = replace(e.candidate, term=combine.term())
+        tangents = e.tangents
+        if names and not tangents:
+            tangents = tuple(range(self.columns, self.columns + len(names)))
+            self.columns += len(names)
+            inner = np.zeros((e.candidate.size + len(names),) * 2)
+            inner[: e.candidate.size, : e.candidate.size] = e.weights
+            inner[range(e.candidate.size, len(inner)), range(e.candidate.size, len(inner))] = 1.0
+            e = replace(e, weights=inner)
+        return replace(
+            e,
+            candidate=candidate,
+            shapes=names,
+            tangents=tangents,
+            amplitude=tuple(
+                e.coefficients(
+                    scaled[: e.size]
+                    if len(scaled) == e.size
+                    else np.append(scaled, np.zeros(e.size - len(scaled)))
+                )
+            ),
+        )
+
+    def _columns_again(self, signals: Sequence[JointSignals], run: RunData, entries: Iterable[int]) -> None:
+        new: dict[Channel, dict[int, FloatArray]] = {c: {} for c in run.channels}
+        for k in entries:
+            e = self.entries[k]
+            c = e.candidate
+            for s in signals:
+                if not shows_at(c.joint, s.number):
+                    continue
+                for column, p in zip(c.columns, c.term.basis, strict=True):
+                    self._put(new, column, contribution(c.effect, p, s), s, run.samples)
+                for column, name in zip(e.tangents, e.shapes, strict=True):
+                    here = c.term.combine(e.amplitude)
+                    there = {**here, name: here[name] * (1.0 + _STEP)}
+                    one, two = contribution(c.effect, here, s), contribution(c.effect, there, s)
+                    scale = limits.SHAPE / _STEP
+                    self._put(new, column, {b: scale * (two[b] - one[b]) for b in one}, s, run.samples)
+        for channel, columns in new.items():
+            d = run.channels[channel]
+            place = {int(k): j for j, k in enumerate(d.index)}
+            regressors = d.regressors.copy()
+            more = []
+            for column, value in columns.items():
+                if column in place:
+                    regressors[:, place[column]] = value
+                else:
+                    more.append((column, value))
+            if more:
+                regressors = np.column_stack((regressors, *(v for _, v in more)))
+            index = np.concatenate((d.index, [k for k, _ in more])).astype(np.intp)
+            run.channels[channel] = replace(d, regressors=regressors, index=index)
+
+    def _put(
+        self,
+        new: dict[Channel, dict[int, FloatArray]],
+        column: int,
+        found: Mapping[str, FloatArray],
+        s: JointSignals,
+        samples: float,
+    ) -> None:
+        for balance, value in found.items():
+            new[Channel(s.number, balance)][column] = binned(s.seen(balance, value), samples)
+
+
+def _only(run: RunData, columns: Index | None) -> RunData:
+    """Return a run with some of its columns, all for None."""
+    if columns is None:
+        return run
+    channels = {}
+    for c, d in run.channels.items():
+        keep = np.isin(d.index, columns)
+        channels[c] = replace(d, regressors=d.regressors[:, keep], index=d.index[keep])
+    return replace(run, channels=channels)
+
+
+def _difference(other: RunData, run: RunData) -> RunData:
+    """Return what the noise of a disturbed run adds to residual and columns; nuisances as none."""
+    channels = {}
+    for c, d in other.channels.items():
+        mine = run.channels[c]
+        channels[c] = ChannelData(
+            mine.valid,
+            d.residual - mine.residual,
+            d.regressors - mine.regressors,
+            mine.index,
+            np.zeros_like(mine.nuisances),
+            mine.families,
+        )
+    return replace(run, channels=channels)

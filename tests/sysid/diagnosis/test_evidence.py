@@ -1,0 +1,321 @@
+"""Evidence of sets of entries against dense normal densities, the search on columns of which the truth is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import combinations, pairwise
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.sysid.diagnosis.entries import Entry
+from jtqd.sysid.diagnosis.evidence import Equations, Set, Sets
+from jtqd.sysid.diagnosis.limits import PRIORS
+
+EVEN = math.log(0.3 / 0.7)
+
+
+def entry(
+    size: int = 1,
+    *,
+    slot: object = None,
+    odds: float = EVEN,
+    low: float = -math.inf,
+    high: float = math.inf,
+) -> Entry:
+    """An entry of `size` columns of which only numbers matter."""
+    candidate = cast("Any", SimpleNamespace(size=size))
+    prior = PRIORS["coulomb_friction"]
+    return Entry(candidate, "made up", prior, np.eye(size), odds, (slot or object(),), low, high)
+
+
+def gram_of(x: FloatArray, y: FloatArray) -> FloatArray:
+    block = np.column_stack((x, y))
+    return np.asarray(block.T @ block)
+
+
+def log_density(y: FloatArray, covariance: FloatArray) -> float:
+    """Of N(y; 0, covariance), less its constant."""
+    return -0.5 * float(y @ np.linalg.solve(covariance, y)) - 0.5 * float(np.linalg.slogdet(covariance)[1])
+
+
+SIZES = (1, 2, 1, 2, 1)
+AT = ([0], [1, 2], [3], [4, 5], [6])
+
+
+@pytest.fixture(scope="module")
+def small() -> tuple[FloatArray, FloatArray, Sets]:
+    """40 rows, entries of one and two columns, columns that have much in common, the second and the third entry there."""
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(40, 7)) * [0.3, 1.0, 0.2, 2.0, 0.5, 1.0, 0.1]
+    x[:, 6] += 0.7 * x[:, 3]
+    y = x @ np.array([0.0, 0.8, -0.5, 1.1, 0.0, 0.0, 0.0]) + rng.normal(size=40)
+    entries = [
+        entry(size, odds=odds) for size, odds in zip(SIZES, (EVEN, -3.0, EVEN, -1.0, 0.3), strict=True)
+    ]
+    return x, y, Sets(entries, gram_of(x, y))
+
+
+EVERY: tuple[Set, ...] = tuple(frozenset(s) for s in ((), (0,), (1,), (2, 4), (0, 1, 2), (0, 1, 2, 3, 4)))
+
+
+@pytest.mark.parametrize("chosen", EVERY, ids=str)
+def test_evidence_is_the_marginal_likelihood(small: tuple[FloatArray, FloatArray, Sets], chosen: Set) -> None:
+    x, y, sets = small
+    columns = x[:, [j for k in sorted(chosen) for j in AT[k]]]
+    whole = log_density(y, columns @ columns.T + np.eye(40))
+    whole += sum(sets.entries[k].odds for k in chosen)
+    nothing = log_density(y, np.eye(40))
+    found = sets.fit(chosen)
+    assert found.evidence - sets.fit(frozenset()).evidence == pytest.approx(whole - nothing, abs=1e-9)
+    precision = columns.T @ columns + np.eye(columns.shape[1])
+    assert found.mean == pytest.approx(np.linalg.solve(precision, columns.T @ y))
+    assert found.covariance == pytest.approx(np.linalg.inv(precision))
+
+
+@pytest.mark.parametrize("chosen", EVERY, ids=str)
+def test_gains_are_differences_of_evidence(small: tuple[FloatArray, FloatArray, Sets], chosen: Set) -> None:
+    _, _, sets = small
+    gains = sets.gains(chosen)
+    for k in range(len(SIZES)):
+        if k in chosen:
+            assert gains[k] == -math.inf
+        else:
+            both = sets.fit(chosen | {k}).evidence - sets.fit(chosen).evidence
+            assert gains[k] == pytest.approx(both, abs=1e-9), k
+
+
+def test_a_slot_is_taken_once_and_what_is_out_stays_out(small: tuple[FloatArray, FloatArray, Sets]) -> None:
+    _, _, sets = small
+    entries = [entry(size, slot="one" if k in (2, 4) else None) for k, size in enumerate(SIZES)]
+    shared = Sets(entries, sets.gram)
+    assert shared.gains(frozenset({2}))[4] == -math.inf
+    assert math.isfinite(shared.gains(frozenset({1}))[4])
+    assert 2 in Sets(entries, sets.gram).search(frozenset())
+    assert 2 not in Sets(entries, sets.gram, out=frozenset({2})).search(frozenset())
+    assert 2 not in shared.search(frozenset(), banned=frozenset({2}))
+
+
+def test_bounds_are_held_and_the_others_follow() -> None:
+    """Friction is not negative: the best coefficient is -1.2, its bound -0.4; the others are as with that one fixed."""
+    rng = np.random.default_rng(2)
+    x = rng.normal(size=(200, 3)) @ np.array([[1.0, 0.6, 0.3], [0.0, 1.0, 0.2], [0.0, 0.0, 1.0]])
+    y = x @ np.array([-1.2, 0.8, 0.3]) + rng.normal(size=200)
+    sets = Sets([entry(low=-0.4), entry(high=5.0), entry()], gram_of(x, y))
+    free = Sets([entry(), entry(), entry()], gram_of(x, y))
+    every = frozenset({0, 1, 2})
+    found = sets.fit(every)
+    assert found.mean[0] == -0.4
+    rest, inner = y + 0.4 * x[:, 0], x[:, 1:]
+    assert found.mean[1:] == pytest.approx(np.linalg.solve(inner.T @ inner + np.eye(2), inner.T @ rest))
+    assert found.evidence < free.fit(every).evidence
+    assert sets.gains(frozenset())[0] == pytest.approx(
+        sets.fit(frozenset({0})).evidence - sets.fit(frozenset()).evidence, abs=1e-9
+    )
+    best = max(
+        (frozenset(s) for n in range(4) for s in combinations(range(3), n)),
+        key=lambda s: sets.fit(s).evidence,
+    )
+    assert sets.search(frozenset()) == sets.search(every) == best
+
+
+def greedy(sets: Sets, chosen: Set) -> Set:
+    """The set from which neither an addition nor a removal gains."""
+    while True:
+        moves = [chosen ^ {k} for k in range(len(sets.entries))]
+        best = max(moves, key=lambda s: sets.fit(s).evidence)
+        if sets.fit(best).evidence <= sets.fit(chosen).evidence:
+            return chosen
+        chosen = best
+
+
+@pytest.mark.parametrize(
+    ("scale", "near"), [(0.3, 1.0), (0.7, 0.5), (3.0, 0.15)], ids=["weak", "strong", "stronger"]
+)
+def test_an_exchange_of_one_for_two_finds_what_additions_and_removals_do_not(
+    scale: float, near: float
+) -> None:
+    """Two losses, and a column that is nearly their sum: with it in the set neither of the two is worth its odds."""
+    rng = np.random.default_rng(5)
+    a, b, others = rng.normal(size=300), rng.normal(size=300), rng.normal(size=(300, 3))
+    x = max(scale, 1.0) * np.column_stack((a, b, a + b + near * rng.normal(size=300), others))
+    y = scale * (a + b) + rng.normal(size=300)
+    odds = (-1.0, -1.0, 1.0, EVEN, EVEN, EVEN)
+    sets = Sets([entry(odds=each) for each in odds], gram_of(x, y))
+    truth, wrong = frozenset({0, 1}), frozenset({2})
+    assert sets.fit(truth).evidence > sets.fit(wrong).evidence + 2.0
+    assert greedy(sets, wrong) == greedy(sets, frozenset()) == wrong, "else this shows nothing"
+    assert sets.search(wrong) == truth
+    assert sets.search(frozenset()) == truth
+
+
+def test_in_noise_nothing_is_found() -> None:
+    rng = np.random.default_rng(4)
+    found = 0
+    for _ in range(40):
+        x, y = 5.0 * rng.normal(size=(100, 10)), rng.normal(size=100)
+        found += len(Sets([entry(odds=-3.0) for _ in range(10)], gram_of(x, y)).search(frozenset()))
+    assert found <= 1, "of 400 columns"
+
+
+def test_what_these_runs_cannot_tell_is_as_uncertain_as_its_prior() -> None:
+    """A column of no energy, and one that is in the set under another name; a strong one can be told."""
+    rng = np.random.default_rng(5)
+    x = rng.normal(size=(100, 4)) * [1.0, 0.02, 1.0, 1.0]
+    x[:, 2] = x[:, 3] + 0.01 * x[:, 2]  # twice the same
+    sets = Sets([entry() for _ in range(4)], gram_of(x, x[:, 3] + rng.normal(size=100)))
+    assert sets.untold(frozenset()) == [1]
+    strong = Sets(sets.entries, 400.0 * sets.gram)
+    assert strong.untold(frozenset()) == []
+    same = Sets(sets.entries[:2], strong.gram[np.ix_([2, 3, 4], [2, 3, 4])] + 1e3 * np.diag([0.0, 1e-9, 0.0]))
+    assert same.untold(frozenset()) == []
+    two = Sets([entry(2)], gram_of(x[:, :2], x[:, 3]))
+    assert two.untold(frozenset()) == [0], "one of its coefficients is not told"
+
+
+# Equations: what runs have of their own, discrepancy, noise in the columns.
+
+
+def equations_of(
+    blocks: Iterable[FloatArray],
+    entries: Sequence[Entry],
+    groups: Sequence[object],
+    *,
+    shared: Sequence[int] = (),
+    noise: FloatArray | None = None,
+    start: float = 0.5,
+    most: float | None = None,
+) -> Equations:
+    """Of rows [E | N | y] of each run."""
+    grams = np.array([b.T @ b for b in blocks])
+    extra = np.zeros_like(grams) if noise is None else np.broadcast_to(noise, grams.shape).copy()
+    kinds = set(groups)
+    capped = {groups[k] for k in shared}
+    limits = dict.fromkeys(capped, math.inf if most is None else most)
+    return Equations(
+        entries, grams, extra, groups, np.array(shared, np.intp), dict.fromkeys(kinds, (start, 2.0)), limits
+    )
+
+
+GROUPS = ("zero", "friction", "discrepancy", "discrepancy")
+
+
+@pytest.fixture(scope="module")
+def drifting() -> list[FloatArray]:
+    """Five runs of 30 rows: three entries, an offset and a friction of the day, two features that all runs share."""
+    rng = np.random.default_rng(6)
+    w, out = rng.normal(size=2), []
+    for _ in range(5):
+        x, z, f = rng.normal(size=(30, 3)), rng.normal(size=(30, 2)), rng.normal(size=(30, 2))
+        z[:, 0] = 1.0
+        y = x @ [0.9, 0.0, -0.4] + z @ (rng.normal(size=2) * [0.8, 0.2])
+        y = y + f @ (w + 0.3 * rng.normal(size=2)) + rng.normal(size=30)
+        out.append(np.column_stack((x, z, f, y)))
+    return out
+
+
+VARIANCES = {"zero": 0.6, "friction": 0.1, "discrepancy": 0.2, ("shared", "discrepancy"): 0.7}
+
+
+def covariance_of(blocks: Sequence[FloatArray], columns: Sequence[int]) -> FloatArray:
+    """Of all y: entries N(0, 1), the runs' own nuisances, and the features' part that all runs share."""
+    rows = np.vstack(blocks)
+    x, f = rows[:, list(columns)], rows[:, 5:7]
+    out = x @ x.T + VARIANCES["shared", "discrepancy"] * (f @ f.T) + np.eye(len(rows))  # type: ignore[index]
+    first = 0
+    for b in blocks:
+        own = b[:, 3:7] * np.sqrt([VARIANCES[g] for g in GROUPS])
+        out[first : first + len(b), first : first + len(b)] += own @ own.T
+        first += len(b)
+    return np.asarray(out)
+
+
+@pytest.mark.parametrize(
+    "chosen", [frozenset(), frozenset({0}), frozenset({0, 2}), frozenset({0, 1, 2})], ids=str
+)
+def test_nuisances_and_discrepancy_are_integrated_out(drifting: list[FloatArray], chosen: Set) -> None:
+    equations = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3))
+    y = np.concatenate([b[:, -1] for b in drifting])
+    sets = equations.sets(VARIANCES)
+    dense = log_density(y, covariance_of(drifting, sorted(chosen))) + EVEN * len(chosen)
+    nothing = log_density(y, covariance_of(drifting, ()))
+    assert sets.fit(chosen).evidence - sets.fit(frozenset()).evidence == pytest.approx(
+        dense - nothing, abs=1e-8
+    )
+    _, score, (beta, _, own) = equations.expected(chosen, VARIANCES, 0)
+    _, empty, _ = equations.expected(frozenset(), VARIANCES, 0)
+    assert score - empty == pytest.approx(-2.0 * (dense - nothing), abs=1e-8)
+    assert beta == pytest.approx(sets.fit(chosen).mean)
+    assert len(own) == len(drifting)
+
+
+@pytest.mark.parametrize("most", [None, 0.05], ids=["free", "capped"])
+def test_expectation_maximisation_raises_the_marginal_likelihood(
+    drifting: list[FloatArray], most: float | None
+) -> None:
+    equations = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3), most=most)
+    first: Any = dict.fromkeys(VARIANCES, 0.04)
+    path = [equations.expected(frozenset({0, 2}), first, k)[1] for k in (0, 1, 2, 4, 8, 16)]
+    assert all(after <= now + 1e-9 for now, after in pairwise(path)), path
+    assert path[0] > path[-1] + 1.0
+    if most is not None:
+        found, _, _ = equations.expected(frozenset({0, 2}), first, 16)
+        assert found["discrepancy"] <= most
+        assert found["shared", "discrepancy"] == most
+
+
+def test_variances_of_many_runs_are_found() -> None:
+    rng = np.random.default_rng(7)
+    blocks = []
+    for _ in range(150):
+        z = rng.normal(size=(40, 2))
+        y = z @ (rng.normal(size=2) * [1.5, 0.3]) + rng.normal(size=40)
+        blocks.append(np.column_stack((rng.normal(size=40), z, y)))
+    equations = equations_of(blocks, [entry()], ("one", "two"))
+    found, _, _ = equations.expected(frozenset(), equations.first(), 60)
+    assert math.sqrt(found["one"]) == pytest.approx(1.5, rel=0.2)
+    assert math.sqrt(found["two"]) == pytest.approx(0.3, rel=0.2)
+
+
+TRUE, ROWS, NOISE2 = 0.8, 400, 0.3
+
+
+def errors_in_variables(seed: int, taken_out: bool) -> FloatArray:
+    """Coefficients of a column that is known with noise, which the response has as well, and of one known without."""
+    rng = np.random.default_rng(seed)
+    x, clean = rng.normal(size=(2, ROWS))
+    x = x + 0.5 * clean
+    u = math.sqrt(NOISE2) * rng.normal(size=ROWS)
+    y = TRUE * x - 0.4 * clean - u + rng.normal(size=ROWS)
+    scale = 10.0  # of the coefficients' prior: wide
+    block = np.column_stack((scale * (x + u), scale * clean, np.ones(ROWS), y))
+    noise = np.zeros((4, 4))
+    noise[0, 0], noise[0, 3], noise[3, 0], noise[3, 3] = (
+        ROWS * NOISE2 * k for k in (scale**2, -scale, -scale, 1.0)
+    )
+    equations = equations_of([block], [entry(), entry()], ("zero",), noise=noise if taken_out else None)
+    return scale * equations.sets({"zero": 0.01}).fit(frozenset({0, 1})).mean
+
+
+def test_noise_in_a_column_bends_no_coefficient() -> None:
+    """Without the correction the noise in the column attenuates, and what the response has of it adds: both go."""
+    draws = range(200)
+    with_it = np.array([errors_in_variables(k, True) for k in draws])
+    without = np.array([errors_in_variables(k, False) for k in draws])
+    spread = np.std(with_it, axis=0) / math.sqrt(len(draws))
+    assert np.mean(with_it, axis=0) == pytest.approx((TRUE, -0.4), abs=float(4.0 * spread.max()))
+    assert float(spread.max()) < 0.01
+    assert np.mean(without[:, 0]) == pytest.approx((TRUE - NOISE2) / (1.0 + NOISE2), abs=0.03)
+
+
+def test_a_column_that_is_mostly_noise_is_in_no_set() -> None:
+    rng = np.random.default_rng(8)
+    block = np.column_stack((rng.normal(size=(200, 2)), np.ones(200), rng.normal(size=200)))
+    noise = np.diag([0.9 * 200, 0.1 * 200, 0.0, 0.0])
+    equations = equations_of([block], [entry(odds=9.0), entry(odds=9.0)], ("zero",), noise=noise)
+    assert equations.noisy == {0}
+    assert 0 not in equations.sets({"zero": 0.1}).search(frozenset())

@@ -1,0 +1,143 @@
+"""The set that predicts: all values of the file, no entry that raises the error on held-out runs, the gain's interval."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.joint import Friction
+from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF
+from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
+from jtqd.sysid.diagnosis.model import Solution
+from jtqd.sysid.diagnosis.verdict import grade_of
+from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1
+from tests.sysid.diagnosis.pendulums import ARM, Rig, runs_of, solved
+
+RUNS = 4
+TRUE = replace(ARM, friction=Friction(ARM.friction.coulomb_nm + 1.0, ARM.friction.viscous_nms_per_rad))
+
+
+@pytest.fixture(scope="module")
+def solution() -> Solution:
+    return solved(ARM, runs_of(TRUE, 2, RUNS, Rig(counts=2.0**22)))
+
+
+def test_the_set_predicts_with_values_of_the_file_that_change(solution: Solution) -> None:
+    found = predict(solution)
+    assert solution.chosen <= found.chosen
+    slots = [solution.entries[k].slot for k in found.chosen]
+    assert len(slots) == len(set(slots))
+    assert all(solution.entries[k].prior.file for k in found.chosen - solution.chosen)
+    assert not found.vetoed
+    first, values = 0, {}
+    for k in sorted(found.chosen):
+        e = solution.entries[k]
+        values |= e.values(found.mean[first : first + e.size])
+        first += e.size
+    assert values["coulomb_nm"] == pytest.approx(TRUE.friction.coulomb_nm, abs=0.05)
+    assert values["torque_constant_nm_per_a"] == pytest.approx(ARM.torque_constant_nm_per_a, rel=0.02)
+
+
+def test_squares_are_those_of_the_runs_without_their_own_say(solution: Solution) -> None:
+    """Before: the residual as it is; after: about the noise, of which the coefficients of the others know nothing."""
+    found = predict(solution)
+    for row, run in zip(found.squares[MOTOR1], solution.runs, strict=True):
+        d = run.channels[MOTOR1]
+        before = d.residual[d.valid]
+        assert row[0] == pytest.approx(float(before @ before))
+        assert row[2] == len(before)
+        assert row[1] < 0.1 * row[0]
+    part = replace(solution, runs=[*solution.runs])
+    spoilt = dict(part.runs[0].channels)
+    spoilt[MOTOR1] = replace(spoilt[MOTOR1], residual=spoilt[MOTOR1].residual + 3.0)
+    part.runs[0] = replace(part.runs[0], channels=spoilt)
+    other = predict(part).squares[MOTOR1]
+    assert other[0, 1] > 5.0 * other[0, 2], "an offset of its own is not learned from it"
+
+
+def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Solution, int]:
+    """The solution, noise of the columns apart, with an entry whose column is the run's noise, in some runs with the other
+    sign.
+    """
+    k = next(k for k, e in enumerate(solution.entries) if e.effect.name == "sensor_gain")
+    column = solution.entries[k].columns[0]
+    runs = []
+    found = predict(solution)
+    weights = solution.transform()
+    at = np.zeros(weights.shape[1])
+    ends = np.cumsum([0, *(e.size for e in solution.entries)])
+    at[[j for m in sorted(found.chosen) for j in range(ends[m], ends[m + 1])]] = found.mean
+    for run, sign in zip(solution.runs, signs, strict=True):
+        d = run.channels[MOTOR1]
+        noise = d.residual - d.regressors @ (weights @ at)[d.index]
+        regressors = d.regressors.copy()
+        regressors[:, d.index == column] = (sign * noise / float(solution.entries[k].weights[0, 0]))[:, None]
+        runs.append(replace(run, channels={MOTOR1: replace(d, regressors=regressors)}))
+    return replace(solution, runs=runs, disturbed=[], chosen=solution.chosen | {k}), k
+
+
+def left_nm2(found: Prediction) -> float:
+    return float(found.squares[MOTOR1][:, 1].sum())
+
+
+def test_an_entry_that_is_noise_is_vetoed(solution: Solution) -> None:
+    tampered, k = with_noise_entry(solution, (1, -1, 1, -1))
+    found = predict(tampered)
+    assert found.vetoed == {k}
+    assert k not in found.chosen
+    plain = predict(replace(solution, disturbed=[]))
+    assert left_nm2(found) == pytest.approx(left_nm2(plain), rel=1e-6)
+
+
+def test_an_entry_that_predicts_every_run_is_kept(solution: Solution) -> None:
+    tampered, k = with_noise_entry(solution, (1, 1, 1, 1))
+    found = predict(tampered)
+    assert not found.vetoed
+    assert k in found.chosen
+    assert left_nm2(found) < 0.5 * left_nm2(predict(replace(solution, disturbed=[])))
+
+
+def made_up(solution: Solution, before: list[float], after: list[float]) -> Any:
+    squares = np.array([(100.0 * b * b, 100.0 * a * a, 100.0) for b, a in zip(before, after, strict=True)])
+    return gain_of(solution, Prediction(frozenset(), np.empty(0), {MOTOR1: squares}, frozenset()))
+
+
+def test_the_interval_of_the_gain_is_over_runs(solution: Solution) -> None:
+    same = made_up(solution, [2.0] * RUNS, [0.5] * RUNS)
+    assert (same.rmse_before_nm, same.rmse_after_nm) == (2.0, 0.5)
+    assert same.ci95 == pytest.approx((1.5, 1.5))
+    apart = made_up(solution, [2.0] * RUNS, [0.2, 0.2, 0.2, 2.5])
+    assert apart.ci95[0] < 0.0 < apart.ci95[1], "one run of four speaks against it"
+    assert apart.ci95[0] < apart.rmse_before_nm - apart.rmse_after_nm < apart.ci95[1]
+    assert [r.rmse_after_nm for r in apart.runs] == pytest.approx([0.2, 0.2, 0.2, 2.5])
+    assert [r.run for r in apart.runs] == [run.name for run in solution.dataset.runs]
+    assert "motor balance of joint 1" in apart.split
+
+
+SURE = {"delta": 40.0, "robust": 30.0, "z": 5.0}
+
+
+@pytest.mark.parametrize(
+    ("change", "rivals", "against", "grade"),
+    [
+        ({}, False, "", CERTAIN),
+        ({}, True, "", CERTAIN),
+        ({}, False, "vetoed", EFFECTIVE),
+        ({}, False, "hidden", EFFECTIVE),
+        ({"robust": 0.5}, False, "", EFFECTIVE),
+        ({"z": 1.0}, False, "", EFFECTIVE),
+        ({"delta": 0.5, "robust": 0.5}, True, "", ONE_OF),
+        ({"delta": 0.5, "robust": 0.5}, False, "", EFFECTIVE),
+    ],
+)
+def test_grades(solution: Solution, change: dict[str, float], rivals: bool, against: str, grade: str) -> None:
+    """Certain: more evidence than any set without it, with more discrepancy as well, an interval without the file's value;
+    not where held-out runs speak against it, or more than it remains in its balance.
+    """
+    entries = tuple(solution.entries[:1]) if rivals else ()
+    one: Any = SimpleNamespace(rivals=entries, **(SURE | change))
+    assert grade_of(one, vetoed=against == "vetoed", hidden=against == "hidden") == grade

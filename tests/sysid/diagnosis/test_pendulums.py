@@ -1,0 +1,266 @@
+"""Whole diagnoses of pendulums on one joint with one encoder: several wrong values at once, one run more, what decides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Friction, Joint
+from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, CERTAIN, NO_GAP, ONE_OF, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.limits import PRIORS
+from jtqd.sysid.diagnosis.model import Solution
+from tests.sysid.diagnosis.pendulums import (
+    ARM,
+    Rig,
+    Runs,
+    extended,
+    friction_of,
+    ladder_error,
+    parameter,
+    predicted,
+    rms_error,
+    runs_of,
+    solved,
+)
+
+KT = ARM.torque_constant_nm_per_a
+
+
+# The scale: a balance that is multiplied by a factor stays true, and a smaller one has less noise.
+
+
+SCALE_RIGS = {
+    "noise of the sensor": Rig(sensor_noise_nm=0.4, current_noise_a=0.005, counts=2.0**22),
+    "noise of the current": Rig(sensor_noise_nm=0.05, current_noise_a=0.04, counts=2.0**22),
+    "noise of the encoder": Rig(sensor_noise_nm=0.02, current_noise_a=0.002, counts=2.0**17),
+    "all, at 1 kHz": Rig(rate_hz=1000.0, moment_nm=45.0, sensor_noise_nm=0.4, counts=2.0**17),
+}
+
+
+@pytest.fixture(scope="module", params=SCALE_RIGS.values(), ids=SCALE_RIGS)
+def nothing_wrong(request: pytest.FixtureRequest) -> Solution:
+    return solved(ARM, runs_of(ARM, 5, 4, request.param))
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.25])
+def test_no_multiple_of_the_balance_has_more_evidence_than_the_truth(
+    nothing_wrong: Solution, factor: float
+) -> None:
+    """Every parameter times a factor, with columns for the load that the sensor reads: friction, inertia, torque constant,
+    and `unbalance`, which is the load of a pendulum.
+    """
+    solution = nothing_wrong
+    assert solution.chosen == frozenset()
+    names = {
+        "torque_constant",
+        "coulomb_friction",
+        "viscous_friction",
+        "rotor_inertia",
+        "link_inertia",
+        "unbalance",
+    }
+    scaled = frozenset(k for k, e in enumerate(solution.entries) if e.effect.name in names)
+    assert len(scaled) == len(names)
+    sets = solution.sets
+    assert sets.fit(scaled).evidence < sets.fit(frozenset()).evidence
+    held = []
+    for e in solution.entries:
+        if e.effect.name == "torque_constant":
+            change = (factor - 1.0) * KT / (e.candidate.term.basis[0]["torque_constant_nm_per_a"] - KT)
+            at = change / float(e.weights[0, 0])
+            e = replace(e, low=min(at, at + 0.01), high=max(at, at + 0.01))  # noqa: PLW2901
+        held.append(e)
+    there = type(sets)(held, sets.gram).fit(scaled)
+    assert there.evidence < sets.fit(frozenset()).evidence - 3.0
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.3])
+def test_constants_and_gain_by_one_factor_predict_the_same(factor: float) -> None:
+    """G Kt i = G^2 Jm a + tau_s / g + loss: torque constant, inertia, friction and 1 / g by one factor is another unit."""
+    runs = runs_of(ARM, 3, 1)
+    same = (
+        ("torque_constant", {"torque_constant_nm_per_a": factor * KT}),
+        ("coulomb_friction", {"coulomb_nm": factor * ARM.friction.coulomb_nm}),
+        ("viscous_friction", {"viscous_nms_per_rad": factor * ARM.friction.viscous_nms_per_rad}),
+        ("rotor_inertia", {"rotor_inertia_kgm2": factor * ARM.rotor_inertia_kgm2}),
+        ("sensor_gain", {"gain": 1.0 / factor}),
+    )
+    (file,), (other,) = predicted(ARM, (), runs), predicted(ARM, same, runs)
+    size = float(np.sqrt(np.mean(file["predicted"] ** 2)))
+    away = other["predicted"] - file["predicted"]
+    assert float(np.sqrt(np.mean(away**2))) < 0.01 * size, "what remains is noise of the sensor above 12 Hz"
+    (apart,) = predicted(ARM, same[:4], runs)
+    assert float(np.sqrt(np.mean((apart["predicted"] - file["predicted"]) ** 2))) > 0.1 * size
+
+
+# A file that is wrong in several values at once.
+
+
+@dataclass(frozen=True)
+class Case:
+    rig: Rig
+    true: Joint
+    found: Findings
+    runs: Runs
+    fresh: Runs
+
+
+TRUE = replace(
+    ARM,
+    torque_constant_nm_per_a=0.92 * KT,
+    friction=Friction(ARM.friction.coulomb_nm / 0.6, ARM.friction.viscous_nms_per_rad / 0.6),
+)
+RIGS = (
+    Rig(18.0, 1.1, 200.0, 12.0, 0.05, 0.01, sensor_zero_nm=0.5),
+    Rig(30.0, 2.5, 500.0, 12.0, 0.2, 0.03, sensor_zero_nm=-0.5),
+    Rig(45.0, 3.5, 1000.0, 12.0, 0.4, 0.02, sensor_zero_nm=0.5),
+)
+
+
+@pytest.fixture(scope="module", params=range(3), ids=[f"{r.rate_hz:.0f} Hz" for r in RIGS])
+def wrong_file(request: pytest.FixtureRequest) -> Case:
+    seed = request.param
+    runs = runs_of(TRUE, seed, 5, RIGS[seed])
+    fresh = runs_of(TRUE, 100 + seed, 3, RIGS[seed])
+    return Case(RIGS[seed], TRUE, diagnose(runs, {1: ARM}), runs, fresh)
+
+
+def test_several_wrong_values_are_found_and_nothing_else_is_certain(wrong_file: Case) -> None:
+    offsets = {"sensor_offset", "current_offset", "friction_asymmetry"}
+    wrong = {"torque_constant", "coulomb_friction", "viscous_friction", "sensor_offset"}
+    causes = wrong_file.found.causes
+    certain = {c.name for c in causes if c.grade == CERTAIN}
+    assert certain <= wrong
+    assert {"torque_constant", "coulomb_friction", "viscous_friction"} <= {
+        c.name for c in causes if c.matters
+    }
+    (offset,) = (c for c in causes if c.name in offsets)
+    assert offset.grade == ONE_OF
+    assert wrong_file.found.verdict == AMBIGUOUS
+
+
+def test_intervals_hold_what_is_true(wrong_file: Case) -> None:
+    for effect, name, true in (
+        ("coulomb_friction", "coulomb_nm", TRUE.friction.coulomb_nm),
+        ("viscous_friction", "viscous_nms_per_rad", TRUE.friction.viscous_nms_per_rad),
+        ("torque_constant", "torque_constant_nm_per_a", TRUE.torque_constant_nm_per_a),
+    ):
+        value = parameter(wrong_file.found, effect, name)
+        assert value.ci95[0] <= true <= value.ci95[1], effect
+        assert value.ci95[1] - value.ci95[0] < 0.15 * true
+
+
+def test_fresh_runs_are_predicted_no_worse_than_by_the_ladder(wrong_file: Case) -> None:
+    file = rms_error(ARM, (), wrong_file.fresh)
+    found = rms_error(ARM, extended(wrong_file.found), wrong_file.fresh)
+    assert found < 1.02 * ladder_error(ARM, wrong_file.runs, wrong_file.fresh)
+    assert found < 0.1 * file
+    gain = wrong_file.found.gain
+    assert gain is not None
+    assert gain.rmse_before_nm == pytest.approx(file, rel=0.15), "of the held-out runs, too"
+    assert gain.rmse_after_nm < 0.1 * gain.rmse_before_nm
+
+
+# One run more.
+
+
+FILE = replace(ARM, friction=Friction(4.0, 4.0))
+
+
+def strange_friction(v: FloatArray, tau: FloatArray, theta: FloatArray) -> FloatArray:
+    """5 Nm and 6 % of the load, 9 |v|^0.8, and a ripple of 0.4 Nm twice per turn of the motor."""
+    lost = 5.0 + 0.06 * np.abs(tau) + 9.0 * np.abs(v) ** 0.8
+    return np.asarray(lost * np.sign(v) + 0.4 * np.cos(2.0 * theta + 0.3))
+
+
+@pytest.fixture(scope="module", params=[3, 4, 6], ids=lambda n: f"{n} runs")
+def one_more(request: pytest.FixtureRequest) -> Case:
+    rig = Rig(days=0.05)
+    runs, fresh = (
+        runs_of(FILE, seed, n, rig, strange_friction) for seed, n in ((9, request.param), (109, 3))
+    )
+    return Case(rig, FILE, diagnose(runs, {1: FILE}), runs, fresh)
+
+
+def test_friction_is_a_cause_however_many_runs_there_are(one_more: Case) -> None:
+    names = {c.name for c in one_more.found.causes if c.matters}
+    assert {"coulomb_friction", "viscous_friction"} <= names
+    present = {c.name for c in (*one_more.found.causes, *one_more.found.too_small)}
+    assert {"torque_ripple", "load_dependent_friction"} <= present
+    coulomb = parameter(one_more.found, "coulomb_friction", "coulomb_nm")
+    assert coulomb.value > FILE.friction.coulomb_nm
+    ripple = parameter(one_more.found, "torque_ripple", "amplitude_nm")
+    assert ripple.value == pytest.approx(0.4, rel=0.1)
+
+
+def test_the_error_on_held_out_runs_falls_to_less_than_a_fifth(one_more: Case) -> None:
+    gain = one_more.found.gain
+    assert gain is not None
+    assert gain.rmse_after_nm < 0.2 * gain.rmse_before_nm
+    assert all(run.rmse_after_nm < run.rmse_before_nm for run in gain.runs)
+    file = rms_error(FILE, (), one_more.fresh)
+    found = rms_error(FILE, extended(one_more.found), one_more.fresh)
+    assert found < 0.2 * file
+    assert found < 1.02 * ladder_error(FILE, one_more.runs, one_more.fresh)
+
+
+# What decides.
+
+
+@pytest.mark.parametrize(("relevance", "verdict"), [(0.001, CAUSE), (0.05, NO_GAP)])
+def test_one_relevance_decides_whether_an_entry_is_a_cause(relevance: float, verdict: str) -> None:
+    """The same runs: 0.7 Nm of Coulomb friction more than in the file, 1.2 % of the rated torque."""
+    true = replace(ARM, friction=replace(ARM.friction, coulomb_nm=ARM.friction.coulomb_nm + 0.7))
+    found = diagnose(runs_of(true, 5, 3), {1: ARM}, relevance=relevance)
+    assert found.verdict == verdict
+    everything = {c.name: c for c in (*found.causes, *found.too_small)}
+    assert everything["coulomb_friction"].rms_nm == pytest.approx(0.7, rel=0.1), "it is listed all the same"
+    assert any(c.matters for c in found.causes) == (verdict == CAUSE)
+    assert found.unexplained is not None
+    assert found.unexplained.relevant_nm == pytest.approx(relevance * ARM.rated_torque_nm)
+
+
+@pytest.mark.parametrize("zero_nm", [0.6, 1.8], ids=["1 % of rated", "3 % of rated"])
+def test_an_offset_of_current_or_sensor_of_one_joint_is_one_of_the_two(zero_nm: float) -> None:
+    found = diagnose(runs_of(ARM, 5, 3, Rig(sensor_zero_nm=zero_nm)), {1: ARM})
+    assert found.verdict == AMBIGUOUS
+    (offset,) = found.causes
+    assert offset.grade == ONE_OF
+    pair = {"sensor_offset", "current_offset"}
+    assert offset.name in pair
+    assert pair <= {name.split(" of ")[0] for name in (offset.name, *offset.rivals)}
+    assert offset.rms_nm == pytest.approx(zero_nm, rel=0.1), "the whole of it, not a share"
+    assert found.next_experiment is not None
+
+
+def notched(v: FloatArray, tau: FloatArray, theta: FloatArray) -> FloatArray:
+    """A notch of 6 Nm at one angle of the joint, which is in no library, and 1.5 Nm of Coulomb friction."""
+    notch = 6.0 * np.exp(-(((theta / ARM.gear_ratio - 0.25) / 0.05) ** 2))
+    return np.asarray(friction_of(ARM)(v, tau, theta) + (1.5 + notch) * np.sign(v))
+
+
+def test_a_foreign_effect_above_the_relevance_is_unexplained_and_keeps_the_entries() -> None:
+    found = diagnose(runs_of(ARM, 5, 4, loss=notched), {1: ARM})
+    assert found.verdict == UNEXPLAINED
+    assert found.unexplained is not None
+    assert found.unexplained.matters
+    assert found.unexplained.rms_nm > found.unexplained.relevant_nm
+    assert "coulomb_friction" in {c.name for c in found.causes}
+    assert found.gaps[0].localisation
+    assert any("motor balance" in reason for reason in found.reasons)
+
+
+def test_a_notch_below_the_relevance_is_no_matter() -> None:
+    found = diagnose(runs_of(ARM, 5, 4, loss=notched), {1: ARM}, relevance=0.1)
+    assert found.verdict == NO_GAP
+    assert found.unexplained is not None
+    assert not found.unexplained.matters
+
+
+def test_causes_name_the_prior_that_they_rest_on(wrong_file: Case) -> None:
+    given = {c.name: c.given for c in wrong_file.found.causes}
+    assert given["torque_constant"] == (PRIORS["torque_constant"].text,)

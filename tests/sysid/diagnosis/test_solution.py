@@ -1,0 +1,118 @@
+"""Torsion and current of a simulation with effects, and what effects leave of the runs."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import RunTable
+from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
+from jtqd.sysid.diagnosis.regressors import contribution
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, remaining, set_state
+from tests.estimator.effects.effect_signals import PLAIN
+from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, candidates, rigid_run
+from tests.sysid.diagnosis.pendulums import ARM, Rig, runs_of
+
+
+def signals(table: RunTable, joint: Joint = PLAIN, name: str = "run") -> JointSignals:
+    return joint_signals(name, table, 1, joint, BaseLoss(joint))
+
+
+def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for() -> None:
+    """Iterated, K d = tau - K3 d^3 swings out where 3 K3 d^2 is more than K."""
+    s = signals(rigid_run(PLAIN, 0.3))
+    stiffness = PLAIN.stiffness_nm_per_rad
+    twist = PLAIN.rated_torque_nm / stiffness
+    s.state.torque_nm = np.linspace(-1.3, 1.3, len(s.time_s)) * PLAIN.rated_torque_nm
+    for cubic in (1.5, 0.02, -0.05):
+        values = {"stiffness_nm_per_rad": 0.9 * stiffness, "cubic_nm_per_rad3": cubic * stiffness / twist**2}
+        set_state(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, values)])
+        d = s.state.torsion_rad
+        spring = values["stiffness_nm_per_rad"] * d + values["cubic_nm_per_rad3"] * d**3
+        assert spring == pytest.approx(s.state.torque_nm, abs=1e-3 * PLAIN.rated_torque_nm)
+    set_state(s, ())
+    assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / stiffness)
+
+
+@pytest.mark.filterwarnings("error")
+def test_the_torsion_of_a_spring_that_cannot_hold_the_torque_stays_finite() -> None:
+    """A softening spring holds no more than its peak; the search tries such values, and steps to them overflowed."""
+    s = signals(rigid_run(PLAIN, 0.3))
+    stiffness = PLAIN.stiffness_nm_per_rad
+    twist = PLAIN.rated_torque_nm / stiffness
+    for stiff, cubic in ((0.9, -2.0), (2.4, -40.0), (0.1, -1e4), (1.0, -1e9)):
+        values = {
+            "stiffness_nm_per_rad": stiff * stiffness,
+            "cubic_nm_per_rad3": cubic * stiffness / twist**2,
+        }
+        set_state(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, values)])
+        assert np.max(np.abs(s.state.torsion_rad)) < 15.0 * twist
+
+
+def test_coefficients_of_the_two_columns_of_a_wave_are_the_wave() -> None:
+    (one,) = candidates(PLAIN, ("torque_ripple", 1, 1))
+    s = signals(rigid_run(PLAIN))
+    columns = [contribution(one.effect, p, s)["motor"] for p in one.term.basis]
+    whole = contribution(one.effect, one.term.combine([0.7, -1.1]), s)["motor"]
+    assert whole == pytest.approx(0.7 * columns[0] - 1.1 * columns[1], abs=1e-9)
+
+
+def test_the_current_is_that_which_a_simulation_with_these_effects_needs() -> None:
+    """i = demand / (G Kt'), whatever current was measured; more friction is more demand; without effects as in the file."""
+    s = signals(rigid_run(PLAIN, 0.3, noise=2.0))
+    per_a = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a
+    set_state(s, ())
+    assert s.state.current_a == pytest.approx(s.demand_nm / per_a)
+    assert np.std(s.state.current_a - s.current_a) > 1.0 / per_a, "the noise of the measured one is not in it"
+    kt = {"torque_constant_nm_per_a": 0.85 * PLAIN.torque_constant_nm_per_a}
+    set_state(s, [PresentEffect(EFFECTS["torque_constant"], 1, kt)])
+    assert s.state.current_a == pytest.approx(s.demand_nm / (0.85 * per_a), rel=1e-4, abs=1e-6)
+    more = {"coulomb_nm": PLAIN.friction.coulomb_nm + 1.5}
+    both = [
+        PresentEffect(EFFECTS["torque_constant"], 1, kt),
+        PresentEffect(EFFECTS["coulomb_friction"], 1, more),
+    ]
+    set_state(s, both)
+    wanted = (s.demand_nm + 1.5 * s.state.direction) / (0.85 * per_a)
+    assert s.state.current_a == pytest.approx(wanted, rel=1e-4, abs=1e-6)
+    set_state(s, [replace(each, joint=2) for each in both])
+    assert s.state.current_a == pytest.approx(s.demand_nm / per_a), (
+        "effects of another joint are none of this one"
+    )
+
+
+def test_the_torsion_is_that_of_the_changed_spring() -> None:
+    s = signals(rigid_run(PLAIN, 0.3))
+    softer = {"stiffness_nm_per_rad": 0.8 * PLAIN.stiffness_nm_per_rad, "cubic_nm_per_rad3": 0.0}
+    set_state(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, softer)])
+    assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / softer["stiffness_nm_per_rad"], rel=1e-3)
+
+
+def test_what_the_true_effects_leave_is_the_noise() -> None:
+    true = {"torque_constant_nm_per_a": 0.9 * ARM.torque_constant_nm_per_a}
+    friction = {"coulomb_nm": ARM.friction.coulomb_nm + 2.0}
+    joint = replace(
+        ARM,
+        torque_constant_nm_per_a=true["torque_constant_nm_per_a"],
+        friction=replace(ARM.friction, coulomb_nm=friction["coulomb_nm"]),
+    )
+    rig = Rig(sensor_noise_nm=0.1, current_noise_a=0.01, counts=2.0**22)
+    usable, _ = usable_signals(runs_of(joint, 1, 2, rig), {1: ARM}, (1,))
+    dataset = build_dataset(usable, {1: ARM})
+    present = [
+        PresentEffect(EFFECTS["torque_constant"], 1, true),
+        PresentEffect(EFFECTS["coulomb_friction"], 1, friction),
+    ]
+    left = remaining(dataset, present, np.zeros((2, len(dataset.families))))
+    for run, before in zip(left.runs, dataset.runs, strict=True):
+        d = run.channels[MOTOR1]
+        assert float(np.std(d.residual[d.valid])) < 0.12
+        assert float(np.std(before.channels[MOTOR1].residual[d.valid])) > 2.0
+    (friction_nm, _) = (found[MOTOR1] for found in contributions(dataset, present[1]))
+    valid = dataset.runs[0].channels[MOTOR1].valid
+    assert np.abs(friction_nm[valid]) == pytest.approx(2.0, rel=1e-2)

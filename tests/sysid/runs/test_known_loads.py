@@ -1,0 +1,119 @@
+"""A torque that is a known load's or a model's is no sensor: what would be a fault of a sensor is none of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Friction, Joint
+from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.runs.bad_samples import held_values, saturation_limits
+from jtqd.sysid.runs.channels import Channels, check_channels
+from jtqd.sysid.runs.checks import CheckedRuns, check_runs
+from jtqd.sysid.runs.column_map import ColumnMap
+from jtqd.sysid.runs.files import read_runs
+
+JOINT: Final[Joint] = replace(
+    load_joint(shipped("joint1.yaml")), efficiency=None, effects=(), friction=Friction(3.0, 6.0)
+)
+T: Final = np.arange(0.0, 12.0, 0.002)
+Q, V, A = 0.9 * np.sin(1.8 * T), 1.62 * np.cos(1.8 * T), -2.916 * np.sin(1.8 * T)
+INERTIA: Final = JOINT.gear_ratio**2 * JOINT.rotor_inertia_kgm2
+SCALE: Final = JOINT.gear_ratio * JOINT.torque_constant_nm_per_a
+
+
+def run(torque: FloatArray) -> RunTable:
+    noise = np.random.default_rng(1).normal(scale=0.02, size=len(T))
+    current = (torque + INERTIA * A + 3.0 * np.sign(V) + 6.0 * V + noise) / SCALE
+    return RunTable(T, {1: JointColumns(current, motor_position_rad=JOINT.gear_ratio * Q, torque_nm=torque)})
+
+
+def step_at(row: int) -> FloatArray:
+    return np.where(np.arange(len(T)) == row, 8.0, 0.0)
+
+
+LOADS: Final[dict[str, Callable[[], FloatArray]]] = {
+    "nothing is mounted": lambda: np.zeros_like(T),
+    "a small inertia": lambda: 0.002 * A,
+    "a weight on a drum": lambda: np.full_like(T, 4.0),
+    "a weight that is set down and stands": lambda: np.where((T > 4.0) & (T < 6.0), 0.0, 6.0 * np.sin(Q)),
+    "a model that is printed in few digits": lambda: np.round(6.0 * np.sin(Q) / 2.0) * 2.0,
+    "a model with a blow": lambda: 6.0 * np.sin(Q) + step_at(3000),
+    "a model that is late": lambda: np.roll(6.0 * np.sin(3.0 * Q), 60),
+}
+NO_FAULT_OF_A_SENSOR: Final = {"a model with a blow", "a small inertia"}
+"""Those that a sensor may read as well, or with a note only."""
+
+
+def checked(table: RunTable, *known: int) -> CheckedRuns:
+    return check_runs([("r.csv", table)], {1: JOINT}, known)
+
+
+@pytest.mark.parametrize("what", LOADS)
+def test_a_known_load_is_used_as_it_is(what: str) -> None:
+    torque = LOADS[what]()
+    result = checked(run(torque), 1)
+    assert (result.refused, result.notes) == ((), ())
+    used = result.runs[0][1].joints[1].torque_nm
+    assert used is not None
+    assert np.array_equal(used, torque)
+    c = Channels(T, run(torque).joints[1], JOINT, "r: j1", known_load=True)
+    assert check_channels(c) == []
+    assert "torque_nm" not in held_values(c)
+    assert "torque_nm" not in saturation_limits([run(torque)], {1: JOINT}, [1])[1]
+
+
+@pytest.mark.parametrize("what", sorted(set(LOADS) - NO_FAULT_OF_A_SENSOR))
+def test_the_same_of_a_sensor_is_its_fault(what: str) -> None:
+    result = checked(run(LOADS[what]()))
+    assert any("torque_nm" in line for line in (*result.refused, *result.notes))
+
+
+def test_a_current_is_judged_beside_a_known_load_too() -> None:
+    """In milliamperes; dead; of the other sign; held while the load changes."""
+    table = run(1.2 * JOINT.rated_torque_nm * np.sin(Q))
+    columns = table.joints[1]
+    assert columns.current_a is not None
+    held = columns.current_a.copy()
+    held[1000:4000] = held[1000]
+    for current, fault in (
+        (1000.0 * columns.current_a, "mA"),
+        (-columns.current_a, "sign"),
+        (0.0 * columns.current_a, "dead channel"),
+        (held, "stuck channel"),
+    ):
+        result = checked(RunTable(T, {1: replace(columns, current_a=current)}), 1)
+        assert any(fault in line for line in (*result.refused, *result.notes)), fault
+
+
+def test_two_known_loads_that_are_opposite_are_two_loads() -> None:
+    one = run(6.0 * np.sin(Q)).joints[1]
+    two = one.map(lambda _, x: -x)
+    table = RunTable(T, {1: one, 2: two})
+    assert list(check_runs([("r", table)], {1: JOINT, 2: JOINT}, (1, 2)).runs[0][1].joints) == [1, 2]
+    assert list(check_runs([("r", table)], {1: JOINT, 2: JOINT}).runs[0][1].joints) == [1]
+
+
+def test_the_reader_keeps_a_known_load_of_zero(tmp_path: Path) -> None:
+    path = tmp_path / "r.csv"
+    rows = [f"{t:.3f},{q:.6f},{v:.6f}" for t, q, v in zip(T, JOINT.gear_ratio * Q, V, strict=True)]
+    path.write_text("\n".join(["t,q,i", *rows]) + "\n")
+    mapping: dict[str, object] = {
+        "time_s": "t",
+        "j1.motor_position_rad": "q",
+        "j1.current_a": "i",
+        "j1.load": {"torque_nm": "0 * q"},
+    }
+    [read] = read_runs([path], ColumnMap.from_mapping(mapping, "map", tmp_path), segments=True)
+    assert read.known_loads == (1,)
+    torque = read.table.joints[1].torque_nm
+    assert torque is not None
+    assert not torque.any()
+    assert not any("dead" in note for note in read.notes)
