@@ -423,25 +423,35 @@ def entry_table(
                 reason,
             )
         )
-    seen = {(name, joint) for name, joint in of}
-    for name in EFFECTS:
-        if not any(name == n for n, _ in seen):
-            asked = any(name == n for _, n in scope.out)
-            reason = (
-                "not looked for, as asked"
-                if asked
-                else "these runs have no channel or no variation that shows it"
-            )
-            if not asked:
-                lost.append(Untold(name, min(solution.dataset.joints), reason, kind_of(name)))
-            rows.append(
-                CandidateEvidence(
-                    name, min(solution.dataset.joints), math.nan, math.nan, math.nan, {}, reason
-                )
-            )
+    looked_at = {name for name, _ in of}
+    first = min(solution.dataset.joints)
+    for name, effect in EFFECTS.items():
+        if name in looked_at:
+            continue
+        reason, motion = _absent(effect, solution.dataset, scope)
+        if reason and motion is not None:
+            lost.append(Untold(name, first, reason, motion))
+        rows.append(CandidateEvidence(name, first, math.nan, math.nan, math.nan, {}, reason))
     return tuple(sorted(rows, key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)), tuple(
         lost
     )
+
+
+def _absent(effect: Effect, dataset: Dataset, scope: Scope) -> tuple[str, str | None]:
+    """Return why no entry of an effect competed, and the kind of motion that would show it: "" where a channel lacks, None
+    where nothing is asked for.
+    """
+    if any(effect.name == name for _, name in scope.out):
+        return "not looked for, as asked", None
+    if dataset.no_torque and effect.hooks == ("sensor_nm",):
+        return "no torque was measured", None
+    if {"twist_rad", "link_rad"} >= set(effect.hooks) and all(
+        s.torsion_nm is None for s in dataset.signals[0]
+    ):
+        return "needs encoders on both sides", ""
+    if "temperature_c" in effect.needs and not np.isfinite(dataset.signals[0][0].state.temperature_c).any():
+        return "needs a temperature", ""
+    return "nothing of it varies in these runs", kind_of(effect.name)
 
 
 def _smallest(sets: Sets, chosen: Set, k: int) -> float:

@@ -401,14 +401,15 @@ def _places(findings: Findings, most: int = 2) -> str:
 
 
 def _untold(findings: Findings) -> str:
-    """Return what these runs cannot tell, by the motion that would."""
+    """Return what these runs cannot tell, by the motion that would, or the channel that lacks."""
     motions: dict[str, dict[str, list[JointName]]] = {}
     for each in findings.cannot_be_told:
-        motions.setdefault(each.experiment, {}).setdefault(each.name, []).append(each.joint)
+        needed = f"would take {each.experiment.replace('_', ' ')}" if each.experiment else each.why
+        motions.setdefault(needed, {}).setdefault(each.name, []).append(each.joint)
     many = len(findings.joints) > 1
     return "; ".join(
-        f"{', '.join(_named(name, joints, many) for name, joints in names.items())} (would take {motion.replace('_', ' ')})"
-        for motion, names in motions.items()
+        f"{', '.join(_named(name, joints, many) for name, joints in names.items())} ({needed})"
+        for needed, names in motions.items()
     )
 
 
