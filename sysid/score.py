@@ -113,10 +113,10 @@ def errors_on(
     Raises SignalsError for a run without what a simulation needs, ConfigError for a joint file that an estimator refuses.
     """
     from jtqd.sysid.diagnosis.dataset import without_known_effects
+    from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
     from jtqd.sysid.diagnosis.free_run import free_run
     from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
     from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
-    from jtqd.sysid.diagnosis.solution import with_effects_applied
 
     plain = with_effects_applied(joint)
     base = BaseLoss(plain)

@@ -74,7 +74,7 @@ class JointModel:
 
 def model_of(joint: Joint) -> JointModel:
     """Return the joint with its effects as far as other simulators can express it."""
-    from jtqd.sysid.diagnosis.solution import with_effects_applied  # scipy, which --help does not need
+    from jtqd.sysid.diagnosis.extended_joint import with_effects_applied  # scipy, which --help does not need
 
     plain = with_effects_applied(joint)
     coulomb, viscous, left_out = _friction(plain)

@@ -24,6 +24,7 @@ from jtqd.sysid.diagnosis.dataset import (
     too_little,
     usable_signals,
 )
+from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -42,7 +43,7 @@ from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import noise_of
-from jtqd.sysid.diagnosis.solution import remaining, with_effects_applied
+from jtqd.sysid.diagnosis.solution import remaining
 from jtqd.sysid.diagnosis.unexplained import events_left
 from jtqd.sysid.diagnosis.verdict import conclude, present_of
 

@@ -13,9 +13,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Value, shows_at
-from jtqd.sysid.diagnosis.solution import with_effects_applied
 from jtqd.sysid.fit.joint_writer import write_joint
 
 FILE: Final = "extended.joint.yaml"
@@ -119,3 +119,31 @@ def _interval(value: Value) -> list[float | None]:
 
 def _rounded(value: float) -> float:
     return float(f"{float(value):.{_DIGITS}g}")
+
+
+def with_effects_applied(joint: Joint) -> Joint:
+    """Return the joint with every effect put into the file's values where all its given parameters have a key for it: the
+    same joint in other words.
+
+    With an efficiency in the file the losses are the table's: there another friction or torque constant in the file is not
+    the effect that bears its name, which is what is lost beside the table. Such an effect stays an effect.
+    """
+    kept = []
+    for item in joint.effects:
+        effect = EFFECTS[item.name]
+        keys = {p.name: p.key for p in effect.parameters}
+        beside_table = joint.efficiency is not None and "loss_nm" in effect.hooks and not effect.changes_joint
+        if beside_table or not all(keys[name] for name in item.parameters):
+            kept.append(item)
+            continue
+        for name, value in item.parameters.items():
+            joint = _with_value(joint, keys[name].split("."), value)
+    return replace(joint, effects=tuple(kept))
+
+
+def _with_value(joint: Joint, path: list[str], value: float) -> Joint:
+    if len(path) == 1:
+        changed: dict[str, Any] = {path[0]: value}
+        return replace(joint, **changed)
+    inner: dict[str, Any] = {path[1]: value}
+    return replace(joint, friction=replace(joint.friction, **inner))

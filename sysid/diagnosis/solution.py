@@ -10,17 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect
 from jtqd.estimator.joint import Effect as EffectOfFile
-from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import Entry
+from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.regressors import RunData, binned, contribution, fields_used
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
@@ -155,31 +154,3 @@ def remaining(dataset: Dataset, present: Sequence[PresentEffect], nuisances: Flo
     ]
     pieces = dataset.recordings
     return Remaining(tuple(present), tuple(runs), nuisances[list(pieces)], pieces)
-
-
-def with_effects_applied(joint: Joint) -> Joint:
-    """Return the joint with every effect put into the file's values where all its given parameters have a key for it: the
-    same joint in other words.
-
-    With an efficiency in the file the losses are the table's: there another friction or torque constant in the file is not
-    the effect that bears its name, which is what is lost beside the table. Such an effect stays an effect.
-    """
-    kept = []
-    for item in joint.effects:
-        effect = EFFECTS[item.name]
-        keys = {p.name: p.key for p in effect.parameters}
-        beside_table = joint.efficiency is not None and "loss_nm" in effect.hooks and not effect.changes_joint
-        if beside_table or not all(keys[name] for name in item.parameters):
-            kept.append(item)
-            continue
-        for name, value in item.parameters.items():
-            joint = _with_value(joint, keys[name].split("."), value)
-    return replace(joint, effects=tuple(kept))
-
-
-def _with_value(joint: Joint, path: list[str], value: float) -> Joint:
-    if len(path) == 1:
-        changed: dict[str, Any] = {path[0]: value}
-        return replace(joint, **changed)
-    inner: dict[str, Any] = {path[1]: value}
-    return replace(joint, friction=replace(joint.friction, **inner))

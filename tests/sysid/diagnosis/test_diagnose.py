@@ -13,6 +13,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import dataset
 from jtqd.sysid.diagnosis import diagnose as module
 from jtqd.sysid.diagnosis.diagnose import combined, diagnose, one_sensor
+from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -24,7 +25,6 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
-from jtqd.sysid.diagnosis.solution import with_effects_applied
 from tests.estimator.effects.effect_signals import PLAIN, extended
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, cause, findings, value
