@@ -26,6 +26,9 @@ from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.smoothing import current_rate
 
 _MOST_STEPS: Final = 8
+_DRAWS: Final = 20
+_MOST_CURRENT: Final = 4.0
+"""Of the largest current that the file alone draws."""
 _TORSION_STEP: Final = 1e-4
 """Of the twist at the rated torque: smaller steps of the torsion are none."""
 _SOFTEST: Final = 0.1
@@ -83,8 +86,10 @@ def set_state(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     acting = [p for p in mine if "current_a" in fields_used(p.effect, p.values, s.joint)]
     rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
     s.state.current_a = rest / scale
-    for _ in range(_MOST_STEPS if acting else 0):
-        s.state.current_a = (rest + _sum(s, acting, MOTOR)) / scale
+    most = _MOST_CURRENT * float(np.max(np.abs(rest), initial=0.0)) / scale
+    for _ in range(_DRAWS if acting else 0):  # damped: a constant twice as large would swing for ever
+        drawn = (rest + _sum(s, acting, MOTOR)) / scale
+        s.state.current_a = np.clip(0.5 * (s.state.current_a + drawn), -most, most)
     s.state.current_rate_a_s = current_rate(s.state.current_a, s.time_s)
 
 
