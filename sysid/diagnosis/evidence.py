@@ -36,8 +36,9 @@ Groups = Sequence[object]
 Variances = Mapping[object, float]
 _LESS: Final = 1e-6
 _TRIED: Final = 3
+"""Additions that are tried at each step, those of largest gain."""
 _PAIRED: Final = 8
-"""Entries of which additions, and of which pairs, are tried at each step."""
+"""Entries that share most with the one that goes, and as many of largest gain: their pairs are tried in its place."""
 _LITTLE: Final = 0.1
 _NOISY: Final = 0.5
 """Part of a column's energy that its noise may be."""

@@ -2,9 +2,8 @@
 
 1. What the values of the file and the waves of the library leave, under their priors, is the first noise.
 2. The set of most evidence is searched from nothing and from all values of the file, with variances of its own.
-3. Currents and torsions are what the simulation with this set has; shapes move to where the set wants them; noise is what
-the
-   set leaves. Then again.
+3. Currents and torsions are what the simulation with this set has; shapes move to where the set wants them; noise is
+   what the set leaves. Then again.
 """
 
 from __future__ import annotations
