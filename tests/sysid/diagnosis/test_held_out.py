@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.joint import Friction
+from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF
 from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution
-from jtqd.sysid.diagnosis.verdict import grade_of
+from jtqd.sysid.diagnosis.verdict import grade_of, judged
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1
 from tests.sysid.diagnosis.pendulums import ARM, Rig, runs_of, solved
 
@@ -142,3 +143,31 @@ def test_grades(solution: Solution, change: dict[str, float], rivals: bool, agai
     entries = tuple(solution.entries[:1]) if rivals else ()
     one: Any = SimpleNamespace(rivals=entries, **(SURE | change))
     assert grade_of(one, vetoed=against == "vetoed", hidden=against == "hidden") == grade
+
+
+def robust(solution: Solution, patch: pytest.MonkeyPatch, factor: float, noise_known: float) -> list[float]:
+    patch.setattr(limits, "ROBUST", factor)
+    patch.setattr(limits, "NOISE_KNOWN", noise_known)
+    return [j.robust for j in judged(solution)]
+
+
+def test_what_a_certain_entry_must_survive(solution: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the discrepancy and the noise as estimated, robust evidence is the evidence; with more of either it is less."""
+    sets, chosen = solution.sets, solution.chosen
+    own = judged(solution)
+    assert own
+    plain = robust(solution, monkeypatch, 1.0, 0.0)
+    for j, found in zip(own, plain, strict=True):
+        left_out = 2.0 * (sets.fit(chosen).evidence - sets.fit(chosen - set(j.members)).evidence)
+        assert found == pytest.approx(min(j.delta, left_out), rel=1e-6)
+    noisy = robust(solution, monkeypatch, 1.0, 0.1)
+    for j, found, first in zip(own, noisy, plain, strict=True):
+        assert first - found == pytest.approx(
+            0.1 * abs(sets.noise(chosen) - sets.noise(j.rival)), rel=1e-6, abs=1e-9
+        )
+    assert max(a - b for a, b in zip(plain, noisy, strict=True)) > 0.01
+    disturbed = robust(solution, monkeypatch, 9.0, 0.0)
+    assert all(b < a for a, b in zip(plain, disturbed, strict=True))
+    assert [j.robust for j in own] == pytest.approx(
+        [d - (a - b) for d, a, b in zip(disturbed, plain, noisy, strict=True)], rel=1e-6
+    ), "both at once, with the limits as they are"
