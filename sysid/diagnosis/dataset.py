@@ -114,21 +114,6 @@ class Dataset:
         valid = self.runs[run].channels[channel].valid
         return valid | self.events[channel][run] if channel in self.events else valid
 
-    def without_recording(self, number: int) -> Dataset:
-        """Return the dataset without the runs that are pieces of recording `number`; candidates, families and lines stay."""
-        pieces = range(len(self.runs)) if self.pieces is None else self.pieces
-        keep = [r for r, piece in enumerate(pieces) if piece != number]
-        left = sorted({pieces[r] for r in keep})
-        return replace(
-            self,
-            signals=[self.signals[r] for r in keep],
-            runs=[self.runs[r] for r in keep],
-            unexplained={c: [x[r] for r in keep] for c, x in self.unexplained.items()},
-            readings=[self.readings[r] for r in keep] if self.readings else (),
-            pieces=[left.index(pieces[r]) for r in keep],
-            events={c: [x[r] for r in keep] for c, x in self.events.items()},
-        )
-
     def without_events(self, events: Mapping[Channel, Events]) -> Dataset:
         """Return the runs with these events taken for not valid, and what is then unexplained."""
         runs, hidden = [], {c: list(e.masks) for c, e in events.items()}

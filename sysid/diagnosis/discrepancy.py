@@ -1,9 +1,9 @@
 """Discrepancy: what the library does not hold, as a random function of speed, load and angle, per balance.
 
 Random Fourier features (Rahimi and Recht 2007) of a Gaussian process over the conditions, plain and, in the motor balance,
-in the direction of motion, as friction is. Its variance is estimated with each set of entries (`evidence`), capped, and
-each run has a part of its own: intervals are as wide as an incomplete model makes them (Kennedy and O'Hagan 2001, J. R.
-Stat. Soc. B 63; Brynjarsdottir and O'Hagan 2014, Inverse Problems 30).
+in the direction of motion, as friction is; rough, as laws with kinks are. Its variance is estimated with each set of entries
+(`evidence`), capped, and each run has a part of its own: intervals are as wide as an incomplete model makes them (Kennedy
+and O'Hagan 2001, J. R. Stat. Soc. B 63; Brynjarsdottir and O'Hagan 2014, Inverse Problems 30).
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ def features(runs: Sequence[RunData], channel: Channel, rng: np.random.Generator
     halves = 2 if channel.balance == MOTOR else 1
     count = halves * limits.FEATURES
     scaled = [_scaled(name, axes, valid) for name in _CONDITIONS]
-    omega = rng.normal(size=(len(_CONDITIONS), count)) / limits.LENGTH
+    rough = np.sqrt(rng.chisquare(limits.ROUGH, count) / limits.ROUGH)
+    omega = rng.normal(size=(len(_CONDITIONS), count)) / (limits.LENGTH * rough)
     phase = rng.uniform(0.0, 2.0 * np.pi, count)
     out = []
     for r, a in enumerate(axes):

@@ -71,7 +71,6 @@ VERDICTS: Final = (NO_GAP, CAUSE, AMBIGUOUS, UNEXPLAINED, INSUFFICIENT)
 CERTAIN: Final = "certain"
 ONE_OF: Final = "one_of"
 EFFECTIVE: Final = "effective"
-GRADES: Final = (CERTAIN, ONE_OF, EFFECTIVE)
 
 SENSOR: Final = "sensor"
 JointName = int | str

@@ -1,8 +1,8 @@
 """The extended model that predicts, and its gain on held-out runs.
 
-Evidence distinguishes sets; what predicts is another estimate: the set and all values of the file that these runs can tell,
-by least squares in Nm under the same priors. The response of each balance has weight one, so an error is that of the
-current that the simulation needs (as torque, G Kt i) and of the twist.
+Evidence distinguishes sets; what predicts is another estimate, without discrepancy: the set under its priors and all other
+values of the file, each as far as the discrepancy resembles it. Errors are in Nm. The response of each balance has weight
+one, so an error is that of the current that the simulation needs (as torque, G Kt i) and of the twist.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel
 
 _BOOTSTRAPS: Final = 2000
-_ROUNDS: Final = 6
+_NONE: Final = 1e-12
 
 
 @dataclass(frozen=True)
@@ -41,25 +41,20 @@ class Prediction:
 def predict(solution: Solution) -> Prediction:
     """Return the set that predicts: without entries that raise the error on held-out runs beyond its scatter."""
     grams, counts = _grams(solution)
-    seconds = sum(float(s.time_s[-1] - s.time_s[0]) for run in solution.dataset.signals for s in run)
     values = {k for k, e in enumerate(solution.entries) if e.prior.file}
     slots = {solution.entries[k].slot for k in solution.chosen}
     more = {k for k in values - solution.equations.noisy if solution.entries[k].slot not in slots}
     chosen: Set = solution.chosen | more
-    weight = _weight(solution, grams, counts, chosen, seconds)
+    without = _fits(solution)
     vetoed: set[int] = set()
     while True:
-        each = _held_out(solution, grams, chosen, weight)
-        worse = _worst(solution, grams, chosen, weight, each)
+        each = _held_out(grams, without, chosen)
+        worse = _worst(solution, grams, without, chosen, each)
         if worse is None:
             break
         vetoed.add(worse)
         chosen -= {worse}
-    total = weight * np.sum([g for run in grams for g in run.values()], axis=0)
-    sets = Sets(solution.entries, total)
-    chosen = _worth(sets, chosen, solution.chosen)
-    each = _held_out(solution, grams, chosen, weight)
-    mean = sets.fit(chosen).mean
+    mean = without[-1].fit(chosen).mean
     squares = {
         c: np.array([(run[c][-1, -1], each[r][c], counts[r][c]) for r, run in enumerate(grams) if c in run])
         for c in grams[0]
@@ -67,15 +62,18 @@ def predict(solution: Solution) -> Prediction:
     return Prediction(chosen, mean, squares, frozenset(vetoed))
 
 
-def _worth(sets: Sets, chosen: Set, found: Set) -> Set:
-    """Return the set without values of the file that change by less than their deviation, and are no entry found."""
-    fit, places = sets.fit(chosen), sets.places(chosen)
-    small = {
-        k
-        for k, at in places.items()
-        if k not in found and bool(np.all(np.abs(fit.mean[at]) < np.sqrt(np.diag(fit.covariance)[at])))
-    }
-    return chosen - small
+def _fits(solution: Solution) -> list[Sets]:
+    """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
+    deviation = solution.wide.deviation(solution.found)
+    deviation[solution.sets.columns(solution.chosen)] = 1.0
+    plain = {g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.found.items()}
+    *without, everything = solution.wide.marginal(plain)
+    if len(without) == 1:
+        without = [everything]
+    return [
+        Sets(solution.entries, gram, deviation=np.maximum(deviation, _NONE))
+        for gram in (*without, everything)
+    ]
 
 
 def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:
@@ -108,41 +106,17 @@ def _rows(run: RunData, channel: Channel, weights: FloatArray, valid_of: RunData
     return np.asarray(x - x.mean(axis=0) if channel.balance == TORSION and len(x) else x)
 
 
-def _weight(
-    solution: Solution,
-    grams: Sequence[dict[Channel, FloatArray]],
-    counts: Sequence[dict[Channel, int]],
-    chosen: Set,
-    seconds: float,
-) -> float:
-    """Return the weight of a bin's square against the priors: what is left is the noise, so many samples of it a second are
-    independent.
-    """
-    total = np.sum([g for run in grams for g in run.values()], axis=0)
-    count = sum(n for run in counts for n in run.values())
-    left = 0.1 * float(total[-1, -1]) / max(count, 1)
-    weight = 1.0
-    for _ in range(_ROUNDS):
-        weight = limits.INDEPENDENT_HZ * seconds / max(count, 1) / max(left, 1e-12)
-        sets = Sets(solution.entries, weight * total)
-        left = _square(total, sets.columns(chosen), sets.fit(chosen).mean) / max(count, 1)
-    return weight
-
-
 def _square(gram: FloatArray, at: Index, mean: FloatArray) -> float:
     """Return the sum of squares that coefficients leave."""
     return float(gram[-1, -1] - 2.0 * mean @ gram[at, -1] + mean @ gram[np.ix_(at, at)] @ mean)
 
 
 def _held_out(
-    solution: Solution, grams: Sequence[dict[Channel, FloatArray]], chosen: Set, weight: float
+    grams: Sequence[dict[Channel, FloatArray]], without: Sequence[Sets], chosen: Set
 ) -> list[dict[Channel, float]]:
     """Return per recording the squares with the coefficients of all others."""
-    total = weight * np.sum([g for run in grams for g in run.values()], axis=0)
     out = []
-    for run in grams:
-        others = total - weight * np.sum(list(run.values()), axis=0) if len(grams) > 1 else total
-        sets = Sets(solution.entries, others)
+    for run, sets in zip(grams, without[:-1], strict=True):
         at, mean = sets.columns(chosen), sets.fit(chosen).mean
         out.append({c: max(_square(g, at, mean), 0.0) for c, g in run.items()})
     return out
@@ -151,8 +125,8 @@ def _held_out(
 def _worst(
     solution: Solution,
     grams: Sequence[dict[Channel, FloatArray]],
+    fits: Sequence[Sets],
     chosen: Set,
-    weight: float,
     each: Sequence[dict[Channel, float]],
 ) -> int | None:
     """Return the structural entry whose removal lowers the held-out error most, beyond the scatter over recordings."""
@@ -163,7 +137,7 @@ def _worst(
     for k in sorted(chosen):
         if solution.entries[k].prior.file:
             continue
-        without = _held_out(solution, grams, chosen - {k}, weight)
+        without = _held_out(grams, fits, chosen - {k})
         gain = now - np.array([sum(run.values()) for run in without])
         scatter = float(np.std(gain, ddof=1)) / np.sqrt(len(gain))
         if float(np.mean(gain)) > max(limits.VETO * scatter, best):

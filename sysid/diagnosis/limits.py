@@ -111,6 +111,8 @@ FEATURES: Final = 12
 """Random Fourier features of a balance's discrepancy, plain; as many in the direction of motion."""
 LENGTH: Final = 1.0
 """Their length scale, in standard deviations of the operating conditions."""
+ROUGH: Final = 3.0
+"""Degrees of freedom of their spectrum: Matern 3/2, as laws with kinks need (Rasmussen and Williams 2006, section 4.2)."""
 FLOOR: Final = 1e-3
 """Prior size of the discrepancy, part of the rated torque, worth FLOOR_COUNT features."""
 FLOOR_COUNT: Final = 2.0
@@ -118,27 +120,21 @@ RUNS_COUNT: Final = 4.0
 """Runs that the prior of a run-to-run variation is worth."""
 CAP: Final = 0.3
 """Largest part of the gap (rms) that may be discrepancy."""
+NOISE_FLOOR: Final = 1.0
+"""White noise on top of what is left, as part of the density of its slow parts: nothing quick is known better."""
 RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 ROBUST: Final = 9.0
 """Factor of the discrepancy's variance that a certain entry must survive."""
-NOISE_KNOWN: Final = 0.1
-"""Part to which the size of a channel's noise is known: a certain entry must not rest on it."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""
 LISTED: Final = 0.2
 """Part of the relevance from which an entry is listed as a cause; smaller ones are listed as too small to matter."""
 RELEVANCE: Final = 0.005
 """Part of the rated torque, rms, from which an entry or an unexplained residual matters; the user may set another."""
-INDEPENDENT_HZ: Final = 2.0
-"""Independent samples a second of what an incomplete model leaves."""
 FEWEST_VETO: Final = 3
 """Recordings from which held-out runs may veto an entry."""
 VETO: Final = 2.0
 """Standard errors over recordings by which an entry must raise the error on held-out runs to be vetoed."""
-INACCURATE: Final = 0.025
+INACCURATE: Final = 0.03
 """Half width of a 95 % interval, as part of an effect's size, for what the equations simplify: no interval is narrower."""
-INACCURATE_RATE: Final = 0.04
-"""The same of what is known by a derivative of measured angles or torques."""
-INACCURATE_TWIST: Final = 0.05
-"""The same of what teeth or torsion do within a few tens of microradians, where encoders round."""

@@ -1,13 +1,15 @@
 """The model of all runs: columns of all entries at the present solution, noise, the set of most evidence, its shapes.
 
 1. What the values of the file and the waves of the library leave, under their priors, is the first noise.
-2. The set of most evidence is searched from nothing and from all values of the file, with variances of its own.
+2. Sets are searched from nothing and from all values of the file; those that are met are compared with variances of their
+   own.
 3. Currents and torsions are what the simulation with this set has; shapes move to where the set wants them; noise is
-   what the set leaves. Then again.
+   what the set leaves, no frequency with less than if it were white. Then again.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
@@ -21,7 +23,7 @@ from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.discrepancy import features
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, shapes_of
-from jtqd.sysid.diagnosis.evidence import Equations, Set, Sets
+from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
 from jtqd.sysid.diagnosis.findings import shows_at
 from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums, white_noise
 from jtqd.sysid.diagnosis.regressors import (
@@ -39,6 +41,11 @@ from jtqd.sysid.diagnosis.solution import present_effects, set_state
 
 _TURNS: Final = 4
 _ROUNDS: Final = 3
+_STEPS: Final = 8
+_CLIMB: Final = 4
+_FROM_NOTHING: Final = 2
+"""Turns that search from the empty set as well."""
+"""Of expectation-maximisation."""
 _STATES: Final = frozenset({"current_a", "current_rate_a_s", "torsion_rad", "torsion_rate_rad_s", "joint"})
 """What effects use that follows from the solution."""
 _SETTLING: Final = 6
@@ -56,8 +63,9 @@ class Solution:
     """A set with its posterior.
 
     entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence; values: the
-    same with all that the torques hold, for the values of the set; noise; runs, disturbed: binned, with discrepancy among
-    the nuisances; own_means: of what each recording has of its own; own: the same for a set with given coefficients.
+    same with all that the torques hold, for the values of the set; noise: of what is left; runs, disturbed: binned, with
+    discrepancy among the nuisances; own_means: of what each recording has of its own; own: the same for a set with given
+    coefficients.
     """
 
     dataset: Dataset
@@ -73,6 +81,8 @@ class Solution:
     values: Sets
     own: Callable[[FloatArray, Set], FloatArray]
     columns: int
+    wide: Equations
+    found: Mapping[object, float]
 
     def transform(self) -> FloatArray:
         """Return the weights of scaled coefficients in the library's columns [P, E]."""
@@ -89,70 +99,115 @@ def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
     return out
 
 
-Means = tuple[FloatArray, FloatArray, list[FloatArray]]
-"""Of coefficients, shared discrepancy, and what each recording has of its own."""
-
-
 class _End(NamedTuple):
-    """Where a search ended: -2 log marginal likelihood, set, variances, means."""
+    """A set with variances of its own: -2 log marginal likelihood (inf: it has none), set, variances, means."""
 
     score: float
     chosen: Set
     variances: Mapping[object, float]
-    means: Means
+    means: Means | None
+
+
+class _Search:
+    """Sets on one noise: searched at the variances of one set, compared with each at its own."""
+
+    def __init__(self, equations: Equations) -> None:
+        self.equations = equations
+        self.met: dict[Set, _End] = {}
+
+    def own(self, chosen: Set) -> _End:
+        """Return a set with variances of its own."""
+        if chosen not in self.met:
+            first = self.equations.first()
+            try:
+                variances, score, means = self.equations.expected(chosen, first, _STEPS)
+                self.met[chosen] = _End(score, chosen, variances, means)
+            except np.linalg.LinAlgError:
+                self.met[chosen] = _End(math.inf, chosen, first, None)
+        return self.met[chosen]
+
+    def best(self, starts: Sequence[Set], *, rivals: bool) -> _End:
+        """Return the set of most evidence of all that searches from these sets meet, and of their neighbours; rivals: also
+        of those that searches without one of its effects end in.
+        """
+        self.own(frozenset())
+        for start in starts:
+            now = start
+            for _ in range(_ROUNDS):
+                sets = self.equations.sets(self.own(now).variances, now)
+                before, now = now, max(map(sets.search, {now, *starts}), key=lambda s: sets.fit(s).evidence)
+                if now == before:
+                    break
+            self.own(now)
+        best = self._least()
+        for _ in range(_CLIMB):
+            sets = self.equations.sets(best.variances, best.chosen)
+            near = sets.neighbours(best.chosen)
+            if rivals:
+                near += [sets.without(best.chosen, members) for members in sets.effects(best.chosen)]
+            for s in near:
+                self.own(s)
+            before_that, best = best, self._least()
+            if best is before_that:
+                break
+        return self._without_the_replaceable(best) if rivals else best
+
+    def _without_the_replaceable(self, best: _End) -> _End:
+        """Return the set without effects that its others nearly replace, which then have the whole size."""
+        sets = self.equations.sets(best.variances, best.chosen, resembling=False)
+        chosen = best.chosen
+        while True:
+            less = [chosen - set(members) for members in sets.effects(chosen)]
+            least = max(less, key=lambda s: sets.fit(s).evidence, default=chosen)
+            if not less or 2.0 * (sets.fit(chosen).evidence - sets.fit(least).evidence) > limits.RIVAL:
+                end = self.own(chosen)
+                return end if math.isfinite(end.score) else best
+            chosen = least
+
+    def _least(self) -> _End:
+        return min(self.met.values(), key=lambda end: end.score)
 
 
 def solve(dataset: Dataset, seed: int = 0) -> Solution:
     """Return the set of entries with most evidence on these runs."""
     work = _Work(dataset, seed)
     residuals = work.first_residuals()
-    best: _End | None = None
+    start = work.file_values()
     for turn in range(_TURNS):
-        noise = (white_noise if turn == 0 else noise_model)(work.runs, residuals, dataset.step_s)
+        first, last = turn == 0, turn + 1 == _TURNS
+        noise = (
+            white_noise(work.runs, residuals, dataset.step_s)
+            if first
+            else noise_model(work.runs, residuals, dataset.step_s, limits.NOISE_FLOOR)
+        )
         equations = work.equations(noise)
-        begin = {(best.chosen if best else work.file_values()) - equations.noisy}
-        starts = begin | ({frozenset[int]()} if turn < 2 else set())
-        ends: list[_End] = []
-        for start in starts:
-            now, variances, last = start, equations.first(), None
-            for _ in range(_ROUNDS):
-                variances, _, _ = equations.expected(now, variances, 4)
-                sets = equations.sets(variances)
-                ends_of = {sets.search(s) for s in {now, *starts}}
-                ends_of |= {
-                    # a gain scales all balances: from it no single exchange leads to what else may be wrong
-                    sets.search(sets.search(s - work.scales, banned=work.gains))
-                    for s in ends_of
-                    if s & work.gains
-                }
-                now = max(ends_of, key=lambda s: sets.fit(s).evidence)
-                if now == last:
-                    break
-                last = now
-            _, score, means = equations.expected(now, variances, 0)
-            ends.append(_End(score, now, variances, means))
-        best = min(ends, key=lambda end: end.score)
-        chosen, variances, means = best.chosen, dict(best.variances), best.means
-        if turn + 1 < _TURNS:
-            residuals = work.left(chosen, means)
-            work.settle(chosen, means[0], noise, variances)
-    assert best is not None
-    sets = equations.sets(variances)
-    means, wide, found = work.values(chosen, means, noise, variances)
+        search = _Search(equations)
+        starts = [start - equations.noisy, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]
+        best = search.best(starts, rivals=last)
+        start, variances, means = best.chosen, best.variances, best.means
+        assert means is not None
+        if not last:
+            residuals = work.left(start, means)
+            work.settle(start, means.beta, noise, variances)
+    assert means is not None
+    sets = equations.sets(variances, start)
+    means, wide, found = work.values(start, means, noise, variances)
     return Solution(
         dataset,
         work.entries,
-        chosen,
+        start,
         equations,
         variances,
-        noise,
+        noise_model(work.runs, residuals, dataset.step_s),
         work.runs,
         work.disturbed,
-        means[2],
+        means.own,
         sets,
-        wide.sets(found),
+        wide.sets(found, start),
         lambda mean, which: wide.own(which, mean, found),
         work.columns,
+        wide,
+        found,
     )
 
 
@@ -201,8 +256,6 @@ class _Work:
                     families=np.concatenate((d.families, np.arange(first, first + count))).astype(np.intp),
                 )
         self.shared = np.array(shared, np.intp)
-        self.gains = frozenset(k for k, e in enumerate(self.entries) if e.effect.scales_all)
-        self.scales = self.gains | {k for k, e in enumerate(self.entries) if e.effect.scales_balance}
         joint = next(iter(dataset.joints.values()))
         self._used = {
             k: fields_used(e.effect, e.candidate.term.basis[0], joint) for k, e in enumerate(self.entries)
@@ -246,7 +299,26 @@ class _Work:
         lacking = set(range(len(grams))) - {pieces[place] for place in self.disturbed_of}
         for p in lacking if self.disturbed else ():  # as the others have
             extra[p] = extra.sum(axis=0) / (len(grams) - len(lacking))
-        return Equations(entries, grams, extra, self.groups, self.shared, self.start, self.most)
+        return Equations(
+            entries, grams, extra, self.groups, self.shared, self.start, self.most, self.resemblance(weights)
+        )
+
+    def resemblance(self, weights: FloatArray) -> dict[object, FloatArray]:
+        """Return per discrepancy the variance of each scaled coefficient that least squares would find in a discrepancy of
+        unit variance [E].
+        """
+        found, energy = {}, np.zeros(weights.shape[1])
+        for channel in self.runs[0].channels:
+            group = ("discrepancy", channel)
+            own = [k for k, g in enumerate(self.groups) if g == group]
+            cross = np.zeros((len(own), weights.shape[1]))
+            for run in self.runs:
+                d = run.channels[channel]
+                x = d.regressors[d.valid] @ weights[d.index]
+                cross += d.nuisances[np.ix_(d.valid, d.families >= own[0])][:, : len(own)].T @ x
+                energy += np.sum(x * x, axis=0)
+            found[group] = np.sum(cross**2, axis=0)
+        return {g: part / np.maximum(energy, 1e-30) ** 2 for g, part in found.items()}
 
     def first_residuals(self) -> dict[Channel, list[FloatArray]]:
         """Return what the values of the file, the waves and the runs' own changes leave under their priors, per run [n].
@@ -254,15 +326,7 @@ class _Work:
         Not what everything could explain: the residual is a sum of measured terms, and with a column for each of them all of
         it is explained by taking everything away.
         """
-        usual = list(range(len(self.entries)))
         weights = self.transform()
-        ends = np.cumsum([0, *(e.size for e in self.entries)])
-        at = (
-            np.concatenate([np.arange(ends[k], ends[k + 1]) for k in usual]).astype(int)
-            if usual
-            else np.empty(0, int)
-        )
-        weights = weights[:, at]
         sigma = np.array([f.sigma for f in self.dataset.families])
         E, Q, R = weights.shape[1], self.families, len(self.runs)
         gram, right, parts, noise = np.zeros((E + R * Q,) * 2), np.zeros(E + R * Q), [], 0.0
@@ -285,17 +349,13 @@ class _Work:
 
     def left(self, chosen: Set, means: Means) -> dict[Channel, list[FloatArray]]:
         """Return what set, discrepancy and the runs' own changes leave, per channel and run [n], NaN where not valid."""
-        beta, w, us = means
-        ends = np.cumsum([0, *(e.size for e in self.entries)])
-        full = np.zeros(ends[-1])
-        at = [j for k in sorted(chosen) for j in range(ends[k], ends[k + 1])]
-        full[at] = beta
-        library = self.transform() @ full
+        weights = self.transform()[:, columns_of(self.entries, chosen)]
         pieces = self.dataset.recordings
         out: dict[Channel, list[FloatArray]] = {c: [] for c in self.runs[0].channels}
         for run, place in zip(self.runs, pieces, strict=True):
-            total = us[place].copy()
-            total[self.shared] += w
+            total = means.own[place].copy()
+            total[self.shared] += means.shared
+            library = weights @ (means.beta - means.turned @ total[self.shared])
             for c, d in run.channels.items():
                 rest = d.residual - d.regressors @ library[d.index] - d.nuisances @ total[d.families]
                 out[c].append(np.where(d.valid, rest, np.nan))
@@ -313,8 +373,9 @@ class _Work:
         """
         for s in (s for run in (*self.dataset.signals, *self.dataset.disturbed) for s in run):
             s.know_torque(VALUES_HZ, VALUES_HZ)
-        self.settle(chosen, means[0], noise, variances, _STATES | _TORQUES)
+        self.settle(chosen, means.beta, noise, variances, _STATES | _TORQUES)
         equations = self.equations(noise)
+        equations.definite(chosen, variances)
         found, _, means = equations.expected(chosen, variances, 2)
         return means, equations, found
 
@@ -331,8 +392,8 @@ class _Work:
         acting = any("current_a" in self._used[k] for k in chosen)
         for _ in range(_SETTLING if acting else 0):
             few = [self.entries[k] for k in sorted(chosen)]
-            sets = self.equations(noise, few).sets(variances)
-            fit = sets.fit(frozenset(range(len(few))))
+            every = frozenset(range(len(few)))
+            fit = self.equations(noise, few).sets(variances, every).fit(every)
             now = fit.mean
             settled = len(now) == len(mean) and bool(
                 np.all(np.abs(now - mean) <= _SETTLED * np.sqrt(np.diag(fit.covariance)))

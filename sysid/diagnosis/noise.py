@@ -19,7 +19,7 @@ from jtqd.sysid.diagnosis.regressors import ChannelData, Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel
 
 ORDER: Final = 24
-_RIDGE: Final = 1e-9
+_LITTLE: Final = 1e-6
 _BLOCK_S: Final = 1.0
 
 
@@ -67,8 +67,10 @@ def saturated_residuals(
     return out
 
 
-def autoregression(stretches: Sequence[FloatArray], order: int = ORDER) -> FloatArray:
-    """Return a [order]: x_t = sum a_k x_{t-k} + e, by Yule-Walker over series with NaN for gaps (Levinson)."""
+def autoregression(stretches: Sequence[FloatArray], order: int = ORDER, white: float = _LITTLE) -> FloatArray:
+    """Return a [order]: x_t = sum a_k x_{t-k} + e, by Yule-Walker over series with NaN for gaps (Levinson); white: variance
+    of white noise on top of them, in theirs.
+    """
     covariance = np.zeros(order + 1)
     for x in stretches:
         good = np.isfinite(x)
@@ -83,7 +85,7 @@ def autoregression(stretches: Sequence[FloatArray], order: int = ORDER) -> Float
         np.float64,
     )
     c = covariance / np.maximum(counts, 1.0)
-    c[0] *= 1.0 + 1e-6
+    c[0] *= 1.0 + white
     a = np.zeros(order)
     error = c[0]
     for k in range(order):
@@ -116,11 +118,22 @@ def past_valid(valid: BoolArray, order: int) -> BoolArray:
 
 
 def noise_model(
-    runs: Sequence[RunData], residuals: Mapping[Channel, list[FloatArray]], step_s: float
+    runs: Sequence[RunData],
+    residuals: Mapping[Channel, list[FloatArray]],
+    step_s: float,
+    floor: float = 0.0,
 ) -> Noise:
-    """Return the noise of all channels from their saturated residuals."""
+    """Return the noise of all channels from what nothing explains.
+
+    floor: white noise on top, as part of the density of what is slow, at most of the mean. A model errs at frequencies at
+    which its data hold little, and a small residual there is no small noise: with a floor of 1 nothing quick has more weight
+    than what is slow (diagonal loading: Carlson 1988, IEEE Trans. Aerosp. Electron. Syst. 24).
+    """
     channels = tuple(residuals)
-    ar = {c: autoregression(residuals[c]) for c in channels}
+    block = max(1, round(_BLOCK_S / step_s))
+    rms = {c: max(float(np.sqrt(np.nanmean(np.concatenate(residuals[c]) ** 2))), 1e-12) for c in channels}
+    on_top = {c: max(floor * min(_slowness(residuals[c], rms[c], block), 1.0), _LITTLE) for c in channels}
+    ar = {c: autoregression(residuals[c], white=on_top[c]) for c in channels}
     white: list[list[FloatArray]] = []
     for c in channels:
         mine = []
@@ -129,6 +142,7 @@ def noise_model(
             mine.append(np.where(good, whiten(np.nan_to_num(x), ar[c]), np.nan))
         white.append(mine)
     sigma = np.array([max(float(np.sqrt(np.nanmean(np.concatenate(w) ** 2))), 1e-12) for w in white])
+    sigma = np.sqrt(sigma**2 + [on_top[c] * rms[c] ** 2 * (1.0 + float(ar[c] @ ar[c])) for c in channels])
     stacked = np.array([np.concatenate(w) / s for w, s in zip(white, sigma, strict=True)])
     count = len(channels)
     correlation = np.eye(count)
@@ -138,7 +152,7 @@ def noise_model(
             if both.sum() > 100:
                 correlation[a, b] = correlation[b, a] = float(np.mean(stacked[a, both] * stacked[b, both]))
     correlation = _definite(correlation)
-    return Noise(channels, ar, sigma, correlation, _inflation(white, sigma, max(1, round(_BLOCK_S / step_s))))
+    return Noise(channels, ar, sigma, correlation, _inflation(white, sigma, block))
 
 
 def white_noise(
@@ -166,19 +180,22 @@ def _definite(correlation: FloatArray) -> FloatArray:
 
 
 def _inflation(white: Sequence[Sequence[FloatArray]], sigma: FloatArray, block: int) -> float:
-    """Return the mean square of block sums against that of white noise, at least 1."""
+    """Return how much more than white noise all channels scatter over blocks, at least 1."""
+    ratios = [_slowness(runs, float(s), block) for runs, s in zip(white, sigma, strict=True)]
+    return max(1.0, float(np.mean(ratios)))
+
+
+def _slowness(series: Sequence[FloatArray], sigma: float, block: int) -> float:
+    """Return the mean square of sums over blocks against that of white noise, 1 where no block is long enough."""
     ratios = []
-    for runs, s in zip(white, sigma, strict=True):
-        for x in runs:
-            count = len(x) // block
-            parts = x[: count * block].reshape(count, block)
-            good = np.isfinite(parts)
-            many = good.sum(axis=1)
-            use = many > block // 4
-            if use.any():
-                sums = np.nansum(parts[use], axis=1)
-                ratios.append(float(np.mean(sums**2 / many[use])) / s**2)
-    return max(1.0, float(np.mean(ratios))) if ratios else 1.0
+    for x in series:
+        count = len(x) // block
+        parts = x[: count * block].reshape(count, block)
+        many = np.isfinite(parts).sum(axis=1)
+        use = many > block // 4
+        if use.any():
+            ratios.append(float(np.mean(np.nansum(parts[use], axis=1) ** 2 / many[use])) / sigma**2)
+    return float(np.mean(ratios)) if ratios else 1.0
 
 
 @dataclass(frozen=True)

@@ -225,12 +225,6 @@ class JointSignals:
         """
         return self.visible(x) if balance == MOTOR else x
 
-    def seen_each(self, balance: str, values: Sequence[FloatArray]) -> Sequence[FloatArray]:
-        """Return `seen` of each of the values; together, because a filter takes longer to be called than to run."""
-        if balance != MOTOR or not self.visible.parts or not values:
-            return values
-        return list(self.visible(np.array(values)))
-
     def usable(self, balance: str) -> BoolArray:
         """Return the samples that a balance is judged at [n]: those of `known` at which no channel of it is held."""
         out = self.known(balance)

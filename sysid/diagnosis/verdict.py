@@ -1,8 +1,8 @@
 """Verdict: the entries of the set with grade, interval and size, what remains, and what these runs cannot tell.
 
-An entry is *certain* where no rival set has nearly as much evidence, also with a discrepancy ROBUST times as large and with
-the noise of the channels another by NOISE_KNOWN, and its interval excludes the value without it; *one of* where a set
-without it has nearly as much evidence; else *effective*: it predicts, and what it stands for is not settled. One relevance
+An entry is *certain* where no rival set has nearly as much evidence, also with a discrepancy ROBUST times as large, its
+interval excludes the value without it, and less than itself remains; *one of* where a set without it has nearly as much
+evidence; else *effective*: it predicts, and what it stands for is not settled. One relevance
 decides the verdict, for entries and for what remains alike.
 """
 
@@ -50,8 +50,6 @@ from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, present_
 from jtqd.sysid.diagnosis.unexplained import Unexplained, held_nm, unexplained_residual
 
 _Z95: Final = 1.96
-_RIVAL_STEPS: Final = 12
-_IMPROVEMENTS: Final = 3
 
 
 @dataclass(frozen=True)
@@ -71,46 +69,6 @@ class Judged:
     z: float
 
 
-def improved(solution: Solution) -> Solution:
-    """Return the solution with the set that searches for rivals of its entries end in, where one has more evidence; and
-    without entries that others of the set nearly replace, which then have the whole size.
-    """
-    sets, chosen = solution.sets, solution.chosen
-    for _ in range(_IMPROVEMENTS):
-        others = [_without(sets, chosen, m) for m in _members(sets, chosen)]
-        best = max(others, key=lambda s: sets.fit(s).evidence, default=chosen)
-        if sets.fit(best).evidence <= sets.fit(chosen).evidence:
-            break
-        chosen = sets.search(best)
-    while True:
-        less = [chosen - set(m) for m in _members(sets, chosen)]
-        best = max(less, key=lambda s: sets.fit(s).evidence, default=chosen)
-        if not less or 2.0 * (sets.fit(chosen).evidence - sets.fit(best).evidence) > limits.RIVAL:
-            break
-        chosen = best
-    return replace(solution, chosen=chosen)
-
-
-def _members(sets: Sets, chosen: Set) -> list[tuple[int, ...]]:
-    """Return the entries of a set, those that are one effect together."""
-    out: dict[tuple[object, ...], list[int]] = {}
-    for k in sorted(chosen):
-        e = sets.entries[k]
-        out.setdefault((*e.key, e.slot[-1]), []).append(k)
-    return [tuple(members) for members in out.values()]
-
-
-def _without(sets: Sets, chosen: Set, members: Sequence[int]) -> Set:
-    """Return the set of most evidence without an effect."""
-    key = sets.entries[members[0]].key
-    same = frozenset(
-        k
-        for k, e in enumerate(sets.entries)
-        if e.key == key and e.slot[-1] == sets.entries[members[0]].slot[-1]
-    )
-    return sets.search(chosen - same, banned=same, steps=_RIVAL_STEPS)
-
-
 def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
     """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
     mean = solution.values.fit(solution.chosen).mean
@@ -122,21 +80,24 @@ def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
 def judged(solution: Solution) -> list[Judged]:
     """Return the effects of the set."""
     sets, chosen = solution.sets, solution.chosen
-    large = solution.equations.sets(
-        {
-            g: v * (limits.ROBUST if isinstance(g, tuple) and g[0] in ("discrepancy", "shared") else 1.0)
-            for g, v in solution.variances.items()
-        }
-    )
-    fit, values = sets.fit(chosen), solution.values.fit(chosen)
+    wide = {
+        g: v * (limits.ROBUST if isinstance(g, tuple) and g[0] in ("discrepancy", "shared") else 1.0)
+        for g, v in solution.variances.items()
+    }
+    plain = solution.equations.sets(solution.variances, chosen, resembling=False)
+    large = solution.equations.sets(wide, chosen, resembling=False)
+    imitated = solution.equations.sets(wide, chosen)
+    values = solution.values.fit(chosen)
     places = solution.values.places(chosen)
     out = []
-    for members in _members(sets, chosen):
+    for members in sets.effects(chosen):
         found = [(solution.entries[k], values.mean[places[k]]) for k in members]
         [present] = present_effects(found)
-        rival = _without(sets, chosen, members)
-        without = chosen - set(members)
-        robust = large.fit(chosen).evidence - max(large.fit(without).evidence, large.fit(rival).evidence)
+        rival = sets.without(chosen, members)
+        robust = min(
+            imitated.fit(chosen).evidence - imitated.fit(chosen - set(members)).evidence,
+            large.fit(chosen).evidence - large.fit(rival).evidence,
+        )
         at = np.concatenate([np.arange(places[k].start, places[k].stop) for k in members])
         mean = values.mean[at]
         z2 = float(mean @ np.linalg.solve(values.covariance[np.ix_(at, at)], mean))
@@ -145,8 +106,8 @@ def judged(solution: Solution) -> list[Judged]:
                 members,
                 present,
                 _rms(solution, present),
-                2.0 * (fit.evidence - sets.fit(rival).evidence),
-                2.0 * robust - limits.NOISE_KNOWN * abs(sets.noise(chosen) - sets.noise(rival)),
+                2.0 * (plain.fit(chosen).evidence - plain.fit(rival).evidence),
+                2.0 * robust,
                 tuple(sets.entries[k] for k in rival - chosen),
                 rival,
                 math.sqrt(max(z2, 0.0)),
@@ -184,7 +145,6 @@ def conclude(
     relevance: float,
 ) -> tuple[Findings, Prediction]:
     """Return the findings of one diagnosis, without what was noted on its runs before, and the model that predicts."""
-    solution = improved(solution)
     dataset = solution.dataset
     prediction = predict(solution)
     effects = judged(solution)
@@ -201,10 +161,7 @@ def conclude(
             left, rest = other, less
     held = held_nm(dataset, left)
     total = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
-    spread = averaged(solution, effects)
-    causes = sorted(
-        (_cause(solution, j, prediction, total, rest, spread) for j in effects), key=lambda c: -c.rms_nm
-    )
+    causes = sorted((_cause(solution, j, prediction, total, rest) for j in effects), key=lambda c: -c.rms_nm)
     matter = [c for c in causes if c.rms_nm >= limits_nm[_channel(c, dataset)]]
     listed = [c for c in causes if c.rms_nm >= limits.LISTED * limits_nm[_channel(c, dataset)]]
     listed = [c if c in matter else replace(c, matters=False) for c in listed]
@@ -237,7 +194,7 @@ def conclude(
         predicts=tuple(
             Present(p.effect.name, p.joint, p.values) for p in extended_effects(solution, prediction)
         ),
-        next_experiment=_next(verdict, matter, untold, dataset),
+        next_experiment=_next(matter, effects, dataset),
     )
     return findings, prediction
 
@@ -257,13 +214,12 @@ def _own(solution: Solution, prediction: Prediction) -> FloatArray:
     return solution.own(prediction.mean, prediction.chosen)[:, : len(solution.dataset.families)]
 
 
-def _cause(  # noqa: PLR0917
+def _cause(
     solution: Solution,
     j: Judged,
     prediction: Prediction,
     total_nm2: float,
     rest: Unexplained,
-    spread: Mapping[int, FloatArray],
 ) -> Cause:
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
     remains = math.sqrt(rest.by_channel().get(channel, 0.0))
@@ -280,7 +236,7 @@ def _cause(  # noqa: PLR0917
         name,
         j.present.joint,
         (name, *(r for r in rivals if r != name)) if grade == ONE_OF else (name,),
-        values_of(solution, j, spread),
+        values_of(solution, j),
         j.delta,
         math.nan,
         j.rms_nm[channel],
@@ -292,35 +248,15 @@ def _cause(  # noqa: PLR0917
     )
 
 
-def averaged(solution: Solution, effects: Sequence[Judged]) -> dict[int, FloatArray]:
-    """Return by how much the coefficients of each entry differ between the set and the rival sets [m, m]: their mean square
-    by the sets' evidence (Bayesian model averaging: Hoeting et al. 1999, Statistical Science 14).
-    """
-    sets, chosen = solution.sets, solution.chosen
-    rivals = {j.rival: math.exp(-0.5 * max(j.delta, 0.0)) for j in effects}
-    total = 1.0 + sum(rivals.values())
-    places, mean = sets.places(chosen), sets.fit(chosen).mean
-    out = {k: np.zeros((sets.entries[k].size,) * 2) for k in chosen}
-    for rival, weight in rivals.items():
-        there = sets.places(rival)
-        for k in chosen & rival:
-            apart = sets.fit(rival).mean[there[k]] - mean[places[k]]
-            out[k] += weight / total * np.outer(apart, apart)
-    return out
-
-
-def values_of(solution: Solution, j: Judged, spread: Mapping[int, FloatArray]) -> dict[str, Value]:
-    """Return the parameters of an effect with 95 % intervals, as wide as the rival sets make them (`averaged`), no narrower
-    than what the equations simplify.
-    """
+def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
+    """Return the parameters of an effect with 95 % intervals, no narrower than what the equations simplify."""
     fit = solution.values.fit(solution.chosen)
     places = solution.values.places(solution.chosen)
     half: dict[str, float] = dict.fromkeys(j.present.values, 0.0)
     none: dict[str, float] = {}
     for k in j.members:
         e, at = solution.entries[k], places[k]
-        mean, covariance = fit.mean[at], fit.covariance[at, at].copy()
-        covariance[: len(spread[k]), : len(spread[k])] += spread[k]
+        mean, covariance = fit.mean[at], fit.covariance[at, at]
         here = e.values(mean)
         none |= {n: v for n, v in e.candidate.term.combine([0.0] * e.candidate.size).items() if n not in none}
         for name in here:
@@ -340,7 +276,7 @@ def values_of(solution: Solution, j: Judged, spread: Mapping[int, FloatArray]) -
             if p.name == "phase_rad"
             else abs(value - (0.0 if p.name.startswith("reference") else none.get(p.name, 0.0)))
         )
-        wide = math.hypot(half[p.name], inaccurate(j.present.effect) * size)
+        wide = math.hypot(half[p.name], limits.INACCURATE * size)
         low, high = value - wide, value + wide
         if p.name != "phase_rad":
             low, high = max(low, p.low), min(high, p.high)
@@ -357,13 +293,6 @@ def _slope(e: Entry, mean: FloatArray, i: int, name: str) -> float:
     if name == "phase_rad":
         change = float(np.angle(np.exp(1j * change)))
     return change / (2.0 * step)
-
-
-def inaccurate(effect: Effect) -> float:
-    """Return the least half width of a 95 % interval, as part of the effect's size."""
-    if effect.follows_torsion or effect.geometric:
-        return limits.INACCURATE_TWIST
-    return limits.INACCURATE_RATE if effect.rate_based else limits.INACCURATE
 
 
 def _unexplained(
@@ -493,15 +422,24 @@ def extended_effects(solution: Solution, prediction: Prediction) -> list[Present
     return present_effects(found)
 
 
-def _next(
-    verdict: str, causes: Sequence[Cause], untold: Sequence[Untold], dataset: Dataset
-) -> dict[str, Any] | None:
-    """Return the experiment that would settle what is one of several."""
-    classes = [tuple(dict.fromkeys(n.split(" of ")[0] for n in c.names)) for c in causes if len(c.names) > 1]
-    if not classes:
+def _next(causes: Sequence[Cause], effects: Sequence[Judged], dataset: Dataset) -> dict[str, Any] | None:
+    """Return the experiment that would settle what is not certain and has rivals."""
+    rivals = {(j.present.effect.name, j.present.joint): [e.effect.name for e in j.rivals] for j in effects}
+    open_causes = [
+        (c, tuple(dict.fromkeys((c.name, *rivals[c.name, c.joint])))) for c in causes if c.grade != CERTAIN
+    ]
+    open_causes = [(c, names) for c, names in open_causes if len(names) > 1]
+    if not open_causes:
         return None
-    text = "; ".join(f"{' and '.join(names)} fit these runs equally well" for names in classes)
+    text = "; ".join(
+        f"{' and '.join(names)} {'fit these runs equally well' if c.grade == ONE_OF else 'are not settled'}"
+        for c, names in open_causes
+    )
     warm = bool(np.isfinite(dataset.signals[0][0].state.temperature_c).any())
     return next_experiment(
-        classes, dataset.joints, text, temperature=warm, signals=[run[0] for run in dataset.signals]
+        [names for _, names in open_causes],
+        dataset.joints,
+        text,
+        temperature=warm,
+        signals=[run[0] for run in dataset.signals],
     )

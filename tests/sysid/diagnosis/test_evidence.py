@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from copy import copy
 from itertools import combinations, pairwise
 from types import SimpleNamespace
 from typing import Any, cast
@@ -221,14 +222,20 @@ def drifting() -> list[FloatArray]:
 VARIANCES = {"zero": 0.6, "friction": 0.1, "discrepancy": 0.2, ("shared", "discrepancy"): 0.7}
 
 
-def covariance_of(blocks: Sequence[FloatArray], columns: Sequence[int]) -> FloatArray:
-    """Of all y: entries N(0, 1), the runs' own nuisances, and the features' part that all runs share."""
+def covariance_of(
+    blocks: Sequence[FloatArray], columns: Sequence[int], beside: Sequence[int] = ()
+) -> FloatArray:
+    """Of all y: entries N(0, 1), the runs' own nuisances, and the features' part that all runs share; features without what
+    these columns explain of them, under the same prior.
+    """
     rows = np.vstack(blocks)
-    x, f = rows[:, list(columns)], rows[:, 5:7]
+    x, other, f = rows[:, list(columns)], rows[:, list(beside)], rows[:, 5:7]
+    f = f - other @ np.linalg.solve(other.T @ other + np.eye(len(beside)), other.T @ f)
     out = x @ x.T + VARIANCES["shared", "discrepancy"] * (f @ f.T) + np.eye(len(rows))  # type: ignore[index]
     first = 0
     for b in blocks:
-        own = b[:, 3:7] * np.sqrt([VARIANCES[g] for g in GROUPS])
+        z = np.hstack((b[:, 3:5], f[first : first + len(b)]))
+        own = z * np.sqrt([VARIANCES[g] for g in GROUPS])
         out[first : first + len(b), first : first + len(b)] += own @ own.T
         first += len(b)
     return np.asarray(out)
@@ -237,24 +244,73 @@ def covariance_of(blocks: Sequence[FloatArray], columns: Sequence[int]) -> Float
 @pytest.mark.parametrize(
     "chosen", [frozenset(), frozenset({0}), frozenset({0, 2}), frozenset({0, 1, 2})], ids=str
 )
-def test_nuisances_and_discrepancy_are_integrated_out(drifting: list[FloatArray], chosen: Set) -> None:
+@pytest.mark.parametrize("beside", [frozenset(), frozenset({0, 2})], ids=str)
+def test_nuisances_and_discrepancy_are_integrated_out(
+    drifting: list[FloatArray], chosen: Set, beside: Set
+) -> None:
     equations = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3))
     y = np.concatenate([b[:, -1] for b in drifting])
-    sets = equations.sets(VARIANCES)
-    dense = log_density(y, covariance_of(drifting, sorted(chosen))) + EVEN * len(chosen)
-    nothing = log_density(y, covariance_of(drifting, ()))
+    sets = equations.sets(VARIANCES, beside)
+    dense = log_density(y, covariance_of(drifting, sorted(chosen), sorted(beside))) + EVEN * len(chosen)
+    nothing = log_density(y, covariance_of(drifting, (), sorted(beside)))
     assert sets.fit(chosen).evidence - sets.fit(frozenset()).evidence == pytest.approx(
         dense - nothing, abs=1e-8
     )
-    _, score, (beta, _, own) = equations.expected(chosen, VARIANCES, 0)
+
+
+@pytest.mark.parametrize("chosen", [frozenset({0}), frozenset({0, 1, 2})], ids=str)
+def test_a_set_is_scored_with_a_discrepancy_beside_it(drifting: list[FloatArray], chosen: Set) -> None:
+    equations = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3))
+    y = np.concatenate([b[:, -1] for b in drifting])
+    _, score, means = equations.expected(chosen, VARIANCES, 0)
     _, empty, _ = equations.expected(frozenset(), VARIANCES, 0)
-    assert score - empty == pytest.approx(-2.0 * (dense - nothing), abs=1e-8)
-    assert beta == pytest.approx(sets.fit(chosen).mean)
-    assert len(own) == len(drifting)
+    of = covariance_of(drifting, sorted(chosen), sorted(chosen))
+    dense = log_density(y, of) + EVEN * len(chosen) - log_density(y, covariance_of(drifting, ()))
+    assert score - empty == pytest.approx(-2.0 * dense, abs=1e-8)
+    assert means.beta == pytest.approx(equations.sets(VARIANCES, chosen).fit(chosen).mean)
+    assert len(means.own) == len(drifting)
+    column, feature = (
+        equations.beside(chosen).grams.sum(axis=0)[: len(chosen)],
+        equations.E + equations.shared,
+    )
+    plain = equations.grams.sum(axis=0)[: len(chosen)]
+    assert np.all(np.abs(column[:, feature]) < 0.1 * np.abs(plain[:, feature]).max(axis=1)[:, None])
+
+
+def test_what_resembles_an_entry_is_no_evidence_for_it(drifting: list[FloatArray]) -> None:
+    """A discrepancy that may look like entry 0 as much as 2 is large: a prior of its own beside the set's."""
+    plain = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3))
+    alike = copy(plain)
+    alike.resemblance = {"discrepancy": np.array([0.64, 0.0, 4.0]) / 0.74}
+    deviation = alike.deviation(VARIANCES)
+    assert deviation == pytest.approx(np.array([0.8, 0.0, 1.0])), "no more than the prior"
+    y = np.concatenate([b[:, -1] for b in drifting])
+    x = np.vstack(drifting)[:, :3] * deviation
+    base = covariance_of(drifting, ()) + x @ x.T
+    for chosen in (frozenset({0}), frozenset({0, 1})):
+        column = np.vstack(drifting)[:, sorted(chosen)]
+        dense = log_density(y, base + column @ column.T) - log_density(y, base) + EVEN * len(chosen)
+        sets = alike.sets(VARIANCES)
+        assert sets.fit(chosen).evidence - sets.fit(frozenset()).evidence == pytest.approx(dense, abs=1e-8)
+    assert alike.sets(VARIANCES).gains(frozenset())[0] < 0.1 * plain.sets(VARIANCES).gains(frozenset())[0]
+
+
+def test_one_gain_stands_for_all_that_it_scales() -> None:
+    """Three columns, and a fourth that is their sum: three values that are the same are one step along it."""
+    rng = np.random.default_rng(12)
+    x = rng.normal(size=(200, 3))
+    x = np.column_stack((x, x.sum(axis=1)))
+    y = x @ [0.5, 0.5, 0.5, 0.0] + 0.1 * rng.normal(size=200)
+    rows = np.column_stack((x, y)) / 0.1
+    sets = Sets([entry() for _ in range(4)], rows.T @ rows)
+    three = frozenset({0, 1, 2})
+    assert sets.one_for_many(three) == [frozenset({3})]
+    apart = np.column_stack((x, x[:, :3] @ [0.5, -0.2, 0.1] + 0.1 * rng.normal(size=200))) / 0.1
+    assert Sets([entry() for _ in range(4)], apart.T @ apart).one_for_many(three) == []
 
 
 @pytest.mark.parametrize("most", [None, 0.05], ids=["free", "capped"])
-def test_expectation_maximisation_raises_the_marginal_likelihood(
+def test_steps_of_the_variances_raise_the_marginal_likelihood(
     drifting: list[FloatArray], most: float | None
 ) -> None:
     equations = equations_of(drifting, [entry() for _ in range(3)], GROUPS, shared=(2, 3), most=most)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -62,8 +63,8 @@ def test_squares_are_those_of_the_runs_without_their_own_say(solution: Solution)
 
 
 def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Solution, int]:
-    """The solution, noise of the columns apart, with an entry whose column is the run's noise, in some runs with the other
-    sign.
+    """The solution, noise of the columns apart, with an entry whose column is what the run leaves, in some with the other
+    sign: in the rows, and in the equations, whose column is a sum of the others.
     """
     k = next(k for k, e in enumerate(solution.entries) if e.effect.name == "sensor_gain")
     column = solution.entries[k].columns[0]
@@ -79,7 +80,15 @@ def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Soluti
         regressors = d.regressors.copy()
         regressors[:, d.index == column] = (sign * noise / float(solution.entries[k].weights[0, 0]))[:, None]
         runs.append(replace(run, channels={MOTOR1: replace(d, regressors=regressors)}))
-    return replace(solution, runs=runs, disturbed=[], chosen=solution.chosen | {k}), k
+    wide = copy(solution.wide)
+    wide.grams = wide.grams.copy()
+    for gram, sign in zip(wide.grams, signs, strict=True):
+        left = np.zeros(len(gram))
+        left[: len(at)], left[-1] = -at, 1.0
+        turn = np.eye(len(gram))
+        turn[:, int(solution.sets.slices[k][0])] = sign * left
+        gram[:] = turn.T @ gram @ turn
+    return replace(solution, runs=runs, disturbed=[], wide=wide, chosen=solution.chosen | {k}), k
 
 
 def left_nm2(found: Prediction) -> float:
@@ -145,29 +154,17 @@ def test_grades(solution: Solution, change: dict[str, float], rivals: bool, agai
     assert grade_of(one, vetoed=against == "vetoed", hidden=against == "hidden") == grade
 
 
-def robust(solution: Solution, patch: pytest.MonkeyPatch, factor: float, noise_known: float) -> list[float]:
-    patch.setattr(limits, "ROBUST", factor)
-    patch.setattr(limits, "NOISE_KNOWN", noise_known)
-    return [j.robust for j in judged(solution)]
-
-
 def test_what_a_certain_entry_must_survive(solution: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the discrepancy and the noise as estimated, robust evidence is the evidence; with more of either it is less."""
-    sets, chosen = solution.sets, solution.chosen
+    """Its rival, and a discrepancy that imitates it; with more discrepancy the evidence is less."""
+    chosen = solution.chosen
     own = judged(solution)
     assert own
-    plain = robust(solution, monkeypatch, 1.0, 0.0)
-    for j, found in zip(own, plain, strict=True):
-        left_out = 2.0 * (sets.fit(chosen).evidence - sets.fit(chosen - set(j.members)).evidence)
-        assert found == pytest.approx(min(j.delta, left_out), rel=1e-6)
-    noisy = robust(solution, monkeypatch, 1.0, 0.1)
-    for j, found, first in zip(own, noisy, plain, strict=True):
-        assert first - found == pytest.approx(
-            0.1 * abs(sets.noise(chosen) - sets.noise(j.rival)), rel=1e-6, abs=1e-9
-        )
-    assert max(a - b for a, b in zip(plain, noisy, strict=True)) > 0.01
-    disturbed = robust(solution, monkeypatch, 9.0, 0.0)
-    assert all(b < a for a, b in zip(plain, disturbed, strict=True))
-    assert [j.robust for j in own] == pytest.approx(
-        [d - (a - b) for d, a, b in zip(disturbed, plain, noisy, strict=True)], rel=1e-6
-    ), "both at once, with the limits as they are"
+    monkeypatch.setattr(limits, "ROBUST", 1.0)
+    plain = judged(solution)
+    apart = solution.equations.sets(solution.variances, chosen, resembling=False)
+    for j in plain:
+        dropped, sets = chosen - set(j.members), solution.sets
+        imitated = 2.0 * (sets.fit(chosen).evidence - sets.fit(dropped).evidence)
+        assert j.delta == pytest.approx(2.0 * (apart.fit(chosen).evidence - apart.fit(j.rival).evidence))
+        assert j.robust == pytest.approx(min(imitated, j.delta), rel=1e-6)
+    assert all(b.robust < a.robust for a, b in zip(plain, own, strict=True))

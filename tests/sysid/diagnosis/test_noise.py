@@ -173,6 +173,24 @@ def test_what_wanders_over_seconds_widens_everything() -> None:
     assert noise_model(runs, parts, 0.005).inflation > 1.5
 
 
+def test_with_a_floor_no_frequency_has_more_weight_than_in_white_noise() -> None:
+    """Slow noise, of which little is left at half the rate: without a floor that little would weigh many times more."""
+    rng = np.random.default_rng(10)
+    slow = coloured(np.array([1.6, -0.64]), rng.normal(size=20000))
+    runs = [run_data("run", {MOTOR1: slow}, {})]
+    k = np.arange(1, ORDER + 1)
+    weights = {}
+    for floor in (0.0, 1.0):
+        noise = noise_model(runs, {MOTOR1: [slow]}, 0.005, floor)
+        response = [
+            1.0 - np.sum(noise.ar[MOTOR1] * np.exp(-1j * w * k)) for w in np.linspace(0.0, np.pi, 200)
+        ]
+        weights[floor] = np.var(slow) * np.abs(response) ** 2 / float(noise.sigma[0]) ** 2
+    assert weights[0.0][-1] > 30.0
+    assert weights[1.0].max() < 1.05
+    assert weights[1.0][0] < 0.2, "slow noise is as large as it is"
+
+
 def test_what_nothing_explains_is_the_residual_of_least_squares() -> None:
     rng = np.random.default_rng(9)
     runs = []
