@@ -81,6 +81,14 @@ def _bounds(entries: Sequence[Entry], chosen: Set) -> tuple[FloatArray, FloatArr
     return np.array([a for a, _ in ends]), np.array([b for _, b in ends])
 
 
+def _root(inner: FloatArray) -> FloatArray:
+    """Return the Cholesky factor, of what rounding leaves indefinite with no negative direction."""
+    values, vectors = np.linalg.eigh(inner)
+    return np.asarray(
+        np.linalg.qr((vectors * np.sqrt(np.maximum(values, 1e-12 * np.max(values, initial=0.0)))).T)[1].T
+    )
+
+
 def _within(inner: FloatArray, right: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the x of inner x = right; what is beyond its bound is held at it."""
     mean = np.linalg.solve(inner, right)
@@ -435,11 +443,11 @@ class Equations:
         out, logs, keep = [], 0.0, []
         for g in self.grams:
             inner = g[np.ix_(self._inner, self._inner)] + np.diag(1.0 / d)
-            lower = np.linalg.cholesky(inner)
+            lower = _root(inner)
             cross = g[np.ix_(self._inner, self._outer)]
             half = np.linalg.solve(lower, cross)
             out.append(g[np.ix_(self._outer, self._outer)] - half.T @ half)
-            logs += 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(d)))
+            logs += 2.0 * float(np.sum(np.log(np.abs(np.diag(lower))))) + float(np.sum(np.log(d)))
             keep.append((lower, cross))
         return out, logs, keep
 
@@ -452,9 +460,9 @@ class Equations:
         w = np.arange(self.E, self.E + many)
         o = np.concatenate((np.arange(self.E), [self.E + many])).astype(np.intp)
         v = self._shared_variances(variances)
-        lower = np.linalg.cholesky(total[np.ix_(w, w)] + np.diag(1.0 / v))
+        lower = _root(total[np.ix_(w, w)] + np.diag(1.0 / v))
         half = np.linalg.solve(lower, total[np.ix_(w, o)])
-        log = 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(v)))
+        log = 2.0 * float(np.sum(np.log(np.abs(np.diag(lower))))) + float(np.sum(np.log(v)))
         return total[np.ix_(o, o)] - half.T @ half, log
 
     def own(self, chosen: Set, mean: FloatArray, variances: Variances) -> FloatArray:
@@ -507,7 +515,7 @@ class Equations:
             score = (
                 float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
                 + logs
-                + 2.0 * float(np.sum(np.log(np.diag(lower))))
+                + 2.0 * float(np.sum(np.log(np.abs(np.diag(lower)))))
                 + float(np.sum(np.log(w)))
                 - 2.0 * sum(self.entries[k].odds for k in chosen)
             )
