@@ -81,14 +81,6 @@ def _bounds(entries: Sequence[Entry], chosen: Set) -> tuple[FloatArray, FloatArr
     return np.array([a for a, _ in ends]), np.array([b for _, b in ends])
 
 
-def _root(inner: FloatArray) -> FloatArray:
-    """Return the Cholesky factor, of what rounding leaves indefinite with no negative direction."""
-    values, vectors = np.linalg.eigh(inner)
-    return np.asarray(
-        np.linalg.qr((vectors * np.sqrt(np.maximum(values, 1e-12 * np.max(values, initial=0.0)))).T)[1].T
-    )
-
-
 def _within(inner: FloatArray, right: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
     """Return the x of inner x = right; what is beyond its bound is held at it."""
     mean = np.linalg.solve(inner, right)
@@ -443,11 +435,11 @@ class Equations:
         out, logs, keep = [], 0.0, []
         for g in self.grams:
             inner = g[np.ix_(self._inner, self._inner)] + np.diag(1.0 / d)
-            lower = _root(inner)
+            lower = np.linalg.cholesky(inner)
             cross = g[np.ix_(self._inner, self._outer)]
             half = np.linalg.solve(lower, cross)
             out.append(g[np.ix_(self._outer, self._outer)] - half.T @ half)
-            logs += 2.0 * float(np.sum(np.log(np.abs(np.diag(lower))))) + float(np.sum(np.log(d)))
+            logs += 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(d)))
             keep.append((lower, cross))
         return out, logs, keep
 
@@ -460,9 +452,9 @@ class Equations:
         w = np.arange(self.E, self.E + many)
         o = np.concatenate((np.arange(self.E), [self.E + many])).astype(np.intp)
         v = self._shared_variances(variances)
-        lower = _root(total[np.ix_(w, w)] + np.diag(1.0 / v))
+        lower = np.linalg.cholesky(total[np.ix_(w, w)] + np.diag(1.0 / v))
         half = np.linalg.solve(lower, total[np.ix_(w, o)])
-        log = 2.0 * float(np.sum(np.log(np.abs(np.diag(lower))))) + float(np.sum(np.log(v)))
+        log = 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(v)))
         return total[np.ix_(o, o)] - half.T @ half, log
 
     def own(self, chosen: Set, mean: FloatArray, variances: Variances) -> FloatArray:
@@ -477,22 +469,19 @@ class Equations:
             out.append(np.linalg.solve(inner, gram[np.ix_(self._inner, ends)] @ contrast))
         return np.array(out)
 
-    def definite(self, chosen: Set, variances: Variances) -> None:
-        """Take less noise out of the columns where what is taken out, known to its scatter, leaves a set no covariance."""
-        while self.kappa > 0.0:
-            try:
-                self.expected(chosen, variances, 0)
-                return
-            except np.linalg.LinAlgError:
-                self._take_out(0.5 * self.kappa if self.kappa > _LITTLE else 0.0)
-
     def expected(
-        self, chosen: Set, variances: Variances, steps: int
+        self, chosen: Set, variances: Variances, steps: int, *, less: bool = False
     ) -> tuple[dict[object, float], float, Means]:
         """Return the variances after `steps` for a set, -2 log marginal likelihood there, and means. LinAlgError: what is
-        taken out as noise leaves no covariance.
+        taken out as noise, known to its scatter, leaves no covariance; less: so much less is taken out that it leaves one.
         """
-        return self.beside(chosen)._expected(chosen, variances, steps)
+        while True:
+            try:
+                return self.beside(chosen)._expected(chosen, variances, steps)
+            except np.linalg.LinAlgError:
+                if not less or self.kappa <= 0.0:
+                    raise
+                self._take_out(0.5 * self.kappa if self.kappa > _LITTLE else 0.0)
 
     def _expected(
         self, chosen: Set, variances: Variances, steps: int
@@ -515,7 +504,7 @@ class Equations:
             score = (
                 float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
                 + logs
-                + 2.0 * float(np.sum(np.log(np.abs(np.diag(lower)))))
+                + 2.0 * float(np.sum(np.log(np.diag(lower))))
                 + float(np.sum(np.log(w)))
                 - 2.0 * sum(self.entries[k].odds for k in chosen)
             )

@@ -375,8 +375,7 @@ class _Work:
             s.know_torque(VALUES_HZ, VALUES_HZ)
         self.settle(chosen, means.beta, noise, variances, _STATES | _TORQUES)
         equations = self.equations(noise)
-        equations.definite(chosen, variances)
-        found, _, means = equations.expected(chosen, variances, 2)
+        found, _, means = equations.expected(chosen, variances, 2, less=True)
         return means, equations, found
 
     def settle(

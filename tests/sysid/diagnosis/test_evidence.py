@@ -368,6 +368,22 @@ def test_noise_in_a_column_bends_no_coefficient() -> None:
     assert np.mean(without[:, 0]) == pytest.approx((TRUE - NOISE2) / (1.0 + NOISE2), abs=0.03)
 
 
+def test_a_set_that_noise_leaves_no_covariance_is_none_or_has_less_taken_out() -> None:
+    """Also where it has one at first, and none at the variances of later steps."""
+    rng = np.random.default_rng(9)
+    block = np.column_stack((rng.normal(size=(200, 1)), np.ones(200), rng.normal(size=200)))
+    energy = float(block[:, 0] @ block[:, 0])
+    equations = equations_of([block], [entry()], ("zero",), noise=np.diag([energy + 5.0, 0.0, 0.0]))
+    one = frozenset({0})
+    with pytest.raises(np.linalg.LinAlgError):
+        equations.expected(one, {"zero": 0.1}, 2)
+    assert equations.kappa == 1.0
+    _, score, means = equations.expected(one, {"zero": 0.1}, 2, less=True)
+    assert 0.0 < equations.kappa < 1.0
+    assert math.isfinite(score)
+    assert np.isfinite(means.beta).all()
+
+
 def test_a_column_that_is_mostly_noise_is_in_no_set() -> None:
     rng = np.random.default_rng(8)
     block = np.column_stack((rng.normal(size=(200, 2)), np.ones(200), rng.normal(size=200)))
