@@ -4,7 +4,7 @@
 2. Sets are searched from nothing and from all values of the file; those that are met are compared with variances of their
    own.
 3. Currents and torsions are what the simulation with this set has; shapes move to where the set wants them; noise is
-   what the set leaves, no frequency with less than if it were white. Then again.
+   what the set leaves, nothing quick of it less dense than what is slow. Then again.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     Index,
     RunData,
-    binned,
     contribution,
     fields_used,
     run_data,
     samples_in,
+    seen_in_bins,
 )
 from jtqd.sysid.diagnosis.signals import RATE_HZ, TORQUE_HZ, VALUES_HZ, Channel, JointSignals
 from jtqd.sysid.diagnosis.solution import present_effects, set_state
@@ -42,10 +42,11 @@ from jtqd.sysid.diagnosis.solution import present_effects, set_state
 _TURNS: Final = 4
 _ROUNDS: Final = 3
 _STEPS: Final = 8
+"""Of the variances."""
 _CLIMB: Final = 4
+"""Steps to a neighbouring set."""
 _FROM_NOTHING: Final = 2
 """Turns that search from the empty set as well."""
-"""Of expectation-maximisation."""
 _STATES: Final = frozenset({"current_a", "current_rate_a_s", "torsion_rad", "torsion_rate_rad_s", "joint"})
 """What effects use that follows from the solution."""
 _SETTLING: Final = 6
@@ -387,23 +388,23 @@ class _Work:
         changed: frozenset[str] = _STATES,
     ) -> None:
         """Move to the solution; again with the coefficients there, where the current that effects see depends on the set."""
-        self.move(chosen, mean, changed)
         acting = any("current_a" in self._used[k] for k in chosen)
-        for _ in range(_SETTLING if acting else 0):
+        self.move(chosen, mean, changed, chosen if acting else None)
+        for step in range(_SETTLING if acting else 0):
             few = [self.entries[k] for k in sorted(chosen)]
             every = frozenset(range(len(few)))
             fit = self.equations(noise, few).sets(variances, every).fit(every)
-            now = fit.mean
-            settled = len(now) == len(mean) and bool(
-                np.all(np.abs(now - mean) <= _SETTLED * np.sqrt(np.diag(fit.covariance)))
+            before, mean = mean, fit.mean
+            done = step + 1 == _SETTLING or (
+                len(mean) == len(before)
+                and bool(np.all(np.abs(mean - before) <= _SETTLED * np.sqrt(np.diag(fit.covariance))))
             )
-            mean = now
-            self.move(chosen, mean)
-            if settled:
+            self.move(chosen, mean, changed, None if done else chosen)
+            if done:
                 return
 
-    def move(self, chosen: Set, mean: FloatArray, changed: frozenset[str] = _STATES) -> None:
-        """Set states and shapes to the solution, and make the columns again that depend on them."""
+    def move(self, chosen: Set, mean: FloatArray, changed: frozenset[str], only: Set | None) -> None:
+        """Set states and shapes to the solution, and make the columns again that depend on them, of all or `only` some."""
         ends, again = 0, set()
         present = []
         for k in sorted(chosen):
@@ -423,6 +424,7 @@ class _Work:
             for k, used in self._used.items()
             if used & changed and not (self.entries[k].effect.follows_torsion and k not in chosen)
         }
+        again = again if only is None else again & only
         for signals, run in zip(
             (*self.dataset.signals, *self.dataset.disturbed), (*self.runs, *self.disturbed), strict=True
         ):
@@ -473,7 +475,7 @@ class _Work:
         )
 
     def _columns_again(self, signals: Sequence[JointSignals], run: RunData, entries: Iterable[int]) -> None:
-        new: dict[Channel, dict[int, FloatArray]] = {c: {} for c in run.channels}
+        made: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in run.channels}
         for k in entries:
             e = self.entries[k]
             c = e.candidate
@@ -481,38 +483,28 @@ class _Work:
                 if not shows_at(c.joint, s.number):
                     continue
                 for column, p in zip(c.columns, c.term.basis, strict=True):
-                    self._put(new, column, contribution(c.effect, p, s), s, run.samples)
+                    for balance, value in contribution(c.effect, p, s).items():
+                        made[Channel(s.number, balance)].append((column, value))
                 for column, name in zip(e.tangents, e.shapes, strict=True):
                     here = c.term.combine(e.amplitude)
                     there = {**here, name: here[name] * (1.0 + _STEP)}
                     one, two = contribution(c.effect, here, s), contribution(c.effect, there, s)
-                    scale = limits.SHAPE / _STEP
-                    self._put(new, column, {b: scale * (two[b] - one[b]) for b in one}, s, run.samples)
-        for channel, columns in new.items():
+                    for balance in one:
+                        change = limits.SHAPE / _STEP * (two[balance] - one[balance])
+                        made[Channel(s.number, balance)].append((column, change))
+        of = {s.number: s for s in signals}
+        for channel, columns in made.items():
             d = run.channels[channel]
             place = {int(k): j for j, k in enumerate(d.index)}
-            regressors = d.regressors.copy()
-            more = []
-            for column, value in columns.items():
+            regressors, more = d.regressors.copy(), []
+            for column, value in seen_in_bins(of[channel.joint], channel.balance, columns, run.samples):
                 if column in place:
                     regressors[:, place[column]] = value
                 else:
                     more.append((column, value))
-            if more:
-                regressors = np.column_stack((regressors, *(v for _, v in more)))
+            regressors = np.column_stack((regressors, *(v for _, v in more)))
             index = np.concatenate((d.index, [k for k, _ in more])).astype(np.intp)
             run.channels[channel] = replace(d, regressors=regressors, index=index)
-
-    def _put(
-        self,
-        new: dict[Channel, dict[int, FloatArray]],
-        column: int,
-        found: Mapping[str, FloatArray],
-        s: JointSignals,
-        samples: float,
-    ) -> None:
-        for balance, value in found.items():
-            new[Channel(s.number, balance)][column] = binned(s.seen(balance, value), samples)
 
 
 def _only(run: RunData, columns: Index | None) -> RunData:

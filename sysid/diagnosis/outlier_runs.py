@@ -34,7 +34,7 @@ from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
 from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
-from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns, seen_in_bins
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
 ENTER: Final = 10.0
@@ -278,7 +278,7 @@ def _with_columns(
                 continue
             d = channels[channel]
             made = [(len(dataset.families) + k, column(kind, s, balance)) for k, kind in enumerate(kinds)]
-            there = [(k, binned(s.seen(balance, c), run.samples)) for k, c in made if c is not None]
+            there = seen_in_bins(s, balance, [(k, c) for k, c in made if c is not None], run.samples)
             channels[channel] = replace(
                 d,
                 nuisances=np.column_stack((d.nuisances, *(c for _, c in there))),

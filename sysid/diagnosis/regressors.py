@@ -171,6 +171,18 @@ def binned(x: FloatArray, samples: float) -> FloatArray:
     return result
 
 
+def seen_in_bins(
+    s: JointSignals, balance: str, columns: Sequence[tuple[int, FloatArray]], samples: float
+) -> list[tuple[int, FloatArray]]:
+    """Return numbered columns as they are seen in a balance, binned; some at once, as calling a filter takes long."""
+    out: list[tuple[int, FloatArray]] = []
+    for first in range(0, len(columns), _AT_ONCE):
+        some = columns[first : first + _AT_ONCE]
+        rows = s.seen(balance, np.array([x for _, x in some]))
+        out += [(k, binned(x, samples)) for (k, _), x in zip(some, rows, strict=True)]
+    return out
+
+
 def all_in_bin(good: BoolArray, samples: float) -> BoolArray:
     """Return whether every sample of the bin is good [n // samples], those that it shares with another too."""
     count = int(len(good) / samples)
@@ -235,6 +247,7 @@ class Family(NamedTuple):
     phase_rad: float = 0.0
 
 
+_AT_ONCE: Final = 16
 _ZERO: Final = 0.0025
 """Prior standard deviation of a run's own sensor zero, part of the rated torque."""
 _SHARE: Final = {"smooth": 0.3, "viscous": 0.08, "coulomb": 0.02}
@@ -318,7 +331,7 @@ def run_data(
                 continue
             valid = all_in_bin(s.usable(balance), samples)
             nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
-            there = [(k, binned(s.seen(balance, c), samples)) for k, c in nuisances if c is not None]
+            there = seen_in_bins(s, balance, [(k, c) for k, c in nuisances if c is not None], samples)
             channels[Channel(s.number, balance)] = ChannelData(
                 valid,
                 binned(s.seen(balance, residual), samples),
@@ -356,9 +369,10 @@ def _fill(
                 continue
             for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
                 for balance, value in contribution(candidate.effect, p, s).items():
-                    seen = binned(s.seen(balance, value), samples)
-                    found[Channel(s.number, balance)].append((column, seen))
-    for channel, columns in found.items():
+                    found[Channel(s.number, balance)].append((column, value))
+    of = {s.number: s for s in run}
+    for channel, made in found.items():
+        columns = seen_in_bins(of[channel.joint], channel.balance, made, samples)
         if columns:
             channels[channel].index = np.array([k for k, _ in columns], np.intp)
             channels[channel].regressors = np.column_stack([c for _, c in columns])
