@@ -55,7 +55,7 @@ GROUPS = {
             "jtqd.sysid.diagnosis.command",
             "find the cause of the simulation error on runs, and extend the joint file",
         ),
-        "score": ("jtqd.sysid.score", "print the error of a joint file on runs, before and after"),
+        "score": ("jtqd.sysid.score.command", "print the error of a joint file on runs, before and after"),
         "export-model": ("jtqd.sysid.simulators", "write a joint file for other simulators: MJCF, URDF"),
     },
     "shell: this terminal": {

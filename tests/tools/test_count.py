@@ -22,7 +22,7 @@ def test_every_file_of_the_product_is_counted_once() -> None:
     [
         ("daemon/core/cycle.pyx", "daemon/core"),
         ("daemon/jtq.py", "daemon"),
-        ("sysid/score.py", "sysid/score"),
+        ("sysid/score/command.py", "sysid/score"),
         ("sysid/plot.py", "sysid"),
         ("estimator/effects/cogging.py", "estimator"),
         ("tools/count.py", "tools"),

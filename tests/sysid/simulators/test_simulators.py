@@ -16,10 +16,10 @@ from jtqd.estimator.joint import Effect, Friction, MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.joint_writer import write_joint
-from jtqd.sysid.score import FREE, errors_on
+from jtqd.sysid.score.command import FREE, errors_on
 from jtqd.sysid.simulators import mjcf, model_of, urdf
+from tests.sysid.score.test_score import TRUE, WRONG, swing
 from tests.sysid.simulators.mujoco_rig import free_run_error
-from tests.sysid.test_score import TRUE, WRONG, swing
 
 
 def test_the_values_of_the_file_are_in_the_model() -> None:

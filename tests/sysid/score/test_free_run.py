@@ -13,8 +13,8 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.free_run import free_run
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+from jtqd.sysid.score.free_run import free_run
 
 RATE_HZ = 1000.0
 INERTIA = (

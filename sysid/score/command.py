@@ -3,7 +3,7 @@
     simulation  residuals of the motor and the torsion balance with all effects of the file, averaged over
                 5 ms and without what the resolution of the positions makes of the acceleration, both as in a diagnosis,
                 rms in motion; the torsion's without its mean in each run, whose zero differs
-    free run    error of the simulated velocity and position in half a second alone (`sysid.diagnosis.free_run`)
+    free run    error of the simulated velocity and position in half a second alone (`free_run`)
     estimators  estimate less sensor, the sensor passed through the same low-pass, rms over the samples in motion
 
 Nothing is fitted. A method that needs what a joint file does not have (efficiency, section `fused`), or a run does not
@@ -114,9 +114,9 @@ def errors_on(
     """
     from jtqd.sysid.diagnosis.dataset import without_known_effects
     from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
-    from jtqd.sysid.diagnosis.free_run import free_run
     from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
     from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
+    from jtqd.sysid.score.free_run import free_run
 
     plain = with_effects_applied(joint)
     base = BaseLoss(plain)

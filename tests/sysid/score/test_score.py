@@ -14,7 +14,7 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.runs.tables import write_run
-from jtqd.sysid.score import FREE, MOTOR, errors_on, rows_of, visible_on
+from jtqd.sysid.score.command import FREE, MOTOR, errors_on, rows_of, visible_on
 from tests.estimator.fused_helpers import fused_joint
 
 TRUE = Joint(
