@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -29,31 +28,20 @@ _NEARLY_ZERO_RAD_S: Final = 1e-9
 """Speed at which the loss of a sticking joint is asked for."""
 
 
-@dataclass(frozen=True)
-class FreeRun:
-    """Error of a free run of one joint over one run.
-
-    rmse_rad_s: of the velocity, joint side, over all samples of all windows but their first ones; rmse_rad: of the position
-    turned since the window's start; windows_rad_s [w]: of the velocity of each window, which begins at start_s [w] (time
-    since the run's first sample) and is window_s long.
+class FreeRun(NamedTuple):
+    """Rms errors of a free run, joint side, over all samples of all windows but their first ones: of the velocity, and of
+    the position turned since the window's start.
     """
 
-    run: str
-    joint: int
     rmse_rad_s: float
     rmse_rad: float
-    window_s: float
-    start_s: FloatArray
-    windows_rad_s: FloatArray
 
 
 Term = tuple[Effect, Values]
 Index = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 
-def free_run(
-    signals: JointSignals, joint: Joint, base: BaseLoss | None = None, *, window_s: float = WINDOW_S
-) -> FreeRun:
+def free_run(signals: JointSignals, joint: Joint, window_s: float = WINDOW_S) -> FreeRun:
     """Simulate one joint of one run in windows and compare its velocity with the measured one.
 
         (G^2 Jm + Jl) dv/dt = G Kt I - TAU_S - load_nm - loss0 - loss_nm          v = omega_m/G
@@ -65,29 +53,19 @@ def free_run(
     part in this. Friction is implicit: its impulse within a step can stop the motor and not turn it round, so a joint
     sticks.
 
-    joint: the model, its `effects` included; signals.joint itself for the run before anything is extended. base: losses of
-    the joint file (effects do not change them), made here if not given. A run shorter than one window is one window.
+    joint: the model, its `effects` included. A run shorter than one window is one window.
     """
-    base = base or BaseLoss(joint)
+    base = BaseLoss(joint)  # effects do not change the losses of the file
     terms = tuple((EFFECTS[e.name], e.parameters) for e in joint.effects)
     for effect, p in terms:
         joint = effect.joint(p, joint)
     terms = tuple(t for t in terms if not t[0].changes_joint)
     drive, torque = _inputs(signals, joint, terms)
-    time = signals.state.time_s
-    index = _windows(time, window_s)
+    index = windows(signals.state.time_s, window_s)
     simulated = _simulate(_Model(signals, joint, base, terms), drive, torque, index)
     error = simulated - signals.state.velocity_rad_s[index]
-    squares = np.mean(np.square(error[1:]), axis=0)
-    return FreeRun(
-        signals.run,
-        signals.number,
-        float(np.sqrt(np.mean(squares))),
-        _position_error(signals, joint, simulated, index),
-        float(time[index[-1, 0]] - time[index[0, 0]]),
-        time[index[0]],
-        np.sqrt(squares),
-    )
+    rmse_rad_s = float(np.sqrt(np.mean(np.square(error[1:]))))
+    return FreeRun(rmse_rad_s, _position_error(signals, joint, simulated, index))
 
 
 def _position_error(signals: JointSignals, joint: Joint, simulated: FloatArray, index: Index) -> float:
@@ -118,7 +96,7 @@ def _inputs(signals: JointSignals, joint: Joint, terms: Sequence[Term]) -> tuple
     return motor - sensor, sensor
 
 
-def _windows(time: FloatArray, window_s: float) -> Index:
+def windows(time: FloatArray, window_s: float) -> Index:
     """Return sample numbers [steps + 1, windows]; the last window ends with the run and may overlap the one before."""
     count = len(time)
     steps = min(max(1, round(window_s / float(np.median(np.diff(time))))), count - 1)

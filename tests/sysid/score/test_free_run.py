@@ -14,7 +14,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.emulated_run import JointCommand, emulate_run
 from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
-from jtqd.sysid.score.free_run import free_run
+from jtqd.sysid.score.free_run import free_run, windows
 
 RATE_HZ = 1000.0
 INERTIA = (
@@ -239,16 +239,15 @@ def test_a_run_without_any_effect_has_next_to_no_error() -> None:
 
 def test_windows_cover_the_run_and_begin_in_the_measured_state() -> None:
     signals = _integrated("current_offset", EFFECTS["current_offset"], 0.0, 1)
-    result = free_run(signals, JOINT, window_s=0.3)
-    assert result.start_s.tolist() == pytest.approx([0.0, 0.3, 0.6, 0.9])
-    assert result.window_s == pytest.approx(0.3)
-    assert result.rmse_rad_s == pytest.approx(math.sqrt(float(np.mean(result.windows_rad_s**2))))
-    assert (result.run, result.joint) == ("run", 1)
+    time = signals.state.time_s
+    index = windows(time, 0.3)
+    assert time[index[0]].tolist() == pytest.approx([0.0, 0.3, 0.6, 0.9])
+    assert time[index[-1]] - time[index[0]] == pytest.approx(np.full(4, 0.3))
     # half as long: the offset has half the time to show
-    assert free_run(signals, JOINT, window_s=0.15).rmse_rad_s < 0.75 * result.rmse_rad_s
-    whole = free_run(signals, JOINT, window_s=1e3)
-    assert whole.start_s.tolist() == [0.0]
-    assert whole.window_s == pytest.approx(1.2)
+    assert free_run(signals, JOINT, 0.15).rmse_rad_s < 0.75 * free_run(signals, JOINT, 0.3).rmse_rad_s
+    whole = windows(time, 1e3)
+    assert time[whole[0]].tolist() == [0.0]
+    assert time[whole[-1, 0]] - time[whole[0, 0]] == pytest.approx(1.2)
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -263,11 +262,10 @@ def test_the_emulated_bench_runs_free_as_its_joint_file_says(number: int) -> Non
         ),
         8.0,
     )
-    base = BaseLoss(joint)
-    signals = joint_signals("emulated", table, number, joint, base)
-    floor = free_run(signals, joint, base).rmse_rad_s
+    signals = joint_signals("emulated", table, number, joint, BaseLoss(joint))
+    floor = free_run(signals, joint).rmse_rad_s
     weaker = Effect("torque_constant", {"torque_constant_nm_per_a": 0.95 * joint.torque_constant_nm_per_a})
-    wrong = free_run(signals, replace(joint, effects=(weaker,)), base).rmse_rad_s
+    wrong = free_run(signals, replace(joint, effects=(weaker,))).rmse_rad_s
     print(f"joint {number}: {floor:.4f} rad/s, torque constant 5 % less: {wrong:.4f} rad/s")
     assert floor < 0.01  # what a current that rings between two samples leaves at the reversals
     assert wrong > 15.0 * floor
