@@ -20,6 +20,8 @@ from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import (
     Dataset,
     build_dataset,
+    piece_notes,
+    recordings,
     resolution_notes,
     too_little,
     usable_signals,
@@ -39,7 +41,6 @@ from jtqd.sysid.diagnosis.limits import RELEVANCE
 from jtqd.sysid.diagnosis.model import Solution, solve
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.outlier_runs import outlier_run
-from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import noise_of

@@ -9,12 +9,11 @@ from pathlib import Path
 import pytest
 
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
+from jtqd.sysid.diagnosis.dataset import build_dataset, piece_notes, recordings, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT
 from jtqd.sysid.diagnosis.held_out import predict
 from jtqd.sysid.diagnosis.model import solve
-from jtqd.sysid.diagnosis.recordings import piece_notes, recordings
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.tables import write_run
