@@ -175,7 +175,7 @@ def as_mapping(results: Sequence[Diagnosed], sha256: Mapping[str, str]) -> dict[
 
 def write(directory: Path, results: Sequence[Diagnosed], sha256: Mapping[str, str]) -> None:
     """Write findings.json and report.html of each joint and the figures. Raises OSError."""
-    from jtqd.sysid.diagnosis.report.page import render
+    from jtqd.sysid.diagnosis.report import render
 
     for one in results:
         folder = directory / f"joint{one.number}"

@@ -99,7 +99,7 @@ def _main(argv: list[str]) -> int:
 
 def _summary(findings: Findings) -> str:
     """Return what the terminal shows."""
-    from jtqd.sysid.diagnosis.report.words import terminal_lines
+    from jtqd.sysid.diagnosis.words import terminal_lines
 
     return "\n".join(terminal_lines(findings))
 
@@ -345,7 +345,7 @@ def _write(
     an earlier diagnosis wrote goes, so that no plan or joint file of it stays beside the new findings.
     """
     from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
-    from jtqd.sysid.diagnosis.report.page import render
+    from jtqd.sysid.diagnosis.report import render
 
     date = findings.provenance.date if findings.provenance else ""
     with tempfile.TemporaryDirectory(prefix=".diagnosis.", dir=directory) as made:

@@ -125,10 +125,10 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> Core:
     one = Core()
     statistics: Any = types.ModuleType("jtqd.sysid.diagnosis.diagnose")
     statistics.diagnose = one.diagnose
-    page: Any = types.ModuleType("jtqd.sysid.diagnosis.report.page")
+    page: Any = types.ModuleType("jtqd.sysid.diagnosis.report")
     page.render = lambda made: f"<html>{made.verdict}</html>"
     monkeypatch.setitem(sys.modules, "jtqd.sysid.diagnosis.diagnose", statistics)
-    monkeypatch.setitem(sys.modules, "jtqd.sysid.diagnosis.report.page", page)
+    monkeypatch.setitem(sys.modules, "jtqd.sysid.diagnosis.report", page)
     return one
 
 

@@ -22,15 +22,14 @@ import yaml
 
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.findings import Provenance, Trace
-from jtqd.sysid.diagnosis.report.words import effect_title, in_words, place, summary
+from jtqd.sysid.diagnosis.words import effect_title, in_words, place, summary
 from jtqd.sysid.report.numbers import number
 from tests.sysid.diagnosis import findings_examples as examples
 
 pytest.importorskip("jinja2")
 pytest.importorskip("matplotlib")
 
-from jtqd.sysid.diagnosis.report.page import render
-from jtqd.sysid.diagnosis.report.pictures import MOST, chosen_traces, panels, pictures
+from jtqd.sysid.diagnosis.report import MOST, chosen_traces, panels, pictures, render
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
 PLAIN_SPACE = str.maketrans("\u00a0\u202f", "  ")

@@ -22,8 +22,8 @@ from jtqd.sysid.diagnosis.findings import (
     priors,
     to_mapping,
 )
-from jtqd.sysid.diagnosis.report.page import candidate_row, gap_axes
-from jtqd.sysid.diagnosis.report.words import (
+from jtqd.sysid.diagnosis.report import candidate_row, gap_axes
+from jtqd.sysid.diagnosis.words import (
     MOST_ROWS,
     effect_title,
     headline,
