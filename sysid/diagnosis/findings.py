@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
@@ -33,9 +33,7 @@ class FileValue(NamedTuple):
         return found / self.value - 1.0
 
 
-def file_values(
-    effect_name: str, where: int | str, parameters: Iterable[str], joints: Mapping[int, Joint]
-) -> dict[str, FileValue]:
+def file_values(effect_name: str, where: int | str, joints: Mapping[int, Joint]) -> dict[str, FileValue]:
     """Return the joint file's value of each parameter of an effect of joint `where` (or "sensor").
 
     An effect that is in the file under `effects` has its value there; else a parameter that stands for a key of the file has
@@ -45,18 +43,16 @@ def file_values(
     effect = EFFECTS.get(effect_name)
     if joint is None or effect is None:
         return {}
-    listed = next((item.parameters for item in joint.effects if item.name == effect_name), None)
-    known = {parameter.name: parameter for parameter in effect.parameters}
+    listed = next((item.parameters for item in joint.effects if item.name == effect_name), {})
     found = {}
-    for name in parameters:
-        parameter = known.get(name)
-        key = parameter.key if parameter else ""
-        if listed is not None and name in listed:
+    for parameter in effect.parameters:
+        name, key = parameter.name, parameter.key
+        if name in listed:
             found[name] = FileValue(float(listed[name]), f"effects: {effect_name}.{name}")
         elif key:
             found[name] = FileValue(float(attrgetter(key)(joint)), key)
         else:
-            found[name] = FileValue(parameter.neutral if parameter else 0.0, "")
+            found[name] = FileValue(parameter.neutral, "")
     return found
 
 
@@ -123,6 +119,11 @@ class Cause:
         """Effect, joint, and what tells several of one effect apart."""
         return self.name, self.joint, *(v.value for n, v in self.parameters.items() if v.ci95[0] == v.ci95[1])
 
+    @property
+    def evidence(self) -> dict[str, float]:
+        """As findings.json has it."""
+        return {"delta_bic": self.delta_evidence, "held_out_gain": self.held_out_gain}
+
 
 class Present(NamedTuple):
     """An effect of the extended model: the set and all values of the file, with the values that predict."""
@@ -155,6 +156,16 @@ class CandidateEvidence:
     reason: str  # "chosen", "class of X", "below threshold", "invisible in these runs", "needs temperature_c", ...
     at_minimum: tuple[Mapping[str, float], ...] = ()  # all parameters at that size, per way of looking for it
     minimum_rms_nm: float = math.nan  # what it contributes at that size, rms over the runs; inf: invisible
+
+    @property
+    def evidence(self) -> dict[str, float]:
+        """As findings.json has it."""
+        return {"delta_bic": self.delta_bic, "held_out_gain": self.held_out_gain}
+
+    @property
+    def sizes(self) -> dict[str, dict[str, Any]]:
+        """Minimum detectable sizes without an interval."""
+        return {name: {"value": each.value, "unit": each.unit} for name, each in self.minimum.items()}
 
 
 @dataclass(frozen=True)
@@ -199,7 +210,7 @@ class RunGain(NamedTuple):
 @dataclass(frozen=True)
 class Gain:
     """Held-out error before and after, leave-one-run-out; ci95: of rmse_before - rmse_after [Nm]; joint, balance: whose
-    error it is (0, "": not stated).
+    error it is (None: not stated).
     """
 
     rmse_before_nm: float
@@ -207,8 +218,8 @@ class Gain:
     split: str
     ci95: tuple[float, float]
     runs: tuple[RunGain, ...] = ()
-    joint: int = 0
-    balance: str = ""
+    joint: int | None = None
+    balance: str | None = None
 
 
 @dataclass(frozen=True)
@@ -244,6 +255,11 @@ class UnexplainedResidual:
     relevant_nm: float
     matters: bool
 
+    @property
+    def percent_of_rated(self) -> float:
+        """Its rms in percent of the rated torque."""
+        return 100.0 * self.of_rated
+
 
 @dataclass(frozen=True)
 class OutlierRun:
@@ -269,23 +285,22 @@ class OutlierRun:
         channel = "torque_nm" if self.joint == SENSOR else f"j{self.joint}.{self.channel}"
         either = f", or it differs in the {' or '.join(self.others)}" if self.others else ""
         if self.what == "gain" and self.value < -1.0:
-            return (
-                f"{self.run}: {channel} has the opposite direction of that in the other runs, {-1.0 - self.value:.3g} times "
-                f"as large{either}: a matter of this run, which is not used"
+            found = f"has the opposite direction of that in the other runs, {-1.0 - self.value:.3g} times as large"
+        else:
+            verb, scale, unit, more, less = _DEVIATIONS[self.what]
+            found = (
+                f"{verb} {abs(scale * self.value):.3g} {unit} {more if self.value > 0.0 else less} than in the other runs, "
+                f"which differ by {scale * self.usual:.2g} {unit} among themselves"
             )
-        what, scale, unit = {
-            "gain": ("reads", 100.0, "%"),
-            "zero": ("has its zero", 100.0, "% of rated torque"),
-            "delay": ("is", 1000.0, "ms"),
-        }[self.what]
-        sides = {"gain": ("more", "less"), "zero": ("higher", "lower"), "delay": ("later", "earlier")}[
-            self.what
-        ]
-        side = sides[0] if self.value > 0.0 else sides[1]
-        return (
-            f"{self.run}: {channel} {what} {abs(scale * self.value):.3g} {unit} {side} than in the other runs, which differ "
-            f"by {scale * self.usual:.2g} {unit} among themselves{either}: a matter of this run, which is not used"
-        )
+        return f"{self.run}: {channel} {found}{either}: a matter of this run, which is not used"
+
+
+_DEVIATIONS: Final = {
+    "gain": ("reads", 100.0, "%", "more", "less"),
+    "zero": ("has its zero", 100.0, "% of rated torque", "higher", "lower"),
+    "delay": ("is", 1000.0, "ms", "later", "earlier"),
+}
+"""How a run differs -> verb, scale and unit for people, and the words for a positive and a negative deviation."""
 
 
 @dataclass(frozen=True)
@@ -307,19 +322,15 @@ class PriorRow(NamedTuple):
 
 
 def priors(trust: Mapping[str, float]) -> list[PriorRow]:
-    """Return the priors in force; trust: factor on the size by name."""
-    return [
-        PriorRow(name, scaled_text(prior.text, trust.get(name, 1.0)), name in trust)
-        for name, prior in PRIORS.items()
-    ]
-
-
-def scaled_text(text: str, factor: float) -> str:
-    """Return the size of a prior in words times a factor: "10 %" by 0.5 is "5 %"."""
-    found = re.match(r"[\d.]+", text)
-    if factor == 1.0 or found is None:
-        return text if factor == 1.0 else f"{factor:.3g} times {text}"
-    return f"{float(found[0]) * factor:.3g}{text[found.end() :]}"
+    """Return the priors in force; trust: factor on the size by name: "10 %" by 0.5 is "5 %"."""
+    rows = []
+    for name, prior in PRIORS.items():
+        size, number = prior.text, re.match(r"[\d.]+", prior.text)
+        if trust.get(name, 1.0) != 1.0:
+            scaled = f"{trust[name] * float(number[0]):.3g}" if number else f"{trust[name]:.3g} times "
+            size = scaled + size[number.end() if number else 0 :]
+        rows.append(PriorRow(name, size, name in trust))
+    return rows
 
 
 @dataclass(frozen=True)
@@ -364,21 +375,18 @@ class Findings:
         return counted(count, "run") if used == count else f"{used} of {counted(count, 'run')}"
 
 
-_NO_GAP_MEASURED: Final[dict[str, Any]] = {
-    "joint": None,
-    "rmse_nm": None,
-    "noise_floor_nm": None,
-    "localisation": [],
+_KEYS: Final[Mapping[type, str]] = {
+    Gap: "joint rmse_nm noise_floor_nm localisation balance floor_from",
+    Cause: "name joint class=names parameters grade matters rivals given evidence rms_nm balance explained_share",
+    CandidateEvidence: "name joint evidence shared minimum=sizes minimum_rms_nm reason",
+    Gain: "rmse_before_nm rmse_after_nm split ci95 joint balance plain_nm=null free_run_before_rad_s=null "
+    "free_run_after_rad_s=null free_run_position_before_rad=null free_run_position_after_rad=null runs",
+    UnexplainedResidual: "joint balance rms_nm percent_of_rated share relevant_nm matters",
+    OutlierRun: "run what channel joint value usual unit or=others text",
 }
-_NOT_MEASURED: Final = (
-    "plain_nm",
-    "free_run_before_rad_s",
-    "free_run_after_rad_s",
-    "free_run_position_before_rad",
-    "free_run_position_after_rad",
-)
-"""Keys of the gain that are null."""
-_NO_GAIN_MEASURED: Final = {"rmse_before_nm": None, "rmse_after_nm": None, "split": None, "ci95": None}
+"""Keys in findings.json of the classes whose keys are not their fields, in order. "key=attribute": where both differ;
+"key=null": promised and never measured.
+"""
 
 
 def to_mapping(
@@ -392,43 +400,67 @@ def to_mapping(
 
     sha256: hash of each run's file by the run's name; files: names of what was written beside findings.json.
     """
+    no_gap: dict[str, Any] = {"joint": None, "rmse_nm": None, "noise_floor_nm": None, "localisation": []}
+    experiment = findings.next_experiment
+    if experiment is not None:  # the positions of a motion are a file of their own
+        experiment = {key: value for key, value in experiment.items() if key not in {"table", "tables"}}
     mapping = {
         "schema": SCHEMA,
         "verdict": findings.verdict,
-        "gap": _gap(findings.gaps[0]) if findings.gaps else _NO_GAP_MEASURED,
+        "gap": findings.gaps[0] if findings.gaps else no_gap,
         "causes": [_cause(each, findings.joint_files) for each in findings.causes],
-        "gain": _NO_GAIN_MEASURED if findings.gain is None else _gain(findings.gain),
+        "gain": findings.gain or dict.fromkeys(("rmse_before_nm", "rmse_after_nm", "split", "ci95")),
         "explained_share": findings.explained_share,
-        "unexplained": None if findings.unexplained is None else _unexplained(findings.unexplained),
-        "next_experiment": _without_table(findings.next_experiment),
+        "unexplained": findings.unexplained,
+        "next_experiment": experiment,
         "reasons": findings.reasons,
-        "outlier_runs": [_outlier_run(each) for each in findings.outlier_runs],
+        "outlier_runs": findings.outlier_runs,
         "too_small": [_cause(each, findings.joint_files) for each in findings.too_small],
-        "cannot_be_told": [vars(each) for each in findings.cannot_be_told],
+        "cannot_be_told": findings.cannot_be_told,
         "joints": findings.joints,
         "runs": [
             {"name": name, "sha256": (sha256 or {}).get(name), "used": name in findings.used_runs}
             for name in findings.runs
         ],
-        "gaps": [_gap(each) for each in findings.gaps],
-        "candidates": [_candidate(each) for each in findings.candidates],
+        "gaps": findings.gaps,
+        "candidates": findings.candidates,
         "channel_notes": findings.channel_notes,
         "relevance": findings.relevance,
-        "priors": [each._asdict() for each in priors(findings.trust)],
-        "provenance": None if findings.provenance is None else vars(findings.provenance),
-        "files": list(files),
+        "priors": priors(findings.trust),
+        "provenance": findings.provenance,
+        "files": files,
     }
     result: dict[str, Any] = plain(mapping)
     return result
 
 
-def plain(value: Any) -> Any:
-    """Return the same value with what JSON knows: numpy's numbers and arrays become plain, NaN and infinity None.
+def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
+    """Return a cause as findings.json has it: beside each value that of the joint file, if there is one, and the change."""
+    known = file_values(cause.name, cause.joint, joints)
+    values = {name: keyed(value) for name, value in cause.parameters.items()}
+    for name in values.keys() & known.keys():
+        change = known[name].change(cause.parameters[name].value)
+        values[name] |= {"file_value": known[name].value, "change": change}
+    return keyed(cause) | {"parameters": values}
 
-    Raises TypeError for anything else.
+
+def keyed(value: Any) -> dict[str, Any]:
+    """Return what findings.json has of a value of one of the classes above, by key: its fields, if `_KEYS` has no others."""
+    found = {}
+    for entry in _KEYS.get(type(value), " ".join(type(value).__annotations__)).split():
+        key, _, attribute = entry.partition("=")
+        found[key] = None if attribute == "null" else getattr(value, attribute or key)
+    return found
+
+
+def plain(value: Any) -> Any:
+    """Return the same value with what JSON knows: frozen values by key, numpy's numbers and arrays plain, NaN and infinity
+    None. Raises TypeError for anything else.
     """
     if isinstance(value, np.generic | np.ndarray):
         value = value.tolist()
+    elif is_dataclass(value) or hasattr(value, "_asdict"):
+        value = keyed(value)
     if value is None or isinstance(value, str | bool | int):
         return value
     if isinstance(value, float):
@@ -438,112 +470,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, Iterable):
         return [plain(item) for item in value]
     raise TypeError(f"found {type(value).__name__} in findings, expected plain values")
-
-
-def _gap(gap: Gap) -> dict[str, Any]:
-    return {
-        "joint": gap.joint,
-        "rmse_nm": gap.rmse_nm,
-        "noise_floor_nm": gap.noise_floor_nm,
-        "localisation": [_place(each) for each in gap.localisation],
-        "balance": gap.balance,
-        "floor_from": gap.floor_from,
-    }
-
-
-def _place(place: Place) -> dict[str, Any]:
-    return {
-        "axis": place.axis,
-        "bin": place.bin,
-        "share": place.share,
-        "low": place.low,
-        "high": place.high,
-        "unit": place.unit,
-        "rms_nm": place.rms_nm,
-    }
-
-
-def _without_table(experiment: Mapping[str, Any] | None) -> Mapping[str, Any] | None:
-    """The positions of a motion are a file of their own."""
-    return experiment and {k: value for k, value in experiment.items() if k not in {"table", "tables"}}
-
-
-def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
-    return {
-        "name": cause.name,
-        "joint": cause.joint,
-        "class": list(cause.names),
-        "parameters": _values(cause, joints),
-        "grade": cause.grade,
-        "matters": cause.matters,
-        "rivals": list(cause.rivals),
-        "given": list(cause.given),
-        "evidence": {"delta_bic": cause.delta_evidence, "held_out_gain": cause.held_out_gain},
-        "rms_nm": cause.rms_nm,
-        "balance": cause.balance,
-        "explained_share": cause.explained_share,
-    }
-
-
-def _unexplained(left: UnexplainedResidual) -> dict[str, Any]:
-    return {
-        "joint": left.joint,
-        "balance": left.balance,
-        "rms_nm": left.rms_nm,
-        "percent_of_rated": 100.0 * left.of_rated,
-        "share": left.share,
-        "relevant_nm": left.relevant_nm,
-        "matters": left.matters,
-    }
-
-
-def _outlier_run(odd: OutlierRun) -> dict[str, Any]:
-    return {
-        "run": odd.run,
-        "what": odd.what,
-        "channel": odd.channel,
-        "joint": odd.joint,
-        "value": odd.value,
-        "usual": odd.usual,
-        "unit": odd.unit,
-        "or": odd.others,
-        "text": odd.text,
-    }
-
-
-def _values(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:
-    """Value, interval and unit; and with joint files the file's value and the relative change."""
-    known = file_values(cause.name, cause.joint, cause.parameters, joints)
-    found: dict[str, Any] = {}
-    for name, each in cause.parameters.items():
-        found[name] = {"value": each.value, "ci95": each.ci95, "unit": each.unit}
-        if name in known:
-            found[name] |= {"file_value": known[name].value, "change": known[name].change(each.value)}
-    return found
-
-
-def _candidate(candidate: CandidateEvidence) -> dict[str, Any]:
-    return {
-        "name": candidate.name,
-        "joint": candidate.joint,
-        "evidence": {"delta_bic": candidate.delta_bic, "held_out_gain": candidate.held_out_gain},
-        "shared": candidate.shared,
-        "minimum": {
-            name: {"value": each.value, "unit": each.unit} for name, each in candidate.minimum.items()
-        },
-        "minimum_rms_nm": candidate.minimum_rms_nm,
-        "reason": candidate.reason,
-    }
-
-
-def _gain(gain: Gain) -> dict[str, Any]:
-    return {
-        "rmse_before_nm": gain.rmse_before_nm,
-        "rmse_after_nm": gain.rmse_after_nm,
-        "split": gain.split,
-        "ci95": gain.ci95,
-        "joint": gain.joint or None,
-        "balance": gain.balance or None,
-        **dict.fromkeys(_NOT_MEASURED),
-        "runs": [each._asdict() for each in gain.runs],
-    }

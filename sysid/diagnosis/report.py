@@ -263,7 +263,7 @@ def chosen_traces(findings: Findings) -> list[Trace]:
 def held_out(findings: Findings) -> dict[tuple[JointName, str], dict[str, float]]:
     """Return the extended model's error [Nm] on each held-out run, of the balance that the gain is of."""
     gain = findings.gain
-    if gain is None or not gain.joint:
+    if gain is None or gain.joint is None or gain.balance is None:
         return {}
     return {(gain.joint, gain.balance): {g.run: g.rmse_after_nm for g in gain.runs}}
 

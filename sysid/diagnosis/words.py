@@ -243,7 +243,7 @@ def leading(cause: Cause, files: Mapping[int, Joint]) -> tuple[str, FileValue | 
     fitted = [n for n, v in cause.parameters.items() if v.ci95[0] != v.ci95[1]] or list(cause.parameters)
     if not fitted:
         return "", None
-    return fitted[0], file_values(cause.name, cause.joint, fitted[:1], files).get(fitted[0])
+    return fitted[0], file_values(cause.name, cause.joint, files).get(fitted[0])
 
 
 def quantity(value: Value, known: FileValue | None) -> tuple[str, str, str, str]:
@@ -385,7 +385,7 @@ def _remains(findings: Findings) -> str:
         return "no structure beyond noise and run-to-run variation"
     where = _places(findings) if left.matters else ""
     return (
-        f"{short(left.rms_nm)} Nm rms ({100.0 * left.of_rated:.2g} % of rated) at joint {left.joint}, {left.balance} balance"
+        f"{short(left.rms_nm)} Nm rms ({left.percent_of_rated:.2g} % of rated) at joint {left.joint}, {left.balance} balance"
         f"{f', {where}' if where else ''}; it {'matters' if left.matters else 'would matter'} from "
         f"{short(left.relevant_nm)} Nm"
     )

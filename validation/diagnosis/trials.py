@@ -194,7 +194,7 @@ def joint_files(case: Case, hidden: bool = False) -> dict[int, Joint]:
 def gains(case: Case, findings: Findings) -> tuple[float, float, float] | None:
     """Return rms before, after, and after with the true model, in the balance that the findings' gain is measured in."""
     gain = findings.gain
-    if gain is None or not gain.balance:
+    if gain is None or gain.joint is None or gain.balance is None:
         return None
     return gain.rmse_before_nm, gain.rmse_after_nm, _true_rms(case, gain.balance, gain.joint)
 

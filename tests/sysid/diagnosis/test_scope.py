@@ -117,15 +117,15 @@ def test_given_is_what_the_file_has() -> None:
 
 
 def test_the_files_value_stands_beside_the_found_one() -> None:
-    found = file_values("coulomb_friction", 1, ("coulomb_nm",), JOINTS)["coulomb_nm"]
+    found = file_values("coulomb_friction", 1, JOINTS)["coulomb_nm"]
     assert found == (JOINT.friction.coulomb_nm, "friction.coulomb_nm")
     assert found.change(1.5 * JOINT.friction.coulomb_nm) == pytest.approx(0.5)
-    gain = file_values("sensor_gain", "sensor", ("gain",), JOINTS)["gain"]
+    gain = file_values("sensor_gain", "sensor", JOINTS)["gain"]
     assert (gain.value, gain.change(1.03)) == (1.0, pytest.approx(0.03))
-    ripple = file_values("torque_ripple", 2, RIPPLE.parameters, JOINTS)
+    ripple = file_values("torque_ripple", 2, JOINTS)
     assert ripple["amplitude_nm"].value == 0.4
-    fresh = file_values("torque_ripple", 1, RIPPLE.parameters, JOINTS)
+    fresh = file_values("torque_ripple", 1, JOINTS)
     assert (fresh["amplitude_nm"].value, fresh["amplitude_nm"].change(0.2)) == (0.0, None)
     assert fresh["phase_rad"].value is None
-    assert file_values("unheard_of", 1, ("x",), JOINTS) == {}
+    assert file_values("unheard_of", 1, JOINTS) == {}
     assert gain.change(math.nan) is None
