@@ -105,7 +105,6 @@ class Cause:
     names: tuple[str, ...]
     parameters: Mapping[str, Value]
     delta_evidence: float  # twice the log evidence that the best set without it lacks
-    held_out_gain: float  # share of the held-out squared error that it takes away
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
     balance: str  # "motor" or "torsion": where it is largest
     explained_share: float = math.nan  # of all that is structure in these runs, as squares
@@ -120,9 +119,9 @@ class Cause:
         return self.name, self.joint, *(v.value for n, v in self.parameters.items() if v.ci95[0] == v.ci95[1])
 
     @property
-    def evidence(self) -> dict[str, float]:
-        """As findings.json has it."""
-        return {"delta_bic": self.delta_evidence, "held_out_gain": self.held_out_gain}
+    def evidence(self) -> dict[str, float | None]:
+        """As findings.json has it; the gain of a single entry on held-out runs is promised and not measured."""
+        return {"delta_bic": self.delta_evidence, "held_out_gain": None}
 
 
 class Present(NamedTuple):
@@ -145,22 +144,18 @@ class Untold:
 
 @dataclass(frozen=True)
 class CandidateEvidence:
-    """Evidence of one effect against the baseline alone; why it was not chosen, and the smallest size detectable."""
+    """Evidence of one effect beyond the set; why it is in the set or not, and the smallest size detectable."""
 
     name: str
     joint: JointName
     delta_bic: float
-    held_out_gain: float
-    shared: float  # part of its column that the chosen causes share, 0 to 1; NaN without causes
     minimum: Mapping[str, Value]  # minimum detectable size of its leading parameter(s); value inf: invisible
-    reason: str  # "chosen", "class of X", "below threshold", "invisible in these runs", "needs temperature_c", ...
-    at_minimum: tuple[Mapping[str, float], ...] = ()  # all parameters at that size, per way of looking for it
-    minimum_rms_nm: float = math.nan  # what it contributes at that size, rms over the runs; inf: invisible
+    reason: str  # "in the set, certain", "no evidence beyond the set", "needs a temperature", ...
 
     @property
-    def evidence(self) -> dict[str, float]:
-        """As findings.json has it."""
-        return {"delta_bic": self.delta_bic, "held_out_gain": self.held_out_gain}
+    def evidence(self) -> dict[str, float | None]:
+        """As findings.json has it, see `Cause.evidence`."""
+        return {"delta_bic": self.delta_bic, "held_out_gain": None}
 
     @property
     def sizes(self) -> dict[str, dict[str, Any]]:
@@ -378,7 +373,7 @@ class Findings:
 _KEYS: Final[Mapping[type, str]] = {
     Gap: "joint rmse_nm noise_floor_nm localisation balance floor_from",
     Cause: "name joint class=names parameters grade matters rivals given evidence rms_nm balance explained_share",
-    CandidateEvidence: "name joint evidence shared minimum=sizes minimum_rms_nm reason",
+    CandidateEvidence: "name joint evidence shared=null minimum=sizes minimum_rms_nm=null reason",
     Gain: "rmse_before_nm rmse_after_nm split ci95 joint balance plain_nm=null free_run_before_rad_s=null "
     "free_run_after_rad_s=null free_run_position_before_rad=null free_run_position_after_rad=null runs",
     UnexplainedResidual: "joint balance rms_nm percent_of_rated share relevant_nm matters",

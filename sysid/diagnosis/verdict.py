@@ -238,7 +238,6 @@ def _cause(
         (name, *(r for r in rivals if r != name)) if grade == ONE_OF else (name,),
         values_of(solution, j),
         j.delta,
-        math.nan,
         j.rms_nm[channel],
         channel.balance,
         explained_share=squares / max(total_nm2, 1e-30),
@@ -346,8 +345,6 @@ def entry_table(
                 name,
                 joint,
                 cause.delta_evidence if cause else 2.0 * float(gains[best]),
-                math.nan,
-                math.nan,
                 _minimum(sets.entries[best], smallest),
                 reason,
             )
@@ -360,7 +357,7 @@ def entry_table(
         reason, motion = _absent(effect, solution.dataset, scope)
         if reason and motion is not None:
             lost.append(Untold(name, first, reason, motion))
-        rows.append(CandidateEvidence(name, first, math.nan, math.nan, math.nan, {}, reason))
+        rows.append(CandidateEvidence(name, first, math.nan, {}, reason))
     return tuple(sorted(rows, key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)), tuple(
         lost
     )

@@ -64,7 +64,7 @@ def value(number: float, half: float = 0.1, unit: str = "Nm") -> Value:
 
 
 def cause(name: str, joint: int | str, parameters: Mapping[str, Value], names: tuple[str, ...] = ()) -> Cause:
-    return Cause(name, joint, names or (name,), parameters, 120.0, 0.4, 0.5, "motor")
+    return Cause(name, joint, names or (name,), parameters, 120.0, 0.5, "motor")
 
 
 def findings(verdict: str = "cause", causes: tuple[Cause, ...] = (), **parts: Any) -> Findings:

@@ -66,11 +66,11 @@ def one_cause() -> Findings:
             ),
             gap(1, "torsion", 0.152, 0.149, {}),
         ),
-        causes=(Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.81, 0.296, "motor", 0.94),),
+        causes=(Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.296, "motor", 0.94),),
         too_small=(
             Cause(
                 *("current_offset", 1, ("current_offset",), {"offset_a": value(0.0123, 0.001, "A")}),
-                *(40.0, NAN, 0.03, "motor", 0.01),
+                *(40.0, 0.03, "motor", 0.01),
             ),
         ),
         cannot_be_told=(
@@ -94,9 +94,9 @@ def one_cause() -> Findings:
         candidates=candidates(
             (1,),
             {
-                ("torque_ripple", 1): (4312.0, 0.81, "in the set, certain"),
-                ("cogging", 1): (212.0, 0.05, "no evidence beyond the set"),
-                ("kinematic_error", 1): (94.0, 0.03, "no evidence beyond the set"),
+                ("torque_ripple", 1): (4312.0, "in the set, certain"),
+                ("cogging", 1): (212.0, "no evidence beyond the set"),
+                ("kinematic_error", 1): (94.0, "no evidence beyond the set"),
             },
         ),
         gain=Gain(
@@ -149,7 +149,7 @@ def two_causes() -> Findings:
             gap(2, "torsion", 0.211, 0.21, {}),
         ),
         causes=(
-            Cause("viscous_friction", 1, ("viscous_friction",), viscous, 8210.0, NAN, 0.81, "motor", 0.91),
+            Cause("viscous_friction", 1, ("viscous_friction",), viscous, 8210.0, 0.81, "motor", 0.91),
             Cause(
                 *(
                     "link_inertia",
@@ -157,7 +157,6 @@ def two_causes() -> Findings:
                     ("link_inertia", "channel_delay"),
                     inertia,
                     4.0,
-                    NAN,
                     0.22,
                     "torsion",
                     0.08,
@@ -169,10 +168,10 @@ def two_causes() -> Findings:
         candidates=candidates(
             (1, 2),
             {
-                ("viscous_friction", 1): (8210.0, 0.77, "in the set, certain"),
-                ("link_inertia", 1): (133.0, 0.09, "in the set, certain"),
-                ("channel_delay", 1): (129.4, 0.088, "no evidence beyond the set"),
-                ("torque_constant", 1): (1204.0, 0.11, "no evidence beyond the set"),
+                ("viscous_friction", 1): (8210.0, "in the set, certain"),
+                ("link_inertia", 1): (133.0, "in the set, certain"),
+                ("channel_delay", 1): (129.4, "no evidence beyond the set"),
+                ("torque_constant", 1): (1204.0, "no evidence beyond the set"),
             },
         ),
         gain=Gain(0.912, 0.238, "6 runs, each left out once", (0.629, 0.711)),
@@ -215,7 +214,7 @@ def unexplained() -> Findings:
         runs=_runs(4),
         joints=(1,),
         gaps=(gap(1, "motor", 0.61, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.2}}),),
-        candidates=candidates((1,), {("stribeck_friction", 1): (38.0, 0.04, "no evidence beyond the set")}),
+        candidates=candidates((1,), {("stribeck_friction", 1): (38.0, "no evidence beyond the set")}),
         unexplained=UnexplainedResidual(1, "motor", 0.58, 0.0145, 1.0, 0.2, matters=True),
         channel_notes=("excitation_03.csv.gz: j1.temperature_c is constant (25.0): not used",),
         traces=tuple(trace(run, 1, "motor", SLIP, seed=k) for k, run in enumerate(_runs(4))),
@@ -237,7 +236,6 @@ def insufficient() -> Findings:
             replace(
                 c,
                 delta_bic=NAN,
-                held_out_gain=NAN,
                 reason="cannot be told from these runs",
                 minimum={k: replace(v, value=INFINITY) for k, v in c.minimum.items()},
             )
@@ -270,7 +268,6 @@ def sensor() -> Findings:
                 ("sensor_gain",),
                 {"gain": value(1.0481, 0.0017, "1")},
                 5120.0,
-                NAN,
                 0.79,
                 "motor",
                 0.97,
@@ -279,9 +276,9 @@ def sensor() -> Findings:
         candidates=candidates(
             (1, 2),
             {
-                ("sensor_gain", "sensor"): (5120.0, 0.92, "in the set, certain"),
-                ("torque_constant", 1): (2230.0, 0.44, "no evidence beyond the set"),
-                ("torque_constant", 2): (2190.0, 0.43, "no evidence beyond the set"),
+                ("sensor_gain", "sensor"): (5120.0, "in the set, certain"),
+                ("torque_constant", 1): (2230.0, "no evidence beyond the set"),
+                ("torque_constant", 2): (2190.0, "no evidence beyond the set"),
             },
         ),
         gain=Gain(0.82, 0.214, "6 runs, each left out once", (0.582, 0.623)),

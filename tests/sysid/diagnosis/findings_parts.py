@@ -53,9 +53,9 @@ def given(number: float, unit: str = "") -> Value:
 
 
 def candidates(
-    joints: tuple[int, ...], chosen: Mapping[tuple[str, int | str], tuple[float, float, str]]
+    joints: tuple[int, ...], chosen: Mapping[tuple[str, int | str], tuple[float, str]]
 ) -> tuple[CandidateEvidence, ...]:
-    """All of the library for these joints; chosen: evidence, held-out gain and reason of those that stand out."""
+    """All of the library for these joints; chosen: evidence and reason of those that stand out."""
     keys: list[tuple[str, int | str]] = [(name, j) for j in joints for name in JOINT_EFFECTS]
     keys += [(name, "sensor") for name in SENSOR_EFFECTS]
     random = np.random.default_rng(4)
@@ -63,20 +63,12 @@ def candidates(
     for name, joint in keys:
         parameter, size, unit = (SENSOR_EFFECTS if joint == "sensor" else JOINT_EFFECTS)[name]
         minimum = {parameter: Value(size, (size, size), unit)}
-        bic, held, reason = chosen.get(
-            (name, joint),
-            (float(random.uniform(-9, 4)), float(random.uniform(-0.01, 0.006)), "no evidence beyond the set"),
-        )
+        bic, reason = chosen.get((name, joint), (float(random.uniform(-9, 4)), "no evidence beyond the set"))
         if (name, joint) not in chosen and "temperature" in name:
-            bic, held, reason = NAN, NAN, "needs temperature_c"
+            bic, reason = NAN, "needs temperature_c"
         elif size == INFINITY:
             reason = "invisible in these runs"
-        shared = float(random.uniform(0, 0.3)) if chosen and np.isfinite(bic) else NAN
-        rows.append(
-            CandidateEvidence(
-                name, joint, bic, held, 1.0 if reason.startswith("in the set") else shared, minimum, reason
-            )
-        )
+        rows.append(CandidateEvidence(name, joint, bic, minimum, reason))
     return tuple(rows)
 
 

@@ -297,7 +297,7 @@ def test_names_are_words() -> None:
 
 
 def test_a_row_of_every_entry_has_its_smallest_size() -> None:
-    row = CandidateEvidence("unbalance", 1, 5e6, math.nan, math.nan, {}, "cannot be told from these runs")
+    row = CandidateEvidence("unbalance", 1, 5e6, {}, "cannot be told from these runs")
     seen = {"moment_nm": Value(0.05, (math.nan, math.nan), "Nm")}
     never = {"moment_nm": Value(math.inf, (math.inf, math.inf), "Nm")}
     texts = [candidate_row(replace(row, minimum=each)) for each in ({}, seen, never)]

@@ -60,9 +60,7 @@ def test_values_are_those_of_the_findings_and_what_is_not_finite_is_null() -> No
     made = findings(
         causes=(replace(RIPPLE, names=("torque_ripple", "cogging")), OFFSET),
         candidates=(
-            CandidateEvidence(
-                "hysteresis", 1, -3.0, math.nan, math.nan, {"torque_nm": Value(math.inf, (0, 0), "Nm")}, "x"
-            ),
+            CandidateEvidence("hysteresis", 1, -3.0, {"torque_nm": Value(math.inf, (0, 0), "Nm")}, "x"),
         ),
         next_experiment={"why": "because", "plan": {"schema": "jtq.plan/1"}},
         too_small=(COULOMB,),
