@@ -91,6 +91,11 @@ class Value:
     ci95: tuple[float, float]
     unit: str
 
+    @property
+    def fitted(self) -> bool:
+        """Whether it was found, not given."""
+        return self.ci95[0] != self.ci95[1]
+
 
 @dataclass(frozen=True)
 class Cause:
@@ -116,7 +121,13 @@ class Cause:
     @property
     def key(self) -> tuple[object, ...]:
         """Effect, joint, and what tells several of one effect apart."""
-        return self.name, self.joint, *(v.value for n, v in self.parameters.items() if v.ci95[0] == v.ci95[1])
+        return self.name, self.joint, *(v.value for v in self.parameters.values() if not v.fitted)
+
+    @property
+    def leading(self) -> str:
+        """The parameter that stands for it: the first that is fitted, else the first; "" without one."""
+        fitted = [name for name, value in self.parameters.items() if value.fitted]
+        return next(iter([*fitted, *self.parameters]), "")
 
     @property
     def evidence(self) -> dict[str, float | None]:
@@ -317,15 +328,21 @@ class PriorRow(NamedTuple):
 
 
 def priors(trust: Mapping[str, float]) -> list[PriorRow]:
-    """Return the priors in force; trust: factor on the size by name: "10 %" by 0.5 is "5 %"."""
-    rows = []
-    for name, prior in PRIORS.items():
-        size, number = prior.text, re.match(r"[\d.]+", prior.text)
-        if trust.get(name, 1.0) != 1.0:
-            scaled = f"{trust[name] * float(number[0]):.3g}" if number else f"{trust[name]:.3g} times "
-            size = scaled + size[number.end() if number else 0 :]
-        rows.append(PriorRow(name, size, name in trust))
-    return rows
+    """Return the priors in force; trust: factor on the size by name."""
+    return [
+        PriorRow(name, _scaled(prior.text, trust.get(name, 1.0)), name in trust)
+        for name, prior in PRIORS.items()
+    ]
+
+
+def _scaled(text: str, factor: float) -> str:
+    """Return the size of a prior in words times a factor: "10 %" by 0.5 is "5 %"."""
+    number = re.match(r"[\d.]+", text)
+    if factor == 1.0:
+        return text
+    if number is None:
+        return f"{factor:.3g} times {text}"
+    return f"{float(number[0]) * factor:.3g}{text[number.end() :]}"
 
 
 @dataclass(frozen=True)

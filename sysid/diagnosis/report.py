@@ -23,7 +23,7 @@ from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gap, Join
 from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, campaign_command, joint_motion_file
 from jtqd.sysid.diagnosis.words import (
     BADGES,
-    balance_title,
+    BALANCES,
     bin_name,
     effect_title,
     in_words,
@@ -66,7 +66,7 @@ def render(findings: Findings) -> str:
         "looked_at": [candidate_row(each) for each in findings.candidates],
         "gaps": [
             (
-                f"Joint {gap.joint}, {balance_title(gap.balance)}: {number(gap.rmse_nm)} Nm rms, noise "
+                f"Joint {gap.joint}, {BALANCES[gap.balance]}: {number(gap.rmse_nm)} Nm rms, noise "
                 f"{number(gap.noise_floor_nm)} Nm (from {gap.floor_from})",
                 gap_axes(gap),
             )
@@ -275,7 +275,7 @@ def pictures(findings: Findings) -> list[Picture]:
     held, drawn = held_out(findings), []
     for k, trace in enumerate(chosen_traces(findings)):
         floor = floors.get((trace.joint, trace.balance), float("nan"))
-        title = f"{trace.run}, joint {trace.joint}, {balance_title(trace.balance)}"
+        title = f"{trace.run}, joint {trace.joint}, {BALANCES[trace.balance]}"
         text = (
             f"Measured and simulated torque of {title}, over {number(trace.time_s[-1])} s: the difference is "
             f"{number(rms(trace.before_nm))} Nm rms"

@@ -5,12 +5,13 @@ alike print `summary`.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.text import counted
+from jtqd.estimator.text import counted, table_lines
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -22,8 +23,8 @@ from jtqd.sysid.diagnosis.findings import (
     SENSOR,
     UNEXPLAINED,
     Cause,
-    FileValue,
     Findings,
+    Gain,
     JointName,
     Place,
     Provenance,
@@ -53,9 +54,8 @@ MOST_INPUTS: Final = 6
 _MOMENTS: Final = {"events": "events that noise does not explain", "seconds": "seconds with a deviating mean"}
 """Lists of moments among the places, by their first word."""
 _PROPER: Final = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
-_UNIT_ENDINGS: Final = (
-    *("_nms_per_rad", "_nm_per_rad3", "_nm_per_rad", "_nm_per_a", "_nm_per_s", "_per_k_nm", "_rad_s"),
-    *("_kgm2", "_nm", "_rad", "_per_motor_rev", "_a", "_s", "_c"),
+_UNIT_ENDING: Final = re.compile(
+    r"_(nms_per_rad|nm_per_(rad3|rad|a|s)|per_k_nm|rad_s|kgm2|nm|rad|per_motor_rev|a|s|c)$"
 )
 _PREFIXED: Final = ("rad", "s", "A")
 _ALIKE: Final = {
@@ -66,8 +66,7 @@ _ALIKE: Final = {
 """Entries that runs with little variation distinguish by their priors: the other's prior is stated beside a certain one."""
 
 
-@dataclass(frozen=True)
-class Row:
+class Row(NamedTuple):
     """One entry of the table: place, name in words, the file's value -> the one found, its 95 % interval, share of the gap,
     grade; more: its further parameters.
     """
@@ -79,6 +78,9 @@ class Row:
     share: str
     grade: str
     more: str = ""
+
+
+HEADS: Final = Row("place", "entry", "file -> found", "95 % interval", "share", "grade")
 
 
 @dataclass(frozen=True)
@@ -110,8 +112,8 @@ def summary(findings: Findings) -> Summary:
         headline(findings),
         (*map(in_words, reasons), *(f"outlier run: {odd.text}" for odd in findings.outlier_runs)),
         tuple(_row(c, files) for c in causes[:MOST_ROWS]),
-        ", ".join(f"{_of(c)} {_sized(c, files)} ({_grade(c)})" for c in causes[MOST_ROWS:]),
-        ", ".join(f"{_of(c)} {_sized(c, files)}" for c in small),
+        ", ".join(f"{_of(c)} {_size(c, files)} ({_grade(c)})" for c in causes[MOST_ROWS:]),
+        ", ".join(f"{_of(c)} {_size(c, files)}" for c in small),
         _foot(causes, findings),
         _remains(findings),
         _next(str(experiment.get("why", ""))),
@@ -124,14 +126,9 @@ def terminal_lines(findings: Findings) -> list[str]:
     """Return the summary for a terminal."""
     s = summary(findings)
     lines = [f"{findings.verdict}: {' '.join(s.headline)}", *(f"  {note}" for note in s.notes)]
-    table = [("place", "entry", "file -> found", "95 % interval", "share", "grade")]
-    for r in s.rows:
-        grade = f"{r.grade} ({r.more})" if r.more else r.grade
-        table.append((r.place, r.entry, r.found, r.interval, r.share, grade))
-    wide = [max(len(row[k]) for row in table) for k in range(5)]
     if s.rows:
-        cells = ([c.ljust(w) for c, w in zip(row, [*wide, 0], strict=True)] for row in table)
-        lines += [f"  {'  '.join(row)}".rstrip() for row in cells]
+        table = [HEADS, *(r._replace(grade=f"{r.grade} ({r.more})" if r.more else r.grade) for r in s.rows)]
+        lines += [f"  {line}" for line in table_lines([row[:-1] for row in table], range(6))]
     named = (
         ("also", s.also),
         ("too small to matter", s.small),
@@ -165,92 +162,73 @@ def by_size(findings: Findings) -> tuple[list[Cause], list[Cause]]:
 def headline(findings: Findings) -> tuple[str, ...]:
     """Return the result in at most two sentences, the largest entry first."""
     causes, small = by_size(findings)
-    left = findings.unexplained
     if findings.verdict == INSUFFICIENT:
-        first = f": {in_words(findings.reasons[0])}" if findings.reasons else ""
-        return (f"These runs are not sufficient to judge the simulation{first}.",)
+        first = in_words(findings.reasons[0]) if findings.reasons else ""
+        return (f"{_joined(': ', 'These runs are not sufficient to judge the simulation', first)}.",)
     if findings.verdict == NO_GAP:
-        count, limit = len(small), f"what remains is below {100.0 * findings.relevance:.2g} % of rated torque"
-        more = (
-            f", and {counted(count, 'entry', 'entries')} {'is' if count == 1 else 'are'} too small to matter"
-        )
-        return (f"The simulation agrees with these runs: {limit}{more if count else ''}.",)
-    rest = "" if left is None or not left.matters else f"{short(left.rms_nm)} Nm rms"
+        limit = f"what remains is below {100.0 * findings.relevance:.2g} % of rated torque"
+        number = counted(len(small), "entry", "entries")
+        more = f"and {number} {'is' if len(small) == 1 else 'are'} too small to matter" if small else ""
+        return (f"The simulation agrees with these runs: {_joined(', ', limit, more)}.",)
+    left = findings.unexplained
+    rest = f"{short(left.rms_nm)} Nm rms at joint {left.joint}" if left is not None and left.matters else ""
     if not causes:
-        where = _places(findings, 1)
-        size = f": {rest} at joint {left.joint}{f', {where}' if where else ''}" if rest and left else ""
-        return (f"No entry explains the gap{size}.",)
-    gain = _gain(findings)
-    if rest and left is not None:
-        gain += f"{', but ' if gain else ''}{rest} at joint {left.joint} remain unexplained"
+        where = _joined(", ", rest, _places(findings, 1)) if rest else ""
+        return (f"{_joined(': ', 'No entry explains the gap', where)}.",)
+    second = _joined(", but ", _gain(findings.gain), f"{rest} remain unexplained" if rest else "")
     found = _headline_causes(causes, findings.joint_files)
-    return (found, *([f"{gain[0].upper()}{gain[1:]}."] if gain else []))
+    return (found, f"{_capital(second)}.") if second else (found,)
 
 
 def _headline_causes(causes: Sequence[Cause], files: Mapping[int, Joint]) -> str:
-    first = causes[0]
-    share = _percent(_share(first))
+    first, share, size = causes[0], _share_text(causes[0]), _size(causes[0], files)
     names = listed([_of(first), *(_rival(name, first.joint) for name in first.rivals[:2])], "or")
-    value = _sized(first, files)
-    if first.grade == ONE_OF:
-        grade = f" ({value} if it is {effect_title(first.name)})" if value else ""
-    else:
-        grade = f"{f': {value}' if value else ''} ({first.grade})"
-    text = f"{names[0].upper()}{names[1:]} explains {f'{share} of ' if share else ''}the gap{grade}"
+    text = f"{_capital(names)} explains {f'{share} of ' if share else ''}the gap"
+    if first.grade != ONE_OF:
+        text = f"{_joined(': ', text, size)} ({first.grade})"
+    elif size:
+        text += f" ({size} if it is {effect_title(first.name)})"
     if len(causes) > 1:
-        second, more = causes[1], len(causes) - 2
-        text += f"; {' '.join(filter(None, (_of(second), _percent(_share(second)))))} ({_grade(second)})"
+        more = len(causes) - 2
+        text += f"; {_joined(' ', _of(causes[1]), _share_text(causes[1]))} ({_grade(causes[1])})"
         text += f" and {counted(more, 'smaller entry', 'smaller entries')}" if more else ""
     return f"{text}."
 
 
-def _gain(findings: Findings) -> str:
-    gain = findings.gain
+def _gain(gain: Gain | None) -> str:
     if gain is None or not math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
         return ""
     before, after = gain.rmse_before_nm, gain.rmse_after_nm
-    if after < before:
-        old, new = short(before), short(after)
-        old, new = (old, new) if old != new else _pair(before, after)
-        return f"the extended model errs by {new} instead of {old} Nm on held-out runs"
-    return f"the extended model errs by {short(after)} Nm on held-out runs, no less than the joint file"
+    if after >= before:
+        return f"the extended model errs by {short(after)} Nm on held-out runs, no less than the joint file"
+    old, new = short(before), short(after)
+    if old == new:
+        old, new = _pair(before, after)
+    return f"the extended model errs by {new} instead of {old} Nm on held-out runs"
 
 
 def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
-    lead, known = leading(cause, files)
-    found = interval = ""
-    if lead:
-        old, new, interval, unit = quantity(cause.parameters[lead], known)
-        found = f"{f'{old} -> ' if old else ''}{new} {unit}".rstrip()
-    rest = (
-        f"{parameter_title(name)} {_plain(value)}"
+    lead = cause.leading
+    found, interval = quantity(cause.parameters[lead], in_file(cause, files)) if lead else ("", "")
+    more = [
+        f"{parameter_title(name)} {_rounded(value) if value.fitted else _given(value)}"
         for name, value in cause.parameters.items()
         if name not in {lead, "channel"}
-    )
-    return Row(
-        place(cause.joint),
-        effect_title(cause.name),
-        found,
-        interval,
-        _percent(_share(cause)),
-        _grade(cause),
-        ", ".join(rest),
-    )
+    ]
+    title, share = effect_title(cause.name), _share_text(cause)
+    return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
 
 
-def leading(cause: Cause, files: Mapping[int, Joint]) -> tuple[str, FileValue | None]:
-    """Return the parameter that stands for a cause, the first that is fitted, and what the joint file has ("": none)."""
-    fitted = [n for n, v in cause.parameters.items() if v.ci95[0] != v.ci95[1]] or list(cause.parameters)
-    if not fitted:
-        return "", None
-    return fitted[0], file_values(cause.name, cause.joint, files).get(fitted[0])
+def in_file(cause: Cause, files: Mapping[int, Joint]) -> float | None:
+    """Return what the joint file has for the leading parameter, or implies (a gain of 1); None: there is no such value."""
+    known = file_values(cause.name, cause.joint, files).get(cause.leading)
+    return known.value if known is not None and (known.key or known.value) else None
 
 
-def quantity(value: Value, known: FileValue | None) -> tuple[str, str, str, str]:
-    """Return the file's value, the one found, its interval and the unit: all with one power of ten and as many places, by
-    two digits of half the interval's width. "" for what there is not.
+def quantity(value: Value, old: float | None) -> tuple[str, str]:
+    """Return "4.00 -> 5.30 Nm" and its interval, or "5.30 Nm" where the file has no value, all with one power of ten and as
+    many places, by two digits of half the interval's width; "" without an interval.
     """
-    old = _in_file(known)
     low, high = value.ci95
     ends = [low, high] if math.isfinite(low + high) and high > low else []
     factor, unit, power = _scale(value.unit, max(abs(x) for x in (value.value, *ends, old or 0.0)))
@@ -259,12 +237,26 @@ def quantity(value: Value, known: FileValue | None) -> tuple[str, str, str, str]
     least = 0.5 * 10.0**-places if half else 0.0
     texts = [_at(x * factor if abs(x * factor) > least else 0.0, places, power) for x in (value.value, *ends)]
     before = "" if old is None else _at(old * factor, places, power)
-    return before, texts[0], f"[{texts[1]}, {texts[2]}]" if ends else "", unit
+    return f"{_joined(' -> ', before, texts[0])} {unit}".rstrip(), f"[{', '.join(texts[1:])}]" if ends else ""
 
 
-def _in_file(known: FileValue | None) -> float | None:
-    """Return the value that the joint file has, or that it implies (a gain of 1); None for one that is not there."""
-    return known.value if known is not None and (known.key or known.value) else None
+def _size(cause: Cause, files: Mapping[int, Joint]) -> str:
+    """Return the leading parameter of a cause, rounded; "" without a parameter."""
+    return _rounded(cause.parameters[cause.leading], in_file(cause, files)) if cause.leading else ""
+
+
+def _rounded(value: Value, old: float | None = None) -> str:
+    """Return "4.0 -> 5.3 Nm", or "5.3 Nm" where the file has no value."""
+    factor, unit, power = _scale(value.unit, max(abs(value.value), abs(old or 0.0)))
+    new = value.value * factor
+    if old is None:
+        return f"{_at(new, 1 - _order(new), power)} {unit}".rstrip()
+    return f"{' -> '.join(_pair(old * factor, new, power))} {unit}".rstrip()
+
+
+def _given(value: Value) -> str:
+    """Return a value that was not fitted."""
+    return f"{value.value:g} {unit_name(value.unit)}".rstrip()
 
 
 def _scale(unit: str, size: float) -> tuple[float, str, str]:
@@ -276,7 +268,7 @@ def _scale(unit: str, size: float) -> tuple[float, str, str]:
     return 1.0, unit_name(unit), ""
 
 
-def _at(x: float, places: int, power: str) -> str:
+def _at(x: float, places: int, power: str = "") -> str:
     """Return x with decimal places; one digit at least of what is not zero."""
     if x and abs(x) < 0.5 * 10.0 ** -max(places, 0):
         places = -_order(x)
@@ -289,7 +281,7 @@ def _order(x: float) -> int:
 
 def short(x: float) -> str:
     """Return x with two digits."""
-    return _at(x, 1 - _order(x), "") if math.isfinite(x) else "-"
+    return _at(x, 1 - _order(x)) if math.isfinite(x) else "-"
 
 
 def _pair(old: float, new: float, power: str = "") -> tuple[str, str]:
@@ -299,32 +291,12 @@ def _pair(old: float, new: float, power: str = "") -> tuple[str, str]:
     return _at(old, places, power), _at(new, places, power)
 
 
-def _sized(cause: Cause, files: Mapping[int, Joint]) -> str:
-    """Return "4.0 -> 5.3 Nm", or what was found where the file has no such value."""
-    lead, known = leading(cause, files)
-    if not lead:
-        return ""
-    value = cause.parameters[lead]
-    old = _in_file(known)
-    factor, unit, power = _scale(value.unit, max(abs(value.value), abs(old or 0.0)))
-    new = value.value * factor
-    if old is None:
-        return f"{_at(new, 1 - _order(new), power)} {unit}".rstrip()
-    before, after = _pair(old * factor, new, power)
-    return f"{before} -> {after} {unit}".rstrip()
-
-
-def _plain(value: Value) -> str:
-    factor, unit, power = _scale(value.unit, abs(value.value))
-    fitted = value.ci95[0] != value.ci95[1]
-    number = (
-        _at(value.value * factor, 1 - _order(value.value * factor), power) if fitted else f"{value.value:g}"
-    )
-    return f"{number} {unit if fitted else unit_name(value.unit)}".rstrip()
-
-
 def _share(cause: Cause) -> float:
     return cause.explained_share if math.isfinite(cause.explained_share) else 0.0
+
+
+def _share_text(cause: Cause) -> str:
+    return _percent(cause.explained_share)
 
 
 def _percent(share: float) -> str:
@@ -353,14 +325,13 @@ def _foot(causes: Sequence[Cause], findings: Findings) -> str:
     grades = {c.grade for c in causes}
     texts = []
     if CERTAIN in grades:
-        sure = [c.name for c in causes if c.grade == CERTAIN]
-        names = dict.fromkeys([*sure, *(_ALIKE[n] for n in sure if n in _ALIKE)])
+        sure = [c for c in causes if c.grade == CERTAIN]
+        names = dict.fromkeys([*(c.name for c in sure), *(name for c in sure for name in _scales_alike(c))])
         rows = {row.name: row for row in priors(findings.trust)}
         sizes: dict[str, list[str]] = {}
-        for row in (rows[n] for n in names if n in rows):
-            sizes.setdefault(f"{row.size}{' (as set)' if row.set_by_user else ''}", []).append(
-                effect_title(row.name)
-            )
+        for row in (rows[name] for name in names if name in rows):
+            size = f"{row.size}{' (as set)' if row.set_by_user else ''}"
+            sizes.setdefault(size, []).append(effect_title(row.name))
         given = ", ".join(f"{listed(of)} ± {size}" for size, of in sizes.items())
         texts.append(f"certain: given {given}" if given else "certain: no other set is nearly as good")
     if ONE_OF in grades:
@@ -368,6 +339,10 @@ def _foot(causes: Sequence[Cause], findings: Findings) -> str:
     if EFFECTIVE in grades:
         texts.append("effective: predicts, but what it stands for is not settled")
     return f"{'; '.join(texts)}." if texts else ""
+
+
+def _scales_alike(cause: Cause) -> list[str]:
+    return [_ALIKE[cause.name]] if cause.name in _ALIKE else []
 
 
 def _next(why: str) -> str:
@@ -383,21 +358,18 @@ def _remains(findings: Findings) -> str:
         return ""
     if not left.rms_nm:
         return "no structure beyond noise and run-to-run variation"
-    where = _places(findings) if left.matters else ""
-    return (
-        f"{short(left.rms_nm)} Nm rms ({left.percent_of_rated:.2g} % of rated) at joint {left.joint}, {left.balance} balance"
-        f"{f', {where}' if where else ''}; it {'matters' if left.matters else 'would matter'} from "
-        f"{short(left.relevant_nm)} Nm"
-    )
+    size = f"{short(left.rms_nm)} Nm rms ({left.percent_of_rated:.2g} % of rated) at joint {left.joint}"
+    what = _joined(", ", size, f"{left.balance} balance", _places(findings) if left.matters else "")
+    return f"{what}; it {'matters' if left.matters else 'would matter'} from {short(left.relevant_nm)} Nm"
 
 
 def _places(findings: Findings, most: int = 2) -> str:
     """Return the largest places of the residual that remains."""
     left = findings.unexplained
-    gaps = [
-        g for g in findings.gaps if left is not None and (g.joint, g.balance) == (left.joint, left.balance)
-    ]
-    return ", ".join(f"{_percent(p.share)} of it {where(p)}" for g in gaps[:1] for p in g.localisation[:most])
+    for gap in findings.gaps:
+        if left is not None and (gap.joint, gap.balance) == (left.joint, left.balance):
+            return ", ".join(f"{_percent(p.share)} of it {where(p)}" for p in gap.localisation[:most])
+    return ""
 
 
 def _untold(findings: Findings) -> str:
@@ -414,11 +386,10 @@ def _untold(findings: Findings) -> str:
 
 
 def _named(name: str, joints: Iterable[JointName], many: bool) -> str:
+    """Return "lost motion of joints 1 and 2"; without the joints where there is one, or where it is the sensor's."""
     numbers = [str(n) for n in sorted({j for j in joints if isinstance(j, int)})]
-    title = effect_title(name)
-    if not many or not numbers:
-        return title
-    return f"{title} of joint{'s' if len(numbers) > 1 else ''} {listed(numbers)}"
+    of = f"joint{'s' if len(numbers) > 1 else ''} {listed(numbers)}" if many and numbers else ""
+    return _joined(" of ", effect_title(name), of)
 
 
 def effect_title(name: str) -> str:
@@ -428,10 +399,7 @@ def effect_title(name: str) -> str:
 
 def parameter_title(name: str) -> str:
     """Return the name of a parameter in words, without its unit: "amplitude_nm" is "amplitude"."""
-    for ending in _UNIT_ENDINGS:
-        if name.endswith(ending) and len(name) > len(ending):
-            return effect_title(name.removesuffix(ending))
-    return effect_title(name)
+    return effect_title(_UNIT_ENDING.sub("", name))
 
 
 def in_words(text: str) -> str:
@@ -459,6 +427,15 @@ def listed(items: Sequence[str], word: str = "and") -> str:
     return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} {word} {items[-1]}"
 
 
+def _joined(between: str, *texts: str) -> str:
+    """Return the texts that are not empty, with something between them."""
+    return between.join(filter(None, texts))
+
+
+def _capital(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"
+
+
 def bin_name(bin_: Place) -> str:
     """Return the name of a bin as it is written."""
     return bin_.bin.replace(bin_.unit, unit_name(bin_.unit)) if bin_.unit else bin_.bin
@@ -472,8 +449,3 @@ def where(place_: Place) -> str:
     if place_.bin.startswith("order"):
         return f"in a line at {bin_name(place_)}"
     return f"at {place_.axis.replace('_', ' ')} {bin_name(place_)}"
-
-
-def balance_title(balance: str) -> str:
-    """Return the balance in words."""
-    return BALANCES.get(balance, balance)
