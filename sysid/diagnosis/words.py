@@ -10,6 +10,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted, table_lines
 from jtqd.sysid.diagnosis.findings import (
@@ -58,12 +59,6 @@ _UNIT_ENDING: Final = re.compile(
     r"_(nms_per_rad|nm_per_(rad3|rad|a|s)|per_k_nm|rad_s|kgm2|nm|rad|per_motor_rev|a|s|c)$"
 )
 _PREFIXED: Final = ("rad", "s", "A")
-_ALIKE: Final = {
-    "torque_constant": "sensor_gain",
-    "load_dependent_friction": "torque_constant",
-    "sensor_gain": "torque_constant",
-}
-"""Entries that runs with little variation distinguish by their priors: the other's prior is stated beside a certain one."""
 
 
 class Row(NamedTuple):
@@ -342,7 +337,9 @@ def _foot(causes: Sequence[Cause], findings: Findings) -> str:
 
 
 def _scales_alike(cause: Cause) -> list[str]:
-    return [_ALIKE[cause.name]] if cause.name in _ALIKE else []
+    """Return the other effects that scale the balance of a cause which scales it: priors decide between them."""
+    scaling = [e.name for e in EFFECTS.values() if e.scales_all or e.scales_balance == cause.balance]
+    return [name for name in scaling if name != cause.name] if cause.name in scaling else []
 
 
 def _next(why: str) -> str:
