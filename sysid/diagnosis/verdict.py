@@ -43,7 +43,7 @@ from jtqd.sysid.diagnosis.findings import (
 from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
 from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution
-from jtqd.sysid.diagnosis.next_experiment import kind_of, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.scope import Scope
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, present_effects, remaining
@@ -337,7 +337,7 @@ def entry_table(
             reason = f"in the set, {cause.grade}"
         elif all(k in untold for k in members):
             reason = "cannot be told from these runs"
-            lost.append(Untold(name, joint, reason, kind_of(name)))
+            lost.append(Untold(name, joint, reason, EFFECTS[name].experiment))
         else:
             reason = "no evidence beyond the set"
         rows.append(
@@ -377,7 +377,7 @@ def _absent(effect: Effect, dataset: Dataset, scope: Scope) -> tuple[str, str | 
         return "needs encoders on both sides", ""
     if "temperature_c" in effect.needs and not np.isfinite(dataset.signals[0][0].state.temperature_c).any():
         return "needs a temperature", ""
-    return "nothing of it varies in these runs", kind_of(effect.name)
+    return "nothing of it varies in these runs", effect.experiment
 
 
 def _smallest(sets: Sets, chosen: Set, k: int) -> float:
