@@ -1,4 +1,7 @@
-"""What the user knows: effects that are absent or given, how far values may be off, and references that are no sensor."""
+"""What the user knows: effects that are absent or given, how far values may be off, and references that are no sensor.
+
+Options --without and --given have items [WHERE=]EFFECT, WHERE a joint's number or "sensor"; --trust has items PRIOR=SIZE.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
@@ -14,9 +17,10 @@ from jtqd.sysid.diagnosis.findings import SENSOR, JointName
 from jtqd.sysid.diagnosis.limits import PRIORS, Usage
 from jtqd.sysid.runs.options import UsageError
 
-_ITEM: Final = re.compile(r"(?:(?P<joint>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
-
-_SIZE: Final = re.compile(r"(?P<value>[\d.]+(?:e[+-]?\d+)?) *(?P<unit>.*)", re.IGNORECASE)
+_ITEM: Final = re.compile(r"(?:(?P<where>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
+_SIZE: Final = re.compile(
+    r"(?P<value>(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(?![\d.]) *(?P<unit>.*)", re.IGNORECASE
+)
 _PERCENT: Final = re.compile(r"([\d.]+) %")
 _PREFIXES: Final = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6}
 _USAGES: Final = (Usage(0.1, 5.0), Usage(3.0, 50.0))
@@ -52,60 +56,64 @@ class Scope:
 EVERYTHING: Final = Scope()
 
 
+class _Item(NamedTuple):
+    """An item of --without or --given: option, as it was written, where (None: wherever it may be), effect."""
+
+    option: str
+    text: str
+    where: JointName | None
+    name: str
+
+
 def scope_of(
     without: Iterable[str], given: Iterable[str], joints: Mapping[int, Joint], known: Iterable[int] = ()
 ) -> Scope:
-    """Return the scope that options --without and --given ask for; items as "NAME", "2=NAME" or "sensor=NAME".
+    """Return the scope that options --without and --given ask for.
 
     Without: the effect is taken to be absent. Given: it is as the joint files have it, in `effects` or as one of their
-    values, which is then not questioned. Raises UsageError for a name that is no effect, or a given effect that no joint
-    file has.
+    values, which is then not questioned. Raises UsageError for a name that is no effect, a joint that there is not, and a
+    given effect that no joint file has: taken as given it would be --without.
     """
-    asked = [*named_effects("--without", without), *named_effects("--given", given)]
+    asked = [*_items("--without", without), *_items("--given", given)]
     for option, text, where, name in asked:
         if where is not None and where != SENSOR and where not in joints:
             have = ", ".join(str(number) for number in sorted(joints))
             raise UsageError(f"{option} {text}: found no joint {where} in runs and joint files: {have}")
-        if option == "--given":
-            _check_given(text, name, where, joints)
-    return Scope(frozenset((where, name) for *_, where, name in asked), frozenset(known))
+        files = [joint for number, joint in joints.items() if where in (None, SENSOR, number)]
+        in_file = any(effect.name == name for joint in files for effect in joint.effects)
+        has_key = any(parameter.key for parameter in EFFECTS[name].parameters)
+        if option == "--given" and not in_file and not has_key:
+            raise UsageError(
+                f"--given {text}: found no effect {name} in {' or '.join(joint.name for joint in files)}, expected it under "
+                f"`effects` with its parameters (or --without {text} for an effect that is absent)"
+            )
+    return Scope(frozenset((item.where, item.name) for item in asked), frozenset(known))
 
 
 def check_effects(without: Iterable[str], given: Iterable[str]) -> None:
     """Refuse what no runs are needed for: a name that is no effect, an effect that is both. Raises UsageError."""
-    absent = named_effects("--without", without)
-    for _, text, where, name in named_effects("--given", given):
-        for _, other, there, same in absent:
-            if name == same and (where == there or None in (where, there)):
-                raise UsageError(f"--without {other}: found it beside --given {text}, expected one of them")
+    absent = _items("--without", without)
+    for known in _items("--given", given):
+        for item in absent:
+            if item.name == known.name and (item.where == known.where or None in (item.where, known.where)):
+                raise UsageError(
+                    f"--without {item.text}: found it beside --given {known.text}, expected one of them"
+                )
 
 
-def named_effects(option: str, items: Iterable[str]) -> list[tuple[str, str, JointName | None, str]]:
-    """Return (option, text, joint, name) of each item of an option. Raises UsageError for a name that is no effect."""
-    found: list[tuple[str, str, JointName | None, str]] = []
-    for text in items:
+def _items(option: str, texts: Iterable[str]) -> list[_Item]:
+    """Return the items of an option. Raises UsageError for a name that is no effect."""
+    items = []
+    for text in texts:
         match = _ITEM.fullmatch(text)
         if match is None or match["name"] not in EFFECTS:
             raise UsageError(
                 f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
                 f"{', '.join(sorted(EFFECTS))}"
             )
-        joint = match["joint"]
-        where: JointName | None = int(joint) if joint and joint != SENSOR else joint
-        found.append((option, text, where, match["name"]))
-    return found
-
-
-def _check_given(text: str, name: str, where: JointName | None, joints: Mapping[int, Joint]) -> None:
-    """Refuse an effect that no joint file has: taken as given it would be --without."""
-    asked = [joint for number, joint in joints.items() if where in (None, SENSOR, number)]
-    in_file = any(effect.name == name for joint in asked for effect in joint.effects)
-    if not in_file and not any(parameter.key for parameter in EFFECTS[name].parameters):
-        files = " or ".join(joint.name for joint in asked)
-        raise UsageError(
-            f"--given {text}: found no effect {name} in {files}, expected it under `effects` with its parameters "
-            f"(or --without {text} for an effect that is absent)"
-        )
+        where = match["where"]
+        items.append(_Item(option, text, where if where in (None, SENSOR) else int(where), match["name"]))
+    return items
 
 
 def trusted(items: Iterable[str], joints: Mapping[int, Joint]) -> dict[str, float]:
@@ -117,30 +125,38 @@ def trusted(items: Iterable[str], joints: Mapping[int, Joint]) -> dict[str, floa
     """
     found: dict[str, float] = {}
     for text in items:
-        name, _, asked = text.partition("=")
+        name, _, size = text.partition("=")
         if name not in PRIORS:
             raise UsageError(
                 f"--trust {text}: found {name!r}, expected NAME=SIZE with one of {', '.join(sorted(PRIORS))}"
             )
         if name in found:
             raise UsageError(f"--trust {text}: found {name} twice, expected one size")
-        size = _SIZE.fullmatch(asked.strip())
-        value = _positive(size["value"]) if size else 0.0
-        if size is None or not value:
-            raise UsageError(
-                f"--trust {text}: found {asked!r}, expected a number above 0 with a unit: {_expected(name)}"
-            )
-        found[name] = _factor(text, name, value, size["unit"].strip(), joints)
+        found[name] = _factor(f"--trust {text}", name, size, joints)
     return found
 
 
-def _positive(text: str) -> float:
-    """Return the number, 0 for what is none or not above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        return 0.0
-    return value if 0.0 < value < math.inf else 0.0
+def _factor(item: str, name: str, asked: str, joints: Mapping[int, Joint]) -> float:
+    """Return the factor on the size of a prior that gives the size asked for. Raises UsageError."""
+    prior, own = PRIORS[name], _unit(name)
+    default = _PERCENT.match(prior.text)
+    fitting = " or ".join(filter(None, ("%" if default else "", own)))
+    expected = f"{fitting} (default {prior.text})"
+    size = _SIZE.fullmatch(asked.strip())
+    if size is None or not 0.0 < float(size["value"]) < math.inf:
+        raise UsageError(f"{item}: found {asked!r}, expected a number above 0 with a unit: {expected}")
+    value, unit = float(size["value"]), size["unit"].replace(" ", "")
+    if unit == "%" and default:
+        return value / float(default[1])
+    scale = _PREFIXES.get(unit.removesuffix(own)) if own and unit.endswith(own) else None
+    if scale is None:
+        raise UsageError(f"{item}: found {unit or 'no unit'!r}, expected {expected}")
+    sizes = [prior.size(joint, use) for joint in joints.values() for use in _USAGES]
+    if not sizes or max(sizes) > (1.0 + 1e-9) * min(sizes):
+        raise UsageError(
+            f"{item}: found {unit}, expected %: the default ({prior.text}) is not one size in {own} for these joints"
+        )
+    return value * scale / sizes[0]
 
 
 def _unit(name: str) -> str:
@@ -148,27 +164,3 @@ def _unit(name: str) -> str:
     effect, _, parameter = name.partition(".")
     first, *others = EFFECTS[effect].parameters
     return next((p.unit for p in others if p.name == parameter), first.unit).replace(" ", "")
-
-
-def _expected(name: str) -> str:
-    """Return the units that fit, and the default."""
-    unit = _unit(name)
-    units = [*(["%"] if _PERCENT.match(PRIORS[name].text) else []), *([unit] if unit else [])]
-    return f"{' or '.join(units)} (default {PRIORS[name].text})"
-
-
-def _factor(text: str, name: str, value: float, unit: str, joints: Mapping[int, Joint]) -> float:
-    prior, own = PRIORS[name], _unit(name)
-    default = _PERCENT.match(prior.text)
-    if unit == "%" and default:
-        return value / float(default[1])
-    unit = unit.replace(" ", "")
-    scale = _PREFIXES.get(unit.removesuffix(own)) if own and unit.endswith(own) else None
-    if scale is None:
-        raise UsageError(f"--trust {text}: found {unit or 'no unit'!r}, expected {_expected(name)}")
-    sizes = [prior.size(joint, use) for joint in joints.values() for use in _USAGES]
-    if not sizes or max(sizes) > (1.0 + 1e-9) * min(sizes):
-        raise UsageError(
-            f"--trust {text}: found {unit}, expected %: the default ({prior.text}) is not one size in {own} for these joints"
-        )
-    return value * scale / sizes[0]
