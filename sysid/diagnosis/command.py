@@ -15,15 +15,16 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 from jtqd import __version__
-from jtqd.estimator.command_line import check_installed, make_directory
+from jtqd.estimator.command_line import check_installed, command_parser, make_directory
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.extended_joint import FILE, write_extended
+from jtqd.sysid.diagnosis.extended_joint import FILE, joint_file, write_extended
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT, NO_GAP, Findings, Provenance, to_mapping
 from jtqd.sysid.diagnosis.limits import RELEVANCE
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of, trusted
@@ -33,7 +34,14 @@ from jtqd.sysid.progress import waiting
 from jtqd.sysid.runs.checks import CheckedRuns, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
-from jtqd.sysid.runs.options import UsageError, check_joint_files, joint_files, joints_of, named_joints
+from jtqd.sysid.runs.options import (
+    UsageError,
+    add_runs,
+    check_joint_files,
+    joint_files,
+    joints_of,
+    named_joints,
+)
 from jtqd.sysid.runs.run_file import RunError, RunFile
 
 BY: Final = "jtq diagnose"
@@ -66,19 +74,13 @@ def _main(argv: list[str]) -> int:
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
-        findings = diagnosed(
-            runs,
-            {number: with_limits(joint, options.limits) for number, joint in joints.items()},
-            scope,
-            options.relevance,
-            trust,
-        )
-        experiment = _with_limits_noted(_with_command(options, findings, joints), options, joints)
+        limited = {number: with_limits(joint, options.limits) for number, joint in joints.items()}
+        findings = diagnosed(runs, limited, scope, options.relevance, trust)
         findings = replace(
             findings,
             joint_files=joints,
-            next_experiment=experiment,
-            relevance=RELEVANCE if options.relevance is None else options.relevance,
+            next_experiment=_next_experiment(findings.next_experiment, options, joints),
+            relevance=options.relevance,
             trust=trust,
             provenance=_provenance(argv, runs, files, options.columns),
         )
@@ -92,25 +94,23 @@ def _main(argv: list[str]) -> int:
     except OSError as error:
         print(f"{BY}: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
         return 1
-    print(json.dumps(mapping, indent=1, allow_nan=False) if options.json else _summary(findings))
+    from jtqd.sysid.diagnosis.words import terminal_lines  # scipy, which --help does not need
+
+    print(_json(mapping) if options.json else "\n".join(terminal_lines(findings)))
     print(f"{BY}: wrote {options.out / REPORT}", file=sys.stderr)
     return 0 if findings.verdict == NO_GAP else 3
 
 
-def _summary(findings: Findings) -> str:
-    """Return what the terminal shows."""
-    from jtqd.sysid.diagnosis.words import terminal_lines
-
-    return "\n".join(terminal_lines(findings))
+def _json(mapping: Mapping[str, Any]) -> str:
+    return json.dumps(mapping, indent=1, allow_nan=False)
 
 
 def _own() -> tuple[str, ...]:
     """Return all names that a diagnosis may write."""
     from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
 
-    names = (FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, FILE)
-    of_joints = (name for n in _JOINTS for name in (f"extended.joint{n}.yaml", joint_motion_file(n)))
-    return (*names, *of_joints)
+    of_joints = (name(number) for number in _JOINTS for name in (joint_file, joint_motion_file))
+    return (FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, FILE, *of_joints)
 
 
 def _provenance(
@@ -124,36 +124,34 @@ def _provenance(
     return Provenance(date, __version__, shlex.join([*BY.split(), *argv]), inputs)
 
 
-def _with_command(
-    options: argparse.Namespace, findings: Findings, joints: Mapping[int, Joint]
+def _next_experiment(
+    experiment: Mapping[str, Any] | None, options: argparse.Namespace, joints: Mapping[int, Joint]
 ) -> dict[str, Any] | None:
-    """Return the next experiment with the command that runs it; nothing of ours runs the motion of an arm."""
-    experiment = findings.next_experiment
-    if experiment is None or not experiment.get("plan"):
-        return None if experiment is None else dict(experiment)
+    """Return the next experiment with the command that runs its plan (nothing of ours runs the motion of an arm), and with a
+    sentence where it goes further than --limits, or --limits than the joint files.
+    """
+    if experiment is None:
+        return None
     from jtqd.sysid.diagnosis.next_experiment import CONFIG, PLAN_FILE, campaign_command
 
-    plan = shlex.quote(str(options.out / PLAN_FILE))
-    config = "" if _of_shipped_bench(joints) else CONFIG
-    if options.config is not None:
-        config = shlex.quote(str(options.config))
-    return {**experiment, "command": campaign_command(plan, shlex.quote(options.bus), config)}
-
-
-def _with_limits_noted(
-    experiment: dict[str, Any] | None, options: argparse.Namespace, joints: Mapping[int, Joint]
-) -> dict[str, Any] | None:
-    """Return the next experiment with a sentence where it goes further than --limits, or --limits than the joint files."""
-    if experiment is None or options.limits is None:
-        return experiment
-    wider = {n: text for n, joint in joints.items() if (text := beyond_file(joint, options.limits))}
-    notes = [f"--limits allows more than motion_limits of joint {n}: {text}." for n, text in wider.items()]
-    if experiment.get("plan") and "travel_rad" in options.limits:
+    made, towing = dict(experiment), bool(experiment.get("plan"))
+    if towing:
+        config = "" if _of_shipped_bench(joints) else CONFIG
+        if options.config is not None:
+            config = shlex.quote(str(options.config))
+        plan = shlex.quote(str(options.out / PLAN_FILE))
+        made["command"] = campaign_command(plan, shlex.quote(options.bus), config)
+    notes = []
+    for number, joint in joints.items() if options.limits is not None else ():
+        if wider := beyond_file(joint, options.limits):
+            notes.append(f"--limits allows more than motion_limits of joint {number}: {wider}.")
+    if towing and options.limits is not None and "travel_rad" in options.limits:
         notes.append(
             "travel_rad of --limits is not kept: two joints on one sensor are taken for a towing bench, whose coupling "
             "turns freely; that of the plan's own limits is."
         )
-    return {**experiment, "why": " ".join([experiment["why"], *notes])} if notes else experiment
+    made["why"] = " ".join([made["why"], *notes])
+    return made
 
 
 def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:
@@ -171,8 +169,8 @@ def diagnosed(
     runs: Sequence[RunFile],
     joints: Mapping[int, Joint],
     scope: Scope = EVERYTHING,
-    relevance: float | None = None,
-    trust: Mapping[str, float] | None = None,
+    relevance: float = RELEVANCE,
+    trust: Mapping[str, float] = MappingProxyType({}),
 ) -> Findings:
     """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`."""
     checked = check_runs([(run.name, run.table) for run in runs], joints, scope.known_references)
@@ -181,20 +179,14 @@ def diagnosed(
     reader = [f"{run.name}: {note}" for run in runs for note in run.notes]
     notes = (*checked.refused, *checked.notes, *reader)
     if not checked.runs:
-        return Findings(
-            verdict=INSUFFICIENT,
-            reasons=checked.refused or ("found no run with columns of a joint to diagnose",),
-            runs=tuple(run.name for run in runs),
-            joints=tuple(joints),
-            channel_notes=notes,
-        )
+        reasons = checked.refused or ("found no run with columns of a joint to diagnose",)
+        names = tuple(run.name for run in runs)
+        return Findings(INSUFFICIENT, reasons, names, tuple(joints), channel_notes=notes)
     with waiting(f"diagnosing {counted(len(checked.runs), 'run')}"):
         from jtqd.sysid.diagnosis.diagnose import diagnose
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
-        given: dict[str, Any] = {} if relevance is None else {"relevance": relevance}
-        given |= {"trust": trust} if trust else {}
-        findings = diagnose(checked.runs, left, scope, **given)
+        findings = diagnose(checked.runs, left, scope, relevance=relevance, trust=trust)
     return _with_channels(findings, checked, notes)
 
 
@@ -204,14 +196,8 @@ def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, .
     if findings.verdict == NO_GAP and checked.lost:
         one = len(checked.lost) == 1
         lost = f"joint{'' if one else 's'} {', '.join(map(str, checked.lost))}"
-        return replace(
-            findings,
-            verdict=INSUFFICIENT,
-            reasons=(
-                f"{lost}: no run of {'it' if one else 'them'} can be used, the others have no gap",
-                *checked.refused,
-            ),
-        )
+        reason = f"{lost}: no run of {'it' if one else 'them'} can be used, the others have no gap"
+        return replace(findings, verdict=INSUFFICIENT, reasons=(reason, *checked.refused))
     if findings.verdict == INSUFFICIENT and checked.refused:
         return replace(findings, reasons=(*findings.reasons, *checked.refused))
     return findings
@@ -219,87 +205,73 @@ def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, .
 
 def parser() -> argparse.ArgumentParser:
     """Return the arguments of `jtq diagnose`; nothing that it loads needs scipy."""
-    parser = argparse.ArgumentParser(
-        prog=BY,
-        description="Measure the error of a joint file's simulation on recorded runs and name its cause.\n"
+    parser = command_parser(
+        BY,
+        "Measure the error of a joint file's simulation on recorded runs and name its cause.\n"
         "If the runs cannot distinguish the possible causes, list them and plan the experiment that would.",
-        epilog=(
-            "examples:\n"
-            "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"
-            "  jtq diagnose a.csv b.csv.gz --joint 1=joint1.yaml --joint 2=joint2.yaml --out diagnosis --json\n"
-            "  jtq diagnose rig/*.csv --columns columns.yaml --joint arm.yaml --out diagnosis\n"
-            "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
-            "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
-            f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
-            "DIR/next_experiment.plan.yaml, when there is one, is for `jtq campaign`, DIR/next_experiment.motion.csv\n"
-            "for the controller of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage."
+        "examples:\n"
+        "  jtq diagnose campaigns/validate --joint models/joint1.yaml --out diagnosis\n"
+        "  jtq diagnose a.csv b.csv.gz --joint 1=joint1.yaml --joint 2=joint2.yaml --out diagnosis --json\n"
+        "  jtq diagnose rig/*.csv --columns columns.yaml --joint arm.yaml --out diagnosis\n"
+        "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
+        "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
+        f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
+        "DIR/next_experiment.plan.yaml, when there is one, is for `jtq campaign`, DIR/next_experiment.motion.csv\n"
+        "for the controller of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage.",
+    )
+    add_runs(parser)
+    again: dict[str, Any] = {"action": "append", "default": []}
+    options: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
+        (
+            "--joint",
+            "[N=]FILE",
+            "joint file of all joints, or of joint N; may be given again (default: those that the column map names)",
+            again,
         ),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        ("--out", "DIR", "output directory; created if missing", {"type": Path, "required": True}),
+        ("--columns", "FILE", "column map for other names, units and signs", {"type": Path}),
+        (
+            "--without",
+            "[N=]EFFECT",
+            "an effect that is absent: not looked for (of joint N, or sensor=EFFECT); may be given again",
+            again,
+        ),
+        (
+            "--given",
+            "[N=]EFFECT",
+            "an effect that is known: as the joint file has it, not questioned; may be given again",
+            again,
+        ),
+        (
+            "--trust",
+            "NAME=SIZE",
+            "how far a value may be off, one standard deviation: sensor_gain=5%%, coulomb_friction=2Nm, channel_delay=5ms "
+            "(defaults: priors in the report); may be given again",
+            again,
+        ),
+        (
+            "--limits",
+            "NAME=VALUE,...",
+            "where the next experiment may move: travel_rad=LOW:HIGH, velocity_rad_s, acceleration_rad_s2, torque_nm "
+            "(default: motion_limits of the joint file); never beyond what the runs did",
+            {"type": motion_limits},
+        ),
+        (
+            "--config",
+            "FILE",
+            "configuration of jtqd for the printed command (default: CONFIG, to be replaced; none for the shipped bench)",
+            {"type": Path},
+        ),
+        ("--bus", "BUS", "bus for the printed command (default can0)", {"default": "can0"}),
+        (
+            "--relevance",
+            "PERCENT",
+            "of the rated torque, rms: entries and what remains matter from here on (default 0.5)",
+            {"type": _percent, "default": RELEVANCE},
+        ),
     )
-    parser.add_argument(
-        "runs",
-        nargs="+",
-        type=Path,
-        metavar="RUN",
-        help="run files (.csv, .csv.gz, .parquet, .mcap) or directories of them",
-    )
-    parser.add_argument(
-        "--joint",
-        action="append",
-        default=[],
-        metavar="[N=]FILE",
-        help="joint file of all joints, or of joint N; may be given again (default: those that the column map names)",
-    )
-    parser.add_argument(
-        "--out", type=Path, required=True, metavar="DIR", help="output directory; created if missing"
-    )
-    parser.add_argument(
-        "--columns", type=Path, metavar="FILE", help="column map for other names, units and signs"
-    )
-    parser.add_argument(
-        "--without",
-        action="append",
-        default=[],
-        metavar="[N=]EFFECT",
-        help="an effect that is absent: not looked for (of joint N, or sensor=EFFECT); may be given again",
-    )
-    parser.add_argument(
-        "--given",
-        action="append",
-        default=[],
-        metavar="[N=]EFFECT",
-        help="an effect that is known: as the joint file has it, not questioned; may be given again",
-    )
-    parser.add_argument(
-        "--trust",
-        action="append",
-        default=[],
-        metavar="NAME=SIZE",
-        help="how far a value may be off, one standard deviation: sensor_gain=5%%, coulomb_friction=2Nm, channel_delay=5ms "
-        "(defaults: priors in the report); may be given again",
-    )
-    parser.add_argument(
-        "--limits",
-        type=motion_limits,
-        metavar="NAME=VALUE,...",
-        help="where the next experiment may move: travel_rad=LOW:HIGH, velocity_rad_s, acceleration_rad_s2, torque_nm "
-        "(default: motion_limits of the joint file); never beyond what the runs did",
-    )
-    parser.add_argument(
-        "--config",
-        type=Path,
-        metavar="FILE",
-        help="configuration of jtqd for the printed command (default: CONFIG, to be replaced; none for the shipped bench)",
-    )
-    parser.add_argument(
-        "--bus", default="can0", metavar="BUS", help="bus for the printed command (default can0)"
-    )
-    parser.add_argument(
-        "--relevance",
-        type=_percent,
-        metavar="PERCENT",
-        help="of the rated torque, rms: entries and what remains matter from here on (default 0.5)",
-    )
+    for name, metavar, text, more in options:
+        parser.add_argument(name, metavar=metavar, help=text, **more)
     parser.add_argument(
         "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
     )
@@ -347,26 +319,21 @@ def _write(
     from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
     from jtqd.sysid.diagnosis.report import render
 
-    date = findings.provenance.date if findings.provenance else ""
+    origin = {"sha256": sha256, "date": findings.provenance.date if findings.provenance else ""}
+    experiment = findings.next_experiment or {}
+    texts = {joint_motion_file(n): text for n, text in (experiment.get("tables") or {}).items()}
+    if experiment.get("table"):
+        texts[MOTION_FILE] = experiment["table"]
+    if experiment.get("plan"):
+        texts[PLAN_FILE] = Plan.from_mapping(experiment["plan"], PLAN_FILE).to_yaml()
+    texts[REPORT] = render(findings)
     with tempfile.TemporaryDirectory(prefix=".diagnosis.", dir=directory) as made:
         fresh = Path(made)
-        names = write_extended(fresh, joints, findings, sha256=sha256, date=date)
-        experiment = findings.next_experiment
-        tables = {joint_motion_file(n): text for n, text in ((experiment or {}).get("tables") or {}).items()}
-        if experiment and experiment.get("table"):
-            tables[MOTION_FILE] = experiment["table"]
-        for name, text in tables.items():
-            names.append(name)
-            (fresh / name).write_text(text, encoding="utf-8")
-        if experiment and experiment.get("plan"):
-            names.append(PLAN_FILE)
-            plan = Plan.from_mapping(experiment["plan"], PLAN_FILE)
-            (fresh / PLAN_FILE).write_text(plan.to_yaml(), encoding="utf-8")
-        names.append(REPORT)
-        (fresh / REPORT).write_text(render(findings), encoding="utf-8")
+        names = [*write_extended(fresh, joints, findings, **origin), *texts]
         mapping = to_mapping(findings, sha256=sha256, files=names)
-        text = json.dumps(mapping, indent=1, allow_nan=False)
-        (fresh / FINDINGS).write_text(f"{text}\n", encoding="utf-8")
+        texts[FINDINGS] = f"{_json(mapping)}\n"
+        for name, text in texts.items():
+            (fresh / name).write_text(text, encoding="utf-8")
         for name in _own():
             (directory / name).unlink(missing_ok=True)
         for name in (*names, FINDINGS):

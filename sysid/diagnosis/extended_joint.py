@@ -8,14 +8,14 @@ file again does not add the same thing twice. Effects of the torque sensor go in
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Value, shows_at
+from jtqd.sysid.diagnosis.findings import Cause, Findings, shows_at
 from jtqd.sysid.fit.joint_writer import write_joint
 
 FILE: Final = "extended.joint.yaml"
@@ -23,15 +23,7 @@ _DIGITS: Final = 7
 """Significant digits of a written value; no interval is a millionth of it."""
 
 
-def extended(
-    joint: Joint,
-    number: int,
-    findings: Findings,
-    *,
-    sha256: Mapping[str, str],
-    date: str,
-    by: str = "jtq diagnose",
-) -> Joint:
+def extended(joint: Joint, number: int, findings: Findings, *, sha256: Mapping[str, str], date: str) -> Joint:
     """Return the joint with what predicts: values of the file replaced, effects of joint `number` and of the sensor among
     its effects, which are relative to the values replaced.
 
@@ -46,7 +38,7 @@ def extended(
     replaced = {p.name for p in found}
     effects = [effect for effect in joint.effects if effect.name not in replaced]
     effects += [Effect(p.name, {name: _rounded(value) for name, value in p.values.items()}) for p in found]
-    record: dict[str, Any] = {"by": by, "date": date, "verdict": findings.verdict}
+    record: dict[str, Any] = {"by": "jtq diagnose", "date": date, "verdict": findings.verdict}
     if causes:
         record["effects"] = [_record(cause) for cause in causes]
     only = replaced - {cause.name for cause in causes}
@@ -54,14 +46,16 @@ def extended(
         record["better_prediction_only"] = sorted(only)
     gain = findings.gain
     if causes and gain is not None and math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
-        record["gain"] = {
-            "rmse_before_nm": _rounded(gain.rmse_before_nm),
-            "rmse_after_nm": _rounded(gain.rmse_after_nm),
-            "split": gain.split,
-        }
+        before, after = _rounded(gain.rmse_before_nm), _rounded(gain.rmse_after_nm)
+        record["gain"] = {"rmse_before_nm": before, "rmse_after_nm": after, "split": gain.split}
     record["sha256"] = {name: sha256[name] for name in findings.used_runs if name in sha256}
     whole = replace(joint, effects=tuple(effects), provenance={**joint.provenance, "diagnosis": record})
     return with_effects_applied(whole)
+
+
+def joint_file(number: int) -> str:
+    """Return the name of the extended file of a joint where there are several."""
+    return f"extended.joint{number}.yaml"
 
 
 def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
@@ -70,12 +64,9 @@ def files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
     extended.joint.yaml is the joint of the largest cause (a cause of the sensor is in every file, so the next one
     decides; then the joint of the largest gap, then the first). With more joints than one each has its own file as well.
     """
-    numbers = sorted(joints)
-    first = _first(numbers, findings)
-    names = {FILE: first}
-    if len(numbers) > 1:
-        names |= {f"extended.joint{number}.yaml": number for number in numbers}
-    return names
+    largest_first = [*(c.joint for c in findings.causes), *(g.joint for g in findings.gaps), *sorted(joints)]
+    first = next(int(number) for number in largest_first if number in joints)
+    return {FILE: first} | {joint_file(number): number for number in sorted(joints) if len(joints) > 1}
 
 
 def title(number: int, findings: Findings) -> str:
@@ -99,22 +90,16 @@ def write_extended(
     return list(names)
 
 
-def _first(numbers: Sequence[int], findings: Findings) -> int:
-    named = [cause.joint for cause in findings.causes] + [gap.joint for gap in findings.gaps]
-    return next((int(number) for number in named if number in numbers), numbers[0])
-
-
 def _record(cause: Cause) -> dict[str, Any]:
+    """Return a cause for the provenance; an end of an interval that is none is None: NaN would not read back as itself."""
     record: dict[str, Any] = {"name": cause.name, "joint": cause.joint, "grade": cause.grade}
     if len(cause.names) > 1:
         record["cannot_be_told_from"] = [name for name in cause.names if name != cause.name]
-    record["ci95"] = {name: _interval(each) for name, each in cause.parameters.items()}
+    record["ci95"] = {
+        name: [_rounded(end) if math.isfinite(end) else None for end in value.ci95]
+        for name, value in cause.parameters.items()
+    }
     return record
-
-
-def _interval(value: Value) -> list[float | None]:
-    """Both ends, None where there is none: NaN would not read back as itself."""
-    return [_rounded(end) if math.isfinite(end) else None for end in value.ci95]
 
 
 def _rounded(value: float) -> float:
@@ -137,13 +122,13 @@ def with_effects_applied(joint: Joint) -> Joint:
             kept.append(item)
             continue
         for name, value in item.parameters.items():
-            joint = _with_value(joint, keys[name].split("."), value)
+            joint = _with_value(joint, keys[name], value)
     return replace(joint, effects=tuple(kept))
 
 
-def _with_value(joint: Joint, path: list[str], value: float) -> Joint:
-    if len(path) == 1:
-        changed: dict[str, Any] = {path[0]: value}
-        return replace(joint, **changed)
-    inner: dict[str, Any] = {path[1]: value}
-    return replace(joint, friction=replace(joint.friction, **inner))
+def _with_value(joint: Joint, key: str, value: float) -> Joint:
+    section, _, name = key.rpartition(".")
+    changed: dict[str, Any] = {name: value}
+    if section:
+        return replace(joint, friction=replace(joint.friction, **changed))
+    return replace(joint, **changed)
