@@ -23,6 +23,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from jtqd.estimator.command_line import check_output, command_parser, write_whole
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint
@@ -74,8 +75,6 @@ class JointModel:
 
 def model_of(joint: Joint) -> JointModel:
     """Return the joint with its effects as far as other simulators can express it."""
-    from jtqd.sysid.diagnosis.extended_joint import with_effects_applied  # scipy, which --help does not need
-
     plain = with_effects_applied(joint)
     coulomb, viscous, left_out = _friction(plain)
     for effect in plain.effects:

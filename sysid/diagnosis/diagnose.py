@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import (
@@ -26,7 +27,6 @@ from jtqd.sysid.diagnosis.dataset import (
     too_little,
     usable_signals,
 )
-from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,

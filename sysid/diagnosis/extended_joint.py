@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.sysid.diagnosis.findings import Cause, Findings, shows_at
 from jtqd.sysid.fit.joint_writer import write_joint
@@ -104,31 +104,3 @@ def _record(cause: Cause) -> dict[str, Any]:
 
 def _rounded(value: float) -> float:
     return float(f"{float(value):.{_DIGITS}g}")
-
-
-def with_effects_applied(joint: Joint) -> Joint:
-    """Return the joint with every effect put into the file's values where all its given parameters have a key for it: the
-    same joint in other words.
-
-    With an efficiency in the file the losses are the table's: there another friction or torque constant in the file is not
-    the effect that bears its name, which is what is lost beside the table. Such an effect stays an effect.
-    """
-    kept = []
-    for item in joint.effects:
-        effect = EFFECTS[item.name]
-        keys = {p.name: p.key for p in effect.parameters}
-        beside_table = joint.efficiency is not None and "loss_nm" in effect.hooks and not effect.changes_joint
-        if beside_table or not all(keys[name] for name in item.parameters):
-            kept.append(item)
-            continue
-        for name, value in item.parameters.items():
-            joint = _with_value(joint, keys[name], value)
-    return replace(joint, effects=tuple(kept))
-
-
-def _with_value(joint: Joint, key: str, value: float) -> Joint:
-    section, _, name = key.rpartition(".")
-    changed: dict[str, Any] = {name: value}
-    if section:
-        return replace(joint, friction=replace(joint.friction, **changed))
-    return replace(joint, **changed)

@@ -15,11 +15,11 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect
 from jtqd.estimator.joint import Effect as EffectOfFile
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import Entry
-from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.regressors import RunData, binned, contribution, fields_used
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals

@@ -26,6 +26,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import command_parser
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.effects.effect import MOTOR as BALANCE_MOTOR
 from jtqd.estimator.effects.effect import TORSION as BALANCE_TORSION
 from jtqd.estimator.errors import ConfigError
@@ -113,7 +114,6 @@ def errors_on(
     Raises SignalsError for a run without what a simulation needs, ConfigError for a joint file that an estimator refuses.
     """
     from jtqd.sysid.diagnosis.dataset import without_known_effects
-    from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
     from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
     from jtqd.sysid.diagnosis.signals import BaseLoss, about_zero, joint_signals
     from jtqd.sysid.score.free_run import free_run

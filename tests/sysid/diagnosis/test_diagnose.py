@@ -7,13 +7,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import dataset
 from jtqd.sysid.diagnosis import diagnose as module
 from jtqd.sysid.diagnosis.diagnose import combined, diagnose, one_sensor
-from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import State
 from jtqd.estimator.joint import Effect, Joint
@@ -16,7 +17,6 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.extended_joint import with_effects_applied
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, SignalsError, about_zero, joint_signals
 from jtqd.sysid.diagnosis.smoothing import second_difference, smooth
