@@ -26,7 +26,7 @@ from jtqd.sysid.planner.campaigns import allowed_torque, missing_limits
 from jtqd.sysid.planner.experiments import (
     EXPERIMENTS,
     JointRange,
-    Motion,
+    csv_text,
     joint_motions,
     pair_range_of,
     pair_runs,
@@ -269,12 +269,3 @@ def _calm_stretch(
 def joint_motion_file(number: int) -> str:
     """Return the name of the motion of a joint where several have one."""
     return f"next_experiment.joint{number}.motion.csv"
-
-
-def csv_text(made: Sequence[Motion]) -> str:
-    """Return all runs as one CSV table at RATE_HZ: run, time_s, position_rad, velocity_rad_s, joint side."""
-    lines = ["run,time_s,position_rad,velocity_rad_s"]
-    for motion in made:
-        rows = zip(motion.time_s, motion.position_rad, motion.velocity_rad_s, strict=True)
-        lines += [f"{motion.name},{t:.2f},{q:.6f},{v:.6f}" for t, q, v in rows]
-    return "\n".join(lines) + "\n"

@@ -543,3 +543,12 @@ def joint_motions(kinds: Iterable[str], joint: JointRange) -> list[Motion]:
         for kind in kinds
         for name, (what, moves) in EXPERIMENTS[kind].joint(joint).items()
     ]
+
+
+def csv_text(made: Sequence[Motion]) -> str:
+    """Return all runs as one CSV table at RATE_HZ: run, time_s, position_rad, velocity_rad_s, joint side."""
+    lines = ["run,time_s,position_rad,velocity_rad_s"]
+    for motion in made:
+        rows = zip(motion.time_s, motion.position_rad, motion.velocity_rad_s, strict=True)
+        lines += [f"{motion.name},{t:.2f},{q:.6f},{v:.6f}" for t, q, v in rows]
+    return "\n".join(lines) + "\n"

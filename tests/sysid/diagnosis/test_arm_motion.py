@@ -9,9 +9,9 @@ from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.next_experiment import csv_text, each_joint, joint_range_of, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import each_joint, joint_range_of, next_experiment
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
-from jtqd.sysid.planner.experiments import EXPERIMENTS, RATE_HZ, JointRange, joint_motions
+from jtqd.sysid.planner.experiments import EXPERIMENTS, RATE_HZ, JointRange, csv_text, joint_motions
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
 JOINT = load_joint(shipped("joint1.yaml"))
