@@ -29,12 +29,11 @@ from jtqd.sysid.diagnosis.findings import (
     JointName,
     Place,
     Provenance,
-    Value,
     file_values,
     priors,
 )
 from jtqd.sysid.planner.experiments import EXPERIMENTS
-from jtqd.sysid.report.numbers import unit_name
+from jtqd.sysid.report.numbers import pair, rounded, short, unit_name, with_interval
 
 BADGES: Final = {
     NO_GAP: ("good", "no gap"),
@@ -58,7 +57,6 @@ _PROPER: Final = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
 _UNIT_ENDING: Final = re.compile(
     r"_(nms_per_rad|nm_per_(rad3|rad|a|s)|per_k_nm|rad_s|kgm2|nm|rad|per_motor_rev|a|s|c)$"
 )
-_PREFIXED: Final = ("rad", "s", "A")
 
 
 class Row(NamedTuple):
@@ -198,18 +196,22 @@ def _gain(gain: Gain | None) -> str:
         return f"the extended model errs by {short(after)} Nm on held-out runs, no less than the joint file"
     old, new = short(before), short(after)
     if old == new:
-        old, new = _pair(before, after)
+        old, new = pair(before, after)
     return f"the extended model errs by {new} instead of {old} Nm on held-out runs"
 
 
 def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
-    lead = cause.leading
-    found, interval = quantity(cause.parameters[lead], in_file(cause, files)) if lead else ("", "")
-    more = [
-        f"{parameter_title(name)} {_rounded(value) if value.fitted else _given(value)}"
-        for name, value in cause.parameters.items()
-        if name not in {lead, "channel"}
-    ]
+    found = interval = ""
+    if cause.leading:
+        value = cause.parameters[cause.leading]
+        found, interval = with_interval(value.value, value.ci95, value.unit, in_file(cause, files))
+    more = []
+    for name, value in cause.parameters.items():
+        if name not in {cause.leading, "channel"}:
+            given = f"{value.value:g} {unit_name(value.unit)}".rstrip()
+            more.append(
+                f"{parameter_title(name)} {rounded(value.value, value.unit) if value.fitted else given}"
+            )
     title, share = effect_title(cause.name), _share_text(cause)
     return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
 
@@ -220,70 +222,12 @@ def in_file(cause: Cause, files: Mapping[int, Joint]) -> float | None:
     return known.value if known is not None and (known.key or known.value) else None
 
 
-def quantity(value: Value, old: float | None) -> tuple[str, str]:
-    """Return "4.00 -> 5.30 Nm" and its interval, or "5.30 Nm" where the file has no value, all with one power of ten and as
-    many places, by two digits of half the interval's width; "" without an interval.
-    """
-    low, high = value.ci95
-    ends = [low, high] if math.isfinite(low + high) and high > low else []
-    factor, unit, power = _scale(value.unit, max(abs(x) for x in (value.value, *ends, old or 0.0)))
-    half = 0.5 * (high - low) * factor if ends else 0.0
-    places = 1 - _order(half) if half else 2 - _order(value.value * factor)
-    least = 0.5 * 10.0**-places if half else 0.0
-    texts = [_at(x * factor if abs(x * factor) > least else 0.0, places, power) for x in (value.value, *ends)]
-    before = "" if old is None else _at(old * factor, places, power)
-    return f"{_joined(' -> ', before, texts[0])} {unit}".rstrip(), f"[{', '.join(texts[1:])}]" if ends else ""
-
-
 def _size(cause: Cause, files: Mapping[int, Joint]) -> str:
     """Return the leading parameter of a cause, rounded; "" without a parameter."""
-    return _rounded(cause.parameters[cause.leading], in_file(cause, files)) if cause.leading else ""
-
-
-def _rounded(value: Value, old: float | None = None) -> str:
-    """Return "4.0 -> 5.3 Nm", or "5.3 Nm" where the file has no value."""
-    factor, unit, power = _scale(value.unit, max(abs(value.value), abs(old or 0.0)))
-    new = value.value * factor
-    if old is None:
-        return f"{_at(new, 1 - _order(new), power)} {unit}".rstrip()
-    return f"{' -> '.join(_pair(old * factor, new, power))} {unit}".rstrip()
-
-
-def _given(value: Value) -> str:
-    """Return a value that was not fitted."""
-    return f"{value.value:g} {unit_name(value.unit)}".rstrip()
-
-
-def _scale(unit: str, size: float) -> tuple[float, str, str]:
-    """Return factor, unit and power of ten, as text, of a handy number."""
-    if unit in _PREFIXED and 0.0 < size < 0.1:
-        return (1e6, f"µ{unit}", "") if size < 1e-3 else (1e3, f"m{unit}", "")
-    if size and not 1e-3 <= size < 1e5:
-        return 10.0 ** -_order(size), unit_name(unit), f"e{_order(size):+03d}"
-    return 1.0, unit_name(unit), ""
-
-
-def _at(x: float, places: int, power: str = "") -> str:
-    """Return x with decimal places; one digit at least of what is not zero."""
-    if x and abs(x) < 0.5 * 10.0 ** -max(places, 0):
-        places = -_order(x)
-    return f"{x:.{min(max(places, 0), 9)}f}{power}" if x else "0"
-
-
-def _order(x: float) -> int:
-    return math.floor(math.log10(abs(x)) + 1e-9) if x else 0
-
-
-def short(x: float) -> str:
-    """Return x with two digits."""
-    return _at(x, 1 - _order(x)) if math.isfinite(x) else "-"
-
-
-def _pair(old: float, new: float, power: str = "") -> tuple[str, str]:
-    """Return two values with as many places as it takes to see the difference."""
-    apart = -_order(new - old) if new != old else 0
-    places = max(1 - _order(max(abs(old), abs(new))), apart)
-    return _at(old, places, power), _at(new, places, power)
+    if not cause.leading:
+        return ""
+    value = cause.parameters[cause.leading]
+    return rounded(value.value, value.unit, in_file(cause, files))
 
 
 def _share(cause: Cause) -> float:
