@@ -7,12 +7,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
-from jtqd.estimator.text import counted, table_lines
+from jtqd.estimator.text import counted, finite, table_lines
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -76,22 +75,15 @@ class Row(NamedTuple):
 HEADS: Final = Row("place", "entry", "file -> found", "95 % interval", "share", "grade")
 
 
-@dataclass(frozen=True)
-class Summary:
-    """All that is shown before the first picture. headline: at most two sentences; also: entries that have no row; small:
-    those too small to matter; foot: what grades rest on; texts are "" where there is nothing to state.
+class Summary(NamedTuple):
+    """All that is shown before the first picture. headline: at most two sentences; lines: texts by their titles, "" where
+    there is nothing to state.
     """
 
     headline: tuple[str, ...]
     notes: tuple[str, ...]
     rows: tuple[Row, ...]
-    also: str
-    small: str
-    foot: str
-    remains: str
-    next: str
-    command: str
-    untold: str
+    lines: Mapping[str, str]
 
 
 def summary(findings: Findings) -> Summary:
@@ -101,18 +93,17 @@ def summary(findings: Findings) -> Summary:
     experiment = findings.next_experiment or {}
     reasons = findings.reasons if findings.verdict == UNEXPLAINED else ()
     reasons = findings.reasons[1:] if findings.verdict == INSUFFICIENT else reasons
-    return Summary(
-        headline(findings),
-        (*map(in_words, reasons), *(f"outlier run: {odd.text}" for odd in findings.outlier_runs)),
-        tuple(_row(c, files) for c in causes[:MOST_ROWS]),
-        ", ".join(f"{_of(c)} {_size(c, files)} ({_grade(c)})" for c in causes[MOST_ROWS:]),
-        ", ".join(f"{_of(c)} {_size(c, files)}" for c in small),
-        _foot(causes, findings),
-        _remains(findings),
-        _next(str(experiment.get("why", ""))),
-        str(experiment.get("command") or ""),
-        _untold(findings),
-    )
+    lines = {
+        "also": ", ".join(f"{_of(c)} {_size(c, files)} ({_grade(c)})" for c in causes[MOST_ROWS:]),
+        "too small to matter": ", ".join(f"{_of(c)} {_size(c, files)}" for c in small),
+        "grades": _grades(causes, findings),
+        "remains": _remains(findings),
+        "measure next": _next(str(experiment.get("why", ""))),
+        "run it": str(experiment.get("command") or ""),
+        "these runs cannot tell": _untold(findings),
+    }
+    notes = (*map(in_words, reasons), *(f"outlier run: {odd.text}" for odd in findings.outlier_runs))
+    return Summary(headline(findings), notes, tuple(_row(c, files) for c in causes[:MOST_ROWS]), lines)
 
 
 def terminal_lines(findings: Findings) -> list[str]:
@@ -122,17 +113,8 @@ def terminal_lines(findings: Findings) -> list[str]:
     if s.rows:
         table = [HEADS, *(r._replace(grade=f"{r.grade} ({r.more})" if r.more else r.grade) for r in s.rows)]
         lines += [f"  {line}" for line in table_lines([row[:-1] for row in table], range(6))]
-    named = (
-        ("also", s.also),
-        ("too small to matter", s.small),
-        ("", s.foot),
-        ("remains", s.remains),
-        ("measure next", s.next),
-        ("run it", s.command),
-        ("these runs cannot tell", s.untold),
-        ("", provenance_text(findings.provenance)),
-    )
-    lines += [f"{name}: {text}" if name else text for name, text in named if text]
+    lines += [text if name == "grades" else f"{name}: {text}" for name, text in s.lines.items() if text]
+    lines += [provenance_text(findings.provenance)] if findings.provenance else []
     return [line.replace("\u00a0", " ") for line in lines]
 
 
@@ -147,7 +129,9 @@ def provenance_text(made: Provenance | None, most: int = MOST_INPUTS) -> str:
 
 def by_size(findings: Findings) -> tuple[list[Cause], list[Cause]]:
     """Return the entries that matter, by their share, and those too small to matter, by their size."""
-    causes = sorted((c for c in findings.causes if c.matters), key=lambda c: -_share(c))
+    causes = sorted(
+        (c for c in findings.causes if c.matters), key=lambda c: -(finite(c.explained_share) or 0.0)
+    )
     small = [*(c for c in findings.causes if not c.matters), *findings.too_small]
     return causes, sorted(small, key=lambda c: -c.rms_nm)
 
@@ -174,7 +158,7 @@ def headline(findings: Findings) -> tuple[str, ...]:
 
 
 def _headline_causes(causes: Sequence[Cause], files: Mapping[int, Joint]) -> str:
-    first, share, size = causes[0], _share_text(causes[0]), _size(causes[0], files)
+    first, share, size = causes[0], _percent(causes[0].explained_share), _size(causes[0], files)
     names = listed([_of(first), *(_rival(name, first.joint) for name in first.rivals[:2])], "or")
     text = f"{_capital(names)} explains {f'{share} of ' if share else ''}the gap"
     if first.grade != ONE_OF:
@@ -183,7 +167,7 @@ def _headline_causes(causes: Sequence[Cause], files: Mapping[int, Joint]) -> str
         text += f" ({size} if it is {effect_title(first.name)})"
     if len(causes) > 1:
         more = len(causes) - 2
-        text += f"; {_joined(' ', _of(causes[1]), _share_text(causes[1]))} ({_grade(causes[1])})"
+        text += f"; {_joined(' ', _of(causes[1]), _percent(causes[1].explained_share))} ({_grade(causes[1])})"
         text += f" and {counted(more, 'smaller entry', 'smaller entries')}" if more else ""
     return f"{text}."
 
@@ -212,7 +196,7 @@ def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
             more.append(
                 f"{parameter_title(name)} {rounded(value.value, value.unit) if value.fitted else given}"
             )
-    title, share = effect_title(cause.name), _share_text(cause)
+    title, share = effect_title(cause.name), _percent(cause.explained_share)
     return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
 
 
@@ -228,14 +212,6 @@ def _size(cause: Cause, files: Mapping[int, Joint]) -> str:
         return ""
     value = cause.parameters[cause.leading]
     return rounded(value.value, value.unit, in_file(cause, files))
-
-
-def _share(cause: Cause) -> float:
-    return cause.explained_share if math.isfinite(cause.explained_share) else 0.0
-
-
-def _share_text(cause: Cause) -> str:
-    return _percent(cause.explained_share)
 
 
 def _percent(share: float) -> str:
@@ -259,7 +235,7 @@ def _rival(name: str, joint: JointName) -> str:
     return words if joint == SENSOR else f"its {words}"
 
 
-def _foot(causes: Sequence[Cause], findings: Findings) -> str:
+def _grades(causes: Sequence[Cause], findings: Findings) -> str:
     """Return what the grades in the table mean, and the priors that a certain entry rests on."""
     grades = {c.grade for c in causes}
     texts = []

@@ -54,7 +54,7 @@ def with_unit(value: float, unit: str, digits: int = 3) -> str:
 def with_interval(
     value: float, ci95: tuple[float, float], unit: str, before: float | None = None
 ) -> tuple[str, str]:
-    """Return value and 95 % interval for page and terminal, e.g. ("4.00 -> 5.30 Nm", "[5.20, 5.40]"); "" without an interval.
+    """Return value and 95 % interval for page and terminal, e.g. ("4.00 -> 5.30 Nm", "[5.20, 5.40]"); "" without one.
 
     before: the same quantity before, None without one. All have one power of ten and as many places, by two digits of half
     the interval's width.

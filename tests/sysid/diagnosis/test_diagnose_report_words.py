@@ -70,7 +70,7 @@ def test_a_person_reads_few_lines_and_no_evidence(make: Callable[[], Findings]) 
     s, lines = summary(found), terminal_lines(found)
     assert 1 <= len(s.headline) <= 2
     assert all(sentence.endswith(".") for sentence in s.headline)
-    shown = [*s.headline, *s.rows, s.also, s.small, s.foot, s.remains, s.next, s.untold]
+    shown = [*s.headline, *s.rows, *(text for name, text in s.lines.items() if name != "run it")]
     assert sum(1 for each in shown if each) <= 10  # with badge and head of the table 12
     assert not re.search(r"\b(nan|inf|None|BIC)\b", "\n".join(lines))
     for cause in found.causes:
@@ -137,7 +137,7 @@ def test_one_of_several_is_named_with_its_rivals() -> None:
     assert "(0.21 kg m² if it is link inertia)" in first
     assert "; viscous friction of joint 1 91 % (certain)." in first
     assert summary(found).rows[0].grade == "one of 3: or its channel delay, sensor offset"
-    assert "one of:" in summary(found).foot
+    assert "one of:" in summary(found).lines["grades"]
 
 
 def test_entries_without_a_row_are_listed_and_counted() -> None:
@@ -146,7 +146,9 @@ def test_entries_without_a_row_are_listed_and_counted() -> None:
     found = replace(base, causes=causes, joints=tuple(range(1, 7)))
     s = summary(found)
     assert [row.place for row in s.rows] == [f"joint {k}" for k in range(1, MOST_ROWS + 1)]
-    assert all(f"torque ripple of joint {k} 0.42 Nm (certain)" in s.also for k in range(MOST_ROWS + 1, 7))
+    assert all(
+        f"torque ripple of joint {k} 0.42 Nm (certain)" in s.lines["also"] for k in range(MOST_ROWS + 1, 7)
+    )
     assert "and 4 smaller entries." in s.headline[0]
 
 
@@ -155,7 +157,9 @@ def test_an_entry_below_the_relevance_has_no_row() -> None:
     small = replace(base.causes[0], joint=2, rms_nm=0.05, matters=False)
     s = summary(replace(base, causes=(*base.causes, small)))
     assert [row.place for row in s.rows] == ["joint 1"]
-    assert s.small == "torque ripple of joint 2 0.42 Nm, current offset of joint 1 12 mA"
+    assert (
+        s.lines["too small to matter"] == "torque ripple of joint 2 0.42 Nm, current offset of joint 1 12 mA"
+    )
     assert "joint 2" not in s.headline[0]
 
 
@@ -167,10 +171,10 @@ def test_unexplained_has_entries_and_gain_first_then_what_remains() -> None:
     assert second == (
         "The extended model errs by 0.15 instead of 0.34 Nm on held-out runs, but 0.61 Nm rms at joint 1 remain unexplained."
     )
-    assert summary(found).remains.endswith("it matters from 0.20 Nm")
+    assert summary(found).lines["remains"].endswith("it matters from 0.20 Nm")
     assert (
-        "21 % of it at motor angle" in summary(found).remains
-        or "22 % of it at motor angle" in summary(found).remains
+        "21 % of it at motor angle" in summary(found).lines["remains"]
+        or "22 % of it at motor angle" in summary(found).lines["remains"]
     )
     assert headline(replace(found, gain=None))[1] == "0.61 Nm rms at joint 1 remain unexplained."
     assert headline(examples.unexplained())[0].startswith(
@@ -199,10 +203,10 @@ def test_a_gain_that_is_a_loss_is_stated_as_one() -> None:
 
 def test_the_priors_that_a_certain_entry_rests_on_are_stated_as_set() -> None:
     found = examples.sensor()
-    assert "sensor gain ± 1 %" in summary(found).foot
-    assert "torque constant ± 10 %" in summary(found).foot  # what it would otherwise be
+    assert "sensor gain ± 1 %" in summary(found).lines["grades"]
+    assert "torque constant ± 10 %" in summary(found).lines["grades"]  # what it would otherwise be
     set_ = replace(found, trust={"sensor_gain": 5.0})
-    assert "sensor gain ± 5 % (as set)" in summary(set_).foot
+    assert "sensor gain ± 5 % (as set)" in summary(set_).lines["grades"]
     rows = {row.name: row for row in priors(set_.trust)}
     assert (rows["sensor_gain"].size, rows["sensor_gain"].set_by_user) == ("5 %", True)
     assert (rows["torque_constant"].size, rows["torque_constant"].set_by_user) == ("10 %", False)
@@ -218,7 +222,7 @@ def test_what_these_runs_cannot_tell_is_grouped_by_the_motion_that_would() -> No
         Untold("hysteresis", 2, "w", "load_ramp"),
         Untold("sensor_drift", "sensor", "w", "warm_up"),
     )
-    text = summary(replace(examples.two_causes(), cannot_be_told=lost)).untold
+    text = summary(replace(examples.two_causes(), cannot_be_told=lost)).lines["these runs cannot tell"]
     assert text == (
         "lost motion of joints 1 and 2, hysteresis of joint 2 (would take load ramp); sensor drift (would take warm up)"
     )
@@ -243,7 +247,10 @@ def test_the_kinds_of_motion_of_the_next_experiment_come_first() -> None:
     found = replace(
         examples.two_causes(), next_experiment={"why": why, "plan": None, "command": "jtq campaign p"}
     )
-    assert summary(found).next == "full turns and zero reading, because unbalance and sensor offset fit alike"
+    assert (
+        summary(found).lines["measure next"]
+        == "full turns and zero reading, because unbalance and sensor offset fit alike"
+    )
     assert "run it: jtq campaign p" in terminal_lines(found)
 
 
