@@ -142,10 +142,11 @@ def _next_experiment(
         plan = shlex.quote(str(options.out / PLAN_FILE))
         made["command"] = campaign_command(plan, shlex.quote(options.bus), config)
     notes = []
-    for number, joint in joints.items() if options.limits is not None else ():
-        if wider := beyond_file(joint, options.limits):
+    for number, joint in joints.items():
+        wider = beyond_file(joint, options.limits)
+        if wider:
             notes.append(f"--limits allows more than motion_limits of joint {number}: {wider}.")
-    if towing and options.limits is not None and "travel_rad" in options.limits:
+    if towing and "travel_rad" in (options.limits or {}):
         notes.append(
             "travel_rad of --limits is not kept: two joints on one sensor are taken for a towing bench, whose coupling "
             "turns freely; that of the plan's own limits is."
@@ -316,14 +317,12 @@ def _write(
     They are made in a directory beside first: what fails on the way leaves the earlier results as they were. Then what
     an earlier diagnosis wrote goes, so that no plan or joint file of it stays beside the new findings.
     """
-    from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
+    from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, motions_of
     from jtqd.sysid.diagnosis.report import render
 
     origin = {"sha256": sha256, "date": findings.provenance.date if findings.provenance else ""}
     experiment = findings.next_experiment or {}
-    texts = {joint_motion_file(n): text for n, text in (experiment.get("tables") or {}).items()}
-    if experiment.get("table"):
-        texts[MOTION_FILE] = experiment["table"]
+    texts = {file: table for file, (_, table) in motions_of(experiment).items()}
     if experiment.get("plan"):
         texts[PLAN_FILE] = Plan.from_mapping(experiment["plan"], PLAN_FILE).to_yaml()
     texts[REPORT] = render(findings)

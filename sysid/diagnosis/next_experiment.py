@@ -269,3 +269,14 @@ def _calm_stretch(
 def joint_motion_file(number: int) -> str:
     """Return the name of the motion of a joint where several have one."""
     return f"next_experiment.joint{number}.motion.csv"
+
+
+def motions_of(experiment: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], str]]:
+    """Return each motion of an experiment and its table by the name of its file."""
+    tables = experiment.get("tables") or {}
+    made = [(MOTION_FILE, experiment.get("motion"), experiment.get("table", ""))]
+    made += [
+        (joint_motion_file(each["joint"]), each["motion"], tables.get(each["joint"], ""))
+        for each in experiment.get("joints", ())
+    ]
+    return {file: (motion, table) for file, motion, table in made if motion}

@@ -9,8 +9,8 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -19,20 +19,22 @@ import yaml
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gap, JointName, Place, Trace, priors
-from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, campaign_command, joint_motion_file
+from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, campaign_command, motions_of
 from jtqd.sysid.diagnosis.words import (
     BADGES,
     BALANCES,
     bin_name,
     effect_title,
     in_words,
-    listed,
+    joints_text,
     parameter_title,
     place,
     provenance_text,
     summary,
 )
+from jtqd.sysid.planner.plan import Plan
 from jtqd.sysid.report import page
 from jtqd.sysid.report.numbers import DASH, number, percent, unit_name, with_unit
 from jtqd.sysid.report.page import LIGHT, page_svg, thinned
@@ -42,7 +44,6 @@ _HOT: Final = 2.0
 """A bin with this many times its even share of the gap is marked."""
 _EVEN: Final = 1.5
 """An axis without a bin above this many even shares is not shown."""
-
 MOST: Final = 4
 """Figures on a page."""
 WIDE_IN: Final = 9.2
@@ -61,7 +62,7 @@ def render(findings: Findings) -> str:
         "made": provenance_text(findings.provenance, most=len(findings.runs) + 8),
         "badge": badge,
         "badge_colour": colour,
-        "scope": _scope(findings),
+        "scope": ", ".join(filter(None, (findings.runs_text, joints_text(findings.joints)))),
         "s": summary(findings),
         "looked_at": [candidate_row(each) for each in findings.candidates],
         "gaps": [
@@ -78,14 +79,6 @@ def render(findings: Findings) -> str:
         "next": _next(findings),
     }
     return page.render("jtqd.sysid.diagnosis", TEMPLATE, content)
-
-
-def _scope(findings: Findings) -> str:
-    """Return what was looked at, e.g. "6 runs, joints 1 and 2"."""
-    if not findings.joints:
-        return findings.runs_text
-    names = listed([str(j) for j in findings.joints])
-    return f"{findings.runs_text}, joint{'s' if len(findings.joints) > 1 else ''} {names}"
 
 
 def candidate_row(each: CandidateEvidence) -> tuple[str, str, str, str]:
@@ -165,49 +158,38 @@ def _axis(name: str, places: Sequence[Place], whole: float, highest: float) -> A
 
 
 def _next(findings: Findings) -> dict[str, Any] | None:
-    """Why, the plan as YAML, and what it amounts to."""
+    """Why, the plan as YAML, and what it amounts to; nothing of a plan that `jtq campaign` would refuse."""
     experiment = findings.next_experiment
     if experiment is None:
         return None
-    plan = experiment.get("plan")
-    made = [(MOTION_FILE, experiment.get("motion"))]
-    made += [(joint_motion_file(each["joint"]), each["motion"]) for each in experiment.get("joints", ())]
-    motions = [(file, motion["runs"]) for file, motion in made if motion]
-    seconds = [run["duration_s"] for _, runs in motions for run in runs]
+    plan, motions = experiment.get("plan"), motions_of(experiment)
+    durations_s = [run["duration_s"] for motion, _ in motions.values() for run in motion["runs"]]
+    if plan is not None:
+        with suppress(ConfigError):
+            durations_s = [run.duration_s for run in Plan.from_mapping(dict(plan), PLAN_FILE).runs]
     return {
         "why": in_words(experiment["why"]),
         "file": PLAN_FILE,
         "command": experiment.get("command") or campaign_command(),
         "motions": [
-            (file, [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in runs])
-            for file, runs in motions
+            (file, [(run["name"], run["what"], f"{number(run['duration_s'])} s") for run in motion["runs"]])
+            for file, (motion, _) in motions.items()
         ],
-        "amount": plan_amount(plan) if plan is not None else _runs_text(seconds),
+        "amount": _amount(durations_s),
         "yaml": "" if plan is None else yaml.safe_dump(plan, sort_keys=False, allow_unicode=True),
     }
 
 
-def plan_amount(plan: Mapping[str, Any]) -> str:
-    """Return how long a plan is, e.g. "4 runs, 12 minutes of motion"; "" for one that `jtq campaign` would refuse."""
-    from jtqd.sysid.planner.plan import Plan
-
-    try:
-        runs = Plan.from_mapping(dict(plan), PLAN_FILE).runs
-    except ConfigError:
-        return ""
-    return _runs_text([run.duration_s for run in runs])
-
-
-def _runs_text(durations_s: Sequence[float]) -> str:
+def _amount(durations_s: Sequence[float]) -> str:
+    """Return how long some runs are, e.g. "4 runs, 12 minutes of motion"; "" for none."""
     if not durations_s:
         return ""
-    seconds, count = sum(durations_s), len(durations_s)
+    seconds = sum(durations_s)
     length = f"{number(seconds)} s" if seconds < 120.0 else f"{number(seconds / 60.0, 2)} minutes"
-    return f"{count} run{'s' if count > 1 else ''}, {length} of motion"
+    return f"{counted(len(durations_s), 'run')}, {length} of motion"
 
 
-@dataclass(frozen=True)
-class Picture:
+class Picture(NamedTuple):
     """One trace as SVG, wide and narrow; text: its alternative text; data: the curves as JSON for `traces.js`."""
 
     title: str
@@ -217,8 +199,7 @@ class Picture:
     data: str
 
 
-@dataclass(frozen=True)
-class Line:
+class Line(NamedTuple):
     """One curve of a panel; role: its colour; curve, less: which arrays of the data it is the first of, less the second."""
 
     role: str
@@ -227,8 +208,7 @@ class Line:
     less: str = ""
 
 
-@dataclass(frozen=True)
-class Panel:
+class Panel(NamedTuple):
     """Curves on one scale [unit]; residual: about zero, with the band of the noise."""
 
     title: str
@@ -316,7 +296,9 @@ def _data(trace: Trace, floor: float, both: bool) -> str:
         "step_s": float(f"{step:.9g}"),
         "floor_nm": float(f"{floor:.4g}") if np.isfinite(floor) else None,
         "curves": {name: _coded(values) for name, values in _curves(trace, both).items()},
-        "panels": [{**vars(p), "lines": [vars(line) for line in p.lines]} for p in panels(trace, both)],
+        "panels": [
+            {**p._asdict(), "lines": [line._asdict() for line in p.lines]} for p in panels(trace, both)
+        ],
     }
     return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 

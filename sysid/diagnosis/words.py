@@ -304,9 +304,13 @@ def _untold(findings: Findings) -> str:
 
 def _named(name: str, joints: Iterable[JointName], many: bool) -> str:
     """Return "lost motion of joints 1 and 2"; without the joints where there is one, or where it is the sensor's."""
-    numbers = [str(n) for n in sorted({j for j in joints if isinstance(j, int)})]
-    of = f"joint{'s' if len(numbers) > 1 else ''} {listed(numbers)}" if many and numbers else ""
-    return _joined(" of ", effect_title(name), of)
+    numbers = sorted({j for j in joints if isinstance(j, int)})
+    return _joined(" of ", effect_title(name), joints_text(numbers) if many else "")
+
+
+def joints_text(numbers: Sequence[int]) -> str:
+    """Return "joint 1" or "joints 1 and 2", "" for none."""
+    return f"joint{'s' if len(numbers) > 1 else ''} {listed([str(n) for n in numbers])}" if numbers else ""
 
 
 def effect_title(name: str) -> str:
