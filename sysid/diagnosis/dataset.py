@@ -24,7 +24,6 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.current_zero import Readings, readings
-from jtqd.sysid.diagnosis.events import Events
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.noise import saturated_residuals
 from jtqd.sysid.diagnosis.regressors import (
@@ -51,7 +50,7 @@ from jtqd.sysid.diagnosis.signals import (
     with_one_sensor,
     without_held,
 )
-from jtqd.sysid.diagnosis.structure import frequency_lines, order_lines, sharpened
+from jtqd.sysid.diagnosis.structure import View, frequency_lines, order_lines, sharpened
 from jtqd.sysid.runs.bad_samples import held_values, saturation_limits
 from jtqd.sysid.runs.channels import Channels
 
@@ -128,7 +127,7 @@ class Dataset:
         valid = self.runs[run].channels[channel].valid
         return valid | self.events[channel][run] if channel in self.events else valid
 
-    def without_events(self, events: Mapping[Channel, Events]) -> Dataset:
+    def without_events(self, events: Mapping[Channel, View]) -> Dataset:
         """Return the runs with these events taken for not valid, and what is then unexplained."""
         runs, hidden = [], {c: list(e.masks) for c, e in events.items()}
         for r, run in enumerate(self.runs):

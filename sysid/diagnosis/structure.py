@@ -1,31 +1,38 @@
-"""Structure of a residual: maps over operating conditions with a test that needs no noise model, and lines.
+"""Views of a residual, and the search for those that explain it.
 
-A residual that has nothing to do with the conditions changes its sign at random from second to second, run to run.
-So its sums over the bins of an axis (velocity, load, angles, ...) are compared with those after flipping the sign of whole
-blocks at random: what is common to many blocks is structure. Lines are at orders of the motor, whatever the speed, or at
-fixed frequencies, whatever the motion. Everything in Nm^2.
+A view is a prediction of the residual of one balance from one thing. Its energy is the squared error that it takes away,
+as a mean over all samples [Nm^2]. There are four kinds:
+
+- *conditions*: the mean of a bin of an axis (velocity, load, an angle, ...) over the other runs predicts this run: plain,
+  in the direction of motion, or in that of the current. Noise of two runs is independent, however coloured, so that bins
+  which only follow the noise explain nothing. The energy is significant where it is larger than with the signs of whole
+  seconds flipped at random;
+- *lines*: a wave at an order of the motor, whatever the speed, or at a fixed frequency, whatever the motion. It stands out
+  of the spectrum around it;
+- *events*: moments at which the residual leaves its noise; its whitened energy stands out of the usual. Where the passes of
+  a range of the link's angle confirm each other, the events are that range's;
+- *seconds*: means over seconds that are too large for noise.
+
+Events and seconds predict nothing but themselves. They count by what the best condition leaves of them. `pursue` takes out
+the view of most energy and searches again (matching pursuit: Mallat and Zhang 1993, IEEE Trans. Signal Process. 41).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from functools import lru_cache
+from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.events import BLOCK_S
-from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.noise import past_valid, whiten
+from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 
-FLIPS: Final = 9999
-SIGNIFICANT: Final = 2e-4
-"""Some seventy maps are looked at: one in a hundred sets of runs has a map this unlikely by chance."""
-_BINS: Final = 12
-_FEWEST_BLOCKS: Final = 8
-UNITS: Final = {
+AXES: Final = {
     "velocity": "rad/s",
     "load": "Nm",
     "current": "A",
@@ -34,51 +41,150 @@ UNITS: Final = {
     "motor_angle": "rad",
     "link_angle": "rad",
     "time": "s",
-    "frequency": "Hz",
 }
-AXES: Final = (
-    "velocity",
-    "load",
-    "current",
-    "quadrant",
-    "temperature",
-    "motor_angle",
-    "link_angle",
-    "time",
-)
+"""Axes of conditions, with their units."""
+BINS: Final = 12
+"""Of an axis; twice as many of velocity, current and link angle."""
+BLOCK_S: Final = 1.0
+"""Seconds that are independent of each other; a bin's mean counts as if it had been zero for so long before."""
+FLIPS: Final = 9999
+SIGNIFICANT: Final = 2e-4
+"""Some seventy conditions are looked at: one in a hundred sets of runs has one this unlikely by chance."""
+LEAST: Final = 6e-4
+"""Part of the rated torque (rms) from which a view is worth a place."""
+MOST: Final = 3
+"""Views that are taken out."""
 ORDERS: Final = np.arange(0.3, 10.0, 0.04)
-"""Per motor revolution, where lines of the unexplained residual are looked for."""
-_FINE: Final = 0.004
-_EXACT: Final = 0.0004
-_COHERENT: Final = 0.5
-"""Part of its size over stretches that a line has over whole runs when it keeps its phase."""
-_STRETCH_S: Final = 2.0
-_FEWEST_TURNS: Final = 8.0
-_FEWEST_STRETCHES: Final = 4.0
-_SEGMENT_S: Final = 4.0
+"""Per motor revolution, where lines of a residual are looked for."""
 _HZ: Final = (2.0, 40.0)
+_LINE: Final = 25.0
+"""Power of a line against the median of its neighbourhood."""
+_FEWEST_TURNS: Final = 8.0
+_FAR: Final = 60.0
+"""Energy of a moment against the median: whitened Gaussian noise over ten samples never reaches a twentieth of it, the mean
+of a normal second does once in 10^7 seconds.
+"""
+_EVENT_S: Final = 0.05
+_JUMP: Final = 0.01
+"""Part of the rated torque by which the residual must move for an event."""
+_JOIN_S: Final = 0.5
+"""Onset and end of one event, or two stays in one bin of angle, are at most this far apart."""
+_AGREE: Final = 0.5
+"""Part of the energy of the events in a bin of angle that the other passes must predict."""
+_WANDER: Final = 0.006
+"""Part of the rated torque (rms of means over seconds) from which a residual is not noise, in all seconds; a third of it in
+those that stand out.
+"""
 
 
 @dataclass(frozen=True)
-class AxisMap:
-    """One axis of one channel: edges [b+1], time spent in each bin [b] (samples), mean and mean square of the residual
-    per bin, energy between bins that is not chance (>= 0, Nm^2), p value.
+class Balance:
+    """A balance of a joint in all runs: ar: autoregression of its noise; step_s: of a sample; rated_nm: of the joint."""
+
+    runs: Sequence[RunData]
+    channel: Channel
+    ar: FloatArray
+    step_s: float
+    rated_nm: float
+
+    @property
+    def axes(self) -> list[dict[str, FloatArray]]:
+        """The operating conditions of every run."""
+        return [run.axes[self.channel.joint] for run in self.runs]
+
+    @property
+    def least_nm2(self) -> float:
+        """The least energy of a view."""
+        return float((LEAST * self.rated_nm) ** 2)
+
+
+@dataclass(frozen=True)
+class View:
+    """A prediction of a residual [run][n] from one thing.
+
+    axis: as in `Place`: a condition, "time" of events and seconds, "frequency". energy_nm2, by_run [runs]: of all runs, of
+    each. edges [b+1], explained [b], places [run][n], side [run][n]: of a condition its bins, what each explains, the bin of
+    every sample, its signs. what, times: "events" or "seconds" with their moments (run, time [s]), strongest first.
+    masks [run][n]: samples that are the view's as a whole.
     """
 
-    channel: Channel
     axis: str
-    unit: str
-    edges: FloatArray
-    count: FloatArray
-    mean_nm: FloatArray
-    square_nm2: FloatArray
     energy_nm2: float
-    p: float
+    by_run: FloatArray
+    prediction: list[FloatArray]
+    edges: FloatArray | None = None
+    explained: FloatArray | None = None
+    places: Sequence[Index] = ()
+    side: Sequence[FloatArray] = ()
+    what: str = ""
+    times: tuple[tuple[str, float], ...] = ()
+    masks: Sequence[BoolArray] = ()
+    line: Line | None = None
+
+    @property
+    def bins(self) -> tuple[int, ...]:
+        """Bins that explain something, the largest first."""
+        if self.explained is None:
+            return ()
+        return tuple(int(k) for k in np.argsort(-self.explained) if self.explained[k] > 0.0)
+
+    def taken_from(self, parts: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return the residual [run][n] without what the view explains, NaN where all is the view's."""
+        less = [x - p for x, p in zip(parts, self.prediction, strict=True)]
+        return [np.where(m, np.nan, x) for m, x in zip(self.masks, less, strict=True)] if self.masks else less
+
+    def same(self, other: View) -> bool:
+        """Return whether both are views of one thing."""
+        return (self.axis, self.what, self.line) == (other.axis, other.what, other.line)
 
 
-def axes_of(channel: Channel) -> tuple[str, ...]:
-    """Return the axes that a channel is drawn over; the spring knows nothing of the current."""
-    return AXES if channel.balance == MOTOR else tuple(a for a in AXES if a != "current")
+def _view(axis: str, parts: Sequence[FloatArray], prediction: list[FloatArray], **more: Any) -> View:
+    """Return the view with its energies on this residual; with masks, above what is usual outside of them."""
+    taken = np.array([np.nansum((2.0 * x - p) * p) for x, p in zip(parts, prediction, strict=True)])
+    if masks := more.get("masks"):
+        outside = np.concatenate([x[~m] for x, m in zip(parts, masks, strict=True)])
+        usual = float(np.nanmean(outside**2)) if np.isfinite(outside).any() else 0.0
+        taken -= [usual * np.sum(m & np.isfinite(x)) for x, m in zip(parts, masks, strict=True)]
+    counts = np.array([np.isfinite(x).sum() for x in parts], np.float64)
+    energy = float(taken.sum() / max(counts.sum(), 1.0))
+    return View(axis, energy, taken / np.maximum(counts, 1.0), prediction, **more)
+
+
+def pursue(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
+    """Return the views that explain a balance's residual [run][n], NaN where not valid: each of what those before it leave,
+    until none is significant and worth a place, at most MOST.
+    """
+    now, found = list(parts), list[View]()
+    while len(found) < MOST:
+        views = [v for v in _views(balance, now, found) if v.energy_nm2 > balance.least_nm2]
+        views = [v for v in views if not any(v.same(before) for before in found)]
+        if not views:
+            break
+        found.append(max(views, key=lambda v: v.energy_nm2))
+        now = found[-1].taken_from(now)
+    return found
+
+
+def _views(balance: Balance, parts: Sequence[FloatArray], before: Sequence[View]) -> list[View]:
+    """Return the significant views of a residual: the best condition of those not among `before`, what events and seconds
+    explain beyond it, and lines.
+    """
+    large = [v for v in conditions(balance, parts) if v.energy_nm2 > balance.least_nm2]
+    ranked = [v for v in sorted(large, key=lambda v: -v.energy_nm2) if not any(v.same(b) for b in before)]
+    best = next((v for v in ranked if chance(v, parts, balance.step_s) < SIGNIFICANT), None)
+    moments, rest = events(balance, parts), list(parts)
+    turn = moments and at_angle(balance, parts, moments)
+    out = [v for v in (best, turn) if v and not any(v.same(b) for b in before)]
+    if out:
+        rest = max(out, key=lambda v: v.energy_nm2).taken_from(parts)
+        moments = events(balance, rest)
+    if moments:
+        out.append(moments)
+        rest = moments.taken_from(rest)
+    return [v for v in (*out, seconds(balance, rest), *lines(balance, parts)) if v]
+
+
+# Conditions.
 
 
 def axis_edges(axis: str, values: FloatArray) -> FloatArray | None:
@@ -87,25 +193,22 @@ def axis_edges(axis: str, values: FloatArray) -> FloatArray | None:
     if len(good) < 100:
         return None
     if axis == "motor_angle":
-        return np.linspace(0.0, 2.0 * np.pi, _BINS + 1)
+        return np.linspace(0.0, 2.0 * np.pi, BINS + 1)
     if axis == "quadrant":
         return np.array([-0.5, 0.5, 1.5, 2.5, 3.5])
     low, high = float(good.min()), float(good.max())
-    if high - low < 1e-6 or (axis == "temperature" and high - low < 2.0):
+    if high - low < (2.0 if axis == "temperature" else 1e-6):
         return None
-    count = 2 * _BINS if axis in ("link_angle", "velocity", "current") else _BINS
+    count = 2 * BINS if axis in ("link_angle", "velocity", "current") else BINS
     edges = np.linspace(low, high, count + 1)
     edges[-1] += 1e-9 * (high - low)
     return edges
 
 
 def axis_values(axes: Mapping[str, FloatArray], axis: str) -> FloatArray:
-    """Return the coordinate of every bin of a run; angles of the motor within a turn, of the link as they are within
-    one turn or wrapped when the link turns further.
-    """
+    """Return the coordinate of every sample of a run; angles within a turn."""
     if axis == "quadrant":
-        v, load = axes["velocity"], axes["load"]
-        return np.where(v >= 0.0, np.where(load >= 0.0, 0.0, 1.0), np.where(load >= 0.0, 2.0, 3.0))
+        return np.asarray(2.0 * (axes["velocity"] < 0.0) + (axes["load"] < 0.0), np.float64)
     if axis == "motor_angle":
         return np.asarray(np.mod(axes[axis], 2.0 * np.pi))
     if axis == "link_angle":
@@ -113,98 +216,136 @@ def axis_values(axes: Mapping[str, FloatArray], axis: str) -> FloatArray:
     return axes[axis]
 
 
-def axis_maps(
-    runs: Sequence[RunData], residuals: Mapping[Channel, list[FloatArray]], step_s: float, seed: int = 0
-) -> list[AxisMap]:
-    """Return the maps of all channels and axes; residuals per channel and run [n], NaN where not valid.
+def bins_of(
+    balance: Balance, axis: str, parts: Sequence[FloatArray]
+) -> tuple[FloatArray, list[Index]] | None:
+    """Return the edges of an axis and the bin of every sample [run][n], None where it does not vary.
 
-    The bins cover what was visited while the residual was valid; those of the link angle all that was visited, because at an
-    event, which is left out of maps, load or speed may be far off, the angle is not.
+    The bins cover what was visited while the residual was valid; those of the link angle all that was visited, so that they
+    stay where they are when moments are taken out. The spring knows nothing of the current.
     """
-    rng = np.random.default_rng(seed)
-    block = max(2, round(BLOCK_S / step_s))
-    out = []
-    for channel, plain in residuals.items():
-        for axis in axes_of(channel):
-            values = [axis_values(run.axes[channel.joint], axis) for run in runs]
-            there = [
-                v if axis == "link_angle" else v[np.isfinite(x)] for v, x in zip(values, plain, strict=True)
-            ]
-            edges = axis_edges(axis, np.concatenate(there))
-            if edges is not None:
-                maps = [
-                    axis_map(channel, axis, edges, values, signed(plain, side), block=block, rng=rng)
-                    for side in directions(runs, channel)
-                ]
-                out.append(max(maps, key=lambda m: (m.p < SIGNIFICANT, m.energy_nm2)))
+    values = [axis_values(axes, axis) for axes in balance.axes]
+    seen = [v if axis == "link_angle" else v[np.isfinite(x)] for v, x in zip(values, parts, strict=True)]
+    edges = axis_edges(axis, np.concatenate(seen))
+    if edges is None or (axis == "current" and balance.channel.balance != MOTOR):
+        return None
+    return edges, [np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2) for v in values]
+
+
+def directions(balance: Balance) -> list[list[FloatArray]]:
+    """Return the signs [run][n] in which a balance is looked at: as it is; in the direction of motion, because a loss (of
+    the link too, which the torsion balance sees) changes its sign with it and would cancel in a mean of both; the motor
+    balance also in the direction of the current, as what a drive loses does.
+    """
+    names = ("velocity", "current") if balance.channel.balance == MOTOR else ("velocity",)
+    plain = [np.ones(len(a["time"])) for a in balance.axes]
+    return [plain, *([np.sign(a[name]) for a in balance.axes] for name in names)]
+
+
+def _times(parts: Sequence[FloatArray], side: Sequence[FloatArray]) -> list[FloatArray]:
+    return [x * d for x, d in zip(parts, side, strict=True)]
+
+
+def conditions(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
+    """Return every axis in every direction as a view, whether significant or not."""
+    out, zero = [], BLOCK_S / balance.step_s
+    for axis in AXES:
+        edges, places = bins_of(balance, axis, parts) or (np.empty(0), [])
+        for side in directions(balance) if places else ():
+            explained, means = explained_by_bins(places, _times(parts, side), len(edges) - 1, zero)
+            more = {"edges": edges, "explained": explained.sum(axis=0), "places": places, "side": side}
+            out.append(_view(axis, parts, _times(means, side), **more))
     return out
 
 
-def directions(runs: Sequence[RunData], channel: Channel) -> list[list[FloatArray] | None]:
-    """Return the signs in which a channel is looked at: as it is (None); in the direction of motion, because a loss (of the
-    link too, which the torsion balance sees) changes its sign with it and would cancel in a map of both; the motor balance
-    also in the direction of the current, as what a drive loses does.
+def explained_by_bins(
+    places: Sequence[Index], parts: Sequence[FloatArray], bins: int, zero: float
+) -> tuple[FloatArray, list[FloatArray]]:
+    """Return the energy that the bins' means over the other runs take off each run, and bin [runs, bins] (sum of squares
+    over samples, Nm^2), and those means at every sample [run][n]. places: bin of every sample; zero: samples of nothing
+    that count in every mean.
     """
-    axes = [run.axes[channel.joint] for run in runs]
-    out: list[list[FloatArray] | None] = [None, [np.sign(a["velocity"]) for a in axes]]
-    return [*out, [np.sign(a["current"]) for a in axes]] if channel.balance == MOTOR else out
+    sums, counts = np.zeros((len(parts), bins)), np.zeros((len(parts), bins))
+    for r, (place, x) in enumerate(zip(places, parts, strict=True)):
+        good = np.isfinite(x)
+        sums[r] = np.bincount(place[good], x[good], minlength=bins)
+        counts[r] = np.bincount(place[good], minlength=bins)
+    others = (sums.sum(axis=0) - sums) / (counts.sum(axis=0) - counts + zero)
+    # sum of x^2 - (x - m)^2 over a bin
+    explained: FloatArray = 2.0 * others * sums - others**2 * counts
+    return explained, [others[r][place] for r, place in enumerate(places)]
 
 
-def signed(parts: Sequence[FloatArray], side: Sequence[FloatArray] | None) -> list[FloatArray]:
-    """Return the residual in these signs [run][n]."""
-    return list(parts) if side is None else [x * d for x, d in zip(parts, side, strict=True)]
+def chance(view: View, parts: Sequence[FloatArray], step_s: float) -> float:
+    """Return how likely a condition explains this much of the residual [run][n] by chance: with random signs of its seconds.
+
+    A residual that has nothing to do with the conditions changes its sign at random from second to second, run to run.
+    """
+    assert view.edges is not None
+    bins, block = len(view.edges) - 1, _block(step_s)
+    tables, counts = [], []
+    for place, x in zip(view.places, _times(parts, view.side), strict=True):
+        good = np.isfinite(x)
+        at = np.arange(len(x))[good] // block * bins + place[good]
+        tables.append(np.bincount(at, x[good], (len(x) // block + 1) * bins).reshape(-1, bins))
+        counts.append(np.bincount(place[good], minlength=bins))
+    ends = np.cumsum([0, *map(len, tables)])
+    signs = _signs(FLIPS, int(ends[-1]))
+    sums = [signs[:, a:b] @ t.astype(np.float32) for a, b, t in zip(ends, ends[1:], tables, strict=False)]
+    whole, energy = np.sum(sums, axis=0), np.zeros(FLIPS + 1)
+    for own, n in zip(sums, counts, strict=True):
+        mean = (whole - own) / (np.sum(counts, axis=0) - n + BLOCK_S / step_s)
+        energy += np.sum(mean * (2.0 * own - mean * n), axis=1)
+    return float(np.mean(energy >= energy[0]))
 
 
-def axis_map(
-    channel: Channel,
-    axis: str,
-    edges: FloatArray,
-    values: Sequence[FloatArray],
-    parts: Sequence[FloatArray],
-    *,
-    block: int,
-    rng: np.random.Generator,
-) -> AxisMap:
-    """Return the map of one axis; values [run][n]: its coordinate, block: samples whose sign is flipped together."""
-    bins = len(edges) - 1
-    sums, counts, squares = [], np.zeros(bins), np.zeros(bins)
-    for v, x in zip(values, parts, strict=True):
-        good = np.isfinite(x) & np.isfinite(v)
-        place = np.clip(np.searchsorted(edges, v[good], side="right") - 1, 0, bins - 1)
-        number = np.arange(len(x))[good] // block
-        many = int(number.max()) + 1 if len(number) else 0
-        flat = np.bincount(number * bins + place, weights=x[good], minlength=many * bins)
-        sums.append(flat.reshape(many, bins))
-        counts += np.bincount(place, minlength=bins)
-        squares += np.bincount(place, weights=x[good] ** 2, minlength=bins)
-    table = np.vstack(sums)
-    busy = counts > 50
-    weight = np.where(busy, 1.0 / np.maximum(counts, 1.0), 0.0)
-    total = table.sum(axis=0)
-    found = float(np.sum(total**2 * weight))
-    signs = rng.choice((-1.0, 1.0), size=(FLIPS, len(table)))
-    chance = ((signs @ table) ** 2) @ weight
-    p = float((1 + np.sum(chance >= found)) / (FLIPS + 1))
-    n = max(float(counts.sum()), 1.0)
-    energy = max(found - float(chance.mean()), 0.0) / n
-    if len(table) < _FEWEST_BLOCKS:
-        p = 1.0
-    return AxisMap(
-        channel,
-        axis,
-        UNITS[axis],
-        edges,
-        counts,
-        np.where(busy, total * weight, np.nan),
-        np.where(busy, squares * weight, np.nan),
-        energy,
-        p,
-    )
+def _block(step_s: float) -> int:
+    return max(2, round(BLOCK_S / step_s))
+
+
+@lru_cache(maxsize=2)
+def _signs(flips: int, blocks: int) -> FloatArray:
+    """Return random signs [flips + 1, blocks], the first row all positive."""
+    signs = np.random.default_rng(0).integers(0, 2, (flips + 1, blocks)).astype(np.float32) * 2.0 - 1.0
+    signs[0] = 1.0
+    return np.asarray(signs)
+
+
+# Lines.
+
+
+def lines(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
+    """Return the lines that stand out of a channel's spectra."""
+    runs, step_s, residual = balance.runs, balance.step_s, {balance.channel: parts}
+    out = []
+    for found in (*order_lines(runs, residual, step_s), *frequency_lines(runs, residual, step_s)):
+        if found.ratio > _LINE and 0.5 * found.amplitude_nm**2 > balance.least_nm2:
+            line = sharpened(found, runs, parts, step_s)
+            energy = 0.5 * line.amplitude_nm**2
+            wave = _wave(line, balance, parts)
+            out.append(View("frequency", energy, np.full(len(parts), energy), wave, line=line))
+    return out
+
+
+def _wave(line: Line, balance: Balance, parts: Sequence[FloatArray]) -> list[FloatArray]:
+    """Return the wave of a line, with size and phase of every two seconds, zero where it hardly turns [run][n]."""
+    out = []
+    for axes, x in zip(balance.axes, parts, strict=True):
+        angle = 2.0 * np.pi * axes["time"] if line.unit == "Hz" else axes["motor_angle"]
+        turn, wave = line.order * angle, np.zeros(len(x))
+        basis = np.column_stack((np.cos(turn), np.sin(turn), np.ones(len(x))))
+        for at in np.array_split(np.arange(len(x)), max(len(x) // (2 * _block(balance.step_s)), 1)):
+            good = at[np.isfinite(x[at])]
+            if len(good) > len(at) // 4 and np.ptp(turn[good]) > 2.0 * np.pi:
+                size, *_ = np.linalg.lstsq(basis[good], x[good], rcond=None)
+                wave[at] = basis[at, :2] @ size[:2]
+        out.append(wave)
+    return out
 
 
 def order_lines(
     runs: Sequence[RunData],
-    residuals: Mapping[Channel, list[FloatArray]],
+    residuals: Mapping[Channel, Sequence[FloatArray]],
     step_s: float,
     orders: FloatArray = ORDERS,
 ) -> list[Line]:
@@ -215,11 +356,35 @@ def order_lines(
     """
     out = []
     for channel, parts in residuals.items():
-        power, weight = _order_power(runs, channel, parts, orders, round(_STRETCH_S / step_s))
-        if weight >= _FEWEST_STRETCHES:
-            out += _peaks(channel, orders, power)
-    out.sort(key=lambda line: -line.ratio)
-    return out
+        power, weight = _order_power(runs, channel, parts, orders, 2 * _block(step_s))
+        if weight >= 4:
+            out += _peaks(Line(channel, 0.0, 0.0, 8.0), orders, power, 30)
+    return sorted(out, key=lambda line: -line.ratio)
+
+
+def frequency_lines(
+    runs: Sequence[RunData], residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float
+) -> list[Line]:
+    """Return lines at a fixed frequency, strongest first: mean spectrum of stretches of 4 s of all runs, Hann window; the
+    ratio is against the median of the neighbourhood.
+    """
+    length = 4 * _block(step_s)
+    window, out = np.hanning(length), list[Line]()
+    hz = np.asarray(np.fft.rfftfreq(length, step_s), np.float64)
+    for channel, parts in residuals.items():
+        powers = []
+        for x in parts:
+            for first in range(0, len(x) - length + 1, length // 2):
+                piece = x[first : first + length]
+                good = np.isfinite(piece)
+                if good.mean() >= 0.6:
+                    shape = window * good
+                    piece = np.where(good, piece - np.nanmean(piece), 0.0)
+                    powers.append(np.abs(np.fft.rfft(piece * shape) / shape.sum()) ** 2)
+        if len(powers) >= 4:
+            out += _peaks(Line(channel, 0.0, 0.0, 12.0, "Hz"), hz, np.mean(powers, axis=0), 12)
+    out = [line for line in out if _HZ[0] < line.order < min(_HZ[1], 0.4 / step_s)]
+    return sorted(out, key=lambda line: -line.ratio)
 
 
 def _order_power(
@@ -229,7 +394,7 @@ def _order_power(
     orders: FloatArray,
     length: int,
 ) -> tuple[FloatArray, int]:
-    """Return the mean power at these orders over stretches of `length` bins, and how many there are."""
+    """Return the mean power at these orders over stretches of `length` samples, and how many there are."""
     power, weight = np.zeros(len(orders)), 0
     for run, x in zip(runs, parts, strict=True):
         angle = run.axes[channel.joint]["motor_angle"]
@@ -247,74 +412,140 @@ def _order_power(
     return power / max(weight, 1), weight
 
 
+def _peaks(least: Line, at: FloatArray, power: FloatArray, near: int) -> list[Line]:
+    """Return local maxima that have the ratio of `least` to the median of `near` neighbours on either side; the amplitude is
+    that of a wave of constant size.
+    """
+    out = []
+    for k in range(1, len(at) - 1):
+        if power[k] >= power[k - 1] and power[k] > power[k + 1]:
+            usual = float(np.median(power[max(0, k - near) : k + near + 1])) + 1e-12
+            if power[k] > least.ratio * usual:
+                size, ratio = 2.0 * float(np.sqrt(power[k] - usual)), float(power[k]) / usual
+                out.append(replace(least, order=float(at[k]), amplitude_nm=size, ratio=ratio))
+    return out
+
+
 def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], step_s: float) -> Line:
     """Return a line at an order with its exact order and size: the orders looked at first lie so far apart that a line
     between two of them turns out of phase within a stretch of many turns. parts: its channel's residual [run][n].
 
     First between its neighbours over the same stretches, then over whole runs, where a turn more or less in a thousand
-    shows; the latter counts when the line keeps its phase over a run.
+    shows; the latter counts when the line keeps half of its size over a run, and so its phase.
     """
-    if line.unit == "Hz":
+    near: FloatArray = line.order + 0.004 * np.arange(-10.0, 11.0)
+    power, weight = _order_power(runs, line.channel, parts, near, 2 * _block(step_s))
+    if line.unit == "Hz" or not weight:
         return line
-    near: FloatArray = line.order + _FINE * np.arange(-10.0, 11.0)
-    power, weight = _order_power(runs, line.channel, parts, near, round(_STRETCH_S / step_s))
-    if not weight:
-        return line
-    best = int(np.argmax(power))
-    order, size = float(near[best]), 2.0 * float(np.sqrt(power[best]))
+    order, size = float(near[np.argmax(power)]), 2.0 * float(np.sqrt(np.max(power)))
     ratio = line.ratio * max((size / line.amplitude_nm) ** 2, 1.0)
-    exact: FloatArray = order + _EXACT * np.arange(-20.0, 21.0)
-    whole = min(len(run.time_s) for run in runs)
-    power, weight = _order_power(runs, line.channel, parts, exact, whole)
-    best = int(np.argmax(power))
-    if weight and 2.0 * float(np.sqrt(power[best])) > _COHERENT * size:
-        order = float(exact[best])
+    exact: FloatArray = order + 0.0004 * np.arange(-20.0, 21.0)
+    power, weight = _order_power(runs, line.channel, parts, exact, min(len(run.time_s) for run in runs))
+    if weight and 2.0 * float(np.sqrt(np.max(power))) > 0.5 * size:
+        order = float(exact[np.argmax(power)])
     return replace(line, order=order, amplitude_nm=max(size, line.amplitude_nm), ratio=ratio)
 
 
-def _peaks(channel: Channel, orders: FloatArray, power: FloatArray) -> list[Line]:
-    """Return local maxima far above the median of 60 neighbours; the amplitude is that of a wave of constant size."""
-    out = []
-    for k in range(1, len(orders) - 1):
-        if power[k] >= power[k - 1] and power[k] > power[k + 1]:
-            usual = float(np.median(power[max(0, k - 30) : k + 31])) + 1e-12
-            if power[k] > 8.0 * usual:
-                size = 2.0 * float(np.sqrt(power[k] - usual))
-                out.append(Line(channel, float(orders[k]), size, float(power[k]) / usual))
-    return out
+# Events and seconds.
 
 
-def frequency_lines(
-    runs: Sequence[RunData], residuals: Mapping[Channel, list[FloatArray]], step_s: float
-) -> list[Line]:
-    """Return lines at a fixed frequency, strongest first: mean spectrum of stretches of 4 s of all runs, Hann window; the
-    ratio is against the median of the neighbourhood.
+def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
+    """Return the events of a residual [run][n], NaN where not valid; None without any.
+
+    Stretches whose whitened energy is far above the usual, where the residual itself moves far enough. A jump, a dip, a
+    dropped reading: whitening makes a short peak of each. What lies between two stretches close together is one.
     """
-    length = round(_SEGMENT_S / step_s)
-    window = np.hanning(length)
-    out = []
-    for channel, parts in residuals.items():
-        power, weight = np.zeros(length // 2 + 1), 0.0
-        for x in parts:
-            for first in range(0, len(x) - length + 1, length // 2):
-                piece = x[first : first + length]
-                good = np.isfinite(piece)
-                if good.mean() < 0.6:
-                    continue
-                shape = window * good
-                piece = np.where(good, piece, 0.0)
-                piece = piece - good * (piece.sum() / good.sum())
-                power += np.abs(np.fft.rfft(piece * shape) / shape.sum()) ** 2
-                weight += 1.0
-        if weight < 4.0:
-            continue
-        power /= weight
-        hz = np.fft.rfftfreq(length, step_s)
-        for k in np.flatnonzero((hz > _HZ[0]) & (hz < min(_HZ[1], 0.4 / step_s))):
-            if power[k] >= power[k - 1] and power[k] > power[k + 1]:
-                near = np.median(power[max(1, k - 12) : k + 13])
-                if power[k] > 12.0 * near:
-                    size = 2.0 * float(np.sqrt(power[k] - near))
-                    out.append(Line(channel, float(hz[k]), size, float(power[k] / near), "Hz"))
-    out.sort(key=lambda line: -line.ratio)
-    return out
+    wide = max(4, round(_EVENT_S / balance.step_s))
+    known = [past_valid(np.isfinite(x), len(balance.ar)) for x in parts]
+    white = [
+        np.where(k, whiten(np.nan_to_num(x), balance.ar), np.nan) for k, x in zip(known, parts, strict=True)
+    ]
+    energies = [np.mean(w[: len(w) // wide * wide].reshape(-1, wide) ** 2, axis=1) for w in white]
+    if np.isfinite(np.concatenate(energies)).sum() < 50:
+        return None
+    usual = float(np.nanmedian(np.concatenate(energies)))
+    found, masks = list[tuple[float, str, float]](), []
+    for run, x, energy in zip(balance.runs, parts, energies, strict=True):
+        mask, end = np.zeros(len(x), bool), -(10**9)  # of the event before
+        for k in np.flatnonzero(np.nan_to_num(energy) > _FAR * usual).tolist():
+            first, last = max(0, (k - 1) * wide), (k + 2) * wide
+            near = x[first:last][np.isfinite(x[first:last])]
+            if len(near) > 2 and float(np.ptp(near)) > _JUMP * balance.rated_nm:
+                found.append((float(energy[k] / usual), run.name, float(run.time_s[k * wide])))
+                mask[end if 0 < first - end <= _JOIN_S / balance.step_s else first : last] = True
+                end = last
+        masks.append(mask)
+    if not found:
+        return None
+    own = [np.where(m & np.isfinite(x), x, 0.0) for m, x in zip(masks, parts, strict=True)]
+    return _view("time", parts, own, masks=masks, what="events", times=_moments(found))
+
+
+def _moments(found: list[tuple[float, str, float]]) -> tuple[tuple[str, float], ...]:
+    """Return (run, time) strongest first, one per event."""
+    kept: list[tuple[str, float]] = []
+    for _, run, t in sorted(found, reverse=True):
+        if all(run != r or abs(t - u) > 0.3 for r, u in kept):
+            kept.append((run, t))
+    return tuple(kept)
+
+
+def at_angle(balance: Balance, parts: Sequence[FloatArray], moments: View) -> View | None:
+    """Return the range of the link's angle that events belong to, None where they belong to none.
+
+    A range of angle that costs torque (a rubbing cover, a pulling cable) makes an event on every pass, and often only one
+    run reaches it, a few times. So passes stand for runs: the mean of a bin over its other passes predicts the events of a
+    pass. The range are the bins of which this is most, with the next on either side, through which its ends may cut.
+    """
+    found = bins_of(balance, "link_angle", parts)
+    if found is None:
+        return None
+    edges, places = found
+    bins, best = len(edges) - 1, np.zeros(len(edges) - 1)
+    own = [np.where(np.isfinite(x), y, np.nan) for x, y in zip(parts, moments.prediction, strict=True)]
+    for side in directions(balance):
+        ours = zip(places, _times(own, side), strict=True)
+        passes = [p for place, y in ours for p in _passes(place, y, balance.step_s)]
+        zero = float(np.median([len(y) for _, y in passes]))
+        each, _ = explained_by_bins([k for k, _ in passes], [y for _, y in passes], bins, zero)
+        best = np.maximum(best, each.sum(axis=0))
+    energy = np.bincount(np.concatenate(places), np.nan_to_num(np.concatenate(own)) ** 2, bins)
+    agree = best > _AGREE * energy
+    if energy[agree].sum() <= _AGREE * energy.sum():
+        return None
+    wide = np.convolve(agree, (1, 1, 1), "same") > 0
+    if edges[-1] - edges[0] > 2.0 * np.pi * (1.0 - 1.5 / bins):  # the ends of a whole turn are neighbours
+        wide |= np.roll(agree, 1) | np.roll(agree, -1)
+    masks = [wide[place] for place in places]
+    own = [np.where(m & np.isfinite(x), x, 0.0) for m, x in zip(masks, parts, strict=True)]
+    explained = np.where(agree, best, 0.0)
+    return _view("link_angle", parts, own, edges=edges, explained=explained, places=places, masks=masks)
+
+
+def _passes(place: Index, x: FloatArray, step_s: float) -> list[tuple[Index, FloatArray]]:
+    """Return the stays of a run in a bin, each as (bins, residual): of all bins that it visits."""
+    every = [np.flatnonzero(place == k) for k in np.unique(place)]
+    stays = (np.split(at, np.flatnonzero(np.diff(at) > _JOIN_S / step_s) + 1) for at in every)
+    return [(place[stay], x[stay]) for each in stays for stay in each]
+
+
+def seconds(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
+    """Return the means over seconds where the residual is not where it should be although no condition explains it: a zero
+    that jumps, a joint that is not always the same. None where they may be noise.
+    """
+    block, prediction, means = _block(balance.step_s), [], list[tuple[float, str, float]]()
+    for run, x in zip(balance.runs, parts, strict=True):
+        cut = x[: len(x) // block * block].reshape(-1, block)
+        count = np.isfinite(cut).sum(axis=1)
+        mean, use = np.nansum(cut, axis=1) / np.maximum(count, 1), count > block // 2
+        prediction.append(np.zeros(len(x)))
+        prediction[-1][: len(mean) * block] = np.repeat(np.where(use, mean, 0.0), block)
+        middle = run.time_s[: len(mean) * block : block][use] + 0.5 * block * balance.step_s
+        means += [(abs(float(m)), run.name, float(t)) for m, t in zip(mean[use], middle, strict=True)]
+    square, least = np.array([m * m for m, _, _ in means]), (_WANDER * balance.rated_nm) ** 2
+    if not means:
+        return None
+    far = square[square > _FAR * np.median(square)]
+    if np.mean(square) > least or np.sum(far) / len(square) > least / 9.0:
+        return _view("time", parts, prediction, what="seconds", times=_moments(means)[:6])
+    return None

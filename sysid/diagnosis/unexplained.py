@@ -1,125 +1,110 @@
-"""Unexplained residual: maps, events and lines in it that are not noise."""
+"""What remains of a residual, and where: the gaps of all balances, with noise floor, places and traces.
+
+What entries and the runs' own changes leave is searched for views (`structure.pursue`). Those that are found are both what
+remains, with energy and reasons, and where. Where nothing that remains matters, the places are those of the whole gap.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from itertools import combinations, pairwise
 from typing import Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import BoolArray, FloatArray
-from jtqd.estimator.joint import Joint
-from jtqd.estimator.text import counted
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.events import (
-    BLOCK_S,
-    MOST_OF_THE_TIME,
-    Burst,
-    EventLimits,
-    Events,
-    block_means,
-    bursts,
-    wandering,
-)
+from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
 from jtqd.sysid.diagnosis.noise import Noise
-from jtqd.sysid.diagnosis.regressors import LINE, ChannelData, RunData
-from jtqd.sysid.diagnosis.signals import Channel, Line
+from jtqd.sysid.diagnosis.regressors import LINE, Index, binned
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.solution import Remaining
-from jtqd.sysid.diagnosis.structure import (
-    SIGNIFICANT,
-    AxisMap,
-    axis_maps,
-    axis_values,
-    frequency_lines,
-    order_lines,
-    sharpened,
-)
+from jtqd.sysid.diagnosis.structure import AXES, Balance, View, bins_of, events, pursue
 
-_RELEVANT: Final = 6e-4
-"""Part of the rated torque (rms) from which structure counts as a gap."""
-_JUMP: Final = 0.01
-"""Part of the rated torque by which the residual must move for an event."""
-_WANDER: Final = 0.006
-"""Part of the rated torque (rms of means over seconds) from which a residual is not noise."""
+Parts = list[FloatArray]
+"""A residual [run][n], NaN where it is not valid."""
 SHARED: Final = 5.0
 """Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
 _OF_A_DAY: Final = ("zero", "viscous", "coulomb")
 """Families that are the joint's where all runs share them; a torsion's zero is nobody's, `smooth` is what is near rest."""
-_LINE_RATIO: Final = 25.0
-_HZ_RATIO: Final = 25.0
+_MOST_OF_THE_TIME: Final = 0.1
+"""What takes more of the time than this is no event but a condition."""
+_SAME: Final = 0.02
+"""Part of their rms by which velocities of repeated runs differ at most; loads by five times as much."""
+_TRACE_POINTS: Final = 4000
+QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
 
 
 @dataclass(frozen=True)
 class Unexplained:
-    """maps: all axes of all channels; found: those whose structure is significant and large enough to be reported; limits:
-    by which a channel's events are judged; worst_nm: rms of the structure in the run that has most of it, per channel.
-    """
+    """views: of what remains, per channel that has any, each of what those before it leave; balances: of all."""
 
-    maps: tuple[AxisMap, ...]
-    found: tuple[AxisMap, ...]
-    bursts: tuple[Burst, ...]
-    lines: tuple[Line, ...]
-    limits: Mapping[Channel, EventLimits] = field(default_factory=dict)
-    worst_nm: Mapping[Channel, float] = field(default_factory=dict)
+    views: Mapping[Channel, Sequence[View]]
+    balances: Mapping[Channel, Balance]
 
     @property
-    def significant(self) -> bool:
-        """Whether anything is left that is not noise."""
-        return bool(self.found or self.bursts or self.lines)
+    def worst_nm(self) -> dict[Channel, float]:
+        """Rms of what remains in the run that has most of it, per channel [Nm]."""
+        most = {c: np.max(np.sum([v.by_run for v in found], axis=0)) for c, found in self.views.items()}
+        return {c: max(float(nm2), 0.0) ** 0.5 for c, nm2 in most.items()}
 
     def energy_nm2(self) -> float:
-        """Return the largest energy per channel that is structure, summed over channels [Nm^2]."""
+        """Return the energy that is structure, summed over channels [Nm^2]."""
         return sum(self.by_channel().values())
 
     def by_channel(self) -> dict[Channel, float]:
-        """Return the largest energy that is structure, per channel [Nm^2]."""
-        by_channel: dict[Channel, float] = {}
-        items = [
-            *((m.channel, m.energy_nm2) for m in self.found),
-            *((b.channel, b.excess_nm2) for b in self.bursts),
-            *((line.channel, 0.5 * line.amplitude_nm**2) for line in self.lines),
-        ]
-        for channel, energy in items:
-            by_channel[channel] = max(by_channel.get(channel, 0.0), energy)
-        return by_channel
-
-    def share(self, explained_nm2: float) -> float:
-        """Return unexplained structure as a part of all structure; explained_nm2: of the causes, summed over channels."""
-        left = self.energy_nm2()
-        return left / max(left + explained_nm2, 1e-30)
+        """Return the energy that is structure, per channel [Nm^2]."""
+        return {c: sum(v.energy_nm2 for v in found) for c, found in self.views.items()}
 
     @property
     def reasons(self) -> list[str]:
-        """Lines for people."""
-        out = []
-        for m in sorted(self.found, key=lambda m: -m.energy_nm2)[:3]:
-            size, axis = np.sqrt(m.energy_nm2), m.axis.replace("_", " ")
-            out.append(
-                f"joint {m.channel.joint}, {m.channel.balance} balance: {size:.3g} Nm rms depend on the {axis}"
-                " in a way that no effect of the library explains"
-            )
-        for b in self.bursts:
-            run, t = b.times[0]
-            many = len(b.times)
-            what = (
-                f"{counted(many, 'event')} that noise does not explain"
-                if b.what == "events"
-                else "means over a second that noise does not explain"
-            )
-            out.append(
-                f"joint {b.channel.joint}, {b.channel.balance} balance: {what}, the strongest in {run} at {t:.1f} s"
-            )
-        for line in self.lines[:2]:
-            where = (
-                f"at {line.order:.3g} Hz, independent of the motion"
-                if line.unit == "Hz"
-                else f"at order {line.order:.2f} per motor revolution, which is no order of gear or motor"
-            )
-            out.append(
-                f"joint {line.channel.joint}, {line.channel.balance} balance: {line.amplitude_nm:.3g} Nm {where}"
-            )
-        return out
+        """Lines for people, largest first."""
+        every = [(v.energy_nm2, c, v) for c, found in self.views.items() for v in found]
+        every.sort(key=lambda each: -each[0])
+        return [
+            f"joint {c.joint}, {c.balance} balance: {nm2**0.5:.3g} Nm rms that no effect of the library explains: {_name(v)}"
+            for nm2, c, v in every
+        ]
+
+
+def _name(view: View) -> str:
+    """Return a line, moments, or an axis as text."""
+    if view.line is not None:
+        order, hertz = view.line.order, view.line.unit == "Hz"
+        return f"{order:.3g} Hz" if hertz else f"order {order:.2f} per motor revolution"
+    if view.what:
+        return f"{view.what}: " + ", ".join(f"{run} {t:.1f} s" for run, t in view.times[:6])
+    return view.axis.replace("_", " ")
+
+
+def unexplained_residual(dataset: Dataset, refined: Remaining, noise: Noise) -> Unexplained:
+    """Return the unexplained residual when causes and the runs' own changes are taken out."""
+    balances = _balances(dataset, noise)
+    found = {c: pursue(balances[c], x) for c, x in less_nuisances(dataset, refined).items()}
+    return Unexplained({c: views for c, views in found.items() if views}, balances)
+
+
+def _balances(dataset: Dataset, noise: Noise) -> dict[Channel, Balance]:
+    rated = {c: dataset.joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
+    return {c: Balance(dataset.runs, c, noise.ar[c], dataset.step_s, nm) for c, nm in rated.items()}
+
+
+def events_left(dataset: Dataset, refined: Remaining, noise: Noise) -> dict[Channel, View]:
+    """Return rare events where the residual of the causes has any that are large enough to matter, else nothing.
+
+    The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
+    when they are: events bend the fitted causes, which then leave residuals at other moments.
+    """
+    balances = _balances(dataset, noise)
+
+    def large(residuals: Mapping[Channel, Parts]) -> dict[Channel, View]:
+        found = {c: events(balances[c], parts) for c, parts in residuals.items()}
+        return {c: e for c, e in found.items() if e and e.energy_nm2 > balances[c].least_nm2}
+
+    found = large(dataset.unexplained) if large(less_nuisances(dataset, refined)) else {}
+    return {c: e for c, e in found.items() if np.mean(np.concatenate(e.masks)) < _MOST_OF_THE_TIME}
 
 
 def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
@@ -137,9 +122,9 @@ def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
     return np.asarray(changes - shared)
 
 
-def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, list[FloatArray]]:
-    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it [run][n]."""
-    out: dict[Channel, list[FloatArray]] = {}
+def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it."""
+    out: dict[Channel, Parts] = {}
     for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
         for channel, d in run.channels.items():
             rest = d.residual - d.nuisances @ u[d.families]
@@ -152,132 +137,169 @@ def held_nm(dataset: Dataset, refined: Remaining) -> dict[Channel, float]:
     what is usual in the others; at rest, where the balance is not known, against a straight line between the rows around
     them. Channels without such rows are left out.
     """
-    return {c: max(e / n for e, n in runs) ** 0.5 for c, runs in _held(dataset, refined).items()}
-
-
-def _measured_or_held(d: ChannelData) -> BoolArray:
-    return d.valid if d.held is None else d.valid | d.held
-
-
-def _held(dataset: Dataset, refined: Remaining) -> dict[Channel, list[tuple[float, int]]]:
-    """Return (sum of squares [Nm^2], samples held or valid) of the runs with held rows, by channel."""
-    out: dict[Channel, list[tuple[float, int]]] = {}
+    out: dict[Channel, float] = {}
     for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):
         for channel, d in run.channels.items():
-            if d.held is None or not (d.held.any() or len(d.at_rest_nm)):
-                continue
-            rest = left.channels[channel].residual - d.nuisances @ u[d.families]
-            usual = float(np.mean(rest[d.valid] ** 2)) if d.valid.any() else 0.0
-            excess = max(float(np.sum(rest[d.held] ** 2 - usual)), 0.0) + float(np.sum(d.at_rest_nm**2))
-            out.setdefault(channel, []).append(
-                (excess, int(np.sum(_measured_or_held(d))) + len(d.at_rest_nm))
-            )
+            if d.held is not None and (d.held.any() or len(d.at_rest_nm)):
+                rest = left.channels[channel].residual - d.nuisances @ u[d.families]
+                usual = float(np.mean(rest[d.valid] ** 2)) if d.valid.any() else 0.0
+                excess = max(float(np.sum(rest[d.held] ** 2 - usual)), 0.0) + float(np.sum(d.at_rest_nm**2))
+                count = int(np.sum(d.valid | d.held)) + len(d.at_rest_nm)
+                out[channel] = max(out.get(channel, 0.0), (excess / count) ** 0.5)
     return out
 
 
-def events_left(dataset: Dataset, refined: Remaining, noise: Noise) -> dict[Channel, Events]:
-    """Return rare events where the residual of the causes has any that are large enough to matter, else nothing.
+# Gaps and their places.
 
-    The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
-    when they are: events bend the fitted causes, which then leave residuals at other moments.
+
+def channel_gaps(dataset: Dataset, refined: Remaining, left: Unexplained, matters: bool) -> tuple[Gap, ...]:
+    """Return the gaps of all channels: with the places of what remains, that which has most of it first, where it matters;
+    else with those of the whole gap, the largest excess over the floor first.
     """
-    if not _bursts(dataset, less_nuisances(dataset, refined), noise):
-        return {}
-    found = _bursts(dataset, dataset.unexplained, noise)
-    return {c: e for c, e in found.items() if e.part < MOST_OF_THE_TIME}
+    # where the gap lives: without what each run has of its own, which would hide a small effect
+    shown = less_nuisances(dataset, refined) if matters else _before(dataset, refined)
+    out = []
+    for channel, balance in left.balances.items():
+        x, rmse = shown[channel], _rms(_raw(dataset, channel))
+        floor, origin = _floor(dataset, refined, channel)
+        floor = min(floor, rmse)  # changes from run to run that work against each other are not noise
+        noise = _rms(dataset.unexplained[channel])
+        views = left.views.get(channel, ()) if matters else pursue(balance, x)
+        ranked = [_places(v, x, noise, max(rmse**2 - noise**2, 1e-30)) for v in views]
+        places = (*(each[0] for each in ranked), *(p for each in ranked for p in each[1:]))
+        drawn = [(axis, bins_of(balance, axis, x)) for axis in AXES]
+        every = [p for axis, found in drawn if found for p in _bins(axis, *found, x, noise)]
+        seen = tuple(p for p in every if np.isfinite(p.rms_nm))
+        out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, places, seen))
+    if matters:  # what is not explained comes first, wherever the gap is largest
+        energy = left.by_channel()
+        return tuple(sorted(out, key=lambda g: -energy.get(Channel(g.joint, g.balance), 0.0)))
+    return tuple(sorted(out, key=lambda g: g.noise_floor_nm**2 - g.rmse_nm**2))
 
 
-def _bursts(
-    dataset: Dataset, residuals: Mapping[Channel, list[FloatArray]], noise: Noise
-) -> dict[Channel, Events]:
-    found = bursts(dataset.runs, residuals, _limits(dataset, noise))
-    return {c: e for c, e in found.items() if e.burst.excess_nm2 > 0.25 * _least(dataset.joints[c.joint])}
+def _rms(parts: Parts) -> float:
+    return float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2)))
 
 
-def _limits(dataset: Dataset, noise: Noise) -> dict[Channel, EventLimits]:
-    rated = {c: dataset.joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
-    return {c: EventLimits(noise.ar[c], dataset.step_s, _JUMP * x, _WANDER * x) for c, x in rated.items()}
+def _places(view: View, parts: Parts, noise: float, excess_nm2: float) -> list[Place]:
+    """Return the places of a view: moments, a line, or at most three bins of a condition."""
+    size, share = float(np.sqrt(view.energy_nm2)), min(view.energy_nm2 / excess_nm2, 1.0)
+    if view.line is not None:
+        order, unit = view.line.order, view.line.unit
+        return [Place("frequency", _name(view), share, order, order, unit, size)]
+    if view.what:
+        start, long = view.times[0][1], 1.0 if view.what == "seconds" else 0.1
+        return [Place("time", _name(view), share, start, start + long, "s", size)]
+    assert view.edges is not None
+    bins = _bins(view.axis, view.edges, view.places, parts, noise)
+    return [bins[k] for k in view.bins[:3]]
 
 
-def _least(joint: Joint) -> float:
-    """Return the energy from which structure is a gap [Nm^2]."""
-    return (_RELEVANT * joint.rated_torque_nm) ** 2
+def _bins(axis: str, edges: FloatArray, places: Sequence[Index], parts: Parts, floor: float) -> list[Place]:
+    """Return all bins of an axis with their share of its energy above the floor; rms NaN where nothing was visited."""
+    place, x, unit = np.concatenate(list(places)), np.concatenate(parts), AXES[axis]
+    count = np.bincount(place[np.isfinite(x)], minlength=len(edges) - 1)
+    square = np.bincount(place, np.nan_to_num(x) ** 2, minlength=len(count))
+    excess = np.maximum(square - floor**2 * count, 0.0)
+    share = excess / max(float(excess.sum()), 1e-30)
+    rms = np.sqrt(np.where(count > 0, square / np.maximum(count, 1), np.nan))
+    names = [f"{a:.3g} to {b:.3g} {unit}".strip() for a, b in pairwise(edges)]
+    names = list(QUADRANT_NAMES) if axis == "quadrant" else names
+    return [
+        Place(axis, name, float(share[k]), float(edges[k]), float(edges[k + 1]), unit, float(rms[k]))
+        for k, name in enumerate(names)
+    ]
 
 
-def unexplained_residual(dataset: Dataset, refined: Remaining, noise: Noise) -> Unexplained:
-    """Return the unexplained residual when causes and the runs' own changes are taken out."""
-    joints = dataset.joints
-    whole = less_nuisances(dataset, refined)
-    found = _bursts(dataset, whole, noise)
-    # maps and lines of what is no event: a few moments say nothing about a condition
-    residuals = {c: _without_rare_events(parts, found.get(c)) for c, parts in whole.items()}
-    maps = axis_maps(refined.runs, residuals, dataset.step_s)
-    significant = tuple(
-        m for m in maps if m.p < SIGNIFICANT and m.energy_nm2 > _least(joints[m.channel.joint])
-    )
-    limits = _limits(dataset, noise)
-    burst = (*(e.burst for e in found.values()), *wandering(refined.runs, residuals, limits))
-    lines = tuple(
-        sharpened(line, refined.runs, residuals[line.channel], dataset.step_s)
-        for line in (
-            *order_lines(refined.runs, residuals, dataset.step_s),
-            *frequency_lines(refined.runs, residuals, dataset.step_s),
-        )
-        if line.ratio > (_HZ_RATIO if line.unit == "Hz" else _LINE_RATIO)
-        and 0.5 * line.amplitude_nm**2 > _least(joints[line.channel.joint])
-    )
-    worst = _worst_runs(
-        refined.runs, whole, dataset.step_s, maps=significant, events=found, bursts=burst, lines=lines
-    )
-    return Unexplained(tuple(maps), significant, burst, lines, limits, worst)
+def _raw(dataset: Dataset, channel: Channel) -> Parts:
+    """Residual of the simulation with the joint file; torsion without each run's zero."""
+    runs = [run.channels[channel].residual for run in dataset.runs]
+    parts = [np.where(dataset.valid_or_event(r, channel), x, np.nan) for r, x in enumerate(runs)]
+    return [x - np.nanmean(x) for x in parts] if channel.balance == TORSION else parts
 
 
-def _worst_runs(
-    runs: Sequence[RunData],
-    whole: Mapping[Channel, Sequence[FloatArray]],
-    step_s: float,
-    *,
-    maps: Sequence[AxisMap],
-    events: Mapping[Channel, Events],
-    bursts: Sequence[Burst],
-    lines: Sequence[Line],
-) -> dict[Channel, float]:
-    """Return the rms of the structure in the run that has most of it [Nm]: of the largest map, event, wandering or line."""
-    energy: dict[Channel, float] = {}
-
-    def at_least(channel: Channel, nm2: float) -> None:
-        energy[channel] = max(energy.get(channel, 0.0), nm2)
-
-    for m in maps:
-        chance = float(np.nansum(m.mean_nm**2 * m.count)) / max(float(m.count.sum()), 1.0)
-        part = m.energy_nm2 / max(chance, 1e-30)  # the rest of the means' energy is chance
-        for run in runs:
-            values = axis_values(run.axes[m.channel.joint], m.axis)
-            place = np.clip(np.searchsorted(m.edges, values, side="right") - 1, 0, len(m.mean_nm) - 1)
-            here = m.mean_nm[place][run.channels[m.channel].valid]
-            if np.isfinite(here).any():
-                at_least(m.channel, part * float(np.nanmean(here**2)))
-    for channel, found in events.items():
-        usual = float(
-            np.nanmedian([np.nanmean(x[~m] ** 2) for x, m in zip(whole[channel], found.masks, strict=True)])
-        )
-        for x, mask in zip(whole[channel], found.masks, strict=True):
-            count = max(int(np.isfinite(x).sum()), 1)
-            at_least(channel, float(np.nansum(x[mask] ** 2 - usual)) / count)
-    block = max(2, round(BLOCK_S / step_s))
-    for b in bursts:
-        if b.what == "seconds":
-            for x in whole[b.channel]:
-                mean, use = block_means(x, block)
-                if use.any():
-                    at_least(b.channel, float(np.mean(mean[use] ** 2)))
-    for line in lines:
-        at_least(line.channel, 0.5 * line.amplitude_nm**2)
-    return {c: float(np.sqrt(e)) for c, e in energy.items()}
+def _floor(dataset: Dataset, refined: Remaining, channel: Channel) -> tuple[float, str]:
+    """Return the noise floor [Nm] and where it was taken from."""
+    repeats = _repeats(dataset, channel)
+    if repeats is not None:
+        return repeats, "repeated runs"
+    drift = []
+    for run, u in zip(refined.runs, own_changes(dataset, refined), strict=True):
+        d = run.channels[channel]
+        part = (d.nuisances @ u[d.families])[d.valid]
+        drift.append(part - part.mean() if channel.balance == TORSION and len(part) else part)
+    square = float(np.mean(np.concatenate(drift) ** 2)) if any(map(len, drift)) else 0.0
+    rms = float(np.hypot(_rms(dataset.unexplained[channel]), np.sqrt(square)))
+    return rms, "what no effect explains, and run-to-run variation"
 
 
-def _without_rare_events(parts: Sequence[FloatArray], found: Events | None) -> list[FloatArray]:
-    """Return the residual without its events where they are rare [run][n]."""
-    if found is None or found.part >= MOST_OF_THE_TIME:
-        return list(parts)
-    return [np.where(m, np.nan, x) for m, x in zip(found.masks, parts, strict=True)]
+def _repeats(dataset: Dataset, channel: Channel) -> float | None:
+    """Return rms of half the difference of repeated runs times sqrt 2 [Nm]; None without repetitions."""
+    found = []
+    for one, two in combinations(dataset.runs, 2):
+        if _alike(one.axes[channel.joint], two.axes[channel.joint]):
+            x, y = one.channels[channel], two.channels[channel]
+            d = (x.residual - y.residual)[x.valid & y.valid]
+            found.append(d - d.mean() if channel.balance == TORSION and len(d) else d)
+    if sum(map(len, found)) < 200:
+        return None
+    return float(np.sqrt(0.5 * np.mean(np.concatenate(found) ** 2)))
+
+
+def _alike(one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> bool:
+    if len(one["velocity"]) != len(two["velocity"]):
+        return False
+    apart = {axis: float(np.mean((one[axis] - two[axis]) ** 2)) for axis in ("velocity", "load")}
+    most = {axis: float(np.mean(one[axis] ** 2)) * _SAME**2 for axis in apart}
+    return 0.0 < most["velocity"] >= apart["velocity"] and 0.0 < 25.0 * most["load"] >= apart["load"]
+
+
+# Traces.
+
+
+def _after(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return what the causes leave, less what each run has of its own where that makes it smaller: fitted to the
+    whitened residual of few seconds it need not.
+    """
+    out = less_nuisances(dataset, refined)
+    for channel, parts in out.items():
+        for r, run in enumerate(refined.runs):
+            plain = np.where(dataset.valid_or_event(r, channel), run.channels[channel].residual, np.nan)
+            parts[r] = min(parts[r], plain, key=lambda x: float(np.nansum(x**2)))
+    return out
+
+
+def _before(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return the same with what the causes explain: the residual with the joint files."""
+    both = list(zip(dataset.runs, refined.runs, strict=True))
+    return {
+        c: [
+            x + run.channels[c].residual - left.channels[c].residual
+            for x, (run, left) in zip(after, both, strict=True)
+        ]
+        for c, after in _after(dataset, refined).items()
+    }
+
+
+def traces(dataset: Dataset, refined: Remaining) -> tuple[Trace, ...]:
+    """Return measurement and residual before and after for plots, thinned, one per run and channel."""
+    out = []
+    after, before = _after(dataset, refined), _before(dataset, refined)
+    for r, run in enumerate(dataset.runs):
+        signals = {s.number: s for s in dataset.signals[r]}
+        every = max(1, len(run.time_s) // _TRACE_POINTS)
+        for c in run.channels:
+            axes = run.axes[c.joint]
+            measured = binned(_measured(signals[c.joint], c.balance), run.samples)
+            curves = (before[c][r], after[c][r], axes["velocity"], axes["load"], measured)
+            shown = [x[::every] for x in (run.time_s, *curves)]
+            out.append(Trace(run.name, c.joint, c.balance, *shown))
+    return tuple(out)
+
+
+def _measured(s: JointSignals, balance: str) -> FloatArray:
+    """Return what a balance measures [n], Nm joint side: G Kt i of the motor, or the torque of the encoders' twist."""
+    if balance == TORSION:
+        return np.asarray(s.sensor_nm if s.torsion_nm is None else s.torsion_nm + s.sensor_nm)
+    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
+    return np.asarray(s.seen(balance, scale * s.current_a))

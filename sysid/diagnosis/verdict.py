@@ -40,14 +40,19 @@ from jtqd.sysid.diagnosis.findings import (
     Value,
     joint_text,
 )
-from jtqd.sysid.diagnosis.gaps import channel_gaps, traces
 from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.scope import Scope
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, present_effects, remaining
-from jtqd.sysid.diagnosis.unexplained import Unexplained, held_nm, unexplained_residual
+from jtqd.sysid.diagnosis.unexplained import (
+    Unexplained,
+    channel_gaps,
+    held_nm,
+    traces,
+    unexplained_residual,
+)
 
 _Z95: Final = 1.96
 
@@ -174,7 +179,7 @@ def conclude(
     else:
         verdict = NO_GAP
     table, untold = entry_table(solution, causes, scope)
-    gaps = channel_gaps(dataset, left, rest if unexplained.matters else None)
+    gaps = channel_gaps(dataset, left, rest, unexplained.matters)
     reasons = rest.reasons if unexplained.matters else []
     gain = gain_of(solution, prediction) if prediction.chosen else None
     findings = Findings(

@@ -11,11 +11,10 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.events import EventLimits
-from jtqd.sysid.diagnosis.gaps import Location, _repeats, explained_by_bins, locate
 from jtqd.sysid.diagnosis.regressors import RunData
-from jtqd.sysid.diagnosis.signals import Channel, Line
-from jtqd.sysid.diagnosis.structure import AxisMap, axis_maps
+from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.structure import Balance, View, explained_by_bins, pursue
+from jtqd.sysid.diagnosis.unexplained import _repeats
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 STEP_S = 0.005
@@ -50,16 +49,14 @@ def noise(seed: int) -> FloatArray:
     return out
 
 
-def told(
-    residual: Residual, channel: Channel = MOTOR1, lines: tuple[Line, ...] = (), seed: int = 0
-) -> tuple[list[Location], dict[str, AxisMap]]:
+def found(residual: Residual, channel: Channel = MOTOR1, seed: int = 0) -> list[View]:
+    """The views of a residual of six runs, of a joint of 50 Nm: events from 0.5 Nm on, means over seconds from 0.3 Nm on."""
     axes = [motion(seed + k) for k in range(6)]
     parts = [residual(a, k) + noise(seed + k) for k, a in enumerate(axes)]
     runs: list[RunData] = [
         run_data(f"run{k}", {channel: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))
     ]
-    maps = {m.axis: m for m in axis_maps(runs, {channel: parts}, STEP_S)}
-    return locate(runs, channel, parts, EventLimits(AR, STEP_S, 0.5, 0.3), lines=lines, maps=maps), maps
+    return pursue(Balance(runs, channel, AR, STEP_S, 50.0), parts)
 
 
 @pytest.mark.parametrize(
@@ -77,36 +74,36 @@ def told(
 def test_the_condition_itself_comes_before_those_that_go_along(
     axis: str, shape: Callable[[dict[str, FloatArray]], FloatArray]
 ) -> None:
-    places, maps = told(lambda a, _: np.asarray(0.6 * shape(a)))
+    places = found(lambda a, _: np.asarray(0.6 * shape(a)))
     assert places[0].axis == axis
     assert places[0].energy_nm2 > 2.0 * sum(p.energy_nm2 for p in places[1:])
     values = np.concatenate([motion(k)[axis] for k in range(6)])
     shapes = np.concatenate([np.abs(shape(motion(k))) for k in range(6)])
-    edges, k = maps[axis].edges, places[0].bins[0]
+    edges, k = places[0].edges, places[0].bins[0]
+    assert edges is not None
     here = (values >= edges[k]) & (values <= edges[k + 1])
-    assert np.mean(shapes[here] ** 2) > 3.0 * np.mean(shapes**2), "the bin that tells most is where it is"
+    assert np.mean(shapes[here] ** 2) > 3.0 * np.mean(shapes**2), "the bin that explains most is where it is"
 
 
-def test_the_second_place_tells_what_the_first_does_not() -> None:
+def test_the_second_place_explains_what_the_first_does_not() -> None:
     def two(a: dict[str, FloatArray], _: int) -> FloatArray:
         angle = np.exp(-(((a["link_angle"] - 0.3) / 0.1) ** 2))
         return np.asarray(0.03 * a["load"] + 0.5 * angle)
 
-    places, _ = told(two, TORSION1)
+    places = found(two, TORSION1)
     assert [p.axis for p in places[:2]] == ["load", "link_angle"]
 
 
 def test_noise_has_no_place() -> None:
     for seed in range(5):
-        assert told(lambda a, _: 0.0 * a["load"], seed=10 * seed)[0] == []
+        assert found(lambda a, _: 0.0 * a["load"], seed=10 * seed) == []
 
 
 def test_what_only_one_run_shows_is_not_its_temperature() -> None:
-    """One run is off as a whole: every condition that only this run has would tell it, and no other run confirms it."""
-    places, _ = told(lambda a, k: np.full(COUNT, 0.8 if k == 2 else 0.0) + 0.0 * a["load"], TORSION1)
-    assert places[0].burst is not None
-    assert places[0].burst.what == "seconds"
-    assert {run for run, _ in places[0].burst.times} == {"run2"}
+    """One run is off as a whole: every condition that only this run has would explain it, and no other run confirms it."""
+    places = found(lambda a, k: np.full(COUNT, 0.8 if k == 2 else 0.0) + 0.0 * a["load"], TORSION1)
+    assert places[0].what == "seconds"
+    assert {run for run, _ in places[0].times} == {"run2"}
 
 
 def test_events_are_the_moments_and_not_where_the_joint_was() -> None:
@@ -116,39 +113,41 @@ def test_events_are_the_moments_and_not_where_the_joint_was() -> None:
             x[start : start + 20] = a["load"][start]
         return x
 
-    places, _ = told(dropped)
-    assert places[0].burst is not None
-    assert places[0].burst.what == "events"
+    places = found(dropped)
+    assert places[0].what == "events"
     rng_times = {
         (f"run{k}", s * STEP_S)
         for k in range(6)
         for s in np.random.default_rng([5, k]).integers(100, 3900, 3)
     }
-    for run, t in places[0].burst.times:
+    for run, t in places[0].times:
         assert any(run == r and abs(t - u) < 0.2 for r, u in rng_times)
 
 
 def test_a_step_on_every_pass_is_the_angles() -> None:
-    places, _ = told(lambda a, _: np.where(np.abs(a["link_angle"] - 0.3) < 0.15, 1.5, 0.0), TORSION1)
+    places = found(lambda a, _: np.where(np.abs(a["link_angle"] - 0.3) < 0.15, 1.5, 0.0), TORSION1)
     assert places[0].axis == "link_angle"
 
 
-def test_a_line_is_ranked_by_its_energy() -> None:
-    def residual(a: dict[str, FloatArray], _: int) -> FloatArray:
-        return np.asarray(0.02 * a["load"])
+@pytest.mark.parametrize(("amplitude", "at"), [(0.2, 1), (1.0, 0)])
+def test_a_line_is_ranked_by_its_energy(amplitude: float, at: int) -> None:
+    def residual(a: dict[str, FloatArray], k: int) -> FloatArray:
+        return np.asarray(0.02 * a["load"] + amplitude * np.cos(2.0 * np.pi * 6.0 * a["time"] + k))
 
-    small, large = Line(TORSION1, 6.0, 0.2, 90.0, "Hz"), Line(TORSION1, 6.0, 1.0, 90.0, "Hz")
-    assert [p.line for p in told(residual, TORSION1, (small,))[0][:2]] == [None, small]
-    assert told(residual, TORSION1, (large,))[0][0].line is large
+    places = found(residual, TORSION1)
+    assert [p.line is not None for p in places[:2]] == [k == at for k in range(2)]
+    line = places[at].line
+    assert line is not None
+    assert (line.unit, line.order) == ("Hz", pytest.approx(6.0, abs=0.13))
 
 
 def test_other_runs_predict_this_one() -> None:
-    """The energy told is that of plain leave-one-out means, sample by sample."""
+    """The energy explained is that of plain leave-one-out means, sample by sample."""
     rng = np.random.default_rng(2)
     places = [rng.integers(0, 3, 400) for _ in range(4)]
     parts = [np.array([0.5, 0.0, -1.0])[p] + rng.normal(0.0, 0.3, 400) for p in places]
     parts[1][50:90] = np.nan
-    energy, means = explained_by_bins(places, parts, 3, STEP_S)
+    energy, means = explained_by_bins(places, parts, 3, 1.0 / STEP_S)
     for r in range(4):
         others = [k for k in range(4) if k != r]
         x = np.concatenate([parts[k] for k in others])

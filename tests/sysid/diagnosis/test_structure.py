@@ -11,20 +11,25 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis import structure
-from jtqd.sysid.diagnosis.events import Burst, EventLimits, bursts, wandering
 from jtqd.sysid.diagnosis.regressors import RunData
-from jtqd.sysid.diagnosis.signals import Channel, Line
+from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.structure import (
     SIGNIFICANT,
-    AxisMap,
+    Balance,
+    View,
     axis_edges,
-    axis_maps,
     axis_values,
+    bins_of,
+    chance,
+    conditions,
+    events,
     frequency_lines,
     order_lines,
+    pursue,
+    seconds,
     sharpened,
 )
-from jtqd.sysid.diagnosis.unexplained import Unexplained
+from jtqd.sysid.diagnosis.unexplained import Unexplained, _bins, _places
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 STEP_S = 0.005
@@ -61,16 +66,20 @@ def runs_with(
     channel: Channel = TORSION1,
     many: int = 4,
     seed: int = 0,
-) -> tuple[list[RunData], dict[Channel, list[FloatArray]]]:
+) -> tuple[Balance, list[FloatArray]]:
     axes = [motion(seed + k) for k in range(many)]
     parts = [torque(a) + noise(seed + k) for k, a in enumerate(axes)]
-    return [run_data(f"run{k}", {channel: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))], {
-        channel: parts
-    }
+    runs = [run_data(f"run{k}", {channel: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))]
+    return balance(runs, channel), parts
 
 
-def map_of(maps: list[AxisMap], axis: str) -> AxisMap:
-    return next(m for m in maps if m.axis == axis)
+def balance(runs: list[RunData], channel: Channel = MOTOR1, rated_nm: float = 50.0) -> Balance:
+    return Balance(runs, channel, AR, STEP_S, rated_nm)
+
+
+def view_of(found: tuple[Balance, list[FloatArray]], axis: str) -> View:
+    """The view of this axis, in the direction in which it explains most."""
+    return max((v for v in conditions(*found) if v.axis == axis), key=lambda v: v.energy_nm2)
 
 
 def nothing(a: dict[str, FloatArray]) -> FloatArray:
@@ -80,11 +89,11 @@ def nothing(a: dict[str, FloatArray]) -> FloatArray:
 def test_p_is_uniform_where_there_is_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Coloured noise of changing size: no model of it is made, and p still means what it says (in one direction)."""
     monkeypatch.setattr(structure, "FLIPS", 999)  # enough for the middle of the distribution
-    monkeypatch.setattr(structure, "directions", lambda runs, channel: [None])
     p = []
     for seed in range(50):
-        runs, residuals = runs_with(nothing, seed=1000 + 10 * seed, many=2)
-        p += [m.p for m in axis_maps(runs, residuals, STEP_S, seed) if m.axis in ("link_angle", "load")]
+        some, parts = runs_with(nothing, seed=1000 + 10 * seed, many=2)
+        plain = [v for v in conditions(some, parts) if v.axis in ("link_angle", "load")][::2]
+        p += [chance(v, parts, STEP_S) for v in plain]
     values = np.sort(p)
     distance = np.max(np.abs(values - (np.arange(len(values)) + 0.5) / len(values)))
     assert len(values) == 100
@@ -98,14 +107,14 @@ def test_structure_is_found_with_its_energy_and_its_place() -> None:
     def bump(a: dict[str, FloatArray]) -> FloatArray:
         return np.asarray(0.4 * np.exp(-(((a["link_angle"] - 0.3) / 0.1) ** 2)))
 
-    runs, residuals = runs_with(bump)
-    found = map_of(axis_maps(runs, residuals, STEP_S), "link_angle")
-    assert found.p < SIGNIFICANT
-    place = int(np.nanargmax(found.mean_nm))
+    some, parts = runs_with(bump)
+    found = view_of((some, parts), "link_angle")
+    assert chance(found, parts, STEP_S) < SIGNIFICANT
+    place = found.bins[0]
+    assert found.edges is not None
     assert found.edges[place] - 0.05 < 0.3 < found.edges[place + 1] + 0.05
     energy = float(np.mean(np.concatenate([bump(motion(k)) for k in range(4)]) ** 2))
     assert found.energy_nm2 == pytest.approx(energy, rel=0.15)
-    assert found.square_nm2[place] > found.mean_nm[place] ** 2
 
 
 @pytest.mark.parametrize("channel", [MOTOR1, TORSION1])
@@ -115,31 +124,32 @@ def test_a_loss_that_follows_the_direction_is_seen(channel: Channel) -> None:
     def loss(a: dict[str, FloatArray]) -> FloatArray:
         return np.asarray(0.4 * np.sign(a["velocity"]) * np.exp(-(((a["link_angle"] - 0.3) / 0.1) ** 2)))
 
-    runs, residuals = runs_with(loss, channel)
-    found = map_of(axis_maps(runs, residuals, STEP_S), "link_angle")
-    assert found.p < SIGNIFICANT
+    some, parts = runs_with(loss, channel)
+    found = view_of((some, parts), "link_angle")
+    assert chance(found, parts, STEP_S) < SIGNIFICANT
     assert found.energy_nm2 > 0.005
 
 
-def test_a_map_is_the_mean_of_what_is_valid() -> None:
-    runs, residuals = runs_with(lambda a: 0.02 * a["load"])
-    for x in residuals[TORSION1]:
+def test_a_map_is_of_what_is_valid() -> None:
+    some, parts = runs_with(lambda a: 0.02 * a["load"])
+    for x in parts:
         x[300:900] = np.nan
-    found = map_of(axis_maps(runs, residuals, STEP_S), "load")
-    load = np.concatenate([r.axes[1]["load"] for r in runs])
-    x = np.concatenate(residuals[TORSION1])
-    for k, mean in enumerate(found.mean_nm):
-        here = (load >= found.edges[k]) & (load < found.edges[k + 1]) & np.isfinite(x)
-        assert found.count[k] == here.sum()
-        assert mean == pytest.approx(float(x[here].mean()))
-        assert found.square_nm2[k] == pytest.approx(float(np.mean(x[here] ** 2)))
+    bins = bins_of(some, "load", parts)
+    assert bins is not None
+    load = np.concatenate([a["load"] for a in some.axes])
+    x = np.concatenate(parts)
+    everything = float(np.nansum(x**2))
+    for place in _bins("load", *bins, parts, 0.0):
+        here = (load >= place.low) & (load < place.high) & np.isfinite(x)
+        assert place.rms_nm**2 == pytest.approx(float(np.mean(x[here] ** 2)))
+        assert place.share == pytest.approx(float(np.sum(x[here] ** 2)) / everything)
 
 
 def test_a_few_seconds_prove_nothing() -> None:
     axes = motion(1, 6)
     x = np.sign(axes["load"])
-    maps = axis_maps([run_data("run", {TORSION1: x}, axes)], {TORSION1: [x]}, STEP_S)
-    assert {m.p for m in maps} == {1.0}
+    some = balance([run_data("run", {TORSION1: x}, axes)], TORSION1)
+    assert {chance(v, [x], STEP_S) for v in conditions(some, [x])} == {1.0}
 
 
 def test_axes_that_do_not_vary_have_no_map() -> None:
@@ -172,8 +182,9 @@ def gaussian(seed: int, count: int = 12000) -> FloatArray:
     return out
 
 
-def limits(nm: float) -> dict[Channel, EventLimits]:
-    return {MOTOR1: EventLimits(AR, STEP_S, jump_nm=nm, wander_nm=nm)}
+def at_least(nm: float, runs: list[RunData], of_rated: float = 0.01) -> Balance:
+    """The balance of a joint whose events count from this size on: 1 % of its rated torque."""
+    return balance(runs, rated_nm=nm / of_rated)
 
 
 def test_events_are_found_at_their_times() -> None:
@@ -182,42 +193,40 @@ def test_events_are_found_at_their_times() -> None:
     parts[2][8000:8200] -= 2.0  # a second that is off: a step at both ends
     parts[2][11000:11050] = np.nan
     runs = [run_data(f"run{k}", {MOTOR1: x}, {}) for k, x in enumerate(parts)]
-    events = bursts(runs, {MOTOR1: parts}, limits(0.5))[MOTOR1]
-    found = events.burst
+    found = events(at_least(0.5, runs), parts)
+    assert found is not None
     assert [t for name, t in found.times if name == "run0"] == [20.0]
     off = sorted(t for name, t in found.times if name == "run2")
     assert (off[0], off[-1]) == pytest.approx((40.0, 41.0), abs=0.06)
     assert all(abs(a - b) > 0.3 for a, b in zip(off[1:], off, strict=False)), "one event is one event"
     assert {name for name, _ in found.times} == {"run0", "run2"}
     dip, second = 10 * 9.0 / 36000.0, 200 * 4.0 / 36000.0
-    assert found.excess_nm2 == pytest.approx(dip + second, rel=0.05), (
+    assert found.energy_nm2 == pytest.approx(dip + second, rel=0.05), (
         "all of the second, not its two steps alone"
     )
-    assert 0.0 < found.share < 1.0
-    assert events.masks[0][4000:4010].all()
-    assert events.masks[2][8000:8200].all()
-    assert not events.masks[1].any()
-    assert events.part == pytest.approx(sum(m.sum() for m in events.masks) / 36000.0)
-    assert events.part < 0.01
-    assert bursts(runs, {MOTOR1: parts}, limits(9.0)) == {}, "too small to be relevant"
+    assert found.masks[0][4000:4010].all()
+    assert found.masks[2][8000:8200].all()
+    assert not found.masks[1].any()
+    assert sum(m.sum() for m in found.masks) / 36000.0 < 0.01
+    assert events(at_least(9.0, runs), parts) is None, "too small to be relevant"
 
 
 def test_an_event_is_all_of_it() -> None:
     """A sensor that is off for a third of a second: between its two steps whitening shows nothing."""
     x = gaussian(4)
     x[6000:6066] += 5.0
-    run = run_data("run0", {MOTOR1: x}, {})
-    found = bursts([run], {MOTOR1: [x]}, limits(0.5))[MOTOR1]
+    found = events(at_least(0.5, [run_data("run0", {MOTOR1: x}, {})]), [x])
+    assert found is not None
     assert found.masks[0][6000:6066].all()
     assert found.masks[0].sum() < 66 + 60
-    assert found.burst.excess_nm2 == pytest.approx(66 * 25.0 / 12000.0, rel=0.1)
+    assert found.energy_nm2 == pytest.approx(66 * 25.0 / 12000.0, rel=0.1)
 
 
 def test_gaussian_noise_has_no_events() -> None:
     for seed in range(5):
         parts = [gaussian(10 * seed + k, 24000) for k in range(2)]
         runs = [run_data(f"run{k}", {MOTOR1: x}, {}) for k, x in enumerate(parts)]
-        assert bursts(runs, {MOTOR1: parts}, limits(0.0)) == {}
+        assert events(at_least(0.0, runs), parts) is None
 
 
 def turning(seed: int) -> dict[str, FloatArray]:
@@ -295,28 +304,39 @@ def test_a_zero_that_jumps_wanders() -> None:
     steady = rng.normal(0.0, 0.5, 6000)
     level = np.repeat(rng.choice([-0.3, 0.3], 30), 200)
     runs = [run_data("run", {MOTOR1: steady}, {})]
-    assert wandering(runs, {MOTOR1: [steady]}, limits(0.1)) == []
+
+    def wandering(nm: float, x: FloatArray) -> View | None:
+        return seconds(at_least(nm, runs, 0.006), [x])
+
+    assert wandering(0.1, steady) is None
     seldom = steady + np.repeat(np.where(np.arange(30) % 10 == 4, 1.0, 0.0), 200)
-    (far,) = wandering(runs, {MOTOR1: [seldom]}, limits(0.7))
+    far = wandering(0.7, seldom)
+    assert far is not None
     assert sorted(t for _, t in far.times[:3]) == pytest.approx([4.5, 14.5, 24.5]), (
         "seldom, but far out of all others"
     )
-    assert wandering(runs, {MOTOR1: [steady]}, limits(0.05)) == [], "ordinary seconds are not far out"
-    (found,) = wandering(runs, {MOTOR1: [steady + level]}, limits(0.1))
-    assert found.excess_nm2 == pytest.approx(0.09, rel=0.15)
-    assert found.share == pytest.approx(0.09 / 0.34, rel=0.2)
-    assert found.name.startswith("seconds: run ")
+    assert wandering(0.05, steady) is None, "ordinary seconds are not far out"
+    found = wandering(0.1, steady + level)
+    assert found is not None
+    assert found.energy_nm2 == pytest.approx(0.09, rel=0.15)
+    (place,) = _places(found, [steady + level], 0.0, float(np.mean((steady + level) ** 2)))
+    assert place.share == pytest.approx(0.09 / 0.34, rel=0.2)
+    assert place.bin.startswith("seconds: run ")
 
 
-def test_what_is_left_counts_once_per_channel() -> None:
-    """Map, events and a line of one channel may be the same torque: the largest counts."""
-    empty = np.zeros(1)
-    one = AxisMap(MOTOR1, "load", "Nm", empty, empty, empty, empty, 0.05, 1e-4)
-    event = Burst(MOTOR1, 0.2, 0.5, (("run2", 3.25), ("run1", 7.0)))
-    line = Line(TORSION1, 3.5, 0.4, 60.0)
-    left = Unexplained((one,), (one,), (event,), (line,))
-    assert left.significant
-    assert left.by_channel() == {MOTOR1: 0.2, TORSION1: pytest.approx(0.08)}
-    assert left.share(0.28) == pytest.approx(0.5)
-    assert len(left.reasons) == 3
-    assert not Unexplained((one,), (), (), ()).significant
+def test_what_remains_counts_once_per_channel() -> None:
+    """A torque that follows the load goes along with the current, and its steps may be events: it counts once."""
+
+    def torque(a: dict[str, FloatArray]) -> FloatArray:
+        return np.asarray(1.5 * np.sign(a["load"]))
+
+    axes = [motion(k) | {"current": 0.01 * motion(k)["load"]} for k in range(4)]
+    parts = [torque(a) + noise(k) for k, a in enumerate(axes)]
+    runs = [run_data(f"run{k}", {MOTOR1: x}, a) for k, (x, a) in enumerate(zip(parts, axes, strict=True))]
+    one = balance(runs)
+    left = Unexplained({MOTOR1: pursue(one, parts)}, {MOTOR1: one})
+    assert left.by_channel() == {MOTOR1: pytest.approx(1.5**2, rel=0.1)}
+    assert left.worst_nm == {MOTOR1: pytest.approx(1.5, rel=0.1)}
+    assert left.energy_nm2() == left.by_channel()[MOTOR1]
+    assert len(left.reasons) == len(left.views[MOTOR1])
+    assert all(reason.startswith("joint 1, motor balance: ") for reason in left.reasons)
