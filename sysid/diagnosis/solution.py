@@ -21,7 +21,7 @@ from jtqd.estimator.joint import Effect as EffectOfFile
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import Entry
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
-from jtqd.sysid.diagnosis.regressors import RunData, binned, contribution, fields_used
+from jtqd.sysid.diagnosis.regressors import LINE, RunData, binned, contribution, fields_used
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.smoothing import current_rate
 
@@ -33,6 +33,12 @@ _TORSION_STEP: Final = 1e-4
 """Of the twist at the rated torque: smaller steps of the torsion are none."""
 _SOFTEST: Final = 0.1
 """Of the file's stiffness: less is taken for no spring, nor is a twist as under so little of it."""
+_SHARED: Final = 5.0
+"""Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
+_OF_A_DAY: Final = ("zero", "viscous", "coulomb")
+"""Families that are the joint's where all runs share them; a torsion's zero is nobody's, `smooth` is what is near rest."""
+Parts = list[FloatArray]
+"""A residual [run][n], NaN where it is not valid."""
 
 
 @dataclass(frozen=True)
@@ -159,3 +165,52 @@ def remaining(dataset: Dataset, present: Sequence[PresentEffect], nuisances: Flo
     ]
     pieces = dataset.recordings
     return Remaining(tuple(present), tuple(runs), nuisances[list(pieces)], pieces)
+
+
+def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
+    """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
+    differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
+    unexplained where no cause covers it.
+    """
+    changes = np.array(refined.nuisances)
+    changes[:, [g.name == LINE for g in dataset.families]] = 0.0
+    pieces = np.array(refined.pieces)
+    runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
+    sigma = np.array([np.inf if g.name not in _OF_A_DAY else g.sigma for g in dataset.families])
+    shared = runs.mean(axis=0)
+    shared[np.abs(shared) < _SHARED * sigma / np.sqrt(len(runs))] = 0.0
+    return np.asarray(changes - shared)
+
+
+def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it."""
+    out: dict[Channel, Parts] = {}
+    for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
+        for channel, d in run.channels.items():
+            rest = d.residual - d.nuisances @ u[d.families]
+            out.setdefault(channel, []).append(np.where(dataset.valid_or_event(r, channel), rest, np.nan))
+    return out
+
+
+def residual_after(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return what the causes leave, less what each run has of its own where that makes it smaller: fitted to the
+    whitened residual of few seconds it need not.
+    """
+    out = less_nuisances(dataset, refined)
+    for channel, parts in out.items():
+        for r, run in enumerate(refined.runs):
+            plain = np.where(dataset.valid_or_event(r, channel), run.channels[channel].residual, np.nan)
+            parts[r] = min(parts[r], plain, key=lambda x: float(np.nansum(x**2)))
+    return out
+
+
+def residual_before(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return the same with what the causes explain: the residual with the joint files."""
+    both = list(zip(dataset.runs, refined.runs, strict=True))
+    return {
+        c: [
+            x + run.channels[c].residual - left.channels[c].residual
+            for x, (run, left) in zip(after, both, strict=True)
+        ]
+        for c, after in residual_after(dataset, refined).items()
+    }

@@ -18,17 +18,18 @@ from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
 from jtqd.sysid.diagnosis.noise import Noise
-from jtqd.sysid.diagnosis.regressors import LINE, Index, binned
+from jtqd.sysid.diagnosis.regressors import Index, binned
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.solution import Remaining
+from jtqd.sysid.diagnosis.solution import (
+    Parts,
+    Remaining,
+    less_nuisances,
+    own_changes,
+    residual_after,
+    residual_before,
+)
 from jtqd.sysid.diagnosis.structure import AXES, Balance, View, bins_of, events, pursue
 
-Parts = list[FloatArray]
-"""A residual [run][n], NaN where it is not valid."""
-SHARED: Final = 5.0
-"""Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
-_OF_A_DAY: Final = ("zero", "viscous", "coulomb")
-"""Families that are the joint's where all runs share them; a torsion's zero is nobody's, `smooth` is what is near rest."""
 _MOST_OF_THE_TIME: Final = 0.1
 """What takes more of the time than this is no event but a condition."""
 _SAME: Final = 0.02
@@ -107,31 +108,6 @@ def events_left(dataset: Dataset, refined: Remaining, noise: Noise) -> dict[Chan
     return {c: e for c, e in found.items() if np.mean(np.concatenate(e.masks)) < _MOST_OF_THE_TIME}
 
 
-def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
-    """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
-    differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
-    unexplained where no cause covers it.
-    """
-    changes = np.array(refined.nuisances)
-    changes[:, [g.name == LINE for g in dataset.families]] = 0.0
-    pieces = np.array(refined.pieces)
-    runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
-    sigma = np.array([np.inf if g.name not in _OF_A_DAY else g.sigma for g in dataset.families])
-    shared = runs.mean(axis=0)
-    shared[np.abs(shared) < SHARED * sigma / np.sqrt(len(runs))] = 0.0
-    return np.asarray(changes - shared)
-
-
-def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it."""
-    out: dict[Channel, Parts] = {}
-    for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
-        for channel, d in run.channels.items():
-            rest = d.residual - d.nuisances @ u[d.families]
-            out.setdefault(channel, []).append(np.where(dataset.valid_or_event(r, channel), rest, np.nan))
-    return out
-
-
 def held_nm(dataset: Dataset, refined: Remaining) -> dict[Channel, float]:
     """Return what the rows of held channels are wrong by: rms over the run that has most of it [Nm], beyond
     what is usual in the others; at rest, where the balance is not known, against a straight line between the rows around
@@ -157,7 +133,7 @@ def channel_gaps(dataset: Dataset, refined: Remaining, left: Unexplained, matter
     else with those of the whole gap, the largest excess over the floor first.
     """
     # where the gap lives: without what each run has of its own, which would hide a small effect
-    shown = less_nuisances(dataset, refined) if matters else _before(dataset, refined)
+    shown = less_nuisances(dataset, refined) if matters else residual_before(dataset, refined)
     out = []
     for channel, balance in left.balances.items():
         x, rmse = shown[channel], _rms(_raw(dataset, channel))
@@ -257,34 +233,10 @@ def _alike(one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> bool
 # Traces.
 
 
-def _after(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return what the causes leave, less what each run has of its own where that makes it smaller: fitted to the
-    whitened residual of few seconds it need not.
-    """
-    out = less_nuisances(dataset, refined)
-    for channel, parts in out.items():
-        for r, run in enumerate(refined.runs):
-            plain = np.where(dataset.valid_or_event(r, channel), run.channels[channel].residual, np.nan)
-            parts[r] = min(parts[r], plain, key=lambda x: float(np.nansum(x**2)))
-    return out
-
-
-def _before(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return the same with what the causes explain: the residual with the joint files."""
-    both = list(zip(dataset.runs, refined.runs, strict=True))
-    return {
-        c: [
-            x + run.channels[c].residual - left.channels[c].residual
-            for x, (run, left) in zip(after, both, strict=True)
-        ]
-        for c, after in _after(dataset, refined).items()
-    }
-
-
 def traces(dataset: Dataset, refined: Remaining) -> tuple[Trace, ...]:
     """Return measurement and residual before and after for plots, thinned, one per run and channel."""
     out = []
-    after, before = _after(dataset, refined), _before(dataset, refined)
+    after, before = residual_after(dataset, refined), residual_before(dataset, refined)
     for r, run in enumerate(dataset.runs):
         signals = {s.number: s for s in dataset.signals[r]}
         every = max(1, len(run.time_s) // _TRACE_POINTS)
