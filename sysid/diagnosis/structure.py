@@ -124,9 +124,8 @@ class View:
     @property
     def bins(self) -> tuple[int, ...]:
         """Bins that explain something, the largest first."""
-        if self.explained is None:
-            return ()
-        return tuple(int(k) for k in np.argsort(-self.explained) if self.explained[k] > 0.0)
+        explained = np.empty(0) if self.explained is None else self.explained
+        return tuple(int(k) for k in np.argsort(-explained) if explained[k] > 0.0)
 
     def taken_from(self, parts: Sequence[FloatArray]) -> list[FloatArray]:
         """Return the residual [run][n] without what the view explains, NaN where all is the view's."""
@@ -155,33 +154,30 @@ def pursue(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
     until none is significant and worth a place, at most MOST.
     """
     now, found = list(parts), list[View]()
-    while len(found) < MOST:
-        views = [v for v in _views(balance, now, found) if v.energy_nm2 > balance.least_nm2]
-        views = [v for v in views if not any(v.same(before) for before in found)]
-        if not views:
-            break
+    while len(found) < MOST and (views := _views(balance, now, found)):
         found.append(max(views, key=lambda v: v.energy_nm2))
         now = found[-1].taken_from(now)
     return found
 
 
 def _views(balance: Balance, parts: Sequence[FloatArray], before: Sequence[View]) -> list[View]:
-    """Return the significant views of a residual: the best condition of those not among `before`, what events and seconds
-    explain beyond it, and lines.
-    """
-    large = [v for v in conditions(balance, parts) if v.energy_nm2 > balance.least_nm2]
-    ranked = [v for v in sorted(large, key=lambda v: -v.energy_nm2) if not any(v.same(b) for b in before)]
+    """Return the significant views of a residual: condition, what events and seconds explain beyond it, lines."""
+
+    def new(view: View) -> bool:
+        return view.energy_nm2 > balance.least_nm2 and not any(view.same(b) for b in before)
+
+    ranked = sorted(filter(new, conditions(balance, parts)), key=lambda v: -v.energy_nm2)
     best = next((v for v in ranked if chance(v, parts, balance.step_s) < SIGNIFICANT), None)
     moments, rest = events(balance, parts), list(parts)
     turn = moments and at_angle(balance, parts, moments)
-    out = [v for v in (best, turn) if v and not any(v.same(b) for b in before)]
+    out = [v for v in (best, turn) if v and new(v)]
     if out:
         rest = max(out, key=lambda v: v.energy_nm2).taken_from(parts)
         moments = events(balance, rest)
     if moments:
-        out.append(moments)
         rest = moments.taken_from(rest)
-    return [v for v in (*out, seconds(balance, rest), *lines(balance, parts)) if v]
+    others = (moments, seconds(balance, rest), *lines(balance, parts))
+    return out + [v for v in others if v and new(v)]
 
 
 # Conditions.
@@ -306,9 +302,8 @@ def _block(step_s: float) -> int:
 @lru_cache(maxsize=2)
 def _signs(flips: int, blocks: int) -> FloatArray:
     """Return random signs [flips + 1, blocks], the first row all positive."""
-    signs = np.random.default_rng(0).integers(0, 2, (flips + 1, blocks)).astype(np.float32) * 2.0 - 1.0
-    signs[0] = 1.0
-    return np.asarray(signs)
+    signs = np.random.default_rng(0).choice(np.array((-1.0, 1.0), np.float32), (flips, blocks))
+    return np.asarray(np.vstack((np.ones((1, blocks), np.float32), signs)))
 
 
 # Lines.
@@ -434,8 +429,10 @@ def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], 
     shows; the latter counts when the line keeps half of its size over a run, and so its phase.
     """
     near: FloatArray = line.order + 0.004 * np.arange(-10.0, 11.0)
-    power, weight = _order_power(runs, line.channel, parts, near, 2 * _block(step_s))
-    if line.unit == "Hz" or not weight:
+    power, weight = np.zeros(1), 0
+    if line.unit != "Hz":
+        power, weight = _order_power(runs, line.channel, parts, near, 2 * _block(step_s))
+    if not weight:
         return line
     order, size = float(near[np.argmax(power)]), 2.0 * float(np.sqrt(np.max(power)))
     ratio = line.ratio * max((size / line.amplitude_nm) ** 2, 1.0)
@@ -456,11 +453,11 @@ def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
     dropped reading: whitening makes a short peak of each. What lies between two stretches close together is one.
     """
     wide = max(4, round(_EVENT_S / balance.step_s))
-    known = [past_valid(np.isfinite(x), len(balance.ar)) for x in parts]
-    white = [
-        np.where(k, whiten(np.nan_to_num(x), balance.ar), np.nan) for k, x in zip(known, parts, strict=True)
-    ]
-    energies = [np.mean(w[: len(w) // wide * wide].reshape(-1, wide) ** 2, axis=1) for w in white]
+    energies = []
+    for x in parts:
+        known = past_valid(np.isfinite(x), len(balance.ar))
+        white = np.where(known, whiten(np.nan_to_num(x), balance.ar), np.nan)
+        energies.append(np.mean(white[: len(x) // wide * wide].reshape(-1, wide) ** 2, axis=1))
     if np.isfinite(np.concatenate(energies)).sum() < 50:
         return None
     usual = float(np.nanmedian(np.concatenate(energies)))

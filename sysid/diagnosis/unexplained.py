@@ -125,9 +125,6 @@ def held_nm(dataset: Dataset, refined: Remaining) -> dict[Channel, float]:
     return out
 
 
-# Gaps and their places.
-
-
 def channel_gaps(dataset: Dataset, refined: Remaining, left: Unexplained, matters: bool) -> tuple[Gap, ...]:
     """Return the gaps of all channels: with the places of what remains, that which has most of it first, where it matters;
     else with those of the whole gap, the largest excess over the floor first.
@@ -228,9 +225,6 @@ def _alike(one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> bool
     apart = {axis: float(np.mean((one[axis] - two[axis]) ** 2)) for axis in ("velocity", "load")}
     most = {axis: float(np.mean(one[axis] ** 2)) * _SAME**2 for axis in apart}
     return 0.0 < most["velocity"] >= apart["velocity"] and 0.0 < 25.0 * most["load"] >= apart["load"]
-
-
-# Traces.
 
 
 def traces(dataset: Dataset, refined: Remaining) -> tuple[Trace, ...]:
