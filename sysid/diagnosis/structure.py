@@ -48,8 +48,8 @@ BINS: Final = 12
 BLOCK_S: Final = 1.0
 """Seconds that are independent of each other; a bin's mean counts as if it had been zero for so long before."""
 FLIPS: Final = 9999
-SIGNIFICANT: Final = 2e-4
-"""Some seventy conditions are looked at: one in a hundred sets of runs has one this unlikely by chance."""
+SIGNIFICANT: Final = 1e-3
+"""Of some twenty conditions of a balance that are looked at, one in fifty balances has one this unlikely by chance."""
 LEAST: Final = 6e-4
 """Part of the rated torque (rms) from which a view is worth a place."""
 MOST: Final = 3
