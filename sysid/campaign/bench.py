@@ -95,6 +95,15 @@ class BenchConfig:
         """Period of SYNC."""
         return 1e-9 * self.config.period_ns
 
+    def may_have(self, joints: Mapping[int, Joint]) -> bool:
+        """Return whether joints, by number, may be those of the bench, by gear ratio, torque constant and rating."""
+
+        def known_by(joint: Joint) -> tuple[float, float, float]:
+            return joint.gear_ratio, joint.torque_constant_nm_per_a, joint.rated_torque_nm
+
+        own = {number: known_by(joint) for number, joint in enumerate(self.joints, 1)}
+        return all(own.get(number) == known_by(joint) for number, joint in joints.items())
+
     def measured(self, number: int) -> bool:
         """Return whether a channel of the torque sensor belongs to the joint."""
         return self.sensor is not None and self.channels[number - 1] is not None

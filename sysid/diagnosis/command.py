@@ -36,6 +36,7 @@ from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import (
     UsageError,
+    add_columns,
     add_runs,
     check_joint_files,
     joint_files,
@@ -136,7 +137,9 @@ def _next_experiment(
 
     made, towing = dict(experiment), bool(experiment.get("plan"))
     if towing:
-        config = "" if _of_shipped_bench(joints) else CONFIG
+        from jtqd.sysid.campaign.bench import BenchConfig
+
+        config = "" if BenchConfig.load(None).may_have(joints) else CONFIG
         if options.config is not None:
             config = shlex.quote(str(options.config))
         plan = shlex.quote(str(options.out / PLAN_FILE))
@@ -153,17 +156,6 @@ def _next_experiment(
         )
     made["why"] = " ".join([made["why"], *notes])
     return made
-
-
-def _of_shipped_bench(joints: Mapping[int, Joint]) -> bool:
-    """Return whether the joints may be those of the bench that `jtq campaign` takes without --config."""
-    from jtqd.sysid.campaign.bench import BenchConfig
-
-    def known_by(joint: Joint) -> tuple[float, float, float]:
-        return joint.gear_ratio, joint.torque_constant_nm_per_a, joint.rated_torque_nm
-
-    bench = {n: known_by(joint) for n, joint in enumerate(BenchConfig.load(None).joints, 1)}
-    return all(bench.get(n) == known_by(joint) for n, joint in joints.items())
 
 
 def diagnosed(
@@ -216,66 +208,41 @@ def parser() -> argparse.ArgumentParser:
         "  jtq diagnose rig/*.csv --columns columns.yaml --joint arm.yaml --out diagnosis\n"
         "  jtq diagnose rig/*.csv --columns columns.yaml --joint 3=arm3.yaml --without sensor_drift \\\n"
         "      --limits travel_rad=-0.5:0.5,velocity_rad_s=1 --out diagnosis\n\n"
+        "--joint, --without, --given and --trust may be given again.\n"
         f"DIR/{REPORT} is for people, DIR/{FINDINGS} for programs, DIR/{FILE} the joint file with the effects found;\n"
         "DIR/next_experiment.plan.yaml, when there is one, is for `jtq campaign`, DIR/next_experiment.motion.csv\n"
         "for the controller of an arm. Exit status: 0 no gap; 3 any other verdict; 1 failure; 2 usage.",
     )
-    add_runs(parser)
     again: dict[str, Any] = {"action": "append", "default": []}
-    options: tuple[tuple[str, str, str, dict[str, Any]], ...] = (
-        (
-            "--joint",
-            "[N=]FILE",
-            "joint file of all joints, or of joint N; may be given again (default: those that the column map names)",
-            again,
-        ),
-        ("--out", "DIR", "output directory; created if missing", {"type": Path, "required": True}),
-        ("--columns", "FILE", "column map for other names, units and signs", {"type": Path}),
-        (
-            "--without",
-            "[N=]EFFECT",
-            "an effect that is absent: not looked for (of joint N, or sensor=EFFECT); may be given again",
-            again,
-        ),
-        (
-            "--given",
-            "[N=]EFFECT",
-            "an effect that is known: as the joint file has it, not questioned; may be given again",
-            again,
-        ),
-        (
-            "--trust",
-            "NAME=SIZE",
-            "how far a value may be off, one standard deviation: sensor_gain=5%%, coulomb_friction=2Nm, channel_delay=5ms "
-            "(defaults: priors in the report); may be given again",
-            again,
-        ),
-        (
-            "--limits",
-            "NAME=VALUE,...",
-            "where the next experiment may move: travel_rad=LOW:HIGH, velocity_rad_s, acceleration_rad_s2, torque_nm "
-            "(default: motion_limits of the joint file); never beyond what the runs did",
-            {"type": motion_limits},
-        ),
-        (
-            "--config",
-            "FILE",
-            "configuration of jtqd for the printed command (default: CONFIG, to be replaced; none for the shipped bench)",
-            {"type": Path},
-        ),
-        ("--bus", "BUS", "bus for the printed command (default can0)", {"default": "can0"}),
-        (
-            "--relevance",
-            "PERCENT",
-            "of the rated torque, rms: entries and what remains matter from here on (default 0.5)",
-            {"type": _percent, "default": RELEVANCE},
-        ),
-    )
-    for name, metavar, text, more in options:
+
+    def option(name: str, metavar: str, text: str, **more: Any) -> None:
         parser.add_argument(name, metavar=metavar, help=text, **more)
-    parser.add_argument(
-        "--force", action="store_true", help="replace the results of an earlier diagnosis in DIR"
+
+    add_runs(parser)
+    option(
+        "--joint", "[N=]FILE", "joint file of all joints, or of joint N (default: of the column map)", **again
     )
+    option("--out", "DIR", "output directory; created if missing", type=Path, required=True)
+    add_columns(parser)
+    option("--without", "[N=]EFFECT", "an effect that is absent (of joint N, or sensor=EFFECT)", **again)
+    option("--given", "[N=]EFFECT", "an effect that is as the joint file has it: not questioned", **again)
+    trust = (
+        "how far a value may be off, one standard deviation: sensor_gain=5%%, coulomb_friction=2Nm, channel_delay=5ms "
+        "(defaults: priors in the report)"
+    )
+    option("--trust", "NAME=SIZE", trust, **again)
+    limits = (
+        "where the next experiment may move: travel_rad=LOW:HIGH, velocity_rad_s, acceleration_rad_s2, torque_nm "
+        "(default: motion_limits of the joint file); never beyond what the runs did"
+    )
+    option("--limits", "NAME=VALUE,...", limits, type=motion_limits)
+    config = "configuration of jtqd for the printed command (default: CONFIG, to be replaced; none for the shipped bench)"
+    option("--config", "FILE", config, type=Path)
+    option("--bus", "BUS", "bus for the printed command (default can0)", default="can0")
+    relevance = "of the rated torque, rms: entries and what remains matter from here on (default 0.5)"
+    option("--relevance", "PERCENT", relevance, type=_percent, default=RELEVANCE)
+    force = "replace the results of an earlier diagnosis in DIR"
+    parser.add_argument("--force", action="store_true", help=force)
     parser.add_argument("--json", action="store_true", help="print findings.json instead of the summary")
     return parser
 
