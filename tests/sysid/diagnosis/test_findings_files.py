@@ -13,7 +13,7 @@ import pytest
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Effect
 from jtqd.models.files import load_joint
-from jtqd.sysid.diagnosis.extended_joint import extended, files, title, write_extended
+from jtqd.sysid.diagnosis.command import extended, extended_files, extended_title, write_extended
 from jtqd.sysid.diagnosis.findings import (
     INSUFFICIENT,
     NO_GAP,
@@ -177,7 +177,7 @@ def test_a_class_is_written_with_what_it_cannot_be_told_from() -> None:
 def test_the_first_file_is_the_joint_of_the_largest_cause(
     causes: tuple[object, ...], numbers: tuple[int, ...], first: int
 ) -> None:
-    names = files(dict.fromkeys(numbers, JOINT), findings(causes=causes))  # type: ignore[arg-type]
+    names = extended_files(dict.fromkeys(numbers, JOINT), findings(causes=causes))  # type: ignore[arg-type]
     assert names["extended.joint.yaml"] == first
     each = {f"extended.joint{n}.yaml": n for n in numbers} if len(numbers) > 1 else {}
     assert names == {"extended.joint.yaml": first, **each}
@@ -192,7 +192,7 @@ def test_files_read_back_as_the_joints_meant(tmp_path: Path) -> None:
     assert load_joint(tmp_path / "extended.joint.yaml") == load_joint(tmp_path / "extended.joint2.yaml")
     assert load_joint(tmp_path / "extended.joint1.yaml") == extended(joints[1], 1, made, **ORIGIN)
     text = (tmp_path / "extended.joint1.yaml").read_text()
-    assert text.startswith(f"# {title(1, made)}")
+    assert text.startswith(f"# {extended_title(1, made)}")
     assert "torque_ripple, sensor_offset" in text.splitlines()[0]
 
 
@@ -225,11 +225,13 @@ def test_what_predicts_is_in_the_file_and_what_was_found_in_its_provenance() -> 
 
 def test_a_file_says_how_many_runs_were_used() -> None:
     made = replace(findings(causes=(COULOMB,)), runs=("a", "b", "c"), used=("a", "c"))
-    assert title(2, made).startswith("Written by jtq diagnose from 2 of 3 runs: found coulomb_friction")
+    assert extended_title(2, made).startswith(
+        "Written by jtq diagnose from 2 of 3 runs: found coulomb_friction"
+    )
     origin = ORIGIN | {"sha256": {"a": "0", "b": "1", "c": "2"}}
     assert extended(JOINT, 2, made, **origin).provenance["diagnosis"]["sha256"] == {"a": "0", "c": "2"}
     assert [run["used"] for run in to_mapping(made)["runs"]] == [True, False, True]
-    assert title(2, replace(made, used=())).startswith("Written by jtq diagnose from 3 runs: ")
+    assert extended_title(2, replace(made, used=())).startswith("Written by jtq diagnose from 3 runs: ")
 
 
 def test_without_a_cause_the_joint_stays_as_it_is(tmp_path: Path) -> None:
