@@ -9,7 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -56,29 +56,21 @@ _TORQUE: Final = {"motor": "motor torque G Kt i", "torsion": "torque by the twis
 
 def render(findings: Findings) -> str:
     """Return the page. The same findings give the same text. Needs jinja2 and matplotlib (ImportError without them)."""
-    colour, badge = BADGES[findings.verdict]
     content = {
         "f": findings,
         "made": provenance_text(findings.provenance, most=len(findings.runs) + 8),
-        "badge": badge,
-        "badge_colour": colour,
+        "badge": BADGES[findings.verdict],
         "scope": ", ".join(filter(None, (findings.runs_text, joints_text(findings.joints)))),
         "s": summary(findings),
         "looked_at": [candidate_row(each) for each in findings.candidates],
-        "gaps": [
-            (
-                f"Joint {gap.joint}, {BALANCES[gap.balance]}: {number(gap.rmse_nm)} Nm rms, noise "
-                f"{number(gap.noise_floor_nm)} Nm (from {gap.floor_from})",
-                gap_axes(gap),
-            )
-            for gap in findings.gaps
-        ],
-        "priors": [(effect_title(p.name), p.size, p.set_by_user) for p in priors(findings.trust)],
-        "runs": _run_rows(findings),
+        "gaps": [(gap, BALANCES[gap.balance], gap_axes(gap)) for gap in findings.gaps],
+        "priors": priors(findings.trust),
+        "gains": {each.run: each for each in findings.gain.runs} if findings.gain else {},
         "pictures": pictures(findings),
         "next": _next(findings),
     }
-    return page.render("jtqd.sysid.diagnosis", TEMPLATE, content)
+    filters: dict[str, Callable[..., str]] = {"number": number, "effect_title": effect_title}
+    return page.render("jtqd.sysid.diagnosis", TEMPLATE, content, filters)
 
 
 def candidate_row(each: CandidateEvidence) -> tuple[str, str, str, str]:
@@ -89,17 +81,6 @@ def candidate_row(each: CandidateEvidence) -> tuple[str, str, str, str]:
             size = with_unit(value.value, value.unit, 2)
             texts.append(size if len(each.minimum) == 1 else f"{size} {parameter_title(name)}")
     return effect_title(each.name), place(each.joint), in_words(each.reason), ", ".join(texts) or DASH
-
-
-def _run_rows(findings: Findings) -> list[tuple[str, str, str, str]]:
-    """Return every run: name, whether it was used, held-out error before and after ("" where it was not measured)."""
-    gains = {g.run: g for g in findings.gain.runs} if findings.gain else {}
-    rows = []
-    for name in findings.runs:
-        gain = gains.get(name)
-        errors = (number(gain.rmse_before_nm), number(gain.rmse_after_nm)) if gain else ("", "")
-        rows.append((name, "" if name in findings.used_runs else "not used", *errors))
-    return rows
 
 
 class Bar(NamedTuple):
