@@ -40,7 +40,7 @@ from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
 from jtqd.sysid.progress import waiting
-from jtqd.sysid.runs.checks import CheckedRuns, check_runs
+from jtqd.sysid.runs.checks import check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.options import (
@@ -177,7 +177,10 @@ def diagnosed(
     relevance: float = RELEVANCE,
     trust: Mapping[str, float] = MappingProxyType({}),
 ) -> Findings:
-    """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`."""
+    """Check the channels and diagnose what may be used; the findings list what may not. relevance, trust: see `diagnose`.
+
+    No gap in the other joints is no proof for a joint that could not be judged.
+    """
     checked = check_runs([(run.name, run.table) for run in runs], joints, scope.known_references)
     for line in (*checked.refused, *checked.notes):
         print(f"{BY}: {line}", file=sys.stderr)
@@ -192,18 +195,13 @@ def diagnosed(
 
         left = {number: joint for number, joint in joints.items() if number not in checked.lost}
         findings = diagnose(checked.runs, left, scope, relevance=relevance, trust=trust)
-    return _with_channels(findings, checked, notes)
-
-
-def _with_channels(findings: Findings, checked: CheckedRuns, notes: tuple[str, ...]) -> Findings:
-    """Findings with the notes of the channels; without a gap they are no proof for a joint that could not be judged."""
     findings = replace(findings, channel_notes=notes + findings.channel_notes)
     if findings.verdict == NO_GAP and checked.lost:
         one = len(checked.lost) == 1
         lost = f"joint{'' if one else 's'} {', '.join(map(str, checked.lost))}"
         reason = f"{lost}: no run of {'it' if one else 'them'} can be used, the others have no gap"
         return replace(findings, verdict=INSUFFICIENT, reasons=(reason, *checked.refused))
-    if findings.verdict == INSUFFICIENT and checked.refused:
+    if findings.verdict == INSUFFICIENT:
         return replace(findings, reasons=(*findings.reasons, *checked.refused))
     return findings
 

@@ -209,24 +209,22 @@ def chosen_traces(findings: Findings) -> list[Trace]:
     """Return the traces to draw, one per balance, at most MOST: first the balance that the gain is of (not stated: that of
     the largest entry) with the run on which the extended model errs most; of the others the run with most error before.
     """
-    held = held_out(findings)
-    order = [*held, *((c.joint, c.balance) for c in findings.causes[:1])]
+    gain, errors = findings.gain, held_out(findings)
+    order: list[tuple[JointName | None, str | None]] = [(gain.joint, gain.balance)] if gain else []
+    order += [(c.joint, c.balance) for c in findings.causes[:1]]
     order += [(g.joint, g.balance) for g in findings.gaps] + [(t.joint, t.balance) for t in findings.traces]
     chosen = []
     for channel in dict.fromkeys(order):
-        errors = held.get(channel, {})
         group = [t for t in findings.traces if (t.joint, t.balance) == channel]
-        size = [(errors.get(t.run, 0.0), float(np.nansum(t.before_nm**2))) for t in group]
+        size = [(errors.get((*channel, t.run), 0.0), float(np.nansum(t.before_nm**2))) for t in group]
         chosen += [group[size.index(max(size))]] if group else []
     return chosen[:MOST]
 
 
-def held_out(findings: Findings) -> dict[tuple[JointName, str], dict[str, float]]:
-    """Return the extended model's error [Nm] on each held-out run, of the balance that the gain is of."""
+def held_out(findings: Findings) -> dict[tuple[JointName | None, str | None, str], float]:
+    """Return the extended model's error [Nm] by joint, balance and held-out run, where the gain is measured."""
     gain = findings.gain
-    if gain is None or gain.joint is None or gain.balance is None:
-        return {}
-    return {(gain.joint, gain.balance): {g.run: g.rmse_after_nm for g in gain.runs}}
+    return {(gain.joint, gain.balance, each.run): each.rmse_after_nm for each in gain.runs} if gain else {}
 
 
 def pictures(findings: Findings) -> list[Picture]:
@@ -242,7 +240,7 @@ def pictures(findings: Findings) -> list[Picture]:
             f"{number(rms(trace.before_nm))} Nm rms"
         )
         text += f" before, {number(rms(trace.after_nm))} Nm rms with the entries found." if both else "."
-        if trace.run in held.get((trace.joint, trace.balance), {}):
+        if (trace.joint, trace.balance, trace.run) in held:
             title += ": the worst held-out run"
         wide, narrow = (
             page_svg(partial(_figure, trace, width, floor, both), f"p{k}{name}")
