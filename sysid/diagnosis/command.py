@@ -35,7 +35,7 @@ from jtqd.sysid.diagnosis.findings import (
     to_mapping,
 )
 from jtqd.sysid.diagnosis.limits import RELEVANCE
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of, trusted
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, asked_effects, scope_of, trusted
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
@@ -75,14 +75,14 @@ def _main(argv: list[str]) -> int:
     try:
         columns = None if options.columns is None else ColumnMap.load(options.columns)
         files = joint_files(options.joint, columns)
-        check_effects(options.without, options.given)
+        asked = asked_effects(options.without, options.given)
         check_installed("analysis", *_NEEDED)
         check_joint_files(files)
         _check_out(options.out, options.force)
         runs = read_runs(options.runs, columns, segments=True, joints=named_joints(files))
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
-        scope = scope_of(options.without, options.given, joints, known)
+        scope = scope_of(asked, joints, known)
         trust = trusted(options.trust, joints)
         for run in runs:
             for note in run.notes:

@@ -56,7 +56,7 @@ class Scope:
 EVERYTHING: Final = Scope()
 
 
-class _Item(NamedTuple):
+class Asked(NamedTuple):
     """An item of --without or --given: option, as it was written, where (None: wherever it may be), effect."""
 
     option: str
@@ -65,16 +65,39 @@ class _Item(NamedTuple):
     name: str
 
 
-def scope_of(
-    without: Iterable[str], given: Iterable[str], joints: Mapping[int, Joint], known: Iterable[int] = ()
-) -> Scope:
-    """Return the scope that options --without and --given ask for.
+def asked_effects(without: Iterable[str], given: Iterable[str]) -> list[Asked]:
+    """Return the items of --without (the effect is taken to be absent) and --given (it is as the joint files have it, in
+    `effects` or as one of their values, which is then not questioned).
 
-    Without: the effect is taken to be absent. Given: it is as the joint files have it, in `effects` or as one of their
-    values, which is then not questioned. Raises UsageError for a name that is no effect, a joint that there is not, and a
-    given effect that no joint file has: taken as given it would be --without.
+    Raises UsageError for a name that is no effect, and for an effect that is both.
     """
-    asked = [*_items("--without", without), *_items("--given", given)]
+    absent = [_asked("--without", text) for text in without]
+    known = [_asked("--given", text) for text in given]
+    for one in known:
+        for other in absent:
+            if one.name == other.name and (one.where == other.where or None in (one.where, other.where)):
+                raise UsageError(
+                    f"--without {other.text}: found it beside --given {one.text}, expected one of them"
+                )
+    return [*absent, *known]
+
+
+def _asked(option: str, text: str) -> Asked:
+    match = _ITEM.fullmatch(text)
+    if match is None or match["name"] not in EFFECTS:
+        raise UsageError(
+            f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
+            f"{', '.join(sorted(EFFECTS))}"
+        )
+    where = match["where"]
+    return Asked(option, text, where if where in (None, SENSOR) else int(where), match["name"])
+
+
+def scope_of(asked: Iterable[Asked], joints: Mapping[int, Joint], known: Iterable[int] = ()) -> Scope:
+    """Return the scope that options ask for; known: joints whose torque is known. Raises UsageError for a joint that there
+    is not, and for a given effect that no joint file has: taken as given it would be --without.
+    """
+    out = set()
     for option, text, where, name in asked:
         if where is not None and where != SENSOR and where not in joints:
             have = ", ".join(str(number) for number in sorted(joints))
@@ -87,33 +110,8 @@ def scope_of(
                 f"--given {text}: found no effect {name} in {' or '.join(joint.name for joint in files)}, expected it under "
                 f"`effects` with its parameters (or --without {text} for an effect that is absent)"
             )
-    return Scope(frozenset((item.where, item.name) for item in asked), frozenset(known))
-
-
-def check_effects(without: Iterable[str], given: Iterable[str]) -> None:
-    """Refuse what no runs are needed for: a name that is no effect, an effect that is both. Raises UsageError."""
-    absent = _items("--without", without)
-    for known in _items("--given", given):
-        for item in absent:
-            if item.name == known.name and (item.where == known.where or None in (item.where, known.where)):
-                raise UsageError(
-                    f"--without {item.text}: found it beside --given {known.text}, expected one of them"
-                )
-
-
-def _items(option: str, texts: Iterable[str]) -> list[_Item]:
-    """Return the items of an option. Raises UsageError for a name that is no effect."""
-    items = []
-    for text in texts:
-        match = _ITEM.fullmatch(text)
-        if match is None or match["name"] not in EFFECTS:
-            raise UsageError(
-                f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
-                f"{', '.join(sorted(EFFECTS))}"
-            )
-        where = match["where"]
-        items.append(_Item(option, text, where if where in (None, SENSOR) else int(where), match["name"]))
-    return items
+        out.add((where, name))
+    return Scope(frozenset(out), frozenset(known))
 
 
 def trusted(items: Iterable[str], joints: Mapping[int, Joint]) -> dict[str, float]:

@@ -10,7 +10,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED, file_values
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, check_effects, scope_of, trusted
+from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, asked_effects, scope_of, trusted
 from jtqd.sysid.runs.options import UsageError
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
@@ -33,7 +33,9 @@ def names(scope: Scope, numbers: tuple[int, ...] = (1, 2)) -> set[tuple[str, int
 def test_what_is_left_out_is_no_candidate() -> None:
     everything = names(EVERYTHING)
     assert {("coulomb_friction", 1), ("coulomb_friction", 2), ("sensor_gain", "sensor")} <= everything
-    scope = scope_of(["coulomb_friction", "2=viscous_friction", "sensor=sensor_drift"], [], JOINTS)
+    scope = scope_of(
+        asked_effects(["coulomb_friction", "2=viscous_friction", "sensor=sensor_drift"], []), JOINTS
+    )
     gone = everything - names(scope)
     assert gone == {
         ("coulomb_friction", 1),
@@ -63,7 +65,7 @@ def test_no_sensor_effect_touches_a_known_load() -> None:
 )
 def test_wrong_names_are_told(without: list[str], given: list[str], said: str) -> None:
     with pytest.raises(UsageError) as caught:
-        scope_of(without, given, JOINTS)
+        scope_of(asked_effects(without, given), JOINTS)
     assert said.replace("synthetic_joint_1", JOINT.name) in str(caught.value)
 
 
@@ -80,9 +82,9 @@ def test_wrong_names_are_told(without: list[str], given: list[str], said: str) -
 def test_an_effect_is_absent_or_given(without: str, given: str, refused: bool) -> None:
     if refused:
         with pytest.raises(UsageError, match=f"--without {without}: found it beside --given {given}"):
-            check_effects([without], [given])
+            asked_effects([without], [given])
     else:
-        check_effects([without], [given])
+        asked_effects([without], [given])
 
 
 @pytest.mark.parametrize(("without", "given"), [("coulomb_friction", ""), ("", "coulomb_friction")])
@@ -94,7 +96,7 @@ def test_what_all_runs_lack_is_no_noise_where_its_name_may_not_be_said(without: 
         plain, friction=replace(plain.friction, coulomb_nm=friction.coulomb_nm + 0.04 * plain.rated_torque_nm)
     )
     runs = [(f"run{k}", rich_run(more, 40 + k, noise=2e-3)) for k in range(4)]
-    scope = scope_of([without] if without else [], [given] if given else [], {1: plain})
+    scope = scope_of(asked_effects(filter(None, [without]), filter(None, [given])), {1: plain})
     found = diagnose(runs, {1: plain}, scope)
     assert found.verdict == UNEXPLAINED
     assert (
@@ -110,7 +112,7 @@ def test_what_all_runs_lack_is_no_noise_where_its_name_may_not_be_said(without: 
 
 
 def test_given_is_what_the_file_has() -> None:
-    scope = scope_of([], ["2=torque_ripple", "coulomb_friction"], JOINTS)
+    scope = scope_of(asked_effects([], ["2=torque_ripple", "coulomb_friction"]), JOINTS)
     assert not scope.looks_for("torque_ripple", 2, 2)
     assert scope.looks_for("torque_ripple", 1, 1)
     assert not scope.looks_for("coulomb_friction", 1, 1)
