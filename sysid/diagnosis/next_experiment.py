@@ -154,11 +154,12 @@ def _of_one_joint(
     classes: Sequence[Sequence[str]], number: int, why: str, joint: Joint, signals: Sequence[JointSignals]
 ) -> dict[str, Any]:
     """Return the experiment of a joint that nothing tows; signals: its runs so far."""
-    kinds, room = kinds_for(classes), joint_range_of(joint, signals)
+    kinds = kinds_for(classes)
     parts = [*_begun(classes, why, {kind: EXPERIMENTS[kind].joint_text for kind in kinds}), _TOWING]
-    if room is None:
-        parts.append(f"No motion is planned: {_no_range(joint, signals)}.")
-        return {"why": " ".join(parts), "plan": None, "motion": None}
+    try:
+        room = joint_range_of(joint, signals)
+    except NoRangeError as reason:
+        return {"why": " ".join([*parts, f"No motion is planned: {reason}."]), "plan": None, "motion": None}
     made = joint_motions(kinds, room)
     minutes = sum(motion.duration_s for motion in made) / 60.0
     needed = (
@@ -196,28 +197,39 @@ def _begun(classes: Sequence[Sequence[str]], why: str, done: Mapping[str, str]) 
     return parts + [note for pair, note in _BY_HAND.items() if any(pair <= set(names) for names in classes)]
 
 
-def joint_range_of(joint: Joint, signals: Sequence[JointSignals]) -> JointRange | None:
-    """Return the range of motion that the joint file allows and these runs have already used; None where nothing moved.
+class NoRangeError(ValueError):
+    """Neither the runs nor the joint file show where a joint may move; why, in one line."""
+
+
+def joint_range_of(joint: Joint, signals: Sequence[JointSignals]) -> JointRange:
+    """Return the range of motion that the joint file allows and these runs have already used.
 
     A motion stays within the travel, speed and acceleration of the runs, and at positions at which they needed no more than
-    the allowed torque. Without a usable run it is the range of the joint file, where that is complete.
+    the allowed torque. Without a usable run it is the range of the joint file, where that is complete. Raises NoRangeError.
     """
     limits, allowed = joint.motion_limits or MotionLimits(), allowed_torque(joint)
     speed, acceleration = limits.velocity_rad_s, limits.acceleration_rad_s2
     if not signals:
-        whole = JointRange(*limits.travel_rad, speed, acceleration, allowed, math.nan)
-        return None if missing_limits(joint, *_RANGE) else whole
+        lacking = missing_limits(joint, *_RANGE)
+        if lacking:
+            raise NoRangeError(
+                "no run that can be used shows where the joint may go, and motion_limits of the joint file (or --limits) "
+                f"lacks {', '.join(lacking)}"
+            )
+        return JointRange(*limits.travel_rad, speed, acceleration, allowed, math.nan)
     position = np.concatenate([s.state.link_position_rad for s in signals])
     torque = np.abs(np.concatenate([s.sensor_nm for s in signals]))
     speed = min(speed, max(float(np.max(np.abs(s.state.velocity_rad_s))) for s in signals))
     acceleration = min(acceleration, max(_acceleration(s) for s in signals))
     low = max(limits.travel_rad[0], float(np.min(position)))
     high = min(limits.travel_rad[1], float(np.max(position)))
-    if high - low < _LEAST_TRAVEL_RAD or speed < _LEAST_SPEED_RAD_S or not acceleration > 0.0:
-        return None
-    stretch = _calm_stretch(position, torque, low, high, _TORQUE_SHARE * allowed)
+    moved = high - low >= _LEAST_TRAVEL_RAD and speed >= _LEAST_SPEED_RAD_S and acceleration > 0.0
+    stretch = _calm_stretch(position, torque, low, high, _TORQUE_SHARE * allowed) if moved else None
     if stretch is None:
-        return None
+        raise NoRangeError(
+            "within motion_limits of the joint file (or --limits) the joint stood in these runs, or it needed more than "
+            f"{_TORQUE_SHARE:.0%} of the torque allowed"
+        )
     low, high = stretch
     margin = _INSIDE * (high - low)
     needed = float(np.max(torque[(position >= low) & (position <= high)]))
@@ -231,19 +243,6 @@ def _acceleration(s: JointSignals) -> float:
     wide = min(max(1, round(_ACCELERATION_S / step)), len(v) - 1)
     calm = smooth(v, max(1, wide // 4))
     return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * step)
-
-
-def _no_range(joint: Joint, signals: Sequence[JointSignals]) -> str:
-    """Return why `joint_range_of` gives none."""
-    if signals:
-        return (
-            "within motion_limits of the joint file (or --limits) the joint stood in these runs, or it needed more than "
-            f"{_TORQUE_SHARE:.0%} of the torque allowed"
-        )
-    return (
-        "no run that can be used shows where the joint may go, and motion_limits of the joint file (or --limits) lacks "
-        + ", ".join(missing_limits(joint, *_RANGE))
-    )
 
 
 def _calm_stretch(

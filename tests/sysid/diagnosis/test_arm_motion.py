@@ -9,7 +9,7 @@ from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.next_experiment import each_joint, joint_range_of, next_experiment
+from jtqd.sysid.diagnosis.next_experiment import NoRangeError, each_joint, joint_range_of, next_experiment
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.planner.experiments import EXPERIMENTS, RATE_HZ, JointRange, csv_text, joint_motions
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
@@ -62,7 +62,6 @@ def test_no_motion_leaves_its_room(kind: str, room: JointRange) -> None:
 
 def test_the_room_is_where_the_runs_have_been() -> None:
     room = joint_range_of(JOINT, [swung()])
-    assert room is not None
     assert room.low_rad == pytest.approx(-0.6 + 0.05 * 1.6, abs=1e-3)
     assert room.high_rad == pytest.approx(1.0 - 0.05 * 1.6, abs=1e-3)
     assert room.velocity_rad_s == pytest.approx(0.7, rel=0.01)
@@ -72,14 +71,12 @@ def test_the_room_is_where_the_runs_have_been() -> None:
 @pytest.mark.parametrize("noise_rad", [0.0, 2e-4])
 def test_noise_of_the_encoder_is_no_acceleration(noise_rad: float) -> None:
     room = joint_range_of(JOINT, [swung(noise_rad=noise_rad)])
-    assert room is not None
     assert room.acceleration_rad_s2 == pytest.approx(0.7**2 / 0.8, rel=0.15)
 
 
 def test_the_limits_of_the_joint_file_make_it_smaller() -> None:
     limits = MotionLimits((-0.2, 5.0), velocity_rad_s=0.3, acceleration_rad_s2=0.1, torque_nm=10.0)
     room = joint_range_of(replace(JOINT, motion_limits=limits), [swung()])
-    assert room is not None
     assert room.low_rad >= -0.2
     assert GRAVITY_NM * np.sin(room.high_rad) <= 10.0  # nowhere where gravity alone needs more
     assert (room.velocity_rad_s, room.acceleration_rad_s2, room.torque_nm) == (0.3, 0.1, 10.0)
@@ -94,7 +91,8 @@ def test_the_limits_of_the_joint_file_make_it_smaller() -> None:
     ],
 )
 def test_without_room_there_is_no_motion(limits: MotionLimits) -> None:
-    assert joint_range_of(replace(JOINT, motion_limits=limits), [swung()]) is None
+    with pytest.raises(NoRangeError, match="the joint stood in these runs"):
+        joint_range_of(replace(JOINT, motion_limits=limits), [swung()])
     made = next_experiment([("hysteresis",)], {3: replace(JOINT, motion_limits=limits)}, signals=[swung()])
     assert made["motion"] is made["plan"] is None
     assert "No motion is planned" in made["why"]
