@@ -7,14 +7,12 @@ import pytest
 
 from jtqd.estimator.joint import MotionLimits
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.next_experiment import NoRangeError, each_joint, joint_range_of, next_experiment
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.planner.experiments import EXPERIMENTS, RATE_HZ, JointRange, csv_text, joint_motions
-from tests.sysid.diagnosis.diagnose_helpers import bench_run
+from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
 
-JOINT = load_joint(shipped("joint1.yaml"))
 GRAVITY_NM = 20.0
 
 

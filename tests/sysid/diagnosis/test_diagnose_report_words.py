@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import pytest
 
-from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.findings import (
     CandidateEvidence,
     Findings,
@@ -34,9 +33,9 @@ from jtqd.sysid.diagnosis.words import (
     terminal_lines,
 )
 from tests.sysid.diagnosis import findings_examples as examples
+from tests.sysid.diagnosis.diagnose_helpers import JOINT
 from tests.sysid.diagnosis.findings_parts import gap, value
 
-JOINT = load_joint(shipped("joint1.yaml"))
 NARROW = "\u00a0"
 INTERVAL = re.compile(r"\[(\S+), (\S+)\]")
 

@@ -6,16 +6,14 @@ from dataclasses import replace
 import pytest
 
 from jtqd.estimator.joint import Effect
-from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED, file_values
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, asked_effects, scope_of, trusted
 from jtqd.sysid.runs.options import UsageError
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
-from tests.sysid.diagnosis.diagnose_helpers import bench_run
+from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
 
-JOINT = load_joint(shipped("joint1.yaml"))
 RIPPLE = Effect("torque_ripple", {"amplitude_nm": 0.4, "order_per_motor_rev": 2.0, "phase_rad": 0.1})
 JOINTS = {1: JOINT, 2: replace(JOINT, effects=(RIPPLE,))}
 
