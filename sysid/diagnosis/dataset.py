@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -147,10 +147,12 @@ def usable_signals(
     joints: Mapping[int, Joint],
     numbers: Sequence[int],
     known_loads: Collection[int] = (),
+    like: Iterable[JointSignals] = (),
 ) -> tuple[list[list[JointSignals]], list[str]]:
     """Return the signals [run][joint] of the usable runs, and why others cannot be used. known_loads: joints whose torque is
-    computed and no sensor's.
+    computed and no sensor's; like: signals of the same runs whose filters are used (`joint_signals`).
     """
+    same = {(s.run, s.number): s for s in like}
     if not numbers:
         return [], ["found no joint that is in both the runs and the joint files"]
     out: list[list[JointSignals]] = []
@@ -168,7 +170,7 @@ def usable_signals(
                 continue
             try:
                 c = Channels(table.time_s, table.joints[n], joints[n], name, n in known_loads)
-                signals = joint_signals(name, table, n, joints[n], bases[n])
+                signals = joint_signals(name, table, n, joints[n], bases[n], same.get((name, n)))
                 mine.append(without_held(signals, held_values(c, limits[n])))
             except SignalsError as error:
                 reasons.append(str(error))

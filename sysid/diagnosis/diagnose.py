@@ -139,7 +139,9 @@ def disturbed_signals(
     rng = np.random.default_rng(seed)
     there = {run[0].run for run in usable}
     noisy = [(name, disturbed(table, joints, rng)) for name, table in runs if name in there]
-    again, _ = usable_signals(noisy, joints, numbers, scope.known_references)
+    again, _ = usable_signals(
+        noisy, joints, numbers, scope.known_references, [s for run in usable for s in run]
+    )
     numbers_used = {s.number for s in usable[0]}
     return [
         [s for s in run if s.number in numbers_used]

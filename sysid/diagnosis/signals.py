@@ -196,6 +196,7 @@ class JointSignals:
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE
+    inertial: Smoother = _ALL_VISIBLE  # of the acceleration in the regressor of an inertia
     believed: list[Joint] = field(
         default_factory=list
     )  # file with the values found; what effects are relative to
@@ -332,7 +333,7 @@ class _Motion:
     """Motion of one motor as it is known, at the motor's shaft.
 
     speed: as recorded or derived; whole: acceleration at the full rate; acceleration, shared: where it is known to
-    `_VISIBLE` and `_SHARED`; visible: the smoother of the first; of_position: all is of the position, else of the velocity;
+    `_VISIBLE` and `_SHARED`; visible, inertial: their smoothers; of_position: all is of the position, else of the velocity;
     coarse: what its noise costs, in words.
     """
 
@@ -342,13 +343,16 @@ class _Motion:
     acceleration: FloatArray
     shared: FloatArray
     visible: Smoother
+    inertial: Smoother
     of_position: bool
     coarse: str
 
 
-def _motion(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint) -> _Motion:
+def _motion(
+    time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint, like: JointSignals | None
+) -> _Motion:
     """Return the motion by the channel whose acceleration is known best, position or velocity, of the motor's side or, with
-    one encoder, of the link's.
+    one encoder, of the link's; like: by the same channel and filters as there.
 
     A velocity channel may be filtered, late or of another scale: beside a position it is taken only where that shows none of
     it.
@@ -359,8 +363,10 @@ def _motion(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: J
         position = ratio * raw.link_position_rad
     if speed is None and one and raw.link_velocity_rad_s is not None:
         speed = ratio * raw.link_velocity_rad_s
-    by_position = None if position is None else _known(time, position, joint, of_position=True)
-    by_speed = None if speed is None else _known(time, speed, joint, of_position=False)
+    if like is not None:
+        position, speed = (position, None) if like.of_position else (None, speed)
+    by_position = None if position is None else _known(time, position, joint, like, of_position=True)
+    by_speed = None if speed is None else _known(time, speed, joint, like, of_position=False)
     found = by_position or by_speed
     assert found is not None
     if by_position is not None and by_speed is not None and _better(time, by_speed, by_position):
@@ -372,15 +378,20 @@ def _motion(time: FloatArray, raw: JointColumns, columns: JointColumns, joint: J
     return replace(found, position=there)
 
 
-def _known(time: FloatArray, x: FloatArray, joint: Joint, *, of_position: bool) -> _Motion:
+def _known(
+    time: FloatArray, x: FloatArray, joint: Joint, like: JointSignals | None, *, of_position: bool
+) -> _Motion:
     """Return the motion by one channel."""
     whole = second_difference(x, time) if of_position else np.gradient(x, time)
     noise = noise_of(x)
-    visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
-    shared = _smoother(joint, time, noise, _SHARED, of_position=of_position)(whole)
+    if like is None:
+        visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
+        inertial = _smoother(joint, time, noise, _SHARED, of_position=of_position)
+    else:
+        visible, inertial = like.visible, like.inertial
     coarse = _cost(joint, time, x, noise, visible, of_position=of_position)
     speed = np.asarray(np.gradient(x, time)) if of_position else x
-    return _Motion(x, speed, whole, visible(whole), shared, visible, of_position, coarse)
+    return _Motion(x, speed, whole, visible(whole), inertial(whole), visible, inertial, of_position, coarse)
 
 
 def _better(time: FloatArray, speed: _Motion, position: _Motion) -> bool:
@@ -404,8 +415,12 @@ def _better(time: FloatArray, speed: _Motion, position: _Motion) -> bool:
     return bool(np.all(off <= np.maximum(np.array(_SAME), _SURELY * sigma)))
 
 
-def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: BaseLoss) -> JointSignals:
-    """Return the signals of one joint; raises SignalsError for a column that is missing and cannot be derived."""
+def joint_signals(  # noqa: PLR0917
+    run: str, table: RunTable, number: int, joint: Joint, base: BaseLoss, like: JointSignals | None = None
+) -> JointSignals:
+    """Return the signals of one joint; like: by the channel and the filters of these, so that a difference is that of the
+    tables. Raises SignalsError for a column that is missing and cannot be derived.
+    """
     raw = table.joints[number]
     columns = table.joint(number, joint.gear_ratio)
     for name in ("current_a", "torque_nm", "motor_velocity_rad_s"):
@@ -415,7 +430,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
     assert columns.torque_nm is not None
     assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None
     time, sensor = table.time_s, columns.torque_nm
-    motion = _motion(time, raw, columns, joint)
+    motion = _motion(time, raw, columns, joint, like)
     velocity = motion.visible(motion.speed) / joint.gear_ratio
     both = raw.two_encoders(joint.gear_ratio)
     link = (
@@ -485,6 +500,7 @@ def joint_signals(run: str, table: RunTable, number: int, joint: Joint, base: Ba
             "torque_nm": float(np.median(noise_of(sensor))),
         },
         visible=motion.visible,
+        inertial=motion.inertial,
         coarse=motion.coarse,
     )
 

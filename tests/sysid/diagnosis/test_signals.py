@@ -37,6 +37,26 @@ def rms(x: FloatArray) -> float:
     return float(np.sqrt(np.mean(x**2)))
 
 
+def test_a_difference_of_two_tables_is_not_one_of_filters() -> None:
+    """Noise of ten times the size asks for a slower filter, which would take motion with it."""
+    clean = rigid_run(PLAIN)
+    rng = np.random.default_rng(2)
+    columns = clean.joints[1]
+    assert columns.motor_position_rad is not None
+    noise = 1e-2 * rng.normal(size=len(clean.time_s))
+    noisy = replace(
+        clean, joints={1: replace(columns, motor_position_rad=columns.motor_position_rad + noise)}
+    )
+    first = signals(clean)
+    again = joint_signals("run", noisy, 1, PLAIN, BaseLoss(PLAIN), first)
+    assert (again.visible, again.inertial, again.of_position) == (
+        first.visible,
+        first.inertial,
+        first.of_position,
+    )
+    assert signals(noisy).visible != first.visible
+
+
 def test_the_second_difference_is_of_fourth_order() -> None:
     def worst(step: float) -> float:
         t = np.arange(0.0, 1.0, step)
