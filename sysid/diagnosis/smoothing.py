@@ -160,8 +160,10 @@ _ON_GRID: Final = 0.95
 """Part of the small distances between values that are whole multiples of the least, on a grid."""
 _SIXTH: Final = math.sqrt(924.0)
 """Rms of a sixth difference of white noise: binomials of six, squared and summed."""
-_OUTLYING: Final = 6.0
-"""Of the median of sixth differences: more is no noise."""
+_CALM: Final = 50
+"""Samples over which sixth differences are averaged."""
+_CALMEST: Final = 0.2
+"""Part of the time in which no motion has such differences."""
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0
 """No cutoff is lower: there is the motion itself."""
@@ -204,8 +206,8 @@ def described(x: FloatArray, unit: str) -> str:
 
 
 def noise_of(x: FloatArray) -> FloatArray:
-    """Return the standard deviation of the white noise near each sample [n]: of the steps, or what is quicker than any
-    motion (sixth differences), whichever is more.
+    """Return the standard deviation of the white noise near each sample [n]: of the steps, or what is quicker than most
+    motion (sixth differences) where the motion is calmest, whichever is more.
     """
     steps = steps_of(x)
     out = np.asarray(steps / math.sqrt(12.0))
@@ -213,9 +215,9 @@ def noise_of(x: FloatArray) -> FloatArray:
         return out
     quick = np.pad(np.abs(np.diff(x, 6)), 3, mode="edge") / _SIXTH
     for there in _magnitudes(x):
-        usual = quick[there]
-        usual = usual[usual <= _OUTLYING * np.median(usual)]
-        out[there] = np.maximum(out[there], np.sqrt(np.mean(usual**2)))
+        square = quick[there] ** 2
+        blocks = np.array_split(square, max(1, len(square) // _CALM))
+        out[there] = np.maximum(out[there], np.sqrt(np.quantile([b.mean() for b in blocks], _CALMEST)))
     return out
 
 

@@ -71,6 +71,14 @@ def test_noise_is_that_of_the_steps_or_of_what_is_quicker_than_motion() -> None:
     assert np.median(noise_of(noisy)) == pytest.approx(0.01, rel=0.15)
 
 
+def test_quick_motion_is_no_noise() -> None:
+    """A ripple at a third of the sampling rate, on most of the time."""
+    noise = 1e-4 * np.random.default_rng(1).normal(size=20000)
+    k = np.arange(20000)
+    ripple = 1e-2 * np.sin(2.1 * k) * (np.sin(2.0 * np.pi * k / 5000) > -0.7)
+    assert np.median(noise_of(ramp() + noise + ripple)) == pytest.approx(1e-4, rel=0.25)
+
+
 @pytest.mark.parametrize("of_velocity", [False, True])
 def test_noise_of_an_acceleration_is_what_differences_of_noise_have_below_a_cutoff(of_velocity: bool) -> None:
     rng = np.random.default_rng(2)
