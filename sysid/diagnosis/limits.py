@@ -108,11 +108,9 @@ SHAPE: Final = 0.4
 REFERENCE_K: Final = 3.0
 """The same of the temperature at which the file's values hold."""
 FEATURES: Final = 12
-"""Random Fourier features of a balance's discrepancy, plain; as many in the direction of motion."""
+"""Eigenfunctions of a balance's discrepancy, plain; as many in the direction of motion."""
 LENGTH: Final = 1.0
-"""Their length scale, in standard deviations of the operating conditions."""
-ROUGH: Final = 3.0
-"""Degrees of freedom of their spectrum: Matern 3/2, as laws with kinks need (Rasmussen and Williams 2006, section 4.2)."""
+"""Its length scale, in standard deviations of the operating conditions."""
 FLOOR: Final = 1e-3
 """Prior size of the discrepancy, part of the rated torque, worth FLOOR_COUNT features."""
 FLOOR_COUNT: Final = 2.0
