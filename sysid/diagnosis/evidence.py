@@ -110,15 +110,8 @@ class Means(NamedTuple):
 class Sets:
     """Sets of entries on marginal normal equations A [E + 1, E + 1], last: the response."""
 
-    def __init__(
-        self,
-        entries: Sequence[Entry],
-        gram: FloatArray,
-        out: Set = frozenset(),
-        deviation: FloatArray | None = None,
-    ) -> None:
+    def __init__(self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset()) -> None:
         self.entries, self.gram, self.out = list(entries), gram, out
-        self._precision = np.ones(len(gram) - 1) if deviation is None else deviation**-2.0
         self.slices: list[Index] = []
         first = 0
         for e in entries:
@@ -150,7 +143,7 @@ class Sets:
 
     def _fit(self, chosen: Set) -> Fit:
         at = self.columns(chosen)
-        inner = self.gram[np.ix_(at, at)] + np.diag(self._precision[at])
+        inner = self.gram[np.ix_(at, at)] + np.eye(len(at))
         right = self.gram[at, -1]
         try:
             factor = cho_factor(inner)
@@ -158,8 +151,10 @@ class Sets:
             return Fit(np.zeros(len(at)), np.eye(len(at)), -math.inf)
         mean = _within(inner, right, *_bounds(self.entries, chosen))
         covariance = cho_solve(factor, np.eye(len(at)))
-        log = float(np.sum(np.log(np.diag(factor[0]))))
-        evidence = float(mean @ right - 0.5 * mean @ inner @ mean) - log
+        explained = float(2.0 * mean @ right - mean @ inner @ mean)
+        if explained >= self.gram[-1, -1]:  # more than there is: what is taken out as noise is none
+            return Fit(mean, covariance, -math.inf)
+        evidence = 0.5 * explained - float(np.sum(np.log(np.diag(factor[0]))))
         return Fit(mean, covariance, evidence + sum(self.entries[k].odds for k in chosen))
 
     def places(self, chosen: Set) -> dict[int, slice]:
@@ -501,8 +496,11 @@ class Equations:
             lower = np.linalg.cholesky(inner)
             covariance = np.linalg.inv(inner)
             theta = _within(inner, total[q, -1], low, high)
+            left = float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
+            if left <= 0.0:
+                raise np.linalg.LinAlgError("found more explained than there is")
             score = (
-                float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
+                left
                 + logs
                 + 2.0 * float(np.sum(np.log(np.diag(lower))))
                 + float(np.sum(np.log(w)))

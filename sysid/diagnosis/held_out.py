@@ -19,11 +19,13 @@ from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.evidence import Set, Sets
 from jtqd.sysid.diagnosis.findings import Gain, RunGain
 from jtqd.sysid.diagnosis.model import Solution
-from jtqd.sysid.diagnosis.regressors import Index, RunData
+from jtqd.sysid.diagnosis.regressors import RunData
 from jtqd.sysid.diagnosis.signals import Channel
 
 _BOOTSTRAPS: Final = 2000
 _NONE: Final = 1e-12
+_ENOUGH: Final = 2
+"""Fits of which one holds a run out."""
 
 
 @dataclass(frozen=True)
@@ -39,41 +41,65 @@ class Prediction:
 
 
 def predict(solution: Solution) -> Prediction:
-    """Return the set that predicts: without entries that raise the error on held-out runs beyond its scatter."""
+    """Return what predicts: between the set and the set with all values of the file what held-out runs want, without entries
+    that raise the error on them beyond its scatter.
+    """
     grams, counts = _grams(solution)
-    values = {k for k, e in enumerate(solution.entries) if e.prior.file}
-    slots = {solution.entries[k].slot for k in solution.chosen}
-    more = {k for k in values - solution.equations.noisy if solution.entries[k].slot not in slots}
-    chosen: Set = solution.chosen | more
     without = _fits(solution)
-    vetoed: set[int] = set()
+    chosen, vetoed = solution.chosen, frozenset[int]()
     while True:
-        each = _held_out(grams, without, chosen)
+        each = _held_out(grams, [_coefficients(sets, chosen) for sets in without[:-1]])
         worse = _worst(solution, grams, without, chosen, each)
         if worse is None:
             break
-        vetoed.add(worse)
+        vetoed |= {worse}
         chosen -= {worse}
-    mean = without[-1].fit(chosen).mean
+    slots = {solution.entries[k].slot for k in solution.chosen}
+    values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
+    wide = chosen | values - solution.equations.noisy
+    part = stacked(grams, without, chosen, wide) if len(without) > _ENOUGH else 0.0
+    mixed = [
+        (1.0 - part) * _coefficients(sets, chosen) + part * _coefficients(sets, wide) for sets in without
+    ]
+    each = _held_out(grams, mixed[:-1])
     squares = {
         c: np.array([(run[c][-1, -1], each[r][c], counts[r][c]) for r, run in enumerate(grams) if c in run])
         for c in grams[0]
     }
-    return Prediction(chosen, mean, squares, frozenset(vetoed))
+    named = wide if part > 0.0 else chosen
+    return Prediction(named, mixed[-1][without[-1].columns(named)], squares, vetoed)
+
+
+def stacked(
+    grams: Sequence[dict[Channel, FloatArray]], without: Sequence[Sets], chosen: Set, wide: Set
+) -> float:
+    """Return the part of the wide set, 0 to 1, at which the mixture of two sets errs least on held-out runs (stacking:
+    Wolpert 1992, Neural Networks 5; Yao et al. 2018, Bayesian Analysis 13).
+    """
+    slope = curvature = 0.0
+    for run, sets in zip(grams, without[:-1], strict=True):
+        few = _coefficients(sets, chosen)
+        step = _coefficients(sets, wide) - few
+        for gram in run.values():
+            slope += float(step @ (gram[:-1, -1] - gram[:-1, :-1] @ few))
+            curvature += float(step @ gram[:-1, :-1] @ step)
+    return min(max(slope / curvature, 0.0), 1.0) if curvature > 0.0 else 0.0
+
+
+def _coefficients(sets: Sets, chosen: Set) -> FloatArray:
+    """Return the coefficients of all entries with this set [E]."""
+    out = np.zeros(len(sets.gram) - 1)
+    out[sets.columns(chosen)] = sets.fit(chosen).mean
+    return out
 
 
 def _fits(solution: Solution) -> list[Sets]:
     """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
-    deviation = solution.wide.deviation(solution.found)
-    deviation[solution.sets.columns(solution.chosen)] = 1.0
     plain = {g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.found.items()}
     *without, everything = solution.wide.marginal(plain)
     if len(without) == 1:
         without = [everything]
-    return [
-        Sets(solution.entries, gram, deviation=np.maximum(deviation, _NONE))
-        for gram in (*without, everything)
-    ]
+    return [Sets(solution.entries, gram) for gram in (*without, everything)]
 
 
 def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:
@@ -106,19 +132,14 @@ def _rows(run: RunData, channel: Channel, weights: FloatArray, valid_of: RunData
     return np.asarray(x - x.mean(axis=0) if channel.balance == TORSION and len(x) else x)
 
 
-def _square(gram: FloatArray, at: Index, mean: FloatArray) -> float:
-    """Return the sum of squares that coefficients leave."""
-    return float(gram[-1, -1] - 2.0 * mean @ gram[at, -1] + mean @ gram[np.ix_(at, at)] @ mean)
-
-
 def _held_out(
-    grams: Sequence[dict[Channel, FloatArray]], without: Sequence[Sets], chosen: Set
+    grams: Sequence[dict[Channel, FloatArray]], without: Sequence[FloatArray]
 ) -> list[dict[Channel, float]]:
-    """Return per recording the squares with the coefficients of all others."""
+    """Return per recording the squares with the coefficients [E] of all others."""
     out = []
-    for run, sets in zip(grams, without[:-1], strict=True):
-        at, mean = sets.columns(chosen), sets.fit(chosen).mean
-        out.append({c: max(_square(g, at, mean), 0.0) for c, g in run.items()})
+    for run, mean in zip(grams, without, strict=True):
+        contrast = np.append(-mean, 1.0)
+        out.append({c: max(float(contrast @ g @ contrast), 0.0) for c, g in run.items()})
     return out
 
 
@@ -137,7 +158,7 @@ def _worst(
     for k in sorted(chosen):
         if solution.entries[k].prior.file:
             continue
-        without = _held_out(grams, fits, chosen - {k})
+        without = _held_out(grams, [_coefficients(sets, chosen - {k}) for sets in fits[:-1]])
         gain = now - np.array([sum(run.values()) for run in without])
         scatter = float(np.std(gain, ddof=1)) / np.sqrt(len(gain))
         if float(np.mean(gain)) > max(limits.VETO * scatter, best):

@@ -384,6 +384,20 @@ def test_a_set_that_noise_leaves_no_covariance_is_none_or_has_less_taken_out() -
     assert np.isfinite(means.beta).all()
 
 
+def test_no_set_explains_more_than_there_is() -> None:
+    """A column that is noise almost to its last part, of which the response should have had more."""
+    rng = np.random.default_rng(10)
+    block = np.column_stack((rng.normal(size=400), np.ones(400), rng.normal(size=400)))
+    noise = np.zeros((3, 3))
+    noise[0, 0] = float(block[:, 0] @ block[:, 0]) - 1.0
+    noise[0, 2] = noise[2, 0] = 100.0
+    equations = equations_of([block], [entry()], ("zero",), noise=noise)
+    one = frozenset({0})
+    assert equations.sets({"zero": 1e-6}).fit(one).evidence == -math.inf
+    with pytest.raises(np.linalg.LinAlgError):
+        equations.expected(one, {"zero": 1e-6}, 0)
+
+
 def test_a_column_that_is_mostly_noise_is_in_no_set() -> None:
     rng = np.random.default_rng(8)
     block = np.column_stack((rng.normal(size=(200, 2)), np.ones(200), rng.normal(size=200)))

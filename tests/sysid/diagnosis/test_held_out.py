@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction
 from jtqd.sysid.diagnosis import limits
+from jtqd.sysid.diagnosis.evidence import Sets
 from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF
-from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
+from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict, stacked
 from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.verdict import grade_of, judged
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1
@@ -110,6 +112,26 @@ def test_an_entry_that_predicts_every_run_is_kept(solution: Solution) -> None:
     assert not found.vetoed
     assert k in found.chosen
     assert left_nm2(found) < 0.5 * left_nm2(predict(replace(solution, disturbed=[])))
+
+
+def test_between_two_sets_held_out_runs_decide(solution: Solution) -> None:
+    """Of what the wide set adds, the part that errs least: all where it is right, none where it is noise, else between."""
+    few, wide = frozenset({0}), frozenset({0, 1})
+
+    def part(held_out: float, fitted: float) -> float:
+        def sums(second: float) -> FloatArray:
+            gram = np.diag([1e4, 1e4, 4e4])
+            gram[0, 2] = gram[2, 0] = 1e4
+            gram[1, 2] = gram[2, 1] = second * 1e4
+            return gram
+
+        entries = [e for e in solution.entries if e.size == 1][:2]
+        fits = [Sets(entries, sums(fitted)) for _ in range(3)]
+        return stacked([{MOTOR1: sums(held_out)}] * 2, fits, few, wide)
+
+    assert part(0.5, 0.5) == pytest.approx(1.0, abs=0.01)
+    assert part(-0.5, 0.5) == 0.0
+    assert part(0.2, 0.5) == pytest.approx(0.4, abs=0.01)
 
 
 def made_up(solution: Solution, before: list[float], after: list[float]) -> Any:
