@@ -1,10 +1,11 @@
 """Discrepancy: what the library does not hold, as a random function of speed, load and angle, per balance.
 
-A Gaussian process over the operating conditions, plain and, in the motor balance, in the direction of motion, as friction is:
-Matern 3/2, because friction has kinks. It is written in its largest eigenfunctions over the conditions of the runs (Nystrom
-approximation: Williams and Seeger 2001, NIPS 13), which hold the most of it that few features can. Its variance is estimated
-with each set of entries (`evidence`), capped, and each run has a part of its own: intervals are as wide as an incomplete
-model makes them (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63; Brynjarsdottir and O'Hagan 2014, Inverse Problems 30).
+A Gaussian process over the operating conditions, plain and, in the motor balance, in the direction of motion, as friction
+is; Matern 3/2, because friction has kinks. It is written in its largest eigenfunctions over the conditions of the runs
+(Nystrom approximation: Williams and Seeger 2001, NIPS 13), which hold the most of it that few features can. Its variance is
+estimated with each set of entries (`evidence`), capped, and each run has a part of its own: intervals are as wide as an
+incomplete model makes them (Kennedy and O'Hagan 2001, J. R. Stat. Soc. B 63; Brynjarsdottir and O'Hagan 2014, Inverse
+Problems 30).
 """
 
 from __future__ import annotations
