@@ -17,7 +17,7 @@ from jtqd.estimator.effects.effect import (
 )
 
 ORDERS = (6.0, 12.0, 18.0, 24.0, 36.0, 42.0, 48.0, 60.0, 72.0, 84.0)
-"""Usual lcm(poles, slots) and harmonics of the pole pairs; any other: `term_of_order`."""
+"""Usual lcm(poles, slots) and harmonics of the pole pairs."""
 
 
 class Cogging(Effect):
@@ -32,6 +32,7 @@ class Cogging(Effect):
     experiment = "full_turns"
     parameters = (Parameter("amplitude_nm", "Nm", 0.0, 20.0), order(5.0, None), PHASE)
     columns = waves("amplitude_nm", 0.1, ORDERS)
+    whole_orders = range(5, 101)
     needs = ("motor_position_rad",)
 
     def loss_nm(self, p: Values, s: State, joint: Joint, x: Functions) -> Any:

@@ -82,7 +82,8 @@ class Parameter:
 
     fixed: not refined by fits (an order, a channel); whole: a whole number, a code. key: dotted key of the joint file
     whose value it replaces, "" for none. neutral: value without the effect, of a parameter without a key; None where it is
-    where or how the effect acts (a phase, an order) and not how large it is.
+    where or how the effect acts (a phase, an order) and not how large it is. prior: name of the prior of its size, or of the
+    effect's where this code is set; "" for that of the effect.
     """
 
     name: str
@@ -94,6 +95,7 @@ class Parameter:
     key: str = ""
     whole: bool = False
     neutral: float | None = 0.0
+    prior: str = ""
 
 
 class Column(NamedTuple):
@@ -397,6 +399,7 @@ class Effect:
     geometric: its twist is one of the teeth, so the damper beside the spring feels its rate too (kinematic error), unlike
     a property of the spring itself. follows_torsion: its state follows the torsion itself (slip, play), for which tau/K is
     not good enough. rate_based: it is known by a derivative of measured angles or torques.
+    whole_orders: of a wave, orders per motor revolution that are looked for beside those of its columns.
     scales_all: it scales everything that the sensor reads. scales_balance: it scales the whole of this balance of a joint.
     changes_joint: `joint()` is all of it for plant and estimator, which then leave its hooks alone (inertias, damping).
     """
@@ -419,6 +422,7 @@ class Effect:
     geometric: ClassVar[bool] = False
     follows_torsion: ClassVar[bool] = False
     rate_based: ClassVar[bool] = False
+    whole_orders: ClassVar[range] = range(0)
     scales_all: ClassVar[bool] = False
     scales_balance: ClassVar[str] = ""
 

@@ -26,7 +26,16 @@ class EncoderEccentricity(Effect):
     parameters = (
         Parameter("amplitude_rad", "rad", 0.0, 0.1),
         PHASE,
-        Parameter("motor_side", "", 0.0, 1.0, default=0.0, fixed=True, whole=True),
+        Parameter(
+            "motor_side",
+            "",
+            0.0,
+            1.0,
+            default=0.0,
+            fixed=True,
+            whole=True,
+            prior="encoder_eccentricity.motor",
+        ),
     )
     columns = (
         Column("amplitude_rad", 1e-5, {"motor_side": 0.0}),

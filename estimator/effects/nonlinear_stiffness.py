@@ -19,7 +19,13 @@ class NonlinearStiffness(Effect):
     experiment = "load_ramp"
     parameters = (
         Parameter(
-            "stiffness_nm_per_rad", "Nm/rad", 100.0, 10000000.0, default=math.nan, key="stiffness_nm_per_rad"
+            "stiffness_nm_per_rad",
+            "Nm/rad",
+            100.0,
+            10000000.0,
+            default=math.nan,
+            key="stiffness_nm_per_rad",
+            prior="stiffness",
         ),
         Parameter("cubic_nm_per_rad3", "Nm/rad3", -100000000000.0, 1000000000000.0, default=0.0),
     )

@@ -20,7 +20,7 @@ class SensorCrosstalk(Effect):
     }
     parameters = (
         Parameter("amplitude_nm", "Nm", 0.0, 20.0, default=0.0),
-        Parameter("share", "", 0.0, 0.5, default=0.0),
+        Parameter("share", "", 0.0, 0.5, default=0.0, prior="sensor_crosstalk.share"),
         PHASE,
     )
     columns = (Column("amplitude_nm", 0.1, {"share": 0.0}), Column("share", 0.01, {"amplitude_nm": 0.0}))

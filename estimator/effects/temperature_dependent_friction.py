@@ -22,8 +22,9 @@ from jtqd.estimator.effects.effect import (
     reference_of,
 )
 
-RATES_PER_K = (0.003, 0.015, 0.03)
-"""Grid of the search: how curved the fall over temperature is; the fit refines it."""
+VISCOUS_PER_K = 0.015
+"""Where a search begins: how curved the fall over temperature is."""
+COULOMB_PER_K = 0.003
 
 _FLAT = 1e-9
 
@@ -91,12 +92,12 @@ class TemperatureDependentFriction(Effect):
         return loss
 
     def terms(self, joint: Joint) -> Terms:
-        """Return two columns (slope over temperature, constant) per rate, of viscous and of Coulomb friction."""
+        """Return two columns (slope over temperature, constant) of viscous and of Coulomb friction."""
         reference = reference_of(joint.provenance)
         viscous, coulomb = "viscous_per_k", "coulomb_per_k"
         terms: list[Term] = []
         if joint.friction.viscous_nms_per_rad:
-            terms += [_Exponential(viscous, k, reference, {coulomb: 0.0}).term() for k in RATES_PER_K]
+            terms.append(_Exponential(viscous, VISCOUS_PER_K, reference, {coulomb: 0.0}).term())
         if joint.friction.coulomb_nm:
-            terms.append(_Exponential(coulomb, RATES_PER_K[0], reference, {viscous: 0.0}).term())
+            terms.append(_Exponential(coulomb, COULOMB_PER_K, reference, {viscous: 0.0}).term())
         return tuple(terms)

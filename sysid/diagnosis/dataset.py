@@ -57,8 +57,6 @@ from jtqd.sysid.runs.channels import Channels
 FEWEST_RUNS: Final = 2
 SHORTEST_MOVING_S: Final = 5.0
 SLOWEST_HZ: Final = 50.0
-COGGING_ORDERS: Final = np.arange(5.0, 101.0)
-"""Per motor revolution, where cogging is looked for."""
 ORDER_STEP_S: Final = 0.002
 STRONG_LINE: Final = 25.0
 _SIDELOBES: Final = 0.25
@@ -362,7 +360,7 @@ def build_dataset(
     every = [s for run in signals for s in run]
     step = bin_samples(every) * max(s.step_s for s in every)
     candidates = library_candidates(signals, joints, scope)
-    candidates += _cogging_orders(signals, joints, candidates, scope)
+    candidates += _whole_orders(signals, joints, candidates, scope)
     lines = unknown_lines(signals, candidates, step)
     groups = families(signals, lines)
     if scope.known_references & set(joints):  # a known load has no zero that differs from run to run
@@ -422,37 +420,34 @@ def _has_channels(effect: Effect, signals: Sequence[Sequence[JointSignals]], num
     return True
 
 
-def _cogging_orders(
+def _whole_orders(
     signals: Sequence[Sequence[JointSignals]],
     joints: Mapping[int, Joint],
     candidates: Sequence[EffectCandidate],
     scope: Scope,
 ) -> list[EffectCandidate]:
-    """Return cogging at integer orders that stand out of the residual's order spectrum."""
+    """Return waves at whole orders that stand out of the residual's order spectrum, of effects that may have any."""
     first = candidates[-1].columns.stop if candidates else 0
     out: list[EffectCandidate] = []
     coarsest = max(s.step_s for run in signals for s in run)
     step = coarsest * max(1, round(ORDER_STEP_S / coarsest))
     bare = [run_data(run, [], samples_in(step, run)) for run in signals]
-    for s in signals[0]:
-        if not scope.looks_for("cogging", s.number, s.number):
-            continue
-        channel = Channel(s.number, "motor")
-        parts = [np.where(r.channels[channel].valid, r.channels[channel].residual, np.nan) for r in bare]
-        there = {
-            round(c.term.basis[0]["order_per_motor_rev"])
-            for c in candidates
-            if c.effect.name == "cogging" and c.joint == s.number
-        }
-        for line in order_lines(bare, {channel: parts}, step, COGGING_ORDERS)[:4]:
-            order = round(line.order)
-            if order >= 5 and abs(line.order - order) < 0.06 and order not in there:
-                term = EFFECTS["cogging"].term_of_order(float(order))
-                if term is None:
-                    continue
-                out.append(EffectCandidate(EFFECTS["cogging"], s.number, term, first))
-                first += len(term.basis)
-                there.add(order)
+    for effect in (e for e in EFFECTS.values() if e.whole_orders):
+        orders = np.array(effect.whole_orders, np.float64)
+        for s in signals[0]:
+            if not scope.looks_for(effect.name, s.number, s.number):
+                continue
+            channel = Channel(s.number, "motor")
+            parts = [np.where(r.channels[channel].valid, r.channels[channel].residual, np.nan) for r in bare]
+            mine = (c for c in candidates if c.key == (effect.name, s.number))
+            there = {round(c.term.basis[0]["order_per_motor_rev"]) for c in mine}
+            for line in order_lines(bare, {channel: parts}, step, orders)[:_MOST_LINES]:
+                order = round(line.order)
+                term = effect.term_of_order(float(order))
+                if term is not None and order not in there:
+                    out.append(EffectCandidate(effect, s.number, term, first))
+                    first += len(term.basis)
+                    there.add(order)
     return out
 
 

@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.effect import SPAN_K, Effect, Term, Values
+from jtqd.estimator.effects.effect import SPAN_K, Effect, Term
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.limits import Prior, Usage
-from jtqd.sysid.diagnosis.regressors import EffectCandidate
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, fields_used
 from jtqd.sysid.diagnosis.signals import JointSignals
 
 _KINDS: Final = ("order_per_motor_rev", "channel", "motor_side")
@@ -91,15 +91,12 @@ class Entry:
         return values
 
 
-def kind_of(effect: Effect, p: Values) -> str:
-    """Return which of an effect's priors a term has: its name, or with a suffix."""
-    name = effect.name
-    if name == "nonlinear_stiffness" and not p.get("cubic_nm_per_rad3"):
-        return "stiffness"
-    for suffix in ("share", "per_k_nm"):
-        if p.get(suffix):
-            return f"{name}.{suffix}"
-    return f"{name}.motor" if p.get("motor_side") else name
+def kind_of(c: EffectCandidate) -> str:
+    """Return the name of the prior of a term's size: of a code that is set, of its leading parameter, else of the effect."""
+    p, lead = c.term.basis[0], lead_of(c)
+    named = {q.name: q.prior for q in c.effect.parameters if q.prior}
+    codes = (q.prior for q in c.effect.parameters if q.fixed and q.prior and p.get(q.name))
+    return next(codes, named.get(lead) or c.effect.name)
 
 
 def shapes_of(effect: Effect, term: Term) -> tuple[str, ...]:
@@ -155,15 +152,13 @@ def entry_of(
 ) -> Entry | None:
     """Return the entry of a candidate, None where it is one of another's or its condition does not vary."""
     effect, p = c.effect, c.term.basis[0]
-    kind = kind_of(effect, p)
+    kind = kind_of(c)
     prior = limits.PRIORS.get(kind, limits.OTHER)
     nothing = c.term.combine([0.0] * c.size)
     lead = lead_of(c)
-    if kind in ("stiffness", "nonlinear_stiffness") and c.size == 2:
+    if _sizes(c) > 1:
         return None
-    if ("temperature_c" in effect.needs or p.get("per_k_nm")) and use.warming_k < _WARMS_K:
-        return None
-    if effect.name == "temperature_dependent_friction" and (p.get("viscous_per_k") or 0.015) != 0.015:
+    if use.warming_k < _WARMS_K and "temperature_c" in fields_used(effect, p, joint):
         return None
     step = p[lead] - (nothing[lead] if c.size == 1 or "phase_rad" not in p else 0.0)
     if "reference_c" in p and c.size == 2:
@@ -191,6 +186,19 @@ def entry_of(
     return Entry(
         c, kind, prior, weights, math.log(chance / (1.0 - chance)), (kind, c.joint, detail), low, high
     )
+
+
+def _sizes(c: EffectCandidate) -> int:
+    """Return how many of the parameters that a term changes are sizes, and no phase or reference."""
+    nothing = c.term.combine([0.0] * c.size)
+    sizes = {q.name for q in c.effect.parameters if q.neutral is not None and not q.fixed}
+    changed = {
+        n
+        for k in range(c.size)
+        for n, v in c.term.combine([float(k == j) for j in range(c.size)]).items()
+        if v != nothing[n]
+    }
+    return len(changed & sizes)
 
 
 def lead_of(c: EffectCandidate) -> str:

@@ -305,7 +305,7 @@ def test_a_temperature_term_gives_rate_and_reference() -> None:
         ("sensor_drift", {"rate_nm_per_s": 0.0, "per_k_nm": -0.03, "reference_c": 33.0}),
         (
             "temperature_dependent_friction",
-            {"viscous_per_k": 0.03, "coulomb_per_k": 0.0, "reference_c": 33.0},
+            {"viscous_per_k": 0.015, "coulomb_per_k": 0.0, "reference_c": 33.0},
         ),
     ]
     for name, truth in rows:
