@@ -118,8 +118,6 @@ RUNS_COUNT: Final = 4.0
 """Runs that the prior of a run-to-run variation is worth."""
 CAP: Final = 0.3
 """Largest part of the gap (rms) that may be discrepancy."""
-NOISE_FLOOR: Final = 1.0
-"""White noise on top of what is left, as part of the density of its slow parts: nothing quick is known better."""
 RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 ROBUST: Final = 9.0

@@ -4,7 +4,7 @@
 2. Sets are searched from nothing and from all values of the file; those that are met are compared with variances of their
    own.
 3. Currents and torsions are what the simulation with this set has; shapes move to where the set wants them; noise is
-   what the set leaves, nothing quick of it less dense than what is slow. Then again.
+   what the set leaves. Then again.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jtqd.sysid.diagnosis.discrepancy import features
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, shapes_of
 from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
 from jtqd.sysid.diagnosis.findings import shows_at
-from jtqd.sysid.diagnosis.noise import Noise, noise_model, run_sums, white_noise
+from jtqd.sysid.diagnosis.noise import Noise, noise_of_channels, run_sums
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     Index,
@@ -64,7 +64,7 @@ class Solution:
     """A set with its posterior.
 
     entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence; values: the
-    same with all that the torques hold, for the values of the set; noise: of what is left; runs, disturbed: binned, with
+    same with all that the torques hold, for the values of the set; runs, disturbed: binned, with
     discrepancy among the nuisances; own_means: of what each recording has of its own; own: the same for a set with given
     coefficients.
     """
@@ -74,7 +74,6 @@ class Solution:
     chosen: Set
     equations: Equations
     variances: Mapping[object, float]
-    noise: Noise
     runs: list[RunData]
     disturbed: list[RunData]
     own_means: list[FloatArray]
@@ -175,12 +174,8 @@ def solve(dataset: Dataset, seed: int = 0) -> Solution:
     residuals = work.first_residuals()
     start = work.file_values()
     for turn in range(_TURNS):
-        first, last = turn == 0, turn + 1 == _TURNS
-        noise = (
-            white_noise(work.runs, residuals, dataset.step_s)
-            if first
-            else noise_model(work.runs, residuals, dataset.step_s, limits.NOISE_FLOOR)
-        )
+        last = turn + 1 == _TURNS
+        noise = noise_of_channels(residuals, dataset.step_s)
         equations = work.equations(noise)
         search = _Search(equations)
         starts = [start - equations.noisy, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]
@@ -199,7 +194,6 @@ def solve(dataset: Dataset, seed: int = 0) -> Solution:
         start,
         equations,
         variances,
-        noise_model(work.runs, residuals, dataset.step_s),
         work.runs,
         work.disturbed,
         means.own,
@@ -273,8 +267,8 @@ class _Work:
     def transform(self) -> FloatArray:
         return transform_of(self.entries, self.columns)
 
-    def equations(self, noise: Noise, entries: Sequence[Entry] | None = None) -> Equations:
-        """Return the whitened normal equations of all recordings, over all entries or these."""
+    def equations(self, noise: Mapping[Channel, Noise], entries: Sequence[Entry] | None = None) -> Equations:
+        """Return the normal equations of all recordings, over all entries or these."""
         entries = self.entries if entries is None else entries
         P, N = self.columns, len(self.groups)
         weights = transform_of(entries, P)
@@ -366,7 +360,7 @@ class _Work:
         self,
         chosen: Set,
         means: Means,
-        noise: Noise,
+        noise: Mapping[Channel, Noise],
         variances: Mapping[object, float],
     ) -> tuple[Means, Equations, Mapping[object, float]]:
         """Return means and sets where the torques in the regressors hold all that the response holds: a set is found with
@@ -383,7 +377,7 @@ class _Work:
         self,
         chosen: Set,
         mean: FloatArray,
-        noise: Noise,
+        noise: Mapping[Channel, Noise],
         variances: Mapping[object, float],
         changed: frozenset[str] = _STATES,
     ) -> None:

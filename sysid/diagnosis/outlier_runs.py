@@ -33,7 +33,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
-from jtqd.sysid.diagnosis.noise import noise_model, run_sums, saturated_residuals
+from jtqd.sysid.diagnosis.noise import noise_of_channels, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns, seen_in_bins
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
@@ -90,12 +90,12 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     for _ in range(_PASSES):
         # the noise is first what nothing explains, then what the chosen effects leave
         residuals = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
-        noise = noise_model(runs, residuals, dataset.step_s)
+        noise = noise_of_channels(residuals, dataset.step_s)
         sums = [run_sums(run, noise, columns, len(sigma) + len(kinds)) for run in runs]
         grams = np.zeros((count, *sums[0].gram.shape))
         np.add.at(grams, pieces, np.array([s.gram for s in sums]))
         each = np.zeros(count)
-        np.add.at(each, pieces, np.array([s.rows / noise.inflation for s in sums]))
+        np.add.at(each, pieces, np.array([s.rows for s in sums]))
         rows = float(each.sum())
         comparison = Comparison(without_days(grams, columns, sigma), columns, echoes)
         chosen, odd = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))

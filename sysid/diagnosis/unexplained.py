@@ -17,7 +17,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
-from jtqd.sysid.diagnosis.noise import Noise
+from jtqd.sysid.diagnosis.noise import autoregression
 from jtqd.sysid.diagnosis.regressors import Index, binned
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.solution import (
@@ -80,25 +80,26 @@ def _name(view: View) -> str:
     return view.axis.replace("_", " ")
 
 
-def unexplained_residual(dataset: Dataset, refined: Remaining, noise: Noise) -> Unexplained:
+def unexplained_residual(dataset: Dataset, refined: Remaining) -> Unexplained:
     """Return the unexplained residual when causes and the runs' own changes are taken out."""
-    balances = _balances(dataset, noise)
+    balances = _balances(dataset)
     found = {c: pursue(balances[c], x) for c, x in less_nuisances(dataset, refined).items()}
     return Unexplained({c: views for c, views in found.items() if views}, balances)
 
 
-def _balances(dataset: Dataset, noise: Noise) -> dict[Channel, Balance]:
+def _balances(dataset: Dataset) -> dict[Channel, Balance]:
     rated = {c: dataset.joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
-    return {c: Balance(dataset.runs, c, noise.ar[c], dataset.step_s, nm) for c, nm in rated.items()}
+    ar = {c: autoregression(parts) for c, parts in dataset.unexplained.items()}
+    return {c: Balance(dataset.runs, c, ar[c], dataset.step_s, nm) for c, nm in rated.items()}
 
 
-def events_left(dataset: Dataset, refined: Remaining, noise: Noise) -> dict[Channel, View]:
+def events_left(dataset: Dataset, refined: Remaining) -> dict[Channel, View]:
     """Return rare events where the residual of the causes has any that are large enough to matter, else nothing.
 
     The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
     when they are: events bend the fitted causes, which then leave residuals at other moments.
     """
-    balances = _balances(dataset, noise)
+    balances = _balances(dataset)
 
     def large(residuals: Mapping[Channel, Parts]) -> dict[Channel, View]:
         found = {c: events(balances[c], parts) for c, parts in residuals.items()}

@@ -156,12 +156,12 @@ def conclude(
     rated = {n: joint.rated_torque_nm for n, joint in dataset.joints.items()}
     limits_nm = {c: relevance * rated[c.joint] for c in dataset.runs[0].channels}
     left = remaining(dataset, *present_of(solution))
-    rest = unexplained_residual(dataset, left, solution.noise)
+    rest = unexplained_residual(dataset, left)
     if (
         _largest(rest, limits_nm) > 1.0
     ):  # the discrepancy has a part in the set's values, and none in those that predict
         other = remaining(dataset, extended_effects(solution, prediction), _own(solution, prediction))
-        less = unexplained_residual(dataset, other, solution.noise)
+        less = unexplained_residual(dataset, other)
         if _largest(less, limits_nm) < _largest(rest, limits_nm):
             left, rest = other, less
     held = held_nm(dataset, left)

@@ -1,4 +1,4 @@
-"""The noise model against known processes, and whitened sums against least squares with the dense covariance."""
+"""The noise of channels against known processes, the normal equations against stacked rows, the autoregression."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from jtqd.sysid.diagnosis.noise import (
     ORDER,
     Noise,
     autoregression,
-    noise_model,
+    noise_of_channels,
     past_valid,
     run_sums,
     saturated_residuals,
@@ -63,18 +63,12 @@ def test_a_row_counts_when_its_past_is_known(order: int) -> None:
     assert not past_valid(np.ones(order, bool), order).any(), "shorter than its past"
 
 
-NOISE = Noise(
-    (MOTOR1, TORSION1, MOTOR2),
-    {MOTOR1: padded(0.8), TORSION1: padded(0.5, -0.4), MOTOR2: padded(1.2, -0.5, 0.1)},
-    np.array([0.5, 2.0, 1.0]),
-    np.array([[1.0, 0.6, -0.2], [0.6, 1.0, 0.3], [-0.2, 0.3, 1.0]]),
-    1.0,
-)
+NOISE = {MOTOR1: Noise(0.5, 1.0), TORSION1: Noise(2.0, 3.0), MOTOR2: Noise(1.0, 1.5)}
 COUNT, COLUMNS, NUISANCES = 90, 3, 2
 
 
 def small_run(invalid: dict[Channel, list[int]]) -> RunData:
-    """Three channels with some of three columns and two nuisances each; silent until every past is known."""
+    """Three channels with some of three columns and two nuisances each."""
     rng = np.random.default_rng(6)
     where = {MOTOR1: ([0, 2], [0]), TORSION1: ([2, 1], [0, 1]), MOTOR2: ([0, 1], [1])}
     run = run_data("run", dict.fromkeys(where, np.zeros(COUNT)), {})
@@ -82,113 +76,61 @@ def small_run(invalid: dict[Channel, list[int]]) -> RunData:
         valid = np.ones(COUNT, bool)
         valid[invalid.get(c, [])] = False
         parts = [rng.normal(size=(COUNT, k)) for k in (len(index), len(families), 1)]
-        for part in parts:
-            part[:ORDER] = 0.0
         run.channels[c] = ChannelData(
             valid, parts[2][:, 0], parts[0], np.array(index, np.intp), parts[1], np.array(families, np.intp)
         )
     return run
 
 
-def stacked(run: RunData) -> FloatArray:
-    """[X Z y] of all channels one below the other, at the places of all columns and families."""
-    rows = []
-    for c in NOISE.channels:
-        d = run.channels[c]
+def stacked(run: RunData) -> tuple[FloatArray, float]:
+    """[X Z y] of the valid rows of all channels one below the other, at the places of all columns and families, in units of
+    noise; how many rows they are worth.
+    """
+    rows, worth = [], 0.0
+    for c, d in run.channels.items():
         wide = np.zeros((COUNT, COLUMNS + NUISANCES + 1))
         wide[:, d.index] = d.regressors
         wide[:, COLUMNS + d.families] = d.nuisances
         wide[:, -1] = d.residual
-        rows.append(wide)
-    return np.vstack(rows)
+        sigma, inflation = NOISE[c]
+        rows.append(wide[d.valid] / (sigma * np.sqrt(inflation)))
+        worth += int(d.valid.sum()) / inflation
+    return np.vstack(rows), worth
 
 
-def filters() -> FloatArray:
-    """The block diagonal matrix that whitens all channels in time."""
-    out = np.zeros((3 * COUNT, 3 * COUNT))
-    for k, c in enumerate(NOISE.channels):
-        block = np.eye(COUNT)
-        for lag, a in enumerate(NOISE.ar[c], 1):
-            block -= a * np.eye(COUNT, k=-lag)
-        out[k * COUNT : (k + 1) * COUNT, k * COUNT : (k + 1) * COUNT] = block
-    return out
-
-
-def innovations() -> FloatArray:
-    one = NOISE.correlation * np.outer(NOISE.sigma, NOISE.sigma)
-    return np.asarray(np.kron(one, np.eye(COUNT)), np.float64)
-
-
-def test_whitened_sums_are_least_squares_with_the_dense_covariance() -> None:
-    run = small_run({})
-    inverse = np.linalg.inv(filters())
-    covariance = inverse @ innovations() @ inverse.T
-    every = stacked(run)
-    direct = every.T @ np.linalg.solve(covariance, every)
-    sums = run_sums(run, NOISE, COLUMNS, NUISANCES)
-    assert sums.gram == pytest.approx(direct, rel=1e-8, abs=1e-8)
-    assert sums.rows == 3 * (COUNT - ORDER)
-
-
-def test_a_row_that_is_not_valid_is_left_out_of_its_own_channel_alone() -> None:
-    """As if the innovations it is in had not been measured; the other channels keep theirs, and their correlation."""
-    invalid = {MOTOR1: [40], TORSION1: [80, 81]}
+@pytest.mark.parametrize("missing", [(), (TORSION1,)])
+@pytest.mark.parametrize("invalid", [{}, {MOTOR1: [40], TORSION1: [80, 81]}])
+def test_sums_are_those_of_the_valid_rows(
+    invalid: dict[Channel, list[int]], missing: tuple[Channel, ...]
+) -> None:
     run = small_run(invalid)
-    good = np.concatenate([past_valid(run.channels[c].valid, ORDER) for c in NOISE.channels])
-    white = (filters() @ stacked(run))[good]
-    direct = white.T @ np.linalg.solve(innovations()[np.ix_(good, good)], white)
+    for c in missing:
+        del run.channels[c]
+    every, worth = stacked(run)
     sums = run_sums(run, NOISE, COLUMNS, NUISANCES)
-    assert sums.gram == pytest.approx(direct, rel=1e-8, abs=1e-8)
-    assert sums.rows == int(good.sum()) == 3 * (COUNT - ORDER) - (ORDER + 1) - 10
+    assert sums.gram == pytest.approx(every.T @ every, rel=1e-9, abs=1e-9)
+    assert sums.rows == pytest.approx(worth)
 
 
-def test_a_channel_that_a_run_has_not_is_not_missed() -> None:
-    run = small_run({})
-    del run.channels[TORSION1]
-    sums = run_sums(run, NOISE, COLUMNS, NUISANCES)
-    assert sums.rows == 2 * (COUNT - ORDER)
-    assert np.isfinite(sums.gram).all()
-
-
-def test_the_noise_of_two_channels_of_one_sensor_is_found() -> None:
+def test_a_mean_is_as_certain_as_the_rows_are_independent() -> None:
+    """Of an autoregression with 0.9 the variance of a mean is (1 + 0.9) / (1 - 0.9) times that of independent rows."""
     rng = np.random.default_rng(7)
-    correlation = np.array([[1.0, -0.7], [-0.7, 1.0]])
-    e = rng.multivariate_normal([0.0, 0.0], correlation, size=(3, 8000)) * [0.2, 3.0]
     parts = {
-        c: [coloured(NOISE.ar[c], e[r, :, k]) for r in range(3)] for k, c in enumerate((MOTOR1, TORSION1))
+        MOTOR1: [coloured(np.array([0.9]), rng.normal(size=12000)) for _ in range(3)],
+        TORSION1: [3.0 * rng.normal(size=12000) for _ in range(3)],
     }
-    runs = [run_data(f"run{r}", {c: parts[c][r] for c in parts}, {}) for r in range(3)]
-    noise = noise_model(runs, parts, 0.005)
-    assert noise.sigma == pytest.approx([0.2, 3.0], rel=0.03)
-    assert noise.correlation == pytest.approx(correlation, abs=0.03)
-    assert noise.inflation == pytest.approx(1.0, abs=0.2)
+    parts[TORSION1][0][100:4000] = np.nan
+    noise = noise_of_channels(parts, 0.005)
+    assert noise[MOTOR1].sigma == pytest.approx(1.0 / np.sqrt(1.0 - 0.81), rel=0.05)
+    assert noise[MOTOR1].inflation == pytest.approx(19.0, rel=0.2)
+    assert noise[TORSION1].sigma == pytest.approx(3.0, rel=0.05)
+    assert noise[TORSION1].inflation < 1.4
 
 
 def test_what_wanders_over_seconds_widens_everything() -> None:
-    """A zero that moves between seconds is more than an autoregression over a tenth of a second knows of."""
     rng = np.random.default_rng(8)
     level = np.repeat(rng.normal(0.0, 0.3, 60), 200)
-    parts = {MOTOR1: [rng.normal(size=12000) + level]}
-    runs = [run_data("run", {MOTOR1: parts[MOTOR1][0]}, {})]
-    assert noise_model(runs, parts, 0.005).inflation > 1.5
-
-
-def test_with_a_floor_no_frequency_has_more_weight_than_in_white_noise() -> None:
-    """Slow noise, of which little is left at half the rate: without a floor that little would weigh many times more."""
-    rng = np.random.default_rng(10)
-    slow = coloured(np.array([1.6, -0.64]), rng.normal(size=20000))
-    runs = [run_data("run", {MOTOR1: slow}, {})]
-    k = np.arange(1, ORDER + 1)
-    weights = {}
-    for floor in (0.0, 1.0):
-        noise = noise_model(runs, {MOTOR1: [slow]}, 0.005, floor)
-        response = [
-            1.0 - np.sum(noise.ar[MOTOR1] * np.exp(-1j * w * k)) for w in np.linspace(0.0, np.pi, 200)
-        ]
-        weights[floor] = np.var(slow) * np.abs(response) ** 2 / float(noise.sigma[0]) ** 2
-    assert weights[0.0][-1] > 30.0
-    assert weights[1.0].max() < 1.05
-    assert weights[1.0][0] < 0.2, "slow noise is as large as it is"
+    assert noise_of_channels({MOTOR1: [rng.normal(size=12000) + level]}, 0.005)[MOTOR1].inflation > 10.0
 
 
 def test_what_nothing_explains_is_the_residual_of_least_squares() -> None:
