@@ -161,9 +161,11 @@ _ON_GRID: Final = 0.95
 _SIXTH: Final = math.sqrt(924.0)
 """Rms of a sixth difference of white noise: binomials of six, squared and summed."""
 _CALM: Final = 50
-"""Samples over which sixth differences are averaged."""
+"""Samples over which the squares of sixth differences are averaged."""
 _CALMEST: Final = 0.2
 """Part of the time in which no motion has such differences."""
+_OF_NOISE: Final = 0.70
+"""This quantile of these means, of white noise of unit variance."""
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0
 """No cutoff is lower: there is the motion itself."""
@@ -217,7 +219,8 @@ def noise_of(x: FloatArray) -> FloatArray:
     for there in _magnitudes(x):
         square = quick[there] ** 2
         blocks = np.array_split(square, max(1, len(square) // _CALM))
-        out[there] = np.maximum(out[there], np.sqrt(np.quantile([b.mean() for b in blocks], _CALMEST)))
+        calm = np.quantile([b.mean() for b in blocks], _CALMEST) / _OF_NOISE
+        out[there] = np.maximum(out[there], np.sqrt(min(float(calm), float(square.mean()))))
     return out
 
 

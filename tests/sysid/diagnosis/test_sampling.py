@@ -35,7 +35,7 @@ def test_a_torque_constant_is_found_as_it_is_whatever_the_rate_of_the_recorder(e
     truth = replace(PLAIN, torque_constant_nm_per_a=TRUE_KT)
     tables = [polled(rich_run(truth, seed, seconds=10.0, noise=NOISE), every) for seed in range(6)]
     found = diagnose([(f"run{k}", table) for k, table in enumerate(tables)], {1: PLAIN})
-    (cause,) = (c for c in found.causes if c.matters)
+    (cause,) = found.causes
     assert cause.name == "torque_constant"
     value = cause.parameters[NAME]
     assert value.ci95[0] <= TRUE_KT <= value.ci95[1]
