@@ -267,7 +267,7 @@ class _Work:
     def transform(self) -> FloatArray:
         return transform_of(self.entries, self.columns)
 
-    def equations(self, noise: Mapping[Channel, Noise], entries: Sequence[Entry] | None = None) -> Equations:
+    def equations(self, noise: Noise, entries: Sequence[Entry] | None = None) -> Equations:
         """Return the normal equations of all recordings, over all entries or these."""
         entries = self.entries if entries is None else entries
         P, N = self.columns, len(self.groups)
@@ -360,7 +360,7 @@ class _Work:
         self,
         chosen: Set,
         means: Means,
-        noise: Mapping[Channel, Noise],
+        noise: Noise,
         variances: Mapping[object, float],
     ) -> tuple[Means, Equations, Mapping[object, float]]:
         """Return means and sets where the torques in the regressors hold all that the response holds: a set is found with
@@ -377,7 +377,7 @@ class _Work:
         self,
         chosen: Set,
         mean: FloatArray,
-        noise: Mapping[Channel, Noise],
+        noise: Noise,
         variances: Mapping[object, float],
         changed: frozenset[str] = _STATES,
     ) -> None:

@@ -25,22 +25,24 @@ _BLOCK_S: Final = 1.0
 
 
 class Noise(NamedTuple):
-    """Noise of one channel: standard deviation [Nm]; inflation: how many rows count as one."""
+    """Noise of the channels: standard deviation of each [Nm]; inflation: how many rows count as one, of all."""
 
-    sigma: float
+    sigma: Mapping[Channel, float]
     inflation: float
 
 
-def noise_of_channels(
-    residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float
-) -> dict[Channel, Noise]:
-    """Return the noise of all channels from what is left of them [run][n], NaN where not valid."""
+def noise_of_channels(residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float) -> Noise:
+    """Return the noise of all channels from what is left of them [run][n], NaN where not valid.
+
+    The inflation is the mean over channels: with one of its own a channel that is fitted badly would weigh little, and stay so.
+    """
     block = max(1, round(_BLOCK_S / step_s))
-    out = {}
-    for channel, parts in residuals.items():
-        sigma = max(float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))), 1e-12)
-        out[channel] = Noise(sigma, max(1.0, _slowness(parts, sigma, block)))
-    return out
+    sigma = {
+        channel: max(float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))), 1e-12)
+        for channel, parts in residuals.items()
+    }
+    slow = [_slowness(parts, sigma[channel], block) for channel, parts in residuals.items()]
+    return Noise(sigma, max(1.0, float(np.mean(slow))))
 
 
 def _slowness(series: Sequence[FloatArray], sigma: float, block: int) -> float:
@@ -66,17 +68,16 @@ class Sums:
     rows: float
 
 
-def run_sums(run: RunData, noise: Mapping[Channel, Noise], columns: int, nuisances: int) -> Sums:
+def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
     """Return the normal equations of one run in units of noise."""
     width = columns + nuisances + 1
     gram = np.zeros((width, width))
     rows = 0.0
     for channel, d in run.channels.items():
-        sigma, inflation = noise[channel]
         block = np.column_stack((d.regressors, d.nuisances, d.residual))[d.valid]
         places = np.concatenate((d.index, columns + d.families, [width - 1])).astype(np.intp)
-        gram[np.ix_(places, places)] += block.T @ block / (sigma**2 * inflation)
-        rows += len(block) / inflation
+        gram[np.ix_(places, places)] += block.T @ block / (noise.sigma[channel] ** 2 * noise.inflation)
+        rows += len(block) / noise.inflation
     return Sums(gram, rows)
 
 

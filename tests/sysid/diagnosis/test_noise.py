@@ -63,7 +63,7 @@ def test_a_row_counts_when_its_past_is_known(order: int) -> None:
     assert not past_valid(np.ones(order, bool), order).any(), "shorter than its past"
 
 
-NOISE = {MOTOR1: Noise(0.5, 1.0), TORSION1: Noise(2.0, 3.0), MOTOR2: Noise(1.0, 1.5)}
+NOISE = Noise({MOTOR1: 0.5, TORSION1: 2.0, MOTOR2: 1.0}, 1.5)
 COUNT, COLUMNS, NUISANCES = 90, 3, 2
 
 
@@ -92,9 +92,8 @@ def stacked(run: RunData) -> tuple[FloatArray, float]:
         wide[:, d.index] = d.regressors
         wide[:, COLUMNS + d.families] = d.nuisances
         wide[:, -1] = d.residual
-        sigma, inflation = NOISE[c]
-        rows.append(wide[d.valid] / (sigma * np.sqrt(inflation)))
-        worth += int(d.valid.sum()) / inflation
+        rows.append(wide[d.valid] / (NOISE.sigma[c] * np.sqrt(NOISE.inflation)))
+        worth += int(d.valid.sum()) / NOISE.inflation
     return np.vstack(rows), worth
 
 
@@ -121,16 +120,17 @@ def test_a_mean_is_as_certain_as_the_rows_are_independent() -> None:
     }
     parts[TORSION1][0][100:4000] = np.nan
     noise = noise_of_channels(parts, 0.005)
-    assert noise[MOTOR1].sigma == pytest.approx(1.0 / np.sqrt(1.0 - 0.81), rel=0.05)
-    assert noise[MOTOR1].inflation == pytest.approx(19.0, rel=0.2)
-    assert noise[TORSION1].sigma == pytest.approx(3.0, rel=0.05)
-    assert noise[TORSION1].inflation < 1.4
+    assert noise.sigma[MOTOR1] == pytest.approx(1.0 / np.sqrt(1.0 - 0.81), rel=0.05)
+    assert noise.sigma[TORSION1] == pytest.approx(3.0, rel=0.05)
+    assert noise.inflation == pytest.approx(0.5 * (19.0 + 1.0), rel=0.2)
+    assert noise_of_channels({MOTOR1: parts[MOTOR1]}, 0.005).inflation == pytest.approx(19.0, rel=0.2)
+    assert noise_of_channels({TORSION1: parts[TORSION1]}, 0.005).inflation < 1.4
 
 
 def test_what_wanders_over_seconds_widens_everything() -> None:
     rng = np.random.default_rng(8)
     level = np.repeat(rng.normal(0.0, 0.3, 60), 200)
-    assert noise_of_channels({MOTOR1: [rng.normal(size=12000) + level]}, 0.005)[MOTOR1].inflation > 10.0
+    assert noise_of_channels({MOTOR1: [rng.normal(size=12000) + level]}, 0.005).inflation > 10.0
 
 
 def test_what_nothing_explains_is_the_residual_of_least_squares() -> None:
