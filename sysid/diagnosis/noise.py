@@ -34,7 +34,7 @@ class Noise(NamedTuple):
 def noise_of_channels(residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float) -> Noise:
     """Return the noise of all channels from what is left of them [run][n], NaN where not valid.
 
-    The inflation is the mean over channels: with one of its own a channel that is fitted badly would weigh little, and stay so.
+    The inflation is the mean over channels: with its own, a channel that is fitted badly would weigh little, and stay so.
     """
     block = max(1, round(_BLOCK_S / step_s))
     sigma = {

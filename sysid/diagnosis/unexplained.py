@@ -82,15 +82,18 @@ def _name(view: View) -> str:
 
 def unexplained_residual(dataset: Dataset, refined: Remaining) -> Unexplained:
     """Return the unexplained residual when causes and the runs' own changes are taken out."""
-    balances = _balances(dataset)
-    found = {c: pursue(balances[c], x) for c, x in less_nuisances(dataset, refined).items()}
+    left = less_nuisances(dataset, refined)
+    balances = _balances(dataset, left)
+    found = {c: pursue(balances[c], x) for c, x in left.items()}
     return Unexplained({c: views for c, views in found.items() if views}, balances)
 
 
-def _balances(dataset: Dataset) -> dict[Channel, Balance]:
-    rated = {c: dataset.joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
-    ar = {c: autoregression(parts) for c, parts in dataset.unexplained.items()}
-    return {c: Balance(dataset.runs, c, ar[c], dataset.step_s, nm) for c, nm in rated.items()}
+def _balances(dataset: Dataset, residuals: Mapping[Channel, Parts]) -> dict[Channel, Balance]:
+    rated = {c: dataset.joints[c.joint].rated_torque_nm for c in residuals}
+    return {
+        c: Balance(dataset.runs, c, autoregression(parts), dataset.step_s, rated[c])
+        for c, parts in residuals.items()
+    }
 
 
 def events_left(dataset: Dataset, refined: Remaining) -> dict[Channel, View]:
@@ -99,9 +102,9 @@ def events_left(dataset: Dataset, refined: Remaining) -> dict[Channel, View]:
     The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
     when they are: events bend the fitted causes, which then leave residuals at other moments.
     """
-    balances = _balances(dataset)
 
     def large(residuals: Mapping[Channel, Parts]) -> dict[Channel, View]:
+        balances = _balances(dataset, residuals)
         found = {c: events(balances[c], parts) for c, parts in residuals.items()}
         return {c: e for c, e in found.items() if e and e.energy_nm2 > balances[c].least_nm2}
 
