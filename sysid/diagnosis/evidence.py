@@ -1,12 +1,12 @@
 """Evidence: marginal likelihood of sets of entries, and the search for the set that has most of it.
 
-    y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e coloured (`noise`)
+    y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e noise (`noise`)
 
 X: columns of the entries, scaled so that beta ~ N(0, 1) for entries in the set and 0 for all others; a set has prior odds.
 F: random Fourier features of the conditions (`discrepancy`): what no library holds; w shared by all runs, v_r a run's own.
 Z: what a run has of its own (`regressors.families`; Laird and Ware 1982, Biometrics 38). The variances of w, v and u are
 where the marginal likelihood is largest (MacKay 1992, Neural Computation 4). Given them everything is linear and Gaussian,
-and the evidence of any set follows from one matrix of whitened normal equations (George and McCulloch 1993, J. Am. Stat.
+and the evidence of any set follows from one matrix of normal equations (George and McCulloch 1993, J. Am. Stat.
 Assoc. 88: spike and slab):
 
     2 log evidence = b' (A_SS + 1)^-1 b - log |A_SS + 1| + 2 sum log odds

@@ -138,8 +138,8 @@ def fields_used(effect: Effect, p: Values, joint: Joint) -> frozenset[str]:
 
 
 def bin_samples(signals: Iterable[JointSignals]) -> int:
-    """Return how many samples make a bin: where all is filtered, bins of what the highest cutoff leaves, because whitening
-    would raise again what no filter has let through.
+    """Return how many samples make a bin: where all is filtered, bins of what the highest cutoff leaves: there is nothing
+    quicker.
     """
     total, step, highest = 0.0, 0.0, 0.0
     for s in signals:

@@ -193,8 +193,8 @@ def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]
 
 
 def residual_after(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return what the causes leave, less what each run has of its own where that makes it smaller: fitted to the
-    whitened residual of few seconds it need not.
+    """Return what the causes leave, less what each run has of its own where that makes it smaller: of few seconds
+    its estimate under a prior need not.
     """
     out = less_nuisances(dataset, refined)
     for channel, parts in out.items():
