@@ -334,9 +334,11 @@ class Equations:
         start: Mapping[object, tuple[float, float]],
         most: Mapping[object, float],
         resemblance: Mapping[object, FloatArray] = MappingProxyType({}),
+        recorded: FloatArray | None = None,
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
         self.resemblance = resemblance
+        self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
         self.plain, self.noise = grams, noise
         self.start, self.most = start, most
         self.E, self.N = sum(e.size for e in entries), len(groups)
@@ -393,8 +395,10 @@ class Equations:
         )
 
     def deviation(self, variances: Variances) -> FloatArray:
-        """Return the prior deviation of coefficients outside of a set [E]: as the discrepancy resembles them, 1 at most."""
-        out = np.zeros(self.E)
+        """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
+        resembles them, 1 at most.
+        """
+        out = self.recorded.copy()
         for g, part in self.resemblance.items():
             out += (variances["shared", g] + variances[g] / len(self.grams)) * part
         return np.sqrt(np.minimum(out, 1.0))

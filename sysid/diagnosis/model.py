@@ -99,6 +99,17 @@ def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
     return out
 
 
+def recorded(entries: Sequence[Entry], step_s: float) -> FloatArray:
+    """Return the variance of each scaled coefficient that a recorder makes [E]: it reads its channels at moments within a
+    step, which stamps do not tell apart.
+    """
+    out = []
+    for e in entries:
+        age_s = e.effect.age_s(e.values(np.ones(e.size)))
+        out += [(step_s / math.sqrt(12.0) / age_s) ** 2 if age_s else 0.0] * e.size
+    return np.array(out)
+
+
 class _End(NamedTuple):
     """A set with variances of its own: -2 log marginal likelihood (inf: it has none), set, variances, means."""
 
@@ -155,14 +166,13 @@ class _Search:
     def _without_the_replaceable(self, best: _End) -> _End:
         """Return the set without effects that its others nearly replace, which then have the whole size."""
         sets = self.equations.sets(best.variances, best.chosen, resembling=False)
-        chosen = best.chosen
         while True:
-            less = [chosen - set(members) for members in sets.effects(chosen)]
-            least = max(less, key=lambda s: sets.fit(s).evidence, default=chosen)
-            if not less or 2.0 * (sets.fit(chosen).evidence - sets.fit(least).evidence) > limits.RIVAL:
-                end = self.own(chosen)
-                return end if math.isfinite(end.score) else best
-            chosen = least
+            less = [best.chosen - set(members) for members in sets.effects(best.chosen)]
+            least = max(less, key=lambda s: sets.fit(s).evidence, default=best.chosen)
+            lacks = 2.0 * (sets.fit(best.chosen).evidence - sets.fit(least).evidence)
+            if not less or max(lacks, self.own(least).score - best.score) > limits.RIVAL:
+                return best
+            best = self.own(least)
 
     def _least(self) -> _End:
         return min(self.met.values(), key=lambda end: end.score)
@@ -295,7 +305,15 @@ class _Work:
         for p in lacking if self.disturbed else ():  # as the others have
             extra[p] = extra.sum(axis=0) / (len(grams) - len(lacking))
         return Equations(
-            entries, grams, extra, self.groups, self.shared, self.start, self.most, self.resemblance(weights)
+            entries,
+            grams,
+            extra,
+            self.groups,
+            self.shared,
+            self.start,
+            self.most,
+            self.resemblance(weights),
+            recorded(entries, max(s.step_s for run in self.dataset.signals for s in run)),
         )
 
     def resemblance(self, weights: FloatArray) -> dict[object, FloatArray]:

@@ -14,6 +14,7 @@ from jtqd.sysid.diagnosis.dataset import library_candidates, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, lead_of, usage
 from jtqd.sysid.diagnosis.limits import PRIORS, Usage
+from jtqd.sysid.diagnosis.model import recorded
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from tests.sysid.diagnosis.pendulums import ARM, Rig, Runs, runs_of
 
@@ -50,6 +51,16 @@ def test_a_temperature_that_does_not_vary_has_no_entries(plain: Runs) -> None:
     assert {e.effect.name for e in varied} >= TEMPERED
     assert not any("per_k_nm" in e.kind for e in constant)
     assert {e.key for e in varied} - {e.key for e in constant} == {(name, 1) for name in TEMPERED}
+
+
+def test_a_recorder_makes_delays_within_its_step_and_nothing_else(plain: Runs) -> None:
+    """Uniform over a step: a deviation of its twelfth part, squared; by the prior of 3 ms."""
+    found = entries(plain)
+    variance = recorded(found, 0.002)
+    first = np.cumsum([0, *(e.size for e in found)])
+    for k, e in enumerate(found):
+        expected = (0.002 / 0.003) ** 2 / 12.0 if e.effect.name == "channel_delay" else 0.0
+        assert variance[first[k] : first[k + 1]] == pytest.approx(expected, rel=1e-6), e.kind
 
 
 @pytest.mark.parametrize("last_c", [25.05, None], ids=["constant", "not recorded"])

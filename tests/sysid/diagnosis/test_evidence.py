@@ -284,6 +284,9 @@ def test_what_resembles_an_entry_is_no_evidence_for_it(drifting: list[FloatArray
     alike.resemblance = {"discrepancy": np.array([0.64, 0.0, 4.0]) / 0.74}
     deviation = alike.deviation(VARIANCES)
     assert deviation == pytest.approx(np.array([0.8, 0.0, 1.0])), "no more than the prior"
+    with_recorder = copy(alike)
+    with_recorder.recorded = np.array([0.09, 0.04, 0.5])
+    assert with_recorder.deviation(VARIANCES) == pytest.approx(np.sqrt([0.73, 0.04, 1.0]))
     y = np.concatenate([b[:, -1] for b in drifting])
     x = np.vstack(drifting)[:, :3] * deviation
     base = covariance_of(drifting, ()) + x @ x.T
