@@ -13,7 +13,7 @@ and an effect that would need another reading pays for it like for any other mis
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -120,7 +120,7 @@ def with_readings(
             # the drift is common to all readings of the joint: however many there are, it stays
             row /= np.hypot(r.noise_a, r.drift_a * np.sqrt(counts[number]))
             gram = gram + np.outer(row, row)
-        out.append(replace(one, gram=gram, rows=one.rows + len(run)) if run else one)
+        out.append(Sums(gram, one.rows + len(run)) if run else one)
     return out
 
 

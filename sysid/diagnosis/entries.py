@@ -49,11 +49,6 @@ class Entry:
     amplitude: tuple[float, ...] = ()
 
     @property
-    def bounded(self) -> bool:
-        """Whether its first coefficient has bounds."""
-        return self.candidate.size == 1
-
-    @property
     def effect(self) -> Effect:
         """The effect of the library."""
         return self.candidate.effect

@@ -74,7 +74,7 @@ def columns_of(entries: Sequence[Entry], chosen: Set) -> Index:
 def _bounds(entries: Sequence[Entry], chosen: Set) -> tuple[FloatArray, FloatArray]:
     """Return the least and the largest value of each coefficient of a set."""
     ends = [
-        (e.low, e.high) if k == 0 and e.bounded else (-math.inf, math.inf)
+        (e.low, e.high) if e.candidate.size == 1 and k == 0 else (-math.inf, math.inf)
         for e in (entries[j] for j in sorted(chosen))
         for k in range(e.size)
     ]
@@ -458,15 +458,10 @@ class Equations:
 
     def own(self, chosen: Set, mean: FloatArray, variances: Variances) -> FloatArray:
         """Return the means of each recording's nuisances beside a set with these coefficients [r, N]."""
-        d = np.array([variances[g] for g in self.groups])
-        contrast = np.zeros(self.E + 1)
+        contrast = np.zeros(len(self._outer))
         contrast[columns_of(self.entries, chosen)], contrast[-1] = -mean, 1.0
-        ends = np.array([*range(self.E), self.E + self.N], np.intp)
-        out = []
-        for gram in self.beside(chosen).grams:
-            inner = gram[np.ix_(self._inner, self._inner)] + np.diag(1.0 / d)
-            out.append(np.linalg.solve(inner, gram[np.ix_(self._inner, ends)] @ contrast))
-        return np.array(out)
+        keep = self.beside(chosen)._reduced(variances)[2]
+        return np.array([cho_solve((lower, True), cross @ contrast) for lower, cross in keep])
 
     def expected(
         self, chosen: Set, variances: Variances, steps: int, *, less: bool = False

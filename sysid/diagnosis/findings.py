@@ -62,7 +62,6 @@ CAUSE: Final = "cause"
 AMBIGUOUS: Final = "ambiguous"
 UNEXPLAINED: Final = "unexplained"
 INSUFFICIENT: Final = "insufficient_data"
-VERDICTS: Final = (NO_GAP, CAUSE, AMBIGUOUS, UNEXPLAINED, INSUFFICIENT)
 
 CERTAIN: Final = "certain"
 ONE_OF: Final = "one_of"

@@ -24,8 +24,6 @@ from jtqd.sysid.diagnosis.signals import Channel
 
 _BOOTSTRAPS: Final = 2000
 _NONE: Final = 1e-12
-_ENOUGH: Final = 2
-"""Fits of which one holds a run out."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +55,7 @@ def predict(solution: Solution) -> Prediction:
     slots = {solution.entries[k].slot for k in solution.chosen}
     values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
     wide = chosen | values - solution.equations.noisy
-    part = stacked(grams, without, chosen, wide) if len(without) > _ENOUGH else 0.0
+    part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
     mixed = [
         (1.0 - part) * _coefficients(sets, chosen) + part * _coefficients(sets, wide) for sets in without
     ]

@@ -103,11 +103,8 @@ def recorded(entries: Sequence[Entry], step_s: float) -> FloatArray:
     """Return the variance of each scaled coefficient that a recorder makes [E]: it reads its channels at moments within a
     step, which stamps do not tell apart.
     """
-    out = []
-    for e in entries:
-        age_s = e.effect.age_s(e.values(np.ones(e.size)))
-        out += [(step_s / math.sqrt(12.0) / age_s) ** 2 if age_s else 0.0] * e.size
-    return np.array(out)
+    ages = [(e.effect.age_s(e.values(np.ones(e.size))), e.size) for e in entries]
+    return np.repeat([(step_s / age) ** 2 / 12.0 if age else 0.0 for age, _ in ages], [n for _, n in ages])
 
 
 class _End(NamedTuple):

@@ -10,7 +10,6 @@ time makes them (Liang and Zeger 1986, Biometrika 73: independence as the workin
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -58,8 +57,7 @@ def _slowness(series: Sequence[FloatArray], sigma: float, block: int) -> float:
     return float(np.mean(ratios)) if ratios else 1.0
 
 
-@dataclass(frozen=True)
-class Sums:
+class Sums(NamedTuple):
     """Normal equations of one run in units of noise: gram [P + Q + 1, P + Q + 1] over effects' columns, nuisances, residual;
     rows: how many independent measurements.
     """
