@@ -103,11 +103,11 @@ def _diagnosed(  # noqa: PLR0917
         plan = next_experiment([], there, "; ".join(reasons), signals=seen) if there else None
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     judged = tuple(s.number for s in usable[0])
-    usable, dataset, odd = without_outlier_runs(usable, joints, scope)
+    usable, dataset, outliers = without_outlier_runs(usable, joints, scope)
     dataset = replace(dataset, disturbed=disturbed_signals(runs, joints, numbers, usable, scope))
     solution = without_events(solve(dataset))
     findings, _ = conclude(solution, names, scope, relevance)
-    notes = (*reasons, *(o.text for o in odd), *resolution_notes(usable), *piece_notes(usable))
+    notes = (*reasons, *(o.text for o in outliers), *resolution_notes(usable), *piece_notes(usable))
     left_out = tuple(f"joint {n}: left out" for n in numbers if n not in judged)
     unjudged = [line for line in reasons if line.startswith(left_out)]
     if unjudged and findings.verdict == NO_GAP:  # no proof for a joint that nobody looked at
@@ -116,7 +116,7 @@ def _diagnosed(  # noqa: PLR0917
     if findings.verdict == UNEXPLAINED:
         findings = replace(findings, reasons=(*findings.reasons, *scope.note))
     used = tuple(run[0].run for run in usable)
-    return replace(findings, channel_notes=notes, outlier_runs=tuple(odd), used=used)
+    return replace(findings, channel_notes=notes, outlier_runs=tuple(outliers), used=used)
 
 
 def without_events(solution: Solution) -> Solution:
@@ -187,18 +187,18 @@ def without_outlier_runs(
     """Return signals and dataset without the runs that differ from all others, and how those differ: one at a time, fewer
     than half of the recordings.
     """
-    odd: list[OutlierRun] = []
+    outliers: list[OutlierRun] = []
     dataset = build_dataset(signals, joints, scope)
     count = len(set(recordings(signals)))
-    while 2 * (len(odd) + 1) < count:
+    while 2 * (len(outliers) + 1) < count:
         found = outlier_run(dataset)
         if found is None:
             break
         places, one = found
-        odd.append(one)
+        outliers.append(one)
         signals = [run for r, run in enumerate(signals) if r not in places]
         dataset = build_dataset(signals, joints, scope)
-    return signals, dataset, odd
+    return signals, dataset, outliers
 
 
 def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> bool:
@@ -239,7 +239,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
             key=lambda left: (left.matters, left.of_rated),
             default=None,
         ),
-        outlier_runs=tuple(odd for f in parts for odd in f.outlier_runs),
+        outlier_runs=tuple(outliers for f in parts for outliers in f.outlier_runs),
         too_small=tuple(c for f in parts for c in f.too_small),
         cannot_be_told=tuple(u for f in parts for u in f.cannot_be_told),
         predicts=tuple(p for f in parts for p in f.predicts),

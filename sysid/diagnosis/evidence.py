@@ -415,15 +415,15 @@ class Equations:
         """
         deviation = self.deviation(variances)
         values, vectors = np.linalg.eigh(gram[: self.E, : self.E])
-        said = vectors[:, values > 0.0]
+        known = vectors[:, values > 0.0]
         root = np.sqrt(values[values > 0.0])
-        half = said * root
-        right = (said.T @ gram[: self.E, -1]) / root
-        inner = np.linalg.inv(np.eye(len(root)) + half.T @ (deviation[:, None] ** 2 * half))
+        factor = known * root
+        projected = (known.T @ gram[: self.E, -1]) / root
+        inner = np.linalg.inv(np.eye(len(root)) + factor.T @ (deviation[:, None] ** 2 * factor))
         out = np.empty_like(gram)
-        out[: self.E, : self.E] = half @ inner @ half.T
-        out[: self.E, -1] = out[-1, : self.E] = half @ (inner @ right)
-        out[-1, -1] = gram[-1, -1] - right @ (right - inner @ right)
+        out[: self.E, : self.E] = factor @ inner @ factor.T
+        out[: self.E, -1] = out[-1, : self.E] = factor @ (inner @ projected)
+        out[-1, -1] = gram[-1, -1] - projected @ (projected - inner @ projected)
         return out
 
     def _reduced(

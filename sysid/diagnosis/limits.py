@@ -1,8 +1,8 @@
 """Priors and limits that decide between sets: what data sheets and calibrations are off by, and which evidence suffices.
 
 Priors are physical sizes: the standard deviation of what a value of a joint file, a calibration or an effect may be off by.
-They are shown in the report, and the user may set them (`--trust`). Limits of gaps,
-events and structure, and steps of the search, stand beside what uses them.
+They are shown in the report, and the user may set them (`--trust`). Limits of events and structure, and steps of the
+search, stand beside what uses them.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ ENTER: Final = 10.0
 """BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
 _RIDGE: Final = 1e-10
 FEWEST: Final = 3
-"""Recordings among which one can be odd."""
+"""Recordings among which one can be an outlier."""
 FAR: Final = 5.0
 USUAL: Final[Mapping[str, float]] = {"gain": 0.01, "zero": 0.004, "delay": 5e-4}
 """What runs usually differ by: a part, a part of the rated torque (of a current, its torque), seconds."""
@@ -98,12 +98,12 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
         np.add.at(each, pieces, np.array([s.rows for s in sums]))
         rows = float(each.sum())
         comparison = Comparison(without_days(grams, columns, sigma), columns, echoes)
-        chosen, odd = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))
-        found = [(comparison.drop(chosen, odd, *at), at, comparison.far(chosen, at, kinds)) for at in odd]
+        chosen, off = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))
+        found = [(comparison.drop(chosen, off, *at), at, comparison.far(chosen, at, kinds)) for at in off]
         far = [
             (drop, at, size)
             for drop, at, size in found
-            if size is not None and comparison.explains_what_is_apart(chosen, odd, at, each)
+            if size is not None and comparison.explains_what_is_apart(chosen, off, at, each)
         ]
         if not far:
             return None
@@ -112,7 +112,7 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     others = tuple(
         f"{o.what} of {o.channel} of {joint_text(o.joint)}"
         for j, o in enumerate(kinds)
-        if j != k and comparison.drop(chosen, odd, r, j) >= _AS_GOOD * most
+        if j != k and comparison.drop(chosen, off, r, j) >= _AS_GOOD * most
     )
     places = [int(p) for p in np.flatnonzero(pieces == r)]
     kind, name = kinds[k], dataset.runs[places[0]].name
@@ -170,7 +170,7 @@ class Comparison:
         ]
         blocks += [([self.place(*at)], at, price) for at in own]
         here: list[int] = []
-        odd: list[tuple[int, int]] = []
+        off: list[tuple[int, int]] = []
         while blocks and len(here) < _MOST_COLUMNS:
             falls = explained_each(self.total, here, [block for block, _, _ in blocks])
             worth = [fall - cost for fall, (_, _, cost) in zip(falls, blocks, strict=True)]
@@ -184,20 +184,20 @@ class Comparison:
                     continue
                 blocks = [b for b in blocks if not isinstance(b[1], EffectCandidate) or b[1].key != new.key]
             else:
-                odd.append(new)
+                off.append(new)
             here += block
-        return [p for p in here if p < self.columns], odd
+        return [p for p in here if p < self.columns], off
 
-    def drop(self, chosen: Sequence[int], odd: Sequence[tuple[int, int]], r: int, k: int) -> float:
+    def drop(self, chosen: Sequence[int], off: Sequence[tuple[int, int]], r: int, k: int) -> float:
         """Return by how much deviation k of run r lowers the squared error beside the effects and other runs' deviations."""
-        beside = [*chosen, *(self.place(*at) for at in odd if at[0] != r)]
+        beside = [*chosen, *(self.place(*at) for at in off if at[0] != r)]
         return explained(self.total, beside, [self.place(r, k)])
 
     def explains_what_is_apart(
-        self, chosen: Sequence[int], odd: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
+        self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
     ) -> bool:
         """Return whether a deviation is most of what sets its run apart beside all else that was chosen; rows: per run."""
-        ends = np.array([*chosen, *(self.place(*one) for one in odd), -1], np.intp)
+        ends = np.array([*chosen, *(self.place(*one) for one in off), -1], np.intp)
         beta, _ = solve(self.total[ends[:, None], ends], len(ends) - 1)
         effects = np.append(-beta[: len(chosen)], 1.0)
 
@@ -209,7 +209,7 @@ class Comparison:
             gram = self.runs[r][free[:, None], free]
             return (whole - float(right @ np.linalg.lstsq(gram, right, rcond=1e-10)[0])) / float(rows[r])
 
-        own = {r: [k for q, k in odd if q == r] for r in range(len(self.runs))}
+        own = {r: [k for q, k in off if q == r] for r in range(len(self.runs))}
         usual = float(np.median([square(r, own[r]) for r in own if r != at[0]]))
         without, with_it = square(at[0], [k for k in own[at[0]] if k != at[1]]), square(at[0], own[at[0]])
         return without - with_it > _MOST * (without - usual)
