@@ -168,7 +168,9 @@ def usable_signals(
                 continue
             try:
                 c = Channels(table.time_s, table.joints[n], joints[n], name, n in known_loads)
-                signals = joint_signals(name, table, n, joints[n], bases[n], same.get((name, n)))
+                signals = joint_signals(
+                    name, table, n, joints[n], bases[n], same.get((name, n)), computed=n in known_loads
+                )
                 mine.append(without_held(signals, held_values(c, limits[n])))
             except SignalsError as error:
                 reasons.append(str(error))

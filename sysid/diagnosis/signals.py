@@ -347,6 +347,15 @@ class _Motion:
     of_position: bool
     coarse: str
 
+    def below(self, hz: float, step_s: float) -> _Motion:
+        """Return the motion with accelerations of nothing quicker than hz."""
+        visible, inertial = (
+            Smoother.of(np.full(len(self.whole), min(hz, each.slowest_hz)), step_s, _FINEST_HZ)
+            for each in (self.visible, self.inertial)
+        )
+        slow, shared = visible(self.whole), inertial(self.whole)
+        return replace(self, acceleration=slow, shared=shared, visible=visible, inertial=inertial)
+
 
 def _motion(
     time: FloatArray, raw: JointColumns, columns: JointColumns, joint: Joint, like: JointSignals | None
@@ -416,10 +425,18 @@ def _better(time: FloatArray, speed: _Motion, position: _Motion) -> bool:
 
 
 def joint_signals(  # noqa: PLR0917
-    run: str, table: RunTable, number: int, joint: Joint, base: BaseLoss, like: JointSignals | None = None
+    run: str,
+    table: RunTable,
+    number: int,
+    joint: Joint,
+    base: BaseLoss,
+    like: JointSignals | None = None,
+    *,
+    computed: bool = False,
 ) -> JointSignals:
     """Return the signals of one joint; like: by the channel and the filters of these, so that a difference is that of the
-    tables. Raises SignalsError for a column that is missing and cannot be derived.
+    tables; computed: the torque is one of a known load or a model, whose acceleration was smoothed, and as slow as that.
+    Raises SignalsError for a column that is missing and cannot be derived.
     """
     raw = table.joints[number]
     columns = table.joint(number, joint.gear_ratio)
@@ -431,6 +448,9 @@ def joint_signals(  # noqa: PLR0917
     assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None
     time, sensor = table.time_s, columns.torque_nm
     motion = _motion(time, raw, columns, joint, like)
+    step = float(np.median(np.diff(time)))
+    if computed and like is None:
+        motion = motion.below(TORQUE_HZ, step)
     velocity = motion.visible(motion.speed) / joint.gear_ratio
     both = raw.two_encoders(joint.gear_ratio)
     link = (
@@ -439,7 +459,6 @@ def joint_signals(  # noqa: PLR0917
         else motion.position / joint.gear_ratio
     )
     link_acceleration = motion.acceleration / joint.gear_ratio
-    step = float(np.median(np.diff(time)))
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad

@@ -29,7 +29,7 @@ def check(result: dict[str, Any]) -> None:
     before, after = result["jtqd"]["1"]
     assert before**2 - after**2 > KEPT**2 * promised
     other = result["jtqd"]["2"]
-    assert other[1] == pytest.approx(other[0], rel=0.15)
+    assert other[1] <= 1.15 * other[0]
     assert result["extended_on_the_same_runs"] == "no_gap"
 
 

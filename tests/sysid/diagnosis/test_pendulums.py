@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,10 +10,13 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction, Joint
+from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, CERTAIN, NO_GAP, ONE_OF, UNEXPLAINED, Findings
 from jtqd.sysid.diagnosis.limits import PRIORS
 from jtqd.sysid.diagnosis.model import Solution
+from jtqd.sysid.diagnosis.scope import Scope
+from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (
     ARM,
     Rig,
@@ -264,3 +268,57 @@ def test_a_notch_below_the_relevance_is_no_matter() -> None:
 def test_causes_name_the_prior_that_they_rest_on(wrong_file: Case) -> None:
     given = {c.name: c.given for c in wrong_file.found.causes}
     assert given["torque_constant"] == (PRIORS["torque_constant"].text,)
+
+
+def computed(runs: Runs, rig: Rig) -> Runs:
+    """The torque of a known inertia, as a column map makes it of the position."""
+    out = []
+    for name, table in runs:
+        columns = table.joints[1]
+        assert columns.motor_position_rad is not None
+        _, a = motion_of(table.time_s, columns.motor_position_rad / ARM.gear_ratio)
+        out.append((name, RunTable(table.time_s, {1: replace(columns, torque_nm=rig.inertia_kgm2 * a)})))
+    return out
+
+
+def test_a_torque_that_is_computed_is_as_slow_as_its_acceleration() -> None:
+    """Constant speeds with ramps: were the motor's acceleration quicker than the load's, all constants times a factor would
+    fit better.
+    """
+    rig = Rig(moment_nm=0.0, inertia_kgm2=0.6, sensor_noise_nm=0.0, counts=2.0**19)
+    true = replace(
+        ARM, friction=Friction(ARM.friction.coulomb_nm + 1.0, ARM.friction.viscous_nms_per_rad + 3.0)
+    )
+    found = diagnose(computed(ramped(true, rig), rig), {1: ARM}, Scope(known_references=frozenset({1})))
+    named = {c.name: c for c in found.causes}
+    assert named.keys() == {"coulomb_friction", "viscous_friction"}
+    for name, key in (("coulomb_friction", "coulomb_nm"), ("viscous_friction", "viscous_nms_per_rad")):
+        low, high = named[name].parameters[key].ci95
+        assert low <= getattr(true.friction, key) <= high
+
+
+def ramped(true: Joint, rig: Rig) -> Runs:
+    """Four speeds in both directions with ramps of 0.1 s between them."""
+    out = []
+    for k in range(4):
+        rng = np.random.default_rng([77, k])
+        t = np.arange(0.0, rig.seconds, 1.0 / rig.rate_hz)
+        speeds = rng.permutation([0.2, 0.5, 0.9, 1.4, -0.2, -0.5, -0.9, -1.4])
+        v = np.repeat(speeds, math.ceil(len(t) / 8))[: len(t)]
+        wide = round(0.1 * rig.rate_hz)
+        v = np.convolve(np.pad(v, wide, mode="edge"), np.ones(wide) / wide, "same")[wide:-wide]
+        a = np.gradient(v, t)
+        q = np.cumsum(v) / rig.rate_hz
+        G = true.gear_ratio
+        tau = rig.inertia_kgm2 * a
+        current = (G**2 * true.rotor_inertia_kgm2 * a + tau + friction_of(true)(v, tau, G * q)) / (
+            G * true.torque_constant_nm_per_a
+        )
+        step = 2.0 * np.pi / rig.counts
+        columns = JointColumns(
+            current_a=current + rig.current_noise_a * rng.normal(size=len(t)),
+            motor_position_rad=step * np.round(G * q / step),
+            torque_nm=tau,
+        )
+        out.append((f"run{k}", RunTable(t, {1: columns})))
+    return out
