@@ -87,7 +87,7 @@ class Dataset:
         families: of nuisances. unknown_lines: those among them at orders or frequencies of no effect.
         readings: per run what the current reads without power.
         pieces: number of the recording that each run is a piece of (None: each is one).
-        no_torque: no torque was measured, the reference is a known load or a model's: the free run is asked too (`guards`).
+        no_torque: no torque was measured, the reference is a known load or a model's.
         events: what is not valid in `runs` only because it is an event, per channel and run [n].
     """
 
@@ -146,9 +146,12 @@ def usable_signals(
     numbers: Sequence[int],
     known_loads: Collection[int] = (),
     like: Iterable[JointSignals] = (),
+    *,
+    as_recorded: bool = False,
 ) -> tuple[list[list[JointSignals]], list[str]]:
     """Return the signals [run][joint] of the usable runs, and why others cannot be used. known_loads: joints whose torque is
-    computed and no sensor's; like: signals of the same runs whose filters are used (`joint_signals`).
+    computed and no sensor's; like: signals of the same runs whose filters are used (`joint_signals`); as_recorded: whatever
+    is known of such a torque.
     """
     same = {(s.run, s.number): s for s in like}
     if not numbers:
@@ -168,9 +171,9 @@ def usable_signals(
                 continue
             try:
                 c = Channels(table.time_s, table.joints[n], joints[n], name, n in known_loads)
-                signals = joint_signals(
-                    name, table, n, joints[n], bases[n], same.get((name, n)), computed=n in known_loads
-                )
+                slow = n in known_loads and not as_recorded
+                like_it = same.get((name, n))
+                signals = joint_signals(name, table, n, joints[n], bases[n], like_it, computed=slow)
                 mine.append(without_held(signals, held_values(c, limits[n])))
             except SignalsError as error:
                 reasons.append(str(error))

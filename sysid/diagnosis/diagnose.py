@@ -94,7 +94,7 @@ def _diagnosed(  # noqa: PLR0917
     trust: Mapping[str, float],
 ) -> Findings:
     names = tuple(name for name, _ in runs)
-    usable, reasons = usable_signals(runs, joints, numbers, scope.known_references)
+    usable, reasons = usable_signals(runs, joints, numbers, scope.known_references, as_recorded=True)
     few = too_little(usable) if usable else None
     reasons += [few] if few else []
     if not usable or few:
@@ -104,6 +104,10 @@ def _diagnosed(  # noqa: PLR0917
         return Findings(INSUFFICIENT, tuple(reasons), names, numbers, next_experiment=plan)
     judged = tuple(s.number for s in usable[0])
     usable, dataset, outliers = without_outlier_runs(usable, joints, scope)
+    if scope.known_references:  # channels are compared as recorded, balances where the torque is known
+        kept = [run for run in runs if run[0] in {signals[0].run for signals in usable}]
+        usable, _ = usable_signals(kept, joints, judged, scope.known_references)
+        dataset = build_dataset(usable, joints, scope)
     dataset = replace(dataset, disturbed=disturbed_signals(runs, joints, numbers, usable, scope))
     solution = without_events(solve(dataset))
     findings, _ = conclude(solution, names, scope, relevance)

@@ -11,11 +11,13 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
+from jtqd.sysid.diagnosis.dataset import usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, CERTAIN, NO_GAP, ONE_OF, UNEXPLAINED, Findings
 from jtqd.sysid.diagnosis.limits import PRIORS
 from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.scope import Scope
+from jtqd.sysid.diagnosis.signals import TORQUE_HZ
 from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (
     ARM,
@@ -322,3 +324,12 @@ def ramped(true: Joint, rig: Rig) -> Runs:
         )
         out.append((f"run{k}", RunTable(t, {1: columns})))
     return out
+
+
+def test_of_a_computed_torque_channels_are_compared_as_recorded() -> None:
+    runs = runs_of(ARM, 5, 2, Rig(counts=2.0**22))
+    (slow,), (quick,), (measured,) = (
+        usable_signals(runs, {1: ARM}, (1,), known, as_recorded=recorded)[0][0]
+        for known, recorded in (({1}, False), ({1}, True), ((), False))
+    )
+    assert slow.visible.slowest_hz <= TORQUE_HZ < quick.visible.slowest_hz == measured.visible.slowest_hz
