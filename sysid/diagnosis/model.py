@@ -182,7 +182,7 @@ def solve(dataset: Dataset, seed: int = 0) -> Solution:
     start = work.file_values()
     for turn in range(_TURNS):
         last = turn + 1 == _TURNS
-        noise = noise_of_channels(residuals, dataset.step_s)
+        noise = noise_of_channels(residuals, dataset.step_s, limits.FLOOR * dataset.rated_torque_nm)
         equations = work.equations(noise)
         search = _Search(equations)
         starts = [start - equations.noisy, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]

@@ -30,14 +30,17 @@ class Noise(NamedTuple):
     inflation: float
 
 
-def noise_of_channels(residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float) -> Noise:
-    """Return the noise of all channels from what is left of them [run][n], NaN where not valid.
+def noise_of_channels(
+    residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float, least_nm: float = 0.0
+) -> Noise:
+    """Return the noise of all channels from what is left of them [run][n], NaN where not valid; least_nm: what the equations
+    are exact to, however little is left.
 
     The inflation is the mean over channels: with its own, a channel that is fitted badly would weigh little, and stay so.
     """
     block = max(1, round(_BLOCK_S / step_s))
     sigma = {
-        channel: max(float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))), 1e-12)
+        channel: max(float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))), least_nm, 1e-12)
         for channel, parts in residuals.items()
     }
     slow = [_slowness(parts, sigma[channel], block) for channel, parts in residuals.items()]
