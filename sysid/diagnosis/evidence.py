@@ -3,7 +3,7 @@
     y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e noise (`noise`)
 
 X: columns of the entries, scaled so that beta ~ N(0, 1) for entries in the set and 0 for all others; a set has prior odds.
-F: random Fourier features of the conditions (`discrepancy`): what no library holds; w shared by all runs, v_r a run's own.
+F: eigenfunctions over the conditions (`discrepancy`): what no library holds; w shared by all runs, v_r a run's own.
 Z: what a run has of its own (`regressors.families`; Laird and Ware 1982, Biometrics 38). The variances of w, v and u are
 where the marginal likelihood is largest (MacKay 1992, Neural Computation 4). Given them everything is linear and Gaussian,
 and the evidence of any set follows from one matrix of normal equations (George and McCulloch 1993, J. Am. Stat.
@@ -15,8 +15,8 @@ Beside a set the discrepancy has no part along the set's columns (Plumlee 2017, 
 entry as it nevertheless resembles is a second, small prior of every entry (George and McCulloch's spike of a width): a set
 needs more evidence than such a discrepancy would give it.
 
-The response of each balance has weight one, so no set gains by scaling a balance. What noise of a torque puts into the
-columns is taken out of the normal equations (Fuller 1987, Measurement Error Models).
+The response of each balance has weight one, so no set gains by scaling a balance. What noise of torques and motion puts into
+the columns is taken out of the normal equations (Fuller 1987, Measurement Error Models); no set explains more than there is.
 """
 
 from __future__ import annotations
@@ -38,8 +38,6 @@ from jtqd.sysid.diagnosis.regressors import Index
 
 Set = frozenset[int]
 """Numbers of entries."""
-Groups = Sequence[object]
-"""Of the variance of each nuisance."""
 Variances = Mapping[object, float]
 _LESS: Final = 1e-6
 _TRIED: Final = 3
@@ -329,7 +327,7 @@ class Equations:
         entries: Sequence[Entry],
         grams: FloatArray,
         noise: FloatArray,
-        groups: Groups,
+        groups: Sequence[object],
         shared: Index,
         start: Mapping[object, tuple[float, float]],
         most: Mapping[object, float],

@@ -1,8 +1,8 @@
 """The extended model that predicts, and its gain on held-out runs.
 
-Evidence distinguishes sets; what predicts is another estimate, without discrepancy: the set under its priors and all other
-values of the file, each as far as the discrepancy resembles it. Errors are in Nm. The response of each balance has weight
-one, so an error is that of the current that the simulation needs (as torque, G Kt i) and of the twist.
+Evidence distinguishes sets; what predicts is another estimate, without discrepancy: a mixture of the set and of the set with
+all values of the file, each under its priors (`stacked`). Errors are in Nm. The response of each balance has weight one, so
+an error is that of the current that the simulation needs (as torque, G Kt i) and of the twist.
 """
 
 from __future__ import annotations

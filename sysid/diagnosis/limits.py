@@ -2,7 +2,7 @@
 
 Priors are physical sizes: the standard deviation of what a value of a joint file, a calibration or an effect may be off by.
 They are shown in the report, and the user may set them (`--trust`). Limits of events and structure, and steps of the
-search, stand beside what uses them.
+search, are defined where they are used.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ FEATURES: Final = 12
 LENGTH: Final = 1.0
 """Its length scale, in standard deviations of the operating conditions."""
 FLOOR: Final = 1e-3
-"""Prior size of the discrepancy, part of the rated torque, worth FLOOR_COUNT features."""
+"""Prior size of the discrepancy, part of the rated torque, worth FLOOR_COUNT features; no balance is known better."""
 FLOOR_COUNT: Final = 2.0
 RUNS_COUNT: Final = 4.0
 """Runs that the prior of a run-to-run variation is worth."""

@@ -33,10 +33,8 @@ class Noise(NamedTuple):
 def noise_of_channels(
     residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float, least_nm: float = 0.0
 ) -> Noise:
-    """Return the noise of all channels from what is left of them [run][n], NaN where not valid; least_nm: what the equations
-    are exact to, however little is left.
-
-    The inflation is the mean over channels: with its own, a channel that is fitted badly would weigh little, and stay so.
+    """Return the noise of all channels from what is left of them [run][n], NaN where not valid, at least least_nm: what the
+    equations are exact to. With an inflation of its own a channel that is fitted badly would weigh little, and stay so.
     """
     block = max(1, round(_BLOCK_S / step_s))
     sigma = {

@@ -354,7 +354,11 @@ class _Motion:
             for each in (self.visible, self.inertial)
         )
         slow, shared = visible(self.whole), inertial(self.whole)
-        return replace(self, acceleration=slow, shared=shared, visible=visible, inertial=inertial)
+        text = f"torque_nm: computed, known below {hz:.0f} Hz; the motor balance is judged below it"
+        coarse = self.coarse if self.visible.slowest_hz <= hz else text
+        return replace(
+            self, acceleration=slow, shared=shared, visible=visible, inertial=inertial, coarse=coarse
+        )
 
 
 def _motion(

@@ -16,6 +16,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.entries import Entry
 from jtqd.sysid.diagnosis.evidence import Equations, Set, Sets
 from jtqd.sysid.diagnosis.limits import PRIORS
+from jtqd.sysid.diagnosis.model import _End, _Search
 
 EVEN = math.log(0.3 / 0.7)
 
@@ -385,6 +386,23 @@ def test_a_set_that_noise_leaves_no_covariance_is_none_or_has_less_taken_out() -
     assert 0.0 < equations.kappa < 1.0
     assert math.isfinite(score)
     assert np.isfinite(means.beta).all()
+
+
+@pytest.mark.parametrize("own", [1.0, 400.0])
+def test_a_set_is_shortened_only_where_it_loses_nothing_at_variances_of_its_own(own: float) -> None:
+    """At the variances of the longer set the shorter one is nearly as good; at its own it is, or it is not."""
+    long, short = frozenset({0, 1}), frozenset({0})
+    fits = {long: 10.0, short: 9.0, frozenset({1}): -math.inf, frozenset(): -math.inf}
+    sets = SimpleNamespace(
+        effects=lambda chosen: [(k,) for k in sorted(chosen)],
+        fit=lambda chosen: SimpleNamespace(evidence=fits[chosen]),
+    )
+    search = _Search(cast("Any", SimpleNamespace(sets=lambda *_, **__: sets)))
+    search.met = {
+        s: _End(score, s, {}, None)
+        for s, score in ((long, 0.0), (short, own), (frozenset(), 1e9), (frozenset({1}), 1e9))
+    }
+    assert search._without_the_replaceable(search.met[long]).chosen == (short if own < 6.0 else long)
 
 
 def test_no_set_explains_more_than_there_is() -> None:

@@ -11,11 +11,12 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
-from jtqd.sysid.diagnosis.dataset import usable_signals
+from jtqd.sysid.diagnosis import diagnose as diagnosis
+from jtqd.sysid.diagnosis.dataset import Dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, CERTAIN, NO_GAP, ONE_OF, UNEXPLAINED, Findings
 from jtqd.sysid.diagnosis.limits import PRIORS
-from jtqd.sysid.diagnosis.model import Solution
+from jtqd.sysid.diagnosis.model import Solution, solve
 from jtqd.sysid.diagnosis.scope import Scope
 from jtqd.sysid.diagnosis.signals import TORQUE_HZ
 from jtqd.sysid.runs.column_map import motion_of
@@ -333,3 +334,64 @@ def test_of_a_computed_torque_channels_are_compared_as_recorded() -> None:
         for known, recorded in (({1}, False), ({1}, True), ((), False))
     )
     assert slow.visible.slowest_hz <= TORQUE_HZ < quick.visible.slowest_hz == measured.visible.slowest_hz
+
+
+# Runs of a simulation: no noise, and what the equations simplify is all that is left.
+
+
+@pytest.mark.parametrize(
+    ("true", "named"),
+    [
+        (ARM, set()),
+        (replace(ARM, friction=Friction(4.2, 6.0)), {"coulomb_friction", "viscous_friction"}),
+    ],
+    ids=["nothing wrong", "friction"],
+)
+def test_without_noise_no_factor_on_all_constants_is_a_cause(true: Joint, named: set[str]) -> None:
+    found = diagnose(
+        runs_of(true, 3, 4, Rig(sensor_noise_nm=0.0, current_noise_a=0.0, counts=2.0**60)), {1: ARM}
+    )
+    assert {c.name for c in found.causes} == named
+    assert found.verdict == (CAUSE if named else NO_GAP)
+
+
+# One filter for all that is compared.
+
+
+def test_the_runs_with_noise_are_filtered_as_the_runs_are(nothing_wrong: Solution) -> None:
+    dataset = nothing_wrong.dataset
+    for run, noisy in zip(dataset.signals, dataset.disturbed, strict=True):
+        (plain,), (more,) = run, noisy
+        assert (more.visible, more.inertial) == (plain.visible, plain.inertial)
+        assert more.of_position == plain.of_position
+
+
+def test_a_delay_within_a_step_has_a_prior_outside_of_a_set(nothing_wrong: Solution) -> None:
+    equations = nothing_wrong.equations
+    delays = [k for k, e in enumerate(nothing_wrong.entries) if e.effect.name == "channel_delay"]
+    assert delays
+    step_s = nothing_wrong.dataset.signals[0][0].step_s
+    for k in delays:
+        (place,) = nothing_wrong.sets.slices[k]
+        least = step_s / math.sqrt(12.0) / 0.003
+        assert equations.deviation(equations.first())[place] >= min(1.0, 0.999 * least)
+
+
+def test_outliers_are_looked_for_as_recorded_and_balances_judged_where_the_torque_is_known(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: dict[str, float] = {}
+
+    def outlier(dataset: Dataset) -> None:
+        seen["outlier"] = dataset.signals[0][0].visible.slowest_hz
+
+    def solution(dataset: Dataset) -> Solution:
+        seen["balance"] = dataset.signals[0][0].visible.slowest_hz
+        return solve(dataset)
+
+    monkeypatch.setattr(diagnosis, "outlier_run", outlier)
+    monkeypatch.setattr(diagnosis, "solve", solution)
+    rig = Rig(moment_nm=0.0, counts=2.0**22)
+    found = diagnose(computed(runs_of(ARM, 5, 3, rig), rig), {1: ARM}, Scope(known_references=frozenset({1})))
+    assert seen["balance"] <= TORQUE_HZ < seen["outlier"]
+    assert any(f"below {TORQUE_HZ:.0f} Hz" in note for note in found.channel_notes)
