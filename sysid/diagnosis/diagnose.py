@@ -44,8 +44,7 @@ from jtqd.sysid.diagnosis.outlier_runs import outlier_run
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import noise_of
-from jtqd.sysid.diagnosis.solution import remaining
-from jtqd.sysid.diagnosis.unexplained import events_left
+from jtqd.sysid.diagnosis.unexplained import events_left, remaining
 from jtqd.sysid.diagnosis.verdict import conclude, present_of
 
 _WORST_FIRST: Final = (UNEXPLAINED, AMBIGUOUS, CAUSE, INSUFFICIENT, NO_GAP)

@@ -1,28 +1,43 @@
-"""Entries: everything that may be wrong, one value or effect each, with its prior; what competes by evidence.
+"""Entries: everything that may be wrong, one value or effect each, with its prior; the effects that a set of them makes.
 
 An entry is a term of an effect of the library (`regressors.EffectCandidate`) whose columns are scaled by its prior's size,
 so that every coefficient is N(0, 1) where the entry is in a set.
+
+Effects that are present decide torsion and current: what a simulation with them has, K d = tau + contributions, and the
+current that the motion and the load need. So the response of each balance (the current, the encoders' twist) has weight one
+and no part in a regressor.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.effects.effect import SPAN_K, Effect, Term
+from jtqd.estimator.corrections import with_effects_applied
+from jtqd.estimator.effects.effect import MOTOR, SPAN_K, TORSION, Effect, Term
+from jtqd.estimator.joint import Effect as EffectOfFile
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.limits import Prior, Usage
-from jtqd.sysid.diagnosis.regressors import EffectCandidate, fields_used
+from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used
 from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.smoothing import current_rate
 
+_MOST_STEPS: Final = 8
+_DRAWS: Final = 20
+_MOST_CURRENT: Final = 4.0
+"""Of the largest current that the file alone draws."""
+_TORSION_STEP: Final = 1e-4
+"""Of the twist at the rated torque: smaller steps of the torsion are none."""
+_SOFTEST: Final = 0.1
+"""Of the file's stiffness: less is taken for no spring, nor is a twist as under so little of it."""
 _KINDS: Final = ("order_per_motor_rev", "channel", "motor_side")
 """Parameters of which several values may be present at once."""
 
@@ -201,3 +216,87 @@ def lead_of(c: EffectCandidate) -> str:
     one = c.term.combine([1.0] * c.size)
     two = c.term.combine([2.0] * c.size)
     return str(next(name for name in one if one[name] != two[name] and name != "phase_rad"))
+
+
+@dataclass(frozen=True)
+class PresentEffect:
+    """An effect with all its parameters by name."""
+
+    effect: Effect
+    joint: JointName
+    values: Mapping[str, float]
+
+
+def present_effects(found: Sequence[tuple[Entry, FloatArray]]) -> list[PresentEffect]:
+    """Return entries with their scaled coefficients as effects with parameters, kinds of one effect together."""
+    out: dict[tuple[object, ...], dict[str, float]] = {}
+    of: dict[tuple[object, ...], Entry] = {}
+    for e, scaled in found:
+        at: tuple[object, ...] = (*e.key, e.slot[-1])
+        values = e.values(scaled)
+        nothing = e.candidate.term.combine([0.0] * e.candidate.size)
+        there = out.setdefault(at, {})
+        of[at] = e
+        for name, value in values.items():
+            if name not in there or value != nothing.get(name):
+                there[name] = value
+    result = []
+    for place, values in out.items():
+        e = of[place]
+        known = {p.name: p for p in e.effect.parameters}
+        for p in known.values():
+            if p.default is not None and not math.isnan(p.default):
+                values.setdefault(p.name, p.default)
+        clipped = {
+            n: v if n == "phase_rad" else float(np.clip(v, known[n].low, known[n].high))
+            for n, v in values.items()
+        }
+        result.append(PresentEffect(e.effect, e.joint, clipped))
+    return result
+
+
+def set_state(s: JointSignals, present: Sequence[PresentEffect]) -> None:
+    """Set torsion and current of one joint of a run to what the simulation with these effects has."""
+    mine = [p for p in present if shows_at(p.joint, s.number)]
+    values = tuple(
+        EffectOfFile(p.effect.name, dict(p.values))
+        for p in mine
+        if p.joint == s.number and all(q.key for q in p.effect.parameters)
+    )
+    s.believed[:] = [with_effects_applied(replace(s.joint, effects=values))]
+    _set_torsion(s, mine)
+    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
+    acting = [p for p in mine if "current_a" in fields_used(p.effect, p.values, s.joint)]
+    rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
+    s.state.current_a = rest / scale
+    most = _MOST_CURRENT * float(np.max(np.abs(rest), initial=0.0)) / scale
+    for _ in range(_DRAWS if acting else 0):  # damped: a constant twice as large would swing for ever
+        drawn = (rest + _sum(s, acting, MOTOR)) / scale
+        s.state.current_a = np.clip(0.5 * (s.state.current_a + drawn), -most, most)
+    s.state.current_rate_a_s = current_rate(s.state.current_a, s.time_s)
+
+
+def _set_torsion(s: JointSignals, mine: Sequence[PresentEffect]) -> None:
+    bent = [p for p in mine if "torsion_rad" in p.effect.needs]
+    stiffness = s.joint.stiffness_nm_per_rad
+    total = s.state.torque_nm + _sum(s, [p for p in mine if p not in bent], TORSION)
+    s.state.torsion_rad = total / stiffness
+    if not bent:
+        return
+    usual = s.joint.rated_torque_nm / stiffness
+    # Newton: a spring that hardens by its own stiffness is no small change, and one that softens may hold no such torque
+    widest = max(usual, float(np.max(np.abs(total))) / stiffness) / _SOFTEST
+    for _ in range(_MOST_STEPS):
+        d = s.state.torsion_rad
+        here = _sum(s, bent, TORSION)
+        s.state.torsion_rad = d + _TORSION_STEP * usual
+        slope = (_sum(s, bent, TORSION) - here) / (_TORSION_STEP * usual)
+        step = (total + here - stiffness * d) / np.maximum(stiffness - slope, _SOFTEST * stiffness)
+        s.state.torsion_rad = np.clip(d + step, -widest, widest)
+        if float(np.max(np.abs(step))) < _TORSION_STEP * usual:
+            return
+
+
+def _sum(s: JointSignals, present: Sequence[PresentEffect], balance: str) -> FloatArray | float:
+    """Return what these effects contribute to a balance [n], Nm."""
+    return sum((contribution(p.effect, p.values, s).get(balance, 0.0) for p in present), 0.0)

@@ -19,10 +19,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import Linear
 from jtqd.sysid.diagnosis import limits
-from jtqd.sysid.diagnosis.current_zero import unpowered_columns, with_readings
-from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.discrepancy import features
-from jtqd.sysid.diagnosis.entries import Entry, entries_of, shapes_of
+from jtqd.sysid.diagnosis.dataset import Dataset, unpowered_columns, with_readings
+from jtqd.sysid.diagnosis.entries import Entry, entries_of, present_effects, set_state, shapes_of
 from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
 from jtqd.sysid.diagnosis.findings import shows_at
 from jtqd.sysid.diagnosis.noise import Noise, noise_of_channels, run_sums
@@ -31,13 +29,13 @@ from jtqd.sysid.diagnosis.regressors import (
     Index,
     RunData,
     contribution,
+    features,
     fields_used,
     run_data,
     samples_in,
     seen_in_bins,
 )
 from jtqd.sysid.diagnosis.signals import RATE_HZ, TORQUE_HZ, VALUES_HZ, Channel, JointSignals
-from jtqd.sysid.diagnosis.solution import present_effects, set_state
 
 _TURNS: Final = 4
 _ROUNDS: Final = 3

@@ -7,7 +7,7 @@ remains, with energy and reasons, and where. Where nothing that remains matters,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import Final
 
@@ -16,18 +16,11 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.findings import Gap, Place, Trace
+from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
+from jtqd.sysid.diagnosis.findings import Gap, Place, Trace, shows_at
 from jtqd.sysid.diagnosis.noise import autoregression
-from jtqd.sysid.diagnosis.regressors import Index, binned
+from jtqd.sysid.diagnosis.regressors import LINE, Index, RunData, binned, contribution
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.solution import (
-    Parts,
-    Remaining,
-    less_nuisances,
-    own_changes,
-    residual_after,
-    residual_before,
-)
 from jtqd.sysid.diagnosis.structure import AXES, Balance, View, bins_of, events, pursue
 
 _MOST_OF_THE_TIME: Final = 0.1
@@ -36,6 +29,105 @@ _SAME: Final = 0.02
 """Part of their rms by which velocities of repeated runs differ at most; loads by five times as much."""
 _TRACE_POINTS: Final = 4000
 QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
+
+
+_SHARED: Final = 5.0
+"""Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
+_OF_A_DAY: Final = ("zero", "viscous", "coulomb")
+"""Families that are the joint's where all runs share them; a torsion's zero is nobody's, `smooth` is what is near rest."""
+Parts = list[FloatArray]
+"""A residual [run][n], NaN where it is not valid."""
+
+
+def contributions(dataset: Dataset, present: PresentEffect) -> list[dict[Channel, FloatArray]]:
+    """Return what an effect contributes to each channel, per run, binned [n], Nm."""
+    out = []
+    for run, data in zip(dataset.signals, dataset.runs, strict=True):
+        found = {}
+        for s in run:
+            if shows_at(present.joint, s.number):
+                for balance, value in contribution(present.effect, present.values, s).items():
+                    found[Channel(s.number, balance)] = binned(s.seen(balance, value), data.samples)
+        out.append(found)
+    return out
+
+
+@dataclass(frozen=True)
+class Remaining:
+    """What effects leave: binned runs whose residual is that; nuisances: what each run has of its own [r, q]; pieces: number
+    of the recording that each run is of.
+    """
+
+    present: tuple[PresentEffect, ...]
+    runs: tuple[RunData, ...]
+    nuisances: FloatArray
+    pieces: Sequence[int]
+
+
+def remaining(dataset: Dataset, present: Sequence[PresentEffect], nuisances: FloatArray) -> Remaining:
+    """Return what effects leave; nuisances: per recording [r, q]."""
+    for s in (joint for run in dataset.signals for joint in run):
+        set_state(s, present)
+    left = [{c: d.residual.copy() for c, d in run.channels.items()} for run in dataset.runs]
+    for p in present:
+        for rest, found in zip(left, contributions(dataset, p), strict=True):
+            for channel, value in found.items():
+                rest[channel] -= value
+    runs = [
+        replace(run, channels={c: replace(d, residual=rest[c]) for c, d in run.channels.items()})
+        for run, rest in zip(dataset.runs, left, strict=True)
+    ]
+    pieces = dataset.recordings
+    return Remaining(tuple(present), tuple(runs), nuisances[list(pieces)], pieces)
+
+
+def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
+    """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
+    differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
+    unexplained where no cause covers it.
+    """
+    changes = np.array(refined.nuisances)
+    changes[:, [g.name == LINE for g in dataset.families]] = 0.0
+    pieces = np.array(refined.pieces)
+    runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
+    sigma = np.array([np.inf if g.name not in _OF_A_DAY else g.sigma for g in dataset.families])
+    shared = runs.mean(axis=0)
+    shared[np.abs(shared) < _SHARED * sigma / np.sqrt(len(runs))] = 0.0
+    return np.asarray(changes - shared)
+
+
+def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it."""
+    out: dict[Channel, Parts] = {}
+    for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
+        for channel, d in run.channels.items():
+            rest = d.residual - d.nuisances @ u[d.families]
+            out.setdefault(channel, []).append(np.where(dataset.valid_or_event(r, channel), rest, np.nan))
+    return out
+
+
+def residual_after(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return what the causes leave, less what each run has of its own where that makes it smaller: of few seconds
+    its estimate under a prior need not.
+    """
+    out = less_nuisances(dataset, refined)
+    for channel, parts in out.items():
+        for r, run in enumerate(refined.runs):
+            plain = np.where(dataset.valid_or_event(r, channel), run.channels[channel].residual, np.nan)
+            parts[r] = min(parts[r], plain, key=lambda x: float(np.nansum(x**2)))
+    return out
+
+
+def residual_before(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
+    """Return the same with what the causes explain: the residual with the joint files."""
+    both = list(zip(dataset.runs, refined.runs, strict=True))
+    return {
+        c: [
+            x + run.channels[c].residual - left.channels[c].residual
+            for x, (run, left) in zip(after, both, strict=True)
+        ]
+        for c, after in residual_after(dataset, refined).items()
+    }
 
 
 @dataclass(frozen=True)

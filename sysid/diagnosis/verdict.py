@@ -20,7 +20,7 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import Effect
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.entries import Entry
+from jtqd.sysid.diagnosis.entries import Entry, PresentEffect, present_effects
 from jtqd.sysid.diagnosis.evidence import Set, Sets
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
@@ -45,11 +45,12 @@ from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.scope import Scope
 from jtqd.sysid.diagnosis.signals import Channel
-from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, present_effects, remaining
 from jtqd.sysid.diagnosis.unexplained import (
     Unexplained,
     channel_gaps,
+    contributions,
     held_nm,
+    remaining,
     traces,
     unexplained_residual,
 )

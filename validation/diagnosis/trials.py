@@ -28,10 +28,10 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
 from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
-from jtqd.sysid.diagnosis.solution import PresentEffect, set_state
 from jtqd.sysid.planner.plan import Plan, check_plan
 from validation.diagnosis.entries import ENTRIES, SENSOR, Array, Columns, Hidden, base_value, scaled
 from validation.diagnosis.recorder import PRESETS, Recorder

@@ -17,10 +17,10 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import disturbed_signals
+from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
 from jtqd.sysid.diagnosis.findings import Findings
 from jtqd.sysid.diagnosis.model import Solution, solve
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
-from jtqd.sysid.diagnosis.solution import PresentEffect, set_state
 
 Loss = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """Of velocity, torque, motor angle [n], joint side, Nm."""

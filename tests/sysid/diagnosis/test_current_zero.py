@@ -8,7 +8,7 @@ import pytest
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTable
-from jtqd.sysid.diagnosis.current_zero import (
+from jtqd.sysid.diagnosis.dataset import (
     DRIFT,
     Reading,
     reading,

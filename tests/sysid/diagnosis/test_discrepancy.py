@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.discrepancy import features
-from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.regressors import RunData, features
 from jtqd.sysid.diagnosis.signals import Channel
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 

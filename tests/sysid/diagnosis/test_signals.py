@@ -17,10 +17,10 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
+from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, SignalsError, about_zero, joint_signals
 from jtqd.sysid.diagnosis.smoothing import second_difference, smooth
-from jtqd.sysid.diagnosis.solution import PresentEffect, set_state
 from jtqd.sysid.runs.checks import on_even_steps
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run

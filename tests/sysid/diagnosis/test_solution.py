@@ -11,9 +11,10 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
+from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
-from jtqd.sysid.diagnosis.solution import PresentEffect, contributions, remaining, set_state
+from jtqd.sysid.diagnosis.unexplained import contributions, remaining
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, candidates, rigid_run
 from tests.sysid.diagnosis.pendulums import ARM, Rig, runs_of
