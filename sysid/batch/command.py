@@ -517,7 +517,7 @@ def _nm(value: float | None) -> str:
 
 
 def _diagnosis_figures(result: Mapping[str, Any]) -> Figures:
-    from jtqd.sysid.diagnosis.words import (  # scipy, which --help does not need
+    from jtqd.sysid.diagnosis.report import (  # scipy, which --help does not need
         BADGES,
         effect_title,
         place,

@@ -107,7 +107,7 @@ def _main(argv: list[str]) -> int:
     except OSError as error:
         print(f"{BY}: {error.filename or options.out}: {error.strerror or error}", file=sys.stderr)
         return 1
-    from jtqd.sysid.diagnosis.words import terminal_lines  # scipy, which --help does not need
+    from jtqd.sysid.diagnosis.report import terminal_lines  # scipy, which --help does not need
 
     print(_json(mapping) if options.json else "\n".join(terminal_lines(findings)))
     print(f"{BY}: wrote {options.out / REPORT}", file=sys.stderr)

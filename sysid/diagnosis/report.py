@@ -1,7 +1,7 @@
-"""Report of a diagnosis: one self-contained HTML page, made from the findings alone.
+"""Report of a diagnosis, made from the findings alone: what a person reads on the terminal and as one self-contained page.
 
-Before the first picture it states what the terminal does (`words`). The pictures show simulation against measurement over
-time, before and after, and their difference. Needs jinja2 and matplotlib.
+Both print `summary`: headline, table of entries, what remains, what to measure next. The pictures of the page show
+simulation against measurement over time, before and after, and their difference. The page needs jinja2 and matplotlib.
 """
 
 from __future__ import annotations
@@ -9,7 +9,8 @@ from __future__ import annotations
 import base64
 import json
 import math
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Any, Final, NamedTuple
@@ -18,26 +19,388 @@ import numpy as np
 import yaml
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Gap, JointName, Place, Trace, priors
-from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, campaign_command, motions_of
-from jtqd.sysid.diagnosis.words import (
-    BADGES,
-    BALANCES,
-    bin_name,
-    effect_title,
-    in_words,
-    joints_text,
-    parameter_title,
-    place,
-    provenance_text,
-    summary,
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.text import counted, finite, table_lines
+from jtqd.sysid.diagnosis.findings import (
+    AMBIGUOUS,
+    CAUSE,
+    CERTAIN,
+    EFFECTIVE,
+    INSUFFICIENT,
+    NO_GAP,
+    ONE_OF,
+    SENSOR,
+    UNEXPLAINED,
+    CandidateEvidence,
+    Cause,
+    Findings,
+    Gain,
+    Gap,
+    JointName,
+    Place,
+    Provenance,
+    Trace,
+    file_values,
+    priors,
 )
+from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, campaign_command, motions_of
+from jtqd.sysid.planner.experiments import EXPERIMENTS
 from jtqd.sysid.planner.plan import Plan
 from jtqd.sysid.report import page
-from jtqd.sysid.report.numbers import DASH, number, percent, unit_name, with_unit
+from jtqd.sysid.report.numbers import (
+    DASH,
+    number,
+    pair,
+    percent,
+    rounded,
+    short,
+    unit_name,
+    with_interval,
+    with_unit,
+)
 from jtqd.sysid.report.page import LIGHT, page_svg, thinned
+
+BADGES: Final = {
+    NO_GAP: ("good", "no gap"),
+    CAUSE: ("after", "cause found"),
+    AMBIGUOUS: ("warn", "ambiguous"),
+    UNEXPLAINED: ("bad", "unexplained"),
+    INSUFFICIENT: ("warn", "insufficient data"),
+}
+"""Colour and text beside the headline."""
+BALANCES: Final = {
+    "motor": "motor balance (current against sensor)",
+    "torsion": "torsion (both encoders against sensor)",
+}
+MOST_ROWS: Final = 4
+"""Rows of the table; smaller entries that matter are listed below it."""
+MOST_INPUTS: Final = 6
+"""Inputs whose hash the line of provenance has; all are in findings.json."""
+_MOMENTS: Final = {"events": "events that noise does not explain", "seconds": "seconds with a deviating mean"}
+"""Lists of moments among the places, by their first word."""
+_PROPER: Final = {"coulomb": "Coulomb", "stribeck": "Stribeck"}
+_UNIT_ENDING: Final = re.compile(
+    r"_(nms_per_rad|nm_per_(rad3|rad|a|s)|per_k_nm|rad_s|kgm2|nm|rad|per_motor_rev|a|s|c)$"
+)
+
+
+class Row(NamedTuple):
+    """One entry of the table: place, name in words, the file's value -> the one found, its 95 % interval, share of the gap,
+    grade; more: its further parameters.
+    """
+
+    place: str
+    entry: str
+    found: str
+    interval: str
+    share: str
+    grade: str
+    more: str = ""
+
+
+HEADS: Final = Row("place", "entry", "file -> found", "95 % interval", "share", "grade")
+
+
+class Summary(NamedTuple):
+    """All that is shown before the first picture. headline: at most two sentences; lines: texts by their titles, "" where
+    there is nothing to state.
+    """
+
+    headline: tuple[str, ...]
+    notes: tuple[str, ...]
+    rows: tuple[Row, ...]
+    lines: Mapping[str, str]
+
+
+def summary(findings: Findings) -> Summary:
+    """Return what is shown of findings."""
+    causes, small = by_size(findings)
+    files = findings.joint_files
+    experiment = findings.next_experiment or {}
+    reasons = findings.reasons if findings.verdict == UNEXPLAINED else ()
+    reasons = findings.reasons[1:] if findings.verdict == INSUFFICIENT else reasons
+    lines = {
+        "also": ", ".join(f"{_of(c)} {_size(c, files)} ({_grade(c)})" for c in causes[MOST_ROWS:]),
+        "too small to matter": ", ".join(f"{_of(c)} {_size(c, files)}" for c in small),
+        "grades": _grades(causes, findings),
+        "remains": _remains(findings),
+        "measure next": _next(str(experiment.get("why", ""))),
+        "run it": str(experiment.get("command") or ""),
+        "these runs cannot tell": _untold(findings),
+    }
+    notes = (*map(in_words, reasons), *(f"outlier run: {odd.text}" for odd in findings.outlier_runs))
+    return Summary(headline(findings), notes, tuple(_row(c, files) for c in causes[:MOST_ROWS]), lines)
+
+
+def terminal_lines(findings: Findings) -> list[str]:
+    """Return the summary for a terminal."""
+    s = summary(findings)
+    lines = [f"{findings.verdict}: {' '.join(s.headline)}", *(f"  {note}" for note in s.notes)]
+    if s.rows:
+        table = [HEADS, *(r._replace(grade=f"{r.grade} ({r.more})" if r.more else r.grade) for r in s.rows)]
+        lines += [f"  {line}" for line in table_lines([row[:-1] for row in table], range(6))]
+    lines += [text if name == "grades" else f"{name}: {text}" for name, text in s.lines.items() if text]
+    lines += [provenance_text(findings.provenance)] if findings.provenance else []
+    return [line.replace("\u00a0", " ") for line in lines]
+
+
+def provenance_text(made: Provenance | None, most: int = MOST_INPUTS) -> str:
+    """Return date, version, inputs with the first 12 digits of their sha256, and the command line; "" for None."""
+    if made is None:
+        return ""
+    inputs = [f"{name} {sha256[:12]}" for name, sha256 in made.inputs.items()]
+    more = f" and {len(inputs) - most} more" if len(inputs) > most else ""
+    return f"{made.date}, jtqd {made.version}, sha256 of {', '.join(inputs[:most])}{more}: {made.command}"
+
+
+def by_size(findings: Findings) -> tuple[list[Cause], list[Cause]]:
+    """Return the entries that matter, by their share, and those too small to matter, by their size."""
+    causes = sorted(
+        (c for c in findings.causes if c.matters), key=lambda c: -(finite(c.explained_share) or 0.0)
+    )
+    small = [*(c for c in findings.causes if not c.matters), *findings.too_small]
+    return causes, sorted(small, key=lambda c: -c.rms_nm)
+
+
+def headline(findings: Findings) -> tuple[str, ...]:
+    """Return the result in at most two sentences, the largest entry first."""
+    causes, small = by_size(findings)
+    if findings.verdict == INSUFFICIENT:
+        first = in_words(findings.reasons[0]) if findings.reasons else ""
+        return (f"{_joined(': ', 'These runs are not sufficient to judge the simulation', first)}.",)
+    if findings.verdict == NO_GAP:
+        limit = f"what remains is below {100.0 * findings.relevance:.2g} % of rated torque"
+        number = counted(len(small), "entry", "entries")
+        more = f"and {number} {'is' if len(small) == 1 else 'are'} too small to matter" if small else ""
+        return (f"The simulation agrees with these runs: {_joined(', ', limit, more)}.",)
+    left = findings.unexplained
+    rest = f"{short(left.rms_nm)} Nm rms at joint {left.joint}" if left is not None and left.matters else ""
+    if not causes:
+        where = _joined(", ", rest, _places(findings, 1)) if rest else ""
+        return (f"{_joined(': ', 'No entry explains the gap', where)}.",)
+    second = _joined(", but ", _gain(findings.gain), f"{rest} remain unexplained" if rest else "")
+    found = _headline_causes(causes, findings.joint_files)
+    return (found, f"{_capital(second)}.") if second else (found,)
+
+
+def _headline_causes(causes: Sequence[Cause], files: Mapping[int, Joint]) -> str:
+    first, share, size = causes[0], _percent(causes[0].explained_share), _size(causes[0], files)
+    names = listed([_of(first), *(_rival(name, first.joint) for name in first.rivals[:2])], "or")
+    text = f"{_capital(names)} explains {f'{share} of ' if share else ''}the gap"
+    if first.grade != ONE_OF:
+        text = f"{_joined(': ', text, size)} ({first.grade})"
+    elif size:
+        text += f" ({size} if it is {effect_title(first.name)})"
+    if len(causes) > 1:
+        more = len(causes) - 2
+        text += f"; {_joined(' ', _of(causes[1]), _percent(causes[1].explained_share))} ({_grade(causes[1])})"
+        text += f" and {counted(more, 'smaller entry', 'smaller entries')}" if more else ""
+    return f"{text}."
+
+
+def _gain(gain: Gain | None) -> str:
+    if gain is None or not math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
+        return ""
+    before, after = gain.rmse_before_nm, gain.rmse_after_nm
+    if after >= before:
+        return f"the extended model errs by {short(after)} Nm on held-out runs, no less than the joint file"
+    old, new = short(before), short(after)
+    if old == new:
+        old, new = pair(before, after)
+    return f"the extended model errs by {new} instead of {old} Nm on held-out runs"
+
+
+def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
+    found = interval = ""
+    if cause.leading:
+        value = cause.parameters[cause.leading]
+        found, interval = with_interval(value.value, value.ci95, value.unit, in_file(cause, files))
+    more = []
+    for name, value in cause.parameters.items():
+        if name not in {cause.leading, "channel"}:
+            given = f"{value.value:g} {unit_name(value.unit)}".rstrip()
+            more.append(
+                f"{parameter_title(name)} {rounded(value.value, value.unit) if value.fitted else given}"
+            )
+    title, share = effect_title(cause.name), _percent(cause.explained_share)
+    return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
+
+
+def in_file(cause: Cause, files: Mapping[int, Joint]) -> float | None:
+    """Return what the joint file has for the leading parameter, or implies (a gain of 1); None: there is no such value."""
+    known = file_values(cause.name, cause.joint, files).get(cause.leading)
+    return known.value if known is not None and (known.key or known.value) else None
+
+
+def _size(cause: Cause, files: Mapping[int, Joint]) -> str:
+    """Return the leading parameter of a cause, rounded; "" without a parameter."""
+    if not cause.leading:
+        return ""
+    value = cause.parameters[cause.leading]
+    return rounded(value.value, value.unit, in_file(cause, files))
+
+
+def _percent(share: float) -> str:
+    if not share > 0.0:
+        return ""
+    return "<1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
+
+
+def _grade(cause: Cause) -> str:
+    if cause.grade != ONE_OF:
+        return cause.grade
+    return f"one of {1 + len(cause.rivals)}: or {', '.join(_rival(n, cause.joint) for n in cause.rivals)}"
+
+
+def _rival(name: str, joint: JointName) -> str:
+    """Return a rival in words: "its torque constant", "sensor offset", "Coulomb friction of joint 2"."""
+    title, _, where = name.partition(" of ")
+    words = effect_title(title)
+    if where:
+        return words if where.endswith(SENSOR) and words.startswith("sensor") else f"{words} of {where}"
+    return words if joint == SENSOR else f"its {words}"
+
+
+def _grades(causes: Sequence[Cause], findings: Findings) -> str:
+    """Return what the grades in the table mean, and the priors that a certain entry rests on."""
+    grades = {c.grade for c in causes}
+    texts = []
+    if CERTAIN in grades:
+        sure = [c for c in causes if c.grade == CERTAIN]
+        names = dict.fromkeys([*(c.name for c in sure), *(name for c in sure for name in _scales_alike(c))])
+        rows = {row.name: row for row in priors(findings.trust)}
+        sizes: dict[str, list[str]] = {}
+        for row in (rows[name] for name in names if name in rows):
+            size = f"{row.size}{' (as set)' if row.set_by_user else ''}"
+            sizes.setdefault(size, []).append(effect_title(row.name))
+        given = ", ".join(f"{listed(of)} ± {size}" for size, of in sizes.items())
+        texts.append(f"certain: given {given}" if given else "certain: no other set is nearly as good")
+    if ONE_OF in grades:
+        texts.append("one of: these runs do not distinguish them")
+    if EFFECTIVE in grades:
+        texts.append("effective: predicts, but what it stands for is not settled")
+    return f"{'; '.join(texts)}." if texts else ""
+
+
+def _scales_alike(cause: Cause) -> list[str]:
+    """Return the other effects that scale the balance of a cause which scales it: priors decide between them."""
+    scaling = [e.name for e in EFFECTS.values() if e.scales_all or e.scales_balance == cause.balance]
+    return [name for name in scaling if name != cause.name] if cause.name in scaling else []
+
+
+def _next(why: str) -> str:
+    """Return the kinds of motion that an experiment has, and the first sentence of its reason."""
+    kinds = [kind.replace("_", " ") for kind in EXPERIMENTS if f"{kind}: " in why]
+    first = in_words(why.partition(". ")[0].rstrip("."))
+    return f"{listed(kinds)}, because {first}" if kinds else first
+
+
+def _remains(findings: Findings) -> str:
+    left = findings.unexplained
+    if left is None or (findings.verdict == NO_GAP and not left.rms_nm):
+        return ""
+    if not left.rms_nm:
+        return "no structure beyond noise and run-to-run variation"
+    size = f"{short(left.rms_nm)} Nm rms ({left.percent_of_rated:.2g} % of rated) at joint {left.joint}"
+    what = _joined(", ", size, f"{left.balance} balance", _places(findings) if left.matters else "")
+    return f"{what}; it {'matters' if left.matters else 'would matter'} from {short(left.relevant_nm)} Nm"
+
+
+def _places(findings: Findings, most: int = 2) -> str:
+    """Return the largest places of the residual that remains."""
+    left = findings.unexplained
+    for gap in findings.gaps:
+        if left is not None and (gap.joint, gap.balance) == (left.joint, left.balance):
+            return ", ".join(f"{_percent(p.share)} of it {where(p)}" for p in gap.localisation[:most])
+    return ""
+
+
+def _untold(findings: Findings) -> str:
+    """Return what these runs cannot tell, by the motion that would, or the channel that lacks."""
+    motions: dict[str, dict[str, list[JointName]]] = {}
+    for each in findings.cannot_be_told:
+        needed = f"would take {each.experiment.replace('_', ' ')}" if each.experiment else each.why
+        motions.setdefault(needed, {}).setdefault(each.name, []).append(each.joint)
+    many = len(findings.joints) > 1
+    return "; ".join(
+        f"{', '.join(_named(name, joints, many) for name, joints in names.items())} ({needed})"
+        for needed, names in motions.items()
+    )
+
+
+def _named(name: str, joints: Iterable[JointName], many: bool) -> str:
+    """Return "lost motion of joints 1 and 2"; without the joints where there is one, or where it is the sensor's."""
+    numbers = sorted({j for j in joints if isinstance(j, int)})
+    return _joined(" of ", effect_title(name), joints_text(numbers) if many else "")
+
+
+def joints_text(numbers: Sequence[int]) -> str:
+    """Return "joint 1" or "joints 1 and 2", "" for none."""
+    return f"joint{'s' if len(numbers) > 1 else ''} {listed([str(n) for n in numbers])}" if numbers else ""
+
+
+def effect_title(name: str) -> str:
+    """Return the name of an effect in words: "stribeck_friction" is "Stribeck friction"."""
+    return " ".join(_PROPER.get(word, word) for word in name.split("_"))
+
+
+def parameter_title(name: str) -> str:
+    """Return the name of a parameter in words, without its unit: "amplitude_nm" is "amplitude"."""
+    return effect_title(_UNIT_ENDING.sub("", name))
+
+
+def in_words(text: str) -> str:
+    """Return a text with names of effects as words: "class of link_inertia" is "class of link inertia"."""
+    return " ".join(
+        effect_title(w) if "_" in w and w.strip(",;:").islower() and "." not in w else w for w in text.split()
+    )
+
+
+def place(joint: JointName) -> str:
+    """Return where an effect is: "joint 1" or "torque sensor"."""
+    return "torque sensor" if joint == SENSOR else f"joint {joint}"
+
+
+def _of(cause: Cause) -> str:
+    """Return effect and place: "torque ripple of joint 1", "sensor gain"."""
+    title = effect_title(cause.name)
+    if cause.joint == SENSOR:
+        return title if title.startswith(SENSOR) else f"{title} of the torque sensor"
+    return f"{title} of {place(cause.joint)}"
+
+
+def listed(items: Sequence[str], word: str = "and") -> str:
+    """Return "a", "a and b", "a, b and c"."""
+    return items[0] if len(items) == 1 else f"{', '.join(items[:-1])} {word} {items[-1]}"
+
+
+def _joined(between: str, *texts: str) -> str:
+    """Return the texts that are not empty, with something between them."""
+    return between.join(filter(None, texts))
+
+
+def _capital(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}"
+
+
+def bin_name(bin_: Place) -> str:
+    """Return the name of a bin as it is written."""
+    return bin_.bin.replace(bin_.unit, unit_name(bin_.unit)) if bin_.unit else bin_.bin
+
+
+def where(place_: Place) -> str:
+    """Return a place with its preposition: "at velocity 0 to 0.1 rad/s", "in bursts, ...", "in a line at order 3.57 ..."."""
+    what, _, moments = place_.bin.partition(":")
+    if what in _MOMENTS:
+        return f"in {_MOMENTS[what]}, the strongest {moments.split(',')[0].strip()}"
+    if place_.bin.startswith("order"):
+        return f"in a line at {bin_name(place_)}"
+    return f"at {place_.axis.replace('_', ' ')} {bin_name(place_)}"
+
+
+# The page.
 
 TEMPLATE: Final = "report.html.j2"
 _HOT: Final = 2.0
@@ -67,7 +430,7 @@ def render(findings: Findings) -> str:
         "priors": priors(findings.trust),
         "gains": {each.run: each for each in findings.gain.runs} if findings.gain else {},
         "pictures": pictures(findings),
-        "next": _next(findings),
+        "next": _planned(findings),
     }
     filters: dict[str, Callable[..., str]] = {"number": number, "effect_title": effect_title}
     return page.render("jtqd.sysid.diagnosis", TEMPLATE, content, filters)
@@ -138,7 +501,7 @@ def _axis(name: str, places: Sequence[Place], whole: float, highest: float) -> A
     return Axis(name.replace("_", " "), bars, (low, high), peak, shares[top] * count, 1.0 / highest)
 
 
-def _next(findings: Findings) -> dict[str, Any] | None:
+def _planned(findings: Findings) -> dict[str, Any] | None:
     """Why, the plan as YAML, and what it amounts to; nothing of a plan that `jtq campaign` would refuse."""
     experiment = findings.next_experiment
     if experiment is None:

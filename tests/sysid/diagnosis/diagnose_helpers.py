@@ -19,6 +19,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
 from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, Gap, Place, Present, Value
+from jtqd.sysid.diagnosis.report import terminal_lines
 from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.runs.tables import write_run
 
@@ -126,7 +127,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch) -> Core:
     statistics: Any = types.ModuleType("jtqd.sysid.diagnosis.diagnose")
     statistics.diagnose = one.diagnose
     page: Any = types.ModuleType("jtqd.sysid.diagnosis.report")
-    page.render = lambda made: f"<html>{made.verdict}</html>"
+    page.render, page.terminal_lines = lambda made: f"<html>{made.verdict}</html>", terminal_lines
     monkeypatch.setitem(sys.modules, "jtqd.sysid.diagnosis.diagnose", statistics)
     monkeypatch.setitem(sys.modules, "jtqd.sysid.diagnosis.report", page)
     return one

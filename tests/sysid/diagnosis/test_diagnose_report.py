@@ -22,7 +22,7 @@ import yaml
 
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.findings import Provenance, Trace
-from jtqd.sysid.diagnosis.words import effect_title, in_words, place, summary
+from jtqd.sysid.diagnosis.report import effect_title, in_words, place, summary
 from jtqd.sysid.report.numbers import number
 from tests.sysid.diagnosis import findings_examples as examples
 

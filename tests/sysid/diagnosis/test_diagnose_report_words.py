@@ -21,10 +21,11 @@ from jtqd.sysid.diagnosis.findings import (
     priors,
     to_mapping,
 )
-from jtqd.sysid.diagnosis.report import candidate_row, gap_axes
-from jtqd.sysid.diagnosis.words import (
+from jtqd.sysid.diagnosis.report import (
     MOST_ROWS,
+    candidate_row,
     effect_title,
+    gap_axes,
     headline,
     in_words,
     parameter_title,
