@@ -3,7 +3,7 @@
     y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e noise (`noise`)
 
 X: columns of the entries, scaled so that beta ~ N(0, 1) for entries in the set and 0 for all others; a set has prior odds.
-F: eigenfunctions over the conditions (`discrepancy`): what no library holds; w shared by all runs, v_r a run's own.
+F: eigenfunctions over the conditions (`regressors.features`): what no library holds; w shared by all runs, v_r a run's own.
 Z: what a run has of its own (`regressors.families`; Laird and Ware 1982, Biometrics 38). The variances of w, v and u are
 where the marginal likelihood is largest (MacKay 1992, Neural Computation 4). Given them everything is linear and Gaussian,
 and the evidence of any set follows from one matrix of normal equations (George and McCulloch 1993, J. Am. Stat.
