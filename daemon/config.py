@@ -38,10 +38,11 @@ from jtqd.drivers.sdo import Key, label, parse_key
 from jtqd.drivers.sensor import SENSOR_SCALING_OBJECTS
 from jtqd.estimator.decoder import FieldError, Text, below, check, choice, in_file, limits, parsed, read
 from jtqd.estimator.errors import ConfigError, Verbatim, range_text
+from jtqd.estimator.files import read_regular
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import CONTACT_THRESHOLD, METHODS, EstimatorSettings, PlausibilityLimits
 from jtqd.estimator.text import sha256_hex
-from jtqd.models.files import read_regular, read_yaml, shipped
+from jtqd.models.files import read_yaml, shipped
 
 _PDO_BITS: Final = 64
 _TYPES: Final = {"I16": (16, True), "I32": (32, True), "U16": (16, False), "U32": (32, False)}

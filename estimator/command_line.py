@@ -1,4 +1,4 @@
-"""Command lines: parser with examples, numbers of options, checks before the work, whole outputs."""
+"""Command lines: printable streams, parser with examples, numbers of options, checks before the work."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import argparse
 import importlib.util
 import math
 import os
+import sys
 from pathlib import Path
+from typing import Any, Final, TextIO
 
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.text import printable
 
 
 def command_parser(prog: str, description: str, examples: str) -> argparse.ArgumentParser:
@@ -19,6 +22,29 @@ def command_parser(prog: str, description: str, examples: str) -> argparse.Argum
         epilog=examples,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+class _PrintableStream:
+    """A text stream to which everything is written as `printable`; what else it has is that of `stream`."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.rich_proxied_file: Final = stream
+        """Where rich writes: its colours are control characters. Texts that go to rich are `printable` before."""
+
+    def write(self, text: str) -> int:
+        """Write a text."""
+        return self.rich_proxied_file.write(printable(text))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.rich_proxied_file, name)
+
+
+def printable_streams() -> None:
+    """Let standard output and standard error of this process have `printable` text only; the command line's first call."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is not None and not isinstance(stream, _PrintableStream):
+            setattr(sys, name, _PrintableStream(stream))
 
 
 def seconds(text: str) -> float:
@@ -75,19 +101,6 @@ def make_directory(path: Path) -> None:
         raise ConfigError(
             f"--out {path}: files cannot be created there: no right to, or a read-only file system"
         )
-
-
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file that is there whole or, also after a crash, as it was before. Raises OSError."""
-    temporary = path.with_name(f".{path.name}.part")
-    try:
-        with temporary.open("wb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def check_installed(extra: str, *packages: str) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-import stat
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Final
@@ -11,13 +11,21 @@ from typing import Any, Final
 import yaml
 
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import read_regular
 from jtqd.estimator.joint import Joint
 
-_LARGEST_YAML: Final = 1_000_000
+_LARGEST_YAML: Final = 250_000
 """Bytes; ours have 3000. A log given by mistake must not keep the parser busy for minutes."""
+_MOST_VALUES: Final = 10_000
+"""Keys and values; the largest of ours has 813. PyYAML takes some 0.1 ms for each."""
+_DEEPEST: Final = 50
+_LONGEST_NUMBER: Final = 100
+"""Characters: the conversion of a longer one takes time that grows as the square."""
+_SURROGATE: Final = re.compile("[\ud800-\udfff]")
 _MOST_MERGED: Final = 100_000
 """Keys taken over by merging (<<), those that were merged before counted again."""
 _MERGE_TAG: Final = "tag:yaml.org,2002:merge"
+_NUMBERS: Final = ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float")
 _SHIPPED: Final = Path(__file__).resolve().parent
 
 
@@ -51,6 +59,52 @@ class _Loader(yaml.SafeLoader):
                     merged.append(pair)
         node.value = merged + own
 
+    _values = _depth = 0
+
+    def __init__(self, stream: bytes) -> None:
+        super().__init__(stream)
+        self._sizes: dict[int, int] = {}
+        """Keys and values of each node; what an alias repeats is counted again."""
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        """Compose the next value, unless the file has too many, or they lie too deep."""
+        self._values += 1
+        self._depth += 1
+        problem = ""
+        if self._values > _MOST_VALUES:
+            problem = f"more than {_MOST_VALUES} keys and values"
+        elif self._depth > _DEEPEST:
+            problem = f"values nested more than {_DEEPEST} deep"
+        if problem:
+            raise yaml.composer.ComposerError(None, None, f"found {problem}", self.peek_event().start_mark)  # type: ignore[no-untyped-call]
+        before, again = self._values, self.check_event(yaml.AliasEvent)
+        node: yaml.Node | None = super().compose_node(parent, index)
+        self._depth -= 1
+        if again:
+            self._values += self._sizes.get(id(node), 0)  # 0: inside of itself
+        else:
+            self._sizes[id(node)] = self._values - before
+        return node
+
+    def fetch_flow_collection_start(self, token: Any) -> None:
+        """Begin a list or mapping in brackets: refused here, because the scanner reads a thousand brackets ahead."""
+        if self.flow_level >= _DEEPEST:
+            problem = f"found brackets nested more than {_DEEPEST} deep"
+            raise yaml.scanner.ScannerError(None, None, problem, self.get_mark())
+        super().fetch_flow_collection_start(token)
+
+    def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
+        """Compose a text or number: no half of a surrogate pair, which no text file has, and no number without end."""
+        node: yaml.ScalarNode = super().compose_scalar_node(anchor)
+        problem = ""
+        if _SURROGATE.search(node.value):
+            problem = "found half of a surrogate pair, expected a character"
+        elif node.tag in _NUMBERS and len(node.value) > _LONGEST_NUMBER:
+            problem = f"found a number of {len(node.value)} characters, expected at most {_LONGEST_NUMBER}"
+        if problem:
+            raise yaml.composer.ComposerError(None, None, problem, node.start_mark)
+        return node
+
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
         for key_node, _ in node.value:
@@ -80,32 +134,6 @@ def _identity(key: yaml.Node) -> tuple[str, str | int]:
     return (key.tag, key.value) if isinstance(key, yaml.ScalarNode) else (key.tag, id(key))
 
 
-def read_regular(path: str | os.PathLike[str], largest: int, expected: str) -> bytes:
-    """Return the bytes of a regular file of at most `largest` bytes: no pipe, device or directory is waited for.
-
-    Raises ConfigError; `expected` names in its message what the file should be.
-    """
-    name = os.fspath(path)
-    try:
-        with open(path, "rb", opener=_open_at_once) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise ConfigError(f"{name}: found no regular file, expected {expected}")
-            data = file.read(largest + 1)
-    except OSError as error:
-        raise ConfigError(f"{name}: cannot be read: {error.strerror or error}") from None
-    except ConfigError:
-        raise
-    except ValueError as error:  # a NUL in the name
-        raise ConfigError(f"{name!r}: cannot be read: {error}") from None
-    if len(data) > largest:
-        raise ConfigError(f"{name}: found more than {largest} bytes, expected {expected}")
-    return data
-
-
-def _open_at_once(path: str, flags: int) -> int:
-    return os.open(path, flags | os.O_NONBLOCK)
-
-
 def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Return the root mapping of a YAML file. Raises ConfigError."""
     return read_yaml(path)[0]
@@ -119,6 +147,8 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[dict[str, Any], bytes]:
 
 def parse_yaml(data: bytes, name: str) -> dict[str, Any]:
     """Return the root mapping of a YAML text; `name` is the file's, for messages. Raises ConfigError."""
+    if len(data) > _LARGEST_YAML:
+        raise ConfigError(f"{name}: found {len(data)} bytes, expected a YAML file written by hand")
     try:
         content = yaml.load(data, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -127,7 +157,7 @@ def parse_yaml(data: bytes, name: str) -> dict[str, Any]:
         raise ConfigError(
             f"{name}: not YAML: found {error.character:02X}h at offset {error.position}, expected a text file"
         ) from None
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{name}: not YAML: {reason}") from None
     if not isinstance(content, dict):

@@ -13,6 +13,7 @@ import numpy as np
 from jtqd.daemon.logs import LogError, Records, read_topic
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import check_installed
+from jtqd.estimator.files import whole_file
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (
@@ -169,6 +170,7 @@ def draw(log: Records, joint: int, path: Path) -> float:
             shade(axis, time_s, status == code, _SHADES.get(int(code), _OTHER), label)
     figure.tight_layout(rect=(0.0, 0.0, 0.84, 1.0))
     above.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0, fontsize=8)
-    figure.savefig(path, dpi=110)
+    with whole_file(path) as file:
+        figure.savefig(file, format=path.suffix[1:].lower(), dpi=110)
     plt.close(figure)
     return rmse

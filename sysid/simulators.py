@@ -22,10 +22,11 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
-from jtqd.estimator.command_line import check_output, command_parser, write_whole
+from jtqd.estimator.command_line import check_output, command_parser
 from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
 

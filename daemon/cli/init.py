@@ -42,6 +42,7 @@ from jtqd.drivers.object_dictionary import EdsError
 from jtqd.drivers.survey import DRIVE, SENSOR, BusSurvey, Survey
 from jtqd.estimator.command_line import command_parser, count
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.text import counted
 
 MAX_JOINTS = 4
@@ -386,7 +387,7 @@ def _write(
         except ConfigError as error:
             raise ConfigError(str(error).replace(temporary, str(directory))) from None
         for path in files:
-            path.replace(directory / path.name)
+            write_whole(directory / path.name, path.read_bytes())
     return [directory / each for each in names], period_us
 
 

@@ -14,6 +14,7 @@ from typing import Any
 
 from jtqd.daemon.shared.cycle_record import MOST_JOINTS
 from jtqd.estimator.command_line import seconds
+from jtqd.estimator.files import write_whole
 
 _LAYOUTS = Path(__file__).with_name("layouts")
 _EXAMPLES = """examples:
@@ -62,7 +63,7 @@ def main(argv: list[str] | None = None) -> int:
         sys.stdout.write(text)
         return 0
     try:
-        arguments.out.write_text(text, encoding="utf-8")
+        write_whole(arguments.out, text.encode())
     except OSError as error:
         print(f"jtq layout: {arguments.out}: {error.strerror}", file=sys.stderr)
         return 1

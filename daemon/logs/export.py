@@ -11,10 +11,9 @@ import csv
 import gzip
 import io
 import json
-import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -38,6 +37,7 @@ from jtqd.daemon.logs.read import (
     topics_of,
 )
 from jtqd.daemon.recording.messages import JOINTS
+from jtqd.estimator.files import whole_file
 from jtqd.estimator.text import counted
 
 _EXAMPLES = """examples:
@@ -181,7 +181,7 @@ def _candump(logs: Logs, options: argparse.Namespace, span: dict[str, int]) -> d
     topic = options.topic or topics[0]
     _one_of(logs, topics, topic, "frames on")
     frames = 0
-    with nullcontext(sys.stdout.buffer) if options.out is None else whole_file(options.out) as file:
+    with nullcontext(sys.stdout.buffer) if options.out is None else _table_file(options.out) as file:
         for part in iter_frames(logs, topic, **span):
             file.write("".join(line + "\n" for line in candump_lines(part, options.interface)).encode())
             frames += len(part.ids)
@@ -193,7 +193,7 @@ def _dbc(logs: Logs, config: Path | None, out: Path | None) -> dict[str, Any]:
     if out is None:
         print(text, end="" if text.endswith("\n") else "\n")
         return {}
-    with whole_file(out) as file:
+    with _table_file(out) as file:
         file.write(text.encode())
     return {"path": str(out), "messages": text.count("\nBO_ ")}
 
@@ -434,39 +434,22 @@ class TableSize(NamedTuple):
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """Open a file for writing that is there when it is complete, or not at all; packed where its name ends in .gz.
-
-    A link is followed, and what is no file (a pipe, /dev/stdout) is written to as it is, never replaced. Raises OSError.
-    """
-    target = Path(os.path.realpath(path))
-    beside = not target.exists() or target.is_file()
-    partial = target.with_name(target.name + f".{os.getpid()}.part") if beside else target
-    try:
-        with open(partial, "wb") as plain:
-            if path.suffix == ".gz":
-                # Without name and time: equal content makes equal files.
-                with gzip.GzipFile("", "wb", 6, plain, mtime=0) as packed:
-                    yield packed  # type: ignore[misc]
-            else:
-                yield plain
-        if beside:
-            os.replace(partial, target)
-    except OSError as error:
-        if error.filename in (None, str(partial)):
-            error.filename = str(path)
-        raise
-    finally:
-        if beside:
-            with suppress(OSError):
-                partial.unlink()
+def _table_file(path: Path) -> Iterator[IO[bytes]]:
+    """Open an output as `whole_file` does, packed where its name ends in .gz."""
+    with whole_file(path) as plain:
+        if path.suffix != ".gz":
+            yield plain
+            return
+        # Without name and time: equal content makes equal files.
+        with gzip.GzipFile("", "wb", 6, plain, mtime=0) as packed:
+            yield packed  # type: ignore[misc]
 
 
 def write_csv(path: Path, blocks: Iterable[Columns]) -> TableSize:
     """Write a table: numbers as the shortest text that reads back the same, NaN as an empty cell. Raises OSError."""
     rows = 0
     names: tuple[str, ...] = ()
-    with whole_file(path) as file:
+    with _table_file(path) as file:
         text = io.TextIOWrapper(file, encoding="utf-8", newline="", write_through=False)
         writer = csv.writer(text, lineterminator="\n")
         try:
@@ -499,7 +482,7 @@ def write_parquet(path: Path, blocks: Iterable[Columns]) -> TableSize:
     except ImportError:
         raise LogError("found no pyarrow, expected it for Parquet: pip install 'jtqd[parquet]'") from None
     rows, columns, writer = 0, 0, None
-    with whole_file(path) as file:
+    with _table_file(path) as file:
         try:
             for block in _gathered(blocks):
                 table = pa.table({name: pa.array(np.ascontiguousarray(v)) for name, v in block.items()})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 from math import isnan
 from pathlib import Path
@@ -24,6 +25,7 @@ from jtqd.estimator.command_line import check_output
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.network import NetworkError
 from jtqd.estimator.settings import METHODS
+from jtqd.estimator.text import printable
 
 # ---- results as text ----
 
@@ -262,7 +264,7 @@ def main(argv: list[str]) -> int:
         options = parser().parse_args(argv)
     except SystemExit as leave:
         return int(leave.code or 0)
-    if options.out is not None and options.out.exists():
+    if options.out is not None and os.path.lexists(options.out):
         print(f"jtq replay: {options.out}: exists already, expected a new file", file=sys.stderr)
         return 2
     bar = _Bar()
@@ -318,7 +320,11 @@ class _Bar:
     def update(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` are done."""
         if self._progress is not None:
-            self._progress.update(self._task, description=what, completed=done, total=total)
+            from rich.markup import escape
+
+            self._progress.update(
+                self._task, description=escape(printable(what)), completed=done, total=total
+            )
 
     def close(self) -> None:
         """Take it away."""

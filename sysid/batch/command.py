@@ -38,7 +38,9 @@ from typing import Any, Final
 
 import jtqd
 from jtqd.estimator.command_line import check_installed, command_parser, count, make_directory, seconds
+from jtqd.estimator.decoder import read_json
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import open_regular, write_whole
 from jtqd.estimator.settings import METHODS
 from jtqd.estimator.text import counted
 from jtqd.sysid.progress import bar
@@ -171,7 +173,7 @@ def _first_kind(inside: Sequence[Path], kinds: Sequence[Sequence[str]]) -> list[
 
 def sha256(path: Path) -> str:
     """Return the hash of a file's content. Raises OSError."""
-    with path.open("rb") as file:
+    with open(open_regular(path), "rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -283,7 +285,7 @@ def executor(scheduler: str | None, jobs: int | None) -> Iterator[tuple[Executor
 def stored(out: Path, key: str) -> dict[str, Any] | None:
     """Return the finished result `key`, None where there is none, or half of one."""
     try:
-        content = json.loads((out / "results" / f"{key}.json").read_bytes())
+        content = read_json(out / "results" / f"{key}.json")
     except (OSError, ValueError):
         return None
     good = isinstance(content, dict) and (content.get("schema"), content.get("key")) == (SCHEMA, key)
@@ -294,24 +296,13 @@ def store(out: Path, key: str, content: Mapping[str, Any], files: Mapping[str, b
     """Keep a result: first the files written beside, then the JSON that marks it as finished. Raises OSError."""
     place = out / "results" / key
     shutil.rmtree(place, ignore_errors=True)
+    place.parent.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).write_bytes(data)
     whole = {"schema": SCHEMA, "key": key, **content, "files": sorted(files)}
-    write_whole(place.with_suffix(".json"), json.dumps(whole, indent=1, allow_nan=False))
+    write_whole(place.with_suffix(".json"), json.dumps(whole, indent=1, allow_nan=False).encode())
     return whole
-
-
-def write_whole(path: Path, text: str) -> None:
-    """Put a file in place that is there whole or not at all, also where two batches write it. Raises OSError."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
 
 
 def run_batch(
@@ -645,11 +636,11 @@ def _run(options: argparse.Namespace, groups: Sequence[Group], task: Task, param
         )
     mapping = to_mapping(task.command, parameters, tool, rows, where)
     text = json.dumps(mapping, indent=1, allow_nan=False)
-    write_whole(options.out / SUMMARY, f"{text}\n")
+    write_whole(options.out / SUMMARY, f"{text}\n".encode())
     made = dt.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
     foot = f"{made} · jtqd {tool}"
     foot += f" · options: {' '.join(task.arguments)}" if task.arguments else ""
-    write_whole(options.out / PAGE, render(task.command, rows, where, foot))
+    write_whole(options.out / PAGE, render(task.command, rows, where, foot).encode())
     number = counts(rows)
     if options.json:
         print(text)

@@ -19,7 +19,9 @@ from typing import Final
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.command_line import count, natural, seconds
+from jtqd.estimator.decoder import read_json
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
 from jtqd.models.files import load_joint, shipped
@@ -79,7 +81,7 @@ def _write_run_files(out: Path, plant: Path, seed: int, numbered: tuple[int, Run
     path = out / f"{run.name}.csv.gz"
     write_run(path, made.table)
     write_truth(path, {number: made.joint_torque_nm[:, place] for place, number in enumerate(run.joints)})
-    (out / f"{run.name}.json").write_text(json.dumps(marks_of(run, expand(run)), indent=1) + "\n")
+    write_whole(out / f"{run.name}.json", f"{json.dumps(marks_of(run, expand(run)), indent=1)}\n".encode())
     return run.name
 
 
@@ -136,14 +138,14 @@ def _claim(out: Path, plan: Plan, plant: Path, seed: int) -> None:
     file = out / _RECIPE
     if file.is_file():
         try:
-            same = json.loads(file.read_bytes()) == recipe
+            same = read_json(file) == recipe
         except ValueError:
             same = False
         if not same:
             raise ConfigError(f"{out}: found runs of another plan, bench or seed, expected a new directory")
         return
     out.mkdir(parents=True)
-    file.write_text(json.dumps(recipe, indent=1) + "\n", encoding="utf-8")
+    write_whole(file, f"{json.dumps(recipe, indent=1)}\n".encode())
 
 
 if __name__ == "__main__":

@@ -25,9 +25,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
-from jtqd.estimator.text import counted
+from jtqd.estimator.text import counted, printable
 from jtqd.sysid.campaign.bench import Bench, BenchConfig, Interrupted, Jtqd, Play, ProcessError, StopAsked
 from jtqd.sysid.campaign.state import DONE, FAILED, PARTS, STATUSES, STOPPED, CampaignDirectory, RunState
 from jtqd.sysid.motion.setpoints import PERIOD_S, MotionError, MotionResult, Setpoints
@@ -278,7 +279,7 @@ def _recorded(run: Run, setpoints: Setpoints, config: BenchConfig, log: Sequence
         return Attempt(state, again=True)
     sha256 = write_run(out / f"{run.name}.csv.gz", logged.table)
     marks = marks_of(run, setpoints) | ({"interpolated_s": gaps} if interpolated else {})
-    (out / f"{run.name}.json").write_text(json.dumps(marks, indent=1) + "\n")
+    write_whole(out / f"{run.name}.json", f"{json.dumps(marks, indent=1)}\n".encode())
     return Attempt(replace(state, status=DONE, sha256=sha256))
 
 
@@ -340,7 +341,7 @@ class Reporter:
         self._name = ""
         self._shown_s = 0.0
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(None),
             TextColumn("{task.percentage:3.0f} %"),
             TextColumn("{task.fields[left]} left"),
@@ -397,7 +398,7 @@ class Reporter:
     def write_line(self, text: str) -> None:
         """Write a line on stderr, above the bar where there is one."""
         if self._console.is_terminal:
-            self._bar.console.print(text, markup=False, highlight=False, soft_wrap=True)
+            self._bar.console.print(printable(text), markup=False, highlight=False, soft_wrap=True)
         else:
             print(f"jtq campaign: {text}", file=sys.stderr, flush=True)
 

@@ -15,9 +15,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from jtqd.estimator.command_line import write_whole
-from jtqd.estimator.decoder import Text, below, choice, in_file, read, split
+from jtqd.estimator.decoder import Text, below, choice, in_file, read, read_json, split
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.sysid.planner.plan import Plan, load_plan
 
 SCHEMA: Final = "jtq.campaign/1"
@@ -148,13 +148,12 @@ class CampaignDirectory:
     def _load(self) -> None:
         path = self.path / STATE_FILE
         try:
-            data = path.read_bytes()
+            content = read_json(path)
+            with in_file(str(path)):
+                file = read(_StateFile, content)
+                self.runs = dict(_run_state(n, each) for n, each in enumerate(file.runs))
         except FileNotFoundError:
             return
-        try:
-            with in_file(str(path)):
-                file = read(_StateFile, json.loads(data))
-                self.runs = dict(_run_state(n, each) for n, each in enumerate(file.runs))
         except (ValueError, ConfigError) as error:  # ConfigError names the file itself
             text = str(error) if isinstance(error, ConfigError) else f"{path}: not JSON: {error}"
             raise StateError(text) from None

@@ -7,7 +7,6 @@ import datetime as dt
 import hashlib
 import json
 import math
-import os
 import shlex
 import sys
 import tempfile
@@ -22,6 +21,7 @@ from jtqd import __version__
 from jtqd.estimator.command_line import check_installed, command_parser, make_directory
 from jtqd.estimator.corrections import with_effects_applied
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Effect, Joint
 from jtqd.estimator.run import RunTableError
 from jtqd.estimator.text import counted
@@ -310,10 +310,10 @@ def _write(
         texts[FINDINGS] = f"{_json(mapping)}\n"
         for name, text in texts.items():
             (fresh / name).write_text(text, encoding="utf-8")
-        for name in _own():
+        for name in {*_own()} - {*names, FINDINGS}:
             (directory / name).unlink(missing_ok=True)
         for name in (*names, FINDINGS):
-            os.replace(fresh / name, directory / name)
+            write_whole(directory / name, (fresh / name).read_bytes())
     return mapping
 
 

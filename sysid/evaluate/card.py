@@ -24,6 +24,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.decoder import plain_values
+from jtqd.estimator.files import whole_file
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
 from jtqd.sysid.evaluate.inputs import OURS, TITLES, JointModels, Samples
@@ -555,7 +556,8 @@ def write_png(card: Card, path: Path) -> None:
         below.text(0.012, top, "What to measure next", fontsize=11, weight="bold", va="top")
         text = "\n".join(lines) or "Nothing: every speed, load and temperature was measured."
         below.text(0.012, top - 0.24 / foot, text, va="top", linespacing=1.35)
-        figure.savefig(path, dpi=110)
+        with whole_file(path) as file:
+            figure.savefig(file, format="png", dpi=110)
         plt.close(figure)
 
 

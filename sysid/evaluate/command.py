@@ -11,8 +11,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-from jtqd.estimator.command_line import check_installed, command_parser, make_directory, write_whole
+from jtqd.estimator.command_line import check_installed, command_parser, make_directory
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.sysid.evaluate.card import (
     BASELINE,
     Card,

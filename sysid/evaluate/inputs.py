@@ -20,10 +20,10 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import json
 import re
 import zlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -33,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
+from jtqd.estimator.decoder import parse_json, read_json
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import STANDSTILL_SIGMAS, estimate_columns, observe_run, quadrants
 from jtqd.estimator.joint import Joint
@@ -109,14 +110,15 @@ def _network_runs(path: Path) -> frozenset[str]:
     hashes = _hashes(_json(metadata.get(_RUNS, "")))
     card = path.with_suffix(".json")
     if card.is_file():
-        content = _json(card.read_text(encoding="utf-8", errors="replace"))
-        hashes |= _hashes(content.get(_RUNS) if isinstance(content, dict) else None)
+        with suppress(OSError, ValueError):
+            content = read_json(card)
+            hashes |= _hashes(content.get(_RUNS) if isinstance(content, dict) else None)
     return hashes
 
 
 def _json(text: str) -> Any:
     try:
-        return json.loads(text)
+        return parse_json(text)
     except ValueError:
         return None
 
@@ -357,7 +359,7 @@ def by_marks(path: Path) -> int | None:
     """Return the velocity joint that the campaign's NAME.json beside NAME.csv.gz names, None where it does not."""
     stem = path.name.removesuffix(".gz").removesuffix(".csv")
     try:
-        marks = json.loads(path.with_name(f"{stem}.json").read_text(encoding="utf-8"))
+        marks = read_json(path.with_name(f"{stem}.json"))
     except (OSError, ValueError):
         return None
     number = marks.get("velocity_joint") if isinstance(marks, dict) else None

@@ -28,6 +28,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import plain_values
+from jtqd.estimator.files import whole_file
 from jtqd.estimator.joint import CONVENTIONS, QUADRANTS, Efficiency, Joint, QuadrantPolynomial
 from jtqd.estimator.losses import (
     BACKDRIVING_CURRENT_MAX_A,
@@ -574,7 +575,8 @@ def draw_fit(points: Sequence[EtaPoint], fit: EfficiencyFit, title: str, path: P
     from matplotlib import pyplot as plt
 
     figure = fit_figure(points, fit, title)
-    figure.savefig(path, dpi=100)
+    with whole_file(path) as file:
+        figure.savefig(file, format=path.suffix[1:].lower(), dpi=100)
     plt.close(figure)
 
 

@@ -13,8 +13,8 @@ from typing import Any, Final
 
 import yaml
 
-from jtqd.estimator.command_line import write_whole
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import parse_yaml
 

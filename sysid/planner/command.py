@@ -14,6 +14,7 @@ import numpy as np
 
 from jtqd.estimator.command_line import command_parser, count, natural, seconds
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.planner.design import FINAL_RATE_HZ, STARTS, Bench, ExcitationLimits, design, starts_of
@@ -125,7 +126,7 @@ def _design(options: argparse.Namespace) -> None:
         )
         plan = Plan("excitation", DEFAULT_LIMITS, runs)
         check_plan(plan)
-        options.out.write_text(plan.to_yaml(), encoding="utf-8")
+        write_whole(options.out, plan.to_yaml().encode())
         print(f"jtq excitation: wrote {options.out}", file=sys.stderr)
     peaks = [_peaks(one.segment, joints) for one in designs]
     if options.json:

@@ -16,6 +16,7 @@ from typing import Final
 
 from jtqd.estimator.command_line import command_parser, make_directory
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import write_whole
 from jtqd.estimator.joint import ELASTIC
 from jtqd.estimator.text import table_lines
 from jtqd.sysid.progress import progress
@@ -53,7 +54,7 @@ def main(argv: list[str]) -> int:
             print(f"{BY}: {options.out / there[0]}: exists; --force replaces it", file=sys.stderr)
             return 2
         for name, text in files.items():
-            (options.out / name).write_text(text, encoding="utf-8")
+            write_whole(options.out / name, text.encode())
     except (RunError, ProposalError, ConfigError) as error:
         where = f"{options.from_csv[0]}: " if isinstance(error, ProposalError) else ""
         print(f"{BY}: {where}{error}", file=sys.stderr)

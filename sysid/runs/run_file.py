@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.files import open_regular
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
 from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import JOINTS, TIME, ColumnMap
@@ -56,7 +57,8 @@ class Content:
 def file_bytes(path: Path) -> tuple[bytes, str]:
     """Return the content of a file and its SHA-256. Raises RunError."""
     try:
-        data = path.read_bytes()
+        with open(open_regular(path), "rb") as file:
+            data = file.read()
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
     if not data:

@@ -25,7 +25,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.command_line import write_whole
+from jtqd.estimator.files import whole_file, write_whole
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
 from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import TIME, Column, ColumnMap, Expression, ExpressionError, targets
@@ -367,7 +367,8 @@ def truth_path(run: Path) -> Path:
 def write_truth(run: Path, torque_nm: Mapping[int, FloatArray]) -> None:
     """Write the true torque [n] of each joint of a run. Raises OSError."""
     arrays = {f"j{number}": values for number, values in torque_nm.items()}
-    np.savez_compressed(truth_path(run), **arrays)  # type: ignore[arg-type]
+    with whole_file(truth_path(run)) as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def read_truth(run: Path) -> dict[int, FloatArray]:

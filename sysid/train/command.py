@@ -16,6 +16,7 @@ import numpy as np
 
 from jtqd.estimator.command_line import check_installed, command_parser, count, make_directory, natural
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import whole_file, write_whole
 from jtqd.estimator.joint import Joint
 from jtqd.models.files import load_joint
 from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
@@ -79,7 +80,7 @@ def write_card(
         *(f"- {name} {sha}" for name, sha in metadata["runs"].items()),
         "",
     ]
-    path.with_suffix(".md").write_text("\n".join(lines), encoding="utf-8")
+    write_whole(path.with_suffix(".md"), "\n".join(lines).encode())
 
 
 def _envelope(metadata: Mapping[str, Any]) -> list[str]:
@@ -125,7 +126,8 @@ def _draw(picture: Path, joint: Joint, kind: str, result: TrainedNetwork) -> Non
         axes[2].set(xlabel="motor torque at the joint, Nm", ylabel="joint velocity, rad/s", title="envelope")
     for axis in axes[:2]:
         axis.grid(alpha=0.3)
-    figure.savefig(picture, dpi=110)
+    with whole_file(picture) as file:
+        figure.savefig(file, format="png", dpi=110)
     plt.close(figure)
 
 
@@ -250,7 +252,7 @@ def _train_joint(
         left = f"; {path} is of an earlier training" if path.exists() else ""
         report(f"{joint.name}: no network is written: {gate.text}; jtqd runs on physics alone{left}")
     else:
-        path.write_bytes(result.data)
+        write_whole(path, result.data)
         digest = hashlib.sha256(result.data).hexdigest()
         write_card(path, joint, options.network, result, digest, gate=gate)
         report(
