@@ -11,6 +11,7 @@ import os
 import sys
 
 from jtqd import __version__
+from jtqd.estimator.command_line import printable_streams
 
 GROUPS = {
     "run: the bus, the daemon and this machine": {
@@ -117,6 +118,7 @@ def _open_streams() -> None:
             if null != number:
                 os.close(null)
             setattr(sys, name, open(number, "w" if number else "r", encoding="utf-8", closefd=False))  # noqa: SIM115
+    printable_streams()
 
 
 def _print_help(arguments: list[str]) -> int:

@@ -16,7 +16,7 @@ from typing import Any
 # What is heavy to load is loaded in `_run`: Ctrl-C must find its handler installed, also in the first second.
 from jtqd import __version__
 from jtqd.daemon.live import NEEDED, Address, address, installed
-from jtqd.estimator.command_line import command_parser, seconds
+from jtqd.estimator.command_line import command_parser, printable_streams, seconds
 
 _EXAMPLES = """examples:
   jtqd --bus sim --duration 20          emulated bench in its own processes, 20 s, with a live table
@@ -57,6 +57,7 @@ def parser() -> argparse.ArgumentParser:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the daemon; returns the exit status."""
+    printable_streams()
     arguments = parser().parse_args(argv)
     with _early_signals() as stop_requests:
         return _run(arguments, stop_requests)

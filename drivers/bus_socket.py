@@ -28,6 +28,7 @@ from jtqd.drivers.frame import (
     CAN_SFF_MASK,
     FRAME_SIZE,
 )
+from jtqd.estimator.files import peer_user, trusted_users
 
 SO_TIMESTAMPNS = 35  # asm-generic/socket.h
 SO_RXQ_OVFL = 40
@@ -233,6 +234,8 @@ def open_unix(path: str, filters: Sequence[CanFilter], error_frames: bool) -> so
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, _CONNECT_TIMEOUT)
         with reachable(path) as address:
             sock.connect(address)
+        if (user := peer_user(sock)) not in trusted_users():
+            raise PermissionError(errno.EPERM, f"user {user} answers there")
         sock.setblocking(False)
     except (FileNotFoundError, NotADirectoryError, ConnectionRefusedError):
         sock.close()

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import io
 import logging
-import os
-import stat
 import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -37,6 +35,8 @@ from jtqd.drivers.sdo import (
     abort_frame,
     label,
 )
+from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import read_regular
 
 # Data types (CiA 301, 7.4.7)
 BOOLEAN, REAL32, VISIBLE_STRING, REAL64 = 0x01, 0x08, 0x09, 0x11
@@ -262,7 +262,7 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     from canopen.objectdictionary import eds as parser
 
     name = str(eds) if str(eds).isprintable() else repr(str(eds))
-    text = _eds_text(eds, name)
+    text = _eds_text(eds)
     logger = logging.getLogger(parser.__name__)
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # an EdsError has the reason in one line
@@ -280,24 +280,15 @@ def read_eds(eds: Path | str, node_id: int) -> list[Entry]:
     return entries
 
 
-def _eds_text(eds: Path | str, name: str) -> str:
+def _eds_text(eds: Path | str) -> str:
     """Return the text of a regular file that is not too large. Raises EdsError.
 
     CiA 306 wants ASCII; makers write units and names in the code page of their machines.
     """
     try:
-        with open(eds, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as file:
-            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-                raise EdsError(f"{name}: found no regular file, expected an EDS")
-            data = file.read(_LARGEST_EDS + 1)
-    except OSError as error:
-        raise EdsError(f"{name}: cannot be read: {error.strerror or error}") from None
-    except EdsError:
-        raise
-    except ValueError as error:  # a NUL in the name
-        raise EdsError(f"{name}: cannot be read: {error}") from None
-    if len(data) > _LARGEST_EDS:
-        raise EdsError(f"{name}: found more than {_LARGEST_EDS} bytes, expected an EDS")
+        data = read_regular(eds, _LARGEST_EDS, "an EDS")
+    except ConfigError as error:
+        raise EdsError(str(error)) from None
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:

@@ -22,9 +22,10 @@ be left out where its field has a default or may be None; a section or list that
 from __future__ import annotations
 
 import math
+import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import cache
@@ -35,6 +36,7 @@ import msgspec
 from msgspec import inspect
 
 from jtqd.estimator.errors import ConfigError, Verbatim, in_unit, number_as_text, range_text, shown
+from jtqd.estimator.files import read_file
 
 T = TypeVar("T")
 _LARGEST = 1e30
@@ -455,6 +457,21 @@ def _expected(node: Any, unit: str) -> str:
 def plain_values(value: Any) -> Any:
     """Return a value as JSON has it: dataclasses and mappings as dicts, keys as text, NaN and infinity as None."""
     return msgspec.json.decode(msgspec.json.encode(value, enc_hook=_json_value))
+
+
+def parse_json(text: bytes | str) -> Any:
+    """Return the value of a JSON text. Raises ValueError, of one line, for whatever is no JSON of this depth and UTF-8."""
+    try:
+        return msgspec.json.decode(text)
+    except RecursionError:
+        raise ValueError("nested too deep") from None
+
+
+def read_json(
+    path: str | os.PathLike[str], largest: int = 1 << 24, *, owners: Container[int] | None = None
+) -> Any:
+    """Return the value of a JSON file, read as by `read_file`. Raises OSError, ValueError."""
+    return parse_json(read_file(path, largest, owners=owners))
 
 
 def _json_value(value: Any) -> Any:

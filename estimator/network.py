@@ -20,7 +20,6 @@ import binascii
 import json
 import math
 import os
-import stat
 import struct
 import sys
 import threading
@@ -29,7 +28,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -37,6 +35,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import FieldError, read
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import open_regular
 from jtqd.estimator.joint import Envelope, Joint
 from jtqd.estimator.native_network import Perceptron
 from jtqd.estimator.settings import METHODS, EstimatorSettings
@@ -436,14 +435,10 @@ class Network:
 
     def _read(self, path: str | os.PathLike[str]) -> bytes:
         try:
-            if stat.S_ISREG(os.stat(path).st_mode):  # a pipe would be waited for
-                return Path(path).read_bytes()
-            reason = "not a regular file"
+            with open(open_regular(path), "rb") as file:
+                return file.read()
         except OSError as error:
-            reason = error.strerror or str(error)
-        except ValueError as error:  # a NUL in the name
-            reason = str(error)
-        raise self.error(f"cannot be read: {reason}")
+            raise self.error(f"cannot be read: {error.strerror or error}") from None
 
 
 class TorqueNetwork(Network):

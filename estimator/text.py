@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Container, Sequence
 from contextlib import suppress
 from importlib import import_module
@@ -10,7 +11,21 @@ from typing import Any, Final
 
 NOTHING: Final = "-"
 """Shown in place of a number that is not known."""
+_CONTROL: Final = re.compile(
+    "[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
 _BYTES: Final = ("B", "kB", "MB", "GB", "TB")
+
+
+def printable(text: str) -> str:
+    """Return a text as a terminal may get it: "?" for control characters but newline and tab, and for half characters.
+
+    Control characters are those of ISO 6429 and those that turn the direction of writing.
+
+    >>> printable("node 3: " + chr(27) + "[2J" + chr(0xD800))
+    'node 3: ?[2J?'
+    """
+    return _CONTROL.sub("?", text)
 
 
 def finite(value: float) -> float | None:

@@ -17,6 +17,7 @@ from jtqd.daemon.config import Config
 from jtqd.daemon.shared.conditions import Condition
 from jtqd.daemon.shared.events import ERROR
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, View
+from jtqd.daemon.supervisor.display import PrintableView
 from jtqd.drivers import nmt
 from jtqd.drivers.bus_load import LIMIT
 from jtqd.drivers.frame import CAN_EFF_FLAG, CAN_EFF_MASK, CAN_SFF_MASK
@@ -64,7 +65,7 @@ def report(results: Sequence[CheckResult], schema: str | None, **more: Any) -> i
     """
     level = worst(results)
     if schema is None:
-        show(Console(), results)
+        show(Console(markup=False), results)
     else:
         items = [asdict(each) for each in results]
         print(json.dumps({"schema": schema, "result": level, **more, "items": items}))
@@ -82,7 +83,7 @@ def show(console: Console, results: Sequence[CheckResult]) -> None:
         if each.hint and (following is None or following.hint != each.hint):  # one hint for a row of them
             text.append(f"\n> {each.hint}", style="italic")
         table.add_row(Text(each.level, style=_STYLES[each.level]), each.item, text)
-    console.print(table)
+    console.print(PrintableView(table))
     count = {level: sum(each.level == level for each in results) for level in (GOOD, WARN, FAIL)}
     level = worst(results)
     counts = f": {count[GOOD]} good, {counted(count[WARN], 'warning')}, {counted(count[FAIL], 'failure')}"

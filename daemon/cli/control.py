@@ -6,6 +6,7 @@ import argparse
 import json
 import socket
 import sys
+from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,9 @@ from jtqd.daemon.cli.running import NoDaemonError, choose_daemon
 from jtqd.daemon.supervisor.control import FILE, REPLY_BYTES, VERBS
 from jtqd.drivers.bus_socket import reachable
 from jtqd.estimator.command_line import command_parser
+from jtqd.estimator.decoder import parse_json
+from jtqd.estimator.files import peer_user, trusted_users
+from jtqd.estimator.text import NOTHING
 
 _TIMEOUT_S = 10.0
 _EXAMPLES = """examples:
@@ -56,9 +60,9 @@ def main(argv: list[str]) -> int:
     if arguments.json:
         print(json.dumps(reply))
     elif reply["ok"]:
-        print(_DONE[arguments.verb].format(**{"bus": bus} | reply))
+        print(_DONE[arguments.verb].format_map(defaultdict(lambda: NOTHING, {"bus": bus} | reply)))
     if not reply["ok"]:
-        print(f"jtq control: {arguments.verb}: {reply['error']}", file=sys.stderr)
+        print(f"jtq control: {arguments.verb}: {reply.get('error', NOTHING)}", file=sys.stderr)
     return 0 if reply["ok"] else 1
 
 
@@ -68,11 +72,13 @@ def ask(path: Path, request: dict[str, Any], timeout_s: float) -> dict[str, Any]
         sock.settimeout(timeout_s)
         with reachable(path) as address:
             sock.connect(address)
+        if (user := peer_user(sock)) not in trusted_users():
+            raise ConnectionError(f"{path}: found that user {user} answers there, expected the daemon's")
         sock.send(json.dumps(request).encode())
         data = sock.recv(REPLY_BYTES)
     if not data:
         raise ConnectionError(f"{path}: jtqd closed the connection without a reply")
-    reply = json.loads(data)
+    reply = parse_json(data)
     if not isinstance(reply, dict) or not isinstance(reply.get("ok"), bool):
         raise ValueError(f"{path}: found a reply without 'ok', expected a JSON object with it")
     return reply

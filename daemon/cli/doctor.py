@@ -463,6 +463,8 @@ def _remains(log: Path | None, search: DaemonSearch) -> Iterator[CheckResult]:
     ]
     text = ", ".join(files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")
     yield judge("unfinished logs", text or "none", (files, WARN, "of a crash: jtq recover FILE"))
+    if search.foreign:
+        yield CheckResult("other users", SKIP, f"{len(search.foreign)} runtime directories, not read")
     if search.abandoned:
         text = ", ".join(map(str, search.abandoned))
         hint = "runtime directories; removed by the next start, or remove them manually"

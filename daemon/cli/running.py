@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import time
 from collections import deque
@@ -16,8 +15,17 @@ from jtqd.daemon.recording.run_files import Account, read_account
 from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import Notice, NoticesReader
-from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, SharedMemoryError, read_about
+from jtqd.daemon.shared.runtime_dir import (
+    FILE,
+    About,
+    AboutError,
+    SharedMemoryError,
+    read_about,
+    read_shared,
+)
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
+from jtqd.estimator.files import trusted_users
+from jtqd.estimator.text import counted
 
 _SHARED = ("/dev/shm", "/run/jtqd/*", "/run/user/*")
 STILL_S = 0.25
@@ -48,6 +56,8 @@ class DaemonSearch(NamedTuple):
     """Runtime directories that this user may not read."""
     abandoned: tuple[Path, ...]
     """Runtime directories of killed daemons; the next start on the same bus reuses them."""
+    foreign: tuple[Path, ...] = ()
+    """What users made who are neither root nor this user nor a service's: not read."""
 
 
 def places() -> list[Path]:
@@ -61,10 +71,13 @@ def places() -> list[Path]:
 
 def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
     """Return every running daemon, by the name of its bus; `roots`: directories instead of `places()`."""
-    daemons, closed, abandoned = [], [], []
+    daemons, closed, abandoned, foreign, users = [], [], [], [], trusted_users()
     for root in places() if roots is None else roots:
         for directory in _subdirectories(root):
             try:
+                if directory.lstat().st_uid not in users:
+                    foreign.append(directory)
+                    continue
                 os.scandir(directory).close()
                 content = read_about(directory / FILE)
             except PermissionError:
@@ -77,7 +90,10 @@ def find_daemons(roots: Iterable[Path] | None = None) -> DaemonSearch:
                 else:
                     abandoned.append(directory)
     return DaemonSearch(
-        tuple(sorted(daemons, key=lambda each: each.about.bus)), tuple(closed), tuple(abandoned)
+        tuple(sorted(daemons, key=lambda each: each.about.bus)),
+        tuple(closed),
+        tuple(abandoned),
+        tuple(foreign),
     )
 
 
@@ -108,10 +124,13 @@ def choose_daemon(bus: str | None) -> Daemon:
     closed = "".join(
         f"\n  {path} belongs to another user: join its group to read it" for path in search.closed
     )
+    if search.foreign:
+        what = counted(len(search.foreign), "directory", "directories")
+        closed = f" ({what} of other users not read){closed}"
     if bus is not None:
         daemon = on_bus(search, bus)
         if daemon is None:
-            raise NoDaemonError(f"no jtqd runs on {bus}{others}{closed}", 1)
+            raise NoDaemonError(f"no jtqd runs on {bus}{closed}{others}", 1)
         return daemon
     if not search.daemons:
         raise NoDaemonError(f"no jtqd runs on this machine{closed}", 1)
@@ -122,7 +141,7 @@ def choose_daemon(bus: str | None) -> Daemon:
 
 def _subdirectories(root: Path) -> list[Path]:
     try:
-        return sorted(each for each in root.glob("jtqd-*-*") if each.is_dir())
+        return sorted(each for each in root.glob("jtqd-*-*") if each.is_dir() and not each.is_symlink())
     except OSError:
         return []
 
@@ -207,7 +226,7 @@ class Watch:
 
 def _bus(directory: Path) -> dict[str, Any]:
     try:
-        content = json.loads((directory / "bus.json").read_text())
+        content = read_shared(directory / "bus.json")
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -38,7 +38,7 @@ from jtqd.daemon.shared.events import ERROR, WARNING
 from jtqd.daemon.shared.reasons import contact_line, contact_of, drive_state, joint_reason, silent_s
 from jtqd.daemon.shared.runtime_dir import About
 from jtqd.daemon.shared.snapshot import LATE_BIN_NS, WORK_BIN_NS, SnapshotReader, View
-from jtqd.daemon.supervisor.display import COLOURS, bus_load, first_that_fits, plain_line
+from jtqd.daemon.supervisor.display import COLOURS, PrintableView, bus_load, first_that_fits, plain_line
 from jtqd.drivers import nmt
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.status import NAMES, PUBLISHED
@@ -52,7 +52,7 @@ _EXAMPLES: Final = """examples:
   jtq status --json | jq '.joints[].torque_nm'
 
 exit status: 0 running, 1 no daemon runs (or none that you may read), 2 usage, 3 stalled or still starting
-you may read your own daemons and those of your groups (usermod -a -G jtqd YOU)"""
+you may read your own daemons, and those of root and of the services of your groups (usermod -a -G jtqd YOU)"""
 _FAULTS: Final = shown_in(Shown.STATUS)
 """Counters shown when they are not zero."""
 _LAST_NOTICES: Final = 4
@@ -599,7 +599,7 @@ def main(argv: list[str]) -> int:
         if arguments.json or arguments.once:
             return _once(daemon, as_json=arguments.json)
         os.nice(5)
-        console = Console()
+        console = Console(markup=False)
         return _live(console, daemon) if console.is_terminal else _lines(daemon)
     except NoDaemonError as error:
         print(f"jtq status: {error}", file=sys.stderr)
@@ -616,7 +616,7 @@ def _once(daemon: Daemon, *, as_json: bool) -> int:
     if as_json:
         print(json.dumps(content(reading)))
     else:
-        Console().print(StatusView(reading))
+        Console(markup=False).print(PrintableView(StatusView(reading)))
     return 0 if reading.state == RUNNING else 3
 
 
@@ -629,7 +629,7 @@ def _live(console: Console, daemon: Daemon) -> int:
                 reading = watch.read()
                 if reading.state == RUNNING:
                     recent.add(time.monotonic(), reading)
-                shown, number = paged(console, StatusView(reading, recent), number)
+                shown, number = paged(console, PrintableView(StatusView(reading, recent)), number)
                 live.update(shown, refresh=True)
             else:
                 ended = f"jtqd on {daemon.about.instance} has ended; waiting for its restart"

@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from jtqd.daemon.recording.mcap_file import MAGIC, SealedChunk, attachment_index, bytes_of, seal
 from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS
 from jtqd.daemon.recording.run_files import ACTIVE
+from jtqd.estimator.files import open_regular
 
 HEAD = struct.Struct("<BQ")
 """Opcode, and the length of what follows."""
@@ -320,12 +321,12 @@ class LogFile:
 
     Raises:
         LogError: no MCAP file, one that ends too early and is not called `.active`, or messages outside chunks.
-        OSError: it cannot be read.
+        OSError: it cannot be read, or is no regular file.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._descriptor = open_regular(path)
         try:
             self._source = Source(self._descriptor)
             self._open()

@@ -27,6 +27,7 @@ import msgspec
 from jtqd.daemon.logs.log_file import Contents, LogError, Source, sealed_chunk
 from jtqd.daemon.recording.mcap_file import Head, McapFile, NamedData, SealedChunk, Span
 from jtqd.daemon.recording.run_files import ACTIVE, PartFile, free_bytes, part_files
+from jtqd.estimator.files import open_regular
 from jtqd.estimator.text import counted
 
 _PARTIAL = ".recovering"
@@ -95,7 +96,7 @@ def recover(
             wrote it, or the new name is taken.
         OSError: it cannot be read or written, or there is no room for the copy.
     """
-    descriptor = os.open(path, (os.O_RDONLY if dry_run else os.O_RDWR) | os.O_CLOEXEC)
+    descriptor = open_regular(path, os.O_RDONLY if dry_run else os.O_RDWR)
     try:
         _lock(descriptor, path, shared=dry_run)
         before = os.fstat(descriptor)
@@ -328,7 +329,7 @@ def recover_unfinished(file: PartFile, keep_free: int = 0) -> tuple[str, bool] |
     """Recover one file of an earlier run: what was done, and whether something was lost. None: it is being written."""
     path = file.path
     try:
-        with open(path, "rb") as opened:
+        with open(open_regular(path), "rb") as opened:
             try:
                 fcntl.flock(opened, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:

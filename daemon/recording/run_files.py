@@ -19,6 +19,8 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from jtqd.estimator.files import read_file, trusted_users
+
 ACTIVE = ".active"
 _RUN = r"(?P<stamp>\d{8}T\d{6}Z)(?:_(?P<again>[1-9]\d*))?"
 RUN_PATTERN = re.compile(_RUN, re.ASCII)
@@ -164,6 +166,6 @@ class ProgressFile:
 def read_account(path: Path) -> Account | None:
     """Return what was stored last; None where there is no such file, or it cannot be read."""
     try:
-        return Account(*_LAYOUT.unpack_from(path.read_bytes()))
+        return Account(*_LAYOUT.unpack_from(read_file(path, _LAYOUT.size, owners=trusted_users())))
     except (OSError, struct.error):
         return None

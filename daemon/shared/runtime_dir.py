@@ -21,12 +21,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from jtqd.estimator.files import open_regular, trusted_users
 from jtqd.estimator.text import sha256_hex
 
 FILE = "about.json"
 SCHEMA = "jtqd.about/1"
 _LOCK = "lock"
 _ATTEMPTS = 100
+_LARGEST_JSON = 1 << 20
+"""Bytes; an about.json of four joints has some 5000."""
 
 
 def write_whole(path: Path, text: str, mode: int = 0o640) -> None:
@@ -54,16 +57,26 @@ def new_memory(path: Path, size: int, head: bytes, mode: int = 0o640) -> mmap.mm
     return memory
 
 
+def read_shared(path: Path) -> Any:
+    """Return the value of a JSON file of a running daemon of a trusted user. Raises OSError, ValueError."""
+    from jtqd.estimator.decoder import read_json
+
+    return read_json(path, _LARGEST_JSON, owners=trusted_users())
+
+
 class SharedMemoryError(Exception):
     """No memory of this kind and layout at the path: ring, snapshot or notices."""
 
 
 def mapped(path: Path, missing: str, *, writable: bool = False) -> mmap.mmap:
-    """Map shared memory of a running daemon. Raises SharedMemoryError, with what is `missing`."""
+    """Map shared memory of a running daemon of a trusted user. Raises SharedMemoryError, with what is `missing`."""
     access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
     try:
-        with open(path, "r+b" if writable else "rb") as file:
-            return mmap.mmap(file.fileno(), 0, access=access)
+        descriptor = open_regular(path, os.O_RDWR if writable else os.O_RDONLY, owners=trusted_users())
+        try:
+            return mmap.mmap(descriptor, 0, access=access)
+        finally:
+            os.close(descriptor)
     except (OSError, ValueError) as error:
         raise SharedMemoryError(f"{path}: {missing}: {error}") from None
 
@@ -232,7 +245,7 @@ def read_about(path: Path) -> About:
     import msgspec
 
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_shared(path)
         if content["schema"] != SCHEMA:
             raise AboutError(f"{path}: written by another version of jtqd")
         return msgspec.convert(content, About)

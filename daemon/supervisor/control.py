@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import os
 import socket
-import struct
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -21,6 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from jtqd.drivers.bus_socket import reachable
+from jtqd.estimator.decoder import parse_json
+from jtqd.estimator.files import peer_user
 
 FILE = "control"
 """Name of the socket in the runtime directory."""
@@ -29,7 +30,6 @@ REQUEST_BYTES, REPLY_BYTES = 4096, 65_536
 MOST_CONNECTIONS = 8
 PATIENCE_S = 5.0
 """A connection that asks nothing for so long is closed."""
-_CREDENTIALS = struct.Struct("3i")
 _BACKLOG = 8
 
 Reply = dict[str, Any]
@@ -147,8 +147,8 @@ class ControlServer:
 
     def _carry_out(self, data: bytes) -> Reply | Answer:
         try:
-            request = json.loads(data)
-        except (ValueError, RecursionError):
+            request = parse_json(data)
+        except ValueError:
             raise ControlError("found no JSON") from None
         verb = request.get("verb") if isinstance(request, dict) else None
         handler = self._handlers.get(verb) if isinstance(verb, str) else None
@@ -159,8 +159,7 @@ class ControlServer:
 
 def _objection(sock: socket.socket) -> str | None:
     """Return an objection to the peer; a second check beside the mode of the socket file."""
-    raw = sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
-    _, uid, _ = _CREDENTIALS.unpack(raw)
+    uid = peer_user(sock)
     return None if uid in (0, os.getuid()) else f"user {uid} may not give orders"
 
 

@@ -14,6 +14,7 @@ from rich.box import HEAVY_HEAD, Box
 from rich.console import Console, ConsoleOptions, Group, JustifyMethod, RenderableType, RenderResult
 from rich.live import Live
 from rich.measure import Measurement
+from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
 
@@ -23,7 +24,7 @@ from jtqd.daemon.shared.events import INFO, OperatorLog, Priority
 from jtqd.daemon.shared.reasons import contact_of, contact_text
 from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
-from jtqd.estimator.text import counted, finite, number, percent
+from jtqd.estimator.text import counted, finite, number, percent, printable
 
 COLOURS = {"valid": "green", "degraded": "yellow", "standstill": "cyan", "starting": "blue", "off": "dim"}
 """Style of a status; what is not here is bad news."""
@@ -161,13 +162,25 @@ _TABLE_PERIOD_S = 0.2
 _LOG_PERIOD_S = 5.0
 
 
+class PrintableView:
+    """A view whose texts are `printable`; markup in them is text on a console with `markup=False`."""
+
+    def __init__(self, view: RenderableType) -> None:
+        self._view = view
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Render what is inside (called by rich)."""
+        for text, style, control in console.render(self._view, options):
+            yield Segment(text if control else printable(text), style, control)
+
+
 class Display:
     """Use it as a context manager; `turn` whenever there is time. bitrate [bit/s]; contacts: they are watched."""
 
     def __init__(
         self, reader: SnapshotReader, bitrate: int, title: str, log: OperatorLog, *, contacts: bool = False
     ) -> None:
-        console = Console(stderr=True)
+        console = Console(stderr=True, markup=False)
         self._terminal = console.is_terminal
         self._live = Live(console=console, auto_refresh=False, transient=False)
         self._reader, self._bitrate, self._title, self._log = reader, bitrate, title, log
@@ -193,7 +206,7 @@ class Display:
             table = LiveTable(
                 self._reader, self._previous, view, self._bitrate, self._title, contacts=self._contacts
             )
-            self._live.update(table, refresh=True)
+            self._live.update(PrintableView(table), refresh=True)
         else:
             line = plain_line(self._reader, self._previous, view, self._bitrate, contacts=self._contacts)
             self._log(line.removeprefix("jtqd: "), Priority.INFO)
