@@ -26,6 +26,7 @@ from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.findings import JointName
 from jtqd.sysid.diagnosis.noise import Sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import (
+    ChannelData,
     EffectCandidate,
     Family,
     RunData,
@@ -113,9 +114,9 @@ class Dataset:
     Attributes:
         signals: [run][joint]. runs: the same binned, each at its own rate, to bins of step_s seconds.
         candidates: of the library, columns numbered. unexplained: what none of them explains, per channel and run [n].
-        families: of nuisances. unknown_lines: those among them at orders or frequencies of no effect.
+        families: of nuisances.
+        recordings: number of the recording that each run is a piece of.
         readings: per run what the current reads without power.
-        pieces: number of the recording that each run is a piece of (None: each is one).
         no_torque: no torque was measured, the reference is a known load or a model's.
         events: what is not valid in `runs` only because it is an event, per channel and run [n].
     """
@@ -126,9 +127,8 @@ class Dataset:
     step_s: float
     unexplained: dict[Channel, list[FloatArray]]
     families: list[Family]
-    unknown_lines: list[Line]
+    recordings: Sequence[int]
     readings: Sequence[Readings] = ()
-    pieces: Sequence[int] | None = None
     events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
     no_torque: bool = False
     disturbed: Sequence[list[JointSignals]] = ()
@@ -140,19 +140,20 @@ class Dataset:
         return {s.number: s.joint for s in self.signals[0]}
 
     @property
-    def recordings(self) -> Sequence[int]:
-        """Number of the recording that each run is a piece of."""
-        return range(len(self.runs)) if self.pieces is None else self.pieces
-
-    @property
     def rated_torque_nm(self) -> float:
         """The largest of the joints."""
         return max(joint.rated_torque_nm for joint in self.joints.values())
 
-    def valid_or_event(self, run: int, channel: Channel) -> BoolArray:
-        """Return where a channel of a run is valid or in an event [n]."""
-        valid = self.runs[run].channels[channel].valid
-        return valid | self.events[channel][run] if channel in self.events else valid
+    def of(self, channel: Channel) -> list[ChannelData]:
+        """Return a channel of every run."""
+        return [run.channels[channel] for run in self.runs]
+
+    def shown(self, channel: Channel, parts: Sequence[FloatArray]) -> list[FloatArray]:
+        """Return a residual [run][n] with NaN where its channel is neither valid nor in an event."""
+        valid = [d.valid for d in self.of(channel)]
+        if channel in self.events:
+            valid = [a | b for a, b in zip(valid, self.events[channel], strict=True)]
+        return [np.where(v, x, np.nan) for v, x in zip(valid, parts, strict=True)]
 
     def without_events(self, events: Mapping[Channel, View]) -> Dataset:
         """Return the runs with these events taken for not valid, and what is then unexplained."""
@@ -402,19 +403,9 @@ def build_dataset(
     runs = [run_data(run, candidates, samples_in(step, run), groups) for run in signals]
     leave = gain_columns(candidates)
     unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
-    pieces = recordings(signals)
-    return Dataset(
-        signals,
-        runs,
-        candidates,
-        step,
-        unexplained,
-        groups,
-        lines,
-        readings(signals),
-        pieces,
-        no_torque=bool(scope.known_references & set(joints)),
-    )
+    no_torque = bool(scope.known_references & set(joints))
+    found = recordings(signals), readings(signals)
+    return Dataset(signals, runs, candidates, step, unexplained, groups, *found, no_torque=no_torque)
 
 
 def library_candidates(

@@ -124,8 +124,7 @@ def _diagnosed(  # noqa: PLR0917
 
 def without_events(solution: Solution) -> Solution:
     """Return the solution again without the events that no effect makes, where there are any: they shall bend none."""
-    left = remaining(solution.dataset, *present_of(solution))
-    events = events_left(solution.dataset, left)
+    events = events_left(remaining(solution.dataset, *present_of(solution)))
     return solve(solution.dataset.without_events(events)) if events else solution
 
 

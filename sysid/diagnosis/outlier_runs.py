@@ -71,7 +71,7 @@ class Deviation(NamedTuple):
 
 def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     """Return places in dataset.runs of the run (or its pieces) that differs most from all others, and how; None: none."""
-    pieces = np.arange(len(dataset.runs)) if dataset.pieces is None else np.array(dataset.pieces, np.intp)
+    pieces = np.array(dataset.recordings, np.intp)
     count = int(pieces.max()) + 1
     if count < FEWEST:
         return None

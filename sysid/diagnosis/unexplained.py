@@ -7,7 +7,8 @@ remains, with energy and reasons, and where. Where nothing that remains matters,
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, pairwise
 from typing import Final
 
@@ -19,7 +20,7 @@ from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace, shows_at
 from jtqd.sysid.diagnosis.noise import autoregression
-from jtqd.sysid.diagnosis.regressors import LINE, Index, RunData, binned, contribution
+from jtqd.sysid.diagnosis.regressors import LINE, Index, binned, contribution
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.structure import AXES, Balance, View, bins_of, events, pursue
 
@@ -29,8 +30,6 @@ _SAME: Final = 0.02
 """Part of their rms by which velocities of repeated runs differ at most; loads by five times as much."""
 _TRACE_POINTS: Final = 4000
 QUADRANT_NAMES: Final = ("v+ load+", "v+ load-", "v- load+", "v- load-")
-
-
 _SHARED: Final = 5.0
 """Standard deviations of the mean over runs, of days that differ as usual, beyond which all runs have it in common."""
 _OF_A_DAY: Final = ("zero", "viscous", "coulomb")
@@ -54,80 +53,71 @@ def contributions(dataset: Dataset, present: PresentEffect) -> list[dict[Channel
 
 @dataclass(frozen=True)
 class Remaining:
-    """What effects leave: binned runs whose residual is that; nuisances: what each run has of its own [r, q]; pieces: number
-    of the recording that each run is of.
-    """
+    """What effects leave of the runs: residual per channel and run [n]; own: what each run has of its own [r, q]."""
 
-    present: tuple[PresentEffect, ...]
-    runs: tuple[RunData, ...]
-    nuisances: FloatArray
-    pieces: Sequence[int]
+    dataset: Dataset
+    residual: Mapping[Channel, Parts]
+    own: FloatArray
+
+    @cached_property
+    def own_changes(self) -> FloatArray:
+        """The runs' own changes [r, q], without strange lines. Of a family that all runs have far more of than days differ by,
+        only what each has beside the others: what all share is the joint's, and unexplained where no cause covers it.
+        """
+        families, pieces = self.dataset.families, np.array(self.dataset.recordings)
+        changes = np.where([g.name == LINE for g in families], 0.0, self.own)
+        runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
+        sigma = np.array([g.sigma if g.name in _OF_A_DAY else np.inf for g in families])
+        shared = runs.mean(axis=0)
+        shared[np.abs(shared) < _SHARED * sigma / np.sqrt(len(runs))] = 0.0
+        return np.asarray(changes - shared)
+
+    @cached_property
+    def less_own(self) -> dict[Channel, Parts]:
+        """The residual less the runs' own changes but not less strange lines, events with it."""
+        out = {}
+        for channel, parts in self.residual.items():
+            data = self.dataset.of(channel)
+            changes = [d.nuisances @ u[d.families] for d, u in zip(data, self.own_changes, strict=True)]
+            out[channel] = self.dataset.shown(channel, [x - y for x, y in zip(parts, changes, strict=True)])
+        return out
+
+    @cached_property
+    def after(self) -> dict[Channel, Parts]:
+        """The residual less what each run has of its own where that makes it smaller: of few seconds its estimate under a
+        prior need not.
+        """
+
+        def smaller(x: FloatArray, y: FloatArray) -> FloatArray:
+            return min(x, y, key=lambda each: float(np.nansum(each**2)))
+
+        return {
+            c: [*map(smaller, self.less_own[c], self.dataset.shown(c, parts))]
+            for c, parts in self.residual.items()
+        }
+
+    @cached_property
+    def before(self) -> dict[Channel, Parts]:
+        """The same with what the effects explain: the residual with the joint files."""
+        return {
+            c: [
+                x + d.residual - left
+                for x, d, left in zip(parts, self.dataset.of(c), self.residual[c], strict=True)
+            ]
+            for c, parts in self.after.items()
+        }
 
 
-def remaining(dataset: Dataset, present: Sequence[PresentEffect], nuisances: FloatArray) -> Remaining:
-    """Return what effects leave; nuisances: per recording [r, q]."""
+def remaining(dataset: Dataset, present: Sequence[PresentEffect], own: FloatArray) -> Remaining:
+    """Return what effects leave; own: per recording [r, q]."""
     for s in (joint for run in dataset.signals for joint in run):
         set_state(s, present)
-    left = [{c: d.residual.copy() for c, d in run.channels.items()} for run in dataset.runs]
+    residual = {c: [d.residual for d in dataset.of(c)] for c in dataset.runs[0].channels}
     for p in present:
-        for rest, found in zip(left, contributions(dataset, p), strict=True):
+        for r, found in enumerate(contributions(dataset, p)):
             for channel, value in found.items():
-                rest[channel] -= value
-    runs = [
-        replace(run, channels={c: replace(d, residual=rest[c]) for c, d in run.channels.items()})
-        for run, rest in zip(dataset.runs, left, strict=True)
-    ]
-    pieces = dataset.recordings
-    return Remaining(tuple(present), tuple(runs), nuisances[list(pieces)], pieces)
-
-
-def own_changes(dataset: Dataset, refined: Remaining) -> FloatArray:
-    """Return the runs' own changes [r, q], without strange lines: of a family that all runs have far more of than days
-    differ by, only what each has beside the others. What all runs share is no change from run to run: it is the joint's, and
-    unexplained where no cause covers it.
-    """
-    changes = np.array(refined.nuisances)
-    changes[:, [g.name == LINE for g in dataset.families]] = 0.0
-    pieces = np.array(refined.pieces)
-    runs = np.array([changes[pieces == r].mean(axis=0) for r in np.unique(pieces)])
-    sigma = np.array([np.inf if g.name not in _OF_A_DAY else g.sigma for g in dataset.families])
-    shared = runs.mean(axis=0)
-    shared[np.abs(shared) < _SHARED * sigma / np.sqrt(len(runs))] = 0.0
-    return np.asarray(changes - shared)
-
-
-def less_nuisances(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return what the causes leave, less the runs' own changes but not less strange lines, events with it."""
-    out: dict[Channel, Parts] = {}
-    for r, (run, u) in enumerate(zip(refined.runs, own_changes(dataset, refined), strict=True)):
-        for channel, d in run.channels.items():
-            rest = d.residual - d.nuisances @ u[d.families]
-            out.setdefault(channel, []).append(np.where(dataset.valid_or_event(r, channel), rest, np.nan))
-    return out
-
-
-def residual_after(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return what the causes leave, less what each run has of its own where that makes it smaller: of few seconds
-    its estimate under a prior need not.
-    """
-    out = less_nuisances(dataset, refined)
-    for channel, parts in out.items():
-        for r, run in enumerate(refined.runs):
-            plain = np.where(dataset.valid_or_event(r, channel), run.channels[channel].residual, np.nan)
-            parts[r] = min(parts[r], plain, key=lambda x: float(np.nansum(x**2)))
-    return out
-
-
-def residual_before(dataset: Dataset, refined: Remaining) -> dict[Channel, Parts]:
-    """Return the same with what the causes explain: the residual with the joint files."""
-    both = list(zip(dataset.runs, refined.runs, strict=True))
-    return {
-        c: [
-            x + run.channels[c].residual - left.channels[c].residual
-            for x, (run, left) in zip(after, both, strict=True)
-        ]
-        for c, after in residual_after(dataset, refined).items()
-    }
+                residual[channel][r] = residual[channel][r] - value
+    return Remaining(dataset, residual, own[list(dataset.recordings)])
 
 
 @dataclass(frozen=True)
@@ -172,11 +162,10 @@ def _name(view: View) -> str:
     return view.axis.replace("_", " ")
 
 
-def unexplained_residual(dataset: Dataset, refined: Remaining) -> Unexplained:
+def unexplained_residual(left: Remaining) -> Unexplained:
     """Return the unexplained residual when causes and the runs' own changes are taken out."""
-    left = less_nuisances(dataset, refined)
-    balances = _balances(dataset, left)
-    found = {c: pursue(balances[c], x) for c, x in left.items()}
+    balances = _balances(left.dataset, left.less_own)
+    found = {c: pursue(balances[c], x) for c, x in left.less_own.items()}
     return Unexplained({c: views for c, views in found.items() if views}, balances)
 
 
@@ -188,7 +177,7 @@ def _balances(dataset: Dataset, residuals: Mapping[Channel, Parts]) -> dict[Chan
     }
 
 
-def events_left(dataset: Dataset, refined: Remaining) -> dict[Channel, View]:
+def events_left(left: Remaining) -> dict[Channel, View]:
     """Return rare events where the residual of the causes has any that are large enough to matter, else nothing.
 
     The residual of the causes decides whether there are events. The residual that no effect of the library explains decides
@@ -196,24 +185,24 @@ def events_left(dataset: Dataset, refined: Remaining) -> dict[Channel, View]:
     """
 
     def large(residuals: Mapping[Channel, Parts]) -> dict[Channel, View]:
-        balances = _balances(dataset, residuals)
+        balances = _balances(left.dataset, residuals)
         found = {c: events(balances[c], parts) for c, parts in residuals.items()}
         return {c: e for c, e in found.items() if e and e.energy_nm2 > balances[c].least_nm2}
 
-    found = large(dataset.unexplained) if large(less_nuisances(dataset, refined)) else {}
+    found = large(left.dataset.unexplained) if large(left.less_own) else {}
     return {c: e for c, e in found.items() if np.mean(np.concatenate(e.masks)) < _MOST_OF_THE_TIME}
 
 
-def held_nm(dataset: Dataset, refined: Remaining) -> dict[Channel, float]:
-    """Return what the rows of held channels are wrong by: rms over the run that has most of it [Nm], beyond
-    what is usual in the others; at rest, where the balance is not known, against a straight line between the rows around
-    them. Channels without such rows are left out.
+def held_nm(left: Remaining) -> dict[Channel, float]:
+    """Return what the rows of held channels are wrong by: rms over the run that has most of it [Nm], beyond what is usual in
+    the others; at rest, where the balance is not known, against a straight line between the rows around them. Channels
+    without such rows are left out.
     """
     out: dict[Channel, float] = {}
-    for run, left, u in zip(dataset.runs, refined.runs, refined.nuisances, strict=True):
-        for channel, d in run.channels.items():
+    for channel, parts in left.residual.items():
+        for d, x, u in zip(left.dataset.of(channel), parts, left.own, strict=True):
             if d.held is not None and (d.held.any() or len(d.at_rest_nm)):
-                rest = left.channels[channel].residual - d.nuisances @ u[d.families]
+                rest = x - d.nuisances @ u[d.families]
                 usual = float(np.mean(rest[d.valid] ** 2)) if d.valid.any() else 0.0
                 excess = max(float(np.sum(rest[d.held] ** 2 - usual)), 0.0) + float(np.sum(d.at_rest_nm**2))
                 count = int(np.sum(d.valid | d.held)) + len(d.at_rest_nm)
@@ -221,27 +210,27 @@ def held_nm(dataset: Dataset, refined: Remaining) -> dict[Channel, float]:
     return out
 
 
-def channel_gaps(dataset: Dataset, refined: Remaining, left: Unexplained, matters: bool) -> tuple[Gap, ...]:
+def channel_gaps(left: Remaining, found: Unexplained, matters: bool) -> tuple[Gap, ...]:
     """Return the gaps of all channels: with the places of what remains, that which has most of it first, where it matters;
     else with those of the whole gap, the largest excess over the floor first.
     """
     # where the gap lives: without what each run has of its own, which would hide a small effect
-    shown = less_nuisances(dataset, refined) if matters else residual_before(dataset, refined)
+    shown = left.less_own if matters else left.before
     out = []
-    for channel, balance in left.balances.items():
-        x, rmse = shown[channel], _rms(_raw(dataset, channel))
-        floor, origin = _floor(dataset, refined, channel)
+    for channel, balance in found.balances.items():
+        x, rmse = shown[channel], _rms(_raw(left.dataset, channel))
+        floor, origin = _floor(left, channel)
         floor = min(floor, rmse)  # changes from run to run that work against each other are not noise
-        noise = _rms(dataset.unexplained[channel])
-        views = left.views.get(channel, ()) if matters else pursue(balance, x)
+        noise = _rms(left.dataset.unexplained[channel])
+        views = found.views.get(channel, ()) if matters else pursue(balance, x)
         ranked = [_places(v, x, noise, max(rmse**2 - noise**2, 1e-30)) for v in views]
         places = (*(each[0] for each in ranked), *(p for each in ranked for p in each[1:]))
         drawn = [(axis, bins_of(balance, axis, x)) for axis in AXES]
-        every = [p for axis, found in drawn if found for p in _bins(axis, *found, x, noise)]
+        every = [p for axis, bins in drawn if bins for p in _bins(axis, *bins, x, noise)]
         seen = tuple(p for p in every if np.isfinite(p.rms_nm))
         out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, places, seen))
     if matters:  # what is not explained comes first, wherever the gap is largest
-        energy = left.by_channel()
+        energy = found.by_channel()
         return tuple(sorted(out, key=lambda g: -energy.get(Channel(g.joint, g.balance), 0.0)))
     return tuple(sorted(out, key=lambda g: g.noise_floor_nm**2 - g.rmse_nm**2))
 
@@ -282,23 +271,21 @@ def _bins(axis: str, edges: FloatArray, places: Sequence[Index], parts: Parts, f
 
 def _raw(dataset: Dataset, channel: Channel) -> Parts:
     """Residual of the simulation with the joint file; torsion without each run's zero."""
-    runs = [run.channels[channel].residual for run in dataset.runs]
-    parts = [np.where(dataset.valid_or_event(r, channel), x, np.nan) for r, x in enumerate(runs)]
+    parts = dataset.shown(channel, [d.residual for d in dataset.of(channel)])
     return [x - np.nanmean(x) for x in parts] if channel.balance == TORSION else parts
 
 
-def _floor(dataset: Dataset, refined: Remaining, channel: Channel) -> tuple[float, str]:
+def _floor(left: Remaining, channel: Channel) -> tuple[float, str]:
     """Return the noise floor [Nm] and where it was taken from."""
-    repeats = _repeats(dataset, channel)
+    repeats = _repeats(left.dataset, channel)
     if repeats is not None:
         return repeats, "repeated runs"
     drift = []
-    for run, u in zip(refined.runs, own_changes(dataset, refined), strict=True):
-        d = run.channels[channel]
+    for d, u in zip(left.dataset.of(channel), left.own_changes, strict=True):
         part = (d.nuisances @ u[d.families])[d.valid]
         drift.append(part - part.mean() if channel.balance == TORSION and len(part) else part)
     square = float(np.mean(np.concatenate(drift) ** 2)) if any(map(len, drift)) else 0.0
-    rms = float(np.hypot(_rms(dataset.unexplained[channel]), np.sqrt(square)))
+    rms = float(np.hypot(_rms(left.dataset.unexplained[channel]), np.sqrt(square)))
     return rms, "what no effect explains, and run-to-run variation"
 
 
@@ -323,17 +310,16 @@ def _alike(one: Mapping[str, FloatArray], two: Mapping[str, FloatArray]) -> bool
     return 0.0 < most["velocity"] >= apart["velocity"] and 0.0 < 25.0 * most["load"] >= apart["load"]
 
 
-def traces(dataset: Dataset, refined: Remaining) -> tuple[Trace, ...]:
+def traces(left: Remaining) -> tuple[Trace, ...]:
     """Return measurement and residual before and after for plots, thinned, one per run and channel."""
     out = []
-    after, before = residual_after(dataset, refined), residual_before(dataset, refined)
-    for r, run in enumerate(dataset.runs):
-        signals = {s.number: s for s in dataset.signals[r]}
+    for r, run in enumerate(left.dataset.runs):
+        signals = {s.number: s for s in left.dataset.signals[r]}
         every = max(1, len(run.time_s) // _TRACE_POINTS)
         for c in run.channels:
             axes = run.axes[c.joint]
             measured = binned(_measured(signals[c.joint], c.balance), run.samples)
-            curves = (before[c][r], after[c][r], axes["velocity"], axes["load"], measured)
+            curves = (left.before[c][r], left.after[c][r], axes["velocity"], axes["load"], measured)
             shown = [x[::every] for x in (run.time_s, *curves)]
             out.append(Trace(run.name, c.joint, c.balance, *shown))
     return tuple(out)

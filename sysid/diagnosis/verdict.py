@@ -157,15 +157,15 @@ def conclude(
     rated = {n: joint.rated_torque_nm for n, joint in dataset.joints.items()}
     limits_nm = {c: relevance * rated[c.joint] for c in dataset.runs[0].channels}
     left = remaining(dataset, *present_of(solution))
-    rest = unexplained_residual(dataset, left)
+    rest = unexplained_residual(left)
     if (
         _largest(rest, limits_nm) > 1.0
     ):  # the discrepancy has a part in the set's values, and none in those that predict
         other = remaining(dataset, extended_effects(solution, prediction), _own(solution, prediction))
-        less = unexplained_residual(dataset, other)
+        less = unexplained_residual(other)
         if _largest(less, limits_nm) < _largest(rest, limits_nm):
             left, rest = other, less
-    held = held_nm(dataset, left)
+    held = held_nm(left)
     total = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
     causes = sorted((_cause(solution, j, prediction, total, rest) for j in effects), key=lambda c: -c.rms_nm)
     matter = [c for c in causes if c.rms_nm >= limits_nm[_channel(c, dataset)]]
@@ -180,7 +180,7 @@ def conclude(
     else:
         verdict = NO_GAP
     table, untold = entry_table(solution, causes, scope)
-    gaps = channel_gaps(dataset, left, rest, unexplained.matters)
+    gaps = channel_gaps(left, rest, unexplained.matters)
     reasons = rest.reasons if unexplained.matters else []
     gain = gain_of(solution, prediction) if prediction.chosen else None
     findings = Findings(
@@ -192,7 +192,7 @@ def conclude(
         tuple(listed),
         table,
         gain,
-        traces=traces(dataset, left),
+        traces=traces(left),
         explained_share=1.0 - rest.energy_nm2() / max(total, 1e-30) if causes else math.nan,
         unexplained=unexplained,
         too_small=tuple(small),

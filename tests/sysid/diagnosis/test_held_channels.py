@@ -14,9 +14,9 @@ from jtqd.sysid.diagnosis import dataset as datasets
 from jtqd.sysid.diagnosis.dataset import unknown_lines, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import UNEXPLAINED
-from jtqd.sysid.diagnosis.regressors import families, run_data
+from jtqd.sysid.diagnosis.regressors import ChannelData, RunData, families, run_data
 from jtqd.sysid.diagnosis.signals import Channel, Line
-from jtqd.sysid.diagnosis.unexplained import held_nm
+from jtqd.sysid.diagnosis.unexplained import Remaining, held_nm
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, rigid_run
 
@@ -36,6 +36,14 @@ def clipped_runs() -> list[tuple[str, RunTable]]:
     return out
 
 
+def nothing_taken_out(runs: list[RunData], families: int) -> Remaining:
+    def of(channel: Channel) -> list[ChannelData]:
+        return [run.channels[channel] for run in runs]
+
+    residual = {c: [d.residual for d in of(c)] for c in (MOTOR1, TORSION1)}
+    return Remaining(cast("Any", SimpleNamespace(of=of)), residual, np.zeros((len(runs), families)))
+
+
 def test_clipped_samples_are_in_no_fit_however_few_and_count_by_what_they_cost() -> None:
     runs, reasons = usable_signals(clipped_runs(), {1: PLAIN}, (1,))
     assert not reasons
@@ -51,9 +59,7 @@ def test_clipped_samples_are_in_no_fit_however_few_and_count_by_what_they_cost()
             assert not (d.valid & (at_limit | d.held)).any()
             rest = d.residual[d.valid]
             assert np.sqrt(np.mean((rest - rest.mean()) ** 2)) < 0.01 * LIMIT, "what is left is measured"
-    none = [np.zeros(len(families(runs)))] * 2
-    data, fit = SimpleNamespace(runs=binned), SimpleNamespace(runs=binned, nuisances=none)
-    cost = held_nm(cast("Any", data), cast("Any", fit))
+    cost = held_nm(nothing_taken_out(binned, len(families(runs))))
     whole = rigid_run(PLAIN, 0.2, seconds=5.0).joints[1].torque_nm
     assert whole is not None
     over = np.maximum(np.abs(whole) - LIMIT, 0.0)
@@ -80,21 +86,20 @@ def test_a_channel_that_is_held_at_rest_costs_what_it_jumps_by_afterwards() -> N
         (1,),
     )
     binned = [run_data(run, [], 5, families(runs)) for run in runs]
-    data, none = SimpleNamespace(runs=binned), [np.zeros(len(families(runs)))] * 2
     at_rest = binned[0].channels[MOTOR1].at_rest_nm
     assert len(at_rest) > 5
     line = np.interp(np.arange(begin - 60, after), [begin - 61, after], current[[begin - 61, after]])
     worth = PLAIN.gear_ratio * PLAIN.torque_constant_nm_per_a * (current[begin - 61] - line)
     assert min(at_rest) >= min(worth) - 1e-9
     assert max(at_rest) <= max(worth) + 1e-9
-    fit = cast("Any", SimpleNamespace(runs=binned, nuisances=none))
-    whole = held_nm(cast("Any", data), fit)[MOTOR1] ** 2
+    fit = nothing_taken_out(binned, len(families(runs)))
+    whole = held_nm(fit)[MOTOR1] ** 2
     d = binned[0].channels[MOTOR1]
     assert d.held is not None
     count = int(np.sum(d.valid | d.held))
     for run in binned:
         run.channels[MOTOR1] = replace(run.channels[MOTOR1], at_rest_nm=np.empty(0))
-    moving = held_nm(cast("Any", data), fit)[MOTOR1] ** 2
+    moving = held_nm(fit)[MOTOR1] ** 2
     assert whole * (count + len(at_rest)) - moving * count == pytest.approx(float(np.sum(at_rest**2)))
 
 

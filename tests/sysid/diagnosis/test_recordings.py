@@ -112,4 +112,4 @@ def test_pieces_share_what_a_run_has_of_its_own_and_are_held_out_together() -> N
 def test_a_dataset_knows_its_pieces() -> None:
     whole = bench_run(seconds=6.0)
     found = signals(("a", cut(whole, slice(0, HALF))), ("b", cut(whole, slice(HALF, None))))
-    assert build_dataset([list(run) for run in found], JOINTS).pieces == [0, 0, 1]
+    assert build_dataset([list(run) for run in found], JOINTS).recordings == [0, 0, 1]

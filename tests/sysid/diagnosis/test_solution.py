@@ -110,10 +110,9 @@ def test_what_the_true_effects_leave_is_the_noise() -> None:
         PresentEffect(EFFECTS["coulomb_friction"], 1, friction),
     ]
     left = remaining(dataset, present, np.zeros((2, len(dataset.families))))
-    for run, before in zip(left.runs, dataset.runs, strict=True):
-        d = run.channels[MOTOR1]
-        assert float(np.std(d.residual[d.valid])) < 0.12
-        assert float(np.std(before.channels[MOTOR1].residual[d.valid])) > 2.0
+    for d, after in zip(dataset.of(MOTOR1), left.residual[MOTOR1], strict=True):
+        assert float(np.std(after[d.valid])) < 0.12
+        assert float(np.std(d.residual[d.valid])) > 2.0
     (friction_nm, _) = (found[MOTOR1] for found in contributions(dataset, present[1]))
     valid = dataset.runs[0].channels[MOTOR1].valid
     assert np.abs(friction_nm[valid]) == pytest.approx(2.0, rel=1e-2)

@@ -23,7 +23,7 @@ def test_measured_less_simulated_is_the_residual_of_each_balance() -> None:
     usable, _ = usable_signals(runs, {1: wrong}, (1,))
     dataset = build_dataset(usable, {1: wrong}, EVERYTHING)
     left = remaining(dataset, [], np.zeros((len(runs), len(dataset.families))))
-    found = {(t.run, t.balance): t for t in traces(dataset, left)}
+    found = {(t.run, t.balance): t for t in traces(left)}
     assert set(found) == {(name, balance) for name, _ in runs for balance in ("motor", "torsion")}
     for name, table in runs:
         columns = table.joints[1]
