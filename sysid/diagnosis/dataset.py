@@ -11,15 +11,16 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects import EFFECTS
-from jtqd.estimator.effects.effect import Effect, ScalarFunctions, State, Values
+from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, ScalarFunctions, State, Values
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
@@ -81,8 +82,8 @@ SETTLED_S: Final = 0.1
 SHORTEST_S: Final = 0.3
 """Of what is left of a rest without power: less is no reading."""
 DRIFT: Final = 5e-4
-"""Of the rated torque over G Kt: what the zero of a current sensor may change by between the reading and the motion, half of
-what is called an effect at all (`evidence.RELEVANT`). All readings of a joint together are no more certain than this.
+"""Of the rated torque over G Kt: what the zero of a current sensor may change by between the reading and the motion, a
+tenth of the usual relevance. All readings of a joint together are no more certain than this.
 """
 _BLOCK_S: Final = 0.1
 
@@ -90,15 +91,12 @@ _BLOCK_S: Final = 0.1
 @dataclass(frozen=True)
 class Reading:
     """What the current of a joint reads without power in one run [A], less what the joint file knows of it; noise_a: its
-    standard deviation by noise alone; drift_a: what all readings of the joint may have in common beside the motion;
-    seconds: of all rests together.
+    standard deviation by noise alone; drift_a: what all readings of the joint may have in common beside the motion.
     """
 
-    joint: Joint
     current_a: float
     noise_a: float
     drift_a: float
-    seconds: float
 
 
 Readings = Mapping[int, Reading]
@@ -128,7 +126,7 @@ class Dataset:
     unexplained: dict[Channel, list[FloatArray]]
     families: list[Family]
     recordings: Sequence[int]
-    readings: Sequence[Readings] = ()
+    readings: Sequence[Readings]
     events: Mapping[Channel, Sequence[BoolArray]] = field(default_factory=dict)
     no_torque: bool = False
     disturbed: Sequence[list[JointSignals]] = ()
@@ -208,7 +206,7 @@ def usable_signals(
             except SignalsError as error:
                 reasons.append(str(error))
         if mine:
-            out.append([with_demand(without_known_effects(s)) for s in about_zero(mine, bases)])
+            out.append([without_known_effects(s) for s in about_zero(mine, bases)])
     out, apart = with_the_same_joints(out)
     reasons += apart
     _same_balances(out)
@@ -293,7 +291,7 @@ def _may_follow(a: str, b: str) -> bool:
 
 def _goes_on(before: Sequence[JointSignals], after: Sequence[JointSignals]) -> bool:
     """Return whether every joint of `after` begins where it ends in `before`."""
-    step = float(np.median(np.diff(before[0].time_s)))
+    step = before[0].step_s
     gap = float(after[0].time_s[0] - before[0].time_s[-1])
     stamped = 0.0 < gap <= _LOST_S
     gap = gap if stamped else step
@@ -336,22 +334,17 @@ def too_little(signals: Sequence[Sequence[JointSignals]]) -> str | None:
 
 def moving_s(signals: Sequence[Sequence[JointSignals]]) -> float:
     """Return the time in motion [s], over all joints and runs."""
-    return sum(float(s.moving.sum()) * float(np.median(np.diff(s.time_s))) for run in signals for s in run)
+    return sum(float(s.moving.sum()) * s.step_s for run in signals for s in run)
 
 
 def resolution_notes(signals: Sequence[Sequence[JointSignals]]) -> list[str]:
     """Return what the resolution of the recordings costs, one line per joint: of the run where it costs most."""
-    worst: dict[int, tuple[float, str]] = {}
-    count: dict[int, int] = {}
-    for run in signals:
-        for s in run:
-            if s.coarse:
-                count[s.number] = count.get(s.number, 0) + 1
-                new = s.visible.slowest_hz, f"{s.run}: j{s.number}.{s.coarse}"
-                worst[s.number] = min(worst.get(s.number, new), new)
+    costs: dict[int, list[tuple[float, str]]] = {}
+    for s in (s for run in signals for s in run if s.coarse):
+        costs.setdefault(s.number, []).append((s.visible.slowest_hz, f"{s.run}: j{s.number}.{s.coarse}"))
     return [
-        text + (f" (so in {counted(count[n], 'run')})" if count[n] > 1 else "")
-        for n, (_, text) in sorted(worst.items())
+        min(found)[1] + (f" (so in {counted(len(found), 'run')})" if len(found) > 1 else "")
+        for _, found in sorted(costs.items())
     ]
 
 
@@ -362,30 +355,25 @@ def _same_balances(runs: list[list[JointSignals]]) -> None:
         run[:] = [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
 
 
-def with_demand(s: JointSignals) -> JointSignals:
-    """Return the signals with the current that effects see as the joint file's simulation draws it."""
-    s.state.current_a = s.demand_nm / (s.joint.gear_ratio * s.joint.torque_constant_nm_per_a)
-    return s
-
-
 def without_known_effects(s: JointSignals) -> JointSignals:
     """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw and the
-    current that the simulation with them draws.
+    current that the simulation with them draws; the current that other effects see is that of the simulation without them.
     """
-    motor, torsion, usual = s.motor_nm, s.torsion_nm, s.state.torsion_rad
+    known = [(EFFECTS[e.name], e.parameters) for e in s.joint.effects]
+    left: dict[str, Any] = {MOTOR: s.motor_nm, TORSION: s.torsion_nm}
+    usual = s.state.torsion_rad
     if s.twist_rad is not None:
         s.state.torsion_rad = s.twist_rad
-    scale, demand = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a, s.demand_nm
-    for _ in range(_DRAWS if s.joint.effects else 0):
-        known = [contribution(EFFECTS[e.name], e.parameters, s).get("motor", 0.0) for e in s.joint.effects]
-        s.state.current_a = (demand + sum(known)) / scale
-    for item in s.joint.effects:
-        found = contribution(EFFECTS[item.name], item.parameters, s)
-        motor = motor - found.get("motor", 0.0)
-        if torsion is not None and "torsion" in found:
-            torsion = torsion - found["torsion"]
+    for _ in range(_DRAWS if known else 0):
+        drawn = sum(contribution(*each, s).get(MOTOR, 0.0) for each in known)
+        s.state.current_a = (s.demand_nm + drawn) / s.nm_per_a
+    for each in known:
+        for balance, value in contribution(*each, s).items():
+            left[balance] = left[balance] - value
     s.state.torsion_rad = usual
-    return replace(s, motor_nm=motor, torsion_nm=torsion)
+    out = replace(s, motor_nm=left[MOTOR], torsion_nm=left[TORSION])
+    out.state.current_a = out.demand_nm / s.nm_per_a
+    return out
 
 
 def build_dataset(
@@ -436,13 +424,12 @@ def library_candidates(
 
 def _has_channels(effect: Effect, signals: Sequence[Sequence[JointSignals]], number: int) -> bool:
     """Return whether the runs have what the effect needs."""
-    for run in signals:
-        for s in run:
-            if s.number == number:
-                for name in effect.needs:
-                    if not np.isfinite(np.asarray(getattr(s.state, name), np.float64)).any():
-                        return False
-    return True
+    states = [s.state for run in signals for s in run if s.number == number]
+    return all(
+        np.isfinite(np.asarray(getattr(state, name), np.float64)).any()
+        for state in states
+        for name in effect.needs
+    )
 
 
 def _whole_orders(
@@ -516,32 +503,25 @@ def reading(s: JointSignals) -> Reading | None:
     """Return the reading of one joint in one run, None without a rest without power that is long enough."""
     if s.off is None or not s.off.any():
         return None
-    step = float(np.median(np.diff(s.time_s)))
-    edge, least = round(SETTLED_S / step), round(SHORTEST_S / step)
-    block = max(1, round(_BLOCK_S / step))
+    edge, least = round(SETTLED_S / s.step_s), round(SHORTEST_S / s.step_s)
+    block = max(1, round(_BLOCK_S / s.step_s))
     bounds = np.flatnonzero(np.diff(np.concatenate(([0], s.off.astype(np.int8), [0]))))
     means: list[float] = []
-    samples = 0
     for first, last in zip(bounds[::2] + edge, bounds[1::2] - edge, strict=True):
         if last - first >= least:
             many = (last - first) // block
             means += s.current_a[first : first + many * block].reshape(many, block).mean(axis=1).tolist()
-            samples += last - first
     if not means:
         return None
     noise = float(np.std(means, ddof=1)) / np.sqrt(len(means)) if len(means) > 1 else 0.0
     known = sum(unpowered(EFFECTS[e.name], e.parameters, s.joint) for e in s.joint.effects)
-    rated_a = s.joint.rated_torque_nm / (s.joint.gear_ratio * s.joint.torque_constant_nm_per_a)
-    return Reading(s.joint, float(np.mean(means)) - known, float(noise), DRIFT * rated_a, samples * step)
+    rated_a = s.joint.rated_torque_nm / s.nm_per_a
+    return Reading(float(np.mean(means)) - known, float(noise), DRIFT * rated_a)
 
 
 def readings(signals: Sequence[Sequence[JointSignals]]) -> list[Readings]:
     """Return the readings of every run."""
-    out: list[Readings] = []
-    for run in signals:
-        found = {s.number: reading(s) for s in run}
-        out.append({n: r for n, r in found.items() if r is not None})
-    return out
+    return [{s.number: found for s in run if (found := reading(s)) is not None} for run in signals]
 
 
 def unpowered(effect: Effect, p: Values, joint: Joint) -> float:
@@ -553,24 +533,16 @@ def unpowered(effect: Effect, p: Values, joint: Joint) -> float:
 
 
 def with_readings(
-    sums: Sequence[Sums], found: Sequence[Readings], rows: Iterable[UnpoweredColumn]
+    sums: Sequence[Sums], found: Sequence[Readings], columns: Sequence[UnpoweredColumn]
 ) -> list[Sums]:
-    """Return the runs' normal equations with a row for every reading; rows: what the columns read (`unpowered_columns`,
-    or of refined parameters), in the order of the columns. Runs without a reading are returned as they are.
-    """
-    if not any(found):
-        return list(sums)
-    rows = list(rows)
-    counts: dict[int, int] = {}
-    for run in found:
-        for number in run:
-            counts[number] = counts.get(number, 0) + 1
+    """Return the runs' normal equations with a row for every reading; columns: what they read (`unpowered_columns`)."""
+    counts = Counter(number for run in found for number in run)
     out = []
     for one, run in zip(sums, found, strict=True):
         gram = one.gram
         for number, r in run.items():
             row = np.zeros(len(gram))
-            for where, column, of in rows:
+            for where, column, of in columns:
                 if where == number:
                     row[column] += of
             row[-1] += r.current_a
@@ -585,11 +557,10 @@ def unpowered_columns(
     candidates: Sequence[EffectCandidate], joints: Mapping[int, Joint]
 ) -> list[UnpoweredColumn]:
     """Return what the search's columns read without power, those that read something."""
-    out: list[UnpoweredColumn] = []
-    for c in candidates:
-        if "current_a" in c.effect.hooks and isinstance(c.joint, int):
-            for column, p in zip(c.columns, c.term.basis, strict=True):
-                value = unpowered(c.effect, p, joints[c.joint])
-                if value:
-                    out.append((c.joint, column, value))
-    return out
+    out = [
+        (c.joint, column, unpowered(c.effect, p, joints[c.joint]))
+        for c in candidates
+        if "current_a" in c.effect.hooks and isinstance(c.joint, int)
+        for column, p in zip(c.columns, c.term.basis, strict=True)
+    ]
+    return [each for each in out if each[-1]]

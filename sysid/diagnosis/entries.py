@@ -265,13 +265,12 @@ def set_state(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     )
     s.believed[:] = [with_effects_applied(replace(s.joint, effects=values))]
     _set_torsion(s, mine)
-    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
     acting = [p for p in mine if "current_a" in fields_used(p.effect, p.values, s.joint)]
     rest = s.demand_nm + _sum(s, [p for p in mine if p not in acting], MOTOR)
-    s.state.current_a = rest / scale
-    most = _MOST_CURRENT * float(np.max(np.abs(rest), initial=0.0)) / scale
+    s.state.current_a = rest / s.nm_per_a
+    most = _MOST_CURRENT * float(np.max(np.abs(rest), initial=0.0)) / s.nm_per_a
     for _ in range(_DRAWS if acting else 0):  # damped: a constant twice as large would swing for ever
-        drawn = (rest + _sum(s, acting, MOTOR)) / scale
+        drawn = (rest + _sum(s, acting, MOTOR)) / s.nm_per_a
         s.state.current_a = np.clip(0.5 * (s.state.current_a + drawn), -most, most)
     s.state.current_rate_a_s = current_rate(s.state.current_a, s.time_s)
 

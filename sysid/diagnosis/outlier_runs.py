@@ -241,11 +241,10 @@ def column(kind: Deviation, s: JointSignals, balance: str) -> FloatArray | None:
     if kind.channel == "current_a":
         if kind.joint != s.number or balance != MOTOR:
             return None
-        scale = joint.gear_ratio * joint.torque_constant_nm_per_a
         made = {
-            "gain": scale * state.current_a,
+            "gain": s.nm_per_a * state.current_a,
             "zero": np.full(len(s.time_s), joint.rated_torque_nm),
-            "delay": -scale * state.current_rate_a_s,
+            "delay": -s.nm_per_a * state.current_rate_a_s,
         }
         return np.asarray(made[kind.what])
     made = {

@@ -84,8 +84,7 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
             effect.loss_nm(p, state, own, x) * s.visible_share_of(order),
         )
     if "current_a" in hooks:
-        scale = joint.gear_ratio * joint.torque_constant_nm_per_a
-        add(MOTOR, scale * effect.current_a(p, state, own, x))
+        add(MOTOR, s.nm_per_a * effect.current_a(p, state, own, x))
     for hook, sign in (("load_nm", 1.0), ("sensor_nm", -1.0)):
         if hook in hooks:
             value = sign * getattr(effect, hook)(p, state, own, x)

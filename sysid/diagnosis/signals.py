@@ -208,17 +208,22 @@ class JointSignals:
         return float(np.median(np.diff(self.time_s)))
 
     @property
+    def nm_per_a(self) -> float:
+        """Motor torque per current, joint side: G Kt of the joint file."""
+        return self.joint.gear_ratio * self.joint.torque_constant_nm_per_a
+
+    @property
     def demand_nm(self) -> FloatArray:
         """Motor torque that the joint file's simulation needs for this motion and load [n], Nm joint side."""
-        scale = self.joint.gear_ratio * self.joint.torque_constant_nm_per_a
         quick = self.state.torque_nm - self.gear_nm
-        return np.asarray(scale * self.current_a - self.motor_nm + self.shared_nm + quick)
+        return np.asarray(self.nm_per_a * self.current_a - self.motor_nm + self.shared_nm + quick)
 
     def know_torque(self, torque_hz: float, rate_hz: float) -> None:
         """Let the torques that effects see be known below torque_hz, their rate below rate_hz."""
-        step = float(np.median(np.diff(self.time_s)))
-        self.state.torque_nm = below(self.gear_nm, step, torque_hz)
-        self.state.torque_rate_nm_s = first_difference(below(self.sensor_nm, step, rate_hz), self.time_s)
+        self.state.torque_nm = below(self.gear_nm, self.step_s, torque_hz)
+        self.state.torque_rate_nm_s = first_difference(
+            below(self.sensor_nm, self.step_s, rate_hz), self.time_s
+        )
 
     def seen(self, balance: str, x: FloatArray) -> FloatArray:
         """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
@@ -258,7 +263,7 @@ class JointSignals:
 
     def slow_torsion(self, angle: FloatArray) -> FloatArray:
         """Return the part of a twist [n] that is slow enough for the acceleration of the torsion to hold it."""
-        return angle if self.torsion_nm is None else slow(angle, float(np.median(np.diff(self.time_s))))
+        return angle if self.torsion_nm is None else slow(angle, self.step_s)
 
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
@@ -278,7 +283,7 @@ class JointSignals:
         A quick torque moves the rotor and nothing else, and samples show less of that acceleration than there is: nothing at
         the sampling rate, where the regressor alone would be left, standing still.
         """
-        turn = np.abs(rate_rad_s) * float(np.median(np.diff(self.time_s)))
+        turn = np.abs(rate_rad_s) * self.step_s
         turn = np.maximum(turn, 1e-3)
         if self.of_position:
             return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))

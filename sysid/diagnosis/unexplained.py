@@ -61,8 +61,8 @@ class Remaining:
 
     @cached_property
     def own_changes(self) -> FloatArray:
-        """The runs' own changes [r, q], without strange lines. Of a family that all runs have far more of than days differ by,
-        only what each has beside the others: what all share is the joint's, and unexplained where no cause covers it.
+        """The runs' own changes [r, q], without strange lines. Of a family that all runs have far more of than days differ
+        by, only what each has beside the others: what all share is the joint's, and unexplained where no cause covers it.
         """
         families, pieces = self.dataset.families, np.array(self.dataset.recordings)
         changes = np.where([g.name == LINE for g in families], 0.0, self.own)
@@ -329,5 +329,4 @@ def _measured(s: JointSignals, balance: str) -> FloatArray:
     """Return what a balance measures [n], Nm joint side: G Kt i of the motor, or the torque of the encoders' twist."""
     if balance == TORSION:
         return np.asarray(s.sensor_nm if s.torsion_nm is None else s.torsion_nm + s.sensor_nm)
-    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
-    return np.asarray(s.seen(balance, scale * s.current_a))
+    return np.asarray(s.seen(balance, s.nm_per_a * s.current_a))
