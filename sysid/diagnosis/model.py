@@ -28,6 +28,7 @@ from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     Index,
     RunData,
+    basis_columns,
     contribution,
     features,
     fields_used,
@@ -482,35 +483,27 @@ class _Work:
         )
 
     def _columns_again(self, signals: Sequence[JointSignals], run: RunData, entries: Iterable[int]) -> None:
-        made: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in run.channels}
-        for k in entries:
-            e = self.entries[k]
+        again = [self.entries[k] for k in entries]
+        made = basis_columns(signals, [e.candidate for e in again])
+        for e in again:
             c = e.candidate
-            for s in signals:
-                if not shows_at(c.joint, s.number):
-                    continue
-                for column, p in zip(c.columns, c.term.basis, strict=True):
-                    for balance, value in contribution(c.effect, p, s).items():
-                        made[Channel(s.number, balance)].append((column, value))
+            for s in (s for s in signals if shows_at(c.joint, s.number)):
                 for column, name in zip(e.tangents, e.shapes, strict=True):
                     here = c.term.combine(e.amplitude)
                     there = {**here, name: here[name] * (1.0 + _STEP)}
                     one, two = contribution(c.effect, here, s), contribution(c.effect, there, s)
                     for balance in one:
                         change = limits.SHAPE / _STEP * (two[balance] - one[balance])
-                        made[Channel(s.number, balance)].append((column, change))
+                        made.setdefault(Channel(s.number, balance), []).append((column, change))
         of = {s.number: s for s in signals}
         for channel, columns in made.items():
             d = run.channels[channel]
             place = {int(k): j for j, k in enumerate(d.index)}
-            regressors, more = d.regressors.copy(), []
-            for column, value in seen_in_bins(of[channel.joint], channel.balance, columns, run.samples):
-                if column in place:
-                    regressors[:, place[column]] = value
-                else:
-                    more.append((column, value))
-            regressors = np.column_stack((regressors, *(v for _, v in more)))
-            index = np.concatenate((d.index, [k for k, _ in more])).astype(np.intp)
+            numbers, values = seen_in_bins(of[channel.joint], channel.balance, columns, run.samples)
+            new = np.array([k not in place for k in numbers.tolist()], bool)
+            regressors = np.hstack((d.regressors, values[:, new]))
+            regressors[:, [place[k] for k in numbers[~new].tolist()]] = values[:, ~new]
+            index = np.concatenate((d.index, numbers[new])).astype(np.intp)
             run.channels[channel] = replace(d, regressors=regressors, index=index)
 
 

@@ -35,7 +35,7 @@ from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
 from jtqd.sysid.diagnosis.noise import noise_of_channels, run_sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns, seen_in_bins
-from jtqd.sysid.diagnosis.signals import Channel, JointSignals
+from jtqd.sysid.diagnosis.signals import JointSignals
 
 ENTER: Final = 10.0
 """BIC difference: very strong evidence on the scale of Kass and Raftery 1995, J. Am. Stat. Assoc. 90."""
@@ -269,20 +269,15 @@ def _with_columns(
     run: RunData, signals: Sequence[JointSignals], kinds: Sequence[Deviation], dataset: Dataset
 ) -> RunData:
     """Return the run with the deviations as further nuisances, behind the families."""
-    channels = dict(run.channels)
-    for s in signals:
-        for balance in ("motor", "torsion"):
-            channel = Channel(s.number, balance)
-            if channel not in channels:
-                continue
-            d = channels[channel]
-            made = [(len(dataset.families) + k, column(kind, s, balance)) for k, kind in enumerate(kinds)]
-            there = seen_in_bins(s, balance, [(k, c) for k, c in made if c is not None], run.samples)
-            channels[channel] = replace(
-                d,
-                nuisances=np.column_stack((d.nuisances, *(c for _, c in there))),
-                families=np.concatenate((d.families, [k for k, _ in there])).astype(np.intp),
-            )
+    channels = {}
+    of = {s.number: s for s in signals}
+    for channel, d in run.channels.items():
+        s = of[channel.joint]
+        made = [(len(dataset.families) + k, column(kind, s, channel.balance)) for k, kind in enumerate(kinds)]
+        there = [(k, c) for k, c in made if c is not None]
+        numbers, columns = seen_in_bins(s, channel.balance, there, run.samples)
+        nuisances, families = np.hstack((d.nuisances, columns)), np.concatenate((d.families, numbers))
+        channels[channel] = replace(d, nuisances=nuisances, families=families)
     return replace(run, channels=channels)
 
 

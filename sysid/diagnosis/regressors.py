@@ -78,11 +78,8 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
 
     hooks = effect.hooks
     if "loss_nm" in hooks:
-        order = p.get("order_per_motor_rev", 0.0)
-        add(
-            MOTOR,
-            effect.loss_nm(p, state, own, x) * s.visible_share_of(order),
-        )
+        share = s.visible_share_of(p.get("order_per_motor_rev", 0.0))
+        add(MOTOR, effect.loss_nm(p, state, own, x) * share)
     if "current_a" in hooks:
         add(MOTOR, s.nm_per_a * effect.current_a(p, state, own, x))
     for hook, sign in (("load_nm", 1.0), ("sensor_nm", -1.0)):
@@ -165,22 +162,21 @@ def binned(x: FloatArray, samples: float) -> FloatArray:
         return whole
     middle = float(np.mean(x))
     sums = np.concatenate(([0.0], np.cumsum(x - middle)))
-    result: FloatArray = (
-        middle + np.diff(np.interp(_edges(count, samples), np.arange(len(sums)), sums)) / samples
-    )
-    return result
+    ends = np.interp(_edges(count, samples), np.arange(len(sums)), sums)
+    return np.asarray(middle + np.diff(ends) / samples)
 
 
 def seen_in_bins(
     s: JointSignals, balance: str, columns: Sequence[tuple[int, FloatArray]], samples: float
-) -> list[tuple[int, FloatArray]]:
-    """Return numbered columns as they are seen in a balance, binned; some at once, as calling a filter takes long."""
-    out: list[tuple[int, FloatArray]] = []
+) -> tuple[Index, FloatArray]:
+    """Return the numbers of columns [p], and the columns as they are seen in a balance, binned [n, p]; some at once, as
+    calling a filter takes long.
+    """
+    out = [np.empty((int(len(s.time_s) / samples), 0))]
     for first in range(0, len(columns), _AT_ONCE):
-        some = columns[first : first + _AT_ONCE]
-        rows = s.seen(balance, np.array([x for _, x in some]))
-        out += [(k, binned(x, samples)) for (k, _), x in zip(some, rows, strict=True)]
-    return out
+        rows = s.seen(balance, np.array([x for _, x in columns[first : first + _AT_ONCE]]))
+        out += [binned(x, samples) for x in rows]
+    return np.array([k for k, _ in columns], np.intp), np.column_stack(out)
 
 
 def all_in_bin(good: BoolArray, samples: float) -> BoolArray:
@@ -248,6 +244,16 @@ class Family(NamedTuple):
 
 
 _AT_ONCE: Final = 16
+_AXES: Final = {
+    "velocity": "velocity_rad_s",
+    "load": "torque_nm",
+    "temperature": "temperature_c",
+    "motor_angle": "motor_position_rad",
+    "link_angle": "link_position_rad",
+    "time": "time_s",
+    "current": "current_a",
+}
+"""Operating conditions, and what they are in the state."""
 _ZERO: Final = 0.0025
 """Prior standard deviation of a run's own sensor zero, part of the rated torque."""
 _SHARE: Final = {"smooth": 0.3, "viscous": 0.08, "coulomb": 0.02}
@@ -307,12 +313,7 @@ def _nuisance(s: JointSignals, balance: str, family: Family) -> FloatArray | Non
     v, d = s.state.velocity_rad_s, s.state.direction
     if balance == TORSION:
         return np.ones(len(s.time_s)) if family.name == "torsion_zero" else None
-    made: dict[str, FloatArray] = {
-        "smooth": d * (1.0 - np.tanh(np.abs(v) / 0.02)),
-        "viscous": v,
-        "coulomb": d,
-    }
-    return made.get(family.name)
+    return {"smooth": d * (1.0 - np.tanh(np.abs(v) / 0.02)), "viscous": v, "coulomb": d}.get(family.name)
 
 
 def run_data(
@@ -323,73 +324,49 @@ def run_data(
 ) -> RunData:
     """Return one run's binned residuals and regressors; `run`: its joints; groups: nuisances, the usual ones if empty."""
     groups = groups or families([run])
+    made = basis_columns(run, candidates)
     channels: dict[Channel, ChannelData] = {}
     for s in run:
         for balance in (MOTOR, TORSION):
             residual = s.motor_nm if balance == MOTOR else s.torsion_nm
             if residual is None:
                 continue
-            valid = all_in_bin(s.usable(balance), samples)
+            channel = Channel(s.number, balance)
+            valid, known = (all_in_bin(x, samples) for x in (s.usable(balance), s.known(balance)))
             nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
-            there = seen_in_bins(s, balance, [(k, c) for k, c in nuisances if c is not None], samples)
-            channels[Channel(s.number, balance)] = ChannelData(
+            index, regressors = seen_in_bins(s, balance, made.get(channel, ()), samples)
+            own, changes = seen_in_bins(s, balance, [(k, c) for k, c in nuisances if c is not None], samples)
+            worth = binned(s.held_nm[balance], samples) if balance in s.held_nm else np.zeros(len(known))
+            channels[channel] = ChannelData(
                 valid,
                 binned(s.seen(balance, residual), samples),
-                np.empty((len(valid), 0)),
-                np.empty(0, np.intp),
-                np.column_stack([c for _, c in there]),
-                np.array([k for k, _ in there], np.intp),
-                all_in_bin(s.known(balance), samples) & ~valid if balance in s.held else None,
-                _held_at_rest(s, balance, samples),
+                regressors,
+                index,
+                changes,
+                own,
+                known & ~valid if balance in s.held else None,
+                worth[(worth != 0.0) & ~known],
             )
-    _fill(channels, run, candidates, samples)
     axes = {s.number: _axes(s, samples) for s in run}
     return RunData(run[0].run, binned(run[0].time_s, samples), channels, axes, samples)
 
 
-def _held_at_rest(s: JointSignals, balance: str, samples: float) -> FloatArray:
-    """Return what `ChannelData.at_rest_nm` is."""
-    if balance not in s.held_nm:
-        return np.empty(0)
-    worth = binned(s.held_nm[balance], samples)
-    return np.asarray(worth[(worth != 0.0) & ~all_in_bin(s.known(balance), samples)])
-
-
-def _fill(
-    channels: dict[Channel, ChannelData],
-    run: Sequence[JointSignals],
-    candidates: Sequence[EffectCandidate],
-    samples: float,
-) -> None:
-    """Put the regressors of all candidates into the channels."""
-    found: dict[Channel, list[tuple[int, FloatArray]]] = {c: [] for c in channels}
+def basis_columns(
+    run: Sequence[JointSignals], candidates: Iterable[EffectCandidate]
+) -> dict[Channel, list[tuple[int, FloatArray]]]:
+    """Return what the columns of these candidates leave in each channel: their numbers, and values [n] in Nm."""
+    out: dict[Channel, list[tuple[int, FloatArray]]] = {}
     for candidate in candidates:
-        for s in run:
-            if not shows_at(candidate.joint, s.number):
-                continue
+        for s in (s for s in run if shows_at(candidate.joint, s.number)):
             for column, p in zip(candidate.columns, candidate.term.basis, strict=True):
                 for balance, value in contribution(candidate.effect, p, s).items():
-                    found[Channel(s.number, balance)].append((column, value))
-    of = {s.number: s for s in run}
-    for channel, made in found.items():
-        columns = seen_in_bins(of[channel.joint], channel.balance, made, samples)
-        if columns:
-            channels[channel].index = np.array([k for k, _ in columns], np.intp)
-            channels[channel].regressors = np.column_stack([c for _, c in columns])
+                    out.setdefault(Channel(s.number, balance), []).append((column, value))
+    return out
 
 
 def _axes(s: JointSignals, samples: float) -> dict[str, FloatArray]:
-    """Return what the maps are drawn over, binned; angles unwrapped."""
-    state = s.state
-    return {
-        "velocity": binned(state.velocity_rad_s, samples),
-        "load": binned(state.torque_nm, samples),
-        "temperature": binned(state.temperature_c, samples),
-        "motor_angle": binned(state.motor_position_rad, samples),
-        "link_angle": binned(state.link_position_rad, samples),
-        "time": binned(state.time_s, samples),
-        "current": binned(state.current_a, samples),
-    }
+    """Return the operating conditions, binned; angles unwrapped."""
+    return {axis: binned(getattr(s.state, name), samples) for axis, name in _AXES.items()}
 
 
 def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:

@@ -139,8 +139,6 @@ VALUES_HZ: Final = 120.0
 TORQUE_HZ: Final = 12.0
 """Torques in regressors are known below this: what is quicker is noise, which the residual has too."""
 _ALL_VISIBLE: Final = Smoother(1.0)
-
-
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
 _AFTER_REST_S: Final = 0.03
@@ -186,20 +184,14 @@ class JointSignals:
     per_torque: FloatArray | float = 1.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
     off: BoolArray | None = None
-    held: Mapping[str, BoolArray] = field(
-        default_factory=dict
-    )  # by balance: rows of a held channel (`runs.bad_samples`)
+    held: Mapping[str, BoolArray] = field(default_factory=dict)  # by balance: rows of a held channel
     held_nm: Mapping[str, FloatArray] = field(default_factory=dict)  # by balance: what they are worth there
-    of_position: bool = (
-        True  # the acceleration is a second difference of the position, else one of the velocity
-    )
+    of_position: bool = True  # the acceleration is a difference of the position, else of the velocity
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE
     inertial: Smoother = _ALL_VISIBLE  # of the acceleration in the regressor of an inertia
-    believed: list[Joint] = field(
-        default_factory=list
-    )  # file with the values found; what effects are relative to
+    believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
 
     @cached_property
@@ -283,8 +275,7 @@ class JointSignals:
         A quick torque moves the rotor and nothing else, and samples show less of that acceleration than there is: nothing at
         the sampling rate, where the regressor alone would be left, standing still.
         """
-        turn = np.abs(rate_rad_s) * self.step_s
-        turn = np.maximum(turn, 1e-3)
+        turn = np.maximum(np.abs(rate_rad_s) * self.step_s, 1e-3)
         if self.of_position:
             return np.asarray((30.0 - 32.0 * np.cos(turn) + 2.0 * np.cos(2.0 * turn)) / (12.0 * turn * turn))
         return np.asarray(np.sin(turn) / turn)
@@ -301,24 +292,25 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """
     if not held:
         return s
-    step = float(np.median(np.diff(s.time_s)))
-    calmed = reach_of_calm(step)
-    reach = {TORSION: calmed, MOTOR: calmed}
+    reach = dict.fromkeys((TORSION, MOTOR), reach_of_calm(s.step_s))
     if s.visible.parts:
         reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
     out, worth = {}, {}
-    scale = s.joint.gear_ratio * s.joint.torque_constant_nm_per_a
-    apart = {name: h.deviation for name, h in held.items()}
-    for balance, columns in ((TORSION, ("torque_nm",)), (MOTOR, ("torque_nm", "current_a"))):
-        rows = [held[name].rows for name in columns if name in held]
-        if rows:
-            units = [
-                (scale if name == "current_a" else -1.0, apart[name]) for name in columns if name in held
-            ]
-            worth[balance] = np.asarray(sum(unit * x for unit, x in units))
-            wide = max(1, round(reach[balance] / step)) + 2  # and that of a second difference
-            out[balance] = np.convolve(np.any(rows, axis=0), np.ones(2 * wide + 1), "same") > 0.5
+    for balance, units in (
+        (TORSION, {"torque_nm": -1.0}),
+        (MOTOR, {"torque_nm": -1.0, "current_a": s.nm_per_a}),
+    ):
+        found = [(unit, held[name]) for name, unit in units.items() if name in held]
+        if found:
+            worth[balance] = np.asarray(sum(unit * h.deviation for unit, h in found))
+            wide = max(1, round(reach[balance] / s.step_s)) + 2  # and that of a second difference
+            out[balance] = _near(np.any([h.rows for _, h in found], axis=0), wide)
     return replace(s, held=out, held_nm=worth)
+
+
+def _near(rows: BoolArray, wide: int) -> BoolArray:
+    """Return the samples that are at most `wide` from one of these."""
+    return np.asarray(np.convolve(rows, np.ones(2 * wide + 1), "same") > 0.5)
 
 
 def with_one_sensor(run: Sequence[JointSignals]) -> list[JointSignals]:
@@ -337,16 +329,14 @@ class SignalsError(ValueError):
 class _Motion:
     """Motion of one motor as it is known, at the motor's shaft.
 
-    speed: as recorded or derived; whole: acceleration at the full rate; acceleration, shared: where it is known to
-    `_VISIBLE` and `_SHARED`; visible, inertial: their smoothers; of_position: all is of the position, else of the velocity;
-    coarse: what its noise costs, in words.
+    speed: as recorded or derived; whole: acceleration at the full rate; visible, inertial: smoothers after which its noise
+    is worth `_VISIBLE` and `_SHARED`; of_position: all is of the position, else of the velocity; coarse: what its noise
+    costs, in words.
     """
 
     position: FloatArray
     speed: FloatArray
     whole: FloatArray
-    acceleration: FloatArray
-    shared: FloatArray
     visible: Smoother
     inertial: Smoother
     of_position: bool
@@ -354,16 +344,11 @@ class _Motion:
 
     def below(self, hz: float, step_s: float) -> _Motion:
         """Return the motion with accelerations of nothing quicker than hz."""
-        visible, inertial = (
-            Smoother.of(np.full(len(self.whole), min(hz, each.slowest_hz)), step_s, _FINEST_HZ)
-            for each in (self.visible, self.inertial)
-        )
-        slow, shared = visible(self.whole), inertial(self.whole)
+        lowest = (min(hz, each.slowest_hz) for each in (self.visible, self.inertial))
+        visible, inertial = (Smoother.of(np.full(len(self.whole), f), step_s, _FINEST_HZ) for f in lowest)
         text = f"torque_nm: computed, known below {hz:.0f} Hz; the motor balance is judged below it"
         coarse = self.coarse if self.visible.slowest_hz <= hz else text
-        return replace(
-            self, acceleration=slow, shared=shared, visible=visible, inertial=inertial, coarse=coarse
-        )
+        return replace(self, visible=visible, inertial=inertial, coarse=coarse)
 
 
 def _motion(
@@ -383,12 +368,12 @@ def _motion(
         speed = ratio * raw.link_velocity_rad_s
     if like is not None:
         position, speed = (position, None) if like.of_position else (None, speed)
-    by_position = None if position is None else _known(time, position, joint, like, of_position=True)
-    by_speed = None if speed is None else _known(time, speed, joint, like, of_position=False)
-    found = by_position or by_speed
-    assert found is not None
-    if by_position is not None and by_speed is not None and _better(time, by_speed, by_position):
-        found = by_speed
+    both = [
+        _known(time, x, joint, like, of_position=of_position)
+        for x, of_position in ((position, True), (speed, False))
+        if x is not None
+    ]
+    found = both[-1] if len(both) > 1 and _better(time, both[1], both[0]) else both[0]
     there = columns.motor_position_rad
     if there is None:
         v = found.speed
@@ -403,13 +388,18 @@ def _known(
     whole = second_difference(x, time) if of_position else np.gradient(x, time)
     noise = noise_of(x)
     if like is None:
-        visible = _smoother(joint, time, noise, _VISIBLE, of_position=of_position)
-        inertial = _smoother(joint, time, noise, _SHARED, of_position=of_position)
+        step = float(np.median(np.diff(time)))
+        per_rated = joint.rated_torque_nm / (joint.gear_ratio * joint.rotor_inertia_kgm2)
+        cutoffs = (
+            cutoff_hz(noise, step, part * per_rated, of_velocity=not of_position)
+            for part in (_VISIBLE, _SHARED)
+        )
+        visible, inertial = (Smoother.of(hz, step, _FINEST_HZ) for hz in cutoffs)
     else:
         visible, inertial = like.visible, like.inertial
     coarse = _cost(joint, time, x, noise, visible, of_position=of_position)
     speed = np.asarray(np.gradient(x, time)) if of_position else x
-    return _Motion(x, speed, whole, visible(whole), inertial(whole), visible, inertial, of_position, coarse)
+    return _Motion(x, speed, whole, visible, inertial, of_position, coarse)
 
 
 def _better(time: FloatArray, speed: _Motion, position: _Motion) -> bool:
@@ -462,12 +452,11 @@ def joint_signals(  # noqa: PLR0917
         motion = motion.below(TORQUE_HZ, step)
     velocity = motion.visible(motion.speed) / joint.gear_ratio
     both = raw.two_encoders(joint.gear_ratio)
-    link = (
-        columns.link_position_rad
-        if columns.link_position_rad is not None
-        else motion.position / joint.gear_ratio
-    )
-    link_acceleration = motion.acceleration / joint.gear_ratio
+    link = columns.link_position_rad
+    if link is None:
+        link = motion.position / joint.gear_ratio
+    acceleration, shared = motion.visible(motion.whole), motion.inertial(motion.whole)
+    link_acceleration = acceleration / joint.gear_ratio
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
@@ -477,17 +466,17 @@ def joint_signals(  # noqa: PLR0917
     scale = joint.gear_ratio * joint.torque_constant_nm_per_a
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2
-    demand = (slow_torque + loss + reflected * motion.shared) / scale
+    demand = (slow_torque + loss + reflected * shared) / scale
     state = State(
         current_a=demand,
         current_rate_a_s=current_rate(demand, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
-        link_acceleration_rad_s2=link_acceleration + (motion.shared - motion.acceleration) / joint.gear_ratio,
+        link_acceleration_rad_s2=link_acceleration + (shared - acceleration) / joint.gear_ratio,
         link_position_rad=link,
         link_velocity_rad_s=velocity,
-        motor_acceleration_rad_s2=motion.shared,
+        motor_acceleration_rad_s2=shared,
         motor_position_rad=motion.position,
-        temperature_c=_or_nan(columns.temperature_c, len(time)),
+        temperature_c=np.full(len(time), np.nan) if columns.temperature_c is None else columns.temperature_c,
         time_s=time - time[0],
         torque_nm=slow_torque,
         torque_rate_nm_s=first_difference(below(sensor, step, RATE_HZ), time),
@@ -518,14 +507,14 @@ def joint_signals(  # noqa: PLR0917
         _moving(time, velocity, motion.visible.slowest_hz),
         sensor,
         columns.current_a,
-        reflected * (motion.shared - motion.whole),
+        reflected * (shared - motion.whole),
         gear_torque,
         twist_rad=bent,
         off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
         of_position=motion.of_position,
         noise={
-            "current_a": float(np.median(noise_of(columns.current_a))),
-            "torque_nm": float(np.median(noise_of(sensor))),
+            name: float(np.median(noise_of(x)))
+            for name, x in (("current_a", columns.current_a), ("torque_nm", sensor))
         },
         visible=motion.visible,
         inertial=motion.inertial,
@@ -534,13 +523,7 @@ def joint_signals(  # noqa: PLR0917
 
 
 def _cost(
-    joint: Joint,
-    time: FloatArray,
-    x: FloatArray,
-    noise: FloatArray,
-    visible: Smoother,
-    *,
-    of_position: bool,
+    joint: Joint, time: FloatArray, x: FloatArray, noise: FloatArray, visible: Smoother, *, of_position: bool
 ) -> str:
     """Return what the noise of position or velocity costs the motor balance, in words."""
     if not visible.parts:
@@ -557,15 +540,6 @@ def _cost(
     )
 
 
-def _smoother(
-    joint: Joint, time: FloatArray, noise: FloatArray, part: float, *, of_position: bool
-) -> Smoother:
-    """Return the smoother after which the noise of the motor's acceleration is worth `part` of the rated torque (rms)."""
-    step = float(np.median(np.diff(time)))
-    most = part * joint.rated_torque_nm / (joint.gear_ratio * joint.rotor_inertia_kgm2)
-    return Smoother.of(cutoff_hz(noise, step, most, of_velocity=not of_position), step, _FINEST_HZ)
-
-
 def _zero(apart: FloatArray, torque: FloatArray) -> float:
     """Return the zero of the torsion [rad]: in the middle between both signs of the load, as play and hysteresis are odd."""
     sides = [apart[torque > 0.0], apart[torque < 0.0]]
@@ -574,18 +548,11 @@ def _zero(apart: FloatArray, torque: FloatArray) -> float:
     return 0.5 * float(np.median(sides[0]) + np.median(sides[1]))
 
 
-def _or_nan(column: FloatArray | None, count: int) -> FloatArray:
-    return np.full(count, np.nan) if column is None else column
-
-
 def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolArray:
     """Return True where the joint moves and has done so, and will, for _AFTER_REST_S, or as long as a filter remembers."""
-    slow = np.abs(velocity) < SLOWEST_RAD_S
     apart = max(_AFTER_REST_S, _REMEMBERED / slowest_hz)
     wide = max(1, round(apart / max(float(np.median(np.diff(time))), 1e-9)))
-    near = np.convolve(slow, np.ones(2 * wide + 1), "same") > 0.5
-    result: BoolArray = ~near
-    return result
+    return ~_near(np.abs(velocity) < SLOWEST_RAD_S, wide)
 
 
 _LARGEST_ZERO: Final = 0.05
@@ -603,8 +570,7 @@ def about_zero(run: Sequence[JointSignals], bases: Mapping[int, BaseLoss]) -> li
         motor = .. - loss0(tau) - tau = .. - z - (loss0(tau) - loss0(tau - z))  ~  .. - z (1 + loss0')
 
     A zero of 1 % of the rated torque is not small where the efficiency turns over, within 5 %. So loss0 is expanded
-    about a first guess z0 of each run's zero and not about 0; the residual still holds the whole of z, now linearly. A bad
-    guess does no harm but that of none.
+    about a first guess z0 of each run's zero and not about 0; the residual still holds the whole of z, now linearly.
     """
     if not any(bases[s.number].depends_on_load for s in run):
         return list(run)
@@ -631,15 +597,8 @@ def _first_guess(run: Sequence[JointSignals]) -> float:
         good, state = s.moving, s.state
         if not good.any():
             continue
-        own = np.column_stack(
-            (
-                state.direction,
-                state.velocity_rad_s,
-                state.current_a,
-                state.motor_acceleration_rad_s2,
-                state.torque_nm,
-            )
-        )[good]
+        moved = (state.direction, state.velocity_rad_s, state.current_a, state.motor_acceleration_rad_s2)
+        own = np.column_stack((*moved, state.torque_nm))[good]
         wide = np.zeros((len(own), 1 + 5 * len(run)))
         wide[:, 0] = -np.broadcast_to(s.per_torque, good.shape)[good]
         wide[:, 1 + 5 * k : 6 + 5 * k] = own

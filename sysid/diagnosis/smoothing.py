@@ -1,16 +1,13 @@
 """Signals and their derivatives as regressors have them: with little of the noise that the same sample has in a residual.
 
-Currents and torques are smoothed over a few milliseconds (`calm`), because their noise is also in the residual, and would be
-explained by itself at the frequencies where there is nothing else. Samples too far apart for smoothing are interpolated from
-their neighbours. Derivatives are central differences, which look ahead: this is for recorded runs.
+Derivatives are central differences, which look ahead: this is for recorded runs.
 
 **Resolution.** Recorders keep seven significant digits, single precision, fixed decimals or counts. A motor position beyond
-1000 rad with seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. At the
-start of the run the steps were a hundred times finer, because steps of digits and of single precision grow with the value.
-So they are estimated from the values, for each magnitude by itself. Where the acceleration would be coarse, its balance is
-judged below a cutoff only: residual and regressors pass the same linear filter, sample by sample. The regressors of
-inertias are filtered further, because noise of an acceleration that is in residual and regressor alike would be explained
-by itself.
+1000 rad with seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. Steps of
+digits and of single precision grow with the value, so they are estimated from the values, for each magnitude by itself.
+Where the acceleration would be coarse, its balance is judged below a cutoff only: residual and regressors pass the same
+linear filter (`Smoother`). The regressors of inertias are filtered further, because noise of an acceleration that is in
+residual and regressor alike would be explained by itself.
 """
 
 from __future__ import annotations
@@ -39,25 +36,20 @@ def calm(x: FloatArray, step_s: float) -> FloatArray:
     residual.
 
     Smoothed over _SMOOTH_S where that is enough samples. An average of fewer keeps half of each sample's own noise and more,
-    at 250 Hz all of it: a gain of that channel is then found by the noise beside the signal, and noise of a torsion moves
-    what slips with it. There each sample is the value of the cubic through its neighbours, with none of its own noise. That
-    keeps 0.98 of what swings at 25 Hz and 0.7 of 50 Hz, at 250 Hz as at 500. The noise of the neighbours is in residuals as
-    well, but of both signs: where all frequencies count alike it adds up to nothing.
+    at 250 Hz all of it. There each sample is the value of the cubic through its neighbours, with none of its own noise. That
+    keeps 0.98 of what swings at 25 Hz and 0.7 of 50 Hz, at 250 Hz as at 500.
     """
-    wide = _smoothed_samples(step_s)
-    if wide >= _ENOUGH:
-        return smooth(x, wide)
+    if _smoothed_samples(step_s) >= _ENOUGH:
+        return slow(x, step_s)
     weights = _neighbours(max(2, round(_NEAR_S / step_s)))
     result: FloatArray = np.convolve(np.pad(x, len(weights) // 2, mode="edge"), weights, "valid")
     return result
 
 
 def below(x: FloatArray, step_s: float, hz: float) -> FloatArray:
-    """Return x [n] without what is quicker than hz, without delay."""
-    sections = _low_pass(min(hz * step_s, 0.45))
-    return np.asarray(
-        signal.sosfiltfilt(sections, x, padlen=min(len(x) - 1, max(12, round(1.0 / (hz * step_s)))))
-    )
+    """Return x [.., n] without what is quicker than hz, without delay."""
+    reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * step_s))))
+    return np.asarray(signal.sosfiltfilt(_low_pass(min(hz * step_s, 0.45)), x, padlen=reach))
 
 
 def reach_of_calm(step_s: float) -> float:
@@ -82,9 +74,9 @@ def _neighbours(reach: int) -> FloatArray:
 def current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
     """Return the derivative [n] of a current as regressors have it.
 
-    Its noise is a tenth and more of its rate, and makes a delay smaller than it is, where little is smoothed: by a third on
-    a bench with slow motions. Cubics through _CUBIC_S of samples take as much of the noise as `calm` does and leave 0.9 of
-    what swings at 50 Hz. Samples that are far apart are interpolated from their neighbours.
+    Its noise is a tenth and more of its rate, and makes a delay smaller than it is, where little is smoothed. Cubics through
+    _CUBIC_S of samples take as much of the noise as `calm` does and leave 0.9 of what swings at 50 Hz. Samples that are far
+    apart are interpolated from their neighbours.
     """
     step = float(np.median(np.diff(time)))
     if _smoothed_samples(step) < _ENOUGH:
@@ -132,9 +124,8 @@ def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
     """Return the second derivative [n]: fourth order on even steps, so that a ripple of 80 Hz at 1 kHz keeps its size
     (two central differences would take 8 % of it); plain differences where steps are uneven; ends held.
     """
-    steps = np.diff(time)
-    step = float(np.median(steps))
-    if len(x) < 5 or float(np.max(np.abs(steps - step))) > 0.05 * step:
+    step = _even_step(time)
+    if step is None:
         return np.asarray(np.gradient(np.gradient(x, time), time))
     inner = (16.0 * (x[3:-1] + x[1:-3]) - x[4:] - x[:-4] - 30.0 * x[2:-2]) / (12.0 * step * step)
     return np.pad(inner, 2, mode="edge")
@@ -142,12 +133,18 @@ def second_difference(x: FloatArray, time: FloatArray) -> FloatArray:
 
 def first_difference(x: FloatArray, time: FloatArray) -> FloatArray:
     """Return the first derivative [n], as `second_difference`."""
-    steps = np.diff(time)
-    step = float(np.median(steps))
-    if len(x) < 5 or float(np.max(np.abs(steps - step))) > 0.05 * step:
+    step = _even_step(time)
+    if step is None:
         return np.asarray(np.gradient(x, time))
     inner = (8.0 * (x[3:-1] - x[1:-3]) - (x[4:] - x[:-4])) / (12.0 * step)
     return np.pad(inner, 2, mode="edge")
+
+
+def _even_step(time: FloatArray) -> float | None:
+    """Return the step of these times, None where they are uneven or too few for a difference of fourth order."""
+    steps = np.diff(time)
+    step = float(np.median(steps))
+    return step if len(time) >= 5 and float(np.max(np.abs(steps - step))) <= 0.05 * step else None
 
 
 _FEWEST: Final = 200
@@ -249,7 +246,7 @@ def _decimal(values: FloatArray, largest: float) -> float:
     place = math.floor(math.log10(largest)) - _DIGITS
     for k in range(place, place + _DIGITS + 2):
         scaled = values * 10.0 ** (-k)
-        if np.max(np.abs(scaled - np.round(scaled))) > 1e-6 * max(1.0, 10.0 ** (_DIGITS - 9)):
+        if np.max(np.abs(scaled - np.round(scaled))) > 1e-6:
             return 10.0 ** (k - 1) if k > place else 0.0
     return 0.0
 
@@ -304,7 +301,7 @@ def _low_pass(part: float) -> FloatArray:
 @dataclass(frozen=True)
 class Smoother:
     """A low-pass without delay whose cutoff depends on the sample: (cutoff [Hz], where it holds [n]) in `parts`; elsewhere
-    the signal as it is. Linear, so the same for residuals and for what explains them.
+    the signal as it is.
     """
 
     step_s: float
@@ -315,8 +312,8 @@ class Smoother:
         """Return the smoother of these cutoffs [n]; those above finest_hz are none."""
         finest = min(finest_hz, 0.45 / step_s)
         level = np.where(hz < finest, np.floor(np.log(np.minimum(hz, 1e9)) / math.log(_STEP)), np.inf)
-        parts = [(_STEP ** float(k), np.asarray(level == k)) for k in np.unique(level[np.isfinite(level)])]
-        return Smoother(step_s, tuple((f, there) for f, there in parts))
+        levels = np.unique(level[np.isfinite(level)])
+        return Smoother(step_s, tuple((_STEP ** float(k), np.asarray(level == k)) for k in levels))
 
     @property
     def slowest_hz(self) -> float:
@@ -338,7 +335,5 @@ class Smoother:
             return x
         out = np.array(x, np.float64)
         for hz, there in self.parts:
-            sections = _low_pass(hz * self.step_s)
-            reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * self.step_s))))
-            out[..., there] = signal.sosfiltfilt(sections, x, padlen=reach)[..., there]
+            out[..., there] = below(x, self.step_s, hz)[..., there]
         return out

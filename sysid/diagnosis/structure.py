@@ -1,20 +1,10 @@
 """Views of a residual, and the search for those that explain it.
 
 A view is a prediction of the residual of one balance from one thing. Its energy is the squared error that it takes away,
-as a mean over all samples [Nm^2]. There are four kinds:
-
-- *conditions*: the mean of a bin of an axis (velocity, load, an angle, ...) over the other runs predicts this run: plain,
-  in the direction of motion, or in that of the current. Noise of two runs is independent, however coloured, so that bins
-  which only follow the noise explain nothing. The energy is significant where it is larger than with the signs of whole
-  seconds flipped at random;
-- *lines*: a wave at an order of the motor, whatever the speed, or at a fixed frequency, whatever the motion. It stands out
-  of the spectrum around it;
-- *events*: moments at which the residual leaves its noise; its whitened energy stands out of the usual. Where the passes of
-  a range of the link's angle confirm each other, the events are that range's;
-- *seconds*: means over seconds that are too large for noise.
-
-Events and seconds predict nothing but themselves. They count by what the best condition leaves of them. `pursue` takes out
-the view of most energy and searches again (matching pursuit: Mallat and Zhang 1993, IEEE Trans. Signal Process. 41).
+as a mean over all samples [Nm^2]. There are four kinds: *conditions* (bins of an axis), *lines* (waves), *events* and
+*seconds*. Events and seconds predict nothing but themselves: they count by what the best condition leaves of them. `pursue`
+takes out the view of most energy and searches again (matching pursuit: Mallat and Zhang 1993, IEEE Trans. Signal Process.
+41).
 """
 
 from __future__ import annotations
@@ -243,7 +233,9 @@ def _times(parts: Sequence[FloatArray], side: Sequence[FloatArray]) -> list[Floa
 
 
 def conditions(balance: Balance, parts: Sequence[FloatArray]) -> list[View]:
-    """Return every axis in every direction as a view, whether significant or not."""
+    """Return every axis in every direction as a view, whether significant or not: the mean of a bin over the other runs
+    predicts this run. Noise of two runs is independent, so bins that only follow the noise explain nothing.
+    """
     out, zero = [], BLOCK_S / balance.step_s
     for axis in AXES:
         edges, places = bins_of(balance, axis, parts) or (np.empty(0), [])
@@ -346,8 +338,8 @@ def order_lines(
 ) -> list[Line]:
     """Return lines that stand out of the order spectrum of a channel, strongest first; orders: where to look, rising.
 
-    Stretches of 2 s in which the motor turns far enough: the residual's Fourier sum over the motor's angle, so that a line
-    at an order stays one whatever the speed. ratio: power against the median of its neighbourhood.
+    The residual's Fourier sum over the motor's angle, in stretches of 2 s in which the motor turns far enough: a line at an
+    order stays one whatever the speed.
     """
     out = []
     for channel, parts in residuals.items():
@@ -360,9 +352,7 @@ def order_lines(
 def frequency_lines(
     runs: Sequence[RunData], residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float
 ) -> list[Line]:
-    """Return lines at a fixed frequency, strongest first: mean spectrum of stretches of 4 s of all runs, Hann window; the
-    ratio is against the median of the neighbourhood.
-    """
+    """Return lines at a fixed frequency, strongest first: mean spectrum of stretches of 4 s of all runs, Hann window."""
     length = 4 * _block(step_s)
     window, out = np.hanning(length), list[Line]()
     hz = np.asarray(np.fft.rfftfreq(length, step_s), np.float64)
@@ -383,22 +373,17 @@ def frequency_lines(
 
 
 def _order_power(
-    runs: Sequence[RunData],
-    channel: Channel,
-    parts: Sequence[FloatArray],
-    orders: FloatArray,
-    length: int,
+    runs: Sequence[RunData], channel: Channel, parts: Sequence[FloatArray], orders: FloatArray, length: int
 ) -> tuple[FloatArray, int]:
     """Return the mean power at these orders over stretches of `length` samples, and how many there are."""
     power, weight = np.zeros(len(orders)), 0
     for run, x in zip(runs, parts, strict=True):
         angle = run.axes[channel.joint]["motor_angle"]
         for first in range(0, len(x) - length + 1, length):
-            good = np.isfinite(x[first : first + length])
-            theta = angle[first : first + length][good]
-            if good.sum() < length // 2 or np.ptp(theta) < 2.0 * np.pi * _FEWEST_TURNS:
+            good = first + np.flatnonzero(np.isfinite(x[first : first + length]))
+            theta, y = angle[good], x[good]
+            if len(good) < length // 2 or np.ptp(theta) < 2.0 * np.pi * _FEWEST_TURNS:
                 continue
-            y = x[first : first + length][good]
             y = ((y - y.mean()) / len(y)).astype(np.float32)
             # the angle within the stretch: single precision is enough for a thousand turns
             turn = np.outer(orders, theta - theta[0]).astype(np.float32)
@@ -412,20 +397,19 @@ def _peaks(least: Line, at: FloatArray, power: FloatArray, near: int) -> list[Li
     that of a wave of constant size.
     """
     out = []
-    for k in range(1, len(at) - 1):
-        if power[k] >= power[k - 1] and power[k] > power[k + 1]:
-            usual = float(np.median(power[max(0, k - near) : k + near + 1])) + 1e-12
-            if power[k] > least.ratio * usual:
-                size, ratio = 2.0 * float(np.sqrt(power[k] - usual)), float(power[k]) / usual
-                out.append(replace(least, order=float(at[k]), amplitude_nm=size, ratio=ratio))
+    for k in (np.flatnonzero((power[1:-1] >= power[:-2]) & (power[1:-1] > power[2:])) + 1).tolist():
+        usual = float(np.median(power[max(0, k - near) : k + near + 1])) + 1e-12
+        if power[k] > least.ratio * usual:
+            size, ratio = 2.0 * float(np.sqrt(power[k] - usual)), float(power[k]) / usual
+            out.append(replace(least, order=float(at[k]), amplitude_nm=size, ratio=ratio))
     return out
 
 
 def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], step_s: float) -> Line:
-    """Return a line at an order with its exact order and size: the orders looked at first lie so far apart that a line
-    between two of them turns out of phase within a stretch of many turns. parts: its channel's residual [run][n].
+    """Return a line at an order with its exact order and size; parts: its channel's residual [run][n].
 
-    First between its neighbours over the same stretches, then over whole runs, where a turn more or less in a thousand
+    The orders looked at first lie so far apart that a line between two of them turns out of phase within a stretch of many
+    turns. So: between its neighbours over the same stretches, then over whole runs, where a turn more or less in a thousand
     shows; the latter counts when the line keeps half of its size over a run, and so its phase.
     """
     near: FloatArray = line.order + 0.004 * np.arange(-10.0, 11.0)
