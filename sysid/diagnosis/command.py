@@ -319,14 +319,11 @@ def _write(
 
 def extended(joint: Joint, number: int, findings: Findings, *, sha256: Mapping[str, str], date: str) -> Joint:
     """Return the joint with what predicts: values of the file replaced, effects of joint `number` and of the sensor among
-    its effects, which are relative to the values replaced. What predicts replaces an effect of the same name, so that a
-    diagnosis with the extended file does not add the same thing twice.
+    its effects, which are relative to the values replaced. What predicts replaces an effect of the same name. What only
+    makes the prediction better, and is no entry found, is listed by name in the provenance.
 
-    sha256: hash of each run's file by name, those that were used are kept; date: ISO 8601. What an effect of a whole
-    class is written as is the first of its class, and the provenance states it: on these runs all of the class fit alike,
-    elsewhere they may not. What only makes the prediction better, and is no entry found, is listed by name.
-
-    Raises ConfigError for an effect or a value that joint files do not allow.
+    sha256: hash of each run's file by name, those that were used are kept; date: ISO 8601. Raises ConfigError for an effect
+    or a value that joint files do not allow.
     """
     causes = [c for c in (*findings.causes, *findings.too_small) if shows_at(c.joint, number)]
     found = [p for p in findings.predicts if shows_at(p.joint, number)]

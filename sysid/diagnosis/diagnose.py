@@ -109,7 +109,7 @@ def _diagnosed(  # noqa: PLR0917
         dataset = build_dataset(usable, joints, scope)
     dataset = replace(dataset, disturbed=disturbed_signals(runs, joints, numbers, usable, scope))
     solution = without_events(solve(dataset))
-    findings, _ = conclude(solution, names, scope, relevance)
+    findings = conclude(solution, names, scope, relevance)
     notes = (*reasons, *(o.text for o in outliers), *resolution_notes(usable), *piece_notes(usable))
     left_out = tuple(f"joint {n}: left out" for n in numbers if n not in judged)
     unjudged = [line for line in reasons if line.startswith(left_out)]
@@ -139,24 +139,18 @@ def disturbed_signals(
 ) -> list[list[JointSignals]]:
     """Return the signals of the usable runs with as much noise again on torques and positions as they have."""
     rng = np.random.default_rng(seed)
-    there = {run[0].run for run in usable}
+    there, like = {run[0].run for run in usable}, [s for run in usable for s in run]
     noisy = [(name, disturbed(table, joints, rng)) for name, table in runs if name in there]
-    again, _ = usable_signals(
-        noisy, joints, numbers, scope.known_references, [s for run in usable for s in run]
-    )
-    numbers_used = {s.number for s in usable[0]}
-    return [
-        [s for s in run if s.number in numbers_used]
-        for run in again
-        if run[0].run in there and numbers_used <= {s.number for s in run}
-    ]
+    again, _ = usable_signals(noisy, joints, numbers, scope.known_references, like)
+    used = {s.number for s in usable[0]}
+    return [[s for s in run if s.number in used] for run in again if used <= {s.number for s in run}]
 
 
 def disturbed(table: RunTable, files: Mapping[int, Joint], rng: np.random.Generator) -> RunTable:
-    """Return the table with as much white noise again on torques and on the motor's motion as they have; one sensor has one
-    noise. The acceleration's noise is in the response and in the inertia's column, as the torque's is in the load's: were
-    one of them alone taken out, a smaller balance would have more evidence. Of a link with an encoder of its own, that as
-    well.
+    """Return the table with as much white noise again on torques and positions as they have; one sensor has one noise.
+
+    The acceleration's noise is in the response and in the inertia's column, as the torque's is in the load's: were one of
+    them alone taken out, a smaller balance would have more evidence.
     """
     known: list[tuple[FloatArray, FloatArray]] = []
     joints = {}
@@ -169,10 +163,7 @@ def disturbed(table: RunTable, files: Mapping[int, Joint], rng: np.random.Genera
             x = getattr(columns, name)
             if x is None:
                 continue
-            noise = next(
-                (f * e for y, e in known for f in (1.0, -1.0) if np.array_equal(x, f * y)),
-                None,
-            )
+            noise = next((f * e for y, e in known for f in (1.0, -1.0) if np.array_equal(x, f * y)), None)
             if noise is None:
                 noise = rng.normal(size=len(x)) * noise_of(x)
                 known.append((x, noise))

@@ -11,6 +11,7 @@ and no part in a regressor.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -132,18 +133,13 @@ def entries_of(
 ) -> list[Entry]:
     """Return the entries of all candidates that these runs can show; trust: factors of priors by their name in limits."""
     joints = {s.number: s.joint for s in signals[0]}
-    of = {n: [s for run in signals for s in run if s.number == n] for n in joints}
-    use = {n: usage(mine) for n, mine in of.items()}
-    terms: dict[tuple[str, JointName], int] = {}
-    for c in candidates:
-        terms[c.key] = terms.get(c.key, 0) + 1
-    out = []
-    for c in candidates:
-        n = c.joint if isinstance(c.joint, int) else min(joints)
-        entry = entry_of(c, joints[n], use[n], terms[c.key], trust)
-        if entry is not None:
-            out.append(entry)
-    return out
+    use = {n: usage([s for run in signals for s in run if s.number == n]) for n in joints}
+    terms = Counter(c.key for c in candidates)
+    places = [c.joint if isinstance(c.joint, int) else min(joints) for c in candidates]
+    found = [
+        entry_of(c, joints[n], use[n], terms[c.key], trust) for c, n in zip(candidates, places, strict=True)
+    ]
+    return [entry for entry in found if entry is not None]
 
 
 def usage(signals: Sequence[JointSignals]) -> Usage:
@@ -170,45 +166,31 @@ def entry_of(
         return None
     if use.warming_k < _WARMS_K and "temperature_c" in fields_used(effect, p, joint):
         return None
-    step = p[lead] - (nothing[lead] if c.size == 1 or "phase_rad" not in p else 0.0)
-    if "reference_c" in p and c.size == 2:
-        step = p[lead]
-    size = trust.get(kind, 1.0) * prior.size(joint, use) / step
-    weights = np.eye(c.size) * size
-    if "reference_c" in p and c.size == 2:
-        part = limits.REFERENCE_K / SPAN_K
-        weights = np.array([[1.0, -part], [0.0, part]]) * size
+    referred = "reference_c" in p and c.size == 2
+    step = p[lead] if referred or (c.size > 1 and "phase_rad" in p) else p[lead] - nothing[lead]
+    weights, part = np.eye(c.size), limits.REFERENCE_K / SPAN_K
+    if referred:
+        weights = np.array([[1.0, -part], [0.0, part]])
+    weights = weights * (trust.get(kind, 1.0) * prior.size(joint, use) / step)
     chance = limits.P_FILE if prior.file else limits.P_EFFECT / terms
     detail = tuple((k, p[k]) for k in _KINDS if k in p)
     low, high = -math.inf, math.inf
     if c.size == 1:
-        q = next(x for x in effect.parameters if x.name == lead)
-        ends = sorted(
-            (
-                (q.low - nothing[lead]) / (step * weights[0, 0]),
-                (q.high - nothing[lead]) / (step * weights[0, 0]),
-            )
-        )
-        low, high = ends
-        if effect.scales_balance or effect.scales_all:
-            around = sorted((f - 1.0) * nothing[lead] / (step * weights[0, 0]) for f in limits.SCALES)
-            low, high = (max(low, around[0]), min(high, around[1])) if nothing[lead] else (low, high)
-    return Entry(
-        c, kind, prior, weights, math.log(chance / (1.0 - chance)), (kind, c.joint, detail), low, high
-    )
+        q, per_scaled = next(x for x in effect.parameters if x.name == lead), step * weights[0, 0]
+        low, high = sorted((end - nothing[lead]) / per_scaled for end in (q.low, q.high))
+        if nothing[lead] and (effect.scales_balance or effect.scales_all):
+            around = sorted((f - 1.0) * nothing[lead] / per_scaled for f in limits.SCALES)
+            low, high = max(low, around[0]), min(high, around[1])
+    odds = math.log(chance / (1.0 - chance))
+    return Entry(c, kind, prior, weights, odds, (kind, c.joint, detail), low, high)
 
 
 def _sizes(c: EffectCandidate) -> int:
     """Return how many of the parameters that a term changes are sizes, and no phase or reference."""
     nothing = c.term.combine([0.0] * c.size)
     sizes = {q.name for q in c.effect.parameters if q.neutral is not None and not q.fixed}
-    changed = {
-        n
-        for k in range(c.size)
-        for n, v in c.term.combine([float(k == j) for j in range(c.size)]).items()
-        if v != nothing[n]
-    }
-    return len(changed & sizes)
+    each = [c.term.combine(one) for one in np.eye(c.size).tolist()]
+    return len(sizes & {n for values in each for n, v in values.items() if v != nothing[n]})
 
 
 def lead_of(c: EffectCandidate) -> str:
@@ -229,20 +211,15 @@ class PresentEffect:
 
 def present_effects(found: Sequence[tuple[Entry, FloatArray]]) -> list[PresentEffect]:
     """Return entries with their scaled coefficients as effects with parameters, kinds of one effect together."""
-    out: dict[tuple[object, ...], dict[str, float]] = {}
-    of: dict[tuple[object, ...], Entry] = {}
+    out: dict[tuple[object, ...], tuple[Entry, dict[str, float]]] = {}
     for e, scaled in found:
-        at: tuple[object, ...] = (*e.key, e.slot[-1])
-        values = e.values(scaled)
         nothing = e.candidate.term.combine([0.0] * e.candidate.size)
-        there = out.setdefault(at, {})
-        of[at] = e
-        for name, value in values.items():
+        _, there = out.setdefault((*e.key, e.slot[-1]), (e, {}))
+        for name, value in e.values(scaled).items():
             if name not in there or value != nothing.get(name):
                 there[name] = value
     result = []
-    for place, values in out.items():
-        e = of[place]
+    for e, values in out.values():
         known = {p.name: p for p in e.effect.parameters}
         for p in known.values():
             if p.default is not None and not math.isnan(p.default):

@@ -28,9 +28,7 @@ class FileValue(NamedTuple):
 
     def change(self, found: float) -> float | None:
         """Return the relative change, None from nothing or zero."""
-        if self.value is None or self.value == 0.0 or not math.isfinite(found):
-            return None
-        return found / self.value - 1.0
+        return found / self.value - 1.0 if self.value and math.isfinite(found) else None
 
 
 def file_values(effect_name: str, where: int | str, joints: Mapping[int, Joint]) -> dict[str, FileValue]:
@@ -45,14 +43,13 @@ def file_values(effect_name: str, where: int | str, joints: Mapping[int, Joint])
         return {}
     listed = next((item.parameters for item in joint.effects if item.name == effect_name), {})
     found = {}
-    for parameter in effect.parameters:
-        name, key = parameter.name, parameter.key
-        if name in listed:
-            found[name] = FileValue(float(listed[name]), f"effects: {effect_name}.{name}")
-        elif key:
-            found[name] = FileValue(float(attrgetter(key)(joint)), key)
+    for p in effect.parameters:
+        if p.name in listed:
+            found[p.name] = FileValue(float(listed[p.name]), f"effects: {effect_name}.{p.name}")
+        elif p.key:
+            found[p.name] = FileValue(float(attrgetter(p.key)(joint)), p.key)
         else:
-            found[name] = FileValue(parameter.neutral, "")
+            found[p.name] = FileValue(p.neutral, "")
     return found
 
 
@@ -289,14 +286,13 @@ class OutlierRun:
         """One line for people."""
         channel = "torque_nm" if self.joint == SENSOR else f"j{self.joint}.{self.channel}"
         either = f", or it differs in the {' or '.join(self.others)}" if self.others else ""
+        verb, scale, unit, more, less = _DEVIATIONS[self.what]
+        found = (
+            f"{verb} {abs(scale * self.value):.3g} {unit} {more if self.value > 0.0 else less} than in the other runs, "
+            f"which differ by {scale * self.usual:.2g} {unit} among themselves"
+        )
         if self.what == "gain" and self.value < -1.0:
             found = f"has the opposite direction of that in the other runs, {-1.0 - self.value:.3g} times as large"
-        else:
-            verb, scale, unit, more, less = _DEVIATIONS[self.what]
-            found = (
-                f"{verb} {abs(scale * self.value):.3g} {unit} {more if self.value > 0.0 else less} than in the other runs, "
-                f"which differ by {scale * self.usual:.2g} {unit} among themselves"
-            )
         return f"{self.run}: {channel} {found}{either}: a matter of this run, which is not used"
 
 
@@ -328,10 +324,8 @@ class PriorRow(NamedTuple):
 
 def priors(trust: Mapping[str, float]) -> list[PriorRow]:
     """Return the priors in force; trust: factor on the size by name."""
-    return [
-        PriorRow(name, _scaled(prior.text, trust.get(name, 1.0)), name in trust)
-        for name, prior in PRIORS.items()
-    ]
+    scaled = {name: _scaled(prior.text, trust.get(name, 1.0)) for name, prior in PRIORS.items()}
+    return [PriorRow(name, text, name in trust) for name, text in scaled.items()]
 
 
 def _scaled(text: str, factor: float) -> str:
@@ -406,10 +400,8 @@ def to_mapping(
     """Return the findings as findings.json has them: dicts, lists, texts and finite numbers only.
 
     The keys of the schema are always there, whatever the verdict: a program that reads `gap.rmse_nm` need not ask first.
-    What has no value is null; NaN and infinity, which JSON does not have, are null as well (an unlimited interval, an
-    effect that no size would make visible). Further keys may be ignored.
-
-    sha256: hash of each run's file by the run's name; files: names of what was written beside findings.json.
+    What has no value is null, NaN and infinity too. sha256: hash of each run's file by the run's name; files: names of what
+    was written beside findings.json.
     """
     no_gap: dict[str, Any] = {"joint": None, "rmse_nm": None, "noise_floor_nm": None, "localisation": []}
     experiment = findings.next_experiment
@@ -441,8 +433,7 @@ def to_mapping(
         "provenance": findings.provenance,
         "files": files,
     }
-    result: dict[str, Any] = plain(mapping)
-    return result
+    return dict(plain(mapping))
 
 
 def _cause(cause: Cause, joints: Mapping[int, Joint]) -> dict[str, Any]:

@@ -1,12 +1,12 @@
 """Outlier runs: runs whose channels differ from those of all others in gain, offset or delay.
 
-A loose plug, a sensor zeroed again or another filter of the drive belongs to one run and to no joint. An effect of the joint
-is in all runs, and changes from day to day are small. A larger deviation of one run alone is the run's own:
+An effect of the joint is in all runs, and changes from day to day are small. A larger deviation of one run alone is the
+run's own: a loose plug, a sensor zeroed again, another filter of the drive.
 
     y_r = X_r beta + Z_r u_r + w_r d_r + e          w: a unit of gain, zero or delay of one channel of run r alone
 
 1. Effects of the library and deviations of single runs are added one by one, whichever lowers the squared error most, beside
-   the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by `search.ENTER`.
+   the usual changes u_r from run to run (`regressors.families`), until none lowers BIC by ENTER.
 2. A run is an outlier where a deviation was chosen and, with the chosen effects fitted too, differs from the mean of the
    other runs by more than FAR standard deviations. These hold the run's own error and the spread of the others, mixed with
    the usual one (USUAL, worth four runs). Of a gain only what is beyond its `echo` counts: a channel that is all noise
@@ -15,8 +15,7 @@ is in all runs, and changes from day to day are small. A larger deviation of one
    (`_MOST`). A delay of the current can imitate a brake that drags or a cover that rubs in one run, but explains only some
    per cent: such a run is no outlier, and its disturbance must stay in the data.
 
-All effects at once would not do: with a coefficient for everything a library with temperatures and gains follows any single
-run. Of two runs none can be called the outlier. One run at a time is taken away, fewer than half of all (`diagnose`).
+Of two runs none can be called the outlier. One run at a time is taken away, fewer than half of all (`diagnose`).
 """
 
 from __future__ import annotations
@@ -65,8 +64,6 @@ class Deviation(NamedTuple):
     what: str
     channel: str
     joint: JointName
-    usual: float
-    unit: str
 
 
 def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
@@ -76,16 +73,13 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     if count < FEWEST:
         return None
     kinds = deviations(dataset.joints)
-    runs = [
-        _with_columns(run, signals, kinds, dataset)
-        for run, signals in zip(dataset.runs, dataset.signals, strict=True)
-    ]
+    both = list(zip(dataset.runs, dataset.signals, strict=True))
+    runs = [_with_columns(run, signals, kinds, len(dataset.families)) for run, signals in both]
     columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
     sigma = np.array([family.sigma for family in dataset.families])
     echoes = np.zeros((count, len(kinds)))
-    for place, run, signals in zip(pieces, dataset.runs, dataset.signals, strict=True):
-        mine = [echo(kind, signals, run.samples) for kind in kinds]
-        echoes[place] = np.maximum(echoes[place], mine)
+    for place, (run, signals) in zip(pieces, both, strict=True):
+        echoes[place] = np.maximum(echoes[place], [echo(kind, signals, run.samples) for kind in kinds])
     leave = gain_columns(dataset.candidates)
     for _ in range(_PASSES):
         # the noise is first what nothing explains, then what the chosen effects leave
@@ -118,7 +112,7 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
     kind, name = kinds[k], dataset.runs[places[0]].name
     if kind.what == "gain" and kind.channel == "torque_nm":
         apart = of_truth(apart)
-    return places, OutlierRun(name, kind.what, kind.channel, kind.joint, apart, spread, kind.unit, others)
+    return places, OutlierRun(name, *kind, apart, spread, UNITS[kind.what], others)
 
 
 def of_truth(gain: float) -> float:
@@ -191,7 +185,7 @@ class Comparison:
     def drop(self, chosen: Sequence[int], off: Sequence[tuple[int, int]], r: int, k: int) -> float:
         """Return by how much deviation k of run r lowers the squared error beside the effects and other runs' deviations."""
         beside = [*chosen, *(self.place(*at) for at in off if at[0] != r)]
-        return explained(self.total, beside, [self.place(r, k)])
+        return explained_each(self.total, beside, [[self.place(r, k)]])[0]
 
     def explains_what_is_apart(
         self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
@@ -219,8 +213,9 @@ class Comparison:
     ) -> tuple[float, float] | None:
         """Return by how much a run is apart from the others, and their spread, where it is far from them."""
         r, k = at
-        values, errors = own_deviations(self.runs, chosen, self.columns + k, _FREE * kinds[k].usual)
-        apart, spread = apart_from_others(values, r, kinds[k].usual)
+        usual = USUAL[kinds[k].what]
+        values, errors = own_deviations(self.runs, chosen, self.columns + k, _FREE * usual)
+        apart, spread = apart_from_others(values, r, usual)
         least = FAR * float(np.hypot(spread, errors[r])) + float(self.echoes[r, k])
         return (apart, spread) if abs(apart) > least else None
 
@@ -228,11 +223,7 @@ class Comparison:
 def deviations(joints: Mapping[int, object]) -> list[Deviation]:
     """Return what is asked of every run with these joints; zeros are in parts of the rated torque."""
     where: list[tuple[str, JointName]] = [*(("current_a", n) for n in joints), ("torque_nm", "sensor")]
-    return [
-        Deviation(what, channel, joint, USUAL[what], UNITS[what])
-        for what in USUAL
-        for channel, joint in where
-    ]
+    return [Deviation(what, channel, joint) for what in USUAL for channel, joint in where]
 
 
 def column(kind: Deviation, s: JointSignals, balance: str) -> FloatArray | None:
@@ -266,18 +257,19 @@ def echo(kind: Deviation, signals: Sequence[JointSignals], samples: float) -> fl
 
 
 def _with_columns(
-    run: RunData, signals: Sequence[JointSignals], kinds: Sequence[Deviation], dataset: Dataset
+    run: RunData, signals: Sequence[JointSignals], kinds: Sequence[Deviation], families: int
 ) -> RunData:
-    """Return the run with the deviations as further nuisances, behind the families."""
+    """Return the run with the deviations as further nuisances, behind so many families."""
     channels = {}
     of = {s.number: s for s in signals}
     for channel, d in run.channels.items():
         s = of[channel.joint]
-        made = [(len(dataset.families) + k, column(kind, s, channel.balance)) for k, kind in enumerate(kinds)]
+        made = [(families + k, column(kind, s, channel.balance)) for k, kind in enumerate(kinds)]
         there = [(k, c) for k, c in made if c is not None]
         numbers, columns = seen_in_bins(s, channel.balance, there, run.samples)
-        nuisances, families = np.hstack((d.nuisances, columns)), np.concatenate((d.families, numbers))
-        channels[channel] = replace(d, nuisances=nuisances, families=families)
+        channels[channel] = replace(
+            d, nuisances=np.hstack((d.nuisances, columns)), families=np.concatenate((d.families, numbers))
+        )
     return replace(run, channels=channels)
 
 
@@ -337,13 +329,10 @@ def _inverses(grams: FloatArray) -> FloatArray:
     return inverses
 
 
-def explained(total: FloatArray, chosen: Sequence[int], extra: Sequence[int]) -> float:
-    """Return by how much the columns `extra` lower the sum of squares beyond `chosen` (last row: residual)."""
-    return explained_each(total, chosen, [extra])[0]
-
-
 def explained_each(total: FloatArray, chosen: Sequence[int], extras: Sequence[Sequence[int]]) -> list[float]:
-    """Return `explained` of each of `extras`; those of one length are solved together, which is several times faster."""
+    """Return by how much each of these sets of columns lowers the sum of squares beyond `chosen` (last row: residual); those
+    of one length are solved together, which is several times faster.
+    """
     [before] = _lowered(total, [list(chosen)])
     after = [0.0] * len(extras)
     for length in {len(extra) for extra in extras}:

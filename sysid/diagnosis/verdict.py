@@ -61,7 +61,7 @@ _Z95: Final = 1.96
 @dataclass(frozen=True)
 class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
-    without them lacks, with the discrepancy as estimated and ROBUST times as large, that best set's entries instead, and
+    without them lacks, with the discrepancy as estimated and ROBUST times as large, that set's entries instead, and
     deviations of the coefficients [z] from none.
     """
 
@@ -71,15 +71,13 @@ class Judged:
     delta: float
     robust: float
     rivals: tuple[Entry, ...]
-    rival: Set
     z: float
 
 
 def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
     """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
     mean = solution.values.fit(solution.chosen).mean
-    places = solution.values.places(solution.chosen)
-    found = [(solution.entries[k], mean[places[k]]) for k in sorted(solution.chosen)]
+    found = [(solution.entries[k], mean[at]) for k, at in solution.values.places(solution.chosen).items()]
     return present_effects(found), np.array([u[: len(solution.dataset.families)] for u in solution.own_means])
 
 
@@ -115,7 +113,6 @@ def judged(solution: Solution) -> list[Judged]:
                 2.0 * (plain.fit(chosen).evidence - plain.fit(rival).evidence),
                 2.0 * robust,
                 tuple(sets.entries[k] for k in rival - chosen),
-                rival,
                 math.sqrt(max(z2, 0.0)),
             )
         )
@@ -144,13 +141,8 @@ def grade_of(j: Judged, *, vetoed: bool, hidden: bool) -> str:
     return CERTAIN if sure else EFFECTIVE
 
 
-def conclude(
-    solution: Solution,
-    names: tuple[str, ...],
-    scope: Scope,
-    relevance: float,
-) -> tuple[Findings, Prediction]:
-    """Return the findings of one diagnosis, without what was noted on its runs before, and the model that predicts."""
+def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance: float) -> Findings:
+    """Return the findings of one diagnosis, without what was noted on its runs before."""
     dataset = solution.dataset
     prediction = predict(solution)
     effects = judged(solution)
@@ -158,10 +150,11 @@ def conclude(
     limits_nm = {c: relevance * rated[c.joint] for c in dataset.runs[0].channels}
     left = remaining(dataset, *present_of(solution))
     rest = unexplained_residual(left)
+    predicting = extended_effects(solution, prediction)
     if (
         _largest(rest, limits_nm) > 1.0
-    ):  # the discrepancy has a part in the set's values, and none in those that predict
-        other = remaining(dataset, extended_effects(solution, prediction), _own(solution, prediction))
+    ):  # the discrepancy has a part in the set's values, none in those that predict
+        other = remaining(dataset, predicting, _own(solution, prediction))
         less = unexplained_residual(other)
         if _largest(less, limits_nm) < _largest(rest, limits_nm):
             left, rest = other, less
@@ -183,7 +176,7 @@ def conclude(
     gaps = channel_gaps(left, rest, unexplained.matters)
     reasons = rest.reasons if unexplained.matters else []
     gain = gain_of(solution, prediction) if prediction.chosen else None
-    findings = Findings(
+    return Findings(
         verdict,
         tuple(reasons),
         names,
@@ -197,12 +190,9 @@ def conclude(
         unexplained=unexplained,
         too_small=tuple(small),
         cannot_be_told=untold,
-        predicts=tuple(
-            Present(p.effect.name, p.joint, p.values) for p in extended_effects(solution, prediction)
-        ),
+        predicts=tuple(Present(p.effect.name, p.joint, p.values) for p in predicting),
         next_experiment=_next(matter, effects, dataset),
     )
-    return findings, prediction
 
 
 def _largest(rest: Unexplained, limits_nm: Mapping[Channel, float]) -> float:
@@ -221,11 +211,7 @@ def _own(solution: Solution, prediction: Prediction) -> FloatArray:
 
 
 def _cause(
-    solution: Solution,
-    j: Judged,
-    prediction: Prediction,
-    total_nm2: float,
-    rest: Unexplained,
+    solution: Solution, j: Judged, prediction: Prediction, total_nm2: float, rest: Unexplained
 ) -> Cause:
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
     remains = math.sqrt(rest.by_channel().get(channel, 0.0))
@@ -276,11 +262,8 @@ def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
             if p.fixed:
                 out[p.name] = Value(value, (value, value), p.unit)
             continue
-        size = (
-            1.0
-            if p.name == "phase_rad"
-            else abs(value - (0.0 if p.name.startswith("reference") else none.get(p.name, 0.0)))
-        )
+        without = 0.0 if p.name.startswith("reference") else none.get(p.name, 0.0)
+        size = 1.0 if p.name == "phase_rad" else abs(value - without)
         wide = math.hypot(half[p.name], limits.INACCURATE * size)
         low, high = value - wide, value + wide
         if p.name != "phase_rad":
@@ -364,9 +347,8 @@ def entry_table(
         if reason and motion is not None:
             lost.append(Untold(name, first, reason, motion))
         rows.append(CandidateEvidence(name, first, math.nan, {}, reason))
-    return tuple(sorted(rows, key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)), tuple(
-        lost
-    )
+    rows.sort(key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)
+    return tuple(rows), tuple(lost)
 
 
 def _absent(effect: Effect, dataset: Dataset, scope: Scope) -> tuple[str, str | None]:
@@ -377,9 +359,8 @@ def _absent(effect: Effect, dataset: Dataset, scope: Scope) -> tuple[str, str | 
         return "not looked for, as asked", None
     if dataset.no_torque and effect.hooks == ("sensor_nm",):
         return "no torque was measured", None
-    if {"twist_rad", "link_rad"} >= set(effect.hooks) and all(
-        s.torsion_nm is None for s in dataset.signals[0]
-    ):
+    bends = {"twist_rad", "link_rad"} >= set(effect.hooks)
+    if bends and all(s.torsion_nm is None for s in dataset.signals[0]):
         return "needs encoders on both sides", ""
     if "temperature_c" in effect.needs and not np.isfinite(dataset.signals[0][0].state.temperature_c).any():
         return "needs a temperature", ""
@@ -417,12 +398,8 @@ def _minimum(e: Entry, smallest: float) -> dict[str, Value]:
 
 def extended_effects(solution: Solution, prediction: Prediction) -> list[PresentEffect]:
     """Return the effects of the extended model with the values that predict."""
-    first, found = 0, []
-    for k in sorted(prediction.chosen):
-        e = solution.entries[k]
-        found.append((e, prediction.mean[first : first + e.size]))
-        first += e.size
-    return present_effects(found)
+    places = solution.values.places(prediction.chosen)
+    return present_effects([(solution.entries[k], prediction.mean[at]) for k, at in places.items()])
 
 
 def _next(causes: Sequence[Cause], effects: Sequence[Judged], dataset: Dataset) -> dict[str, Any] | None:

@@ -165,7 +165,7 @@ def test_a_channel_that_is_all_noise_makes_no_run_odd() -> None:
     assert diagnose(idle, {1: PLAIN}).outlier_runs == ()
     table = dict(idle)["run2"]
     (signals,), _ = usable_signals([("run2", table)], {1: PLAIN}, (1,))
-    gain, zero = Deviation("gain", "current_a", 1, 0.01, ""), Deviation("zero", "current_a", 1, 0.004, "")
+    gain, zero = Deviation("gain", "current_a", 1), Deviation("zero", "current_a", 1)
     assert echo(zero, signals, 5) == 0.0
     (driven,), _ = usable_signals([("run1", dict(runs())["run1"])], {1: PLAIN}, (1,))
     assert echo(gain, driven, 5) < 1e-3 < echo(gain, signals, 5)
