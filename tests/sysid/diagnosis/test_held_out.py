@@ -187,6 +187,7 @@ def test_what_a_certain_entry_must_survive(solution: Solution, monkeypatch: pyte
     for j in plain:
         dropped, sets = chosen - set(j.members), solution.sets
         imitated = 2.0 * (sets.fit(chosen).evidence - sets.fit(dropped).evidence)
-        assert j.delta == pytest.approx(2.0 * (apart.fit(chosen).evidence - apart.fit(j.rival).evidence))
+        rival = sets.without(chosen, j.members)
+        assert j.delta == pytest.approx(2.0 * (apart.fit(chosen).evidence - apart.fit(rival).evidence))
         assert j.robust == pytest.approx(min(imitated, j.delta), rel=1e-6)
     assert all(b.robust < a.robust for a, b in zip(plain, own, strict=True))
