@@ -7,6 +7,7 @@ an error is that of the current that the simulation needs (as torque, G Kt i) an
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -19,7 +20,7 @@ from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.evidence import Set, Sets
 from jtqd.sysid.diagnosis.findings import Gain, RunGain
 from jtqd.sysid.diagnosis.model import Solution
-from jtqd.sysid.diagnosis.regressors import RunData
+from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel
 
 _BOOTSTRAPS: Final = 2000
@@ -98,6 +99,31 @@ def _fits(solution: Solution) -> list[Sets]:
     if len(without) == 1:
         without = [everything]
     return [Sets(solution.entries, gram) for gram in (*without, everything)]
+
+
+class Sizes:
+    """The size of an effect in each recording alone, beside all others of the set with the values of all recordings."""
+
+    def __init__(self, solution: Solution) -> None:
+        sets = _fits(solution)
+        self._mean = sets[-1].fit(solution.chosen).mean
+        at = np.append(sets[-1].columns(solution.chosen), -1)
+        total = sets[-1].gram[np.ix_(at, at)]
+        self._runs = [total - one.gram[np.ix_(at, at)] for one in sets[:-1]]
+
+    def over_runs(self, at: Index) -> float:
+        """Return how much the size of the coefficients at these places of the set differs from recording to recording, part
+        of it: rms, each recording weighted by what it holds of it (random effects: DerSimonian and Laird 1986,
+        Controlled Clinical Trials 7); inf with one recording.
+        """
+        energy, lacking = 0.0, 0.0
+        for gram in self._runs:
+            own = float(self._mean[at] @ gram[np.ix_(at, at)] @ self._mean[at])
+            more = float(self._mean[at] @ (gram[at, -1] - gram[at, :-1] @ self._mean))
+            if own > 0.0:
+                energy += own
+                lacking += more**2 / own
+        return math.sqrt(lacking / energy) if len(self._runs) > 1 and energy > 0.0 else math.inf
 
 
 def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:

@@ -120,8 +120,10 @@ CAP: Final = 0.3
 """Largest part of the gap (rms) that may be discrepancy."""
 RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
-ROBUST: Final = 9.0
-"""Factor of the discrepancy's variance that a certain entry must survive."""
+SURE: Final = 3.0
+"""Standard deviations by which a certain entry differs from none."""
+DIFFERS: Final = 0.15
+"""Part of its size by which a certain entry may differ from run to run (rms)."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""
 LISTED: Final = 0.2

@@ -1,9 +1,9 @@
 """Verdict: the entries of the set with grade, interval and size, what remains, and what these runs cannot tell.
 
-An entry is *certain* where no rival set has nearly as much evidence, also with a discrepancy ROBUST times as large, its
-interval excludes the value without it, and less than itself remains; *one of* where a set without it has nearly as much
-evidence; else *effective*: it predicts, and what it stands for is not settled. One relevance
-decides the verdict, for entries and for what remains alike.
+An entry is *certain* where no rival set has nearly as much evidence, a discrepancy cannot imitate it, it differs from none
+by SURE standard deviations, it has the same size in every run, and less than itself remains; *one of* where a set without it
+has nearly as much evidence; else *effective*: it predicts, and what it stands for is not settled. One relevance decides the
+verdict, for entries and for what remains alike.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from jtqd.sysid.diagnosis.findings import (
     Value,
     joint_text,
 )
-from jtqd.sysid.diagnosis.held_out import Prediction, gain_of, predict
+from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.scope import Scope
@@ -61,17 +61,18 @@ _Z95: Final = 1.96
 @dataclass(frozen=True)
 class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
-    without them lacks, with the discrepancy as estimated and ROBUST times as large, that set's entries instead, and
-    deviations of the coefficients [z] from none.
+    without them lacks, and that the set without them lacks where a discrepancy may imitate them, that best set's entries
+    instead, deviations of the coefficients [z] from none, and how much their size differs from run to run.
     """
 
     members: tuple[int, ...]
     present: PresentEffect
     rms_nm: Mapping[Channel, float]
     delta: float
-    robust: float
+    imitated: float
     rivals: tuple[Entry, ...]
     z: float
+    differs: float
 
 
 def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
@@ -84,13 +85,9 @@ def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
 def judged(solution: Solution) -> list[Judged]:
     """Return the effects of the set."""
     sets, chosen = solution.sets, solution.chosen
-    wide = {
-        g: v * (limits.ROBUST if isinstance(g, tuple) and g[0] in ("discrepancy", "shared") else 1.0)
-        for g, v in solution.variances.items()
-    }
     plain = solution.equations.sets(solution.variances, chosen, resembling=False)
-    large = solution.equations.sets(wide, chosen, resembling=False)
-    imitated = solution.equations.sets(wide, chosen)
+    imitating = solution.equations.sets(solution.variances, chosen)
+    differs = Sizes(solution)
     values = solution.values.fit(chosen)
     places = solution.values.places(chosen)
     out = []
@@ -98,10 +95,7 @@ def judged(solution: Solution) -> list[Judged]:
         found = [(solution.entries[k], values.mean[places[k]]) for k in members]
         [present] = present_effects(found)
         rival = sets.without(chosen, members)
-        robust = min(
-            imitated.fit(chosen).evidence - imitated.fit(chosen - set(members)).evidence,
-            large.fit(chosen).evidence - large.fit(rival).evidence,
-        )
+        imitated = imitating.fit(chosen).evidence - imitating.fit(chosen - set(members)).evidence
         at = np.concatenate([np.arange(places[k].start, places[k].stop) for k in members])
         mean = values.mean[at]
         z2 = float(mean @ np.linalg.solve(values.covariance[np.ix_(at, at)], mean))
@@ -111,9 +105,10 @@ def judged(solution: Solution) -> list[Judged]:
                 present,
                 _rms(solution, present),
                 2.0 * (plain.fit(chosen).evidence - plain.fit(rival).evidence),
-                2.0 * robust,
+                2.0 * imitated,
                 tuple(sets.entries[k] for k in rival - chosen),
                 math.sqrt(max(z2, 0.0)),
+                differs.over_runs(at),
             )
         )
     return out
@@ -137,8 +132,8 @@ def grade_of(j: Judged, *, vetoed: bool, hidden: bool) -> str:
     """Return the grade of an effect; see the module. hidden: what remains in its balance is larger than itself."""
     if j.delta <= limits.RIVAL and j.rivals:
         return ONE_OF
-    sure = not hidden and j.delta > limits.RIVAL and j.robust > limits.RIVAL and j.z > _Z95 and not vetoed
-    return CERTAIN if sure else EFFECTIVE
+    evident = min(j.delta, j.imitated) > limits.RIVAL and j.z > limits.SURE
+    return CERTAIN if evident and j.differs < limits.DIFFERS and not (hidden or vetoed) else EFFECTIVE
 
 
 def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance: float) -> Findings:
