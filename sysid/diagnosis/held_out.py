@@ -16,7 +16,6 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
-from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.evidence import Set, Sets
 from jtqd.sysid.diagnosis.findings import Gain, RunGain
 from jtqd.sysid.diagnosis.model import Solution
@@ -36,24 +35,24 @@ class Prediction:
     chosen: Set
     mean: FloatArray
     squares: dict[Channel, FloatArray]
-    vetoed: Set
 
 
 def predict(solution: Solution) -> Prediction:
     """Return what predicts: between the set and the set with all values of the file what held-out runs want, without entries
-    that raise the error on them beyond its scatter.
+    whose size differs from run to run by more than itself: without these the error is less.
     """
     grams, counts = _grams(solution)
-    without = _fits(solution)
-    chosen, vetoed = solution.chosen, frozenset[int]()
-    while True:
-        each = _held_out(grams, [_coefficients(sets, chosen) for sets in without[:-1]])
-        worse = _worst(solution, grams, without, chosen, each)
-        if worse is None:
+    without = fits_without(solution)
+    chosen = solution.chosen
+    while chosen:
+        sizes = Sizes(without, chosen)
+        places = without[-1].places(chosen)
+        differs = {k: sizes.differ(np.arange(s.start, s.stop)) for k, s in places.items()}
+        worst = max(differs, key=differs.__getitem__)
+        if not 1.0 < differs[worst] < math.inf:
             break
-        vetoed |= {worse}
-        chosen -= {worse}
-    slots = {solution.entries[k].slot for k in solution.chosen}
+        chosen -= {worst}
+    slots = {solution.entries[k].slot for k in chosen}
     values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
     wide = chosen | values - solution.equations.noisy
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
@@ -66,7 +65,7 @@ def predict(solution: Solution) -> Prediction:
         for c in grams[0]
     }
     named = wide if part > 0.0 else chosen
-    return Prediction(named, mixed[-1][without[-1].columns(named)], squares, vetoed)
+    return Prediction(named, mixed[-1][without[-1].columns(named)], squares)
 
 
 def stacked(
@@ -92,7 +91,7 @@ def _coefficients(sets: Sets, chosen: Set) -> FloatArray:
     return out
 
 
-def _fits(solution: Solution) -> list[Sets]:
+def fits_without(solution: Solution) -> list[Sets]:
     """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
     plain = {g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.found.items()}
     *without, everything = solution.wide.marginal(plain)
@@ -102,16 +101,17 @@ def _fits(solution: Solution) -> list[Sets]:
 
 
 class Sizes:
-    """The size of an effect in each recording alone, beside all others of the set with the values of all recordings."""
+    """The size of an effect in each recording alone, beside all others of a set with the values of all recordings."""
 
-    def __init__(self, solution: Solution) -> None:
-        sets = _fits(solution)
-        self._mean = sets[-1].fit(solution.chosen).mean
-        at = np.append(sets[-1].columns(solution.chosen), -1)
-        total = sets[-1].gram[np.ix_(at, at)]
-        self._runs = [total - one.gram[np.ix_(at, at)] for one in sets[:-1]]
+    def __init__(self, without: Sequence[Sets], chosen: Set) -> None:
+        """Take the sets without each recording in turn, and with all."""
+        everything = without[-1]
+        self._mean = everything.fit(chosen).mean
+        at = np.append(everything.columns(chosen), -1)
+        total = everything.gram[np.ix_(at, at)]
+        self._runs = [total - sets.gram[np.ix_(at, at)] for sets in without[:-1]]
 
-    def over_runs(self, at: Index) -> float:
+    def differ(self, at: Index) -> float:
         """Return how much the size of the coefficients at these places of the set differs from recording to recording, part
         of it: rms, each recording weighted by what it holds of it (random effects: DerSimonian and Laird 1986,
         Controlled Clinical Trials 7); inf with one recording.
@@ -165,29 +165,6 @@ def _held_out(
         contrast = np.append(-mean, 1.0)
         out.append({c: max(float(contrast @ g @ contrast), 0.0) for c, g in run.items()})
     return out
-
-
-def _worst(
-    solution: Solution,
-    grams: Sequence[dict[Channel, FloatArray]],
-    fits: Sequence[Sets],
-    chosen: Set,
-    each: Sequence[dict[Channel, float]],
-) -> int | None:
-    """Return the structural entry whose removal lowers the held-out error most, beyond the scatter over recordings."""
-    if len(grams) < limits.FEWEST_VETO:
-        return None
-    now = np.array([sum(run.values()) for run in each])
-    best, found = 0.0, None
-    for k in sorted(chosen):
-        if solution.entries[k].prior.file:
-            continue
-        without = _held_out(grams, [_coefficients(sets, chosen - {k}) for sets in fits[:-1]])
-        gain = now - np.array([sum(run.values()) for run in without])
-        scatter = float(np.std(gain, ddof=1)) / np.sqrt(len(gain))
-        if float(np.mean(gain)) > max(limits.VETO * scatter, best):
-            best, found = float(np.mean(gain)), k
-    return found
 
 
 def gain_of(solution: Solution, prediction: Prediction, seed: int = 0) -> Gain:

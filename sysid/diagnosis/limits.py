@@ -122,17 +122,13 @@ RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
-DIFFERS: Final = 0.15
-"""Part of its size by which a certain entry may differ from run to run (rms)."""
+DIFFERS: Final = 0.1
+"""Part of its size by which a certain entry may differ from run to run (rms); at its whole size it predicts nothing."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""
 LISTED: Final = 0.2
 """Part of the relevance from which an entry is listed as a cause; smaller ones are listed as too small to matter."""
 RELEVANCE: Final = 0.005
 """Part of the rated torque, rms, from which an entry or an unexplained residual matters; the user may set another."""
-FEWEST_VETO: Final = 3
-"""Recordings from which held-out runs may veto an entry."""
-VETO: Final = 2.0
-"""Standard errors over recordings by which an entry must raise the error on held-out runs to be vetoed."""
 INACCURATE: Final = 0.03
 """Half width of a 95 % interval, as part of an effect's size, for what the equations simplify: no interval is narrower."""

@@ -40,7 +40,7 @@ from jtqd.sysid.diagnosis.findings import (
     Value,
     joint_text,
 )
-from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, gain_of, predict
+from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, fits_without, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.scope import Scope
@@ -87,7 +87,7 @@ def judged(solution: Solution) -> list[Judged]:
     sets, chosen = solution.sets, solution.chosen
     plain = solution.equations.sets(solution.variances, chosen, resembling=False)
     imitating = solution.equations.sets(solution.variances, chosen)
-    differs = Sizes(solution)
+    sizes = Sizes(fits_without(solution), chosen)
     values = solution.values.fit(chosen)
     places = solution.values.places(chosen)
     out = []
@@ -108,7 +108,7 @@ def judged(solution: Solution) -> list[Judged]:
                 2.0 * imitated,
                 tuple(sets.entries[k] for k in rival - chosen),
                 math.sqrt(max(z2, 0.0)),
-                differs.over_runs(at),
+                sizes.differ(at),
             )
         )
     return out
@@ -128,12 +128,12 @@ def _rms(solution: Solution, present: PresentEffect) -> dict[Channel, float]:
     }
 
 
-def grade_of(j: Judged, *, vetoed: bool, hidden: bool) -> str:
+def grade_of(j: Judged, *, hidden: bool) -> str:
     """Return the grade of an effect; see the module. hidden: what remains in its balance is larger than itself."""
     if j.delta <= limits.RIVAL and j.rivals:
         return ONE_OF
     evident = min(j.delta, j.imitated) > limits.RIVAL and j.z > limits.SURE
-    return CERTAIN if evident and j.differs < limits.DIFFERS and not (hidden or vetoed) else EFFECTIVE
+    return CERTAIN if evident and j.differs < limits.DIFFERS and not hidden else EFFECTIVE
 
 
 def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance: float) -> Findings:
@@ -155,7 +155,7 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
             left, rest = other, less
     held = held_nm(left)
     total = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
-    causes = sorted((_cause(solution, j, prediction, total, rest) for j in effects), key=lambda c: -c.rms_nm)
+    causes = sorted((_cause(solution, j, total, rest) for j in effects), key=lambda c: -c.rms_nm)
     matter = [c for c in causes if c.rms_nm >= limits_nm[_channel(c, dataset)]]
     listed = [c for c in causes if c.rms_nm >= limits.LISTED * limits_nm[_channel(c, dataset)]]
     listed = [c if c in matter else replace(c, matters=False) for c in listed]
@@ -205,12 +205,10 @@ def _own(solution: Solution, prediction: Prediction) -> FloatArray:
     return solution.own(prediction.mean, prediction.chosen)[:, : len(solution.dataset.families)]
 
 
-def _cause(
-    solution: Solution, j: Judged, prediction: Prediction, total_nm2: float, rest: Unexplained
-) -> Cause:
+def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -> Cause:
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
     remains = math.sqrt(rest.by_channel().get(channel, 0.0))
-    grade = grade_of(j, vetoed=bool(prediction.vetoed & set(j.members)), hidden=remains > j.rms_nm[channel])
+    grade = grade_of(j, hidden=remains > j.rms_nm[channel])
     rivals = tuple(
         dict.fromkeys(
             e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != j.present.joint else "")
