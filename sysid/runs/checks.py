@@ -20,7 +20,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.text import counted
@@ -192,8 +192,9 @@ def _turn(position: FloatArray) -> float | None:
 def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
     """Return the seconds by which the sensor's torque is late (early: negative) against current and motion; None: unknown.
 
-    The torque is shifted over the regression on motor torque, acceleration, friction's sign, velocity and a constant; the
-    channels are in step where the residual is smallest. Friction would bias a plain cross-correlation.
+    The torque is shifted over the regression on motor torque, acceleration, friction's sign, velocity and a constant, over
+    the rows in which the joint moves: in one that stands stiction holds any torque. The channels are in step where the
+    residual is smallest. Friction would bias a plain cross-correlation.
     """
     columns = table.joint(number, joint.gear_ratio)
     torque, current, velocity = columns.torque_nm, columns.current_a, columns.motor_velocity_rad_s
@@ -207,12 +208,14 @@ def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
     reach = round(_SKEW_LONGEST_S / step)
     v = w / joint.gear_ratio
     inside = slice(reach, len(v) - reach)
-    if len(v) < 6 * reach or np.count_nonzero(np.abs(v[inside]) > MOVING_RAD_S) < 100:
+    moving = np.abs(v[inside]) > MOVING_RAD_S
+    if len(v) < 6 * reach or np.count_nonzero(moving) < 100:
         return None
-    x = np.column_stack((i, np.gradient(w, step), np.tanh(v / MOVING_RAD_S), v, np.ones(len(v))))[inside]
+    x = np.column_stack((i, np.gradient(w, step), np.sign(v), v, np.ones(len(v))))[inside]
     size = np.linalg.norm(x, axis=0)
-    q, _ = np.linalg.qr(x / np.where(size > 0.0, size, 1.0))
-    residual = _residual_shares(q, tau - np.mean(tau), 2 * reach + 1)
+    q = np.zeros_like(x)
+    q[moving], _ = np.linalg.qr((x / np.where(size > 0.0, size, 1.0))[moving])
+    residual = _residual_shares(q, moving, tau - np.mean(tau), 2 * reach + 1)
     best = int(np.argmin(residual))
     if residual[reach] - residual[best] < _SKEW_MATTERS:
         return 0.0
@@ -222,18 +225,20 @@ def skew_s(table: RunTable, number: int, joint: Joint) -> float | None:
     return (best - reach) * step
 
 
-def _residual_shares(q: FloatArray, y: FloatArray, shifts: int) -> FloatArray:
-    """Return the part of the variance of y[k : k + n] that the orthonormal q [n, p] does not explain, k = 0 .. shifts - 1.
+def _residual_shares(q: FloatArray, rows: BoolArray, y: FloatArray, shifts: int) -> FloatArray:
+    """Return the part of the variance of y[k : k + n][rows] that q does not explain, k = 0 .. shifts - 1.
 
-    q spans the constant. All shifts at once: the products with q are correlations by FFT, the sums are running ones.
+    q [n, p]: orthonormal, its span has the constant, and it is zero outside of rows [n]. All shifts at once: sums of
+    products are correlations, by FFT.
     """
-    n = len(q)
-    size = 1 << (len(y) + n).bit_length()
-    spectrum = np.fft.rfft(y, size)[:, None] * np.conj(np.fft.rfft(q, size, axis=0))
-    products = np.fft.irfft(spectrum, size, axis=0)[:shifts]
-    total, energy = (np.concatenate(([0.0], np.cumsum(x))) for x in (y, y * y))
-    constant = (total[n : n + shifts] - total[:shifts]) ** 2 / n
-    variance = np.maximum(energy[n : n + shifts] - energy[:shifts] - constant, 1e-30)
+    size = 1 << (len(y) + len(q)).bit_length()
+    spectra = [np.conj(np.fft.rfft(x, size, axis=0)) for x in (q, rows[:, None])]
+    products, total, energy = (
+        np.fft.irfft(np.fft.rfft(x, size)[:, None] * spectrum, size, axis=0)[:shifts]
+        for x, spectrum in ((y, spectra[0]), (y, spectra[1]), (y * y, spectra[1]))
+    )
+    constant = total[:, 0] ** 2 / np.count_nonzero(rows)
+    variance = np.maximum(energy[:, 0] - constant, 1e-30)
     result: FloatArray = 1.0 - (np.sum(products**2, axis=1) - constant) / variance
     return result
 

@@ -304,6 +304,33 @@ def test_channels_in_step_have_no_skew(run):
     assert [skew_s(run, number, JOINTS[number]) for number in (1, 2)] == [0.0, 0.0]
 
 
+@pytest.mark.parametrize("coulomb_nm", [3.0, 5.0])
+def test_a_pendulum_that_sticks_has_its_torque_in_step(coulomb_nm):
+    """The joint stands while the current leads a wave inside the friction: the sensor has the weight's torque alone."""
+    joint, inertia, weight, step = PLAIN, 0.3, 9.0, 1e-3
+    gain = joint.gear_ratio * joint.torque_constant_nm_per_a
+    whole = inertia + joint.gear_ratio**2 * joint.rotor_inertia_kgm2
+    q = v = 0.0
+    rows = []
+    for k in range(20000):
+        t = k * step
+        wanted = 0.4 * math.sin(0.9 * t) + 0.3 * math.sin(1.7 * t) + 0.2 * math.sin(3.1 * t)
+        motor = 60.0 * whole * (wanted - q) - 16.0 * whole * v
+        motor += weight * math.sin(q) + coulomb_nm * math.tanh(10.0 * math.cos(0.9 * t))
+        free = v + step * (motor - weight * math.sin(q)) / whole
+        after = math.copysign(max(abs(free) - step * coulomb_nm / whole, 0.0), free)
+        rows.append(
+            (t, joint.gear_ratio * q, motor / gain, weight * math.sin(q) + inertia * (after - v) / step)
+        )
+        v = after
+        q += step * v
+    t, position, current, torque = np.array(rows).T
+    columns = JointColumns(current_a=current, motor_position_rad=position, torque_nm=torque)
+    assert skew_s(RunTable(t, {1: columns}), 1, joint) == 0.0
+    late = replace(columns, torque_nm=np.roll(torque, 150))
+    assert skew_s(RunTable(t, {1: late}), 1, joint) == pytest.approx(0.15, abs=0.006)
+
+
 @pytest.mark.parametrize(("least", "late_s"), [(0.02, 0.105), (0.031, None)])
 def test_a_shift_counts_where_it_halves_the_residual(monkeypatch, least, late_s):
     """0.051 in step and 0.031 after 0.105 s come from slow motions with stiction, whose channels are in step."""
@@ -311,7 +338,7 @@ def test_a_shift_counts_where_it_halves_the_residual(monkeypatch, least, late_s)
     velocity = np.sin(t)
     columns = JointColumns(current_a=velocity, motor_velocity_rad_s=100.0 * velocity, torque_nm=np.cos(t))
 
-    def residual_shares(_q: object, _y: object, shifts: int) -> np.ndarray:
+    def residual_shares(_q: object, _rows: object, _y: object, shifts: int) -> np.ndarray:
         curve = np.full(shifts, 0.051)
         curve[shifts // 2 + 21] = least
         return curve
