@@ -46,7 +46,7 @@ from jtqd.estimator.text import counted
 from jtqd.sysid.progress import bar
 from jtqd.sysid.report import page
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import LOGS, TABLES
+from jtqd.sysid.runs.files import LOGS, TABLES, ends_in
 from jtqd.sysid.runs.options import UsageError, check_joint_files, joint_files
 from jtqd.sysid.runs.run_file import RunError
 
@@ -166,7 +166,7 @@ def _first_kind(inside: Sequence[Path], kinds: Sequence[Sequence[str]]) -> list[
             by_directory.setdefault(path.parent, []).append(path)
     found: list[Path] = []
     for paths in by_directory.values():
-        of_kinds = ([path for path in paths if path.name.endswith(tuple(kind))] for kind in kinds)
+        of_kinds = ([path for path in paths if ends_in(path, tuple(kind))] for kind in kinds)
         found += next((chosen for chosen in of_kinds if chosen), [])
     return found
 

@@ -217,6 +217,10 @@ class _Compiler(NamedTuple):
             )
             if any(each != "pi" for each in names):
                 raise self.error("a period of unwrap that is no number", "e.g. 2 * pi or 4096")
+            with np.errstate(all="ignore"):
+                period = float(self.compiled(node.args[1])({}))
+            if not 0.0 < period < math.inf:
+                raise self.error(f"a period of unwrap of {period:g}", "a number above 0, e.g. 2 * pi or 4096")
         return function
 
 

@@ -37,6 +37,11 @@ _PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.
 """Name of a part of a run: PREFIX-RUN-PART.mcap."""
 
 
+def ends_in(path: Path, endings: tuple[str, ...]) -> bool:
+    """Return whether a file's name has one of the endings; recorders write LOG001.CSV as well."""
+    return path.name.lower().endswith(endings)
+
+
 def run_paths(arguments: Sequence[Path]) -> list[Path]:
     """Return the run files: a file is itself; a directory stands for its tables, or its logs where it has no table. Raises
     RunError.
@@ -51,7 +56,7 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
             paths.append(argument)
             continue
         names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith("."))
-        inside = [p for p in names if p.name.endswith(TABLES)] or [p for p in names if p.name.endswith(LOGS)]
+        inside = [p for p in names if ends_in(p, TABLES)] or [p for p in names if ends_in(p, LOGS)]
         if not inside:
             raise RunError(
                 f"{argument}: found no run file in it, expected names ending in {', '.join(TABLES + LOGS)}"
@@ -144,13 +149,13 @@ def _content(
             else "no such file"
         )
         raise RunError(f"{path}: found {found}, expected a run file ({', '.join(TABLES + LOGS)})")
-    if path.name.endswith(LOGS):
+    if ends_in(path, LOGS):
         from jtqd.sysid.runs.logs import read_log
 
         return read_log(path, *parts, joints=joints)
-    if path.name.endswith(".parquet"):
+    if ends_in(path, (".parquet",)):
         return read_parquet(path, columns, blanks=blanks)
-    if path.name.endswith(TABLES):
+    if ends_in(path, TABLES):
         return read_csv(path, columns, blanks=blanks)
     raise RunError(f"{path}: found a file ending in '{path.suffix}', expected {', '.join(TABLES + LOGS)}")
 

@@ -21,8 +21,17 @@ from jtqd.estimator.joint import ELASTIC
 from jtqd.estimator.text import table_lines
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.column_names import TORQUE, VOLTAGE, quoted
-from jtqd.sysid.runs.files import TABLES, run_paths
-from jtqd.sysid.runs.propose import DRIVE, OPEN, Guess, JointProposal, Proposal, ProposalError, propose
+from jtqd.sysid.runs.files import TABLES, ends_in, run_paths
+from jtqd.sysid.runs.propose import (
+    DRIVE,
+    OPEN,
+    Guess,
+    JointProposal,
+    Proposal,
+    ProposalError,
+    Table,
+    propose,
+)
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import read_columns
 
@@ -40,12 +49,12 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     try:
         paths = run_paths(options.from_csv)
-        wrong = next((path for path in paths if not path.name.endswith(TABLES)), None)
+        wrong = next((path for path in paths if not ends_in(path, TABLES)), None)
         if wrong is not None:
             raise RunError(f"{wrong}: found a file ending in '{wrong.suffix}', expected {', '.join(TABLES)}")
         read = [read_columns(path) for path in progress(paths, "reading tables")]
         texts = {name: text for _, each in read for name, text in each.items()}
-        proposal = propose([{k: x for k, x in table.items() if k not in texts} for table, _ in read])
+        proposal = proposed([table for table, _ in read], texts)
         files = {COLUMNS: columns_text(proposal)}
         files |= {joint_file(proposal, each): joint_text(each) for each in proposal.joints}
         make_directory(options.out)
@@ -61,6 +70,17 @@ def main(argv: list[str]) -> int:
         return 1
     print(report(proposal, texts, options.from_csv, options.out))
     return 0
+
+
+def proposed(tables: Sequence[Table], texts: Mapping[str, str]) -> Proposal:
+    """Return the proposal for the columns that hold numbers in every table; texts: the first text of the others. Raises
+    ProposalError, which shows them: a time may be among them.
+    """
+    try:
+        return propose([{k: x for k, x in table.items() if k not in texts} for table in tables])
+    except ProposalError as error:
+        few = ", ".join(f"{name[:_WIDEST]!r} ({text!r})" for name, text in list(texts.items())[:3])
+        raise ProposalError(f"{error}{few and f'; not numbers: {few}'}") from None
 
 
 def parser() -> argparse.ArgumentParser:
@@ -136,7 +156,7 @@ def map_lines(joint: JointProposal) -> list[str]:
 
 
 def _text(source: str) -> str:
-    return json.dumps(source, ensure_ascii=False)
+    return json.dumps(source, ensure_ascii=not source.isprintable())
 
 
 def joint_file(proposal: Proposal, joint: JointProposal) -> str:
@@ -174,7 +194,7 @@ def joint_text(joint: JointProposal) -> str:
 def report(proposal: Proposal, texts: Mapping[str, str], arguments: Sequence[Path], out: Path) -> str:
     """Return the text for a terminal: columns, notes, what is open, the next command."""
     cells = [("column", "taken for", "unit", "why"), *map(_cells, proposal.columns)]
-    cells += [(column, "-", "-", f"text: {text!r}") for column, text in texts.items()]
+    cells += [(_shown(column), "-", "-", f"text: {text!r}") for column, text in texts.items()]
     lines = [*table_lines(cells, (0, 1, 2, 3)), "", f"about {proposal.rate_hz:.4g} rows per second"]
     lines += [f"joint {each.number}: {note}" for each in proposal.joints for note in each.notes]
     files = [out / joint_file(proposal, each) for each in proposal.joints]
@@ -197,6 +217,16 @@ def report(proposal: Proposal, texts: Mapping[str, str], arguments: Sequence[Pat
     return "\n".join([*lines, "", "then:", f"  {command}"])
 
 
+_WIDEST: Final = 40
+"""Characters of a column's name in a table of a terminal."""
+
+
+def _shown(column: str) -> str:
+    """Return the name of a column without what controls a terminal, shortened."""
+    name = column if column.isprintable() else repr(column)[1:-1]
+    return name if len(name) <= _WIDEST else f"{name[: _WIDEST - 3]}..."
+
+
 def _cells(guess: Guess) -> tuple[str, str, str, str]:
     target = f"j{guess.joint}.{guess.target}" if guess.target != "time_s" else "time_s"
-    return guess.column, target if guess.target else "-", guess.unit or "-", "; ".join(guess.why)
+    return _shown(guess.column), target if guess.target else "-", guess.unit or "-", "; ".join(guess.why)

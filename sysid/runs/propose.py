@@ -247,7 +247,7 @@ def _unusable(guess: Guess) -> str:
     reasons = (
         (not guess.kind, "no quantity of a joint by its name"),
         (bool(COMMAND & words), "a command, not a measurement"),
-        (len(x) < 2, "blank in every row"),
+        (len(x) < 2, "no finite numbers"),
         (
             guess.kind in (VOLTAGE, TEMPERATURE, CURRENT) and SUPPLY & words,
             "of supply or electronics, not of the motor",
@@ -315,6 +315,9 @@ class _Joint:
         speeds = self._sides_of_speeds(positions, speeds)
         current = self._one(CURRENT, "current_a", frozenset({"iq", "motor", "q", "actual"}))
         drive = current or self._one(VOLTAGE, DRIVE, frozenset({"uq", "motor"})) or self._one(DUTY, DRIVE)
+        for each in (*self._of(VOLTAGE), *self._of(DUTY)):
+            if drive is not None and each is not drive:
+                each.drop(f"not needed besides {drive.column!r}")
         torque = self._torque(current, drive)
         self._one(TEMPERATURE, "temperature_c", frozenset({"motor", "winding", "coil"}))
         self._one(ENABLED, "enabled")

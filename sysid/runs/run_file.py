@@ -68,7 +68,7 @@ def file_bytes(path: Path) -> tuple[bytes, str]:
 
 def header_place(path: Path) -> str:
     """Return the line of a table's header for messages; only text has lines."""
-    return " line 1:" if ".csv" in path.suffixes else ""
+    return " line 1:" if ".csv" in path.name.lower() else ""
 
 
 LONGEST_GAP: Final = 10.0
@@ -260,7 +260,7 @@ def _with_spread_stamps(content: Content) -> Content:
         return content
     new = np.concatenate(([True], steps > 0.0))
     rows = np.flatnonzero(new)
-    many = np.max(np.diff(rows)) > _MOST_ALIKE or not new[-1]
+    many = not new[-1] or np.max(np.diff(rows)) > _MOST_ALIKE
     if many or np.mean(steps) < _LEAST_STEP * np.median(steps[steps > 0.0]):
         return content
     spread = np.interp(np.arange(len(time_s)), rows, time_s[rows])

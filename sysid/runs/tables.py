@@ -1,6 +1,7 @@
 """Run tables as files: CSV, gzipped CSV and Parquet are read, CSV and gzipped CSV are written.
 
-A table has one header row, UTF-8, cells between commas, semicolons or tabs; lines of comment (#) may stand above it.
+A table has one header row, UTF-8, cells between commas, semicolons or tabs; lines of comment (#) may stand above it. Its
+numbers have decimal points, or all of them decimal commas.
 pyarrow is imported when a Parquet file is read.
 The true torques of an emulated run, which no instrument measures, are NAME.truth.npz beside NAME.csv.gz.
 """
@@ -14,7 +15,7 @@ import importlib.util
 import io
 import math
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import chain, islice
@@ -38,18 +39,19 @@ _BLANK: Final = ("", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "na
 def read_csv(path: Path, columns: ColumnMap | None, *, blanks: bool = False) -> Content:
     """Read a table; blanks: rows with a blank cell are left out, and so is a last row that was cut; else refused."""
     data, sha256 = file_bytes(path)
-    header, rows, notes = _table(path, data, cut=blanks)
+    header, rows, notes, number = _table(path, data, cut=blanks)
     wanted = _Wanted.of(header, path, columns)
     source = {name: header.index(name) for name in wanted.names}
     cells: dict[str, list[float]] = {name: [] for name in source}
     lines: list[int] = []
     for line, row in rows:
         for name, index in source.items():
-            value = _number(row[index])
+            value = number(row[index])
             if not math.isfinite(value) and not (blanks and row[index].strip().lower() in _BLANK):
-                comma = " with a decimal point" if "," in row[index] else ""
+                mark = "comma" if number is _comma_number else "point" if "," in row[index] else ""
                 raise RunError(
-                    f"{path}: line {line}, column {name!r}: found {row[index][:40]!r}, expected a finite number{comma}"
+                    f"{path}: line {line}, column {name!r}: found {row[index][:40]!r}, expected a finite number"
+                    f"{mark and f' with a decimal {mark}'}"
                 )
             cells[name].append(value)
         lines.append(line)
@@ -67,17 +69,18 @@ def read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, str]]:
     data, _ = file_bytes(path)
     numbers: dict[str, FloatArray] = {}
     texts: dict[str, str] = {}
-    if path.name.endswith(".parquet"):
+    number = _number
+    if path.name.lower().endswith(".parquet"):
         with _parquet(path, data) as file:
             table = file.read()
         cells = {name: table.column(name).to_pylist() for name in table.column_names}
     else:
-        header, rows, _ = _table(path, data, cut=True)
+        header, rows, _, number = _table(path, data, cut=True)
         columns = zip(*(row for _, row in rows), strict=True)
         cells = {name: list(column) for name, column in zip(header, columns, strict=False) if name}
     for name, column in cells.items():
         shown = ["" if cell is None else str(cell).strip() for cell in column]
-        values = np.array([_number(cell) for cell in shown])
+        values = np.array([number(cell) for cell in shown])
         wrong = next((k for k in np.flatnonzero(np.isnan(values)) if shown[k].lower() not in _BLANK), None)
         if wrong is None:
             numbers[name] = values
@@ -86,7 +89,11 @@ def read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, str]]:
     if not cells or len(next(iter(cells.values()))) < 2:
         raise RunError(f"{path}: found fewer than 2 rows below the header, expected a recording")
     if not numbers:
-        raise RunError(f"{path}: found no column of numbers, expected a table of a recording")
+        name, text = next(iter(texts.items()))
+        raise RunError(
+            f"{path}: found no column of numbers (column {name[:40]!r} has {text!r}), expected numbers from the row below "
+            "the header on, cells between commas, semicolons or tabs"
+        )
     return numbers, texts
 
 
@@ -203,11 +210,13 @@ def _names(expressions: Mapping[str, Expression]) -> list[str]:
 
 def _text(path: Path, data: bytes) -> str:
     try:
-        text = (gzip.decompress(data) if path.suffix == ".gz" else data).decode("utf-8-sig")
+        text = (gzip.decompress(data) if path.suffix.lower() == ".gz" else data).decode("utf-8-sig")
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise RunError(f"{path}: found a broken gzip stream ({error}), expected gzipped CSV") from None
     except UnicodeDecodeError as error:
-        raise RunError(f"{path}: found byte {error.start} that is not UTF-8, expected CSV text") from None
+        raise RunError(
+            f"{path}: found byte {error.start} that is not UTF-8, expected CSV as UTF-8 text"
+        ) from None
     if not text.strip():
         raise RunError(f"{path}: found an empty file, expected a header row and samples")
     return text
@@ -215,8 +224,9 @@ def _text(path: Path, data: bytes) -> str:
 
 def _table(
     path: Path, data: bytes, *, cut: bool
-) -> tuple[list[str], Iterator[tuple[int, list[str]]], tuple[str, ...]]:
-    """Return the header of a table, its rows with the line of each, and notes; cut: a last row that was cut is left out.
+) -> tuple[list[str], Iterator[tuple[int, list[str]]], tuple[str, ...], Callable[[str], float]]:
+    """Return the header of a table, its rows with the line of each, notes, and what reads the number of a cell (NaN: none);
+    cut: a last row that was cut is left out.
 
     Raises RunError, also for a header of numbers, a name given twice, and a row of another length.
     """
@@ -242,16 +252,29 @@ def _table(
             f"{path}: line {line + len(above)}: found column {twice!r} twice, expected every name once"
         )
 
+    first = list(islice(rows, _SHOWING))
+    cells = [cell for _, row in first for cell in row]
+    number = (
+        _comma_number
+        if any("," in each and math.isfinite(_comma_number(each)) for each in cells)
+        else _number
+    )
+    if any("." in each and math.isfinite(_number(each)) for each in cells):
+        number = _number
+    if number is _comma_number:
+        notes += ("numbers have decimal commas",)
+    rows = chain(first, rows)
+
     def whole() -> Iterator[tuple[int, list[str]]]:
-        for number, row in rows:
+        for place, row in rows:
             if row and len(row) != len(header):
                 raise RunError(
-                    f"{path}: line {number + len(above)}: found {counted(len(row), 'cell')}, expected {len(header)}"
+                    f"{path}: line {place + len(above)}: found {counted(len(row), 'cell')}, expected {len(header)}"
                 )
             if row:
-                yield number + len(above), row
+                yield place + len(above), row
 
-    return header, whole(), notes
+    return header, whole(), notes, number
 
 
 def _comments(text: str) -> tuple[list[str], str]:
@@ -269,6 +292,15 @@ def _number(cell: str) -> float:
         return float(cell)
     except ValueError:
         return math.nan
+
+
+_SHOWING: Final = 100
+"""Rows that show whether numbers have decimal points or commas."""
+
+
+def _comma_number(cell: str) -> float:
+    """Return the number of a cell with a decimal comma; NaN for anything else, also for a point."""
+    return math.nan if "." in cell else _number(cell.replace(",", "."))
 
 
 def _separator(text: str) -> str:

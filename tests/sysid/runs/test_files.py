@@ -20,7 +20,7 @@ from jtqd.sysid import runs
 from jtqd.sysid.diagnosis import command as diagnose
 from jtqd.sysid.runs import column_names
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import read_run, read_runs, same_run, windows
+from jtqd.sysid.runs.files import read_run, read_runs, run_paths, same_run, windows
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import write_run
 from tests.paths import ROOT
@@ -171,6 +171,13 @@ def test_one_wrong_stamp_is_no_other_run(tmp_path):
             read_runs([path], segments=True)
 
 
+@pytest.mark.parametrize("stamp", [0.0, 1.7e9])
+def test_a_time_that_stands_is_refused(tmp_path, stamp):
+    path = _table(tmp_path / "a.csv", {"time_s": np.full(len(T), stamp), "j1.current_a": T})
+    with pytest.raises(RunError, match=r"line 3: found time .* after .*, expected rising time"):
+        read_runs([path], segments=True)
+
+
 def test_rows_written_twice_are_left_out_with_a_note(tmp_path):
     t = 0.002 * np.arange(2000.0)
     rows = np.sort(np.concatenate((np.arange(2000), [700, 900, 900])))
@@ -296,10 +303,29 @@ def test_a_comma_in_a_name_separates_nothing_where_the_rows_have_none(tmp_path, 
     columns = _map(time_s={"column": "Zeit, ms", "scale": 1e-3}, j1__current_a="Strom, A")
     assert np.allclose(read_run(path, columns).table.time_s, T)
     path.write_text(path.read_text().replace(".", ","))
-    with pytest.raises(
-        RunError, match=r"column 'Zeit, ms': found '.*', expected a finite number with a decimal point"
-    ):
+    run = read_run(path, columns)
+    assert np.allclose(run.table.time_s, T)
+    assert np.allclose(column(run.table, "current_a"), T + 1.0)
+    assert "numbers have decimal commas" in run.notes
+    path.write_text(path.read_text().replace("3,99", "3.99"))
+    with pytest.raises(RunError, match="expected a finite number with a decimal comma"):
         read_run(path, columns)
+
+
+def test_thousands_apart_by_commas_are_no_decimal_commas(tmp_path):
+    path = _file(tmp_path, 'time_s,j1.current_a\n0.5,"1,000"\n1.5,"2,000"\n')
+    with pytest.raises(RunError, match=r"found '1,000', expected a finite number with a decimal point"):
+        read_run(path)
+
+
+def test_endings_in_capitals_are_read(tmp_path):
+    for name, content in (("LOG001.CSV", GOOD.encode()), ("LOG002.CSV.GZ", gzip.compress(GOOD.encode()))):
+        _file(tmp_path, content, name)
+    assert [path.name for path in run_paths([tmp_path])] == ["LOG001.CSV", "LOG002.CSV.GZ"]
+    plain = read_run(_file(tmp_path, GOOD)).table.time_s.tolist()
+    assert all(
+        read_run(tmp_path / name).table.time_s.tolist() == plain for name in ("LOG001.CSV", "LOG002.CSV.GZ")
+    )
 
 
 @pytest.mark.parametrize("separator", [";", "\t"])

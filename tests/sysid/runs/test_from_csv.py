@@ -168,6 +168,13 @@ def test_parquet_and_several_joints(tmp_path, capsys):
         ("a.csv", "", "found an empty file"),
         ("a.csv", "t,pos\n", "fewer than 2 rows"),
         ("a.csv", "t,pos\na,b\nc,d\n", "no column of numbers"),
+        ("a.csv", "t,pos\ns,deg\n0,1\n1,2\n", "no column of numbers (column 't' has 's')"),
+        (
+            "a.csv",
+            "t|pos\n0|1\n1|2\n",
+            "(column 't|pos' has '0|1'), expected numbers from the row below the header on",
+        ),
+        ("a.csv", "time,pos\n2024-11-27,1\n2024-11-28,2\n", "not numbers: 'time' ('2024-11-27')"),
         ("a.csv", "0.0,1,2\n0.1,1,2\n", "line 1: found numbers, expected a header row"),
         ("a.csv", "t,t\n0,1\n1,2\n", "column 't' twice"),
         ("a.csv", "t,pos\n0,1\n1\n", "line 3: found 1 cell, expected 2"),
@@ -188,6 +195,28 @@ def test_what_is_no_recording_is_one_line(tmp_path, capsys, name, content, words
     assert words in captured.err
     assert not captured.out
     assert not (tmp_path / "o").exists()
+
+
+def test_names_of_columns_do_not_control_the_terminal(tmp_path, capsys):
+    columns = recording(5)
+    names = {"Iq [mA]": "Iq\x1b[31m [mA]", "Temp [C]": "x" * 300}
+    table = written(tmp_path / "a.csv", {names.get(name, name): x for name, x in columns.items()})
+    assert init(table, "--out", tmp_path / "o") == 0
+    out = capsys.readouterr().out
+    assert "\x1b" not in out
+    assert r"Iq\x1b[31m [mA]" in out
+    assert max(map(len, out.split("\n\n")[0].splitlines())) < 160
+    columns_map = ColumnMap.load(tmp_path / "o" / "columns.yaml")
+    assert read_run(table, columns_map).table.joints[1].current_a is not None
+
+
+def test_every_column_that_is_not_used_has_a_reason(tmp_path, capsys):
+    columns = recording(6)
+    spare = {"U [V]": columns["Iq [mA]"] * 1e-3, "Duty": columns["Iq [mA]"] * 1e-4}
+    assert init(written(tmp_path / "a.csv", columns | spare), "--out", tmp_path / "o") == 0
+    rows = capsys.readouterr().out.split("\n\n")[0].splitlines()
+    spared = [row for row in rows if "not needed besides 'Iq [mA]'" in row]
+    assert [row.split()[0] for row in spared] == ["U", "Duty"]
 
 
 def test_files_that_are_there_stay_without_force(tmp_path, capsys):
