@@ -413,9 +413,8 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
         return velocity, np.gradient(velocity, time_s)
     weights = _weights(longest, step)
     largest = float(np.max(np.abs(np.correlate(position, weights[1], mode="valid"))))
-    noise = float(np.std(np.diff(position, 4))) / math.sqrt(
-        70.0
-    )  # white noise; the motion adds almost nothing
+    # white noise; the motion adds almost nothing
+    noise = float(np.std(np.diff(position, 4))) / math.sqrt(70.0)
     half = longest
     for half in range(min(_FEWEST_ROWS // 2, longest), longest + 1):
         weights = _weights(half, step)

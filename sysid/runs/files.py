@@ -141,13 +141,8 @@ def _content(
 ) -> Content:
     """Read a file, or all parts of a log; blanks: rows of a table with a blank cell are left out, else refused."""
     if not path.is_file():
-        found = (
-            "a directory"
-            if path.is_dir()
-            else "something that is no file"
-            if path.exists()
-            else "no such file"
-        )
+        found = "something that is no file" if path.exists() else "no such file"
+        found = "a directory" if path.is_dir() else found
         raise RunError(f"{path}: found {found}, expected a run file ({', '.join(TABLES + LOGS)})")
     if ends_in(path, LOGS):
         from jtqd.sysid.runs.logs import read_log

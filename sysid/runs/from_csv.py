@@ -22,16 +22,7 @@ from jtqd.estimator.text import table_lines
 from jtqd.sysid.progress import progress
 from jtqd.sysid.runs.column_names import TORQUE, VOLTAGE, quoted
 from jtqd.sysid.runs.files import TABLES, ends_in, run_paths
-from jtqd.sysid.runs.propose import (
-    DRIVE,
-    OPEN,
-    Guess,
-    JointProposal,
-    Proposal,
-    ProposalError,
-    Table,
-    propose,
-)
+from jtqd.sysid.runs.propose import DRIVE, OPEN, Guess, JointProposal, Proposal, ProposalError, propose
 from jtqd.sysid.runs.run_file import RunError
 from jtqd.sysid.runs.tables import read_columns
 
@@ -54,7 +45,7 @@ def main(argv: list[str]) -> int:
             raise RunError(f"{wrong}: found a file ending in '{wrong.suffix}', expected {', '.join(TABLES)}")
         read = [read_columns(path) for path in progress(paths, "reading tables")]
         texts = {name: text for _, each in read for name, text in each.items()}
-        proposal = proposed([table for table, _ in read], texts)
+        proposal = propose([{k: x for k, x in table.items() if k not in texts} for table, _ in read])
         files = {COLUMNS: columns_text(proposal)}
         files |= {joint_file(proposal, each): joint_text(each) for each in proposal.joints}
         make_directory(options.out)
@@ -64,23 +55,15 @@ def main(argv: list[str]) -> int:
             return 2
         for name, text in files.items():
             write_whole(options.out / name, text.encode())
-    except (RunError, ProposalError, ConfigError) as error:
-        where = f"{options.from_csv[0]}: " if isinstance(error, ProposalError) else ""
-        print(f"{BY}: {where}{error}", file=sys.stderr)
+    except ProposalError as error:
+        few = ", ".join(f"'{_shown(name)}' ({text!r})" for name, text in list(texts.items())[:3])
+        print(f"{BY}: {options.from_csv[0]}: {error}{few and f'; not numbers: {few}'}", file=sys.stderr)
+        return 1
+    except (RunError, ConfigError) as error:
+        print(f"{BY}: {error}", file=sys.stderr)
         return 1
     print(report(proposal, texts, options.from_csv, options.out))
     return 0
-
-
-def proposed(tables: Sequence[Table], texts: Mapping[str, str]) -> Proposal:
-    """Return the proposal for the columns that hold numbers in every table; texts: the first text of the others. Raises
-    ProposalError, which shows them: a time may be among them.
-    """
-    try:
-        return propose([{k: x for k, x in table.items() if k not in texts} for table in tables])
-    except ProposalError as error:
-        few = ", ".join(f"{name[:_WIDEST]!r} ({text!r})" for name, text in list(texts.items())[:3])
-        raise ProposalError(f"{error}{few and f'; not numbers: {few}'}") from None
 
 
 def parser() -> argparse.ArgumentParser:

@@ -366,9 +366,8 @@ class _Joint:
                     _units_by_ratio(position, speed, ratio)
         bare = [each for each in positions if not each.unit]
         sizes = [float(np.max(np.abs(each.finite))) for each in bare if each.side != "motor"]
-        large = (
-            min(sizes, default=0.0) > _LARGEST_RAD
-        )  # of two positions without a unit the slower one shows it
+        # of two positions without a unit the slower one shows it
+        large = min(sizes, default=0.0) > _LARGEST_RAD
         for each in bare:
             unit, by = ("deg", "by its size") if large else ("rad", "taken as rad")
             each.take(unit, _ANGLES[unit], f"no unit in its name: {by}")

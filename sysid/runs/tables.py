@@ -69,7 +69,7 @@ def read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, str]]:
     data, _ = file_bytes(path)
     numbers: dict[str, FloatArray] = {}
     texts: dict[str, str] = {}
-    number = _number
+    number: Callable[[str], float] = _number
     if path.name.lower().endswith(".parquet"):
         with _parquet(path, data) as file:
             table = file.read()
@@ -89,11 +89,9 @@ def read_columns(path: Path) -> tuple[dict[str, FloatArray], dict[str, str]]:
     if not cells or len(next(iter(cells.values()))) < 2:
         raise RunError(f"{path}: found fewer than 2 rows below the header, expected a recording")
     if not numbers:
-        name, text = next(iter(texts.items()))
-        raise RunError(
-            f"{path}: found no column of numbers (column {name[:40]!r} has {text!r}), expected numbers from the row below "
-            "the header on, cells between commas, semicolons or tabs"
-        )
+        found = f"no column of numbers (column {next(iter(texts))[:40]!r} has {next(iter(texts.values()))!r})"
+        expected = "numbers from the row below the header on, cells between commas, semicolons or tabs"
+        raise RunError(f"{path}: found {found}, expected {expected}")
     return numbers, texts
 
 
@@ -214,9 +212,7 @@ def _text(path: Path, data: bytes) -> str:
     except (gzip.BadGzipFile, EOFError, zlib.error) as error:
         raise RunError(f"{path}: found a broken gzip stream ({error}), expected gzipped CSV") from None
     except UnicodeDecodeError as error:
-        raise RunError(
-            f"{path}: found byte {error.start} that is not UTF-8, expected CSV as UTF-8 text"
-        ) from None
+        raise RunError(f"{path}: found byte {error.start} that is not UTF-8, expected UTF-8 text") from None
     if not text.strip():
         raise RunError(f"{path}: found an empty file, expected a header row and samples")
     return text
@@ -253,20 +249,14 @@ def _table(
         )
 
     first = list(islice(rows, _SHOWING))
-    cells = [cell for _, row in first for cell in row]
-    number = (
-        _comma_number
-        if any("," in each and math.isfinite(_comma_number(each)) for each in cells)
-        else _number
-    )
-    if any("." in each and math.isfinite(_number(each)) for each in cells):
-        number = _number
+    cells = [each for _, row in first for each in row]
+    marks = {mark for each in cells for mark in _READ if mark in each and math.isfinite(_READ[mark](each))}
+    number = _READ["," if marks == {","} else "."]
     if number is _comma_number:
         notes += ("numbers have decimal commas",)
-    rows = chain(first, rows)
 
     def whole() -> Iterator[tuple[int, list[str]]]:
-        for place, row in rows:
+        for place, row in chain(first, rows):
             if row and len(row) != len(header):
                 raise RunError(
                     f"{path}: line {place + len(above)}: found {counted(len(row), 'cell')}, expected {len(header)}"
@@ -294,13 +284,14 @@ def _number(cell: str) -> float:
         return math.nan
 
 
-_SHOWING: Final = 100
-"""Rows that show whether numbers have decimal points or commas."""
-
-
 def _comma_number(cell: str) -> float:
     """Return the number of a cell with a decimal comma; NaN for anything else, also for a point."""
     return math.nan if "." in cell else _number(cell.replace(",", "."))
+
+
+_READ: Final = {".": _number, ",": _comma_number}
+_SHOWING: Final = 100
+"""What reads a number by its decimal mark; rows that show the mark of a table."""
 
 
 def _separator(text: str) -> str:
