@@ -19,6 +19,7 @@ import pytest
 from distributed import LocalCluster
 
 from jtqd.daemon.jtq import main as jtq
+from jtqd.estimator.files import write_whole
 from jtqd.sysid.batch import command
 from jtqd.sysid.batch.command import (
     DONE,
@@ -39,7 +40,6 @@ from jtqd.sysid.batch.command import (
     store,
     stored,
     to_mapping,
-    write_whole,
 )
 from tests.paths import ROOT
 from tests.sysid.diagnosis.diagnose_helpers import JOINT_FILE, write_runs
@@ -241,11 +241,11 @@ def test_a_result_is_there_whole_or_not_at_all(tmp_path):
     assert stored(tmp_path, "k") is None
     path.write_text(json.dumps(kept | {"key": "another"}))
     assert stored(tmp_path, "k") is None
-    write_whole(tmp_path / "x", "1")
-    with pytest.raises(UnicodeEncodeError):  # fails in the middle, as on a full disk
-        write_whole(tmp_path / "x", "2\udc80")
+    write_whole(tmp_path / "x", b"1")
+    with pytest.raises(TypeError):  # fails in the middle, as on a full disk
+        write_whole(tmp_path / "x", "2")
     with pytest.raises(IsADirectoryError):
-        write_whole(tmp_path / "results", "3")
+        write_whole(tmp_path / "results", b"3")
     assert (tmp_path / "x").read_text() == "1"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["results", "x"]
 
