@@ -3,6 +3,7 @@
 Those of 2200h stand in `jtqd.daemon.shared.counters`.
 """
 
+from jtqd.drivers.nmt import HEARTBEAT_BASE
 from jtqd.drivers.pdo import MappedObject, PdoMap
 
 _SEQUENCE = MappedObject(0x2103, 0, 8, False, "sequence")
@@ -12,6 +13,13 @@ COMMANDER_NODE = 0x21
 ESTIMATE_BASES = (0x180, 0x280)
 CONTACT_BASES = (0x380, 0x480)
 """Of jtqd's PDOs with the estimates of joints 1 and 2, and of joints 3 and 4."""
+
+
+def loop_cob_ids(node: int) -> tuple[int, ...]:
+    """Return the COB-IDs that only the loop sends with, echoes of which it receives: estimates, contacts, heartbeat."""
+    return tuple(base + node for base in (*ESTIMATE_BASES, *CONTACT_BASES, HEARTBEAT_BASE))
+
+
 BUS_FIELDS = (
     "state",
     "tx_errors",

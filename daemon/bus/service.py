@@ -176,17 +176,21 @@ _NODE_CONDITIONS = {
     "single": ("node_doubled", False),
 }
 """What an event of `NodeWatch` begins or ends."""
+_OWN_BASES = (emcy.EMCY_BASE, RESPONSE_ID)
+"""Of the COB-IDs that only this service sends with; its socket receives no own echo."""
+_CONFLICT_S = 1.0
+"""A conflict of COB-IDs has ended when no frame of another node came for so long."""
 _NODE_LINES = ("restarted", "state", "malformed", "foreign")
 
 LogEvent = Callable[[str, int, str], None]
 
 
 def service_filters(config: Config) -> list[CanFilter]:
-    """Return filters for SDO requests to jtqd, SDO traffic of the nodes, EMCY, heartbeats and NMT commands."""
+    """Return filters for SDO requests to jtqd, SDO traffic of the nodes, EMCY, heartbeats, NMT commands, own COB-IDs."""
     heartbeats = CanFilter(nmt.HEARTBEAT_BASE, 0x780 | CAN_EFF_FLAG | CAN_RTR_FLAG)
     nodes = [base + node for node in nodes_of(config) for base in (emcy.EMCY_BASE, RESPONSE_ID, REQUEST_ID)]
     return [
-        exact(REQUEST_ID + config.node_id),
+        *(exact(base + config.node_id) for base in (REQUEST_ID, *_OWN_BASES)),
         exact(0x000),
         heartbeats,
         *(exact(cob_id) for cob_id in nodes),
@@ -263,6 +267,9 @@ class BusService:
         self._limit = RateLimit()
         self._report_due = 0.0
         self._view = reader.read()
+        self._own_cob_ids = {base + config.node_id for base in _OWN_BASES}
+        self._conflicts = self._view.counters["cob_id_conflicts"]
+        self._conflict_until_s: dict[int, float] = {}
         self.foreign_nmt = 0
         self._heard = False
         self._refused_calls = 0
@@ -299,7 +306,9 @@ class BusService:
         with suppress(BusDown):
             while count := self.socket.receive():
                 for can_id, data in self._frames(count):
-                    if 0x080 < can_id <= 0x0FF:
+                    if can_id in self._own_cob_ids:
+                        self._conflict_until_s[can_id] = now_s + _CONFLICT_S
+                    elif 0x080 < can_id <= 0x0FF:
                         self._on_emergency(can_id - 0x080, data, now_s)
                     elif can_id == REQUEST_ID + self._config.node_id:
                         self._on_request(data)
@@ -325,6 +334,7 @@ class BusService:
         refused, self._refused_calls = self._refused_calls, view.counters["bus_errors"]
         if self._refused_calls > refused and not self._heard:
             self._bus_change(self.bus.down(), now_s)
+        self._observe_conflicts(view, now_s)
         requests = self.care.turn(view, now_s)
         for node, subject in self._subjects.items():
             text = self.care.changed.get(node)
@@ -343,6 +353,15 @@ class BusService:
                 with suppress(OSError):  # nothing depends on the file
                     write_whole(self._directory / FILE, text)
                     self._written = text
+
+    def _observe_conflicts(self, view: View, now_s: float) -> None:
+        """Report COB-IDs of jtqd that others send with: those of the loop, which counts them, and those of this socket."""
+        before, self._conflicts = self._conflicts, view.counters["cob_id_conflicts"]
+        if self._conflicts > before:
+            self._conflict_until_s[view.conflict_cob_id] = now_s + _CONFLICT_S
+        for cob_id, until_s in self._conflict_until_s.items():
+            subject = Subject(f"COB-ID {cob_id:03X}h", cob_id)
+            self._conditions.update("cob_id_conflict", subject, now_s < until_s, now_s)
 
     # Frames ---------------------------------------------------------------------------------------------------------------
 
@@ -368,7 +387,9 @@ class BusService:
             return
         self._heard = True
         self._bus_change(self.bus.alive(), now_s)
-        if can_id == REQUEST_ID + self._config.node_id:
+        if can_id in self._own_cob_ids:
+            self._conflict_until_s[can_id] = now_s + _CONFLICT_S
+        elif can_id == REQUEST_ID + self._config.node_id:
             self._on_request(data)
         elif can_id >= nmt.HEARTBEAT_BASE:
             self._node_events(self.heartbeats.receive(can_id - nmt.HEARTBEAT_BASE, data, now_s), now_s)

@@ -164,6 +164,7 @@ cdef class SnapshotWriter:
         self.work, self.late, self.status_cycles = snapshot.work, snapshot.late, snapshot.status_cycles
         self.inputs, self.node_heard, self.node_states = snapshot.inputs, snapshot.node_heard, snapshot.node_states
         self.unconfigured, self.restarts, self.learned = snapshot.unconfigured, snapshot.restarts, snapshot.learned
+        intake.conflict = snapshot.conflict
         self.sequence, self.estimate, self.joints = snapshot.sequence, snapshot.estimate, snapshot.joints
         for n in range(MOST_JOINTS):
             self.status[n] = -1
@@ -636,12 +637,14 @@ cdef class Cycle:
         return count
 
     cdef int receive(self) except -1:
-        """Take what has come; a bus that is down gives nothing and is counted."""
+        """Take what has come, without echoes of own PDOs; a bus that is down gives nothing and is counted."""
+        cdef int count
         try:
-            return self.bus.take()
+            count = self.bus.take()
         except BusDown:
             self.writer.counters[BUS_ERRORS] += 1
             return 0
+        return self.intake.without_own(self.bus.frames_c, self.bus.stamps_c, self.bus.own_c, count)
 
     cdef bint send(self, const Frame *frame) except -1:
         """Send a frame; a bus that is down takes none and is counted."""

@@ -52,9 +52,9 @@ cdef struct Nodes:  # by node-ID
 
 cdef class Intake:
     cdef readonly tuple pdos, temperatures
-    cdef readonly uint64_t[::1] counters
+    cdef readonly uint64_t[::1] counters, conflict
     cdef readonly int64_t sync_stamp_ns, last_delay_ns
-    cdef public bint gap_wanted
+    cdef public bint gap_wanted, claims
     cdef int count, temperature_count
     cdef Input inputs[MOST_INPUTS]
     cdef Temperature celsius[MOST_INPUTS]
@@ -71,6 +71,7 @@ cdef class Intake:
     cpdef bint close(self) noexcept
     cdef void drain_frame(self, const Frame *frame, int64_t stamp_ns, bint own) noexcept nogil
     cdef void drained(self) noexcept nogil
+    cdef int without_own(self, Frame *frames, int64_t *stamps_ns, bint *own, int count) noexcept nogil
     cpdef void pass_slot(self) noexcept
     cdef Input *input_with(self, uint32_t can_id) noexcept nogil
     cdef Temperature *temperature_with(self, uint32_t can_id) noexcept nogil

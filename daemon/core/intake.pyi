@@ -8,9 +8,13 @@ Buffer = bytes | bytearray | memoryview
 class Intake:
     pdos: Final[tuple[InputPdo, ...]]
     temperatures: Final[tuple[TemperaturePdo, ...]]
+    claims: bool
     gap_wanted: bool
-    def __init__(self, pdos: Sequence[InputPdo], temperatures: Sequence[TemperaturePdo] = ()) -> None: ...
+    def __init__(
+        self, pdos: Sequence[InputPdo], temperatures: Sequence[TemperaturePdo] = (), own: Sequence[int] = ()
+    ) -> None: ...
     counters: Final[Sequence[int]]
+    conflict: Final[Sequence[int]]
     last_delay_ns: Final[int]
     sync_stamp_ns: Final[int]
     unconfigured: Final[frozenset[int]]

@@ -19,6 +19,7 @@ the same PDO can still be under way:
   then the input is not used in that cycle;
 * a wrong length, a 29-bit identifier or a remote frame under one of our identifiers is rejected and counted;
 * a SYNC that is not our own echo makes every input of the cycle doubtful: none is used;
+* a frame with a COB-ID that only the loop may use, and that is no own echo, is a conflict: counted, and used for nothing;
 * a node that sent its boot-up message has lost its PDO mapping: its PDOs are neither used nor waited for until it has been
   configured again. The same holds for one whose configuration was changed, and for an optional one that is absent.
 
@@ -58,7 +59,9 @@ cdef int STALE_INPUTS = word_of("stale_inputs"), LATE_FRAMES = word_of("late_fra
 cdef int DUPLICATE_FRAMES = word_of("duplicate_frames"), REJECTED_FRAMES = word_of("rejected_frames")
 cdef int UNKNOWN_FRAMES = word_of("unknown_frames"), FOREIGN_SYNC = word_of("foreign_sync")
 cdef int SYNC_ERRORS = word_of("sync_errors"), SYNC_GAPS = word_of("sync_gaps"), BOOT_UPS = word_of("boot_ups")
-cdef int TEMPERATURES_LOST = word_of("temperatures_lost")
+cdef int TEMPERATURES_LOST = word_of("temperatures_lost"), COB_ID_CONFLICTS = word_of("cob_id_conflicts")
+
+cdef int8_t OWN = -2  # of `Intake.input_of`; -1: nobody's
 
 cdef uint32_t SYNC = SYNC_COB_ID, HEARTBEAT = nmt.HEARTBEAT_BASE
 cdef uint32_t IDENTIFIER = can_frame.CAN_EFF_MASK, NOT_STANDARD = can_frame.CAN_EFF_FLAG | can_frame.CAN_RTR_FLAG
@@ -189,11 +192,13 @@ cdef class Intake:
     then `fresh` and `values`; `drain(...)` for what arrives before the next SYNC. Where `gap_wanted` is then True,
     `pass_slot()` takes the place of the next cycle, and no SYNC is sent in its slot.
 
-    pdos: expected (`InputPdo`), results are indexed in this order; temperatures: may come at any time (`TemperaturePdo`).
+    pdos: expected (`InputPdo`), results are indexed in this order; temperatures: may come at any time (`TemperaturePdo`);
+    own: COB-IDs that only the loop may use.
 
     Attributes:
-        counters: words of the table of counters; those of a snapshot once a loop has one.
+        counters: words of the table of counters; conflict: COB-ID of the last conflict; a snapshot's once a loop has one.
         gap_wanted: the next slot shall pass without SYNC.
+        claims: conflicts of COB-IDs are counted; not while the boot still sends the heartbeat.
         last_delay_ns: delay of the last input after the SYNC, in the last cycle that had them all.
         sync_stamp_ns: CLOCK_REALTIME stamp of the own SYNC's echo, 0 while it has not been seen in this cycle.
 
@@ -201,7 +206,7 @@ cdef class Intake:
         ValueError: too many PDOs, two with one COB-ID, or a layout that cannot be decoded.
     """
 
-    def __init__(self, pdos, temperatures=()):
+    def __init__(self, pdos, temperatures=(), own=()):
         cdef int n, node
         self.pdos, self.temperatures = tuple(pdos), tuple(temperatures)
         self.count, self.temperature_count = len(self.pdos), len(self.temperatures)
@@ -212,10 +217,12 @@ cdef class Intake:
             raise ValueError("two inputs share a COB-ID")
         if identifiers and max(identifiers) >= IDENTIFIERS:
             raise ValueError(f"{max(identifiers):X}h has more than 11 bits")
-        self.counters = array("Q", bytes(8 * len(COUNTERS)))
+        self.counters, self.conflict = array("Q", bytes(8 * len(COUNTERS))), array("Q", bytes(8))
         memset(self.input_of, -1, sizeof(self.input_of))
         memset(self.temperature_of, -1, sizeof(self.temperature_of))
         memset(self.nodes.state, NOT_HEARD, sizeof(self.nodes.state))
+        for cob_id in own:
+            self.input_of[<int> cob_id] = OWN
         for n, pdo in enumerate(self.pdos):
             self.inputs[n] = _input_of(pdo)
             self.input_of[<int> pdo.cob_id] = n
@@ -225,6 +232,7 @@ cdef class Intake:
             node = _node(each.node_id)
             self.celsius[n] = Temperature(each.cob_id, node, each.life_cycles, NEVER, False, NAN, each.c_per_unit, 0, 0)
             self.temperature_of[<int> each.cob_id] = n
+            self.input_of[<int> each.cob_id] = -1
 
     # Python values ----------------------------------------------------------------------------------------------------
 
@@ -410,6 +418,20 @@ cdef class Intake:
             self.gap.arrivals += 1
         else:
             self.duplicate(state, _differs(state, frame))
+
+    cdef int without_own(self, Frame *frames, int64_t *stamps_ns, bint *own, int count) noexcept nogil:
+        """Take out the frames with a COB-ID that only the loop may use; return how many remain. Echoes, and conflicts."""
+        cdef int n, kept = 0
+        for n in range(count):
+            if frames[n].id < IDENTIFIERS and self.input_of[frames[n].id] == OWN:
+                if self.claims and not own[n]:
+                    self.conflict[0] = frames[n].id  # first: who sees the count rise reads it
+                    self.counters[COB_ID_CONFLICTS] += 1
+                continue
+            if kept != n:
+                frames[kept], stamps_ns[kept], own[kept] = frames[n], stamps_ns[n], own[n]
+            kept += 1
+        return kept
 
     cdef void drained(self) noexcept nogil:
         """All frames of a `drain` have been sorted in: one more slot without SYNC where late ones came in the last one."""

@@ -30,9 +30,10 @@ from jtqd.daemon.loop import realtime
 from jtqd.daemon.shared.cycle_record import Ring, layout_of
 from jtqd.daemon.shared.processes import Child, ChildError, LoopWatchdog, Notifier, watchdog_seconds
 from jtqd.daemon.shared.snapshot import Snapshot
-from jtqd.drivers.bus_socket import CanFilter, any_format
+from jtqd.drivers.bus_socket import CanFilter, any_format, exact
 from jtqd.drivers.frame_socket import BusError, BusGone, FrameSocket, open_frame_socket
 from jtqd.drivers.nmt import HEARTBEAT_BASE
+from jtqd.drivers.own_objects import loop_cob_ids
 from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import Estimator, make_estimator
@@ -41,6 +42,8 @@ from jtqd.estimator.settings import METHODS
 
 _PATIENCE_S = 1.0
 """Without a sign of life of the supervisor, which comes twenty times a second, the watchdog is fed no longer than this."""
+_HANDOVER_S = 1.0
+"""From the first cycle: so long the boot may still send jtqd's heartbeat, until the supervisor has ended it."""
 SLOTS = 8
 """Slots that pass without the interpreter: so late at most are signals, requests and the watchdog."""
 
@@ -56,6 +59,7 @@ class Duties:
         self._advanced, self._index = watchdog.advanced, cycle.index
         self._sign, self._sign_at = self._orders[4], self._index
         self._patience = round(_PATIENCE_S * 1e9 / cycle.grid.period_ns)
+        self._claim_from = cycle.index + round(_HANDOVER_S * 1e9 / cycle.grid.period_ns)
 
     def __call__(self) -> None:
         """Run the duties after some cycles."""
@@ -65,6 +69,8 @@ class Duties:
         if index - self._sign_at <= self._patience:
             self._advanced(index - self._index)
         self._index = index
+        if index >= self._claim_from:
+            self._cycle.intake.claims = True
         if (number := orders[0]) != orders[1]:
             self._cycle.reset_faults()
             orders[1] = number
@@ -154,14 +160,16 @@ def build_estimator(
 
 
 def loop_filters(config: Config) -> list[CanFilter]:
-    """Return filters for SYNC (own echo and foreign), inputs, temperatures and the nodes' heartbeats.
+    """Return filters for SYNC and the loop's own COB-IDs (echo and foreign), inputs, temperatures, the nodes' heartbeats.
 
-    Each in every frame format, so that 29-bit and remote frames under our identifiers are seen and counted.
+    Those of others in every frame format, so that 29-bit and remote frames under their identifiers are seen and counted.
     """
     inputs = input_pdos(config)
     pdos = [*(pdo.cob_id for pdo in inputs), *(each.cob_id for each in joint_temperatures(config))]
     nodes = dict.fromkeys(pdo.node_id for pdo in inputs)
-    return [any_format(cob_id) for cob_id in (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))]
+    others = (SYNC_COB_ID, *pdos, *(HEARTBEAT_BASE + node for node in nodes))
+    own = set(loop_cob_ids(config.node_id)) - set(pdos)
+    return [*map(any_format, others), *map(exact, sorted(own))]
 
 
 def warm_up(estimators: list[Estimator]) -> None:
@@ -218,7 +226,7 @@ def build_cycle(
         float(report.get("worst_load", request["worst_load"])),
         len(config.joints),
     )
-    intake = Intake(input_pdos(config), joint_temperatures(config))
+    intake = Intake(input_pdos(config), joint_temperatures(config), loop_cob_ids(config.node_id))
     for node in {pdo.node_id for pdo in intake.pdos} - {int(node) for node in report["nodes"]}:
         intake.leave_out(node)
     cycle = Cycle(

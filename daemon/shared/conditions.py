@@ -132,6 +132,8 @@ _ROWS = (
     Definition("bus_down", BUS, ERROR, "interface down, previously {}", "error active", topic="bus"),
     Definition("foreign_sync", BUS, ERROR, "another SYNC producer: inputs of these cycles are not used",
                "no other SYNC producer", topic="sync", emcy=Emcy(0x8150, detail=0x080)),
+    Definition("cob_id_conflict", BUS, ERROR, "another node sends with this COB-ID of jtqd",
+               "only jtqd sends with it", topic="bus", emcy=Emcy(0x8150, names_joints=False)),
     Definition("sync_late", BUS, WARNING, "the own SYNC waits in the transmit queue", topic="sync", logged=False),
     Definition("receive_overrun", BUS, WARNING, "received frames were lost: the loop's socket was read too late",
                "no further received frames lost", topic="bus", emcy=Emcy(0x8110, detail=1)),

@@ -83,6 +83,7 @@ TABLE: Final = (
     Counter("latches", 35, "faults that were latched", Shown.STATUS | Shown.SUMMARY_TORQUE),
     Counter("latch_resets", 36, "joints whose latched faults a reset released", Shown.SUMMARY_TORQUE),
     Counter("contacts", 37, "contacts that began"),
+    Counter("cob_id_conflicts", 38, "frames of others with COB-IDs that only the loop may use", _BUS_ALL),
 )
 """The counters of the loop."""
 RECORDER_LOST: Final = Counter("recorder_lost", 11, "cycles missing from the log")

@@ -119,6 +119,8 @@ class View(NamedTuple):
     """What the estimator of each joint has learned of its zeros."""
     pasts: tuple[bytes, ...] = ()
     """State of each joint's estimator after this cycle (`FusedEstimator.past`); empty where it learns nothing."""
+    conflict_cob_id: int = 0
+    """Of the last frame that `cob_id_conflicts` counted."""
 
 
 def quantiles(bins: Sequence[int], bin_ns: int, largest_ns: int, shares: tuple[float, ...]) -> list[float]:
@@ -141,7 +143,7 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 20
 """Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_410A  # "JTQDSTA", layout 10
+_MAGIC = 0x4A54_5144_5354_410B  # "JTQDSTA", layout 11
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH4d")
@@ -168,6 +170,7 @@ class _Views:
         # resets requested by the supervisor, executed; changed nodes reported, taken; signs of life of the supervisor
         self.orders = self._next("Q", 5)
         self.counters = self._next("Q", len(COUNTERS))
+        self.conflict = self._next("Q", 1)  # COB-ID of the last of `cob_id_conflicts`
         self.sequence = self._next("Q", 1)  # odd during a write
         self.estimate = self._next("B", ESTIMATE_SIZE)
         # per joint: sums of squared errors against the sensor of the estimate's age and the sensor now, number of samples
@@ -277,6 +280,7 @@ class SnapshotReader:
             inputs=tuple(each for each in inputs if any(each)),
             zeros=tuple(Zeros(*each[:9]) for each in learned),
             pasts=tuple(each[10][: each[9]] for each in learned),
+            conflict_cob_id=views.conflict[0],
         )
 
     def work_us(self, *shares: float) -> list[float]:
