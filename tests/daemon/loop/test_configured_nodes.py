@@ -168,15 +168,18 @@ def test_the_watchdog_is_fed_only_while_the_supervisor_turns(loop: Loop) -> None
         def advanced(self, cycles: int) -> None:
             fed.append(cycles)
 
-    cycle = SimpleNamespace(index=0, grid=loop.cycle.grid, snapshot=loop.cycle.snapshot)
+    intake = SimpleNamespace(claims=False)
+    cycle = SimpleNamespace(index=0, grid=loop.cycle.grid, snapshot=loop.cycle.snapshot, intake=intake)
     duties = Duties(cycle, Counting())  # type: ignore[arg-type]
     patience = round(1e9 / cycle.grid.period_ns)
     for _ in range(3):
         loop.supervisor.note_alive()
         for _ in range(patience):
+            assert not intake.claims or cycle.index >= patience, "the boot may still send the heartbeat"
             cycle.index += 1
             duties()
     assert sum(fed) == 3 * patience
+    assert intake.claims
     for _ in range(3 * patience):  # it is stopped
         cycle.index += 1
         duties()

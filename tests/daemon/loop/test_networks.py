@@ -134,6 +134,7 @@ def test_the_loop_hears_what_its_configuration_needs_and_nothing_else(
     filters = loop_filters(load_config(configured(tmp_path, "tob", {}, temperature=temperature)))
     wanted = {0x080, 0x181, 0x281, 0x182, 0x282, 0x183, 0x701, 0x702, 0x703}
     wanted |= {0x381, 0x382} if temperature else set()
+    wanted |= {0x1A0, 0x2A0, 0x3A0, 0x4A0, 0x720}  # its own: what it did not send is a conflict
     assert {can_id for can_id in range(0x800) if received(filters, can_id)} == wanted
 
 
