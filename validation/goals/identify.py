@@ -43,11 +43,13 @@ from jtqd.sysid.fit.fused import fit_fused
 from jtqd.sysid.fit.plateaus import Plateau, PlateauError, find_plateaus
 from jtqd.sysid.fit.signals import UNIT_TORSION, run_signals
 from jtqd.sysid.planner.campaigns import Scale, make_plan, outside_runs
-from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Run
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, Run, expand
 from jtqd.sysid.train.network import Schedule, paper_block, train_paper
+from validation.generator import coarse
 
 SIDES: Final = ("joint_1", "joint_2")
 Mapped = dict[str, Any]
+AnyBench = AnyPlant | coarse.Bench
 
 
 class PlantFile(NamedTuple):
@@ -60,15 +62,20 @@ class PlantFile(NamedTuple):
     @property
     def has_own_laws(self) -> bool:
         """Whether it is a bench of docs/testing.md, which shares no equation with the estimator."""
-        return bench_file.KEY in self.mapping
+        return bench_file.KEY in self.mapping or coarse.KEY in self.mapping
 
-    def bench(self, effects: tuple[Effect, ...] = ()) -> AnyPlant:
+    def bench(self, effects: tuple[Effect, ...] = ()) -> AnyBench:
         """Return the plant, its joints with these effects. Raises ConfigError."""
 
         def joint_of(name: str) -> Joint:
             joint = load_joint(self.directory / name)
             return replace(joint, effects=effects) if effects else joint
 
+        if coarse.KEY in self.mapping:
+            nominal = [joint_of(self.mapping[side]["joint"]) for side in SIDES]
+            return coarse.Bench(
+                self.mapping, [{key: getattr(joint, key) for key in coarse.NOMINAL} for joint in nominal]
+            )
         if self.has_own_laws:
             return bench_file.bench_from_mapping(self.mapping, self.name, joint_of)
         return plant_from_mapping(self.mapping, self.name, joint_of)
@@ -95,6 +102,11 @@ def the_three() -> tuple[PlantFile, PlantFile, PlantFile]:
     )
 
 
+def the_four() -> tuple[PlantFile, ...]:
+    """Return the three, and the plant that is not kind (`validation/generator/coarse.py`)."""
+    return (*the_three(), plant_file("coarse", coarse.FILE))
+
+
 class Change(NamedTuple):
     """One thing changed: in the plant's file, by an effect of its joints, or in the link position (angle, motor's share
     motor/G). A kind of plant that has no such thing has None in its place.
@@ -108,7 +120,7 @@ class Change(NamedTuple):
     def possible(self, plant: PlantFile) -> bool:
         return self.link is not None or (self.own_laws if plant.has_own_laws else self.table_i) is not None
 
-    def bench(self, plant: PlantFile) -> AnyPlant:
+    def bench(self, plant: PlantFile) -> AnyBench:
         """Return the changed plant; the plant itself for a change of what is measured."""
         how = None if self.link is not None else self.own_laws if plant.has_own_laws else self.table_i
         if isinstance(how, Effect):
@@ -138,6 +150,9 @@ def _scaled(part: str, keys: tuple[str, ...], factor: float) -> Callable[[Mapped
 
 @of_sides
 def _harder(side: Mapped) -> None:
+    if "hardening_rad" in side["gear"]:
+        side["gear"]["hardening_rad"] /= 1.3
+        return
     k1, k2, k3 = side["gear"]["stiffness_nm_per_rad"]
     side["gear"]["stiffness_nm_per_rad"] = [k1, 1.1 * k2, 1.2 * k3]
 
@@ -145,6 +160,43 @@ def _harder(side: Mapped) -> None:
 @of_sides
 def _wider(side: Mapped) -> None:
     side["gear"]["slips"].append({"torque_nm": 0.6, "travel_rad": 3.0e-4})
+
+
+@of_sides
+def _reclocked(side: Mapped) -> None:
+    for number, error in enumerate(side["gear"]["errors"]):
+        error["phase_rad"] += 2.0 + number
+
+
+@of_sides
+def _reclocked_table_i(side: Mapped) -> None:
+    side["deviations"]["kinematic_error"]["phase_rad"] += 2.0
+
+
+@of_sides
+def _doubled(side: Mapped) -> None:
+    for slip in side["gear"]["slips"]:
+        slip["torque_nm"] *= 2.0
+
+
+@of_sides
+def _doubled_table_i(side: Mapped) -> None:
+    side["deviations"]["hysteresis"]["torque_nm"] *= 2.0
+
+
+@of_sides
+def _noisy(side: Mapped) -> None:
+    side["measurement"]["link_noise_rad"] *= 4.0
+
+
+@of_sides
+def _eccentric(side: Mapped) -> None:
+    side["measurement"]["motor_errors"].append({"order": 1.0, "amplitude_rad": 2.0e-3, "phase_rad": 2.0})
+
+
+@of_sides
+def _coarse_scale(side: Mapped) -> None:
+    side["measurement"]["link_counts_per_rev"] = 1 << 14
 
 
 @of_sides
@@ -180,7 +232,9 @@ CHANGES: Final = (
         _harder,
     ),
     Change("hysteresis 1.2 Nm wider", _wider_table_i, _wider),
+    Change("hysteresis doubled", _doubled_table_i, _doubled),
     Change("kinematic error +110 urad", _wavier_table_i, _wavier),
+    Change("kinematic error re-clocked", _reclocked_table_i, _reclocked),
     Change(
         "friction +30 %",
         _scaled("deviations", ("friction_scale",), 1.3),
@@ -190,6 +244,9 @@ CHANGES: Final = (
     Change("link eccentricity 60 urad", link=lambda link, motor: link + 60e-6 * np.sin(link + 1.0)),
     Change("link zero 100 urad", link=lambda link, motor: link + 100e-6),
     Change("gear ratio +0.02 %", link=lambda link, motor: link - 2e-4 * motor),
+    Change("link noise x4", _noisy, _noisy),
+    Change("motor encoder 2 mrad, once a turn", None, _eccentric),
+    Change("link encoder of 14 bits", _coarse_scale, _coarse_scale),
 )
 """What was measured to break the estimate: `nothing` stands beside, on the same days."""
 
@@ -293,6 +350,8 @@ class Sizes(NamedTuple):
 
 
 FULL: Final = Sizes(96, 12.0, 400, 1.2, 1000, 192, 8.0, 1.6, 48, 24)
+FEW: Final = FULL._replace(judge_runs=24, changed_runs=12, outside_runs=4)
+"""Identified as in full, judged on fewer days."""
 QUICK: Final = Sizes(32, 12.0, 160, 1.2, 150, 24, 8.0, 1.0, 8, 4)
 TINY: Final = Sizes(8, 8.0, 2, 0.8, 2, 2, 5.0, 0.6, 1, 1)
 """For tests of the steps."""
@@ -309,13 +368,49 @@ class Driven(NamedTuple):
         return self.table.joint(number, joint.gear_ratio)
 
 
-def drive(bench: AnyPlant, runs: Sequence[Run], seed: int) -> list[Driven]:
+def drive(bench: AnyBench, runs: Sequence[Run], seed: int) -> list[Driven]:
     """Return the runs on a plant, each on a day of its own of this seed."""
+    if isinstance(bench, coarse.Bench):
+        return _drive_coarse(bench, runs, seed)
     made = []
     for day, run in enumerate(runs):
         emulated = emulated_with_truth(bench, seed, day, run)
         made.append(Driven(run.name, emulated.table, emulated.joint_torque_nm))
     return made
+
+
+_TOGETHER: Final = 96
+"""Runs of `coarse` that are integrated side by side."""
+
+
+def _drive_coarse(bench: coarse.Bench, runs: Sequence[Run], seed: int) -> list[Driven]:
+    made = []
+    for first in range(0, len(runs), _TOGETHER):
+        part = runs[first : first + _TOGETHER]
+        points = [expand(run) for run in part]
+        commands = [
+            coarse.Command(each.joints.index(each.velocity_joint), each.velocity_rad_s, each.current_a)
+            for each in points
+        ]
+        for run, read in zip(part, bench.record(commands, seed, first), strict=True):
+            made.append(Driven(run.name, _table(read), read.true_nm))
+    return made
+
+
+def _table(read: coarse.Recorded) -> RunTable:
+    joints = {
+        number: JointColumns(
+            current_a=read.current_a[:, k],
+            motor_position_rad=read.motor_rad[:, k],
+            motor_velocity_rad_s=read.motor_rad_s[:, k],
+            link_position_rad=read.link_rad[:, k],
+            torque_nm=read.sensor_nm,
+            temperature_c=read.temperature_c[:, k],
+        )
+        for k, number in enumerate(NUMBERS)
+    }
+    time_s: FloatArray = coarse.CYCLE_S * np.arange(len(read.sensor_nm), dtype=np.float64)
+    return RunTable(time_s, joints)
 
 
 class Range(NamedTuple):
@@ -345,13 +440,17 @@ def _present(column: FloatArray | None) -> FloatArray:
 
 @dataclass(frozen=True)
 class Identified:
-    """One joint of a plant: its file, the paper's network (ONNX), coefficients by baseline, what was driven."""
+    """One joint of a plant: its file, the paper's network (ONNX), coefficients by baseline, what was driven.
+
+    one_encoder: the same fit without the link encoder; None where it was not asked for.
+    """
 
     number: int
     joint: Joint
     network: bytes
     baselines: Mapping[str, FloatArray]
     driven: Range
+    one_encoder: Joint | None = None
 
 
 def scale_of(sizes: Sizes, joints: tuple[Joint, Joint], seed: int, part: str) -> Scale:
@@ -405,6 +504,23 @@ def fit_physics(joints: tuple[Joint, Joint], excitation: Sequence[Driven]) -> tu
     return tuple(found)
 
 
+def one_encoder(columns: JointColumns, joint: Joint) -> JointColumns:
+    """Return the columns with the link's position that the motor's tells."""
+    return replace(columns, link_position_rad=_present(columns.motor_position_rad) / joint.gear_ratio)
+
+
+def fit_one_encoder(joint: Joint, number: int, runs: Sequence[Driven]) -> Joint:
+    """Return the joint with section `fused` fitted to these runs without their link encoder. Raises as `identify`."""
+    settings = EstimatorSettings(method="fused")  # as `jtq fit losses`
+    signals = [
+        run_signals(
+            run.name, joint, settings, run.table.time_s, one_encoder(run.columns(number, joint), joint)
+        )
+        for run in runs
+    ]
+    return replace(joint, fused=fit_fused(signals, joint, two_encoders=False).fused)
+
+
 def with_efficiency(joint: Joint, number: int, runs: Sequence[Driven]) -> Joint:
     """Return the joint with the paper's efficiency, fitted to the plateaus of runs, as `jtq fit efficiency` does it."""
     plateaus: list[Plateau] = []
@@ -430,7 +546,8 @@ def _with_others(
     network = train_paper(blocks, joint, names, Schedule(iterations, seed))
     examples = [example(run, number, joint) for run in excitation]
     baselines = {name: fit_baseline(baseline, examples) for name, baseline in BASELINES.items()}
-    return replace(one, joint=joint, network=network.data, baselines=baselines)
+    known = fit_one_encoder(one.joint, number, excitation)
+    return replace(one, joint=joint, network=network.data, baselines=baselines, one_encoder=known)
 
 
 OF_BASELINES: Final = replace(recommended("fused"), track_torsion=False)

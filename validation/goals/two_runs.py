@@ -65,6 +65,7 @@ from validation.goals.identify import (
     drive,
     fit_baseline,
     nominal_joints,
+    one_encoder,
     the_three,
 )
 from validation.measured import JOINTS, RUNS
@@ -158,12 +159,6 @@ class Row(NamedTuple):
     def honest(self) -> bool:
         """Whether our interval holds about as much as its 90 %."""
         return INSIDE[0] <= self.inside[OURS] <= INSIDE[1]
-
-
-def one_encoder(columns: JointColumns, joint: Joint) -> JointColumns:
-    """Return the columns with the link's position that the motor's tells."""
-    assert columns.motor_position_rad is not None
-    return replace(columns, link_position_rad=columns.motor_position_rad / joint.gear_ratio)
 
 
 def rows_of(case: Case) -> list[Row]:
