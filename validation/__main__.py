@@ -19,7 +19,7 @@ from jtqd.estimator.command_line import check_output
 from validation.study import UsageError, json_of, text_of
 
 STUDIES: Final = {
-    "goals": ("validation.goals.goals", "three plants: error and interval against the true torque"),
+    "goals": ("validation.goals.goals", "four plants: error and interval against the true torque"),
     "sources": ("validation.goals.sources", "what the error of the estimate is made of on a bench"),
     "other_plant": ("validation.goals.other_plant", "joint files of another plant: how soon it is flagged"),
     "two_runs": (

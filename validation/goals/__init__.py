@@ -1,1 +1,1 @@
-"""The goals: three plants, our estimate and its baselines, against the torque that only a plant knows."""
+"""The goals: four plants, our estimate and its baselines, against the torque that only a plant knows."""
