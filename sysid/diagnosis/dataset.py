@@ -24,7 +24,7 @@ from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, ScalarFunction
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.diagnosis.findings import JointName
+from jtqd.sysid.diagnosis.findings import EVERYTHING, JointName, Scope
 from jtqd.sysid.diagnosis.noise import Sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
@@ -38,7 +38,6 @@ from jtqd.sysid.diagnosis.regressors import (
     run_data,
     samples_in,
 )
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import (
     SLOWEST_RAD_S,
     BaseLoss,

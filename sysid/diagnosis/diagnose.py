@@ -30,18 +30,19 @@ from jtqd.sysid.diagnosis.dataset import (
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
+    EVERYTHING,
     INSUFFICIENT,
     NO_GAP,
     UNEXPLAINED,
     Findings,
     OutlierRun,
+    Scope,
     shows_at,
 )
 from jtqd.sysid.diagnosis.limits import RELEVANCE
 from jtqd.sysid.diagnosis.model import Solution, solve
 from jtqd.sysid.diagnosis.next_experiment import each_joint, next_experiment
 from jtqd.sysid.diagnosis.outlier_runs import outlier_run
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.signals import JointSignals
 from jtqd.sysid.diagnosis.smoothing import noise_of
 from jtqd.sysid.diagnosis.unexplained import events_left, remaining

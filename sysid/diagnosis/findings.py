@@ -80,6 +80,35 @@ def joint_text(joint: JointName) -> str:
 
 
 @dataclass(frozen=True)
+class Scope:
+    """Effects that are not looked for, and joints whose torque is known.
+
+    out: (joint or "sensor", name); joint None: wherever it may be. known_references: joints whose reference is a known load
+    or a model's torque: no sensor effect may touch it, and it has no zero that drifts.
+    """
+
+    out: frozenset[tuple[JointName | None, str]] = frozenset()
+    known_references: frozenset[int] = frozenset()
+
+    def looks_for(self, name: str, where: JointName, number: int) -> bool:
+        """Return whether an effect of a joint or the sensor, seen in the balances of joint `number`, is a candidate."""
+        if where == SENSOR and number in self.known_references:
+            return False
+        return (None, name) not in self.out and (where, name) not in self.out
+
+    @property
+    def note(self) -> tuple[str, ...]:
+        """One line in the presence of an unexplained residual: which effects were not looked for; none where all were."""
+        names = ", ".join(sorted({name for _, name in self.out}))
+        return (
+            (f"not looked for, as asked: {names}; the unexplained residual may be theirs",) if names else ()
+        )
+
+
+EVERYTHING: Final = Scope()
+
+
+@dataclass(frozen=True)
 class Value:
     """A parameter with its 95 % interval."""
 

@@ -35,6 +35,7 @@ from jtqd.sysid.diagnosis.findings import (
     Findings,
     JointName,
     Present,
+    Scope,
     UnexplainedResidual,
     Untold,
     Value,
@@ -43,7 +44,6 @@ from jtqd.sysid.diagnosis.findings import (
 from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, fits_without, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
-from jtqd.sysid.diagnosis.scope import Scope
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.unexplained import (
     Unexplained,

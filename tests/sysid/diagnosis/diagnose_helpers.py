@@ -18,9 +18,8 @@ from jtqd.estimator.losses import FrictionModel
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.command import main
-from jtqd.sysid.diagnosis.findings import Cause, Findings, Gain, Gap, Place, Present, Value
+from jtqd.sysid.diagnosis.findings import EVERYTHING, Cause, Findings, Gain, Gap, Place, Present, Scope, Value
 from jtqd.sysid.diagnosis.report import terminal_lines
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from jtqd.sysid.runs.tables import write_run
 
 JOINT_FILE = shipped("joint1.yaml")

@@ -13,9 +13,9 @@ from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import library_candidates, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, lead_of, usage
+from jtqd.sysid.diagnosis.findings import EVERYTHING, Scope
 from jtqd.sysid.diagnosis.limits import PRIORS, Usage
 from jtqd.sysid.diagnosis.model import recorded
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope
 from tests.sysid.diagnosis.pendulums import ARM, Rig, Runs, runs_of
 
 TEMPERED = {"temperature_dependent_friction", "torque_constant_temperature"}

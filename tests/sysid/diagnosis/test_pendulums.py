@@ -14,10 +14,18 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import diagnose as diagnosis
 from jtqd.sysid.diagnosis.dataset import Dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.findings import AMBIGUOUS, CAUSE, CERTAIN, NO_GAP, ONE_OF, UNEXPLAINED, Findings
+from jtqd.sysid.diagnosis.findings import (
+    AMBIGUOUS,
+    CAUSE,
+    CERTAIN,
+    NO_GAP,
+    ONE_OF,
+    UNEXPLAINED,
+    Findings,
+    Scope,
+)
 from jtqd.sysid.diagnosis.limits import PRIORS
 from jtqd.sysid.diagnosis.model import Solution, solve
-from jtqd.sysid.diagnosis.scope import Scope
 from jtqd.sysid.diagnosis.signals import TORQUE_HZ
 from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (

@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from jtqd.estimator.joint import Effect
+from jtqd.sysid.diagnosis.command import asked_effects, scope_of, trusted
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.findings import NO_GAP, UNEXPLAINED, file_values
-from jtqd.sysid.diagnosis.scope import EVERYTHING, Scope, asked_effects, scope_of, trusted
+from jtqd.sysid.diagnosis.findings import EVERYTHING, NO_GAP, UNEXPLAINED, Scope, file_values
 from jtqd.sysid.runs.options import UsageError
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run

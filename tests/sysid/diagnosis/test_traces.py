@@ -7,7 +7,7 @@ import pytest
 
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
-from jtqd.sysid.diagnosis.scope import EVERYTHING
+from jtqd.sysid.diagnosis.findings import EVERYTHING
 from jtqd.sysid.diagnosis.unexplained import remaining, traces
 from tests.sysid.diagnosis.diagnose_helpers import bench_run
 
