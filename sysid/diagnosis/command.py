@@ -270,7 +270,7 @@ def parser() -> argparse.ArgumentParser:
     return parser
 
 
-# What the user knows: --without and --given have items [WHERE=]EFFECT, WHERE a joint's number or "sensor"; --trust PRIOR=SIZE.
+# What the user knows: items [WHERE=]EFFECT of --without and --given, WHERE a joint or "sensor"; items PRIOR=SIZE of --trust.
 
 
 class Asked(NamedTuple):
