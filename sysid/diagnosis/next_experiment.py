@@ -78,11 +78,10 @@ def kinds_for(classes: Iterable[Sequence[str]]) -> tuple[str, ...]:
     """
     votes: Counter[str] = Counter()
     for names in classes:
-        if len(names) == 1:
-            votes[SHOWN_BY.get(names[0], _DEFAULT)] += 1
-        for pair in combinations(dict.fromkeys(names), 2):
-            separating = PAIRS.get(frozenset(pair))
-            votes.update({separating} if separating else {SHOWN_BY.get(name, _DEFAULT) for name in pair})
+        alone = [tuple(names)] if len(names) == 1 else []
+        for some in (*alone, *combinations(dict.fromkeys(names), 2)):
+            separating = PAIRS.get(frozenset(some))
+            votes.update({separating} if separating else {SHOWN_BY.get(name, _DEFAULT) for name in some})
     if not votes:
         return (_DEFAULT, "repeat")
     order = list(EXPERIMENTS)
@@ -98,13 +97,12 @@ def next_experiment(
     signals: Sequence[JointSignals] = (),
 ) -> dict[str, Any]:
     """Return what would settle it: {"why": text, "plan": mapping of jtq.plan/1} for two joints on a towing bench, and
-    {"why": text, "plan": None, "motion": ..} for one joint, which is moved alone. Three and more are an
-    arm: each gets a motion of its own (`each_joint`).
+    {"why": text, "plan": None, "motion": ..} for one joint, which is moved alone. Three and more are an arm: each gets a
+    motion of its own (`each_joint`).
 
-    classes: names of effects that the runs cannot distinguish, one sequence per class; a sequence of one name asks to make
-    that effect visible. joints: files of the joints in the runs, whose ratings the plan keeps. why: what the
-    diagnosis states before it. temperature: whether the runs have one; without it the plan does not supervise it. signals:
-    of one joint, its runs so far: where it may go. Raises ValueError without a joint.
+    classes: names of effects that the runs cannot distinguish, one sequence per class; one name alone is to be made visible.
+    joints: files of the joints in the runs; why: what the diagnosis states before it; temperature: whether the runs have
+    one, else the plan does not supervise it; signals: of one joint, its runs so far. Raises ValueError without a joint.
     """
     classes = [tuple(names) for names in classes]
     if len(joints) == 1:
@@ -163,8 +161,8 @@ def _of_one_joint(
     made = joint_motions(kinds, room)
     minutes = sum(motion.duration_s for motion in made) / 60.0
     needed = (
-        "as in these runs and within the joint's limits; there they needed up to "
-        f"{room.needed_nm:.3g} Nm of {room.torque_nm:.3g} Nm, a payload may add no more than the rest."
+        f"as in these runs and within the joint's limits; there they needed up to {room.needed_nm:.3g} Nm of "
+        f"{room.torque_nm:.3g} Nm, a payload may add no more than the rest."
     )
     if not math.isfinite(room.needed_nm):
         needed = (
@@ -239,10 +237,9 @@ def joint_range_of(joint: Joint, signals: Sequence[JointSignals]) -> JointRange:
 def _acceleration(s: JointSignals) -> float:
     """Return the acceleration of a run [rad/s2], mean over _ACCELERATION_S: single samples are noise of the encoder."""
     v = s.state.velocity_rad_s
-    step = float(np.median(np.diff(s.time_s)))
-    wide = min(max(1, round(_ACCELERATION_S / step)), len(v) - 1)
+    wide = min(max(1, round(_ACCELERATION_S / s.step_s)), len(v) - 1)
     calm = smooth(v, max(1, wide // 4))
-    return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * step)
+    return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * s.step_s)
 
 
 def _calm_stretch(

@@ -157,9 +157,8 @@ def provenance_text(made: Provenance | None, most: int = MOST_INPUTS) -> str:
 
 def by_size(findings: Findings) -> tuple[list[Cause], list[Cause]]:
     """Return the entries that matter, by their share, and those too small to matter, by their size."""
-    causes = sorted(
-        (c for c in findings.causes if c.matters), key=lambda c: -(finite(c.explained_share) or 0.0)
-    )
+    matter = [c for c in findings.causes if c.matters]
+    causes = sorted(matter, key=lambda c: -(finite(c.explained_share) or 0.0))
     small = [*(c for c in findings.causes if not c.matters), *findings.too_small]
     return causes, sorted(small, key=lambda c: -c.rms_nm)
 
@@ -218,12 +217,10 @@ def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
         value = cause.parameters[cause.leading]
         found, interval = with_interval(value.value, value.ci95, value.unit, in_file(cause, files))
     more = []
-    for name, value in cause.parameters.items():
+    for name, v in cause.parameters.items():
         if name not in {cause.leading, "channel"}:
-            given = f"{value.value:g} {unit_name(value.unit)}".rstrip()
-            more.append(
-                f"{parameter_title(name)} {rounded(value.value, value.unit) if value.fitted else given}"
-            )
+            given = f"{v.value:g} {unit_name(v.unit)}".rstrip()
+            more.append(f"{parameter_title(name)} {rounded(v.value, v.unit) if v.fitted else given}")
     title, share = effect_title(cause.name), _percent(cause.explained_share)
     return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
 

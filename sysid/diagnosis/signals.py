@@ -17,6 +17,7 @@ from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
+from scipy import linalg
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR, TORSION, Effect, State, Values
@@ -444,7 +445,6 @@ def joint_signals(  # noqa: PLR0917
             raise SignalsError(f"{run}: j{number}.{name}: missing, and no column to derive it from")
     assert columns.current_a is not None
     assert columns.torque_nm is not None
-    assert columns.motor_position_rad is not None or columns.motor_velocity_rad_s is not None
     time, sensor = table.time_s, columns.torque_nm
     motion = _motion(time, raw, columns, joint, like)
     step = float(np.median(np.diff(time)))
@@ -463,10 +463,10 @@ def joint_signals(  # noqa: PLR0917
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     slow_torque = below(gear_torque, step, TORQUE_HZ)
-    scale = joint.gear_ratio * joint.torque_constant_nm_per_a
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2
-    demand = (slow_torque + loss + reflected * shared) / scale
+    nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
+    demand = (slow_torque + loss + reflected * shared) / nm_per_a
     state = State(
         current_a=demand,
         current_rate_a_s=current_rate(demand, time),
@@ -558,6 +558,7 @@ def _moving(time: FloatArray, velocity: FloatArray, slowest_hz: float) -> BoolAr
 _LARGEST_ZERO: Final = 0.05
 """Part of the rated torque that a first guess of the sensor's zero may be."""
 _TURNS: Final = 2
+_OF_A_GUESS: Final = "direction", "velocity_rad_s", "current_a", "motor_acceleration_rad_s2", "torque_nm"
 
 
 def about_zero(run: Sequence[JointSignals], bases: Mapping[int, BaseLoss]) -> list[JointSignals]:
@@ -591,21 +592,12 @@ def _expanded(s: JointSignals, base: BaseLoss, zero_nm: float) -> JointSignals:
 
 def _first_guess(run: Sequence[JointSignals]) -> float:
     """Return the zero [Nm] that fits all motor balances best, beside friction, inertia and gain of each joint."""
-    rows: list[FloatArray] = []
-    rest: list[FloatArray] = []
-    for k, s in enumerate(run):
-        good, state = s.moving, s.state
-        if not good.any():
-            continue
-        moved = (state.direction, state.velocity_rad_s, state.current_a, state.motor_acceleration_rad_s2)
-        own = np.column_stack((*moved, state.torque_nm))[good]
-        wide = np.zeros((len(own), 1 + 5 * len(run)))
-        wide[:, 0] = -np.broadcast_to(s.per_torque, good.shape)[good]
-        wide[:, 1 + 5 * k : 6 + 5 * k] = own
-        rows.append(wide)
-        rest.append(s.motor_nm[good])
-    if not rows:
+    moving = [s for s in run if s.moving.any()]
+    if not moving:
         return 0.0
-    found = np.linalg.lstsq(np.concatenate(rows), np.concatenate(rest), rcond=None)[0]
+    zero = [-np.broadcast_to(s.per_torque, s.moving.shape)[s.moving] for s in moving]
+    own = [np.column_stack([getattr(s.state, name)[s.moving] for name in _OF_A_GUESS]) for s in moving]
+    columns = np.column_stack((np.concatenate(zero), linalg.block_diag(*own)))
+    found = np.linalg.lstsq(columns, np.concatenate([s.motor_nm[s.moving] for s in moving]), rcond=None)[0]
     largest = _LARGEST_ZERO * min(s.joint.rated_torque_nm for s in run)
     return float(np.clip(found[0], -largest, largest))
