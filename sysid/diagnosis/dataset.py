@@ -14,6 +14,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Final
 
 import numpy as np
@@ -25,18 +26,19 @@ from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.findings import EVERYTHING, JointName, Scope
-from jtqd.sysid.diagnosis.noise import Sums, saturated_residuals
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     EffectCandidate,
     Family,
     RunData,
+    Sums,
     bin_samples,
     contribution,
     families,
     gain_columns,
     run_data,
     samples_in,
+    saturated_residuals,
 )
 from jtqd.sysid.diagnosis.signals import (
     SLOWEST_RAD_S,
@@ -110,8 +112,7 @@ class Dataset:
 
     Attributes:
         signals: [run][joint]. runs: the same binned, each at its own rate, to bins of step_s seconds.
-        candidates: of the library, columns numbered. unexplained: what none of them explains, per channel and run [n].
-        families: of nuisances.
+        candidates: of the library, columns numbered. families: of nuisances.
         recordings: number of the recording that each run is a piece of.
         readings: per run what the current reads without power.
         no_torque: no torque was measured, the reference is a known load or a model's.
@@ -122,7 +123,6 @@ class Dataset:
     runs: list[RunData]
     candidates: list[EffectCandidate]
     step_s: float
-    unexplained: dict[Channel, list[FloatArray]]
     families: list[Family]
     recordings: Sequence[int]
     readings: Sequence[Readings]
@@ -141,6 +141,12 @@ class Dataset:
         """The largest of the joints."""
         return max(joint.rated_torque_nm for joint in self.joints.values())
 
+    @cached_property
+    def unexplained(self) -> dict[Channel, list[FloatArray]]:
+        """What none of the candidates explains, per channel and run [n]."""
+        leave = gain_columns(self.candidates)
+        return {c: saturated_residuals(self.runs, c, leave) for c in self.runs[0].channels}
+
     def of(self, channel: Channel) -> list[ChannelData]:
         """Return a channel of every run."""
         return [run.channels[channel] for run in self.runs]
@@ -153,7 +159,7 @@ class Dataset:
         return [np.where(v, x, np.nan) for v, x in zip(valid, parts, strict=True)]
 
     def without_events(self, events: Mapping[Channel, View]) -> Dataset:
-        """Return the runs with these events taken for not valid, and what is then unexplained."""
+        """Return the runs with these events taken for not valid."""
         runs, hidden = [], {c: list(e.masks) for c, e in events.items()}
         for r, run in enumerate(self.runs):
             channels = dict(run.channels)
@@ -162,9 +168,7 @@ class Dataset:
                 masks[r] = masks[r] & d.valid
                 channels[channel] = replace(d, valid=d.valid & ~masks[r])
             runs.append(replace(run, channels=channels))
-        leave = gain_columns(self.candidates)
-        unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
-        return replace(self, runs=runs, unexplained=unexplained, events=hidden)
+        return replace(self, runs=runs, events=hidden)
 
 
 def usable_signals(
@@ -388,11 +392,9 @@ def build_dataset(
     if scope.known_references & set(joints):  # a known load has no zero that differs from run to run
         groups = [group for group in groups if group.name != "zero"]
     runs = [run_data(run, candidates, samples_in(step, run), groups) for run in signals]
-    leave = gain_columns(candidates)
-    unexplained = {c: saturated_residuals(runs, c, leave) for c in runs[0].channels}
     no_torque = bool(scope.known_references & set(joints))
     found = recordings(signals), readings(signals)
-    return Dataset(signals, runs, candidates, step, unexplained, groups, *found, no_torque=no_torque)
+    return Dataset(signals, runs, candidates, step, groups, *found, no_torque=no_torque)
 
 
 def library_candidates(

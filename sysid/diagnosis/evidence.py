@@ -1,6 +1,6 @@
 """Evidence: marginal likelihood of sets of entries, and the search for the set that has most of it.
 
-    y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e noise (`noise`)
+    y_r = X beta + F (w + v_r) + Z_r u_r + e_r        per balance, binned, e noise (`regressors`)
 
 X: columns of the entries, scaled so that beta ~ N(0, 1) for entries in the set and 0 for all others; a set has prior odds.
 F: eigenfunctions over the conditions (`regressors.features`): what no library holds; w shared by all runs, v_r a run's own.

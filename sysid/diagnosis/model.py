@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -23,16 +23,18 @@ from jtqd.sysid.diagnosis.dataset import Dataset, unpowered_columns, with_readin
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, present_effects, set_state, shapes_of
 from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
 from jtqd.sysid.diagnosis.findings import shows_at
-from jtqd.sysid.diagnosis.noise import Noise, noise_of_channels, run_sums
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
     Index,
+    Noise,
     RunData,
     basis_columns,
     contribution,
     features,
     fields_used,
+    noise_of_channels,
     run_data,
+    run_sums,
     samples_in,
     seen_in_bins,
 )
@@ -63,9 +65,8 @@ class Solution:
     """A set with its posterior.
 
     entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence; values: the
-    same with all that the torques hold, for the values of the set; runs, disturbed: binned, with
-    discrepancy among the nuisances; own_means: of what each recording has of its own; own: the same for a set with given
-    coefficients.
+    same with all that the torques hold, for the values of the set; runs, disturbed: binned, with discrepancy among the
+    nuisances; own_means: of what each recording has of its own; wide, found: equations and variances of `values`.
     """
 
     dataset: Dataset
@@ -78,7 +79,6 @@ class Solution:
     own_means: list[FloatArray]
     sets: Sets
     values: Sets
-    own: Callable[[FloatArray, Set], FloatArray]
     columns: int
     wide: Equations
     found: Mapping[object, float]
@@ -86,6 +86,10 @@ class Solution:
     def transform(self) -> FloatArray:
         """Return the weights of scaled coefficients in the library's columns [P, E]."""
         return transform_of(self.entries, self.columns)
+
+    def own(self, mean: FloatArray, chosen: Set) -> FloatArray:
+        """Return what each recording has of its own beside a set with these coefficients [r, N]."""
+        return self.wide.own(chosen, mean, self.found)
 
 
 def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
@@ -205,7 +209,6 @@ def solve(dataset: Dataset, seed: int = 0) -> Solution:
         means.own,
         sets,
         wide.sets(found, start),
-        lambda mean, which: wide.own(which, mean, found),
         work.columns,
         wide,
         found,
@@ -371,11 +374,7 @@ class _Work:
         return out
 
     def values(
-        self,
-        chosen: Set,
-        means: Means,
-        noise: Noise,
-        variances: Mapping[object, float],
+        self, chosen: Set, means: Means, noise: Noise, variances: Mapping[object, float]
     ) -> tuple[Means, Equations, Mapping[object, float]]:
         """Return means and sets where the torques in the regressors hold all that the response holds: a set is found with
         less of their noise, its values with more of what they say.

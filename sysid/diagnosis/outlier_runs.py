@@ -32,8 +32,16 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import MOTOR
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.findings import JointName, OutlierRun, joint_text
-from jtqd.sysid.diagnosis.noise import noise_of_channels, run_sums, saturated_residuals
-from jtqd.sysid.diagnosis.regressors import EffectCandidate, RunData, binned, gain_columns, seen_in_bins
+from jtqd.sysid.diagnosis.regressors import (
+    EffectCandidate,
+    RunData,
+    binned,
+    gain_columns,
+    noise_of_channels,
+    run_sums,
+    saturated_residuals,
+    seen_in_bins,
+)
 from jtqd.sysid.diagnosis.signals import JointSignals
 
 ENTER: Final = 10.0

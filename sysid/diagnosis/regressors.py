@@ -1,14 +1,13 @@
-"""Regressors of all effects, averaged over bins: what each hidden effect would leave in the residuals of the balances.
+"""Regressors: what effects, changes from run to run and the discrepancy would leave in the residuals, binned; their sums.
 
 A channel is one balance of one joint: up to four with two joints. An effect of joint j shows in the motor balance, the
-torsion balance or both of that joint; an effect of the sensor in all channels at once. That pattern is what separates
-many of them (the isolability matrix of fault diagnosis).
+torsion balance or both of that joint; an effect of the sensor in all channels at once.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
@@ -269,10 +268,7 @@ LINE: Final = "line"
 
 
 def families(runs: Sequence[Sequence[JointSignals]], lines: Sequence[Line] = ()) -> list[Family]:
-    """Return the families of nuisances of the joints of these runs [run][joint], and of lines.
-
-    All scales are in proportion to the joint: its rated torque, its friction, the speeds of the runs.
-    """
+    """Return the families of nuisances of these runs [run][joint], and of lines; scales are in proportion to the joint."""
     joints = [s.number for s in runs[0]]
     rated = {s.number: s.joint.rated_torque_nm for s in runs[0]}
     usual = {n: usual_friction([s for run in runs for s in run if s.number == n]) for n in joints}
@@ -370,7 +366,7 @@ def _axes(s: JointSignals, samples: float) -> dict[str, FloatArray]:
 
 
 def gain_columns(candidates: Sequence[EffectCandidate]) -> set[int]:
-    """Return the columns of the torque sensor's gain (see `noise.saturated_residuals`)."""
+    """Return the columns of the torque sensor's gain (see `saturated_residuals`)."""
     return {k for c in candidates if c.effect.scales_all for k in c.columns}
 
 
@@ -416,3 +412,102 @@ def _scaled(name: str, axes: Sequence[dict[str, FloatArray]], valid: Sequence[Bo
     middle = float(np.mean(known)) if name == "link_angle" and len(known) else 0.0
     width = max(float(np.sqrt(np.mean((known - middle) ** 2))) if len(known) else 0.0, 1e-9)
     return [(a[name] - middle) / width for a in axes]
+
+
+# Noise and normal equations.
+#
+# What a model leaves is slow for the most part, and small where it is quick. That it is small there proves neither that the
+# model is right there to the same part nor that the noise is: whitening would let the quick errors of a simulation decide
+# which slow cause is named. So every row of a channel has the same weight, as under independence, and its variance is that
+# which sums over a second have per row: estimates are those of least squares, and intervals are as wide as correlation in
+# time makes them (Liang and Zeger 1986, Biometrika 73: independence as the working covariance).
+
+_BLOCK_S: Final = 1.0
+
+
+class Noise(NamedTuple):
+    """Noise of the channels: standard deviation of each [Nm]; inflation: how many rows count as one, of all."""
+
+    sigma: Mapping[Channel, float]
+    inflation: float
+
+
+def noise_of_channels(
+    residuals: Mapping[Channel, Sequence[FloatArray]], step_s: float, least_nm: float = 0.0
+) -> Noise:
+    """Return the noise of all channels from what is left of them [run][n], NaN where not valid, at least least_nm: what the
+    equations are exact to. With an inflation of its own a channel that is fitted badly would weigh little, and stay so.
+    """
+    block = max(1, round(_BLOCK_S / step_s))
+    sigma = {
+        channel: max(float(np.sqrt(np.nanmean(np.concatenate(parts) ** 2))), least_nm, 1e-12)
+        for channel, parts in residuals.items()
+    }
+    slow = [_slowness(parts, sigma[channel], block) for channel, parts in residuals.items()]
+    return Noise(sigma, max(1.0, float(np.mean(slow))))
+
+
+def _slowness(series: Sequence[FloatArray], sigma: float, block: int) -> float:
+    """Return the mean square of sums over blocks against that of white noise, 1 where no block is long enough."""
+    ratios = []
+    for x in series:
+        count = len(x) // block
+        parts = x[: count * block].reshape(count, block)
+        many = np.isfinite(parts).sum(axis=1)
+        use = many > block // 4
+        if use.any():
+            ratios.append(float(np.mean(np.nansum(parts[use], axis=1) ** 2 / many[use])) / sigma**2)
+    return float(np.mean(ratios)) if ratios else 1.0
+
+
+class Sums(NamedTuple):
+    """Normal equations of one run in units of noise: gram [P + Q + 1, P + Q + 1] over effects' columns, nuisances, residual;
+    rows: how many independent measurements.
+    """
+
+    gram: FloatArray
+    rows: float
+
+
+def run_sums(run: RunData, noise: Noise, columns: int, nuisances: int) -> Sums:
+    """Return the normal equations of one run in units of noise."""
+    width = columns + nuisances + 1
+    gram = np.zeros((width, width))
+    rows = 0.0
+    for channel, d in run.channels.items():
+        block = np.column_stack((d.regressors, d.nuisances, d.residual))[d.valid]
+        places = np.concatenate((d.index, columns + d.families, [width - 1])).astype(np.intp)
+        gram[np.ix_(places, places)] += block.T @ block / (noise.sigma[channel] ** 2 * noise.inflation)
+        rows += len(block) / noise.inflation
+    return Sums(gram, rows)
+
+
+def saturated_residuals(
+    runs: Sequence[RunData], channel: Channel, leave: Collection[int] = ()
+) -> list[FloatArray]:
+    """Return what no effect and no change from run to run explains, per run [n], NaN where not valid.
+
+    leave: columns not to use. The residual is a sum of measured terms (current, friction, acceleration, sensor); with a
+    regressor for each of them it would be explained completely by taking all of them away.
+    """
+    data = [run.channels[channel] for run in runs if channel in run.channels]
+    keep = np.flatnonzero(~np.isin(data[0].index, list(leave)))
+    q = data[0].nuisances.shape[1]
+    p = len(keep)
+    total = p + q * len(data)
+    gram, right = np.zeros((total, total)), np.zeros(total)
+    blocks = []
+    for r, d in enumerate(data):
+        x = np.hstack((d.regressors[:, keep], d.nuisances))[d.valid]
+        places = np.concatenate((np.arange(p), p + q * r + np.arange(q)))
+        gram[np.ix_(places, places)] += x.T @ x
+        right[places] += x.T @ d.residual[d.valid]
+        blocks.append(places)
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(gram), 1e-30))
+    scaled = gram * scale[:, None] * scale[None, :]
+    solution = scale * np.linalg.solve(scaled + 1e-7 * np.eye(total), scale * right)
+    out = []
+    for places, d in zip(blocks, data, strict=True):
+        rest = d.residual - np.hstack((d.regressors[:, keep], d.nuisances)) @ solution[places]
+        out.append(np.where(d.valid, rest, np.nan))
+    return out

@@ -18,7 +18,6 @@ import numpy as np
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR
-from jtqd.sysid.diagnosis.noise import past_valid, whiten
 from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel, Line
 
@@ -47,6 +46,8 @@ MOST: Final = 3
 ORDERS: Final = np.arange(0.3, 10.0, 0.04)
 """Per motor revolution, where lines of a residual are looked for."""
 _HZ: Final = (2.0, 40.0)
+AR_ORDER: Final = 24
+"""Of the autoregression."""
 _LINE: Final = 25.0
 """Power of a line against the median of its neighbourhood."""
 _FEWEST_TURNS: Final = 8.0
@@ -428,6 +429,54 @@ def sharpened(line: Line, runs: Sequence[RunData], parts: Sequence[FloatArray], 
 
 
 # Events and seconds.
+
+
+def autoregression(stretches: Sequence[FloatArray], order: int = AR_ORDER) -> FloatArray:
+    """Return a [order]: x_t = sum a_k x_{t-k} + e, by Yule-Walker over series with NaN for gaps (Levinson)."""
+    covariance = np.zeros(order + 1)
+    for x in stretches:
+        good = np.isfinite(x)
+        y = np.where(good, x, 0.0)
+        for lag in range(min(order + 1, len(y))):
+            covariance[lag] += float(y[lag:] @ y[: len(y) - lag])
+    counts = np.array(
+        [
+            sum(int(np.sum(np.isfinite(x[k:]) & np.isfinite(x[: len(x) - k]))) for x in stretches)
+            for k in range(order + 1)
+        ],
+        np.float64,
+    )
+    c = covariance / np.maximum(counts, 1.0)
+    c[0] *= 1.0 + 1e-6
+    a = np.zeros(order)
+    error = c[0]
+    for k in range(order):
+        if error <= 0.0:
+            break
+        reflection = (c[k + 1] - float(a[:k] @ c[k:0:-1])) / error
+        if abs(reflection) >= 1.0:
+            break
+        a[:k], a[k] = a[:k] - reflection * a[:k][::-1], reflection
+        error *= 1.0 - reflection * reflection
+    return a
+
+
+def whiten(x: FloatArray, a: FloatArray) -> FloatArray:
+    """Return x_t - sum a_k x_{t-k} along axis 0; the first rows, whose past is unknown, take it as zero."""
+    out = x.copy()
+    for k, weight in enumerate(a, 1):
+        if weight != 0.0:
+            out[k:] -= weight * x[:-k]
+    return out
+
+
+def past_valid(valid: BoolArray, order: int) -> BoolArray:
+    """Return where a row and its `order` predecessors are valid."""
+    run = np.concatenate(([0], np.cumsum(valid)))
+    out = np.zeros(len(valid), bool)
+    if len(valid) > order:
+        out[order:] = run[order + 1 :] - run[: -order - 1] == order + 1
+    return out
 
 
 def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:

@@ -19,10 +19,9 @@ from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
 from jtqd.sysid.diagnosis.findings import Gap, Place, Trace, shows_at
-from jtqd.sysid.diagnosis.noise import autoregression
 from jtqd.sysid.diagnosis.regressors import LINE, Index, binned, contribution
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.structure import AXES, Balance, View, bins_of, events, pursue
+from jtqd.sysid.diagnosis.structure import AXES, Balance, View, autoregression, bins_of, events, pursue
 
 _MOST_OF_THE_TIME: Final = 0.1
 """What takes more of the time than this is no event but a condition."""

@@ -17,7 +17,7 @@ from jtqd.sysid.diagnosis.dataset import (
 )
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import Cause
-from jtqd.sysid.diagnosis.noise import Sums
+from jtqd.sysid.diagnosis.regressors import Sums
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from tests.estimator.effects import effect_signals
 from tests.sysid.diagnosis.diagnose_core_helpers import candidates, rigid_run

@@ -6,18 +6,16 @@ import numpy as np
 import pytest
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.sysid.diagnosis.noise import (
-    ORDER,
+from jtqd.sysid.diagnosis.regressors import (
+    ChannelData,
     Noise,
-    autoregression,
+    RunData,
     noise_of_channels,
-    past_valid,
     run_sums,
     saturated_residuals,
-    whiten,
 )
-from jtqd.sysid.diagnosis.regressors import ChannelData, RunData
 from jtqd.sysid.diagnosis.signals import Channel
+from jtqd.sysid.diagnosis.structure import AR_ORDER, autoregression, past_valid, whiten
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, TORSION1, run_data
 
 MOTOR2 = Channel(2, "motor")
@@ -32,7 +30,7 @@ def coloured(a: FloatArray, noise: FloatArray) -> FloatArray:
 
 
 def padded(*a: float) -> FloatArray:
-    return np.concatenate((a, np.zeros(ORDER - len(a))))
+    return np.concatenate((a, np.zeros(AR_ORDER - len(a))))
 
 
 def test_coefficients_of_an_autoregression_come_back_through_gaps() -> None:
