@@ -22,9 +22,10 @@ the columns is taken out of the normal equations (Fuller 1987, Measurement Error
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -65,8 +66,14 @@ class Fit:
 
 def columns_of(entries: Sequence[Entry], chosen: Set) -> Index:
     """Return the places of a set's coefficients among those of all entries."""
-    ends = np.cumsum([0, *(e.size for e in entries)])
-    return np.array([j for k in sorted(chosen) for j in range(ends[k], ends[k + 1])], np.intp)
+    spans = slices_of(entries)
+    return np.array([j for k in sorted(chosen) for j in range(spans[k].start, spans[k].stop)], np.intp)
+
+
+def slices_of(entries: Iterable[Entry]) -> list[slice]:
+    """Return where the coefficients of each entry are among those of all."""
+    ends = np.cumsum([0, *(e.size for e in entries)]).tolist()
+    return [slice(a, b) for a, b in pairwise(ends)]
 
 
 def _bounds(entries: Sequence[Entry], chosen: Set) -> tuple[FloatArray, FloatArray]:
@@ -110,11 +117,7 @@ class Sets:
 
     def __init__(self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset()) -> None:
         self.entries, self.gram, self.out = list(entries), gram, out
-        self.slices: list[Index] = []
-        first = 0
-        for e in entries:
-            self.slices.append(np.arange(first, first + e.size))
-            first += e.size
+        self.slices: list[Index] = [np.arange(s.start, s.stop) for s in slices_of(entries)]
         one = np.array([e.size == 1 for e in entries], bool)
         self._single = np.flatnonzero(one)
         self._place = np.array([self.slices[k][0] for k in self._single], np.intp)
@@ -157,11 +160,7 @@ class Sets:
 
     def places(self, chosen: Set) -> dict[int, slice]:
         """Return where the coefficients of each entry of a set are among those of all."""
-        out, first = {}, 0
-        for k in sorted(chosen):
-            out[k] = slice(first, first + self.entries[k].size)
-            first += self.entries[k].size
-        return out
+        return dict(zip(sorted(chosen), slices_of(self.entries[k] for k in sorted(chosen)), strict=True))
 
     def gains(self, chosen: Set) -> FloatArray:
         """Return the log evidence that adding each entry brings [entries]; -inf where its slot is taken."""
@@ -273,12 +272,9 @@ class Sets:
         cross = self.gram[:, at]
         column = self.slices[gone][0]
         taken = {self.entries[k].slot for k in less}
+        never = banned | self.out | {gone}
         usable = np.array(
-            [
-                k not in banned | self.out and k != gone and self.entries[k].slot not in taken
-                for k in self._single.tolist()
-            ],
-            bool,
+            [k not in never and self.entries[k].slot not in taken for k in self._single.tolist()], bool
         )
         if usable.sum() < 2:
             return []
@@ -295,10 +291,9 @@ class Sets:
         p, q, r = rest[i, i] + 1.0, rest[j, j] + 1.0, rest[i, j]
         determinant = p * q - r * r
         good = (p >= 1.0) & (q >= 1.0) & (determinant >= 1.0)
-        value = (
-            0.5 * (q * b[i] ** 2 - 2.0 * r * b[i] * b[j] + p * b[j] ** 2) / np.where(good, determinant, 1.0)
-        )
-        value = np.where(good, value - 0.5 * np.log(np.where(good, determinant, 1.0)), -math.inf)
+        determinant = np.where(good, determinant, 1.0)
+        value = 0.5 * (q * b[i] ** 2 - 2.0 * r * b[i] * b[j] + p * b[j] ** 2) / determinant
+        value = np.where(good, value - 0.5 * np.log(determinant), -math.inf)
         best = np.argsort(value)[-2:]
         return [frozenset((int(members[i[k]]), int(members[j[k]]))) for k in best if math.isfinite(value[k])]
 
@@ -352,10 +347,9 @@ class Equations:
 
     def _noisy(self) -> Set:
         """Return the entries whose columns are noise for the most part, as a rate of a noisy torque is."""
-        ends = np.cumsum([0, *(e.size for e in self.entries)])
         signal, noise = (np.einsum("rii->i", g)[: self.E] for g in (self.plain, self.noise))
         much = noise > _NOISY * signal
-        return frozenset(k for k in range(len(self.entries)) if much[ends[k] : ends[k + 1]].any())
+        return frozenset(k for k, s in enumerate(slices_of(self.entries)) if much[s].any())
 
     def _take_out(self, kappa: float) -> None:
         self.kappa = kappa
@@ -379,18 +373,14 @@ class Equations:
     def first(self) -> dict[object, float]:
         """Return the variances to begin with."""
         out = {g: v for g, (v, _) in self.start.items()}
-        for g in self.kinds:
-            if g in self.most:
-                out["shared", g] = out[g]
-        return out
+        return out | {("shared", g): out[g] for g in self.kinds if g in self.most}
 
     def sets(self, variances: Variances, chosen: Set = frozenset(), *, resembling: bool = True) -> Sets:
         """Return the sets at these variances, with the discrepancy beside a set; resembling: and what resembles any."""
         here = self.beside(chosen)
         gram = here._without_shared(np.sum(here._reduced(variances)[0], axis=0), variances)[0]
-        return Sets(
-            self.entries, self._without_resemblance(gram, variances) if resembling else gram, self.noisy
-        )
+        gram = self._without_resemblance(gram, variances) if resembling else gram
+        return Sets(self.entries, gram, self.noisy)
 
     def deviation(self, variances: Variances) -> FloatArray:
         """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
@@ -480,10 +470,8 @@ class Equations:
     ) -> tuple[dict[object, float], float, Means]:
         at, many, e = columns_of(self.entries, chosen), len(self.shared), self.E
         now = dict(variances)
-        low, high = (
-            np.append(x, np.full(many, x0))
-            for x, x0 in zip(_bounds(self.entries, chosen), (-math.inf, math.inf), strict=True)
-        )
+        ends = zip(_bounds(self.entries, chosen), (-math.inf, math.inf), strict=True)
+        low, high = (np.append(x, np.full(many, none)) for x, none in ends)
         for step in range(steps + 1):
             parts, logs, keep = self._reduced(now)
             total = np.sum(parts, axis=0)
@@ -496,13 +484,8 @@ class Equations:
             left = float(total[-1, -1] - 2.0 * theta @ total[q, -1] + theta @ inner @ theta)
             if left <= 0.0:
                 raise np.linalg.LinAlgError("found more explained than there is")
-            score = (
-                left
-                + logs
-                + 2.0 * float(np.sum(np.log(np.diag(lower))))
-                + float(np.sum(np.log(w)))
-                - 2.0 * sum(self.entries[k].odds for k in chosen)
-            )
+            score = left + logs + 2.0 * float(np.sum(np.log(np.diag(lower)))) + float(np.sum(np.log(w)))
+            score -= 2.0 * sum(self.entries[k].odds for k in chosen)
             contrast = np.zeros(e + many + 1)
             contrast[q], contrast[-1] = -theta, 1.0
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
@@ -526,10 +509,7 @@ class Equations:
         return now, score, Means(theta[: len(at)], theta[len(at) :], means, self.turned)
 
     def _maximised(
-        self,
-        now: Variances,
-        own: tuple[FloatArray, FloatArray],
-        shared: tuple[FloatArray, FloatArray],
+        self, now: Variances, own: tuple[FloatArray, FloatArray], shared: tuple[FloatArray, FloatArray]
     ) -> dict[object, float]:
         """Return the variances at which the squares are what the effective numbers of coefficients make expect (MacKay 1992,
         Neural Computation 4): many times fewer steps than by expectation-maximisation.

@@ -21,7 +21,7 @@ from jtqd.estimator.effects.effect import Linear
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset, unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, present_effects, set_state, shapes_of
-from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of
+from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of, slices_of
 from jtqd.sysid.diagnosis.findings import shows_at
 from jtqd.sysid.diagnosis.regressors import (
     ChannelData,
@@ -95,10 +95,8 @@ class Solution:
 def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
     """Return the weights of scaled coefficients of entries in the library's columns [P, E]."""
     out = np.zeros((columns, sum(e.size for e in entries)))
-    first = 0
-    for e in entries:
-        out[np.ix_(list(e.columns), range(first, first + e.size))] = e.weights
-        first += e.size
+    for e, at in zip(entries, slices_of(entries), strict=True):
+        out[list(e.columns), at] = e.weights
     return out
 
 
@@ -412,12 +410,9 @@ class _Work:
 
     def move(self, chosen: Set, mean: FloatArray, changed: frozenset[str], only: Set | None) -> None:
         """Set states and shapes to the solution, and make the columns again that depend on them, of all or `only` some."""
-        ends, again = 0, set()
-        present = []
-        for k in sorted(chosen):
-            e = self.entries[k]
-            scaled = mean[ends : ends + e.size]
-            ends += e.size
+        again, present = set(), []
+        for k, at in zip(sorted(chosen), slices_of(self.entries[k] for k in sorted(chosen)), strict=True):
+            e, scaled = self.entries[k], mean[at]
             moved = self._shaped(e, scaled)
             if moved is not e:
                 self.entries[k] = moved
@@ -472,13 +467,7 @@ class _Work:
             candidate=candidate,
             shapes=names,
             tangents=tangents,
-            amplitude=tuple(
-                e.coefficients(
-                    scaled[: e.size]
-                    if len(scaled) == e.size
-                    else np.append(scaled, np.zeros(e.size - len(scaled)))
-                )
-            ),
+            amplitude=tuple(e.coefficients(np.append(scaled, np.zeros(e.size - len(scaled))))),
         )
 
     def _columns_again(self, signals: Sequence[JointSignals], run: RunData, entries: Iterable[int]) -> None:
