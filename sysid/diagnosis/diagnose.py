@@ -108,7 +108,8 @@ def _diagnosed(  # noqa: PLR0917
         kept = [run for run in runs if run[0] in {signals[0].run for signals in usable}]
         usable, _ = usable_signals(kept, joints, judged, scope.known_references)
         dataset = build_dataset(usable, joints, scope)
-    dataset = replace(dataset, disturbed=disturbed_signals(runs, joints, numbers, usable, scope))
+    noisy = disturbed_signals(runs, joints, numbers, usable, scope)
+    dataset = replace(dataset, disturbed=noisy, trust=trust)
     solution = without_events(solve(dataset))
     findings = conclude(solution, names, scope, relevance)
     notes = (*reasons, *(o.text for o in outliers), *resolution_notes(usable), *piece_notes(usable))

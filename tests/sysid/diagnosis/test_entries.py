@@ -189,3 +189,11 @@ def test_values_of_the_file_have_better_odds_than_structure(plain: Runs) -> None
     assert len(waves) > 1
     alone = next(e for e in found if e.effect.name == "sensor_gain")
     assert waves[0].odds < alone.odds, "the ways to look for one effect share its odds"
+
+
+def test_a_value_that_the_user_trusts_is_not_what_is_wrong() -> None:
+    friction = replace(ARM.friction, coulomb_nm=1.5 * ARM.friction.coulomb_nm)
+    runs = runs_of(replace(ARM, friction=friction), 1, 2)
+    free, trusted = (diagnose(runs, {1: ARM}, trust=trust) for trust in ({}, {"coulomb_friction": 1e-4}))
+    assert "coulomb_friction" in {c.name for c in free.causes}
+    assert "coulomb_friction" not in {c.name for c in trusted.causes}
