@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import permutations
 from typing import Any, Final
 
 import numpy as np
@@ -256,14 +257,12 @@ def recordings(runs: Sequence[Sequence[JointSignals]]) -> list[int]:
     another ends: stamps, positions of both sides, velocity and temperature. Where stamps begin at zero again, two runs are
     one recording only if the joint moves at the cut: many runs begin and end at rest in the same place.
     """
-    count = len(runs)
-    root = list(range(count))
-    for a in range(count):
-        for b in range(count):
-            names = runs[a][0].run, runs[b][0].run
-            if a != b and (_same_name(*names) or (_may_follow(*names) and _goes_on(runs[a], runs[b]))):
-                old, new = max(root[a], root[b]), min(root[a], root[b])
-                root = [new if r == old else r for r in root]
+    root = list(range(len(runs)))
+    for a, b in permutations(range(len(runs)), 2):
+        names = runs[a][0].run, runs[b][0].run
+        if _same_name(*names) or (_may_follow(*names) and _goes_on(runs[a], runs[b])):
+            old, new = max(root[a], root[b]), min(root[a], root[b])
+            root = [new if r == old else r for r in root]
     order = sorted(set(root))
     return [order.index(r) for r in root]
 
@@ -386,15 +385,24 @@ def build_dataset(
     every = [s for run in signals for s in run]
     step = bin_samples(every) * max(s.step_s for s in every)
     candidates = library_candidates(signals, joints, scope)
-    candidates += _whole_orders(signals, joints, candidates, scope)
-    lines = unknown_lines(signals, candidates, step)
-    groups = families(signals, lines)
-    if scope.known_references & set(joints):  # a known load has no zero that differs from run to run
-        groups = [group for group in groups if group.name != "zero"]
-    runs = [run_data(run, candidates, samples_in(step, run), groups) for run in signals]
+    candidates += _whole_orders(signals, candidates, scope)
+    groups = families(signals, unknown_lines(signals, candidates, step))
     no_torque = bool(scope.known_references & set(joints))
+    if no_torque:  # a known load has no zero that differs from run to run
+        groups = [group for group in groups if group.name != "zero"]
+    runs = binned_runs(signals, step, candidates, groups)
     found = recordings(signals), readings(signals)
     return Dataset(signals, runs, candidates, step, groups, *found, no_torque=no_torque)
+
+
+def binned_runs(
+    signals: Sequence[Sequence[JointSignals]],
+    step_s: float,
+    candidates: Sequence[EffectCandidate] = (),
+    groups: Sequence[Family] = (),
+) -> list[RunData]:
+    """Return all runs in bins of step_s seconds (`run_data`)."""
+    return [run_data(run, candidates, samples_in(step_s, run), groups) for run in signals]
 
 
 def library_candidates(
@@ -403,18 +411,18 @@ def library_candidates(
     """Return every term of every effect of the scope that these runs have the channels for, columns numbered."""
     out: list[EffectCandidate] = []
     first = 0
-    numbers = [s.number for s in signals[0]]
     for effect in EFFECTS.values():
-        for n in numbers:
+        for s in signals[0]:
+            n = s.number
             for term in effect.terms(joints[n]):
                 at_sensor = effect.at_sensor_of(term.basis[0])
-                if at_sensor and n != numbers[0]:
+                if at_sensor and n != signals[0][0].number:
                     continue
                 where: JointName = "sensor" if at_sensor else n
                 if not scope.looks_for(effect.name, where, n) or not _has_channels(effect, signals, n):
                     continue
-                shown = [contribution(effect, term.basis[0], s) for s in signals[0] if s.number == n]
-                size = max((float(np.abs(v).max()) for found in shown for v in found.values()), default=0.0)
+                shown = contribution(effect, term.basis[0], s)
+                size = max((float(np.abs(v).max()) for v in shown.values()), default=0.0)
                 if size > 0.0 and np.isfinite(size):
                     out.append(
                         EffectCandidate(effect, where, term, first, effect.largest(joints[n], term.basis[-1]))
@@ -434,17 +442,14 @@ def _has_channels(effect: Effect, signals: Sequence[Sequence[JointSignals]], num
 
 
 def _whole_orders(
-    signals: Sequence[Sequence[JointSignals]],
-    joints: Mapping[int, Joint],
-    candidates: Sequence[EffectCandidate],
-    scope: Scope,
+    signals: Sequence[Sequence[JointSignals]], candidates: Sequence[EffectCandidate], scope: Scope
 ) -> list[EffectCandidate]:
     """Return waves at whole orders that stand out of the residual's order spectrum, of effects that may have any."""
     first = candidates[-1].columns.stop if candidates else 0
     out: list[EffectCandidate] = []
     coarsest = max(s.step_s for run in signals for s in run)
     step = coarsest * max(1, round(ORDER_STEP_S / coarsest))
-    bare = [run_data(run, [], samples_in(step, run)) for run in signals]
+    bare = binned_runs(signals, step)
     for effect in (e for e in EFFECTS.values() if e.whole_orders):
         orders = np.array(effect.whole_orders, np.float64)
         for s in signals[0]:
@@ -465,26 +470,18 @@ def _whole_orders(
 
 
 def unknown_lines(
-    signals: Sequence[Sequence[JointSignals]],
-    candidates: Sequence[EffectCandidate],
-    step_s: float,
+    signals: Sequence[Sequence[JointSignals]], candidates: Sequence[EffectCandidate], step_s: float
 ) -> list[Line]:
     """Return strong lines of the residuals at orders and frequencies that no candidate has; no sidelobes of others."""
-    bare = [run_data(run, [], samples_in(step_s, run)) for run in signals]
+    bare = binned_runs(signals, step_s)
     residuals = {c: saturated_residuals(bare, c) for c in bare[0].channels}
-    known = {
-        (c.joint, float(c.term.basis[0]["order_per_motor_rev"]))
-        for c in candidates
-        if "order_per_motor_rev" in c.term.basis[0]
-    }
+    known = [(c.joint, c.term.basis[0].get("order_per_motor_rev", math.inf)) for c in candidates]
     out: list[Line] = []
     for line in order_lines(bare, residuals, step_s):
-        stronger = any(
-            o.channel == line.channel and o.unit == line.unit and abs(o.order - line.order) < _SIDELOBES
-            for o in out
-        )
-        near = any(j == line.channel.joint and abs(o - line.order) < _SIDELOBES for j, o in known)
-        if line.ratio > STRONG_LINE and line.order > _LOWEST_ORDER and not stronger and not near:
+        there = [o.order for o in out if o.channel == line.channel]
+        there += [order for joint, order in known if joint == line.channel.joint]
+        near = any(abs(order - line.order) < _SIDELOBES for order in there)
+        if line.ratio > STRONG_LINE and line.order > _LOWEST_ORDER and not near:
             out.append(sharpened(line, bare, residuals[line.channel], step_s))
     hz = [line for line in frequency_lines(bare, residuals, step_s) if line.ratio > STRONG_LINE]
     # one vibration of the frame or the sensor, in every channel that shows it

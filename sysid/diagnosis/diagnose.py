@@ -115,13 +115,16 @@ def _diagnosed(  # noqa: PLR0917
     notes = (*reasons, *(o.text for o in outliers), *resolution_notes(usable), *piece_notes(usable))
     left_out = tuple(f"joint {n}: left out" for n in numbers if n not in judged)
     unjudged = [line for line in reasons if line.startswith(left_out)]
-    if unjudged and findings.verdict == NO_GAP:  # no proof for a joint that nobody looked at
-        findings = replace(findings, verdict=INSUFFICIENT)
-    findings = replace(findings, reasons=(*unjudged, *findings.reasons))
-    if findings.verdict == UNEXPLAINED:
-        findings = replace(findings, reasons=(*findings.reasons, *scope.note))
-    used = tuple(run[0].run for run in usable)
-    return replace(findings, channel_notes=notes, outlier_runs=tuple(outliers), used=used)
+    verdict = findings.verdict
+    # no proof for a joint that nobody looked at
+    return replace(
+        findings,
+        verdict=INSUFFICIENT if unjudged and verdict == NO_GAP else verdict,
+        reasons=(*unjudged, *findings.reasons, *(scope.note if verdict == UNEXPLAINED else ())),
+        channel_notes=notes,
+        outlier_runs=tuple(outliers),
+        used=tuple(run[0].run for run in usable),
+    )
 
 
 def without_events(solution: Solution) -> Solution:

@@ -19,7 +19,7 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import Linear
 from jtqd.sysid.diagnosis import limits
-from jtqd.sysid.diagnosis.dataset import Dataset, unpowered_columns, with_readings
+from jtqd.sysid.diagnosis.dataset import Dataset, binned_runs, unpowered_columns, with_readings
 from jtqd.sysid.diagnosis.entries import Entry, entries_of, present_effects, set_state, shapes_of
 from jtqd.sysid.diagnosis.evidence import Equations, Means, Set, Sets, columns_of, slices_of
 from jtqd.sysid.diagnosis.findings import shows_at
@@ -33,9 +33,7 @@ from jtqd.sysid.diagnosis.regressors import (
     features,
     fields_used,
     noise_of_channels,
-    run_data,
     run_sums,
-    samples_in,
     seen_in_bins,
 )
 from jtqd.sysid.diagnosis.signals import RATE_HZ, TORQUE_HZ, VALUES_HZ, Channel, JointSignals
@@ -226,10 +224,7 @@ class _Work:
             s.know_torque(TORQUE_HZ, RATE_HZ)  # as the runs were binned, whatever was solved since
             set_state(s, ())
         self.runs = [replace(run, channels=dict(run.channels)) for run in dataset.runs]
-        self.disturbed = [
-            run_data(run, dataset.candidates, samples_in(dataset.step_s, run), dataset.families)
-            for run in dataset.disturbed
-        ]
+        self.disturbed = binned_runs(dataset.disturbed, dataset.step_s, dataset.candidates, dataset.families)
         names = [run.name for run in self.runs]
         self.disturbed_of = [names.index(run.name) for run in self.disturbed]
         self.groups: list[object] = [("family", k) for k in range(self.families)]
