@@ -416,7 +416,7 @@ def _write(
     """Put all files in place and return what is in findings.json. Raises ConfigError, OSError.
 
     They are made in a directory beside first: what fails on the way leaves the earlier results as they were. Then what
-    an earlier diagnosis wrote goes, so that no plan or joint file of it stays beside the new findings.
+    an earlier diagnosis wrote goes.
     """
     from jtqd.sysid.diagnosis.next_experiment import PLAN_FILE, motions_of
     from jtqd.sysid.diagnosis.report import render

@@ -254,8 +254,8 @@ def recordings(runs: Sequence[Sequence[JointSignals]]) -> list[int]:
     """Return the number of the recording that each run [run][joint] belongs to, from 0 in order of their first pieces.
 
     Pieces are known by their names ("a.csv (2 of 3)": the reader cuts a recording at its gaps), or because one begins where
-    another ends: stamps, positions of both sides, velocity and temperature. Where stamps begin at zero again, two runs are
-    one recording only if the joint moves at the cut: many runs begin and end at rest in the same place.
+    another ends. Where stamps begin at zero again, two runs are one recording only if the joint moves at the cut: many runs
+    begin and end at rest in the same place.
     """
     root = list(range(len(runs)))
     for a, b in permutations(range(len(runs)), 2):

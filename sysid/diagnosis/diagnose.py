@@ -62,10 +62,10 @@ def diagnose(
     """Return what the joint files' simulation gets wrong in these runs.
 
     runs: (name, table); joints: nominal joint per number; scope: what may be named; relevance: part of the rated torque,
-    rms over a run, from which what the causes leave matters. Never raises for what is in the tables: data that cannot
-    serve give the verdict insufficient_data with its reasons. Joints with a sensor each are diagnosed one by one. Where a
-    cause has the name of an effect that a file already has, the diagnosis is made again without that effect, so that what
-    is reported is the whole of it.
+    rms over a run, from which what the causes leave matters; trust: factors of priors by their names. Data that cannot serve
+    give the verdict insufficient_data with its reasons. Joints with a sensor each are diagnosed one by one. Where a cause
+    has the name of an effect that a file already has, the diagnosis is made again without that effect, so that what is
+    reported is the whole of it.
     """
     numbers = tuple(sorted(n for n in joints if any(n in table.joints for _, table in runs)))
     if len(numbers) > 1 and not one_sensor(runs, numbers):

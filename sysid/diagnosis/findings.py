@@ -32,10 +32,8 @@ class FileValue(NamedTuple):
 
 
 def file_values(effect_name: str, where: int | str, joints: Mapping[int, Joint]) -> dict[str, FileValue]:
-    """Return the joint file's value of each parameter of an effect of joint `where` (or "sensor").
-
-    An effect that is in the file under `effects` has its value there; else a parameter that stands for a key of the file has
-    that key's; any other has the value that means no effect.
+    """Return the joint file's value of each parameter of an effect of joint `where` (or "sensor"): that under `effects`,
+    else of the key that it stands for, else the value that means no effect.
     """
     joint = joints.get(where) if isinstance(where, int) else next(iter(joints.values()), None)
     effect = EFFECTS.get(effect_name)

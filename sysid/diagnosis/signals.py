@@ -1,8 +1,6 @@
 """What a diagnosis sees of one joint in one run: state for the effects, residuals of both balances, masks.
 
-The residuals are those of `jtqd.estimator.effects.effect`: measured less simulated with the joint file. Derivatives
-are central differences of positions (`smoothing`). All arrays are later averaged over equal bins, residual and regressors
-alike, so that noise of differences averages out and nothing is compared with something filtered in another way.
+The residuals are those of `jtqd.estimator.effects.effect`: measured less simulated with the joint file.
 
 The torsion that the effects see is tau/K, not the encoders' difference: the residual of the torsion balance contains that
 difference, and a regressor that contains it too would explain its noise. Its rate is that of the difference, whose noise
@@ -51,8 +49,7 @@ class BaseLoss:
     """Losses of one joint file as the simulation has them, loss0(tau, v), signed like the velocity [Nm, joint side].
 
     The law of the emulated plant for this file (`jtqd.sim_can.plant_file.plant_of_joint`): with an efficiency the table of
-    `jtqd.sim_can.plant` and the file's Stribeck peak, else the file's friction. The direction of friction is known: samples
-    near rest, where a simulation's smoothing would matter, are not used by the diagnosis.
+    `jtqd.sim_can.plant` and the file's Stribeck peak, else the file's friction.
     """
 
     def __init__(self, joint: Joint) -> None:
@@ -101,9 +98,7 @@ class BaseLoss:
         return signed
 
     def slope(self, torque_nm: FloatArray, velocity_rad_s: FloatArray) -> FloatArray:
-        """Return d loss / d torque [n]: torque that is wrong by e leaves a loss wrong by slope times e.
-
-        Zero without efficiency: such losses know no load. Taken over +-_SLOPE of the rated torque, so that the grid of the
+        """Return d loss / d torque [n], zero without efficiency; over +-_SLOPE of the rated torque, so that the grid of the
         table does not show.
         """
         if self._rows is None:
@@ -358,8 +353,7 @@ def _motion(
     """Return the motion by the channel whose acceleration is known best, position or velocity, of the motor's side or, with
     one encoder, of the link's; like: by the same channel and filters as there.
 
-    A velocity channel may be filtered, late or of another scale: beside a position it is taken only where that shows none of
-    it.
+    A velocity channel may be filtered, late or of another scale: beside a position it is taken only where that shows none.
     """
     ratio, one = joint.gear_ratio, not raw.two_encoders(joint.gear_ratio)
     position, speed = raw.motor_position_rad, raw.motor_velocity_rad_s

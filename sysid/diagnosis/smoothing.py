@@ -104,10 +104,7 @@ def smooth(x: FloatArray, samples: int) -> FloatArray:
 
 
 def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:
-    """Return the mean of x from each time to span_s later [n]; the last value goes on after the end, the first before.
-
-    All samples between are in it, so that it has the noise of a difference over the span where x is a rate.
-    """
+    """Return the mean of x from each time to span_s later [n]; the last value goes on after the end, the first before."""
     steps = np.diff(time_s)
     sums = np.concatenate(([0.0], np.cumsum(0.5 * (x[1:] + x[:-1]) * steps)))
     later = time_s + span_s
@@ -173,9 +170,8 @@ _STEP: Final = 1.25
 
 
 def steps_of(x: FloatArray) -> FloatArray:
-    """Return the steps of the values near each sample [n], in units of x; 0 where they are finer than shows.
-
-    Decimals (fixed, or significant digits), single precision, or counts of any size.
+    """Return the steps of the values near each sample [n], in units of x; 0 where they are finer than shows: of decimals
+    (fixed, or significant digits), single precision, or counts.
     """
     out = np.zeros(len(x))
     for there in _magnitudes(x):

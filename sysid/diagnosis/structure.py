@@ -266,9 +266,8 @@ def explained_by_bins(
 
 
 def chance(view: View, parts: Sequence[FloatArray], step_s: float) -> float:
-    """Return how likely a condition explains this much of the residual [run][n] by chance: with random signs of its seconds.
-
-    A residual that has nothing to do with the conditions changes its sign at random from second to second, run to run.
+    """Return how likely a condition explains this much of the residual [run][n] by chance: with random signs of its seconds,
+    as a residual has that has nothing to do with the conditions.
     """
     assert view.edges is not None
     bins, block = len(view.edges) - 1, _block(step_s)
