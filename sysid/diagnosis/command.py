@@ -91,7 +91,7 @@ def _main(argv: list[str]) -> int:
         asked = asked_effects(options.without, options.given)
         check_installed("analysis", *_NEEDED)
         check_joint_files(files)
-        _check_out(options.out, options.force)
+        _check_out(options.out, options.force, [*options.runs, *files.values()])
         runs = read_runs(options.runs, columns, segments=True, joints=named_joints(files))
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
@@ -145,9 +145,10 @@ def _provenance(
     """Return when and by what the findings were made, and of what; a joint file of several joints is named once."""
     inputs = {run.name: run.sha256 for run in runs}
     for path in dict.fromkeys([*files.values(), *([columns] if columns else [])]):
-        inputs[str(path)] = hashlib.sha256(path.read_bytes()).hexdigest()
-    date = dt.datetime.now().astimezone().date().isoformat()
-    return Provenance(date, __version__, shlex.join([*BY.split(), *argv]), inputs)
+        name = str(path).encode(errors="backslashreplace").decode()  # it may hold other bytes than UTF-8
+        inputs[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    command = shlex.join([*BY.split(), *argv]).encode(errors="backslashreplace").decode()
+    return Provenance(dt.datetime.now().astimezone().date().isoformat(), __version__, command, inputs)
 
 
 def _next_experiment(
@@ -400,8 +401,13 @@ def _percent(text: str) -> float:
     return value / 100.0
 
 
-def _check_out(directory: Path, force: bool) -> None:
-    """Make DIR before minutes of work, and refuse to overwrite. Raises ConfigError."""
+def _check_out(directory: Path, force: bool, inputs: Sequence[Path]) -> None:
+    """Make DIR before minutes of work; refuse to overwrite, an input in any case, and to write among runs in a directory,
+    where results would be read as runs. Raises ConfigError.
+    """
+    own = {directory.resolve(), *((directory / name).resolve() for name in _own())}
+    if used := next((path for path in inputs if path.resolve() in own), None):
+        raise ConfigError(f"--out {directory}: found the input {used} there, expected another directory")
     make_directory(directory)
     there = [name for name in _own() if (directory / name).exists()]
     if there and not force:

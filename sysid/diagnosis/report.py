@@ -159,7 +159,7 @@ def by_size(findings: Findings) -> tuple[list[Cause], list[Cause]]:
     """Return the entries that matter, by their share, and those too small to matter, by their size."""
     matter = [c for c in findings.causes if c.matters]
     causes = sorted(matter, key=lambda c: -(finite(c.explained_share) or 0.0))
-    small = [*(c for c in findings.causes if not c.matters), *findings.too_small]
+    small = [c for c in (*findings.causes, *findings.too_small) if c not in matter and c.rms_nm > 0.0]
     return causes, sorted(small, key=lambda c: -c.rms_nm)
 
 
@@ -266,8 +266,9 @@ def _grades(causes: Sequence[Cause], findings: Findings) -> str:
     texts = []
     if CERTAIN in grades:
         sure = [c for c in causes if c.grade == CERTAIN]
+        absent = {c.name for c in findings.candidates if math.isnan(c.delta_bic)}  # of a sensor that is none
         names = dict.fromkeys([*(c.name for c in sure), *(name for c in sure for name in _scales_alike(c))])
-        rows = {row.name: row for row in priors(findings.trust)}
+        rows = {row.name: row for row in priors(findings.trust) if row.name not in absent}
         sizes: dict[str, list[str]] = {}
         for row in (rows[name] for name in names if name in rows):
             size = f"{row.size}{' (as set)' if row.set_by_user else ''}"
@@ -349,10 +350,9 @@ def parameter_title(name: str) -> str:
 
 
 def in_words(text: str) -> str:
-    """Return a text with names of effects as words: "class of link_inertia" is "class of link inertia"."""
-    return " ".join(
-        effect_title(w) if "_" in w and w.strip(",;:").islower() and "." not in w else w for w in text.split()
-    )
+    """Return a text with names of effects and experiments as words: "class of link_inertia" is "class of link inertia"."""
+    names = {*EFFECTS, *EXPERIMENTS}
+    return " ".join(effect_title(w) if w.strip(",;:.()") in names else w for w in text.split())
 
 
 def place(joint: JointName) -> str:

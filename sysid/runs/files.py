@@ -50,9 +50,7 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
     for argument in arguments:
         if not argument.is_dir():
             if not argument.exists():
-                raise RunError(
-                    f"{argument}: found no such file or directory, expected a run file or a directory of runs"
-                )
+                raise RunError(f"{argument}: found no such file or directory, expected a run or a directory")
             paths.append(argument)
             continue
         names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith("."))
@@ -62,6 +60,8 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
                 f"{argument}: found no run file in it, expected names ending in {', '.join(TABLES + LOGS)}"
             )
         paths += inside
+    if wrong := next((p for p in map(str, paths) if p != p.encode(errors="ignore").decode()), None):
+        raise RunError(f"{wrong!r}: found a name that is not UTF-8, expected a file of another name")
     return paths
 
 

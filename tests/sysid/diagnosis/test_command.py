@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -356,6 +357,44 @@ def test_nothing_is_overwritten_without_force(
     assert made_in(out)["verdict"] == "no_gap"
     assert not (out / "next_experiment.plan.yaml").exists()  # of the earlier diagnosis
     assert (out / "mine.txt").read_text() == "kept"
+
+
+def test_an_input_is_not_overwritten_and_results_do_not_stand_among_the_runs(
+    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_runs(tmp_path)
+    mine = tmp_path / "o" / "extended.joint.yaml"
+    mine.parent.mkdir()
+    mine.write_bytes(JOINT_FILE.read_bytes())
+    link = tmp_path / "link"
+    link.symlink_to(tmp_path)
+    for runs, joint, out in (
+        ((tmp_path / "a.csv", tmp_path / "b.csv.gz"), mine, mine.parent),
+        ((tmp_path,), JOINT_FILE, tmp_path),
+        ((tmp_path,), JOINT_FILE, link),
+    ):
+        assert run(*runs, "--joint", joint, "--out", out, "--force") == 1
+        assert "found the input" in said(capsys)
+    assert not core.asked
+    assert mine.read_bytes() == JOINT_FILE.read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "b.csv.gz", "c.csv", "link", "o"]
+
+
+def test_a_name_of_a_file_that_is_no_utf_8_costs_no_result(
+    tmp_path: Path, core: Core, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_runs(tmp_path)
+    odd = tmp_path / "j\udcff.yaml"
+    odd.write_bytes(JOINT_FILE.read_bytes())
+    runs, out = (tmp_path / "a.csv", tmp_path / "b.csv.gz"), tmp_path / "o"
+    page = sys.modules["jtqd.sysid.diagnosis.report"]
+    monkeypatch.setattr(page, "render", lambda findings: findings.provenance.command)
+    assert run(*runs, "--joint", odd, "--out", out) == 3
+    assert str(tmp_path / "j\\udcff.yaml") in made_in(out)["provenance"]["inputs"]
+    assert "j\\udcff.yaml" in (out / "report.html").read_text()
+    (tmp_path / "a.csv").rename(tmp_path / "a\udcff.csv")
+    assert run(tmp_path, "--joint", JOINT_FILE, "--out", tmp_path / "p") == 1
+    assert "a\\udcff.csv': found a name that is not UTF-8" in capsys.readouterr().err
 
 
 def test_a_failure_on_the_way_leaves_the_earlier_results(

@@ -299,6 +299,28 @@ def test_names_are_words() -> None:
     assert in_words("b.csv: j1.torque_nm and link_inertia, sensor_gain;") == (
         "b.csv: j1.torque_nm and link inertia, sensor gain;"
     )
+    named = "r: time_s: found peaks of rated_torque_nm (15 Nm), gear_ratio"
+    assert in_words(f"{named}; speed_ladder: load_dependent_friction") == (
+        f"{named}; speed ladder: load dependent friction"
+    )
+
+
+def test_an_entry_of_no_size_is_not_listed() -> None:
+    base = examples.one_cause()
+    (small,) = base.too_small
+    nothing = replace(small, name="link_inertia", rms_nm=0.0)
+    assert summary(replace(base, too_small=(small, nothing))).lines == summary(base).lines
+    agree = replace(base, verdict="no_gap", causes=(), too_small=(nothing,))
+    assert "too small" not in " ".join(headline(agree))
+
+
+def test_a_certain_entry_rests_on_no_prior_of_a_sensor_that_is_none() -> None:
+    one = replace(examples.one_cause().causes[0], name="torque_constant", balance="motor")
+    base = replace(examples.one_cause(), causes=(one,), too_small=(), candidates=())
+    assert summary(base).lines["grades"] == "certain: given torque constant ± 10 %, sensor gain ± 1 %."
+    absent = CandidateEvidence("sensor_gain", 1, math.nan, {}, "no torque was measured")
+    known = summary(replace(base, candidates=(absent,)))
+    assert known.lines["grades"] == "certain: given torque constant ± 10 %."
 
 
 def test_a_row_of_every_entry_has_its_smallest_size() -> None:
