@@ -133,14 +133,11 @@ def mjcf(model: JointModel, *, flexible: bool = False) -> str:
     if flexible:
         ET.SubElement(body, "joint", rotor)
     link = _body(body, f"{name}_link", joint.link_inertia_kgm2)
-    spring = {
-        "name": f"{name}_spring",
-        "type": "hinge",
-        "axis": "0 0 1",
-        "stiffness": _number(joint.stiffness_nm_per_rad),
-        "damping": _number(joint.damping_nms_per_rad),
-    }
-    ET.SubElement(link, "joint", spring if flexible else rotor)
+    if flexible:
+        elastic = {"stiffness": joint.stiffness_nm_per_rad, "damping": joint.damping_nms_per_rad}
+        rotor = {"name": f"{name}_spring", "type": "hinge", "axis": "0 0 1"}  # in its place the spring
+        rotor |= {key: _number(value) for key, value in elastic.items()}
+    ET.SubElement(link, "joint", rotor)
     gear = _number(model.torque_per_ampere_nm)
     ET.SubElement(ET.SubElement(root, "actuator"), "motor", name=f"{name}_current", joint=name, gear=gear)
     return _text(root)
@@ -162,7 +159,7 @@ def urdf(model: JointModel) -> str:
     )
     ET.SubElement(root, "link", name="base")
     inertial = ET.SubElement(ET.SubElement(root, "link", name=f"{name}_link"), "inertial")
-    inertia = _number(max(joint.link_inertia_kgm2, _LEAST_INERTIA_KGM2))
+    inertia = _number(max(_LEAST_INERTIA_KGM2, joint.link_inertia_kgm2))
     ET.SubElement(inertial, "mass", value=_number(_LEAST_MASS_KG))
     ET.SubElement(inertial, "inertia", ixx=inertia, iyy=inertia, izz=inertia, ixy="0", ixz="0", iyz="0")
     kind = "continuous" if model.travel_rad is None else "revolute"
@@ -194,7 +191,7 @@ def _step_s(joint: Joint, flexible: bool) -> float:
     """Return a step at which the integration is stable: the spring swings with the link inertia of the file."""
     if not flexible:
         return _STEP_S
-    rate = math.sqrt(joint.stiffness_nm_per_rad / max(joint.link_inertia_kgm2, _LEAST_INERTIA_KGM2))
+    rate = math.sqrt(joint.stiffness_nm_per_rad / max(_LEAST_INERTIA_KGM2, joint.link_inertia_kgm2))
     return min(_STEP_S, _STEP_SHARE / rate)
 
 
@@ -206,7 +203,7 @@ def _comments(root: ET.Element, model: JointModel) -> None:
 
 def _body(parent: ET.Element, name: str, inertia_kgm2: float) -> ET.Element:
     body = ET.SubElement(parent, "body", name=name)
-    inertia = _number(max(inertia_kgm2, _LEAST_INERTIA_KGM2))
+    inertia = _number(max(_LEAST_INERTIA_KGM2, inertia_kgm2))  # NaN: a joint with one encoder has none
     ET.SubElement(
         body, "inertial", pos="0 0 0", mass=_number(_LEAST_MASS_KG), diaginertia=" ".join([inertia] * 3)
     )

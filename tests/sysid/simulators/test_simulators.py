@@ -56,6 +56,22 @@ def test_urdf_has_dynamics_that_mujoco_reads() -> None:
     assert limit.attrib == {"effort": "20", "velocity": "3", "lower": "-1", "upper": "2"}
 
 
+@pytest.mark.parametrize("known", [(), ("link_inertia_kgm2",)])
+def test_a_joint_with_one_encoder_has_no_stiffness(tmp_path: Path, known: tuple[str, ...]) -> None:
+    """Such a joint file leaves stiffness and damping out, and the inertia where the load has all of it."""
+    write_joint(tmp_path / "whole.yaml", TRUE, "t")
+    elastic = ("stiffness_nm_per_rad", "damping_nms_per_rad", "link_inertia_kgm2")
+    lines = (tmp_path / "whole.yaml").read_text().splitlines()
+    kept = [line for line in lines if not line.startswith(tuple(key for key in elastic if key not in known))]
+    (tmp_path / "joint.yaml").write_text("\n".join(kept) + "\n")
+    joint = load_joint(tmp_path / "joint.yaml", elastic=False)
+    for text in (mjcf(model_of(joint)), urdf(model_of(joint))):
+        model = mujoco.MjModel.from_xml_string(text)
+        assert model.dof_frictionloss[0] == pytest.approx(1.2)
+    assert jtq(["export-model", str(tmp_path / "joint.yaml"), "--out", str(tmp_path / "joint.xml")]) == 0
+    assert jtq(["export-model", str(tmp_path / "joint.yaml"), "--flexible"]) == 1
+
+
 LINK_KGM2 = 0.02
 
 
