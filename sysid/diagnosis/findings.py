@@ -125,7 +125,7 @@ class Cause:
     """One entry of the set: a value of the file that is wrong, or an effect that is present.
 
     names: its class, itself first: what these runs cannot distinguish it from. grade: certain, one_of or effective; rivals:
-    of one_of; given: what certainty rests on, the priors of its kind in words.
+    of one_of; given: what certainty rests on, the priors of its kind in words; doubts: why it is not certain.
     """
 
     name: str
@@ -139,6 +139,7 @@ class Cause:
     grade: str = CERTAIN
     rivals: tuple[str, ...] = ()
     given: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
     matters: bool = True  # above the relevance
 
     @property
@@ -409,7 +410,7 @@ class Findings:
 
 _KEYS: Final[Mapping[type, str]] = {
     Gap: "joint rmse_nm noise_floor_nm localisation balance floor_from",
-    Cause: "name joint class=names parameters grade matters rivals given evidence rms_nm balance explained_share",
+    Cause: "name joint class=names parameters grade matters rivals given doubts evidence rms_nm balance explained_share",
     CandidateEvidence: "name joint evidence shared=null minimum=sizes minimum_rms_nm=null reason",
     Gain: "rmse_before_nm rmse_after_nm split ci95 joint balance plain_nm=null free_run_before_rad_s=null "
     "free_run_after_rad_s=null free_run_position_before_rad=null free_run_position_after_rad=null runs",

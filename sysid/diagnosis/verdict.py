@@ -128,12 +128,21 @@ def _rms(solution: Solution, present: PresentEffect) -> dict[Channel, float]:
     }
 
 
-def grade_of(j: Judged, *, hidden: bool) -> str:
-    """Return the grade of an effect; see the module. hidden: what remains in its balance is larger than itself."""
-    if j.delta <= limits.RIVAL and j.rivals:
-        return ONE_OF
-    evident = min(j.delta, j.imitated) > limits.RIVAL and j.z > limits.SURE
-    return CERTAIN if evident and j.differs < limits.DIFFERS and not hidden else EFFECTIVE
+def grade_of(j: Judged, *, hidden: bool) -> tuple[str, tuple[str, ...]]:
+    """Return the grade of an effect, and why it is not certain; see the module. hidden: what remains in its balance is
+    larger than itself.
+    """
+    size = f"its size differs by {100.0 * j.differs:.0f} % from run to run"
+    doubts = {
+        "other entries explain these runs alike": j.delta <= limits.RIVAL,
+        "a discrepancy would look alike": j.imitated <= limits.RIVAL,
+        f"it is less than {limits.SURE:g} standard deviations from none": j.z <= limits.SURE,
+        size if math.isfinite(j.differs) else "one recording has no other to agree with": j.differs
+        >= limits.DIFFERS,
+        "more than it remains in its balance": hidden,
+    }
+    found = tuple(text for text, holds in doubts.items() if holds)
+    return (ONE_OF if j.delta <= limits.RIVAL and j.rivals else EFFECTIVE if found else CERTAIN), found
 
 
 def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance: float) -> Findings:
@@ -208,7 +217,7 @@ def _own(solution: Solution, prediction: Prediction) -> FloatArray:
 def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -> Cause:
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
     remains = math.sqrt(rest.by_channel().get(channel, 0.0))
-    grade = grade_of(j, hidden=remains > j.rms_nm[channel])
+    grade, doubts = grade_of(j, hidden=remains > j.rms_nm[channel])
     rivals = tuple(
         dict.fromkeys(
             e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != j.present.joint else "")
@@ -229,6 +238,7 @@ def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -
         grade=grade,
         rivals=rivals if grade == ONE_OF else (),
         given=tuple(dict.fromkeys(solution.entries[k].prior.text for k in j.members)),
+        doubts=doubts,
     )
 
 
@@ -316,7 +326,7 @@ def entry_table(
         best = max(members, key=lambda k: gains[k])
         smallest = min((_smallest(sets, chosen, k) for k in members if k not in untold), default=math.inf)
         if cause is not None:
-            reason = f"in the set, {cause.grade}"
+            reason = "; ".join((f"in the set, {cause.grade}", *cause.doubts))
         elif all(k in untold for k in members):
             reason = "cannot be told from these runs"
             lost.append(Untold(name, joint, reason, EFFECTS[name].experiment))

@@ -170,7 +170,9 @@ def test_grades(solution: Solution, change: dict[str, float], rivals: bool, hidd
     """
     entries = tuple(solution.entries[:1]) if rivals else ()
     one: Any = SimpleNamespace(rivals=entries, **(SURE | change))
-    assert grade_of(one, hidden=hidden) == grade
+    found, doubts = grade_of(one, hidden=hidden)
+    assert found == grade
+    assert len(doubts) == len(change) + hidden
 
 
 def test_what_a_certain_entry_must_survive(solution: Solution) -> None:
