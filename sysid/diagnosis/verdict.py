@@ -158,7 +158,8 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     if (
         _largest(rest, limits_nm) > 1.0
     ):  # the discrepancy has a part in the set's values, none in those that predict
-        other = remaining(dataset, predicting, _own(solution, prediction))
+        own = solution.own(prediction.mean, prediction.chosen)[:, : len(dataset.families)]
+        other = remaining(dataset, predicting, own)
         less = unexplained_residual(other)
         if _largest(less, limits_nm) < _largest(rest, limits_nm):
             left, rest = other, less
@@ -207,11 +208,6 @@ def _largest(rest: Unexplained, limits_nm: Mapping[Channel, float]) -> float:
 def _channel(cause: Cause, dataset: Dataset) -> Channel:
     number = cause.joint if isinstance(cause.joint, int) else next(iter(dataset.joints))
     return Channel(number, cause.balance)
-
-
-def _own(solution: Solution, prediction: Prediction) -> FloatArray:
-    """Return what each recording has of its own beside the extended model, without discrepancy [r, q]."""
-    return solution.own(prediction.mean, prediction.chosen)[:, : len(solution.dataset.families)]
 
 
 def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -> Cause:
