@@ -58,6 +58,18 @@ _LEAST_SECANT: Final = 1e-3
 """Of the prior's size: less has no secant."""
 
 
+def between(
+    before: tuple[FloatArray, FloatArray], now: tuple[FloatArray, FloatArray], covariance: FloatArray
+) -> FloatArray:
+    """Return the next point of an iteration from its last two, each with its image: where the line through both has its
+    fixed point, no further than either image (Anderson 1965, J. ACM 12). A motor that saturates by a third overshoots else.
+    """
+    rest, change = now[1] - now[0], (now[1] - now[0]) - (before[1] - before[0])
+    weighted = np.linalg.solve(covariance, change)
+    part = float(rest @ weighted) / max(float(change @ weighted), 1e-30)
+    return np.asarray(now[1] - min(max(part, 0.0), 1.0) * (now[1] - before[1]))
+
+
 @dataclass
 class Solution:
     """A set with its posterior.
@@ -390,15 +402,18 @@ class _Work:
         """Move to the solution; again with the coefficients there, where the current that effects see depends on the set."""
         acting = any("current_a" in self._used[k] for k in chosen)
         self.move(chosen, mean, changed, chosen if acting else None)
+        before: tuple[FloatArray, FloatArray] | None = None
         for step in range(_SETTLING if acting else 0):
             few = [self.entries[k] for k in sorted(chosen)]
             every = frozenset(range(len(few)))
             fit = self.equations(noise, few).sets(variances, every).fit(every)
-            before, mean = mean, fit.mean
             done = step + 1 == _SETTLING or (
-                len(mean) == len(before)
-                and bool(np.all(np.abs(mean - before) <= _SETTLED * np.sqrt(np.diag(fit.covariance))))
+                len(mean) == len(fit.mean)
+                and bool(np.all(np.abs(fit.mean - mean) <= _SETTLED * np.sqrt(np.diag(fit.covariance))))
             )
+            now = mean, fit.mean
+            mean = fit.mean if before is None or done else between(before, now, fit.covariance)
+            before = now if len(now[0]) == len(now[1]) and not any(e.tangents for e in few) else None
             self.move(chosen, mean, changed, None if done else chosen)
             if done:
                 return

@@ -25,8 +25,9 @@ from jtqd.sysid.diagnosis.findings import (
     Scope,
 )
 from jtqd.sysid.diagnosis.limits import PRIORS
-from jtqd.sysid.diagnosis.model import Solution, solve
+from jtqd.sysid.diagnosis.model import Solution, between, solve
 from jtqd.sysid.diagnosis.signals import TORQUE_HZ
+from jtqd.sysid.diagnosis.verdict import judged
 from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (
     ARM,
@@ -403,3 +404,35 @@ def test_outliers_are_looked_for_as_recorded_and_balances_judged_where_the_torqu
     found = diagnose(computed(runs_of(ARM, 5, 3, rig), rig), {1: ARM}, Scope(known_references=frozenset({1})))
     assert seen["balance"] <= TORQUE_HZ < seen["outlier"]
     assert any(f"below {TORQUE_HZ:.0f} Hz" in note for note in found.channel_notes)
+
+
+@pytest.mark.parametrize(("part", "constant"), [(0.23, 0.95), (0.21, 1.08)])
+def test_a_motor_that_saturates_by_a_third_settles(part: float, constant: float) -> None:
+    """The current of the simulation follows from the saturation, and overshoots where it is strong."""
+    plain = runs_of(ARM, 21, 4, Rig(moment_nm=40.0))
+    per_a = part / max(float(np.max(np.abs(table.joints[1].current_a))) for _, table in plain)
+    runs = []
+    for name, table in plain:
+        current = table.joints[1].current_a
+        drawn = np.sign(current) * (1.0 - np.sqrt(1.0 - 4.0 * per_a * np.abs(current))) / (2.0 * per_a)
+        runs.append((name, replace(table, joints={1: replace(table.joints[1], current_a=drawn)})))
+    solution = solved(replace(ARM, torque_constant_nm_per_a=constant * KT), runs)
+    found = {j.present.effect.name: j.present.values for j in judged(solution)}
+    assert set(found) == {"torque_constant", "torque_constant_saturation"}
+    assert found["torque_constant_saturation"]["saturation_per_a"] == pytest.approx(per_a, rel=0.02)
+    assert found["torque_constant"]["torque_constant_nm_per_a"] == pytest.approx(KT, rel=0.005)
+
+
+def test_an_iteration_that_overshoots_meets_its_fixed_point() -> None:
+    truth, covariance = np.array([3.0, -1.0]), np.diag([1.0, 4.0])
+
+    def image(x: FloatArray) -> FloatArray:
+        return truth - 1.5 * (x - truth)
+
+    first = np.zeros(2)
+    before, now = (first, image(first)), (image(first), image(image(first)))
+    assert between(before, now, covariance) == pytest.approx(truth)
+    slow = np.array([1.0, 1.0])
+    assert between((0.0 * slow, slow), (slow, 1.9 * slow), covariance) == pytest.approx(1.9 * slow), (
+        "what converges from one side is not carried beyond"
+    )
