@@ -20,6 +20,10 @@ from validation.study import UsageError, json_of, text_of
 
 STUDIES: Final = {
     "goals": ("validation.goals.goals", "four plants: error and interval against the true torque"),
+    "current_path": (
+        "validation.current_path.study",
+        "a network of the current path: one encoder on four plants",
+    ),
     "sources": ("validation.goals.sources", "what the error of the estimate is made of on a bench"),
     "other_plant": ("validation.goals.other_plant", "joint files of another plant: how soon it is flagged"),
     "two_runs": (

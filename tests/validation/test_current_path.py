@@ -1,0 +1,148 @@
+"""The network of the current path: what it sees, how it learns, and the figures of its study."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.joint import Joint
+from jtqd.estimator.run import JointColumns
+from jtqd.models.files import load_joint, shipped
+from jtqd.sysid.planner.plan import DEFAULT_LIMITS, expand
+from jtqd.sysid.train.network import network_output
+from validation.current_path.recipe import (
+    EVERY,
+    INPUTS,
+    Block,
+    Recipe,
+    Seen,
+    block,
+    estimate_nm,
+    seen,
+    train,
+)
+from validation.current_path.study import Example, load_step_runs, percent, share
+
+JOINT: Joint = load_joint(shipped("joint1.yaml"))
+N = 1500
+TIME: FloatArray = 1e-3 * np.arange(N)
+
+
+def columns(**changes: FloatArray) -> JointColumns:
+    """A joint that swings with 2 rad/s at a current that swings as well."""
+    speed = 2.0 * np.sin(4.0 * TIME)
+    motor = 100.0 * np.cumsum(speed) * 1e-3
+    return replace(
+        JointColumns(
+            current_a=3.0 * np.cos(6.0 * TIME),
+            motor_position_rad=motor,
+            motor_velocity_rad_s=100.0 * speed,
+            link_position_rad=motor / 100.0 + 1e-3,
+            torque_nm=np.full(N, 5.0),
+            temperature_c=30.0 + TIME,
+        ),
+        **changes,
+    )
+
+
+def test_inputs_are_of_one_encoder_and_of_the_past() -> None:
+    found = seen(JOINT, TIME, columns())
+    assert found.inputs.shape == (N, INPUTS)
+    assert np.isfinite(found.inputs).all()
+    other = seen(JOINT, TIME, columns(link_position_rad=np.zeros(N), torque_nm=np.zeros(N)))
+    assert np.array_equal(other.inputs, found.inputs), "neither link encoder nor sensor"
+    early = columns().map(lambda name, column: column[:700])
+    assert seen(JOINT, TIME[:700], early).inputs == pytest.approx(found.inputs[:700], abs=1e-12)
+    assert len({each.tobytes() for each in found.inputs.T}) == INPUTS, "no input is there twice"
+    with pytest.raises(ValueError, match="temperature_c"):
+        seen(JOINT, TIME, columns(temperature_c=None))  # type: ignore[arg-type]
+
+
+def test_the_base_is_the_torque_of_a_rotor_that_accelerates_less_a_low_pass() -> None:
+    """Constant current i and acceleration a: G (Kt i - J a) once the low pass of 200 rad/s has settled."""
+    omega = 50.0 * TIME
+    steady = columns(current_a=np.full(N, 2.0), motor_velocity_rad_s=omega)
+    found = seen(JOINT, TIME, steady).base_nm[-1]
+    expected = 100.0 * (JOINT.torque_constant_nm_per_a * 2.0 - JOINT.rotor_inertia_kgm2 * 50.0)
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_stop_operator_has_memory_of_the_last_reversal() -> None:
+    """Swung by 0.2 rad a stop of 0.07 rad is at its end, one of 0.8 rad is not."""
+    forth = np.concatenate((np.linspace(0.0, 0.2, 500), np.linspace(0.2, 0.16, 1000)))
+    stops = seen(JOINT, TIME, columns(motor_position_rad=forth)).inputs[:, 22:26]
+    assert stops[499, 0] == stops[499, 1] == 1.0
+    assert abs(stops[499, 3]) < 0.2
+    assert stops[-1, 1] == pytest.approx(1.0 - 0.04 / 0.07, abs=1e-6)
+
+
+def test_only_settled_samples_that_the_teacher_knows_are_learned() -> None:
+    known = Seen(np.arange(240.0)[:, None] * np.ones(INPUTS), np.full(240, 2.0))
+    teacher = np.full(240, 5.0)
+    teacher[120:] = np.nan
+    settled = np.arange(240) >= 24
+    found = block(known, teacher, settled)
+    assert found.inputs[:, 0].tolist() == list(range(24, 120, EVERY))
+    assert (found.target_nm == 3.0).all()
+
+
+QUICK = Recipe(hidden=(8,), epochs=30, fewest_steps=200, batch=128)
+
+
+def made(count: int, seed: int) -> list[Block]:
+    rng = np.random.default_rng(seed)
+    xs = [rng.normal(size=(300, INPUTS)) for _ in range(count)]
+    return [Block(x, 3.0 * np.tanh(x[:, 0]) + 0.5 * x[:, 1] - 1.0) for x in xs]
+
+
+def test_it_learns_a_function_and_the_same_one_again() -> None:
+    blocks, fresh = made(8, 1), made(2, 2)
+    network = train(blocks, QUICK)
+    for each in fresh:
+        error = network_output(network, each.inputs) - each.target_nm
+        assert np.sqrt(np.mean(error**2)) < 0.25 * each.target_nm.std()
+    again = train(blocks, QUICK)
+    for (w, b), (other_w, other_b) in zip(network.weights, again.weights, strict=True):
+        assert np.array_equal(w, other_w)
+        assert np.array_equal(b, other_b)
+    known = Seen(fresh[0].inputs, np.full(300, 7.0))
+    assert estimate_nm(network, known) == pytest.approx(7.0 + network_output(network, known.inputs))
+    with pytest.raises(ValueError, match="1 runs"):
+        train(blocks[:1], QUICK)
+
+
+def test_the_weights_are_those_of_the_epoch_that_was_best_on_runs_left_out() -> None:
+    """Runs left out of pure noise: the smallest loss on them is not the last one, and it is the one that is kept."""
+    rng = np.random.default_rng(5)
+    blocks = [Block(rng.normal(size=(60, INPUTS)), rng.normal(size=60)) for _ in range(12)]
+    recipe = replace(QUICK, epochs=60, hidden=(40,), rate=2e-2)
+    network = train(blocks, recipe)
+    held = [each for k, each in enumerate(blocks) if k % recipe.stop == recipe.member]
+    error = np.concatenate([network_output(network, each.inputs) - each.target_nm for each in held])
+    scaled = np.abs(error / network.output_std)
+    knee = recipe.knee
+    loss = np.where(scaled < knee, 0.5 * scaled**2, knee * (scaled - 0.5 * knee)).mean()
+    assert loss == pytest.approx(min(network.losses), rel=1e-3)
+    assert min(network.losses) < 0.98 * network.losses[-1]
+
+
+def test_figures_count_settled_samples_that_have_a_value() -> None:
+    true = np.zeros(4)
+    known = Seen(np.zeros((4, INPUTS)), true)
+    one = Example(known, true, true, np.array([False, True, True, True]), np.array([True, True, True, False]))
+    found = share(np.array([99.0, 4.0, np.nan, 8.0]), one, 40.0)
+    assert found.moving == (pytest.approx(0.01), 1)
+    assert found.standing == (pytest.approx(0.04), 1)
+    assert percent([found.moving, (0.03, 3)]) == pytest.approx(10.0)
+    assert math.isnan(percent([(0.0, 0)]))
+
+
+def test_load_steps_are_steep_and_within_limits() -> None:
+    for run in load_step_runs(3, 8.0, 3):
+        points = expand(run)
+        assert np.abs(points.current_a).max() <= DEFAULT_LIMITS.current_a
+        assert np.abs(np.diff(points.current_a)).max() > 0.5
