@@ -139,11 +139,9 @@ def disturbed_signals(
     numbers: Sequence[int],
     usable: Sequence[Sequence[JointSignals]],
     scope: Scope = EVERYTHING,
-    *,
-    seed: int = 0,
 ) -> list[list[JointSignals]]:
     """Return the signals of the usable runs with as much noise again on torques and positions as they have."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     there, like = {run[0].run for run in usable}, [s for run in usable for s in run]
     noisy = [(name, disturbed(table, joints, rng)) for name, table in runs if name in there]
     again, _ = usable_signals(noisy, joints, numbers, scope.known_references, like)

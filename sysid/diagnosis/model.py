@@ -186,9 +186,9 @@ class _Search:
         return min(self.met.values(), key=lambda end: end.score)
 
 
-def solve(dataset: Dataset, seed: int = 0) -> Solution:
+def solve(dataset: Dataset) -> Solution:
     """Return the set of entries with most evidence on these runs."""
-    work = _Work(dataset, seed)
+    work = _Work(dataset)
     residuals = work.first_residuals()
     start = work.file_values()
     for turn in range(_TURNS):
@@ -226,12 +226,12 @@ def solve(dataset: Dataset, seed: int = 0) -> Solution:
 class _Work:
     """Binned columns of runs and disturbed runs at the present solution."""
 
-    def __init__(self, dataset: Dataset, seed: int) -> None:
+    def __init__(self, dataset: Dataset) -> None:
         self.dataset = dataset
         self.entries = entries_of(dataset.candidates, dataset.signals, dataset.trust)
         self.families = len(dataset.families)
         self.columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
-        rng = np.random.default_rng(seed)
+        rng = np.random.default_rng(0)
         for s in (s for run in (*dataset.signals, *dataset.disturbed) for s in run):
             s.know_torque(TORQUE_HZ, RATE_HZ)  # as the runs were binned, whatever was solved since
             set_state(s, ())

@@ -15,6 +15,7 @@ from functools import lru_cache
 from typing import Any, Final
 
 import numpy as np
+from scipy import signal
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects.effect import MOTOR
@@ -462,20 +463,14 @@ def autoregression(stretches: Sequence[FloatArray], order: int = AR_ORDER) -> Fl
 
 def whiten(x: FloatArray, a: FloatArray) -> FloatArray:
     """Return x_t - sum a_k x_{t-k} along axis 0; the first rows, whose past is unknown, take it as zero."""
-    out = x.copy()
-    for k, weight in enumerate(a, 1):
-        if weight != 0.0:
-            out[k:] -= weight * x[:-k]
-    return out
+    return np.asarray(signal.lfilter(np.append(1.0, -a), 1.0, x, axis=0))
 
 
 def past_valid(valid: BoolArray, order: int) -> BoolArray:
     """Return where a row and its `order` predecessors are valid."""
-    run = np.concatenate(([0], np.cumsum(valid)))
-    out = np.zeros(len(valid), bool)
-    if len(valid) > order:
-        out[order:] = run[order + 1 :] - run[: -order - 1] == order + 1
-    return out
+    out = np.convolve(~valid, np.ones(order + 1))[: len(valid)] < 0.5
+    out[:order] = False
+    return np.asarray(out, np.bool_)
 
 
 def events(balance: Balance, parts: Sequence[FloatArray]) -> View | None:
