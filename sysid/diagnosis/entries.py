@@ -25,7 +25,7 @@ from jtqd.estimator.effects.effect import MOTOR, SPAN_K, TORSION, Effect, Term
 from jtqd.estimator.joint import Effect as EffectOfFile
 from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
-from jtqd.sysid.diagnosis.findings import JointName, shows_at
+from jtqd.sysid.diagnosis.findings import JointName, Present, shows_at
 from jtqd.sysid.diagnosis.limits import Prior, Usage
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used
 from jtqd.sysid.diagnosis.signals import JointSignals
@@ -200,16 +200,7 @@ def lead_of(c: EffectCandidate) -> str:
     return str(next(name for name in one if one[name] != two[name] and name != "phase_rad"))
 
 
-@dataclass(frozen=True)
-class PresentEffect:
-    """An effect with all its parameters by name."""
-
-    effect: Effect
-    joint: JointName
-    values: Mapping[str, float]
-
-
-def present_effects(found: Sequence[tuple[Entry, FloatArray]]) -> list[PresentEffect]:
+def present_effects(found: Sequence[tuple[Entry, FloatArray]]) -> list[Present]:
     """Return entries with their scaled coefficients as effects with parameters, kinds of one effect together."""
     out: dict[tuple[object, ...], tuple[Entry, dict[str, float]]] = {}
     for e, scaled in found:
@@ -228,11 +219,11 @@ def present_effects(found: Sequence[tuple[Entry, FloatArray]]) -> list[PresentEf
             n: v if n == "phase_rad" else float(np.clip(v, known[n].low, known[n].high))
             for n, v in values.items()
         }
-        result.append(PresentEffect(e.effect, e.joint, clipped))
+        result.append(Present(e.effect.name, e.joint, clipped))
     return result
 
 
-def set_state(s: JointSignals, present: Sequence[PresentEffect]) -> None:
+def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     """Set torsion and current of one joint of a run to what the simulation with these effects has."""
     mine = [p for p in present if shows_at(p.joint, s.number)]
     values = tuple(
@@ -252,7 +243,7 @@ def set_state(s: JointSignals, present: Sequence[PresentEffect]) -> None:
     s.state.current_rate_a_s = current_rate(s.state.current_a, s.time_s)
 
 
-def _set_torsion(s: JointSignals, mine: Sequence[PresentEffect]) -> None:
+def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
     bent = [p for p in mine if "torsion_rad" in p.effect.needs]
     stiffness = s.joint.stiffness_nm_per_rad
     total = s.state.torque_nm + _sum(s, [p for p in mine if p not in bent], TORSION)
@@ -273,6 +264,6 @@ def _set_torsion(s: JointSignals, mine: Sequence[PresentEffect]) -> None:
             return
 
 
-def _sum(s: JointSignals, present: Sequence[PresentEffect], balance: str) -> FloatArray | float:
+def _sum(s: JointSignals, present: Sequence[Present], balance: str) -> FloatArray | float:
     """Return what these effects contribute to a balance [n], Nm."""
     return sum((contribution(p.effect, p.values, s).get(balance, 0.0) for p in present), 0.0)

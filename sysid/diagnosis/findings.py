@@ -13,6 +13,7 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
+from jtqd.estimator.effects.effect import Effect
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.limits import PRIORS, RELEVANCE
@@ -160,11 +161,16 @@ class Cause:
 
 
 class Present(NamedTuple):
-    """An effect of the extended model: the set and all values of the file, with the values that predict."""
+    """An effect that is present, with all its parameters by name."""
 
     name: str
     joint: JointName
     values: Mapping[str, float]
+
+    @property
+    def effect(self) -> Effect:
+        """The effect of the library."""
+        return EFFECTS[self.name]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ import numpy as np
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
-from jtqd.sysid.diagnosis.findings import Gap, Place, Trace, shows_at
+from jtqd.sysid.diagnosis.entries import set_state
+from jtqd.sysid.diagnosis.findings import Gap, Place, Present, Trace, shows_at
 from jtqd.sysid.diagnosis.regressors import LINE, Index, binned, contribution
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 from jtqd.sysid.diagnosis.structure import AXES, Balance, View, autoregression, bins_of, events, pursue
@@ -37,7 +37,7 @@ Parts = list[FloatArray]
 """A residual [run][n], NaN where it is not valid."""
 
 
-def contributions(dataset: Dataset, present: PresentEffect) -> list[dict[Channel, FloatArray]]:
+def contributions(dataset: Dataset, present: Present) -> list[dict[Channel, FloatArray]]:
     """Return what an effect contributes to each channel, per run, binned [n], Nm."""
     out = []
     for run, data in zip(dataset.signals, dataset.runs, strict=True):
@@ -107,7 +107,7 @@ class Remaining:
         }
 
 
-def remaining(dataset: Dataset, present: Sequence[PresentEffect], own: FloatArray) -> Remaining:
+def remaining(dataset: Dataset, present: Sequence[Present], own: FloatArray) -> Remaining:
     """Return what effects leave; own: per recording [r, q]."""
     for s in (joint for run in dataset.signals for joint in run):
         set_state(s, present)

@@ -20,7 +20,7 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.effects.effect import Effect
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset
-from jtqd.sysid.diagnosis.entries import Entry, PresentEffect, present_effects
+from jtqd.sysid.diagnosis.entries import Entry, present_effects
 from jtqd.sysid.diagnosis.evidence import Set, Sets
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
@@ -66,7 +66,7 @@ class Judged:
     """
 
     members: tuple[int, ...]
-    present: PresentEffect
+    present: Present
     rms_nm: Mapping[Channel, float]
     delta: float
     imitated: float
@@ -75,7 +75,7 @@ class Judged:
     differs: float
 
 
-def present_of(solution: Solution) -> tuple[list[PresentEffect], FloatArray]:
+def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
     """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
     mean = solution.values.fit(solution.chosen).mean
     found = [(solution.entries[k], mean[at]) for k, at in solution.values.places(solution.chosen).items()]
@@ -114,7 +114,7 @@ def judged(solution: Solution) -> list[Judged]:
     return out
 
 
-def _rms(solution: Solution, present: PresentEffect) -> dict[Channel, float]:
+def _rms(solution: Solution, present: Present) -> dict[Channel, float]:
     """Return the rms of an effect per channel over valid bins of all runs, a constant in torsion taken off."""
     squares: dict[Channel, list[FloatArray]] = {}
     for run, found in zip(solution.dataset.runs, contributions(solution.dataset, present), strict=True):
@@ -195,7 +195,7 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
         unexplained=unexplained,
         too_small=tuple(small),
         cannot_be_told=untold,
-        predicts=tuple(Present(p.effect.name, p.joint, p.values) for p in predicting),
+        predicts=tuple(predicting),
         next_experiment=_next(matter, effects, dataset),
     )
 
@@ -220,7 +220,7 @@ def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -
             for e in j.rivals
         )
     )
-    name = j.present.effect.name
+    name = j.present.name
     squares = sum(r * r for r in j.rms_nm.values())
     return Cause(
         name,
@@ -395,7 +395,7 @@ def _minimum(e: Entry, smallest: float) -> dict[str, Value]:
     }
 
 
-def extended_effects(solution: Solution, prediction: Prediction) -> list[PresentEffect]:
+def extended_effects(solution: Solution, prediction: Prediction) -> list[Present]:
     """Return the effects of the extended model with the values that predict."""
     places = solution.values.places(prediction.chosen)
     return present_effects([(solution.entries[k], prediction.mean[at]) for k, at in places.items()])
@@ -403,7 +403,7 @@ def extended_effects(solution: Solution, prediction: Prediction) -> list[Present
 
 def _next(causes: Sequence[Cause], effects: Sequence[Judged], dataset: Dataset) -> dict[str, Any] | None:
     """Return the experiment that would settle what is not certain and has rivals."""
-    rivals = {(j.present.effect.name, j.present.joint): [e.effect.name for e in j.rivals] for j in effects}
+    rivals = {(j.present.name, j.present.joint): [e.effect.name for e in j.rivals] for j in effects}
     open_causes = [
         (c, tuple(dict.fromkeys((c.name, *rivals[c.name, c.joint])))) for c in causes if c.grade != CERTAIN
     ]

@@ -28,8 +28,8 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
-from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
-from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings
+from jtqd.sysid.diagnosis.entries import set_state
+from jtqd.sysid.diagnosis.findings import CandidateEvidence, Findings, Present
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned, contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
 from jtqd.sysid.planner.plan import Plan, check_plan
@@ -217,7 +217,7 @@ def unexplained(
     residual = s.motor_nm if balance == "motor" else s.torsion_nm
     if residual is None:
         return None
-    set_state(s, [PresentEffect(EFFECTS[e.name], number, e.parameters) for e in joint.effects])
+    set_state(s, [Present(e.name, number, e.parameters) for e in joint.effects])
     for effect in joint.effects:
         there = contribution(EFFECTS[effect.name], effect.parameters, s)
         residual = residual - there.get(balance, 0.0)

@@ -17,8 +17,8 @@ from jtqd.estimator.joint import Effect, Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.diagnose import disturbed_signals
-from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
-from jtqd.sysid.diagnosis.findings import Findings
+from jtqd.sysid.diagnosis.entries import set_state
+from jtqd.sysid.diagnosis.findings import Findings, Present
 from jtqd.sysid.diagnosis.model import Solution, solve
 from jtqd.sysid.diagnosis.regressors import all_in_bin, bin_samples, binned
 
@@ -99,9 +99,7 @@ def predicted(joint: Joint, effects: Effects, runs: Runs) -> list[dict[str, Floa
     """Of each run where it moves, in bins: torque of the measured current and of that which a simulation with these effects
     needs, G Kt i [m], velocity, acceleration, load.
     """
-    present = [
-        PresentEffect(EFFECTS[name], "sensor" if EFFECTS[name].at_sensor else 1, p) for name, p in effects
-    ]
+    present = [Present(name, "sensor" if EFFECTS[name].at_sensor else 1, p) for name, p in effects]
     signals, reasons = usable_signals(runs, {1: joint}, (1,))
     assert not reasons
     scale = joint.gear_ratio * joint.torque_constant_nm_per_a

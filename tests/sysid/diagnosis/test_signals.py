@@ -17,7 +17,8 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sim_can.plant import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
-from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
+from jtqd.sysid.diagnosis.entries import set_state
+from jtqd.sysid.diagnosis.findings import Present
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, SignalsError, about_zero, joint_signals
 from jtqd.sysid.diagnosis.smoothing import second_difference, smooth
@@ -128,7 +129,7 @@ def test_what_is_wrong_in_the_file_is_what_its_effect_leaves(
     truth = replace(PLAIN, **values)  # type: ignore[arg-type]
     damping = truth.damping_nms_per_rad if effect == "gear_damping" else 0.0
     s = signals(rigid_run(truth, damping_nms_per_rad=damping))
-    set_state(s, [PresentEffect(EFFECTS[effect], 1, parameters)])
+    set_state(s, [Present(effect, 1, parameters)])
     made = contribution(EFFECTS[effect], parameters, s)
     assert s.torsion_nm is not None
     motor, torsion = s.motor_nm[s.moving], s.torsion_nm - np.median(s.torsion_nm)

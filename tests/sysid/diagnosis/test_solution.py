@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
-from jtqd.sysid.diagnosis.entries import PresentEffect, set_state
+from jtqd.sysid.diagnosis.entries import set_state
+from jtqd.sysid.diagnosis.findings import Present
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
 from jtqd.sysid.diagnosis.unexplained import contributions, remaining
@@ -32,7 +32,7 @@ def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for
     s.state.torque_nm = np.linspace(-1.3, 1.3, len(s.time_s)) * PLAIN.rated_torque_nm
     for cubic in (1.5, 0.02, -0.05):
         values = {"stiffness_nm_per_rad": 0.9 * stiffness, "cubic_nm_per_rad3": cubic * stiffness / twist**2}
-        set_state(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, values)])
+        set_state(s, [Present("nonlinear_stiffness", 1, values)])
         d = s.state.torsion_rad
         spring = values["stiffness_nm_per_rad"] * d + values["cubic_nm_per_rad3"] * d**3
         assert spring == pytest.approx(s.state.torque_nm, abs=1e-3 * PLAIN.rated_torque_nm)
@@ -51,7 +51,7 @@ def test_the_torsion_of_a_spring_that_cannot_hold_the_torque_stays_finite() -> N
             "stiffness_nm_per_rad": stiff * stiffness,
             "cubic_nm_per_rad3": cubic * stiffness / twist**2,
         }
-        set_state(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, values)])
+        set_state(s, [Present("nonlinear_stiffness", 1, values)])
         assert np.max(np.abs(s.state.torsion_rad)) < 15.0 * twist
 
 
@@ -71,17 +71,17 @@ def test_the_current_is_that_which_a_simulation_with_these_effects_needs() -> No
     assert s.state.current_a == pytest.approx(s.demand_nm / per_a)
     assert np.std(s.state.current_a - s.current_a) > 1.0 / per_a, "the noise of the measured one is not in it"
     kt = {"torque_constant_nm_per_a": 0.85 * PLAIN.torque_constant_nm_per_a}
-    set_state(s, [PresentEffect(EFFECTS["torque_constant"], 1, kt)])
+    set_state(s, [Present("torque_constant", 1, kt)])
     assert s.state.current_a == pytest.approx(s.demand_nm / (0.85 * per_a), rel=1e-4, abs=1e-6)
     more = {"coulomb_nm": PLAIN.friction.coulomb_nm + 1.5}
     both = [
-        PresentEffect(EFFECTS["torque_constant"], 1, kt),
-        PresentEffect(EFFECTS["coulomb_friction"], 1, more),
+        Present("torque_constant", 1, kt),
+        Present("coulomb_friction", 1, more),
     ]
     set_state(s, both)
     wanted = (s.demand_nm + 1.5 * s.state.direction) / (0.85 * per_a)
     assert s.state.current_a == pytest.approx(wanted, rel=1e-4, abs=1e-6)
-    set_state(s, [replace(each, joint=2) for each in both])
+    set_state(s, [each._replace(joint=2) for each in both])
     assert s.state.current_a == pytest.approx(s.demand_nm / per_a), (
         "effects of another joint are none of this one"
     )
@@ -90,7 +90,7 @@ def test_the_current_is_that_which_a_simulation_with_these_effects_needs() -> No
 def test_the_torsion_is_that_of_the_changed_spring() -> None:
     s = signals(rigid_run(PLAIN, 0.3))
     softer = {"stiffness_nm_per_rad": 0.8 * PLAIN.stiffness_nm_per_rad, "cubic_nm_per_rad3": 0.0}
-    set_state(s, [PresentEffect(EFFECTS["nonlinear_stiffness"], 1, softer)])
+    set_state(s, [Present("nonlinear_stiffness", 1, softer)])
     assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / softer["stiffness_nm_per_rad"], rel=1e-3)
 
 
@@ -106,8 +106,8 @@ def test_what_the_true_effects_leave_is_the_noise() -> None:
     usable, _ = usable_signals(runs_of(joint, 1, 2, rig), {1: ARM}, (1,))
     dataset = build_dataset(usable, {1: ARM})
     present = [
-        PresentEffect(EFFECTS["torque_constant"], 1, true),
-        PresentEffect(EFFECTS["coulomb_friction"], 1, friction),
+        Present("torque_constant", 1, true),
+        Present("coulomb_friction", 1, friction),
     ]
     left = remaining(dataset, present, np.zeros((2, len(dataset.families))))
     for d, after in zip(dataset.of(MOTOR1), left.residual[MOTOR1], strict=True):
