@@ -232,7 +232,7 @@ def combined(parts: Sequence[Findings]) -> Findings:
         explained_share=math.nan if leading is None else leading.explained_share,
         unexplained=max(
             (f.unexplained for f in parts if f.unexplained is not None),
-            key=lambda left: (left.matters, left.of_rated),
+            key=lambda left: (left.matters, left.percent_of_rated),
             default=None,
         ),
         outlier_runs=tuple(outliers for f in parts for outliers in f.outlier_runs),

@@ -279,22 +279,17 @@ class Trace:
 
 @dataclass(frozen=True)
 class UnexplainedResidual:
-    """What the entries leave that is structure, in the balance and run where it is most: rms [Nm], part of the rated torque,
-    share of all structure; from `relevant_nm` on it matters.
+    """What the entries leave that is structure, in the balance and run where it is most: rms [Nm], also in percent of the
+    rated torque, share of all structure; from `relevant_nm` on it matters.
     """
 
     joint: int
     balance: str
     rms_nm: float
-    of_rated: float
+    percent_of_rated: float
     share: float
     relevant_nm: float
     matters: bool
-
-    @property
-    def percent_of_rated(self) -> float:
-        """Its rms in percent of the rated torque."""
-        return 100.0 * self.of_rated
 
 
 @dataclass(frozen=True)
@@ -420,7 +415,6 @@ _KEYS: Final[Mapping[type, str]] = {
     CandidateEvidence: "name joint evidence shared=null minimum=sizes minimum_rms_nm=null reason",
     Gain: "rmse_before_nm rmse_after_nm split ci95 joint balance plain_nm=null free_run_before_rad_s=null "
     "free_run_after_rad_s=null free_run_position_before_rad=null free_run_position_after_rad=null runs",
-    UnexplainedResidual: "joint balance rms_nm percent_of_rated share relevant_nm matters",
     OutlierRun: "run what channel joint value usual unit or=others text",
 }
 """Keys in findings.json of the classes whose keys are not their fields, in order. "key=attribute": where both differ;

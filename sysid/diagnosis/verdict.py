@@ -296,7 +296,7 @@ def _unexplained(
         worst.joint,
         worst.balance,
         sizes[worst],
-        sizes[worst] / rated[worst.joint],
+        100.0 * (sizes[worst] / rated[worst.joint]),
         rest.energy_nm2() / max(total_nm2, 1e-30),
         limits_nm[worst],
         sizes[worst] > limits_nm[worst],

@@ -234,7 +234,7 @@ def _reported(bench: Bench, count: int, seed: int) -> Report:
         for name, size in reported_sizes(findings, drawn.joints).items():
             found[name].append(size)
         if findings.unexplained is not None:
-            left.append(100.0 * findings.unexplained.of_rated)
+            left.append(findings.unexplained.percent_of_rated)
     visible = sizes(bench.name)
     medians = {name: float(np.median(sizes_found)) for name, sizes_found in found.items()}
     rows = []

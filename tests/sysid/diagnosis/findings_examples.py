@@ -78,7 +78,7 @@ def one_cause() -> Findings:
             Untold("sensor_drift", "sensor", "cannot be told from these runs", "warm_up"),
         ),
         explained_share=0.94,
-        unexplained=UnexplainedResidual(1, "motor", 0.072, 0.0018, 0.06, 0.2, matters=False),
+        unexplained=UnexplainedResidual(1, "motor", 0.072, 0.18, 0.06, 0.2, matters=False),
         outlier_runs=(
             OutlierRun(
                 "excitation_07.csv.gz",
@@ -215,7 +215,7 @@ def unexplained() -> Findings:
         joints=(1,),
         gaps=(gap(1, "motor", 0.61, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.2}}),),
         candidates=candidates((1,), {("stribeck_friction", 1): (38.0, "no evidence beyond the set")}),
-        unexplained=UnexplainedResidual(1, "motor", 0.58, 0.0145, 1.0, 0.2, matters=True),
+        unexplained=UnexplainedResidual(1, "motor", 0.58, 1.45, 1.0, 0.2, matters=True),
         channel_notes=("excitation_03.csv.gz: j1.temperature_c is constant (25.0): not used",),
         traces=tuple(trace(run, 1, "motor", SLIP, seed=k) for k, run in enumerate(_runs(4))),
     )

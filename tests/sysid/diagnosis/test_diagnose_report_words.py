@@ -164,7 +164,7 @@ def test_an_entry_below_the_relevance_has_no_row() -> None:
 
 
 def test_unexplained_has_entries_and_gain_first_then_what_remains() -> None:
-    left = UnexplainedResidual(1, "motor", 0.61, 0.015, 0.3, 0.2, matters=True)
+    left = UnexplainedResidual(1, "motor", 0.61, 1.5, 0.3, 0.2, matters=True)
     found = replace(examples.one_cause(), verdict="unexplained", unexplained=left)
     first, second = headline(found)
     assert first.startswith("Torque ripple of joint 1 explains 94 % of the gap")
