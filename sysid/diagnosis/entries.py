@@ -160,7 +160,7 @@ def entry_of(
     effect, p = c.effect, c.term.basis[0]
     kind = kind_of(c)
     prior = limits.PRIORS.get(kind, limits.OTHER)
-    nothing = c.term.combine([0.0] * c.size)
+    nothing = c.nothing
     lead = lead_of(c)
     if _sizes(c) > 1:
         return None
@@ -187,10 +187,9 @@ def entry_of(
 
 def _sizes(c: EffectCandidate) -> int:
     """Return how many of the parameters that a term changes are sizes, and no phase or reference."""
-    nothing = c.term.combine([0.0] * c.size)
     sizes = {q.name for q in c.effect.parameters if q.neutral is not None and not q.fixed}
     each = [c.term.combine(one) for one in np.eye(c.size).tolist()]
-    return len(sizes & {n for values in each for n, v in values.items() if v != nothing[n]})
+    return len(sizes & {n for values in each for n, v in values.items() if v != c.nothing[n]})
 
 
 def lead_of(c: EffectCandidate) -> str:
@@ -204,7 +203,7 @@ def present_effects(found: Sequence[tuple[Entry, FloatArray]]) -> list[Present]:
     """Return entries with their scaled coefficients as effects with parameters, kinds of one effect together."""
     out: dict[tuple[object, ...], tuple[Entry, dict[str, float]]] = {}
     for e, scaled in found:
-        nothing = e.candidate.term.combine([0.0] * e.candidate.size)
+        nothing = e.candidate.nothing
         _, there = out.setdefault((*e.key, e.slot[-1]), (e, {}))
         for name, value in e.values(scaled).items():
             if name not in there or value != nothing.get(name):

@@ -64,6 +64,11 @@ class EffectCandidate:
         """Effect and joint, whatever the term."""
         return self.effect.name, self.joint
 
+    @property
+    def nothing(self) -> dict[str, float]:
+        """Its parameters where it is not there."""
+        return dict(self.term.combine([0.0] * self.size))
+
 
 def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatArray]:
     """Return what the effect with parameters p leaves in each balance of this joint [n], Nm; absent: nothing."""

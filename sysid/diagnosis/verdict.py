@@ -248,7 +248,7 @@ def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
         e, at = solution.entries[k], places[k]
         mean, covariance = fit.mean[at], fit.covariance[at, at]
         here = e.values(mean)
-        none |= {n: v for n, v in e.candidate.term.combine([0.0] * e.candidate.size).items() if n not in none}
+        none = e.candidate.nothing | none
         for name in here:
             slope = np.array([_slope(e, mean, i, name) for i in range(e.size)])
             half[name] = max(half[name], _Z95 * math.sqrt(max(float(slope @ covariance @ slope), 0.0)))
@@ -386,7 +386,7 @@ def _minimum(e: Entry, smallest: float) -> dict[str, Value]:
     scaled = np.zeros(e.size)
     scaled[0] = smallest
     values = e.values(scaled)
-    none = e.candidate.term.combine([0.0] * e.candidate.size)
+    none = e.candidate.nothing
     unit = {p.name: p.unit for p in e.effect.parameters}
     return {
         n: Value(abs(v - none.get(n, 0.0)), (math.nan, math.nan), unit[n])
