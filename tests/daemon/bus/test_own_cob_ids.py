@@ -94,16 +94,20 @@ def test_the_loop_counts_frames_that_it_did_not_send_and_goes_on(tmp_path: Path)
         assert FALSE not in [FRAME.unpack(each)[2] for each, _ in frames_of(record)]
 
 
-def test_an_input_with_such_a_cob_id_stays_an_input() -> None:
-    """A drive may be mapped to any COB-ID that the configuration gives it."""
-    own = [PDOS[0].cob_id, 0x381, 0x1A0]
-    intake = Intake(PDOS, [TemperaturePdo(0x381, 1, "381h", 2000)], own)
-    intake.begin(1)
-    frames = [*inputs()[:2], pack(0x381, b"\x64\x00")]
-    intake.take(bytearray(b"".join(frames)), [1, 2, 3], [False] * 3, 3)
-    assert intake.fresh(0) is True
-    intake.age_temperatures(1)
-    assert intake.temperature(0) == pytest.approx(10.0)
+def test_an_input_with_such_a_cob_id_stays_an_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive may be mapped to any COB-ID that the configuration gives it, its temperature as well."""
+    ExactTime().install(monkeypatch)
+    own = [PDOS[0].cob_id, 0x381, *LOOP_IDS]
+    monkeypatch.setattr(cycle_helpers, "Intake", lambda *known: Intake(*known, own=own))
+    script = lambda sync: [*inputs(), pack(0x381, b"\x64\x00")]  # noqa: E731
+    cycle, _, _ = make(tmp_path, script, temperatures=[TemperaturePdo(0x381, 1, "381h", 2000)])
+    cycle.intake.claims = True
+    turn(cycle, 30)
+    assert cycle.intake.fresh(0)
+    assert cycle.intake.temperature(0) == pytest.approx(10.0)
+    cycle.write_snapshot()
+    counters = SnapshotReader(tmp_path / "snapshot").read().counters
+    assert (counters["complete"], counters["cob_id_conflicts"]) == (30, 0)
 
 
 @pytest.fixture
