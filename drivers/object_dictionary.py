@@ -35,7 +35,7 @@ from jtqd.drivers.sdo import (
     abort_frame,
     label,
 )
-from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.errors import ConfigError, OneLineError
 from jtqd.estimator.files import read_regular
 
 # Data types (CiA 301, 7.4.7)
@@ -249,7 +249,7 @@ class ObjectStore:
         return entry.layout.pack(value)
 
 
-class EdsError(ValueError):
+class EdsError(OneLineError):
     """An EDS file that cannot be read; the message is one line with its path."""
 
 

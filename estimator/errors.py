@@ -5,8 +5,20 @@ from __future__ import annotations
 import reprlib
 from typing import Final
 
+from jtqd.estimator.text import printable
 
-class ConfigError(ValueError):
+_LONGEST: Final = 2000
+
+
+class OneLineError(ValueError):
+    """An error whose message is one line of bounded length, whatever names and texts of files it quotes."""
+
+    def __init__(self, message: str) -> None:
+        line = printable(message).replace("\n", "?")
+        super().__init__(line if len(line) <= _LONGEST else f"{line[:_LONGEST]}...")
+
+
+class ConfigError(OneLineError):
     """An operator's input cannot be used; the message is one line: file and key, what was found, what was expected."""
 
 

@@ -66,11 +66,13 @@ def open_regular(
     raise OSError(code, problem, os.fspath(path))
 
 
-def read_file(path: str | os.PathLike[str], largest: int, *, owners: Container[int] | None = None) -> bytes:
+def read_file(
+    path: str | os.PathLike[str], largest: int | None = None, *, owners: Container[int] | None = None
+) -> bytes:
     """Return the content of a file as `open_regular` opens it. Raises OSError, also for more than `largest` bytes."""
     with open(open_regular(path, owners=owners), "rb") as file:
-        data = file.read(largest + 1)
-    if len(data) > largest:
+        data = file.read() if largest is None else file.read(largest + 1)
+    if largest is not None and len(data) > largest:
         raise OSError(errno.EFBIG, f"found more than {largest} bytes", os.fspath(path))
     return data
 

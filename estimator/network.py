@@ -34,8 +34,8 @@ import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import FieldError, read
-from jtqd.estimator.errors import ConfigError
-from jtqd.estimator.files import open_regular
+from jtqd.estimator.errors import ConfigError, OneLineError
+from jtqd.estimator.files import read_file
 from jtqd.estimator.joint import Envelope, Joint
 from jtqd.estimator.native_network import Perceptron
 from jtqd.estimator.settings import METHODS, EstimatorSettings
@@ -83,7 +83,7 @@ def finite(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-class NetworkError(ValueError):
+class NetworkError(OneLineError):
     """The network file cannot be used; one line that names file, found and expected."""
 
 
@@ -435,8 +435,7 @@ class Network:
 
     def _read(self, path: str | os.PathLike[str]) -> bytes:
         try:
-            with open(open_regular(path), "rb") as file:
-                return file.read()
+            return read_file(path)
         except OSError as error:
             raise self.error(f"cannot be read: {error.strerror or error}") from None
 

@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 from jtqd.daemon.recording.mcap_file import MAGIC, SealedChunk, attachment_index, bytes_of, seal
 from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS
 from jtqd.daemon.recording.run_files import ACTIVE
+from jtqd.estimator.errors import OneLineError
 from jtqd.estimator.files import open_regular
 
 HEAD = struct.Struct("<BQ")
@@ -63,7 +64,7 @@ _FOOTER_SIZE = HEAD.size + 20
 _U2, _U4, _U8 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 
 
-class LogError(ValueError):
+class LogError(OneLineError):
     """The log cannot be used; one line: file, topic, found, expected."""
 
 

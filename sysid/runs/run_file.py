@@ -15,13 +15,14 @@ from typing import Final
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
-from jtqd.estimator.files import open_regular
+from jtqd.estimator.errors import OneLineError
+from jtqd.estimator.files import read_file
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
 from jtqd.estimator.text import counted
 from jtqd.sysid.runs.column_map import JOINTS, TIME, ColumnMap
 
 
-class RunError(ValueError):
+class RunError(OneLineError):
     """A run file cannot be used; the message is one line: file, place, found, expected."""
 
 
@@ -57,8 +58,7 @@ class Content:
 def file_bytes(path: Path) -> tuple[bytes, str]:
     """Return the content of a file and its SHA-256. Raises RunError."""
     try:
-        with open(open_regular(path), "rb") as file:
-            data = file.read()
+        data = read_file(path)
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from None
     if not data:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import pickle
 import re
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ import pytest
 from jtqd.daemon.config import load_config
 from jtqd.estimator.errors import ConfigError, range_text
 from jtqd.estimator.joint import ELASTIC, Effect, Friction, Joint
-from jtqd.models.files import load_joint, load_yaml, read_yaml, shipped
+from jtqd.models.files import load_joint, load_yaml, parse_yaml, read_yaml, shipped
 from jtqd.sim_can.plant_file import load_plant
 from jtqd.sysid.fit.efficiency import TABLE_I
 from jtqd.sysid.fit.joint_writer import write_joint
@@ -281,6 +282,68 @@ def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_readin
             with pytest.raises(ConfigError) as caught:
                 load(large)
             assert str(caught.value) == f"{large}: found {found}, expected a YAML file written by hand"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("".join(f"k{n}: 1\n" for n in range(20_000)), "more than 10000 keys and values"),
+        ("a: {" + ", ".join(f"k{n}" for n in range(20_000)) + "}", "more than 10000 keys and values"),
+        ("a: [" + "1," * 100_000 + "]", "more than 10000 keys and values"),
+        ("[" * 200_000, "line 1, column 51 not YAML: found brackets nested more than 50 deep"),
+        ("a: " + "{" * 200_000, "found brackets nested more than 50 deep"),
+        ("- " * 100_000, "found values nested more than 50 deep"),
+        ("? " * 100_000, "found values nested more than 50 deep"),
+        (
+            "a: " + "1" * 4000,
+            "line 1, column 4 not YAML: found a number of 4000 characters, expected at most 100",
+        ),
+        ("a: 0x" + "f" * 200_000, "found a number of 200002 characters"),
+        ("a: 1" + ":1" * 100_000, "found a number of 200001 characters"),
+        ("a: 1" + ":1" * 100_000 + ".5", "found a number of 200003 characters"),
+        ('a: "\\ud800"', "line 1, column 4 not YAML: found half of a surrogate pair, expected a character"),
+        ('"\\udfff": 1', "found half of a surrogate pair"),
+        ('a: "\\Uffffffff"', "not YAML: "),
+        (
+            "a: &a " + str(list(range(100))) + "\n" + "".join(f"b{n}: *a\n" for n in range(100)),
+            "more than 10000",
+        ),
+        (
+            "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 60)),
+            "more than 10000",
+        ),
+    ],
+)
+def test_decoding_takes_no_longer_than_the_values_of_a_file_written_by_hand(text: str, words: str) -> None:
+    """One line, within a second: the time of PyYAML grows with the values, of its numbers with the square of the digits."""
+    before = time.process_time()
+    with pytest.raises(ConfigError) as refused:
+        parse_yaml(text.encode(), "x.yaml")
+    assert words in str(refused.value)
+    assert "\n" not in str(refused.value)
+    assert len(str(refused.value)) < 200
+    assert time.process_time() - before < 2.0
+
+
+def test_a_message_is_one_line_of_bounded_length_whatever_a_file_holds() -> None:
+    for text in ('"a\\nb\\e[2J": 1', "? " + "x" * 200_000 + "\n: 1", "a: *" + "x" * 200_000):
+        with pytest.raises(ConfigError) as refused:
+            Joint.from_mapping(parse_yaml(text.encode(), "x\n.yaml"), "x\n.yaml", elastic=False)
+        assert str(refused.value).isprintable()
+        assert len(str(refused.value)) <= 2003
+        assert type(pickle.loads(pickle.dumps(refused.value))) is ConfigError
+
+
+def test_a_value_that_contains_itself_ends() -> None:
+    content = parse_yaml(b"a: &a {b: *a}", "x.yaml")
+    assert content["a"]["b"] is content["a"]
+
+
+def test_a_text_of_a_log_has_the_bounds_of_a_file() -> None:
+    with pytest.raises(
+        ConfigError, match=r"x\.yaml: found 250001 bytes, expected a YAML file written by hand"
+    ):
+        parse_yaml(b"a: 1\n#".ljust(250_001), "x.yaml")
 
 
 @pytest.mark.parametrize("load", [load_yaml, load_joint, load_config, load_plant])
