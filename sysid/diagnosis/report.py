@@ -278,7 +278,9 @@ def _grades(causes: Sequence[Cause], findings: Findings) -> str:
     if ONE_OF in grades:
         texts.append("one of: these runs do not distinguish them")
     if EFFECTIVE in grades:
-        texts.append("effective: predicts, but what it stands for is not settled")
+        first = next(c for c in causes if c.grade == EFFECTIVE)
+        why = f" ({effect_title(first.name)}: {first.doubts[0]})" if first.doubts else ""
+        texts.append(f"effective: predicts, but what it stands for is not settled{why}")
     return f"{'; '.join(texts)}." if texts else ""
 
 

@@ -1,9 +1,7 @@
 """Verdict: the entries of the set with grade, interval and size, what remains, and what these runs cannot tell.
 
-An entry is *certain* where no rival set has nearly as much evidence, a discrepancy cannot imitate it, it differs from none
-by SURE standard deviations, it has the same size in every run, and less than itself remains; *one of* where a set without it
-has nearly as much evidence; else *effective*: it predicts, and what it stands for is not settled. One relevance decides the
-verdict, for entries and for what remains alike.
+An entry is *certain* where nothing of `grade_of` speaks against it, *one of* where a set without it has nearly as much
+evidence, else *effective*: it predicts. One relevance decides the verdict, for entries and for what remains alike.
 """
 
 from __future__ import annotations

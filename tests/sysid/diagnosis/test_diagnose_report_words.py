@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from jtqd.sysid.diagnosis.findings import (
+    EFFECTIVE,
     CandidateEvidence,
     Findings,
     Gain,
@@ -213,6 +214,14 @@ def test_the_priors_that_a_certain_entry_rests_on_are_stated_as_set() -> None:
     mapping = to_mapping(set_)
     assert {"name": "sensor_gain", "size": "5 %", "set_by_user": True} in mapping["priors"]
     assert mapping["relevance"] == 0.005
+
+
+def test_an_effective_entry_has_the_reason_why_it_is_not_certain() -> None:
+    base = examples.one_cause()
+    one = replace(base.causes[0], grade=EFFECTIVE, doubts=("its size differs by 18 % from run to run",))
+    text = summary(replace(base, causes=(one,))).lines["grades"]
+    assert one.doubts[0] in text
+    assert one.doubts[0] not in summary(base).lines["grades"]
 
 
 def test_what_these_runs_cannot_tell_is_grouped_by_the_motion_that_would() -> None:
