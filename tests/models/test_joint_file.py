@@ -312,6 +312,10 @@ def test_a_file_too_large_for_anything_written_by_hand_is_refused_without_readin
             "a0: &a0 [1, 1]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 60)),
             "more than 10000",
         ),
+        (
+            "a: &a {" + "".join(f"k{n}: 1, " for n in range(2000)) + "<<: [" + "*a, " * 2000 + "]}",
+            "more than 100000 keys by merging",
+        ),
     ],
 )
 def test_decoding_takes_no_longer_than_the_values_of_a_file_written_by_hand(text: str, words: str) -> None:
