@@ -46,7 +46,7 @@ from jtqd.estimator.text import counted
 from jtqd.sysid.progress import bar
 from jtqd.sysid.report import page
 from jtqd.sysid.runs.column_map import ColumnMap
-from jtqd.sysid.runs.files import LOGS, TABLES, ends_in
+from jtqd.sysid.runs.files import LOGS, NO_RUNS, TABLES, ends_in
 from jtqd.sysid.runs.options import UsageError, check_joint_files, joint_files
 from jtqd.sysid.runs.run_file import RunError
 
@@ -159,10 +159,10 @@ def find_groups(
 
 
 def _first_kind(inside: Sequence[Path], kinds: Sequence[Sequence[str]]) -> list[Path]:
-    """Return the files of each directory that are of the first kind it has, without hidden ones."""
+    """Return the files of each directory that are of the first kind it has, without hidden ones and plans of motions."""
     by_directory: dict[Path, list[Path]] = {}
     for path in inside:
-        if not path.name.startswith("."):
+        if not path.name.startswith(NO_RUNS):
             by_directory.setdefault(path.parent, []).append(path)
     found: list[Path] = []
     for paths in by_directory.values():

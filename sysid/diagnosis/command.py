@@ -402,10 +402,8 @@ def _percent(text: str) -> float:
 
 
 def _check_out(directory: Path, force: bool, inputs: Sequence[Path]) -> None:
-    """Make DIR before minutes of work; refuse to overwrite, an input in any case, and to write among runs in a directory,
-    where results would be read as runs. Raises ConfigError.
-    """
-    own = {directory.resolve(), *((directory / name).resolve() for name in _own())}
+    """Make DIR before minutes of work; refuse to overwrite, an input in any case. Raises ConfigError."""
+    own = {(directory / name).resolve() for name in _own()}
     if used := next((path for path in inputs if path.resolve() in own), None):
         raise ConfigError(f"--out {directory}: found the input {used} there, expected another directory")
     make_directory(directory)

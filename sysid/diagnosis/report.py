@@ -352,8 +352,8 @@ def parameter_title(name: str) -> str:
 
 
 def in_words(text: str) -> str:
-    """Return a text with names of effects and experiments as words: "class of link_inertia" is "class of link inertia"."""
-    names = {*EFFECTS, *EXPERIMENTS}
+    """Return a text with names (effects, experiments, grades) as words: "class of link_inertia" is "class of link inertia"."""
+    names = {*EFFECTS, *EXPERIMENTS, ONE_OF}
     return " ".join(effect_title(w) if w.strip(",;:.()") in names else w for w in text.split())
 
 

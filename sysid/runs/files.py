@@ -33,6 +33,7 @@ from jtqd.sysid.runs.tables import read_csv, read_parquet
 
 TABLES: Final = (".csv", ".csv.gz", ".parquet")
 LOGS: Final = (".mcap",)
+NO_RUNS: Final = (".", "next_experiment.")  # first part of a name: hidden, or written by a diagnosis
 _PART: Final = re.compile(r"(?P<run>.+-\d{8}T\d{6}Z(?:_\d+)?)-\d{4,}\.mcap", re.ASCII)
 """Name of a part of a run: PREFIX-RUN-PART.mcap."""
 
@@ -53,7 +54,7 @@ def run_paths(arguments: Sequence[Path]) -> list[Path]:
                 raise RunError(f"{argument}: found no such file or directory, expected a run or a directory")
             paths.append(argument)
             continue
-        names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith("."))
+        names = sorted(p for p in argument.iterdir() if p.is_file() and not p.name.startswith(NO_RUNS))
         inside = [p for p in names if ends_in(p, TABLES)] or [p for p in names if ends_in(p, LOGS)]
         if not inside:
             raise RunError(

@@ -252,8 +252,7 @@ def _table(
     cells = [each for _, row in first for each in row]
     marks = {mark for each in cells for mark in _READ if mark in each and math.isfinite(_READ[mark](each))}
     number = _READ["," if marks == {","} else "."]
-    if number is _comma_number:
-        notes += ("numbers have decimal commas",)
+    notes += ("numbers have decimal commas",) * (number is _comma_number)
 
     def whole() -> Iterator[tuple[int, list[str]]]:
         for place, row in chain(first, rows):

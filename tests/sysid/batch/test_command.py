@@ -151,6 +151,7 @@ def test_groups_by_directory_run_and_file(tmp_path):
 
 def test_a_directory_with_tables_and_logs_gives_its_tables(tmp_path):
     touch(tmp_path, "a/run.csv", "a/run.mcap", "b/run.mcap", "b/.hidden.csv")
+    (tmp_path / "b" / "next_experiment.motion.csv").write_text("of an earlier diagnosis")
     assert names_of(find_groups([tmp_path], "directory", _KINDS)) == {"a": ["run.csv"], "b": ["run.mcap"]}
 
 

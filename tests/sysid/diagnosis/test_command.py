@@ -359,25 +359,18 @@ def test_nothing_is_overwritten_without_force(
     assert (out / "mine.txt").read_text() == "kept"
 
 
-def test_an_input_is_not_overwritten_and_results_do_not_stand_among_the_runs(
-    tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_input_is_not_overwritten(tmp_path: Path, core: Core, capsys: pytest.CaptureFixture[str]) -> None:
     write_runs(tmp_path)
     mine = tmp_path / "o" / "extended.joint.yaml"
     mine.parent.mkdir()
     mine.write_bytes(JOINT_FILE.read_bytes())
     link = tmp_path / "link"
-    link.symlink_to(tmp_path)
-    for runs, joint, out in (
-        ((tmp_path / "a.csv", tmp_path / "b.csv.gz"), mine, mine.parent),
-        ((tmp_path,), JOINT_FILE, tmp_path),
-        ((tmp_path,), JOINT_FILE, link),
-    ):
-        assert run(*runs, "--joint", joint, "--out", out, "--force") == 1
+    link.symlink_to(mine.parent)
+    for out in (mine.parent, link):
+        assert run(tmp_path, "--joint", mine, "--out", out, "--force") == 1
         assert "found the input" in said(capsys)
     assert not core.asked
     assert mine.read_bytes() == JOINT_FILE.read_bytes()
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "b.csv.gz", "c.csv", "link", "o"]
 
 
 def test_a_name_of_a_file_that_is_no_utf_8_costs_no_result(

@@ -308,6 +308,7 @@ def test_names_are_words() -> None:
     assert in_words("b.csv: j1.torque_nm and link_inertia, sensor_gain;") == (
         "b.csv: j1.torque_nm and link inertia, sensor gain;"
     )
+    assert in_words("in the set, one_of") == "in the set, one of"
     named = "r: time_s: found peaks of rated_torque_nm (15 Nm), gear_ratio"
     assert in_words(f"{named}; speed_ladder: load_dependent_friction") == (
         f"{named}; speed ladder: load dependent friction"

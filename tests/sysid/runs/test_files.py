@@ -318,6 +318,12 @@ def test_thousands_apart_by_commas_are_no_decimal_commas(tmp_path):
         read_run(path)
 
 
+def test_motions_that_a_diagnosis_wrote_beside_runs_are_none(tmp_path):
+    _file(tmp_path, GOOD)
+    _file(tmp_path, "run,time_s,position_rad\na,0,0\n", "next_experiment.motion.csv")
+    assert [path.name for path in run_paths([tmp_path])] == ["run.csv"]
+
+
 def test_endings_in_capitals_are_read(tmp_path):
     for name, content in (("LOG001.CSV", GOOD.encode()), ("LOG002.CSV.GZ", gzip.compress(GOOD.encode()))):
         _file(tmp_path, content, name)
