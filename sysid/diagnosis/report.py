@@ -352,7 +352,7 @@ def parameter_title(name: str) -> str:
 
 
 def in_words(text: str) -> str:
-    """Return a text with names (effects, experiments, grades) as words: "class of link_inertia" is "class of link inertia"."""
+    """Return a text with names of effects, experiments and grades as words: "link_inertia" is "link inertia"."""
     names = {*EFFECTS, *EXPERIMENTS, ONE_OF}
     return " ".join(effect_title(w) if w.strip(",;:.()") in names else w for w in text.split())
 

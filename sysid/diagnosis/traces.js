@@ -129,7 +129,8 @@
     draw() {
       this.width = Math.max(this.box.clientWidth, 280);
       const part = this.width < 560 ? 42 : 54, heights = this.panels.map((p) => part * p.height);
-      this.height = heights.reduce((a, b) => a + b + TOP, 0) + AXIS;
+      const legend = (p) => this.width < 760 && p.lines.length > 1 ? 15 * p.lines.length : 0;  // a row for each curve
+      this.height = heights.reduce((a, b, k) => a + b + TOP + legend(this.panels[k]), 0) + AXIS;
       this.svg.replaceChildren();
       this.svg.setAttribute("viewBox", `0 0 ${this.width} ${this.height}`);
       const x = (k) => LEFT + (k - this.from) / (this.to - this.from) * (this.width - LEFT - RIGHT);
@@ -147,7 +148,7 @@
       const torque = range(this.panels.filter((p) => p.unit === "Nm" && !p.residual));
       let top = 0;
       this.panels.forEach((p, place) => {
-        top += TOP;
+        top += TOP + legend(p);
         const height = heights[place], base = top;
         let [least, most] = p.residual || p.unit !== "Nm" ? range([p]) : torque;
         if (p.residual) { most = Math.max(-least, most, 2.6 * (this.floor || 0)); least = -most; }
@@ -159,11 +160,11 @@
           make(this.svg, "text", { x: LEFT - 6, y: y(v) + 4, "text-anchor": "end" }, v.toFixed(places));
         }
         for (const t of times) make(this.svg, "line", { x1: x((t - this.start) / this.step), x2: x((t - this.start) / this.step), y1: top, y2: top + height, class: "grid" });
-        const title = make(this.svg, "text", { x: LEFT, y: top - 6, class: "title" }, `${p.title} [${p.unit}]`);
+        const title = make(this.svg, "text", { x: LEFT, y: top - 6 - legend(p), class: "title" }, `${p.title} [${p.unit}]`);
         for (const l of p.lines) {
           make(this.svg, "path", { d: this.path(l.values, x, y), style: `stroke:var(--${l.role})` });
           const size = p.residual ? ` ${rms(l.values, this.from, this.to).toPrecision(3)} Nm rms` : "";
-          if (p.lines.length > 1) make(title, "tspan", { dx: 14, style: `fill:var(--${l.role})` }, `${l.title}${size}`);
+          if (p.lines.length > 1) make(title, "tspan", { ...(legend(p) ? { x: LEFT, dy: 15 } : { dx: 14 }), style: `fill:var(--${l.role})` }, `${l.title}${size}`);
         }
         top += height;
       });

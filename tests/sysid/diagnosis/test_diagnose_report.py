@@ -153,40 +153,57 @@ def test_a_figure_has_measurement_and_simulation_before_and_after_and_their_diff
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
+def in_a_browser(page: str, path: Path, script: str, width: int) -> str:
+    """The page after the script has run in it; an error is its title."""
+    errors = 'window.onerror = (text) => { document.title = "ERROR " + text; };'
+    path.write_text(page.replace("</body>", f"<script>{errors}{script}</script></body>"), encoding="utf-8")
+    assert BROWSER is not None
+    profile = f"--user-data-dir={path.parent / 'profile'}"
+    quiet = (
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        profile,
+        "--virtual-time-budget=2000",
+        "--dump-dom",
+    )
+    command = [BROWSER, *quiet, f"--window-size={width},1500", path.as_uri()]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False).stdout
+    assert "ERROR" not in found.partition("</title>")[0]
+    return found
+
+
 @pytest.mark.skipif(BROWSER is None, reason="no browser")
 def test_a_browser_draws_them(pages: dict[str, str], tmp_path: Path) -> None:
     """Dragging over a third of the first figure leaves a third of its run."""
-    drag = """<script>
-    window.onerror = (text) => { document.title = "ERROR " + text; };
+    drag = """
     const svg = document.querySelector(".zoom svg"), box = svg.getBoundingClientRect();
     svg.setPointerCapture = () => {};
     const send = (kind, x) => svg.dispatchEvent(
       new PointerEvent(kind, { clientX: box.left + x, clientY: box.top + 40, pointerId: 1, bubbles: true }));
     send("pointerdown", 300); send("pointermove", 400); send("pointerup", 500);
-    </script></body>"""
-    path = tmp_path / "page.html"
-    path.write_text(pages["one_cause"].replace("</body>", drag), encoding="utf-8")
-    assert BROWSER is not None
-    found = subprocess.run(
-        [
-            BROWSER,
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--window-size=1000,1500",
-            f"--user-data-dir={tmp_path / 'profile'}",
-            "--virtual-time-budget=2000",
-            "--dump-dom",
-            path.as_uri(),
-        ],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    ).stdout
-    assert "ERROR" not in found.partition("</title>")[0]
+    """
+    found = in_a_browser(pages["one_cause"], tmp_path / "page.html", drag, 1000)
     assert found.count('class="live"') == found.count("<figure data-trace")
     assert re.search(r"[\d.]+ to [\d.]+ s; double click: whole run", found)
+
+
+@pytest.mark.skipif(BROWSER is None, reason="no browser")
+@pytest.mark.parametrize("width", [360, 600, 1000])
+def test_the_legend_is_inside_the_figure(pages: dict[str, str], tmp_path: Path, width: int) -> None:
+    measure = """
+    setTimeout(() => {
+      const inside = (t, box) => t.getBoundingClientRect().right < box.right && t.getBoundingClientRect().top >= box.top;
+      const all = [...document.querySelectorAll(".zoom svg text.title")];
+      const good = all.filter((t) => inside(t, t.ownerSVGElement.getBoundingClientRect()));
+      document.title = `${good.length} of ${all.length} inside`;
+    }, 500);
+    """
+    page = pages["one_cause"].replace("</head>", f"<style>body {{ width: {width}px; }}</style></head>")
+    found = in_a_browser(page, tmp_path / "page.html", measure, 1000)
+    inside = re.search(r"(\d+) of (\d+) inside</title>", found)
+    assert inside is not None
+    assert int(inside[1]) == int(inside[2]) > 0
 
 
 def test_the_table_has_the_files_value_and_the_found_one() -> None:
