@@ -157,7 +157,7 @@ def parse_yaml(data: bytes, name: str) -> dict[str, Any]:
         raise ConfigError(
             f"{name}: not YAML: found {error.character:02X}h at offset {error.position}, expected a text file"
         ) from None
-    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError, LookupError, AttributeError) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise ConfigError(f"{name}: not YAML: {reason}") from None
     if not isinstance(content, dict):

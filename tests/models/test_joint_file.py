@@ -236,6 +236,9 @@ def test_files(tmp_path: Path) -> None:
         (b"", "an empty file"),
         (b"\xff\xfe\x00", "not YAML"),
         (b"a: \x00", "not YAML"),
+        (b'a: !!int ""\n', "not YAML"),
+        (b'a: !!bool "x"\n', "not YAML"),
+        (b'a: !!timestamp "x"\n', "not YAML"),
         (b"a: !!python/object:os.system {}", "not YAML"),
         (b"? [1]\n: 2\n? {a: 1}\n: 3\n", "not YAML"),
     ):
