@@ -19,7 +19,7 @@ from jtqd.estimator.errors import ConfigError
 
 _SERVICES: Final = Path("/run/jtqd")
 """Runtime directories of the services; only root makes entries in it."""
-_CREDENTIALS: Final = struct.Struct("3i")
+_Name = str | os.PathLike[str]
 
 
 def trusted_users() -> frozenset[int]:
@@ -33,14 +33,10 @@ def trusted_users() -> frozenset[int]:
 
 def peer_user(sock: socket.socket) -> int:
     """Return the user-ID of the process at the other end of a connected unix socket."""
-    return int(
-        _CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))[1]
-    )
+    return int(struct.unpack("3i", sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12))[1])
 
 
-def open_regular(
-    path: str | os.PathLike[str], flags: int = os.O_RDONLY, *, owners: Container[int] | None = None
-) -> int:
+def open_regular(path: _Name, flags: int = os.O_RDONLY, *, owners: Container[int] | None = None) -> int:
     """Return the descriptor of a regular file; a pipe, a device or a directory is neither waited for nor read.
 
     owners: users one of whom must own the file, which not everybody may write; a link is then not followed. Raises OSError.
@@ -50,10 +46,9 @@ def open_regular(
         descriptor = os.open(path, flags)
     except ValueError as error:  # a NUL in the name
         raise OSError(errno.EINVAL, str(error), os.fspath(path)) from None
-    found, code = os.fstat(descriptor), errno.EINVAL
+    found = os.fstat(descriptor)
     if stat.S_ISDIR(found.st_mode):
-        code = errno.EISDIR
-        problem = os.strerror(code)
+        problem = os.strerror(errno.EISDIR)
     elif not stat.S_ISREG(found.st_mode):
         problem = "found no regular file"
     elif owners is not None and found.st_uid not in owners:
@@ -63,12 +58,10 @@ def open_regular(
     else:
         return descriptor
     os.close(descriptor)
-    raise OSError(code, problem, os.fspath(path))
+    raise OSError(errno.EINVAL, problem, os.fspath(path))
 
 
-def read_file(
-    path: str | os.PathLike[str], largest: int | None = None, *, owners: Container[int] | None = None
-) -> bytes:
+def read_file(path: _Name, largest: int | None = None, *, owners: Container[int] | None = None) -> bytes:
     """Return the content of a file as `open_regular` opens it. Raises OSError, also for more than `largest` bytes."""
     with open(open_regular(path, owners=owners), "rb") as file:
         data = file.read() if largest is None else file.read(largest + 1)
@@ -77,7 +70,7 @@ def read_file(
     return data
 
 
-def read_regular(path: str | os.PathLike[str], largest: int, expected: str) -> bytes:
+def read_regular(path: _Name, largest: int, expected: str) -> bytes:
     """Return the content of a file of the operator, as `read_file`.
 
     Raises ConfigError; `expected` names in its message what the file should be.
@@ -105,8 +98,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
     try:
         if found is None or (stat.S_ISREG(found.st_mode) and not _is_output(found)):
             partial = target.with_name(f".{target.name}.{os.urandom(4).hex()}.part")
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
-            plain = open(os.open(partial, flags, 0o666), "wb")  # noqa: SIM115 - closed below
+            plain = open(partial, "xb")  # noqa: SIM115 - closed below
         else:
             plain = open(path, "ab" if stat.S_ISREG(found.st_mode) else "wb")  # noqa: SIM115
         with plain:

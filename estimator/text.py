@@ -18,13 +18,7 @@ _BYTES: Final = ("B", "kB", "MB", "GB", "TB")
 
 
 def printable(text: str) -> str:
-    """Return a text as a terminal may get it: "?" for control characters but newline and tab, and for half characters.
-
-    Control characters are those of ISO 6429 and those that turn the direction of writing.
-
-    >>> printable("node 3: " + chr(27) + "[2J" + chr(0xD800))
-    'node 3: ?[2J?'
-    """
+    """Return a text as a terminal may get it: "?" for control characters but newline and tab, and for half characters."""
     return _CONTROL.sub("?", text)
 
 

@@ -67,19 +67,22 @@ class _Loader(yaml.SafeLoader):
         """Keys and values of each node; what an alias repeats is counted again."""
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        """Compose the next value, unless the file has too many, or they lie too deep."""
+        """Compose the next value: not one too many or too deep, no number without end, no half of a surrogate pair."""
         self._values += 1
         self._depth += 1
-        problem = ""
-        if self._values > _MOST_VALUES:
-            problem = f"more than {_MOST_VALUES} keys and values"
-        elif self._depth > _DEEPEST:
-            problem = f"values nested more than {_DEEPEST} deep"
-        if problem:
-            raise yaml.composer.ComposerError(None, None, f"found {problem}", self.peek_event().start_mark)  # type: ignore[no-untyped-call]
+        mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+        _refuse(self._values > _MOST_VALUES, f"more than {_MOST_VALUES} keys and values", mark)
+        _refuse(self._depth > _DEEPEST, f"values nested more than {_DEEPEST} deep", mark)
         before, again = self._values, self.check_event(yaml.AliasEvent)
         node: yaml.Node | None = super().compose_node(parent, index)
         self._depth -= 1
+        if isinstance(node, yaml.ScalarNode):
+            half = _SURROGATE.search(node.value) is not None
+            _refuse(half, "half of a surrogate pair, expected a character", mark)
+            long = node.tag in _NUMBERS and len(node.value) > _LONGEST_NUMBER
+            _refuse(
+                long, f"a number of {len(node.value)} characters, expected at most {_LONGEST_NUMBER}", mark
+            )
         if again:
             self._values += self._sizes.get(id(node), 0)  # 0: inside of itself
         else:
@@ -88,22 +91,8 @@ class _Loader(yaml.SafeLoader):
 
     def fetch_flow_collection_start(self, token: Any) -> None:
         """Begin a list or mapping in brackets: refused here, because the scanner reads a thousand brackets ahead."""
-        if self.flow_level >= _DEEPEST:
-            problem = f"found brackets nested more than {_DEEPEST} deep"
-            raise yaml.scanner.ScannerError(None, None, problem, self.get_mark())
+        _refuse(self.flow_level >= _DEEPEST, f"brackets nested more than {_DEEPEST} deep", self.get_mark())
         super().fetch_flow_collection_start(token)
-
-    def compose_scalar_node(self, anchor: Any) -> yaml.ScalarNode:
-        """Compose a text or number: no half of a surrogate pair, which no text file has, and no number without end."""
-        node: yaml.ScalarNode = super().compose_scalar_node(anchor)
-        problem = ""
-        if _SURROGATE.search(node.value):
-            problem = "found half of a surrogate pair, expected a character"
-        elif node.tag in _NUMBERS and len(node.value) > _LONGEST_NUMBER:
-            problem = f"found a number of {len(node.value)} characters, expected at most {_LONGEST_NUMBER}"
-        if problem:
-            raise yaml.composer.ComposerError(None, None, problem, node.start_mark)
-        return node
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen: set[str] = set()
@@ -116,6 +105,12 @@ class _Loader(yaml.SafeLoader):
                     )
                 seen.add(key)
         return super().construct_mapping(node, deep)
+
+
+def _refuse(wrong: bool, what: str, mark: Any) -> None:
+    """Raise the error for what was found at a mark, where it is wrong."""
+    if wrong:
+        raise yaml.MarkedYAMLError(None, None, f"found {what}", mark)
 
 
 def _sources(merges: list[yaml.Node]) -> Iterator[yaml.MappingNode]:

@@ -7,8 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any, TypeVar
 
-from jtqd.estimator.text import printable
-
 T = TypeVar("T")
 
 
@@ -19,7 +17,7 @@ def progress(items: Sequence[T], text: str) -> Iterable[T]:
     from rich.console import Console
     from rich.progress import track
 
-    return track(items, description=_text(text), console=Console(stderr=True), transient=True)
+    return track(items, description=text, console=Console(stderr=True), transient=True)
 
 
 @contextmanager
@@ -32,7 +30,7 @@ def bar(text: str, total: int) -> Iterator[Callable[[int], None]]:
     from rich.progress import Progress
 
     with Progress(console=Console(stderr=True), transient=True) as shown:
-        task = shown.add_task(_text(text), total=total)
+        task = shown.add_task(text, total=total)
         yield lambda steps: shown.advance(task, steps)
 
 
@@ -42,11 +40,4 @@ def waiting(text: str) -> AbstractContextManager[Any]:
         return nullcontext()
     from rich.console import Console
 
-    return Console(stderr=True).status(_text(text))
-
-
-def _text(text: str) -> str:
-    """Return a text, which may have names of files, as rich shows it: printable, and without meaning of brackets."""
-    from rich.markup import escape
-
-    return escape(printable(text))
+    return Console(stderr=True).status(text)

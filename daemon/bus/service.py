@@ -176,10 +176,8 @@ _NODE_CONDITIONS = {
     "single": ("node_doubled", False),
 }
 """What an event of `NodeWatch` begins or ends."""
-_OWN_BASES = (emcy.EMCY_BASE, RESPONSE_ID)
-"""Of the COB-IDs that only this service sends with; its socket receives no own echo."""
-_CONFLICT_S = 1.0
-"""A conflict of COB-IDs has ended when no frame of another node came for so long."""
+_OWN_BASES, _CONFLICT_S = (emcy.EMCY_BASE, RESPONSE_ID), 1.0
+"""Of the COB-IDs that only this service sends with (no own echo is received); silence that ends a conflict of COB-IDs."""
 _NODE_LINES = ("restarted", "state", "malformed", "foreign")
 
 LogEvent = Callable[[str, int, str], None]

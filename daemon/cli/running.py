@@ -15,14 +15,7 @@ from jtqd.daemon.recording.run_files import Account, read_account
 from jtqd.daemon.shared.conditions import Condition, read_conditions
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import Notice, NoticesReader
-from jtqd.daemon.shared.runtime_dir import (
-    FILE,
-    About,
-    AboutError,
-    SharedMemoryError,
-    read_about,
-    read_shared,
-)
+from jtqd.daemon.shared.runtime_dir import FILE, About, AboutError, SharedMemoryError, json_of, read_about
 from jtqd.daemon.shared.snapshot import SnapshotReader, View
 from jtqd.estimator.files import trusted_users
 from jtqd.estimator.text import counted
@@ -226,7 +219,7 @@ class Watch:
 
 def _bus(directory: Path) -> dict[str, Any]:
     try:
-        content = read_shared(directory / "bus.json")
+        content = json_of(directory / "bus.json")
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

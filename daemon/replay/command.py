@@ -25,7 +25,6 @@ from jtqd.estimator.command_line import check_output
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.network import NetworkError
 from jtqd.estimator.settings import METHODS
-from jtqd.estimator.text import printable
 
 # ---- results as text ----
 
@@ -320,11 +319,7 @@ class _Bar:
     def update(self, what: str, done: int, total: int) -> None:
         """Show that `done` of `total` are done."""
         if self._progress is not None:
-            from rich.markup import escape
-
-            self._progress.update(
-                self._task, description=escape(printable(what)), completed=done, total=total
-            )
+            self._progress.update(self._task, description=what, completed=done, total=total)
 
     def close(self) -> None:
         """Take it away."""

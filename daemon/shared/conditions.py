@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from jtqd.daemon.shared.events import ERROR, INFO, WARNING
-from jtqd.daemon.shared.runtime_dir import read_shared, write_whole
+from jtqd.daemon.shared.runtime_dir import json_of, write_whole
 
 FILE = "conditions.json"
 """Name of the file in the runtime directory of a daemon."""
@@ -418,7 +418,7 @@ def read_conditions(directory: Path) -> list[Condition]:
     They are as of the supervisor's last look: `jtqd.daemon.shared.runtime_dir.About.running` is whether that runs.
     """
     try:
-        content = read_shared(directory / FILE)
+        content = json_of(directory / FILE)
         if content["schema"] != SCHEMA:
             return []
         return [Condition(**each) for each in content["conditions"]]

@@ -57,7 +57,7 @@ def new_memory(path: Path, size: int, head: bytes, mode: int = 0o640) -> mmap.mm
     return memory
 
 
-def read_shared(path: Path) -> Any:
+def json_of(path: Path) -> Any:
     """Return the value of a JSON file of a running daemon of a trusted user. Raises OSError, ValueError."""
     from jtqd.estimator.decoder import read_json
 
@@ -72,11 +72,9 @@ def mapped(path: Path, missing: str, *, writable: bool = False) -> mmap.mmap:
     """Map shared memory of a running daemon of a trusted user. Raises SharedMemoryError, with what is `missing`."""
     access = mmap.ACCESS_WRITE if writable else mmap.ACCESS_READ
     try:
-        descriptor = open_regular(path, os.O_RDWR if writable else os.O_RDONLY, owners=trusted_users())
-        try:
-            return mmap.mmap(descriptor, 0, access=access)
-        finally:
-            os.close(descriptor)
+        flags = os.O_RDWR if writable else os.O_RDONLY
+        with open(open_regular(path, flags, owners=trusted_users()), "r+b" if writable else "rb") as file:
+            return mmap.mmap(file.fileno(), 0, access=access)
     except (OSError, ValueError) as error:
         raise SharedMemoryError(f"{path}: {missing}: {error}") from None
 
@@ -245,7 +243,7 @@ def read_about(path: Path) -> About:
     import msgspec
 
     try:
-        content = read_shared(path)
+        content = json_of(path)
         if content["schema"] != SCHEMA:
             raise AboutError(f"{path}: written by another version of jtqd")
         return msgspec.convert(content, About)

@@ -107,20 +107,15 @@ def _network_runs(path: Path) -> frozenset[str]:
 
     model = onnx.load_model(str(path), load_external_data=False)
     metadata = {entry.key: entry.value for entry in model.metadata_props}
-    hashes = _hashes(_json(metadata.get(_RUNS, "")))
+    hashes: frozenset[str] = frozenset()
+    with suppress(ValueError):
+        hashes = _hashes(parse_json(metadata.get(_RUNS, "")))
     card = path.with_suffix(".json")
     if card.is_file():
         with suppress(OSError, ValueError):
             content = read_json(card)
             hashes |= _hashes(content.get(_RUNS) if isinstance(content, dict) else None)
     return hashes
-
-
-def _json(text: str) -> Any:
-    try:
-        return parse_json(text)
-    except ValueError:
-        return None
 
 
 def _hashes(value: Any) -> frozenset[str]:
