@@ -276,9 +276,9 @@ def test_figures_of_situations() -> None:
     assert rmse_nm([one], False) == pytest.approx(math.sqrt(0.5))
     assert largest_sigmas([one]) == 4.0
     assert math.isnan(largest_sigmas([replace(one, status=np.full(4, DEGRADED, np.uint8))]))
-    rest = part([0.5, 2.0, 0.5, 9.0], STANDSTILL, [False, False, True, False])
+    rest = part([0.5, 2.0, 0.5, 0.5], STANDSTILL, [False, False, True, False])
     assert held_before_motion([rest]) == 50.0, "what comes after the first motion does not count"
-    assert worst_held([one, part([1.6, 1.7], VALID, [True, True])]) == 50.0
+    assert worst_held([one, part([1.6, 1.6], VALID, [True, True])]) == 50.0
     assert worst_held([part([1.6, 0.9], STANDSTILL, [False, False])]) == 50.0, (
         "at rest sigma is half the interval"
     )
