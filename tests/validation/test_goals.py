@@ -38,6 +38,7 @@ from validation.goals.goals import (
     Judged,
     Outside,
     Result,
+    _beyond_sigma,
     _outside,
     _worse,
     goal_rows,
@@ -132,6 +133,15 @@ def test_outside_counts_missed_and_false_flags() -> None:
     assert math.isnan(found.flagged["speed"].value)
 
 
+def test_beyond_three_sigma_counts_where_nothing_is_flagged() -> None:
+    status = np.full(N, VALID, np.uint8)
+    status[: N // 4] = DEGRADED
+    true = np.full(N, 10.0)
+    off = {OURS: Result(true + np.where(np.arange(N) < N // 2, 3.1, 2.9), true, np.ones(N), status)}
+    assert _beyond_sigma([judged(results=off)], OURS).value == 25.0
+    assert math.isnan(_beyond_sigma([judged()], REGRESSION).value), "least squares has no sigma"
+
+
 def test_worse_than_least_squares_is_counted_by_joint_and_run() -> None:
     assert (
         _worse(
@@ -199,6 +209,22 @@ def test_a_change_of_the_link_reaches_the_estimate_and_not_the_truth() -> None:
     beyond = judged_beyond({"speed": [run]}, [slow])["speed"][0]
     assert beyond.beyond[600]
     assert not beyond.beyond[100]
+
+
+def test_one_encoder_has_its_own_file_and_no_link() -> None:
+    plant = the_three()[1]
+    run = drive(plant.bench(), [short_run()], 5)[0]
+    joint = nominal_joints(plant)[0]
+    own = replace(joint, fused=fused(torsion=None))
+    one = Identified(1, replace(joint, fused=fused()), b"", {}, Range(1000.0, 1000.0, (-50.0, 200.0)), own)
+    zero = next(change for change in CHANGES if change.name == "link zero 100 urad")
+    plain, changed = (judge(run, one, link, (ONE,)).results[ONE] for link in (None, zero.link))
+    assert np.array_equal(plain.torque_nm, changed.torque_nm, equal_nan=True)
+    assert np.nanmax(np.abs(plain.torque_nm)) > 5.0
+    both = judge(run, one, None, (ZEROS,)).results[ZEROS]
+    assert not np.array_equal(plain.torque_nm, both.torque_nm, equal_nan=True)
+    with pytest.raises(ValueError, match="no fit of one encoder"):
+        judge(run, replace(one, one_encoder=None), None, (ONE,))
 
 
 def test_days_that_judge_are_of_no_fit() -> None:
