@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from scipy.stats import t
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
@@ -47,7 +48,7 @@ def predict(solution: Solution) -> Prediction:
     while chosen:
         sizes = Sizes(without, chosen)
         places = without[-1].places(chosen)
-        differs = {k: sizes.differ(np.arange(s.start, s.stop)) for k, s in places.items()}
+        differs = {k: sizes.over_runs(np.arange(s.start, s.stop))[0] for k, s in places.items()}
         worst = max(differs, key=differs.__getitem__)
         if not 1.0 < differs[worst] < math.inf:
             break
@@ -111,19 +112,23 @@ class Sizes:
         total = everything.gram[np.ix_(at, at)]
         self._runs = [total - sets.gram[np.ix_(at, at)] for sets in without[:-1]]
 
-    def differ(self, at: Index) -> float:
+    def over_runs(self, at: Index) -> tuple[float, float]:
         """Return how much the size of the coefficients at these places of the set differs from recording to recording, part
-        of it: rms, each recording weighted by what it holds of it (random effects: DerSimonian and Laird 1986,
-        Controlled Clinical Trials 7); inf with one recording.
+        of it (rms, each recording weighted by what it holds of it), and the chance that recordings agree so on a size whose
+        mean is zero (t-test over recordings, which are what is independent); inf and 1 with one recording.
         """
-        energy, lacking = 0.0, 0.0
+        held, change = [], []
         for gram in self._runs:
             own = float(self._mean[at] @ gram[np.ix_(at, at)] @ self._mean[at])
-            more = float(self._mean[at] @ (gram[at, -1] - gram[at, :-1] @ self._mean))
             if own > 0.0:
-                energy += own
-                lacking += more**2 / own
-        return math.sqrt(lacking / energy) if len(self._runs) > 1 and energy > 0.0 else math.inf
+                held.append(own)
+                change.append(float(self._mean[at] @ (gram[at, -1] - gram[at, :-1] @ self._mean)) / own)
+        weight, by = np.array(held) / max(sum(held), 1e-30), np.array(change)
+        many = 1.0 / max(float(np.sum(weight**2)), 1e-30)
+        if len(held) < 2 or many <= 1.0:
+            return math.inf, 1.0
+        error = math.sqrt(float(np.sum((weight * by) ** 2)) * many / (many - 1.0))
+        return math.sqrt(float(np.sum(weight * by**2))), 2.0 * float(t.sf(1.0 / max(error, 1e-9), many - 1.0))
 
 
 def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:

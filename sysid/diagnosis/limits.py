@@ -122,8 +122,8 @@ RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
-DIFFERS: Final = 0.1
-"""Part of its size by which a certain entry may differ from run to run (rms); at its whole size it predicts nothing."""
+CHANCE: Final = 1e-3
+"""Chance that the runs agree so on the size of an entry that is none; of a certain entry it is less."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""
 LISTED: Final = 0.2

@@ -60,7 +60,8 @@ _Z95: Final = 1.96
 class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
     without them lacks, and that the set without them lacks where a discrepancy may imitate them, that best set's entries
-    instead, deviations of the coefficients [z] from none, and how much their size differs from run to run.
+    instead, deviations of the coefficients [z] from none; how much their size differs from run to run, and the chance that
+    runs agree so on none.
     """
 
     members: tuple[int, ...]
@@ -71,6 +72,7 @@ class Judged:
     rivals: tuple[Entry, ...]
     z: float
     differs: float
+    chance: float
 
 
 def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
@@ -106,7 +108,7 @@ def judged(solution: Solution) -> list[Judged]:
                 2.0 * imitated,
                 tuple(sets.entries[k] for k in rival - chosen),
                 math.sqrt(max(z2, 0.0)),
-                sizes.differ(at),
+                *sizes.over_runs(at),
             )
         )
     return out
@@ -130,13 +132,12 @@ def grade_of(j: Judged, *, hidden: bool) -> tuple[str, tuple[str, ...]]:
     """Return the grade of an effect, and why it is not certain; see the module. hidden: what remains in its balance is
     larger than itself.
     """
-    size = f"its size differs by {100.0 * j.differs:.0f} % from run to run"
+    size = f"its size differs by {100.0 * j.differs:.0f} % from run to run, and the runs are few"
     doubts = {
         "other entries explain these runs alike": j.delta <= limits.RIVAL,
         "a discrepancy would look alike": j.imitated <= limits.RIVAL,
         f"it is less than {limits.SURE:g} standard deviations from none": j.z <= limits.SURE,
-        size if math.isfinite(j.differs) else "one recording has no other to agree with": j.differs
-        >= limits.DIFFERS,
+        size if math.isfinite(j.differs) else "one run has no other to agree with": j.chance >= limits.CHANCE,
         "more than it remains in its balance": hidden,
     }
     found = tuple(text for text, holds in doubts.items() if holds)
