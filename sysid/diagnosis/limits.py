@@ -27,12 +27,13 @@ class Prior:
     """Prior of the leading parameter of an entry.
 
     size: standard deviation [SI] for a joint as it is used; text: the same for people; file: a value of the joint file or a
-    zero, which is usually a little wrong, and no structural effect.
+    zero, which is usually a little wrong, and no structural effect; calibration: of an instrument, which is never exact.
     """
 
     size: Callable[[Joint, Usage], float]
     text: str
     file: bool = False
+    calibration: bool = False
 
 
 def _rated_a(joint: Joint) -> float:
@@ -68,11 +69,13 @@ PRIORS: Final[Mapping[str, Prior]] = {
     "gear_damping": Prior(
         lambda j, u: max(j.damping_nms_per_rad, 1e-3 * j.stiffness_nm_per_rad), "100 %", file=True
     ),
-    "sensor_offset": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated", file=True),
-    "current_offset": Prior(lambda j, u: 0.01 * _rated_a(j), "1 % of rated", file=True),
-    "sensor_gain": Prior(lambda j, u: 0.01, "1 %"),
-    "sensor_crosstalk": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated"),
-    "sensor_crosstalk.share": Prior(lambda j, u: 0.01, "1 %"),
+    "sensor_offset": Prior(
+        lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated", file=True, calibration=True
+    ),
+    "current_offset": Prior(lambda j, u: 0.01 * _rated_a(j), "1 % of rated", file=True, calibration=True),
+    "sensor_gain": Prior(lambda j, u: 0.01, "1 %", calibration=True),
+    "sensor_crosstalk": Prior(lambda j, u: 0.01 * j.rated_torque_nm, "1 % of rated", calibration=True),
+    "sensor_crosstalk.share": Prior(lambda j, u: 0.01, "1 %", calibration=True),
     "sensor_drift": Prior(lambda j, u: 1e-4 * j.rated_torque_nm, "0.01 % of rated per second"),
     "sensor_drift.per_k_nm": Prior(lambda j, u: 1e-3 * j.rated_torque_nm, "0.1 % of rated per kelvin"),
     "stribeck_friction": Prior(lambda j, u: 0.5 * _coulomb(j), "half of Coulomb friction"),

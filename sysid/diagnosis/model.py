@@ -11,7 +11,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -96,6 +98,14 @@ class Solution:
     def transform(self) -> FloatArray:
         """Return the weights of scaled coefficients in the library's columns [P, E]."""
         return transform_of(self.entries, self.columns)
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Of the set's values [q, q], with what calibrations outside of the set may be off by (JCGM 100:2008, type B)."""
+        off = [e.prior.calibration and k not in self.chosen for k, e in enumerate(self.entries)]
+        wide = copy(self.wide)
+        wide.recorded = np.maximum(wide.recorded, np.repeat(off, [e.size for e in self.entries]))
+        return wide.sets(self.found, self.chosen).fit(self.chosen).covariance
 
     def own(self, mean: FloatArray, chosen: Set) -> FloatArray:
         """Return what each recording has of its own beside a set with these coefficients [r, N]."""

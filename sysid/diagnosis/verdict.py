@@ -98,7 +98,7 @@ def judged(solution: Solution) -> list[Judged]:
         imitated = imitating.fit(chosen).evidence - imitating.fit(chosen - set(members)).evidence
         at = np.concatenate([np.arange(places[k].start, places[k].stop) for k in members])
         mean = values.mean[at]
-        z2 = float(mean @ np.linalg.solve(values.covariance[np.ix_(at, at)], mean))
+        z2 = float(mean @ np.linalg.solve(solution.covariance[np.ix_(at, at)], mean))
         out.append(
             Judged(
                 members,
@@ -245,7 +245,7 @@ def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
     none: dict[str, float] = {}
     for k in j.members:
         e, at = solution.entries[k], places[k]
-        mean, covariance = fit.mean[at], fit.covariance[at, at]
+        mean, covariance = fit.mean[at], solution.covariance[at, at]
         here = e.values(mean)
         none = e.candidate.nothing | none
         for name in here:
