@@ -27,7 +27,7 @@ from jtqd.sysid.diagnosis.findings import (
 from jtqd.sysid.diagnosis.limits import PRIORS
 from jtqd.sysid.diagnosis.model import Solution, between, solve
 from jtqd.sysid.diagnosis.signals import TORQUE_HZ
-from jtqd.sysid.diagnosis.verdict import judged
+from jtqd.sysid.diagnosis.verdict import judged, values_of
 from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (
     ARM,
@@ -436,3 +436,28 @@ def test_an_iteration_that_overshoots_meets_its_fixed_point() -> None:
     assert between((0.0 * slow, slow), (slow, 1.9 * slow), covariance) == pytest.approx(1.9 * slow), (
         "what converges from one side is not carried beyond"
     )
+
+
+def spread(solution: Solution, effect: str) -> tuple[float, float]:
+    """Deviations of an entry's coefficient: of these runs alone, and with calibrations outside of the set."""
+    [k] = [k for k in solution.chosen if solution.entries[k].effect.name == effect]
+    at = solution.values.places(solution.chosen)[k]
+    alone = solution.values.fit(solution.chosen).covariance
+    return math.sqrt(alone[at, at][0, 0]), math.sqrt(solution.covariance[at, at][0, 0])
+
+
+def test_an_interval_holds_the_gain_of_a_sensor_that_is_not_exact() -> None:
+    """With torque constant and frictions all wrong, the sensor's gain is the unit of all of them; it is off by 1.5 %."""
+    gain, runs = 1.015, []
+    for name, table in runs_of(ARM, 23, 5):
+        torque = gain * table.joints[1].torque_nm
+        runs.append((name, replace(table, joints={1: replace(table.joints[1], torque_nm=torque)})))
+    solution = solved(replace(ARM, torque_constant_nm_per_a=0.85 * KT, friction=Friction(1.5, 2.0)), runs)
+    found = {
+        (j.present.effect.name, p): v for j in judged(solution) for p, v in values_of(solution, j).items()
+    }
+    assert ("sensor_gain", "gain") not in found
+    constant = found["torque_constant", "torque_constant_nm_per_a"]
+    assert constant.ci95[0] <= KT < constant.value / 1.01
+    alone, whole = spread(solution, "torque_constant")
+    assert whole > 1.5 * alone
