@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from scipy.stats import t
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects.effect import TORSION
@@ -113,22 +112,19 @@ class Sizes:
         self._runs = [total - sets.gram[np.ix_(at, at)] for sets in without[:-1]]
 
     def over_runs(self, at: Index) -> tuple[float, float]:
-        """Return how much the size of the coefficients at these places of the set differs from recording to recording, part
-        of it (rms, each recording weighted by what it holds of it), and the chance that recordings agree so on a size whose
-        mean is zero (t-test over recordings, which are what is independent); inf and 1 with one recording.
+        """Return how much the size of the coefficients at these places of the set differs from recording to recording (rms,
+        each weighted by what it holds of it), and the standard error of its mean, parts of it; inf with one recording.
         """
-        held, change = [], []
+        energy, lacking, count = 0.0, 0.0, 0
         for gram in self._runs:
             own = float(self._mean[at] @ gram[np.ix_(at, at)] @ self._mean[at])
+            more = float(self._mean[at] @ (gram[at, -1] - gram[at, :-1] @ self._mean))
             if own > 0.0:
-                held.append(own)
-                change.append(float(self._mean[at] @ (gram[at, -1] - gram[at, :-1] @ self._mean)) / own)
-        weight, by = np.array(held) / max(sum(held), 1e-30), np.array(change)
-        many = 1.0 / max(float(np.sum(weight**2)), 1e-30)
-        if len(held) < 2 or many <= 1.0:
-            return math.inf, 1.0
-        error = math.sqrt(float(np.sum((weight * by) ** 2)) * many / (many - 1.0))
-        return math.sqrt(float(np.sum(weight * by**2))), 2.0 * float(t.sf(1.0 / max(error, 1e-9), many - 1.0))
+                energy, lacking, count = energy + own, lacking + more**2 / own, count + 1
+        if count < 2:
+            return math.inf, math.inf
+        differs = math.sqrt(lacking / energy)
+        return differs, differs / math.sqrt(count - 1)
 
 
 def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:

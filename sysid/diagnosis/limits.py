@@ -125,8 +125,8 @@ RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
-CHANCE: Final = 1e-3
-"""Chance that the runs agree so on the size of an entry that is none; of a certain entry it is less."""
+AGREE: Final = 0.07
+"""Standard error of the mean size of a certain entry over the runs, part of it; runs are what is independent."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""
 LISTED: Final = 0.2

@@ -60,8 +60,8 @@ _Z95: Final = 1.96
 class Judged:
     """Entries that are one effect, in the set: their places, rms per channel [Nm], twice the log evidence that the best set
     without them lacks, and that the set without them lacks where a discrepancy may imitate them, that best set's entries
-    instead, deviations of the coefficients [z] from none; how much their size differs from run to run, and the chance that
-    runs agree so on none.
+    instead, deviations of the coefficients [z] from none; how much their size differs from run to run, and the standard
+    error of its mean over runs, parts of it.
     """
 
     members: tuple[int, ...]
@@ -72,7 +72,7 @@ class Judged:
     rivals: tuple[Entry, ...]
     z: float
     differs: float
-    chance: float
+    error: float
 
 
 def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
@@ -132,12 +132,12 @@ def grade_of(j: Judged, *, hidden: bool) -> tuple[str, tuple[str, ...]]:
     """Return the grade of an effect, and why it is not certain; see the module. hidden: what remains in its balance is
     larger than itself.
     """
-    size = f"its size differs by {100.0 * j.differs:.0f} % from run to run, and the runs are few"
+    size = f"its size differs by {100.0 * j.differs:.0f} % from run to run"
     doubts = {
         "other entries explain these runs alike": j.delta <= limits.RIVAL,
         "a discrepancy would look alike": j.imitated <= limits.RIVAL,
         f"it is less than {limits.SURE:g} standard deviations from none": j.z <= limits.SURE,
-        size if math.isfinite(j.differs) else "one run has no other to agree with": j.chance >= limits.CHANCE,
+        size if math.isfinite(j.differs) else "one run has no other to agree with": j.error >= limits.AGREE,
         "more than it remains in its balance": hidden,
     }
     found = tuple(text for text, holds in doubts.items() if holds)
