@@ -125,7 +125,7 @@ RIVAL: Final = 6.0
 """Twice the log evidence within which another set is a rival."""
 SURE: Final = 3.0
 """Standard deviations by which a certain entry differs from none."""
-AGREE: Final = 0.07
+AGREE: Final = 0.06
 """Standard error of the mean size of a certain entry over the runs, part of it; runs are what is independent."""
 UNTOLD: Final = 0.7
 """Posterior over prior deviation above which these runs cannot tell a value."""

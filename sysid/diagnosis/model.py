@@ -327,7 +327,6 @@ class _Work:
             self.start,
             self.most,
             self.resemblance(weights),
-            recorded(entries, max(s.step_s for run in self.dataset.signals for s in run)),
         )
 
     def resemblance(self, weights: FloatArray) -> dict[object, FloatArray]:

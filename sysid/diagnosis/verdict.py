@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -40,7 +41,7 @@ from jtqd.sysid.diagnosis.findings import (
     joint_text,
 )
 from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, fits_without, gain_of, predict
-from jtqd.sysid.diagnosis.model import Solution
+from jtqd.sysid.diagnosis.model import Solution, recorded
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.unexplained import (
@@ -86,7 +87,11 @@ def judged(solution: Solution) -> list[Judged]:
     """Return the effects of the set."""
     sets, chosen = solution.sets, solution.chosen
     plain = solution.equations.sets(solution.variances, chosen, resembling=False)
-    imitating = solution.equations.sets(solution.variances, chosen)
+    recorder = copy(solution.equations)
+    recorder.recorded = recorded(
+        solution.entries, max(s.step_s for run in solution.dataset.signals for s in run)
+    )
+    imitating = recorder.sets(solution.variances, chosen)
     sizes = Sizes(fits_without(solution), chosen)
     values = solution.values.fit(chosen)
     places = solution.values.places(chosen)
