@@ -111,6 +111,29 @@ def test_a_second_sync_producer_makes_all_inputs_stale_and_is_8150h(daemon: Daem
     assert daemon.until(daemon.well), "it has gone, and estimates are back"
 
 
+def test_frames_of_others_with_own_cob_ids_are_8150h_and_own_echoes_are_none(daemon: Daemon) -> None:
+    """Estimate PDOs, heartbeat, EMCY and SDO answer; before them thousands of own frames have come back as echoes."""
+    before = daemon.reader.read().counters
+    assert before["cob_id_conflicts"] == 0
+    own = (0x1A0, 0x2A0, 0x3A0, 0x720, 0x0A0, 0x5A0)
+    for cob_id in own:
+        daemon.send(cob_id, b"\x05" if cob_id == 0x720 else bytes(8))
+        identifier = cob_id.to_bytes(2, "little")
+        assert daemon.until(
+            lambda identifier=identifier: frame("5081 11 0000") + identifier + b"\0" in daemon.emcys
+        ), hex(cob_id)
+        assert f"COB-ID {cob_id:03X}h: another node sends with this COB-ID of jtqd" in daemon.log_text()
+    assert daemon.until(
+        lambda: (
+            {each[5:7] for each in daemon.emcys if each[:2] == b"\0\0"}
+            == {cob_id.to_bytes(2, "little") for cob_id in own}
+        )
+    )
+    after = daemon.reader.read().counters
+    assert after["cob_id_conflicts"] - before["cob_id_conflicts"] == 4
+    assert after["unknown_frames"] == before["unknown_frames"]
+
+
 def test_a_node_that_stops_is_8250h_for_each_of_its_pdos(daemon: Daemon) -> None:
     """NMT stop by another master: reported, its PDOs time out, and it is configured and started again."""
     daemon.send(0x000, b"\x02\x02")
