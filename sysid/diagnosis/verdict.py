@@ -140,7 +140,7 @@ def grade_of(j: Judged, *, hidden: bool) -> tuple[str, tuple[str, ...]]:
     size = f"its size differs by {100.0 * j.differs:.0f} % from run to run"
     doubts = {
         "other entries explain these runs alike": j.delta <= limits.RIVAL,
-        "a discrepancy would look alike": j.imitated <= limits.RIVAL,
+        "a discrepancy, or a recorder within its step, would look alike": j.imitated <= limits.RIVAL,
         f"it is less than {limits.SURE:g} standard deviations from none": j.z <= limits.SURE,
         size if math.isfinite(j.differs) else "one run has no other to agree with": j.error >= limits.AGREE,
         "more than it remains in its balance": hidden,

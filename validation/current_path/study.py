@@ -1,10 +1,10 @@
-"""What a network of the current path brings: one encoder's torque on the four plants, beside what there is today.
+"""Study of a network of the current path: the torque of one encoder on the four plants, with and without the network.
 
 Each plant is driven by a campaign (ordinary runs of excitation and quick ones), and judged on other days and motions. The
 network of `recipe.py` learns from 96, 24 and 12 ordinary runs and as many quick ones in proportion; its teacher is the
-torque sensor, or the fused estimate of a joint file that was fitted to 8 runs with a sensor. Beside it stands today's
-estimate with one encoder and with two, fitted to the ordinary runs. Figures: RMSE against the true torque of the same
-instant, % of rated, over both joints.
+torque sensor, or the fused estimate of a joint file that was fitted to 8 runs with a sensor. It is compared with
+the estimates of the joint file for one encoder and for two, fitted to the ordinary runs. Figures: RMSE against the true
+torque of the same instant, % of rated, over both joints.
 
 python -m validation current_path --quick --plant typical      fewer runs
 python -m validation current_path --json current_path.json
@@ -224,8 +224,8 @@ def methods_of(
     ordinary = [example(run, number, joint) for run in days.ordinary]
     quick = [example(run, number, joint) for run in days.quick]
     found: dict[str, Estimate] = {
-        "today, two encoders": lambda run, each: fused_nm(run, number, two.joint),
-        "today, one encoder": lambda run, each: one_encoder_nm(run, number, one),
+        "without it, two encoders": lambda run, each: fused_nm(run, number, two.joint),
+        "without it, one encoder": lambda run, each: one_encoder_nm(run, number, one),
     }
     sensor = [each.sensor_nm for each in (*ordinary, *quick)]
     most = scale.counts[0]
