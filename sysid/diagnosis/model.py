@@ -64,7 +64,7 @@ def between(
     before: tuple[FloatArray, FloatArray], now: tuple[FloatArray, FloatArray], covariance: FloatArray
 ) -> FloatArray:
     """Return the next point of an iteration from its last two, each with its image: where the line through both has its
-    fixed point, no further than either image (Anderson 1965, J. ACM 12). Images alone diverge if a motor saturates by a third.
+    fixed point, no further than either image (Anderson 1965, J. ACM 12). Images alone diverge where a motor saturates.
     """
     rest, change = now[1] - now[0], (now[1] - now[0]) - (before[1] - before[0])
     weighted = np.linalg.solve(covariance, change)

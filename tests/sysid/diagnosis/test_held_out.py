@@ -96,6 +96,14 @@ def left_nm2(found: Prediction) -> float:
     return float(found.squares[MOTOR1][:, 1].sum())
 
 
+def test_values_outside_of_the_set_predict_as_far_as_held_out_runs_want(solution: Solution) -> None:
+    """A friction that is not in the set but in the runs comes back with the values of the file."""
+    [k] = [k for k in solution.chosen if solution.entries[k].effect.name == "coulomb_friction"]
+    less = predict(replace(solution, chosen=solution.chosen - {k}))
+    assert k in less.chosen
+    assert left_nm2(less) == pytest.approx(left_nm2(predict(solution)), rel=0.05)
+
+
 def test_an_entry_whose_sign_differs_from_run_to_run_does_not_predict(solution: Solution) -> None:
     tampered, _ = with_noise_entry(solution, (1, -1, 1, -1))
     found = predict(tampered)

@@ -13,7 +13,7 @@ from jtqd.estimator.joint import Friction, Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis import diagnose as diagnosis
 from jtqd.sysid.diagnosis.dataset import Dataset, usable_signals
-from jtqd.sysid.diagnosis.diagnose import diagnose
+from jtqd.sysid.diagnosis.diagnose import diagnose, disturbed_signals
 from jtqd.sysid.diagnosis.findings import (
     AMBIGUOUS,
     CAUSE,
@@ -368,11 +368,15 @@ def test_without_noise_no_factor_on_all_constants_is_a_cause(true: Joint, named:
 # One filter for all that is compared.
 
 
-def test_the_runs_with_noise_are_filtered_as_the_runs_are(nothing_wrong: Solution) -> None:
-    dataset = nothing_wrong.dataset
-    for run, noisy in zip(dataset.signals, dataset.disturbed, strict=True):
+def test_the_runs_with_noise_are_filtered_as_the_runs_are() -> None:
+    """An encoder of 4096 counts is filtered, and by its own noise twice as much again."""
+    runs = runs_of(ARM, 5, 2, Rig(counts=2.0**12, rate_hz=250.0))
+    usable, _ = usable_signals(runs, {1: ARM}, (1,))
+    for run, noisy in zip(usable, disturbed_signals(runs, {1: ARM}, (1,), usable), strict=True):
         (plain,), (more,) = run, noisy
-        assert (more.visible, more.inertial) == (plain.visible, plain.inertial)
+        assert plain.visible.parts
+        assert more.visible is plain.visible
+        assert more.inertial is plain.inertial
         assert more.of_position == plain.of_position
 
 
@@ -464,3 +468,6 @@ def test_an_interval_holds_the_gain_of_a_sensor_that_is_not_exact() -> None:
     assert constant.ci95[0] <= KT < constant.value / 1.01
     alone, whole = spread(solution, "torque_constant")
     assert whole > 1.5 * alone
+    [j] = [j for j in judged(solution) if j.present.effect.name == "torque_constant"]
+    at = solution.values.places(solution.chosen)[j.members[0]]
+    assert j.z == pytest.approx(abs(solution.values.fit(solution.chosen).mean[at][0]) / whole)
