@@ -13,6 +13,7 @@ from scipy.stats import sem
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction
+from jtqd.sysid.diagnosis import held_out
 from jtqd.sysid.diagnosis.evidence import Sets
 from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF
 from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, gain_of, predict, stacked
@@ -102,6 +103,19 @@ def test_values_outside_of_the_set_predict_as_far_as_held_out_runs_want(solution
     less = predict(replace(solution, chosen=solution.chosen - {k}))
     assert k in less.chosen
     assert left_nm2(less) == pytest.approx(left_nm2(predict(solution)), rel=0.05)
+
+
+def test_what_predicts_is_the_mixture(solution: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the part that held-out runs want: a value outside of the set has this part of what the wide set gives it."""
+    found = {}
+    for part in (0.0, 0.25, 1.0):
+        monkeypatch.setattr(held_out, "stacked", lambda *_, part=part: part)
+        prediction = predict(solution)
+        places = solution.sets.places(prediction.chosen)
+        found[part] = {k: float(prediction.mean[s][0]) for k, s in places.items() if k not in solution.chosen}
+    assert found[0.0] == {}
+    assert len(found[1.0]) > 1
+    assert found[0.25] == pytest.approx({k: 0.25 * value for k, value in found[1.0].items()})
 
 
 def test_an_entry_whose_sign_differs_from_run_to_run_does_not_predict(solution: Solution) -> None:
