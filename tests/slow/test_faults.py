@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from tests.paths import ROOT
-from tests.slow.faults.__main__ import line, play
 from tests.slow.faults.cases import CASES, ELSEWHERE, LEFT_OUT, NOT_COVERED, Case, with_library
 from tests.slow.faults.injections import Fault
+from tests.slow.faults.on_bus import line, play
 from tests.slow.faults.rig import Watcher
 from tests.slow.heard_bus import healthy, heard_of
 

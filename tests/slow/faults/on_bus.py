@@ -1,4 +1,4 @@
-"""Command line: `python -m tests.slow.faults [--case N ...] [--json]`."""
+"""Command line: `python -m tests.slow.faults.on_bus [--case N ...] [--json]`."""
 
 from __future__ import annotations
 
@@ -197,9 +197,9 @@ def _hex(found: frozenset[int]) -> str:
 
 
 _EXAMPLES = """examples:
-  python -m tests.slow.faults                 every case that is played on the bus, as a table
-  python -m tests.slow.faults --case 16 12    only these (16: all its parts; 16a: this part)
-  python -m tests.slow.faults --library       with nodes that share no code with jtqd or its bench
+  python -m tests.slow.faults.on_bus                 every case that is played on the bus, as a table
+  python -m tests.slow.faults.on_bus --case 16 12    only these (16: all its parts; 16a: this part)
+  python -m tests.slow.faults.on_bus --library       with nodes that share no code with jtqd or its bench
 
 Where this machine has no SocketCAN, it runs in the bench kernel, with exact time. Exit status 1: a case does not hold.
 """
@@ -245,7 +245,7 @@ def _ms(value: float | None) -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
-        prog="python -m tests.slow.faults",
+        prog="python -m tests.slow.faults.on_bus",
         epilog=_EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -269,7 +269,7 @@ def main(arguments: list[str] | None = None) -> int:
         )
     bus = os.environ.get("JTQD_CAN_INTERFACE", "vcan0")
     if not build.ensure_vcan(bus):
-        command = [sys.executable, "-m", "tests.slow.faults", *(arguments or sys.argv[1:])]
+        command = [sys.executable, "-m", "tests.slow.faults.on_bus", *(arguments or sys.argv[1:])]
         sinks = (sys.stdout.buffer, sys.stderr.buffer)
         return guest.run(command, time_travel=True, sinks=sinks).returncode
 
