@@ -1,6 +1,6 @@
-"""The fault cases of docs/testing.md: injected on a real bus, with what jtqd reported, counted and published, and when.
+"""Faults of inputs, timing and nodes at a gateway, each estimate judged by the true torque; a catalogue of faults on a bus.
 
-`rig` is the emulated bench with a hook between its nodes and the bus, and the watcher that reads the bus and holds the
-invariants; `injections` are the kinds of fault, `listener` an independent listener and what it must have heard, `cases` the
-catalogue, `__main__` plays it.
+`gateway` changes what nodes send, `table` has the faults, `runs` the plants, `trial` runs jtqd in exact time and judges.
+`on_bus` plays the catalogue `cases`: `rig` is the emulated bench on a real bus with a hook between its nodes and the bus,
+and a watcher of all that jtqd sends; `injections` are kinds of fault, `listener` hears the bus by itself.
 """
