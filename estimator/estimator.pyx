@@ -40,7 +40,7 @@ from jtqd.estimator.corrections import ExtendedInputs, acting_effects, plain_joi
 from jtqd.estimator.observer import columns
 from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
 from jtqd.estimator.run import INPUTS, EstimateRun, ObservedRun
-from jtqd.estimator.settings import METHODS
+from jtqd.estimator.settings import METHODS, largest_torque_nm
 from jtqd.estimator.status import Estimate
 from jtqd.estimator.native_network import FADE_START
 from jtqd.estimator.fusion import FOREIGN_SIGMAS
@@ -208,7 +208,7 @@ cdef class JointEstimator(Estimator):
         fill_uncertainty(&self.law.uncertainty, joint, settings)
         self.law.with_efficiency = "efficiency" in METHODS[settings.method].sections
         self.law.inverse_gain = 1.0 / losses.torque_per_ampere
-        self.law.limit = settings.torque_limit * joint.rated_torque_nm
+        self.law.limit = largest_torque_nm(joint, settings)
         self.law.network_sigma = 0.0 if used is None else used.sigma_nm
         self.with_network = used is not None
         self.run_one = fill_network(&self.law.network, used, joint)
@@ -327,7 +327,7 @@ cdef class FusedEstimator(Estimator):
         self.law.stand_share = 1.0 + settings.friction_uncertainty
         self.law.stand_floor = settings.sigma_floor * joint.rated_torque_nm
         self.law.stand_sigmas = 0.0 if fused.standstill is None else fused.standstill.sigmas
-        self.law.limit = settings.torque_limit * joint.rated_torque_nm
+        self.law.limit = largest_torque_nm(joint, settings)
         self.law.network_limit = settings.network_limit * joint.rated_torque_nm
         self.law.fade = FADE_START * self.law.network_limit
         self.law.inverse_fade = 1.0 / max(self.law.network_limit - self.law.fade, 1e-12)

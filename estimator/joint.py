@@ -502,7 +502,7 @@ class Joint:
     """One joint: `joint.yaml` as values. Numbers out of range raise ConfigError (replace() too).
 
     `effects` add to what the other sections say; an effect that replaces one of their values may be there once. Stiffness
-    and damping of a joint with one encoder may be NaN: not known.
+    and damping of a joint with one encoder may be NaN: not known. `peak_torque_nm`: no torque beyond it is sent.
     """
 
     name: Text
@@ -513,6 +513,7 @@ class Joint:
     damping_nms_per_rad: Annotated[float, limits("Nms/rad", ge=0.0)] = math.nan
     link_inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)] = 0.0
     rated_torque_nm: Annotated[float, limits("Nm", gt=0.0)]
+    peak_torque_nm: Annotated[float, limits("Nm", gt=0.0)] | None = None
     friction: Friction
     efficiency: Efficiency | None = None
     fused: Fused | None = None

@@ -158,6 +158,12 @@ def bandwidth_of(joint: Joint, settings: EstimatorSettings) -> float:
     return settings.bandwidth_rad_s
 
 
+def largest_torque_nm(joint: Joint, settings: EstimatorSettings) -> float:
+    """Return the largest torque that is believed [Nm]: the peak of the joint file, else `torque_limit` rated torques."""
+    peak = joint.peak_torque_nm
+    return settings.torque_limit * joint.rated_torque_nm if peak is None else peak
+
+
 def age_ms(joint: Joint, settings: EstimatorSettings) -> float:
     """Return the group delay of a joint's estimate at low frequency [ms]."""
     return 1e3 / bandwidth_of(joint, settings)

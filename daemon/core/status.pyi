@@ -28,6 +28,7 @@ class JointStatus:
 class JointSafety:
     plausibility: Final[Plausibility | None]
     torque_limit_nm: Final[float]
+    sigma_limit_nm: Final[float]
     def __init__(
         self,
         settings: SafetySettings | None = None,

@@ -27,6 +27,7 @@ cimport cython
 from libc.math cimport INFINITY, NAN, fabs, isnan, sqrt
 from libc.stdint cimport int8_t, int64_t, uint64_t
 
+from sys import float_info
 from typing import Final
 
 from jtqd.daemon.config import SafetySettings
@@ -40,7 +41,7 @@ from jtqd.estimator import status as st
 from jtqd.estimator.detection cimport Plausibility
 from jtqd.estimator.observer cimport Sample, follow_reference, restart_reference
 from jtqd.estimator.estimator cimport Values
-from jtqd.estimator.settings import bandwidth_of
+from jtqd.estimator.settings import bandwidth_of, largest_torque_nm
 
 NEEDED: Final = {st.DEGRADED: 100, st.STARTING: 1, st.OFF: 20, st.STALE: 5, st.INVALID: 50, st.DRIVE_FAULT: 100}
 """Cycles in a row that must be better before this status is left; the last of them is published already."""
@@ -205,6 +206,9 @@ if faults.COUNTED != tuple([1 << _bit for _bit in range(LOW_BYTE)]):
 
 TORQUE_RANGE_NM: Final = 327.67
 """Of the field of the estimate PDO."""
+SIGMA_LIMIT: Final = 0.5
+"""Part of the rated torque: a torque that is known no better than this is of no use to a receiver."""
+cdef double LARGEST = float_info.max
 
 
 class JointSafety:
@@ -213,7 +217,7 @@ class JointSafety:
     Attributes:
         settings: as configured (`SafetySettings`).
         plausibility: checks of its inputs, None for none.
-        torque_limit_nm: a torque beyond it is never published.
+        torque_limit_nm, sigma_limit_nm: a torque beyond it, or with a larger sigma, is never published.
         network_limit_nm: a network further from physics than this has been dropped by the estimator.
         deviation_cycles: length of the fault `deviation`, 0 where it is not latched.
         sensor_zero_nm: of the torque sensor, beside sigma: standard deviation.
@@ -225,6 +229,7 @@ class JointSafety:
         self.settings = settings or SafetySettings()
         self.plausibility = None
         self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, INFINITY
+        self.sigma_limit_nm = LARGEST
         self.deviation_cycles, self.sensor_zero_nm = 0, 0.0
         self.bandwidth_rad_s, self.max_gap_s = 0.0, 0.05
         if self.settings.latch & faults.DEVIATION:
@@ -233,7 +238,8 @@ class JointSafety:
             return
         rated_nm = joint.rated_torque_nm
         self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator), estimator.max_gap_s
-        self.torque_limit_nm = min(TORQUE_RANGE_NM, estimator.torque_limit * rated_nm)
+        self.torque_limit_nm = min(TORQUE_RANGE_NM, largest_torque_nm(joint, estimator))
+        self.sigma_limit_nm = SIGMA_LIMIT * rated_nm
         self.network_limit_nm = estimator.network_limit * rated_nm
         self.sensor_zero_nm = estimator.sensor_zero_nm(rated_nm)
         if self.settings.plausibility is not None:
@@ -281,6 +287,7 @@ cdef class JointRules:
         self.with_network = with_network
         self.plausibility, self.is_checked = safety.plausibility, safety.plausibility is not None
         self.torque_limit_nm, self.network_limit_nm = safety.torque_limit_nm, safety.network_limit_nm
+        self.sigma_limit_nm = safety.sigma_limit_nm
         self.deviation_cycles, self.deviation_sigmas = safety.deviation_cycles, safety.settings.deviation_sigmas
         self.sensor_variance = safety.sensor_zero_nm**2
         self.bandwidth, self.max_gap = safety.bandwidth_rad_s, safety.max_gap_s
@@ -336,10 +343,9 @@ cdef class JointRules:
         """Return the faults of numbers that the estimator marked as good."""
         cdef double torque = estimate.torque_nm, sigma = estimate.sigma_nm, network = estimate.network_nm
         cdef double limit = self.torque_limit_nm
-        cdef bint is_sigma = 0.0 <= sigma < INFINITY
         cdef int found = 0
-        if not (-limit <= torque <= limit and is_sigma):  # so that NaN fails too
-            found = FAULT_OUT_OF_RANGE if torque - torque == 0.0 and is_sigma else FAULT_NOT_FINITE
+        if not (-limit <= torque <= limit and 0.0 <= sigma <= self.sigma_limit_nm):  # so that NaN fails too
+            found = FAULT_OUT_OF_RANGE if torque - torque == 0.0 and 0.0 <= sigma < INFINITY else FAULT_NOT_FINITE
         if self.with_network and (estimate.status == DEGRADED or network - network != 0.0):
             self.count_network(estimate, network_wanted)
         if self.deviation_cycles:

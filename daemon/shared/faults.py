@@ -9,7 +9,7 @@ from jtqd.estimator.status import CURRENT_FROZEN, LINK_JUMP, MOTOR_JUMP, TORSION
 NOT_FINITE: Final = 0x01
 """The estimator gave a number that is none, or a sigma that is none, as if it were good."""
 OUT_OF_RANGE: Final = 0x02
-"""The torque, or what it is made of, is beyond everything that the joint can do."""
+"""The torque, or what it is made of, is beyond everything that the joint can do; or sigma is."""
 DEVIATION: Final = 0x80
 """Too far from the torque sensor for too long; looked for only where it is latched."""
 DRIVE_FAULT: Final = 0x100
@@ -36,7 +36,7 @@ COUNTED: Final = tuple(bit for bit in NAMES if bit <= DEVIATION)
 
 MEANINGS: Final = {
     NOT_FINITE: "the estimate is not finite",
-    OUT_OF_RANGE: "the torque is out of range",
+    OUT_OF_RANGE: "the torque or its sigma is out of range",
     MOTOR_JUMP: "the motor position jumped",
     LINK_JUMP: "the link position jumped",
     VELOCITY_MISMATCH: "motor position and motor velocity disagree",

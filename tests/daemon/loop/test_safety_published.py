@@ -19,6 +19,8 @@ from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared import faults
 from jtqd.daemon.shared.snapshot import SnapshotReader
+from jtqd.estimator.estimator import make_estimator
+from jtqd.estimator.joint import Joint
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import (
     DEGRADED,
@@ -91,6 +93,7 @@ BROKEN = [
     (LIMIT_NM[0] * 1.0001, 0.5, "out_of_range"),
     (-LIMIT_NM[0] * 1.0001, 0.5, "out_of_range"),
     (400.0, 0.5, "out_of_range"),
+    (5.0, 0.5001 * JOINTS[0].rated_torque_nm, "out_of_range"),
 ]
 
 
@@ -124,6 +127,29 @@ def test_the_largest_torque_that_a_joint_can_have_is_published(tmp_path: Path, c
     cycle, socket, _ = checked(tmp_path, reported)
     clock.turn(cycle, 25)
     assert pdos(socket)[-1].torque_nm[0] == pytest.approx(LIMIT_NM[0])
+
+
+def test_a_sigma_of_half_the_rated_torque_is_published(tmp_path: Path, clock: ExactTime) -> None:
+    reported = itertools.repeat(GOOD._replace(sigma_nm=0.5 * JOINTS[0].rated_torque_nm))
+    cycle, socket, _ = checked(tmp_path, reported)
+    clock.turn(cycle, 25)
+    assert pdos(socket)[-1].torque_nm[0] == 5.0
+
+
+def _status_at_6_a(joint: Joint) -> int:
+    estimator = make_estimator(joint, dataclasses.replace(SETTINGS, method="efficiency"))
+    run = [estimator.step(1e-3, 6.0, 0.1 * k, 100.0, 1e-3 * k) for k in range(100)]
+    return run[-1].status
+
+
+def test_the_peak_torque_of_a_joint_is_its_limit() -> None:
+    peaked = dataclasses.replace(JOINTS[0], peak_torque_nm=57.0)
+    assert JointSafety(SafetySettings(), SETTINGS, peaked).torque_limit_nm == 57.0
+    assert [_status_at_6_a(joint) for joint in (peaked, dataclasses.replace(peaked, peak_torque_nm=5.0))] == [
+        VALID,
+        INVALID,
+    ]
+    assert JointSafety(SafetySettings(), SETTINGS, JOINTS[0]).torque_limit_nm == LIMIT_NM[0]
 
 
 def test_a_torque_beyond_the_field_is_out_of_range_for_the_strongest_joint_too() -> None:
