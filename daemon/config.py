@@ -859,8 +859,8 @@ def _whole(values: Mapping[str, float]) -> dict[str, int]:
 
 def _check_encoders(method: str, objects: DriveObjects, joint: Joint, network: NetworkFile | None) -> None:
     """Refuse a method that needs the link position of a drive without one. Raises FieldError."""
-    torsion = METHODS[method].torsion_of(joint) is not None
-    if objects.link_position is None and (torsion or network is not None):
+    torsion, needs = METHODS[method].torsion_of(joint) is not None, METHODS[method].network_required
+    if objects.link_position is None and (torsion or (network is not None and needs)):
         use = "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
         expected = f"a link position because estimator.method {method} {use}; tob and efficiency do without"
         raise FieldError("joint", "objects.link_position", Verbatim("false"), expected)

@@ -6,11 +6,11 @@ from jtqd.estimator.observer cimport (
     Sample
 )
 from jtqd.estimator.fusion cimport AgreementLaw, AgreementState, Fused, FusionLaw, Learned, OffsetLaw, OffsetState
-from jtqd.estimator.native_network cimport FusedTrustLaw, PerceptronLaw, TrustLaw
+from jtqd.estimator.native_network cimport FusedTrustLaw, PathLaw, PathState, PerceptronLaw, TrustLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw, UncertaintyLaw
 
 cdef enum:
-    MOST_FEATURES = 8
+    MOST_FEATURES = 28
 
 cdef struct Values:  # `jtqd.estimator.status.Estimate` as a block; NaN where not computed or not to be published
     double torque_nm, sigma_nm, tob_nm, physics_nm, network_nm
@@ -59,8 +59,11 @@ cdef struct FusedLaw:
     AdditiveLaw loss
     FusionLaw fusion
     FusedTrustLaw trust
-    bint with_envelope  # trust is set, of the network or of the joint file
+    bint with_envelope  # trust is set
     NetworkLaw network
+    PathLaw path  # of the network, as the next three
+    FusionLaw view
+    double rest, outside  # half width at rest; sigma without trust
     OffsetLaw offsets
     AgreementLaw agreement
     LinkLaw link
@@ -68,7 +71,7 @@ cdef struct FusedLaw:
     double tracking_noise, tracking_viscous, tracking_bend  # bend: of the viscous part [s^2/rad^2], 0: none
     double physics_scale[4]
     double network_scale[4]
-    double stand_share, stand_floor, stand_sigmas, limit, network_limit, fade, inverse_fade
+    double stand_share, stand_floor, stand_sigmas, limit
 
 cdef struct FusedState:
     GuardState guard
@@ -79,6 +82,7 @@ cdef struct FusedState:
     OffsetState offsets
     AgreementState agreement
     LinkState link
+    PathState path
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law
@@ -91,6 +95,7 @@ cdef class FusedEstimator(Estimator):
     cdef double half_interval(
         self, const FusedObserved *seen, const Fused *physics, double half, double more, double sigma
     ) noexcept nogil
+    cdef double current_path(self, bint network_wanted) noexcept nogil
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil
 
 cdef class ExtendedEstimator(Estimator):

@@ -3,7 +3,7 @@ from typing import Final
 
 from jtqd.estimator.arrays import BoolArray, FloatArray, QuadrantArray
 from jtqd.estimator.joint import Joint, Torsion
-from jtqd.estimator.network import AnyNetwork, FusedNetwork, TorqueNetwork
+from jtqd.estimator.network import AnyNetwork, PathNetwork, TorqueNetwork
 from jtqd.estimator.run import EstimateRun, JointColumns, ObservedRun
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import Estimate, Zeros
@@ -20,7 +20,7 @@ class JointEstimator(Estimator):
 
 class FusedEstimator(Estimator):
     def __init__(
-        self, joint: Joint, settings: EstimatorSettings, network: FusedNetwork | None = None
+        self, joint: Joint, settings: EstimatorSettings, network: PathNetwork | None = None
     ) -> None: ...
     @property
     def zeros(self) -> Zeros | None: ...

@@ -9,7 +9,7 @@
 `make_estimator` chooses. All inputs of the loss pass the same filter; delay of the result: `settings.age_ms`.
 """
 
-from libc.math cimport NAN, fabs, fmin, sqrt
+from libc.math cimport NAN, fabs, fmin, hypot, sqrt
 from libc.string cimport memcmp, memcpy, memset
 
 from jtqd.estimator.detection cimport LinkLoad, fill_link, restart_link, update_link
@@ -24,13 +24,15 @@ from jtqd.estimator.fusion cimport (
     reweigh, turn_differs, update_difference, update_turn
 )
 from jtqd.estimator.native_network cimport (
-    Perceptron, evaluate, fill_fused_trust, fill_trust, fused_trust, network_share, trust
+    PATH_INPUTS, Perceptron, evaluate, fill_fused_trust, fill_path, fill_trust, follow_path, fused_trust, path_trust,
+    start_path, trust
 )
 from jtqd.estimator.losses cimport (
     AdditiveLaw, AdditiveLossModel, Loss, LossModel, Spread, additive_loss, efficiency_loss, fill_uncertainty,
     sigma_moving, standing, thermal_friction
 )
 
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -38,11 +40,11 @@ import numpy as np
 from jtqd.estimator import status as st
 from jtqd.estimator.corrections import ExtendedInputs, acting_effects, plain_joint
 from jtqd.estimator.observer import columns
-from jtqd.estimator.network import FEATURES, FUSED_FEATURES, check_fit, native_of
+from jtqd.estimator.native_network import OUTSIDE
+from jtqd.estimator.network import FEATURES, check_fit, native_of
 from jtqd.estimator.run import INPUTS, EstimateRun, ObservedRun
 from jtqd.estimator.settings import METHODS, largest_torque_nm
 from jtqd.estimator.status import Estimate
-from jtqd.estimator.native_network import FADE_START
 from jtqd.estimator.fusion import FOREIGN_SIGMAS
 
 STANDSTILL_SIGMAS: Final = 3.0
@@ -286,15 +288,19 @@ def quadrants(raw_nm, velocity_rad_s):
 
 
 cdef class FusedEstimator(Estimator):
-    """Estimator of one joint, method `fused`; without a network the physics alone, degraded outside the joint file's envelope.
+    """Estimator of one joint, method `fused`, degraded outside the joint file's envelope.
 
         tau_raw, v, tau_t, waves, s, open  <-  fused observer   s: direction, -1 to 1; open: of the torsion's slip
         physics = fusion of tau_raw - loss(tau_raw, v, s, T) and tau_t
-        torque  = physics + w share(v) N(features)              w: trust of the network; share: 0 at rest, 1 from 0.2 rad/s
+        torque  = physics
 
-    w is 1 inside the network's envelope, falls continuously to 0 outside it, and falls from 1 to 0 while |N| goes
-    from 75 % to 100 % of the limit. Status 2 where w = 1, 3 where it is less (at w = 0 the value is the physics alone),
-    6 at standstill.
+    With a network of the current path (`native_network`), which has no delay, in motion
+
+        torque  = tau_c + alpha (tau_t - tau_c),   alpha = s_c^2/(s_c^2 + s_t^2),   tau_c = tau_r + N(x)
+
+    s_c: its spread, wider where it is not trusted, and the friction interval near standstill. At standstill the torque is that
+    of physics, without torsion tau_c. Offsets and agreement of the paths are those of physics. Where the network has no value
+    the torque is physics, and the status 3; without torsion also where the trust is below one half.
 
     Raises ConfigError for a joint without section `fused`, effects (`make_estimator` applies them), another joint's
     network, or settings of another method; NetworkError for a network whose native evaluation differs from its runtime's.
@@ -304,7 +310,7 @@ cdef class FusedEstimator(Estimator):
         check_fit(joint, settings, network, "FusedEstimator")
         fused = joint.fused
         self.joint, self.settings = joint, settings
-        self.width = len(FUSED_FEATURES)
+        self.width = 0 if network is None else PATH_INPUTS
         fill_guard(&self.law.guard, joint, settings)
         fill_fused_observer(&self.law.observer, joint, fused.torsion, settings)
         self.law.loss = (<AdditiveLossModel>AdditiveLossModel(fused.loss)).law
@@ -321,22 +327,25 @@ cdef class FusedEstimator(Estimator):
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
         physics_scale = fused.zeros.scale if self.law.offsets.spread > 0.0 else fused.sigma.scale
-        network_scale = physics_scale if network is None else network.sigma_scale
+        network_scale = physics_scale if network is None else network.sigma.scale
         for k in range(4):
             self.law.physics_scale[k], self.law.network_scale[k] = physics_scale[k], network_scale[k]
         self.law.stand_share = 1.0 + settings.friction_uncertainty
         self.law.stand_floor = settings.sigma_floor * joint.rated_torque_nm
         self.law.stand_sigmas = 0.0 if fused.standstill is None else fused.standstill.sigmas
         self.law.limit = largest_torque_nm(joint, settings)
-        self.law.network_limit = settings.network_limit * joint.rated_torque_nm
-        self.law.fade = FADE_START * self.law.network_limit
-        self.law.inverse_fade = 1.0 / max(self.law.network_limit - self.law.fade, 1e-12)
         self.with_network = network is not None
         self.run_one = fill_network(&self.law.network, network, joint)
-        envelope = fused.envelope if network is None else network.envelope
-        self.law.with_envelope = envelope is not None
-        if envelope is not None:
-            fill_fused_trust(&self.law.trust, envelope)
+        if network is not None:
+            fill_path(&self.law.path, joint, network)
+            own = network.sigma
+            path = replace(fused.sigma, current_nm=own.current_nm, viscous_nms_per_rad=own.viscous_nms_per_rad, load=own.load)
+            fill_fusion(&self.law.view, path, fused.torsion is not None)
+            self.law.view.reference = 0.0
+            self.law.rest, self.law.outside = network.rest_nm, OUTSIDE * joint.rated_torque_nm
+        self.law.with_envelope = fused.envelope is not None
+        if fused.envelope is not None:
+            fill_fused_trust(&self.law.trust, fused.envelope)
         self.state.temperature, self.state.thermal = NAN, 0.0
         self.reset()
 
@@ -379,10 +388,12 @@ cdef class FusedEstimator(Estimator):
     def shares_past(self, FusedEstimator other):
         """Return whether the state of `other` is valid here: the parameters that offsets are estimated with are the same.
 
-        These are the observer with its torsion, the losses, and the torque per ampere. Limits, sigmas and networks may differ.
+        These are the observer with its torsion, the losses, the torque per ampere, and whether there is a network. Limits, sigmas
+        and the network itself may differ.
         """
         return (
-            self.law.offsets.corrected == other.law.offsets.corrected
+            self.law.network.used == other.law.network.used
+            and self.law.offsets.corrected == other.law.offsets.corrected
             and self.law.offsets.torque_per_ampere == other.law.offsets.torque_per_ampere
             and memcmp(&self.law.observer, &other.law.observer, sizeof(FusedObserverLaw)) == 0
             and memcmp(&self.law.loss, &other.law.loss, sizeof(AdditiveLaw)) == 0
@@ -392,6 +403,7 @@ cdef class FusedEstimator(Estimator):
         cdef FusedObserved seen
         cdef LinkLoad link
         cdef Sample corrected
+        cdef const Sample *read = x
         if self.law.offsets.corrected:
             corrected = x[0]
             corrected.link_position_rad -= self.state.offsets.link_rad
@@ -400,6 +412,11 @@ cdef class FusedEstimator(Estimator):
         self.observed = observe_fused(
             &self.law.guard, &self.state.guard, &self.law.observer, &self.state.observer, x, &seen
         )
+        if self.law.network.used and self.state.guard.running:  # trained on readings as they come
+            if self.observed:
+                follow_path(&self.law.path, &self.state.path, read, self.features)
+            else:
+                start_path(&self.law.path, &self.state.path, read, self.features)
         no_values(out, self.state.guard.status)
         if self.observed:
             update_link(
@@ -461,15 +478,23 @@ cdef class FusedEstimator(Estimator):
         cdef double rest = self.state.offsets.uncorrected_nm
         return self.law.offsets.corrected and rest * rest > FOREIGN * FOREIGN * self.law.fusion.torsion
 
+    cdef double current_path(self, bint network_wanted) noexcept nogil:
+        """Return the torque of the current path by the network [Nm]; NaN where it has no value that can be believed."""
+        cdef double correction = NAN
+        if self.law.network.used and network_wanted:
+            correction = evaluate(&self.law.network.perceptron, self.features) if self.law.network.native else self.ask()
+        return self.features[0] + correction
+
     cdef void estimate(self, const FusedObserved *seen, const Sample *x, bint network_wanted, Values *out) noexcept nogil:
         """Set `out`, whose status is the guard's, to the estimate of an observed sample."""
         cdef const FusedLaw *law = &self.law
         cdef FusedState *s = &self.state
         cdef double raw = seen.raw_nm, v = seen.joint_velocity_rad_s
-        cdef double scale, weight = 0.0, correction, size, difference, mismatch = 0.0, known = 0.0
+        cdef double scale, view, trusted = 1.0, difference, mismatch = 0.0, known = 0.0, early = 1.0, share = 1.0
+        cdef bint standing = out.status == STANDSTILL, alone = not law.fusion.with_torsion
         cdef int quadrant = quadrant_of(raw, v)
         cdef Loss loss
-        cdef Fused physics
+        cdef Fused physics, best
         if x.temperature_c != s.temperature:  # reported twice a second
             s.temperature = x.temperature_c
             s.thermal = thermal_friction(&law.loss, x.temperature_c)
@@ -482,54 +507,56 @@ cdef class FusedEstimator(Estimator):
         if law.offsets.spread > 0.0:
             known = known_nm2(&law.offsets, &s.offsets)
             reweigh(&physics, known)
-            physics.sigma *= early_factor(&law.offsets, known)
-        out.torque_nm = out.physics_nm = physics.value + seen.ahead_nm  # paths fused at the same delay, then advanced by the torsion
-        scale = law.physics_scale[quadrant]
-        self.features[0], self.features[1], self.features[2] = v, raw, seen.torsion_nm - (raw - loss.nm)
-        self.features[3], self.features[4] = seen.cos2, seen.sin2
-        self.features[5], self.features[6] = seen.cos4, seen.sin4
+            early = early_factor(&law.offsets, known)
+        out.physics_nm = physics.value + seen.ahead_nm  # paths fused at the same delay, then advanced by the torsion
         # at rest the current path is only an interval, and its distance to the torsion is no evidence against the file
-        difference = 0.0 if out.status == STANDSTILL else self.features[2]
-        if law.network.used:
-            if network_wanted:
-                correction = (evaluate(&law.network.perceptron, self.features) if law.network.native else self.ask())
-                out.network_nm = out.physics_nm + correction
-                size = fabs(correction)
-                if size <= law.network_limit:  # not so for NaN
-                    weight = fused_trust(&law.trust, v, raw, difference, x.temperature_c)
-                    if size > law.fade:
-                        weight = fmin(weight, (law.network_limit - size) * law.inverse_fade)
-                    out.torque_nm += weight * network_share(v) * correction
-                    scale += weight * (law.network_scale[quadrant] - scale)
-            if weight < 1.0:
-                degraded = True
-        elif law.with_envelope:
+        difference = 0.0 if standing else seen.torsion_nm - (raw - loss.nm)
+        if law.with_envelope:
             # the fit is known up to half the weight; the same motor torque holds more load when back-driven
             if fabs(physics.value) > law.trust.load or fused_trust(&law.trust, v, raw, difference, x.temperature_c) < 0.5:
                 degraded = True
-        out.sigma_nm = scale * physics.sigma
+        best, out.torque_nm, scale = physics, out.physics_nm, law.physics_scale[quadrant]
+        view = out.network_nm = self.current_path(network_wanted)
+        if -law.limit <= view <= law.limit:  # not so for NaN
+            trusted = path_trust(&law.path, &s.path, self.features, x.temperature_c)
+            if alone or not standing:
+                # the friction interval counts where the torsion can take over
+                best = fuse_paths(
+                    &law.view, raw, raw - view, hypot(0.0 if alone else s.half, (1.0 - trusted) * law.outside), v,
+                    seen.torsion_nm + seen.ahead_nm, seen.open_nm
+                )
+                if law.offsets.spread > 0.0:
+                    reweigh(&best, known)
+                out.torque_nm, scale, share = best.value, law.network_scale[quadrant], best.alpha * best.alpha
+            if alone and trusted < 0.5:
+                degraded = True
+        elif law.network.used:
+            degraded = True
+        out.sigma_nm = scale * (best.sigma * early)
         # an uncorrected offset counts once: as mismatch, where the file has section agreement
-        wider = disagreement(&physics, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
+        wider = disagreement(&best, 0.0 if law.agreement.used else s.offsets.uncorrected_nm)
         if wider > 0.0:
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + wider * wider)
         if law.agreement.used:
-            mismatch = mismatch_variance(&s.agreement, physics.alpha, seen.torsion_nm)
+            mismatch = mismatch_variance(&s.agreement, best.alpha, seen.torsion_nm)
             if degrades(
-                &law.agreement, &s.agreement, &s.offsets, mismatch, out.sigma_nm, physics.alpha, seen.torsion_nm
+                &law.agreement, &s.agreement, &s.offsets, mismatch, out.sigma_nm, best.alpha, seen.torsion_nm
             ):
                 s.degraded_s, degraded = LOWERED_S, True
             # an offset estimated while the paths disagree is as uncertain as they are
-            mismatch += physics.alpha * physics.alpha * fmin(known, s.agreement.mismatch)
+            mismatch += best.alpha * best.alpha * fmin(known, s.agreement.mismatch)
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + mismatch)
         if degraded:
             out.status = DEGRADED
-        elif out.status == STANDSTILL:
+        elif standing and alone and law.network.used:
+            out.sigma_nm = hypot(law.rest, 2.0 * (1.0 - trusted) * law.outside)
+        elif standing:
             out.sigma_nm = self.half_interval(seen, &physics, loss.half, wider * wider + mismatch, out.sigma_nm)
-        if law.tracked and out.status != STANDSTILL:  # measured in motion
+        if law.tracked and out.status != STANDSTILL:  # measured in motion; of the torsion, by its share
             out.sigma_nm = sqrt(
                 out.sigma_nm * out.sigma_nm
-                + law.tracking_noise
-                + law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v)
+                + share * law.tracking_noise
+                + share * law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v)
             )
         publish_within(out, law.limit)
 

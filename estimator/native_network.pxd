@@ -1,4 +1,6 @@
-"""A multilayer perceptron and the weight of a network as flat blocks; native_network.pyx."""
+"""A multilayer perceptron, the weight of a network, and inputs of ours as flat blocks; native_network.pyx."""
+
+from jtqd.estimator.observer cimport Sample
 
 cdef enum:
     FEATURES = 6  # of the paper's network (jtqd.estimator.network.FEATURES)
@@ -10,8 +12,6 @@ cdef enum:
 cdef struct PerceptronLaw:
     int layers
     int width[MOST_LAYERS + 1]  # inputs of each layer, then the outputs of the last
-    int gated  # the last outputs are gains of the inputs `gate`; 0: the one output is the answer
-    int gate[MOST_WIDTH]
     double numbers[MOST_NUMBERS]  # per layer: weights [inputs][outputs], biases [outputs]
 
 cdef double evaluate(const PerceptronLaw *law, const double *x) noexcept nogil
@@ -40,4 +40,27 @@ cdef double trust(const TrustLaw *law, const double *features, double difference
 cdef double fused_trust(
     const FusedTrustLaw *law, double velocity, double raw, double distance, double temperature
 ) noexcept nogil
-cdef double network_share(double velocity) noexcept nogil
+
+cdef enum:
+    PATH_INPUTS = 28  # of the network of the current path
+    LOW_PASSES = 4  # of the motor torque, and of the velocity
+    STOPS = 4
+
+cdef struct PathLaw:
+    double gear, inverse_gear, kt, inertia
+    double middle  # temperature where it is not known
+    double inverse_quick[3]
+    FusedTrustLaw trust
+
+cdef struct PathState:
+    double current, omega, angle  # of the last sample
+    double torque[LOW_PASSES]
+    double speed[LOW_PASSES]
+    double low[STOPS]
+    double high[STOPS]
+    double quick  # largest part of its limits that quickness had, fading
+
+cdef int fill_path(PathLaw *law, joint, network) except -1
+cdef void start_path(const PathLaw *law, PathState *s, const Sample *x, double *out) noexcept nogil
+cdef void follow_path(const PathLaw *law, PathState *s, const Sample *x, double *out) noexcept nogil
+cdef double path_trust(const PathLaw *law, const PathState *s, const double *inputs, double temperature) noexcept nogil

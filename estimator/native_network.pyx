@@ -2,24 +2,38 @@
 
 **Evaluation**: a perceptron with tanh, of which the daemon needs no runtime in a cycle.
 
-    h_0 = x,   h_(k+1) = tanh(h_k W_k + b_k),   y = h_last W_last + b_last          Gemm, Tanh, ..., Gemm
-    answer = y                                          the paper's network, one output
-    answer = sum over j of y_j x_(gate_j)               gated (method `fused`): gains of some of its inputs
+    h_0 = x,   h_(k+1) = tanh(h_k W_k + b_k),   answer = h_last W_last + b_last     Gemm, Tanh, ..., Gemm
 
 ONNX Runtime loads and checks the file and stays the referee: `jtqd.estimator.network.native_of` compares the two.
 
 **Weight of a network**, 1 where it alone counts and 0 where only physics does, continuous in all arguments:
 
-    network       1 inside the training range of every feature and near physics, 0 at a margin beside a range, or at the limit
+    paper's       1 inside the training range of every feature and near physics, 0 at a margin beside a range, or at the limit
                   of the distance to physics
-    fused         a table over (v, tau_raw), 1 in cells that several training runs have visited and 0 in others, bilinear
-                  between cell centres (a range per feature would count fast and heavy as known when the data has only fast or
-                  heavy); times 1 inside the training range of temperature and of |tau_t - tau_c|, falling to 0 beside it
+    envelope      of a fit and of ours: a table over (v, tau_raw), 1 in cells that several training runs have visited and 0 in
+                  others, bilinear between cell centres (a range per feature would count fast and heavy as known when the data
+                  has only fast or heavy); times 1 inside the training range of temperature and of |tau_t - tau_c|, falling to
+                  0 beside it
+
+**Ours** gives the torque of the current path without delay, from the signals of one encoder (INPUTS; table: docs/estimator.md):
+
+    tau_c = tau_r + N(x)      tau_r = G [ r/(s+r) (Kt i + J r w) - J r w ], r = 200 rad/s: motor torque less the rotor's
+
+A stop operator follows the motor angle and stops at -1 and 1; its start is unknown: it is the middle of its bounds, which meet
+after a swing of twice its travel. Low passes are exact for signals that are linear between samples (`observer`). Its trust is
+
+    w = (envelope) times 1 while acceleration, |tau_r at 800 - tau_r| and |tau_r at 50 - tau_r| are within their limits, 0 from
+        QUICK of them on; what exceeds a limit is forgotten within 0.05 s
+
+Without trust its sigma is wider by OUTSIDE of the rated torque. The value stays: the law of the joint file is worse there.
 """
 
-from libc.math cimport INFINITY, NAN, copysign, fabs, fmax, fmin, isnan
+from libc.math cimport INFINITY, NAN, copysign, cos, fabs, fmax, fmin, isfinite, isnan, sin, sqrt, tanh
 from libc.stdint cimport uint64_t
 from libc.string cimport memset
+
+from jtqd.estimator.fusion cimport fading
+from jtqd.estimator.observer cimport Hold, filtered, hold
 
 from typing import Final
 
@@ -30,9 +44,6 @@ from jtqd.estimator.joint import MAX_CELLS
 if MAX_CELLS + 2 > MOST_CELLS:
     raise ImportError(f"{MAX_CELLS} cells may be in an envelope, the compiled map has room for {MOST_CELLS - 2}")
 
-SLOW_RAD_S: Final = 0.05
-FAST_RAD_S: Final = 0.2
-"""The fused network fades in between these speeds: at lower ones a wave of the motor angle looks like an offset."""
 FADE_START: Final = 0.75
 """Part of the network's limit from which it fades into physics; at the limit only physics is used."""
 TEMPERATURE_MARGIN_K: Final = 1.0
@@ -40,7 +51,6 @@ TEMPERATURE_MARGIN_K: Final = 1.0
 DISTANCE_MARGIN: Final = 0.25
 """The same of the distance between torsion and current, as a part of its range."""
 
-cdef double SLOW = SLOW_RAD_S, FAST = FAST_RAD_S, INVERSE_RANGE = 1.0 / (FAST_RAD_S - SLOW_RAD_S)
 cdef double PER_KELVIN = 1.0 / TEMPERATURE_MARGIN_K
 
 # The hyperbolic tangent -----------------------------------------------------------------------------------------------
@@ -103,8 +113,7 @@ cdef double evaluate(const PerceptronLaw *law, const double *x) noexcept nogil:
     cdef const double *h = x
     cdef const double *numbers = &law.numbers[0]
     cdef double *y = layer[0]
-    cdef double answer = 0.0
-    cdef int k, n, m, inputs, outputs = 0
+    cdef int k, m, inputs, outputs
     for k in range(law.layers):
         inputs, outputs = law.width[k], law.width[k + 1]
         y = layer[k & 1]
@@ -120,29 +129,24 @@ cdef double evaluate(const PerceptronLaw *law, const double *x) noexcept nogil:
             for m in range(outputs):
                 y[m] = tanh_of(y[m])
         h = y
-    if not law.gated:
-        return y[0]
-    for m in range(outputs):
-        answer += y[m] * x[law.gate[m]]
-    return answer
+    return y[0]
 
 
 cdef class Perceptron:
-    """A perceptron of `layers`, each (weights [inputs, outputs], biases [outputs]); gate: inputs that the outputs are gains of.
+    """A perceptron of `layers`, each (weights [inputs, outputs], biases [outputs]); the last has one output.
 
     Raises ValueError for layers that do not fit together, or that are too large for the block (`fits`).
     """
 
-    def __init__(self, layers, gate=None):
+    def __init__(self, layers):
         widths = [layers[0][0].shape[0], *(w.shape[1] for w, _ in layers)]
         if not self.fits(layers):
             raise ValueError(f"found a perceptron of widths {widths}, too large for native evaluation")
         for (w, b), inputs, outputs in zip(layers, widths, widths[1:], strict=False):
             if w.shape != (inputs, outputs) or b.shape != (outputs,):
                 raise ValueError(f"found weights {w.shape} and biases {b.shape} after {inputs} inputs")
-        answers = 1 if gate is None else len(gate)
-        if widths[-1] != answers:
-            raise ValueError(f"found {widths[-1]} outputs, expected {answers}")
+        if widths[-1] != 1:
+            raise ValueError(f"found {widths[-1]} outputs, expected 1")
         self.law.layers = len(layers)
         numbers = np.concatenate([part.astype(np.float64).ravel() for layer in layers for part in layer])
         cdef const double[::1] flat = numbers
@@ -151,11 +155,6 @@ cdef class Perceptron:
             self.law.numbers[k] = flat[k]
         for n, width in enumerate(widths):
             self.law.width[n] = width
-        self.law.gated = gate is not None
-        for n, at in enumerate(gate or ()):
-            if not 0 <= at < widths[0]:
-                raise ValueError(f"found gate {at}, expected one of {widths[0]} inputs")
-            self.law.gate[n] = at
 
     @staticmethod
     def fits(layers):
@@ -235,25 +234,7 @@ def network_weights(low, high, double margin, double limit_nm, features, differe
     return np.array([trust(&law, &x[k, 0], difference[k]) for k in range(x.shape[0])])
 
 
-# Weight of a fused network -------------------------------------------------------------------------------------------
-
-cdef double network_share(double v) noexcept nogil:
-    """Return the fused network's share at this speed, 0 to 1."""
-    cdef double a = fabs(v)
-    if a >= FAST:
-        return 1.0
-    return (a - SLOW) * INVERSE_RANGE if a > SLOW else 0.0
-
-
-def network_shares(velocity_rad_s):
-    cdef const double[::1] v = np.ascontiguousarray(velocity_rad_s, np.float64)
-    out = np.empty(len(v))
-    cdef double[::1] to = out
-    cdef Py_ssize_t k
-    for k in range(v.shape[0]):
-        to[k] = network_share(v[k])
-    return out
-
+# Envelope of a fit and of a network of the current path -----------------------------------------------------------------
 
 cdef int fill_fused_trust(FusedTrustLaw *law, envelope) except -1:
     rows = envelope.known
@@ -313,3 +294,100 @@ def envelope_weights(envelope, velocity_rad_s, raw_nm, distance_nm=0.0, temperat
     if temperature_c is None:
         law.with_temperature = False
     return np.array([fused_trust(&law, x[0, k], x[1, k], x[2, k], x[3, k]) for k in range(x.shape[1])])
+
+
+# The network of the current path ---------------------------------------------------------------------------------------
+
+TORQUE_RAD_S: Final = (200.0, 800.0, 50.0, 10.0)
+VELOCITY_RAD_S: Final = (50.0, 10.0, 2.0, 100.0)  # the last is that of the acceleration
+DIRECTION_RAD_S: Final = 0.03
+TRAVELS_RAD: Final = (0.02, 0.07, 0.25, 0.8)  # a fixed grid, that belongs to no joint
+INPUTS: Final = tuple(
+    "torque_nm torque_800_nm torque_50_nm torque_10_nm current_a velocity_rad_s velocity_50_rad_s velocity_10_rad_s "
+    "velocity_2_rad_s acceleration_rad_s2 direction temperature_c sin_1_motor cos_1_motor sin_2_motor cos_2_motor sin_4_motor "
+    "cos_4_motor sin_1_link cos_1_link sin_2_link cos_2_link stop_0.02_rad stop_0.07_rad stop_0.25_rad stop_0.8_rad "
+    "stop_by_torque stop_by_velocity".split()
+)
+OUTSIDE: Final = 0.075
+"""Sigma of a value without trust, part of the rated torque: load, speed, 30 K and quick motions outside gave 2 to 7 %."""
+QUICK: Final = 1.5
+DEFAULT_C: Final = 25.0
+"""Temperature of a joint that reports none."""
+if (len(INPUTS), len(TORQUE_RAD_S), len(VELOCITY_RAD_S), len(TRAVELS_RAD)) != (PATH_INPUTS, LOW_PASSES, LOW_PASSES, STOPS):
+    raise ImportError("the inputs of the current path and their room differ in number")
+
+cdef double[LOW_PASSES] TORQUE_RATE = TORQUE_RAD_S, SPEED_RATE = VELOCITY_RAD_S
+cdef double[STOPS] INVERSE_TRAVEL = [1.0 / travel for travel in TRAVELS_RAD]
+cdef double ACCELERATION = VELOCITY_RAD_S[3], INVERSE_DIRECTION = 1.0 / DIRECTION_RAD_S
+cdef double BEYOND = QUICK, INVERSE_BEYOND = 1.0 / (QUICK - 1.0)
+
+
+cdef int fill_path(PathLaw *law, joint, network) except -1:
+    law.gear, law.inverse_gear = joint.gear_ratio, 1.0 / joint.gear_ratio
+    law.kt, law.inertia = joint.torque_constant_nm_per_a, joint.rotor_inertia_kgm2
+    fill_fused_trust(&law.trust, network.envelope)
+    law.middle = 0.5 * (law.trust.low + law.trust.high) if law.trust.with_temperature else DEFAULT_C
+    for n, limit in enumerate(network.quick):
+        law.inverse_quick[n] = 1.0 / limit
+    return 0
+
+
+cdef void _set_inputs(const PathLaw *law, PathState *s, double temperature, double *out) noexcept nogil:
+    cdef double v = s.omega * law.inverse_gear, c = cos(s.angle), d = sin(s.angle), e
+    cdef int n
+    for n in range(LOW_PASSES):
+        out[n] = law.gear * (s.torque[n] - law.inertia * TORQUE_RATE[n] * s.omega)
+        if n:
+            out[n] -= out[0]
+    out[4], out[5] = s.current, v
+    for n in range(LOW_PASSES - 1):
+        out[6 + n] = s.speed[n] - v
+    out[9] = ACCELERATION * (v - s.speed[LOW_PASSES - 1])
+    out[10] = tanh(v * INVERSE_DIRECTION)
+    out[11] = temperature if law.trust.with_temperature and isfinite(temperature) else law.middle
+    for n in range(3):  # of the angle itself: a multiple of a finite angle need not be finite
+        out[12 + 2 * n], out[13 + 2 * n] = d, c
+        e = 2.0 * c * d
+        c, d = c * c - d * d, e
+    c, d = cos(s.angle * law.inverse_gear), sin(s.angle * law.inverse_gear)
+    out[18], out[19], out[20], out[21] = d, c, 2.0 * c * d, c * c - d * d
+    for n in range(STOPS):
+        out[22 + n] = 0.5 * (s.low[n] + s.high[n])
+    out[26], out[27] = fabs(out[0]) * out[24], sqrt(fabs(v)) * out[24]
+
+
+cdef void start_path(const PathLaw *law, PathState *s, const Sample *x, double *out) noexcept nogil:
+    """Set the states of a joint in steady motion at this speed; what came before is unknown. `out`: inputs of this sample."""
+    cdef int n
+    s.current, s.omega, s.angle, s.quick = x.current_a, x.motor_velocity_rad_s, x.motor_position_rad, 0.0
+    for n in range(LOW_PASSES):
+        s.torque[n] = law.kt * s.current + law.inertia * TORQUE_RATE[n] * s.omega
+        s.speed[n] = s.omega * law.inverse_gear
+        s.low[n], s.high[n] = -1.0, 1.0
+    _set_inputs(law, s, x.temperature_c, out)
+
+
+cdef void follow_path(const PathLaw *law, PathState *s, const Sample *x, double *out) noexcept nogil:
+    """Take a sample, dt > 0 after the last; `out`: its inputs."""
+    cdef double part, now = x.motor_velocity_rad_s, way = x.motor_position_rad - s.angle
+    cdef Hold h
+    cdef int n
+    for n in range(LOW_PASSES):
+        h, part = hold(TORQUE_RATE[n], x.dt_s), law.inertia * TORQUE_RATE[n]
+        s.torque[n] = filtered(
+            &h, s.torque[n], law.kt * x.current_a + part * now, law.kt * s.current + part * s.omega
+        )
+        h, part = hold(SPEED_RATE[n], x.dt_s), way * INVERSE_TRAVEL[n]
+        s.speed[n] = filtered(&h, s.speed[n], now * law.inverse_gear, s.omega * law.inverse_gear)
+        s.low[n] = fmin(fmax(s.low[n] + part, -1.0), 1.0)
+        s.high[n] = fmin(fmax(s.high[n] + part, -1.0), 1.0)
+    s.current, s.omega, s.angle = x.current_a, now, x.motor_position_rad
+    _set_inputs(law, s, x.temperature_c, out)
+    part = fmax(fabs(out[1]) * law.inverse_quick[1], fabs(out[2]) * law.inverse_quick[2])
+    s.quick = fading(fmax(fabs(out[9]) * law.inverse_quick[0], part), s.quick, x.dt_s)
+
+
+cdef double path_trust(const PathLaw *law, const PathState *s, const double *inputs, double temperature) noexcept nogil:
+    """Return the trust, 0 to 1, at these inputs."""
+    cdef double weight = fused_trust(&law.trust, inputs[5], inputs[0], 0.0, temperature)
+    return weight * fmin(fmax((BEYOND - s.quick) * INVERSE_BEYOND, 0.0), 1.0)

@@ -1,8 +1,8 @@
 """Networks of one joint: files, metadata, and whether they fit the joint and the method.
 
-`TorqueNetwork` is that of the paper's section III (method `network`): six features in, torque out. `FusedNetwork` (method
-`fused`) gives a correction to the physics from speed, load, torsion and ripple angles. Both are ONNX files whose metadata
-say what they were trained on; how far each is trusted is in `native_network`.
+`TorqueNetwork` is that of the paper's section III (method `network`): six features in, torque out. `PathNetwork` (method
+`fused`) gives the torque of the current path from the signals of one encoder (`native_network`). Both are ONNX files whose
+metadata say what they were trained on; how far each is trusted is in `native_network`.
 
 Program `python -m jtqd.estimator.network`: checks network files by ONNX Runtime. It reads a JSON line [method, path, SHA-256
 or null] per network, and answers each with a line: the fields of a `RuntimeCheck`, or {"refused": why}.
@@ -28,7 +28,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import pairwise
-from typing import Any, ClassVar, Final, NamedTuple
+from typing import Any, ClassVar, Final, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -36,9 +36,9 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.decoder import FieldError, read
 from jtqd.estimator.errors import ConfigError, OneLineError
 from jtqd.estimator.files import read_file
-from jtqd.estimator.joint import Envelope, Joint
-from jtqd.estimator.native_network import Perceptron
-from jtqd.estimator.settings import METHODS, EstimatorSettings
+from jtqd.estimator.joint import Envelope, FusedSigma, Joint
+from jtqd.estimator.native_network import INPUTS, Perceptron
+from jtqd.estimator.settings import METHODS, EstimatorSettings, tracking_of
 from jtqd.estimator.text import sha256_hex
 
 FEATURES: Final = (
@@ -49,20 +49,9 @@ FEATURES: Final = (
     "link_velocity_rad_s",
     "efficiency_torque_nm",
 )
-FUSED_FEATURES: Final = (
-    "joint_velocity_rad_s",
-    "motor_torque_nm",
-    "torsion_minus_current_nm",
-    "cos_2_motor_filtered",
-    "sin_2_motor_filtered",
-    "cos_4_motor_filtered",
-    "sin_4_motor_filtered",
-)
-"""The last four are waves: an absolute angle, or one that turns as slowly as the link, would identify the run."""
+Section = TypeVar("Section", Envelope, FusedSigma)
 NATIVE_LIMIT: Final = 1e-6
 """Largest difference between native evaluation and ONNX Runtime, in rated torques."""
-_ZERO_PROBES: Final = 8
-"""Samples that distinguish a network whose last layer is zero from one that corrects something."""
 
 PERCEPTRON: Final = "perceptron"
 """Key of the metadata that holds the weights."""
@@ -99,10 +88,8 @@ class RuntimeCheck(NamedTuple):
     native_error_nm: float | None
 
 
-def perceptron_content(
-    layers: Sequence[tuple[FloatArray, FloatArray]], gate: Sequence[int] | None = None
-) -> dict[str, Any]:
-    """Return the JSON-able value of the metadata key PERCEPTRON; layers, gate: as `Perceptron` takes them.
+def perceptron_content(layers: Sequence[tuple[FloatArray, FloatArray]]) -> dict[str, Any]:
+    """Return the JSON-able value of the metadata key PERCEPTRON; layers: as `Perceptron` takes them.
 
     numbers: per layer weights [inputs][outputs], then biases [outputs]; little-endian float64 in base64.
     """
@@ -110,14 +97,13 @@ def perceptron_content(
     return {
         "widths": [layers[0][0].shape[0], *(len(b) for _, b in layers)],
         "numbers": [base64.b64encode(each).decode() for each in numbers],
-        "gate": None if gate is None else list(gate),
     }
 
 
 def perceptron_of(content: Any) -> Perceptron:
     """Return the network of a metadata value as `perceptron_content` writes it. Raises ValueError."""
     try:
-        widths, numbers, gate = (content[key] for key in ("widths", "numbers", "gate"))
+        widths, numbers = content["widths"], content["numbers"]
         if len(widths) < 2 or not all(isinstance(each, int) and each > 0 for each in widths):
             raise ValueError(f"found widths {str(widths)[:40]}, expected at least 2 whole numbers > 0")
         if len(numbers) != len(widths) - 1:
@@ -128,7 +114,7 @@ def perceptron_of(content: Any) -> Perceptron:
             if not np.isfinite(values).all():
                 raise ValueError("found a value that is not finite")
             layers.append((values[:-outputs].reshape(inputs, outputs), values[-outputs:]))
-        return Perceptron(layers, gate)
+        return Perceptron(layers)
     except (TypeError, KeyError, IndexError, OverflowError, binascii.Error) as error:
         raise ValueError(f"found no layers as 'jtq train' writes them ({error})") from None
 
@@ -334,14 +320,12 @@ def _perceptron_in(graph: Any, constants: Mapping[str, Any]) -> dict[str, Any] |
     """
     operators = [node.op_type for node in graph.node]
     count = operators.count("Gemm")
-    plain = ["Gemm", "Tanh"] * (count - 1) + ["Gemm"]
     layers: Any = [(constants.get(f"W{n}"), constants.get(f"b{n}")) for n in range(count)]
-    if operators not in (plain, [*plain, "MatMul", "Mul", "MatMul"]) or not all(
+    if operators != ["Gemm", "Tanh"] * (count - 1) + ["Gemm"] or not all(
         isinstance(each, np.ndarray) and each.dtype == np.float64 for layer in layers for each in layer
     ):
         return None
-    gate = None if operators == plain else constants["pick"].argmax(axis=0).tolist()
-    return perceptron_content(layers, gate)
+    return perceptron_content(layers)
 
 
 def _numbers(metadata: Mapping[str, Any], key: str, count: int, name: str) -> tuple[float, ...]:
@@ -465,17 +449,17 @@ class TorqueNetwork(Network):
         self.sigma_nm: Final = float(sigma)
 
 
-class FusedNetwork(Network):
-    """Network of method `fused`: `run_one` gives the correction of the physics.
+class PathNetwork(Network):
+    """Network of method `fused`: `run_one` gives the torque of the current path less the motor's (`native_network`).
 
-    Metadata besides those of `Network`: input_low and input_high (range of the training data per feature), envelope
-    (`Envelope`), sigma_scale (4, quadrants in QUADRANTS' order, factor on the physics' standard deviation where the network
-    is in charge). `corrects`: False where the correction is 0 everywhere (share 0: the file holds envelope and calibration
-    only).
+    Metadata besides those of `Network`: input_low and input_high (range of the training data per input), envelope
+    (`Envelope`), sigma (`FusedSigma` of the current path, and the factors on sigma of the estimate), rest_nm (half width of
+    the interval of one encoder at rest), quick (largest acceleration [rad/s^2], |tau_r at 800 rad/s - tau_r| and
+    |tau_r at 50 rad/s - tau_r| [Nm]).
     """
 
-    features = FUSED_FEATURES
-    keys = ("input_low", "input_high", "envelope", "sigma_scale", "joint", "data_sha256")
+    features = INPUTS
+    keys = ("input_low", "input_high", "envelope", "sigma", "rest_nm", "quick", "joint", "data_sha256")
 
     def __init__(
         self,
@@ -484,23 +468,25 @@ class FusedNetwork(Network):
         check: RuntimeCheck | None = None,
     ) -> None:
         super().__init__(source, sha256, check)
-        try:
-            self.envelope: Final = read(Envelope, self.metadata["envelope"])
-        except FieldError as error:
+        self.envelope: Final = self._section(Envelope, "envelope")
+        self.sigma: Final = self._section(FusedSigma, "sigma")
+        self.rest_nm, *quick = self.numbers("rest_nm", 1) + self.numbers("quick", 3)
+        self.quick: Final = tuple(quick)
+        if min(self.rest_nm, *quick) <= 0.0:
             raise self.error(
-                f"metadata 'envelope': {f'{error.key}: ' if error.key else ''}{error.problem}{error.others}"
-            ) from None
-        a, b, c, d = self.numbers("sigma_scale", 4)
-        if min(a, b, c, d) <= 0.0:
-            raise self.error(f"metadata 'sigma_scale': found {[a, b, c, d]}, expected numbers > 0")
-        self.sigma_scale: Final = (a, b, c, d)
-        low, high = (np.array(self.numbers(key, len(FUSED_FEATURES))) for key in self.keys[:2])
-        probes = low + np.linspace(0.05, 0.95, _ZERO_PROBES)[:, None] * (high - low)
-        self.corrects: Final = any(self.run_one(*probe) != 0.0 for probe in probes.tolist())
+                f"metadata 'rest_nm', 'quick': found {[self.rest_nm, *quick]}, expected numbers > 0"
+            )
+
+    def _section(self, kind: type[Section], key: str) -> Section:
+        try:
+            return read(kind, self.metadata[key])
+        except FieldError as error:
+            where = f"{error.key}: " if error.key else ""
+            raise self.error(f"metadata '{key}': {where}{error.problem}{error.others}") from None
 
 
-AnyNetwork = TorqueNetwork | FusedNetwork
-_KINDS: Final[dict[str, type[AnyNetwork]]] = {kind.__name__: kind for kind in (TorqueNetwork, FusedNetwork)}
+AnyNetwork = TorqueNetwork | PathNetwork
+_KINDS: Final[dict[str, type[AnyNetwork]]] = {kind.__name__: kind for kind in (TorqueNetwork, PathNetwork)}
 
 
 def load_network(
@@ -564,6 +550,11 @@ def check_fit(joint: Joint, settings: EstimatorSettings, network: object, estima
         raise error(f"found a network of method '{found}', expected one of '{settings.method}'")
     if (name := getattr(network, "joint", "")) != joint.name:
         raise error(f"found a network of joint '{name}', expected one of '{joint.name}'")
+    if method.torsion_of(joint) is not None and tracking_of(joint, settings) is None:
+        raise error(
+            "found a network of the current path, which has no delay, and a torsion with one; expected "
+            "estimator.track_torsion and fused.tracking of the joint file"
+        )
 
 
 def main() -> int:

@@ -1,5 +1,7 @@
 """Observers and their guard: parameters, states, outputs; the equations stand in observer.pyx."""
 
+from libc.math cimport expm1
+
 from jtqd.estimator.losses cimport MOST_NODES, FrictionLaw
 
 cdef struct Sample:
@@ -77,6 +79,20 @@ cdef struct GuardLaw:
 cdef struct GuardState:
     bint running, standing
     int status
+
+cdef struct Hold:
+    double a, b0, b1, decay  # decay: 1 - a
+
+cdef inline Hold hold(double rate, double dt) noexcept nogil:
+    """Return the coefficients of one step dt > 0 of a first-order hold; expm1 keeps tiny steps exact."""
+    cdef double x = rate * dt
+    cdef double decay = -expm1(-x)
+    cdef double share = decay / x
+    cdef double a = 1.0 - decay
+    return Hold(a, 1.0 - share, share - a, decay)
+
+cdef inline double filtered(const Hold *h, double z, double now, double last) noexcept nogil:
+    return h.a * z + h.b0 * now + h.b1 * last
 
 cdef int fill_observer(ObserverLaw *law, joint, settings) except -1
 cdef int fill_fused_observer(FusedObserverLaw *law, joint, torsion, settings) except -1

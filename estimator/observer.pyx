@@ -66,23 +66,6 @@ def columns(*arrays):
 
 # First-order hold -----------------------------------------------------------------------------------------------------
 
-cdef struct Hold:
-    double a, b0, b1, decay  # decay: 1 - a
-
-
-cdef Hold _hold(double rate, double dt) noexcept nogil:
-    """Return the coefficients of one step dt > 0; expm1 keeps tiny steps exact."""
-    cdef double x = rate * dt
-    cdef double decay = -expm1(-x)
-    cdef double share = decay / x
-    cdef double a = 1.0 - decay
-    return Hold(a, 1.0 - share, share - a, decay)
-
-
-cdef inline double _filtered(const Hold *h, double z, double now, double last) noexcept nogil:
-    return h.a * z + h.b0 * now + h.b1 * last
-
-
 def low_pass(values, dt_s, double bandwidth_rad_s):
     """Return values [n] through g/(s+g), exact for values linear between samples.
 
@@ -98,8 +81,8 @@ def low_pass(values, dt_s, double bandwidth_rad_s):
         raise ValueError(f"found {x.shape[0]} values and {dt.shape[0]} steps, expected as many")
     for k in range(1, x.shape[0]):
         if dt[k] > 0.0:
-            h = _hold(bandwidth_rad_s, dt[k])
-            z[k] = _filtered(&h, z[k - 1], x[k], x[k - 1])
+            h = hold(bandwidth_rad_s, dt[k])
+            z[k] = filtered(&h, z[k - 1], x[k], x[k - 1])
     return out
 
 
@@ -124,8 +107,8 @@ cdef double follow_reference(Reference *r, double rate, double max_gap, double d
     if now != now:
         return NAN
     if r.since <= max_gap:
-        h = _hold(rate, r.since)
-        r.z = _filtered(&h, r.z, now, r.last)
+        h = hold(rate, r.since)
+        r.z = filtered(&h, r.z, now, r.last)
         r.settled += r.since
     else:
         r.z, r.settled = now, 0.0
@@ -170,14 +153,14 @@ cdef void _start(const ObserverLaw *law, ObserverState *s, const Sample *x, Obse
 
 
 cdef void _step(const ObserverLaw *law, ObserverState *s, const Sample *x, Observed *out) noexcept nogil:
-    cdef Hold h = _hold(law.rate, x.dt_s)
+    cdef Hold h = hold(law.rate, x.dt_s)
     cdef double spin = law.inertia_rate * x.motor_velocity_rad_s
     cdef double u = x.current_a * law.kt + spin
     cdef double v = x.motor_velocity_rad_s * law.inverse_gear
     cdef double friction = friction_torque(&law.friction, v)
-    s.z = _filtered(&h, s.z, u, s.u)
-    s.z_v = _filtered(&h, s.z_v, v, s.v)
-    s.z_friction = _filtered(&h, s.z_friction, friction, s.friction)
+    s.z = filtered(&h, s.z, u, s.u)
+    s.z_v = filtered(&h, s.z_v, v, s.v)
+    s.z_friction = filtered(&h, s.z_friction, friction, s.friction)
     s.u, s.v, s.friction = u, v, friction
     cdef double decay = h.decay if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
     s.link_velocity += decay * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)
@@ -393,7 +376,7 @@ cdef void _delay_torsion(const FusedObserverLaw *law, FusedObserverState *s, con
     tracked has no delay: r = 0.
     """
     cdef double early = out.torsion_nm
-    s.torsion_z = _filtered(h, s.torsion_z, early, s.torsion)
+    s.torsion_z = filtered(h, s.torsion_z, early, s.torsion)
     s.torsion = early
     out.torsion_nm = s.torsion_z + law.torsion_share * (early - s.torsion_z)
     out.ahead_nm = early - out.torsion_nm
@@ -466,10 +449,10 @@ cdef void _start_fused(const FusedObserverLaw *law, FusedObserverState *s, const
 
 
 cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const Sample *x, FusedObserved *out) noexcept nogil:
-    cdef Hold h = _hold(law.rate, x.dt_s)
+    cdef Hold h = hold(law.rate, x.dt_s)
     cdef Inputs now = _inputs(law, x)
-    s.z.u = _filtered(&h, s.z.u, now.u, s.last.u)
-    s.z.v = _filtered(&h, s.z.v, now.v, s.last.v)
+    s.z.u = filtered(&h, s.z.u, now.u, s.last.u)
+    s.z.v = filtered(&h, s.z.v, now.v, s.last.v)
     cdef Hold own
     cdef double damped
     if law.tracking > 0.0:
@@ -486,16 +469,16 @@ cdef void _step_fused(const FusedObserverLaw *law, FusedObserverState *s, const 
         s.d_moved = (now.d - s.last.d) / x.dt_s
         damped = law.damping * s.d_rate
     else:
-        own = _hold(law.torsion_rate, x.dt_s) if law.apart else h
-        s.z.d = _filtered(&own, s.z.d, now.d, s.last.d)
+        own = hold(law.torsion_rate, x.dt_s) if law.apart else h
+        s.z.d = filtered(&own, s.z.d, now.d, s.last.d)
         damped = law.damping * (s.z.d - s.d) / x.dt_s
-    s.z.cos1 = _filtered(&h, s.z.cos1, now.cos1, s.last.cos1)
-    s.z.sin1 = _filtered(&h, s.z.sin1, now.sin1, s.last.sin1)
-    s.z.cos2 = _filtered(&h, s.z.cos2, now.cos2, s.last.cos2)
-    s.z.sin2 = _filtered(&h, s.z.sin2, now.sin2, s.last.sin2)
-    s.z.cos4 = _filtered(&h, s.z.cos4, now.cos4, s.last.cos4)
-    s.z.sin4 = _filtered(&h, s.z.sin4, now.sin4, s.last.sin4)
-    s.z.direction = _filtered(&h, s.z.direction, now.direction, s.last.direction)
+    s.z.cos1 = filtered(&h, s.z.cos1, now.cos1, s.last.cos1)
+    s.z.sin1 = filtered(&h, s.z.sin1, now.sin1, s.last.sin1)
+    s.z.cos2 = filtered(&h, s.z.cos2, now.cos2, s.last.cos2)
+    s.z.sin2 = filtered(&h, s.z.sin2, now.sin2, s.last.sin2)
+    s.z.cos4 = filtered(&h, s.z.cos4, now.cos4, s.last.cos4)
+    s.z.sin4 = filtered(&h, s.z.sin4, now.sin4, s.last.sin4)
+    s.z.direction = filtered(&h, s.z.direction, now.direction, s.last.direction)
     s.last = now
     cdef double decay = h.decay if law.link_rate == law.rate else -expm1(-law.link_rate * x.dt_s)
     s.link_velocity += decay * ((x.link_position_rad - s.link) / x.dt_s - s.link_velocity)

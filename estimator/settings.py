@@ -64,7 +64,7 @@ METHODS: Final[Mapping[str, Method]] = {
         "ours",
         "FusedEstimator",
         ("fused",),
-        network="FusedNetwork",
+        network="PathNetwork",
         network_ending=".fused.onnx",
         with_torsion=True,
         sigma_has_floor=False,
@@ -84,7 +84,7 @@ class EstimatorSettings:
     bandwidth_rad_s: g of the observer, group delay 1/g; torsion_bandwidth_rad_s: g_t of the torsion of method
     `fused`, at least g, None for g; link_bandwidth_rad_s: of the link velocity;
     standstill_velocity_rad_s: joint side, entered below it, left above twice it; max_gap_s: longer steps
-    restart; envelope_margin: part of each feature's span over which the network fades out; network_limit,
+    restart; envelope_margin: part of each feature's span over which the paper's network fades out; network_limit,
     sigma_floor, torque_limit: parts of the rated torque (largest trusted difference between network and
     physics, sigma that nothing undercuts, largest believable torque); friction_uncertainty: standard
     deviation of friction as a part of it; load_uncertainty: of the classical observer, which knows no
@@ -144,14 +144,15 @@ def tracking_of(joint: Joint, settings: EstimatorSettings) -> Tracking | None:
     return None if tracking is None or tracking.wave_rad_s is None else tracking
 
 
-def bandwidth_of(joint: Joint, settings: EstimatorSettings) -> float:
-    """Return the bandwidth of a joint's estimate [rad/s]; infinite where the torsion is tracked, without delay.
+def bandwidth_of(joint: Joint, settings: EstimatorSettings, *, network: bool = False) -> float:
+    """Return the bandwidth of a joint's estimate [rad/s]; infinite where it has no delay.
 
-    Every path of an estimator passes g/(s+g), whose group delay at low frequency is 1/g (`observer`). An estimate from
-    torsion is as old as its torsion path with bandwidth g_t, every other one as old as the motor path. The sensor is
-    compared through the same filter (`observer.low_pass`, `observer.reference_of`).
+    network: the joint has one. Without delay are a torsion that is tracked and a network of the current path. Every other
+    path of an estimator passes g/(s+g), whose group delay at low frequency is 1/g (`observer`). An estimate from torsion
+    is as old as its torsion path with bandwidth g_t, every other one as old as the motor path. The sensor is compared
+    through the same filter (`observer.low_pass`, `observer.reference_of`).
     """
-    if tracking_of(joint, settings) is not None:
+    if tracking_of(joint, settings) is not None or (network and METHODS[settings.method].network_optional):
         return inf
     if METHODS[settings.method].torsion_of(joint) is not None:
         return settings.own_torsion_bandwidth_rad_s
@@ -164,9 +165,16 @@ def largest_torque_nm(joint: Joint, settings: EstimatorSettings) -> float:
     return settings.torque_limit * joint.rated_torque_nm if peak is None else peak
 
 
-def age_ms(joint: Joint, settings: EstimatorSettings) -> float:
-    """Return the group delay of a joint's estimate at low frequency [ms]."""
-    return 1e3 / bandwidth_of(joint, settings)
+def largest_difference_nm(joint: Joint, settings: EstimatorSettings) -> float:
+    """Return the largest difference of network and physics that is believed [Nm]; ours is a view of its own."""
+    if METHODS[settings.method].network_optional:
+        return largest_torque_nm(joint, settings)
+    return settings.network_limit * joint.rated_torque_nm
+
+
+def age_ms(joint: Joint, settings: EstimatorSettings, *, network: bool = False) -> float:
+    """Return the group delay of a joint's estimate at low frequency [ms]; arguments as `bandwidth_of`."""
+    return 1e3 / bandwidth_of(joint, settings, network=network)
 
 
 @dataclass(frozen=True, slots=True)

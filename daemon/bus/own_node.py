@@ -192,7 +192,12 @@ class OwnNode:
         for index, joint in zip(PARAMETERS, config.joints, strict=False):
             for sub, name in enumerate(JOINT_PARAMETERS, start=1):
                 of_estimate = name == "age_ms"
-                value = age_ms(joint.joint, config.estimator) if of_estimate else getattr(joint.joint, name)
+                network = joint.network is not None
+                value = (
+                    age_ms(joint.joint, config.estimator, network=network)
+                    if of_estimate
+                    else getattr(joint.joint, name)
+                )
                 store.set_number(index, sub, value)
 
 

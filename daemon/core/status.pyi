@@ -35,6 +35,7 @@ class JointSafety:
         estimator: EstimatorSettings | None = None,
         joint: Joint | None = None,
         period_ns: int = 1_000_000,
+        network: bool = False,
     ) -> None: ...
 
 def safety_of(config: Config) -> list[JointSafety]: ...

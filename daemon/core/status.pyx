@@ -41,7 +41,7 @@ from jtqd.estimator import status as st
 from jtqd.estimator.detection cimport Plausibility
 from jtqd.estimator.observer cimport Sample, follow_reference, restart_reference
 from jtqd.estimator.estimator cimport Values
-from jtqd.estimator.settings import bandwidth_of, largest_torque_nm
+from jtqd.estimator.settings import bandwidth_of, largest_difference_nm, largest_torque_nm
 
 NEEDED: Final = {st.DEGRADED: 100, st.STARTING: 1, st.OFF: 20, st.STALE: 5, st.INVALID: 50, st.DRIVE_FAULT: 100}
 """Cycles in a row that must be better before this status is left; the last of them is published already."""
@@ -225,7 +225,7 @@ class JointSafety:
         max_gap_s: that a sensor of the same age bridges.
     """
 
-    def __init__(self, settings=None, estimator=None, joint=None, period_ns=1_000_000):
+    def __init__(self, settings=None, estimator=None, joint=None, period_ns=1_000_000, network=False):
         self.settings = settings or SafetySettings()
         self.plausibility = None
         self.torque_limit_nm, self.network_limit_nm = TORQUE_RANGE_NM, INFINITY
@@ -237,10 +237,10 @@ class JointSafety:
         if joint is None or estimator is None:
             return
         rated_nm = joint.rated_torque_nm
-        self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator), estimator.max_gap_s
+        self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator, network=network), estimator.max_gap_s
         self.torque_limit_nm = min(TORQUE_RANGE_NM, largest_torque_nm(joint, estimator))
         self.sigma_limit_nm = SIGMA_LIMIT * rated_nm
-        self.network_limit_nm = estimator.network_limit * rated_nm
+        self.network_limit_nm = largest_difference_nm(joint, estimator)
         self.sensor_zero_nm = estimator.sensor_zero_nm(rated_nm)
         if self.settings.plausibility is not None:
             limits = self.settings.plausibility
@@ -249,7 +249,10 @@ class JointSafety:
 
 def safety_of(config):
     """Return the configured limits and checks of each joint."""
-    return [JointSafety(config.safety, config.estimator, each.joint, config.period_ns) for each in config.joints]
+    return [
+        JointSafety(config.safety, config.estimator, each.joint, config.period_ns, each.network is not None)
+        for each in config.joints
+    ]
 
 
 # The rules of docs/safety.md ------------------------------------------------------------------------------------------

@@ -37,7 +37,7 @@ from jtqd.drivers.own_objects import loop_cob_ids
 from jtqd.drivers.pdo import SYNC_COB_ID
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import Estimator, make_estimator
-from jtqd.estimator.network import AnyNetwork, FusedNetwork, NetworkError, RuntimeCheck, load_network
+from jtqd.estimator.network import NetworkError, RuntimeCheck, load_network
 from jtqd.estimator.settings import METHODS
 
 _PATIENCE_S = 1.0
@@ -96,16 +96,6 @@ class Stop:
         self.requested = True
 
 
-def physics_only(joint: JointConfig, network: AnyNetwork | None) -> str:
-    """Return the line for the operator where no network corrects the physics; "" where one does."""
-    if network is None or joint.network is None:
-        return f"joint {joint.number}: no network, physics only"
-    if isinstance(network, FusedNetwork) and not network.corrects:
-        name = joint.network.path.name
-        return f"joint {joint.number}: no network, physics only ({name} has the share 0: envelope and calibration only)"
-    return ""
-
-
 def check_networks(config: Config) -> list[RuntimeCheck | str | None]:
     """Have ONNX Runtime check the networks of a start in a process of its own, which has ended before the loop begins.
 
@@ -150,9 +140,8 @@ def build_estimator(
             raise NetworkError(check)
         if joint.network is not None:
             network = load_network(method, str(joint.network.path), joint.network.sha256, check)
-        note = physics_only(joint, network) if METHODS[method].network_optional else ""
-        if note and notes is not None:
-            notes.append(note)
+        if network is None and METHODS[method].network_optional and notes is not None:
+            notes.append(f"joint {joint.number}: no network, physics only")
         return make_estimator(joint.joint, config.estimator, network)
     except (ConfigError, NetworkError) as error:
         key = f"joint_{joint.number}"

@@ -114,7 +114,9 @@ class Replayer:
                 intake=self._intake,
                 snapshot=unread,
                 period_ns=config.period_ns,
-                safety=JointSafety(config.safety, model.settings, model.joint, config.period_ns),
+                safety=JointSafety(
+                    config.safety, model.settings, model.joint, config.period_ns, model.network is not None
+                ),
             )
             for n, (inputs, model) in enumerate(zip(setup.inputs, models, strict=True))
         ]
@@ -433,7 +435,10 @@ def _replay_run(
             same = identity(*compared, pdos, replayed.states_differ, network_nm=limit)
     comparisons = []
     for n, (each, model) in enumerate(zip(config.joints, models, strict=True)):
-        bandwidths = bandwidth_of(each.joint, config.estimator), bandwidth_of(model.joint, model.settings)
+        bandwidths = (
+            bandwidth_of(each.joint, config.estimator, network=each.network is not None),
+            bandwidth_of(model.joint, model.settings, network=model.network is not None),
+        )
         known = _known(run, same, n + 1)
         comparisons.append(compare(n + 1, run.joints[n], replayed.joints[n], known, bandwidths))
     return Result(

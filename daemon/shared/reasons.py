@@ -117,7 +117,7 @@ def degraded_reason(seen: JointView, network_limit_nm: float | None, zeros: Zero
     apart = abs(seen.network_nm - seen.physics_nm)
     if apart > network_limit_nm:
         return f"the network is {apart:.1f} Nm from physics, limit {network_limit_nm:.1f} Nm: physics only"
-    return "outside the network's training range: physics with a reduced share of the network"
+    return "outside the network's training range or the fit of the joint file: the network counts less, or sigma is wider"
 
 
 def _doubt(zeros: Zeros) -> str:

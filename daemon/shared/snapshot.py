@@ -143,7 +143,7 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 20
 """Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_410B  # "JTQDSTA", layout 11
+_MAGIC = 0x4A54_5144_5354_410C  # "JTQDSTA", layout 12
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH4d")
@@ -151,7 +151,7 @@ ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
-PAST_WORDS = 192
+PAST_WORDS = 216
 """Room for the state of an estimator."""
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""

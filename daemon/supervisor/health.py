@@ -35,6 +35,7 @@ from jtqd.daemon.shared.reasons import (
 from jtqd.daemon.shared.snapshot import InputView, JointView, View
 from jtqd.drivers import nmt
 from jtqd.estimator import status as st
+from jtqd.estimator.settings import largest_difference_nm
 from jtqd.estimator.status import Zeros
 
 NEAR_SIGMAS = 2.0
@@ -167,7 +168,6 @@ class Health:
         self._conditions = conditions
         names = [pdo.name for pdo in input_pdos(config)]
         temperatures = {each.node_id: each.name for each in joint_temperatures(config)}
-        limit = config.estimator.network_limit
         self._joints = []
         for n, joint in enumerate(config.joints):
             sensor, rated_nm = sensor_index(config, joint.sensor_channel), joint.joint.rated_torque_nm
@@ -180,7 +180,9 @@ class Health:
                     sensor=None if sensor is None else names[sensor],
                     sensor_node=config.sensor.node_id if sensor is not None and config.sensor else None,
                     temperature=temperatures.get(joint.node_id),
-                    network_limit_nm=None if joint.network is None else limit * rated_nm,
+                    network_limit_nm=None
+                    if joint.network is None
+                    else largest_difference_nm(joint.joint, config.estimator),
                     sensor_zero_nm=config.estimator.sensor_zero_nm(rated_nm),
                 )
             )

@@ -50,7 +50,7 @@ from jtqd.drivers.bus_load import BusLoad, BusLoadError, check_bus_load
 from jtqd.drivers.drive import tpdos_as_json
 from jtqd.drivers.frame_socket import BusError, FrameSocket, open_frame_socket
 from jtqd.drivers.object_dictionary import ObjectStore, entries_from_json
-from jtqd.estimator.settings import largest_torque_nm
+from jtqd.estimator.settings import largest_difference_nm, largest_torque_nm
 
 _WARM_UP_TIMEOUT_S = 60.0
 """Generous: a controller may load its libraries from a slow card; nothing is published meanwhile."""
@@ -201,7 +201,7 @@ def _about_joint(config: Config, number: int, names: tuple[str, ...]) -> AboutJo
         rated_torque_nm=rated,
         torque_limit_nm=largest_torque_nm(joint.joint, config.estimator),
         network=joint.network.path.name if joint.network else None,
-        network_limit_nm=config.estimator.network_limit * rated,
+        network_limit_nm=largest_difference_nm(joint.joint, config.estimator),
         inputs=names_of_inputs(config, number),
         sensor=None if sensor is None else names[sensor],
         temperature=joint.temperature is not None,

@@ -18,7 +18,7 @@ import numpy as np
 
 from jtqd.estimator.estimator import make_estimator
 from jtqd.estimator.joint import Envelope
-from jtqd.estimator.network import FusedNetwork
+from jtqd.estimator.network import PathNetwork
 from jtqd.estimator.settings import recommended
 from jtqd.estimator.text import counted
 from jtqd.sysid.evaluate.inputs import (
@@ -319,12 +319,14 @@ def _samples(estimated: Iterable[_Estimated]) -> list[Samples]:
 
 
 def _envelopes(models: Iterable[JointModels]) -> dict[int, Envelope]:
-    """Return the envelope of each joint: of the network of ours, or without one of the fit."""
+    """Return the envelope of each joint: of the fit, and without torsion of the network of the current path."""
     found = {}
     for each in models:
         network = each.networks.get(OURS)
         fitted = None if each.joint.fused is None else each.joint.fused.envelope
-        found[each.number] = network.envelope if isinstance(network, FusedNetwork) else fitted
+        found[each.number] = (
+            network.envelope if fitted is None and isinstance(network, PathNetwork) else fitted
+        )
     return {number: envelope for number, envelope in found.items() if envelope is not None}
 
 

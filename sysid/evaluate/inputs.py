@@ -312,7 +312,9 @@ def take_samples(
     runs, seen = models.estimate(time_s, columns)
     joint = models.joint
     dt = np.diff(time_s, prepend=time_s[0])
-    rates = {method: bandwidth_of(joint, settings_of(method)) for method in runs}
+    rates = {
+        method: bandwidth_of(joint, settings_of(method), network=method in models.networks) for method in runs
+    }
     sensors = {rate: low_pass(columns.torque_nm, dt, rate) for rate in {PAPERS_BANDWIDTH, *rates.values()}}
     settled = time_s - time_s[0] >= SETTLE_S
     published = settled & np.logical_and.reduce([np.isfinite(each.torque_nm) for each in runs.values()])

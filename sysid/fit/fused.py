@@ -88,15 +88,12 @@ from jtqd.sysid.fit.torsion import fit_torsion
 
 # Operating envelope ----------------------------------------------------------------------------------
 
-VELOCITY_STEP_RAD_S: Final = 0.25
 VELOCITY_STEP_SHARE: Final = 1.0 / 12.0
-"""Of the largest speed of the runs: the same 0.25 rad/s on the shipped joints (3 rad/s)."""
+"""Of the largest speed of the runs: 0.25 rad/s on the shipped joints (3 rad/s)."""
 _ROUND: Final = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 """Steps of speed, times a power of ten: readable, and independent of the noise of the fastest sample."""
-TORQUE_STEP_NM: Final = 3.0
 TORQUE_STEP_SHARE: Final = 0.075
-"""Of rated torque: the same 3 Nm on the shipped joints."""
-MARGIN_K: Final = 0.5
+"""Of rated torque: 3 Nm on the shipped joints."""
 FIT_MARGIN_K: Final = 3.0
 """A friction that is known over some days is known 3 K beyond the warmest: 2 to 3 % per kelvin of its viscous part."""
 _VISITS: Final = 20
@@ -116,13 +113,12 @@ def envelope_of(
     apart_nm: FloatArray,
     temperatures_c: Sequence[float],
     *,
-    velocity_step_rad_s: float = VELOCITY_STEP_RAD_S,
-    torque_step_nm: float = TORQUE_STEP_NM,
-    margin_k: float = MARGIN_K,
+    velocity_step_rad_s: float,
+    torque_step_nm: float,
 ) -> Envelope:
     """Return what moving samples [n] covered: cells of velocity and motor torque with enough of them, and cells between.
 
-    apart_nm: torsion less current path [n]. temperatures_c: of the runs, NaN where unknown. margin_k: known beyond them.
+    apart_nm: torsion less current path [n]. temperatures_c: of the runs, NaN where unknown.
     """
     rows = int(np.ceil(np.abs(velocity_rad_s).max() / velocity_step_rad_s)) + 1
     columns = int(np.ceil(np.abs(raw_nm).max() / torque_step_nm)) + 1
@@ -133,7 +129,7 @@ def envelope_of(
         *steps,
         _as_rows(known),
         1.25 * float(np.quantile(np.abs(apart_nm), 0.999)),
-        (min(temperatures) - margin_k, max(temperatures) + margin_k) if temperatures else None,
+        (min(temperatures) - FIT_MARGIN_K, max(temperatures) + FIT_MARGIN_K) if temperatures else None,
     )
 
 
@@ -200,25 +196,33 @@ def filled(known: Table) -> Table:
     return result
 
 
+def map_of(
+    runs: Sequence[tuple[FloatArray, FloatArray]],
+    apart_nm: FloatArray,
+    temperatures_c: Sequence[float],
+    rated_nm: float,
+) -> Envelope | None:
+    """Return what runs covered, each (velocity, motor torque) [n] in motion, others as `envelope_of`.
+
+    None where that takes a larger map than an envelope may have.
+    """
+    velocity, raw = (np.concatenate(part) for part in zip(*runs, strict=True))
+    steps = {"velocity_step_rad_s": velocity_step(velocity), "torque_step_nm": TORQUE_STEP_SHARE * rated_nm}
+    made = envelope_of(velocity, raw, apart_nm, temperatures_c, **steps)
+    large = max(len(made.known), len(made.known[0])) > MAX_CELLS - 2 * MOST_WIDER
+    return None if large else widened(made, runs)
+
+
 def fit_envelope(
     runs: Sequence[RunSignals], loss: AdditiveLoss, torsion: Torsion, rated_nm: float
 ) -> Envelope | None:
-    """Return what the runs covered; None where that takes a larger map than an envelope may have."""
+    """Return what the runs covered; None as `map_of`."""
     seen = [path_residuals(run, loss, torsion) for run in runs if run.moving.any()]
-    velocity = np.concatenate([run.velocity_rad_s for run in seen])
-    made = envelope_of(
-        velocity,
-        np.concatenate([run.raw_nm for run in seen]),
-        np.concatenate([run.apart_nm for run in seen]),
-        [run.temperature_c for run in runs],
-        velocity_step_rad_s=velocity_step(velocity),
-        torque_step_nm=TORQUE_STEP_SHARE * rated_nm,
-        margin_k=FIT_MARGIN_K,
-    )
-    if max(len(made.known), len(made.known[0])) > MAX_CELLS - 2 * MOST_WIDER:
-        return None
+    pairs = [(run.velocity_rad_s, run.raw_nm) for run in seen]
+    apart = np.concatenate([run.apart_nm for run in seen])
+    made = map_of(pairs, apart, [run.temperature_c for run in runs], rated_nm)
     load = max(float(np.abs(run.torsion_nm).max()) for run in seen)
-    return replace(widened(made, [(run.velocity_rad_s, run.raw_nm) for run in seen]), load_nm=load)
+    return None if made is None else replace(made, load_nm=load)
 
 
 # Day-to-day offsets ----------------------------------------------------------------------------------

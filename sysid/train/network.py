@@ -3,8 +3,6 @@
     y = mean_y + std_y (W_n h_n + b_n),  h_(k+1) = sigma(h_k W_k + b_k),  h_0 = (x - mean_x)/std_x
     sigma(x) = (1 - e^-x)/(1 + e^-x) = tanh(x/2), Eq. (9)
 
-With waves the last layer has one output per wave, its gain, and y = std_y sum_m g_m wave_m.
-
 The same data and seed give the same weights: one thread, deterministic algorithms, every random choice from the seed.
 One thread is also the fastest: the layers are so small that two threads mostly wait for each other.
 
@@ -89,75 +87,100 @@ class Schedule(NamedTuple):
     progress: Callable[[int, float], None] = lambda n, loss: None
 
 
+class Steps(NamedTuple):
+    """Of `descend`. used: samples of an epoch, in so many batches; knee: of a Huber loss, None for the mean square; seed: of
+    initial weights and batches.
+    """
+
+    hidden: tuple[int, ...]
+    epochs: int
+    used: int
+    batches: int
+    rate: float
+    seed: int
+    weight_decay: float = 0.0
+    knee: float | None = None
+
+
+def descend(
+    x: FloatArray, y: FloatArray, steps: Steps, after: Callable[[int, float, Any, Any], None]
+) -> list[Layer]:
+    """Return the weights of standardised inputs [n, inputs] and outputs [n], by AdamW, the rate rising and falling once.
+
+    after(number, mean loss, function of the loss of (x, y), function of the weights so far) is called after every epoch.
+    """
+    import torch
+
+    torch.set_num_threads(1)
+    torch.manual_seed(steps.seed)
+    torch.use_deterministic_algorithms(True)
+
+    def tensors(some_x: FloatArray, some_y: FloatArray) -> tuple[Any, Any]:
+        return torch.tensor(some_x, dtype=torch.float32), torch.tensor(some_y, dtype=torch.float32)[:, None]
+
+    inputs, outputs = tensors(x, y)
+    layers = [torch.nn.Linear(a, b) for a, b in pairwise((x.shape[1], *steps.hidden, 1))]
+    for layer in layers[:-1]:
+        # tanh(x/2) has slope 1/2 at zero: Xavier's gain doubles (Glorot and Bengio 2010).
+        torch.nn.init.xavier_uniform_(layer.weight, gain=2.0)
+    parameters = [parameter for layer in layers for parameter in layer.parameters()]
+    optimiser = torch.optim.AdamW(parameters, lr=steps.rate, weight_decay=steps.weight_decay)
+    rates = torch.optim.lr_scheduler.OneCycleLR(
+        optimiser,
+        max_lr=steps.rate,
+        total_steps=steps.epochs * steps.batches,
+        pct_start=0.1,
+        final_div_factor=1e3,
+    )
+
+    def loss_of(some_x: Any, some_y: Any) -> Any:
+        for layer in layers[:-1]:
+            some_x = torch.tanh(0.5 * layer(some_x))
+        found = layers[-1](some_x)
+        if steps.knee is None:
+            return torch.nn.functional.mse_loss(found, some_y)
+        return torch.nn.functional.huber_loss(found, some_y, delta=steps.knee)
+
+    def judged(some_x: FloatArray, some_y: FloatArray) -> float:
+        with torch.no_grad():
+            return float(loss_of(*tensors(some_x, some_y)))
+
+    def weights() -> list[Layer]:
+        parts = [(layer.weight.detach().numpy().T, layer.bias.detach().numpy()) for layer in layers]
+        return [(w.astype(np.float64), b.astype(np.float64)) for w, b in parts]
+
+    for n in range(steps.epochs):
+        total = 0.0
+        for part in torch.randperm(len(inputs))[: steps.used].tensor_split(steps.batches):
+            optimiser.zero_grad(set_to_none=True)
+            loss = loss_of(inputs[part], outputs[part])
+            loss.backward()
+            optimiser.step()
+            rates.step()
+            total += loss.item() * len(part)
+        after(n, total / steps.used, judged, weights)
+    return weights()
+
+
 def train(
     features: Sequence[FloatArray],
     target_nm: Sequence[FloatArray],
     schedule: Schedule,
     *,
     hidden: tuple[int, ...] = HIDDEN,
-    waves: Sequence[FloatArray] | None = None,
-    weight_decay: float = 0.0,
 ) -> Trained:
-    """Fit by AdamW in random batches, the rate rising and falling once over all iterations.
-
-    Args:
-        features, target_nm, waves: of each run, [n, inputs], [n], [n, m]. The target is the sensor's torque, or what the
-            network is to add to a physics estimate. With waves the result has no part that does not turn with them.
-        schedule: iterations, seed, progress.
-        hidden: widths of the hidden layers.
-        weight_decay: of AdamW; 0 is Adam.
-    """
-    import torch
-
-    torch.set_num_threads(1)
-    torch.manual_seed(schedule.seed)
-    torch.use_deterministic_algorithms(True)
+    """Fit the sensor's torque, target_nm [n] of each run, by features [n, inputs]; mean square error in random batches."""
     raw, target = thinned(features), thinned(target_nm)
     mean, std = raw.mean(axis=0), np.maximum(raw.std(axis=0), 1e-9)
     output_mean, output_std = float(target.mean()), max(float(target.std()), 1e-9)
-    outputs, wave = 1, None
-    if waves is not None:
-        wave = torch.tensor(thinned(waves), dtype=torch.float32)
-        output_mean, outputs = 0.0, wave.shape[1]
-    x = torch.tensor((raw - mean) / std, dtype=torch.float32)
-    y = torch.tensor((target - output_mean) / output_std, dtype=torch.float32)[:, None]
-    layers = [torch.nn.Linear(a, b) for a, b in pairwise((raw.shape[1], *hidden, outputs))]
-    for layer in layers[:-1]:
-        # tanh(x/2) has slope 1/2 at zero: Xavier's gain doubles (Glorot and Bengio 2010).
-        torch.nn.init.xavier_uniform_(layer.weight, gain=2.0)
-    parameters = [parameter for layer in layers for parameter in layer.parameters()]
-    optimiser = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=weight_decay)
-    used = min(len(x), BATCH * BATCHES)
-    batches = -(-used // BATCH)
-    rates = torch.optim.lr_scheduler.OneCycleLR(
-        optimiser,
-        max_lr=_RATE,
-        total_steps=schedule.iterations * batches,
-        pct_start=0.1,
-        final_div_factor=1e3,
-    )
-    losses = []
-    for n in range(schedule.iterations):
-        total = 0.0
-        for part in torch.randperm(len(x))[:used].tensor_split(batches):
-            optimiser.zero_grad(set_to_none=True)
-            out = x[part]
-            for layer in layers[:-1]:
-                out = torch.tanh(0.5 * layer(out))
-            out = layers[-1](out)
-            if wave is not None:
-                out = (out * wave[part]).sum(dim=1, keepdim=True)
-            loss = torch.nn.functional.mse_loss(out, y[part])
-            loss.backward()
-            optimiser.step()
-            rates.step()
-            total += loss.item() * len(part)
-        losses.append(total / used * output_std**2)
+    used, losses = min(len(raw), BATCH * BATCHES), []
+
+    def after(n: int, loss: float, *_: Any) -> None:
+        losses.append(loss * output_std**2)
         schedule.progress(n, losses[-1])
-    weights = [
-        (layer.weight.detach().numpy().T.astype(np.float64), layer.bias.detach().numpy().astype(np.float64))
-        for layer in layers
-    ]
+
+    steps = Steps(hidden, schedule.iterations, used, -(-used // BATCH), _RATE, schedule.seed)
+    weights = descend((raw - mean) / std, (target - output_mean) / output_std, steps, after)
     return Trained(weights, mean, std, output_mean, output_std, losses)
 
 
@@ -167,16 +190,13 @@ def thinned(arrays: Sequence[FloatArray]) -> FloatArray:
     return np.concatenate([each[::step] for each in arrays])
 
 
-def network_output(trained: Trained, x: FloatArray, waves: FloatArray | None = None) -> FloatArray:
-    """Return the output [n] for x [n, inputs], with waves [n, m], by Eq. (9): what the exported graph must equal."""
+def network_output(trained: Trained, x: FloatArray) -> FloatArray:
+    """Return the output [n] for x [n, inputs], by Eq. (9): what the exported graph must equal."""
     h: FloatArray = (x - trained.input_mean) / trained.input_std
     for n, (w, b) in enumerate(trained.weights):
         h = h @ w + b
         if n < len(trained.weights) - 1:
             h = (1.0 - np.exp(-h)) / (1.0 + np.exp(-h))
-    if waves is not None:
-        gated: FloatArray = trained.output_std * (h * waves).sum(axis=1)
-        return gated
     result: FloatArray = trained.output_mean + trained.output_std * h[:, 0]
     return result
 
@@ -197,53 +217,37 @@ def _folded(trained: Trained) -> list[Layer]:
     return [*((0.5 * w, 0.5 * b) for w, b in hidden), last]
 
 
-def export_network(trained: Trained, metadata: Mapping[str, Any], waves: int = 0) -> bytes:
-    """Return the ONNX file of a network; with waves its input is features and waves side by side.
+def export_network(trained: Trained, metadata: Mapping[str, Any]) -> bytes:
+    """Return the ONNX file of a network.
 
     metadata: key to JSON-able value (estimator/network.py); the weights for native evaluation are added. Raises ValueError
-    where the last layer has not one output, or not one per wave. Needs the package onnx (extra `train`).
+    where the last layer has not one output. Needs the package onnx (extra `train`).
     """
     from onnx import TensorProto, helper, numpy_helper
 
     layers = _folded(trained)
-    inputs, outputs = len(trained.input_mean), len(layers[-1][1])
-    if outputs != (waves or 1):
-        raise ValueError(f"found {outputs} outputs, expected {waves or 1}")
+    if len(layers[-1][1]) != 1:
+        raise ValueError(f"found {len(layers[-1][1])} outputs, expected 1")
     constants: dict[str, FloatArray] = {}
-    if waves:
-        w, b = layers[0]
-        layers[0] = np.vstack((w, np.zeros((waves, w.shape[1])))), b  # the waves do not enter the gains
-        constants = {
-            "pick": np.vstack((np.zeros((inputs, waves)), np.eye(waves))),
-            "sum": np.ones((waves, 1)),
-        }
     nodes, name = [], "x"
     for n, (w, b) in enumerate(layers):
         constants[f"W{n}"], constants[f"b{n}"] = w, b
         last = n == len(layers) - 1
-        gemm = "torque_nm" if last and not waves else f"g{n}"
+        gemm = "torque_nm" if last else f"g{n}"
         nodes.append(helper.make_node("Gemm", [name, f"W{n}", f"b{n}"], [gemm]))
-        name = gemm
         if not last:
-            name = f"h{n if waves else n + 1}"
+            name = f"h{n + 1}"
             nodes.append(helper.make_node("Tanh", [gemm], [name]))
-    if waves:
-        nodes += [
-            helper.make_node("MatMul", ["x", "pick"], ["waves"]),
-            helper.make_node("Mul", [name, "waves"], ["parts"]),
-            helper.make_node("MatMul", ["parts", "sum"], ["torque_nm"]),
-        ]
     graph = helper.make_graph(
         nodes,
-        "ripple_correction" if waves else "joint_torque",
-        [helper.make_tensor_value_info("x", TensorProto.DOUBLE, ["N", inputs + waves])],
+        "joint_torque",
+        [helper.make_tensor_value_info("x", TensorProto.DOUBLE, ["N", len(trained.input_mean)])],
         [helper.make_tensor_value_info("torque_nm", TensorProto.DOUBLE, ["N", 1])],
         [numpy_helper.from_array(np.asarray(value, np.float64), key) for key, value in constants.items()],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="jtqd")
     model.ir_version = IR_VERSION
-    gate = range(inputs, inputs + waves) if waves else None
-    values = {**metadata, PERCEPTRON: perceptron_content(layers, gate)}
+    values = {**metadata, PERCEPTRON: perceptron_content(layers)}
     helper.set_model_props(model, {key: json.dumps(value) for key, value in values.items()})
     data: bytes = model.SerializeToString()
     return data

@@ -33,7 +33,10 @@ def configured(
     directory: Path, method: str, onnx: dict[int, bytes], *, without_fused: tuple[int, ...] = (), **joint: Any
 ) -> Path:
     """bench.yaml with this method, joint files with section `fused` and these networks; `joint` adds keys to both."""
-    content = {**yaml.safe_load(shipped("bench.yaml").read_text()), "estimator": {"method": method}}
+    content = {
+        **yaml.safe_load(shipped("bench.yaml").read_text()),
+        "estimator": {"method": method, **({"track_torsion": True} if onnx and method == "fused" else {})},
+    }
     for number in (1, 2):
         file = yaml.safe_load(shipped(f"joint{number}.yaml").read_text())
         file.pop("fused", None)

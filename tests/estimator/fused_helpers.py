@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.joint import (
     AdditiveLoss,
     Agreement,
@@ -20,17 +21,20 @@ from jtqd.estimator.joint import (
     Joint,
     LossSide,
     Torsion,
+    Tracking,
 )
 from jtqd.estimator.losses import AdditiveLossModel
-from jtqd.estimator.network import FUSED_FEATURES
+from jtqd.estimator.native_network import INPUTS
 from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.estimator_helpers import Motion, SmallNetwork, joint1, motion
 
 NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)
-SIZES = (7, 16, 16, 1)
-LOW = (-3.5, -50.0, -4.0, *([-1.0] * 4))
-HIGH = (3.5, 50.0, 4.0, *([1.0] * 4))
+SIZES = (28, 16, 16, 1)
+HIGH = (50.0, 20.0, 20.0, 20.0, 8.0, 3.5, 3.0, 3.0, 3.0, 60.0, 1.0, 32.0, *([1.0] * 14), 50.0, 1.8)
+LOW = (*(-each for each in HIGH[:11]), 20.0, *(-each for each in HIGH[12:]))
 TRAINED_C = (20.0, 32.0)
+TRACKED = EstimatorSettings(method="fused", track_torsion=True)
+"""With a network the torsion has no delay either."""
 
 
 def side(seed: int, nodes: tuple[float, ...] = NODES) -> LossSide:
@@ -54,8 +58,11 @@ WIDE = FusedSigma(6.0, 3.0, 0.6, 10.5, 0.45, 4.5, SIGMA.scale)
 """30 times as wide, with the same weights: no disagreement of motions whose current and torsion have nothing in common."""
 
 
+TRACKING = Tracking(400.0, 0.08, 0.17, 160.0, 0.2)
+
+
 def fused(seed: int = 1, torsion: Torsion | None = TORSION, sigma: FusedSigma = WIDE) -> Fused:
-    return Fused(loss_of(seed), torsion, sigma)
+    return Fused(loss_of(seed), torsion, sigma, tracking=TRACKING)
 
 
 def fused_joint(seed: int = 1, torsion: Torsion | None = TORSION) -> Joint:
@@ -77,31 +84,44 @@ def patches(seed: int, temperature_c: tuple[float, float] | None = TRAINED_C) ->
     return Envelope(0.5, 6.0, table, 12.0, temperature_c)
 
 
+OWN = FusedSigma(0.3, 0.2, 0.04, 1.0, 0.0, 0.0, (0.5, 0.6, 0.7, 0.8))
+"""Of a network of the current path: 0.3 Nm, 0.2 Nms/rad, 4 % of the motor torque."""
+REST_NM, QUICK_LIMITS = 0.8, (400.0, 80.0, 80.0)
+"""Wide limits of quickness: motions of tests are rough."""
+
+
 def fused_network(seed: int = 1, noise: float = 0.4, size_nm: float = 1.0, **metadata: Any) -> SmallNetwork:
-    """7-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
+    """28-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
     rng = np.random.default_rng(seed)
     layers = tuple((noise * rng.normal(size=(m, n)), noise * rng.normal(size=n)) for m, n in pairwise(SIZES))
     values = {
-        "features": list(FUSED_FEATURES),
+        "features": list(INPUTS),
         "envelope": everywhere().to_mapping(),
-        "sigma_scale": [0.5, 0.6, 0.7, 0.8],
+        "sigma": plain_values(OWN),
+        "rest_nm": [REST_NM],
+        "quick": list(QUICK_LIMITS),
         "input_low": list(LOW),
         "input_high": list(HIGH),
         "joint": "joint1",
         "data_sha256": "cd" * 32,
     }
     kept = {key: value for key, value in (values | metadata).items() if value is not ...}
-    return SmallNetwork(layers, np.zeros(7), np.array(HIGH), 0.0, size_nm, kept)
+    return SmallNetwork(layers, np.zeros(28), np.array(HIGH), 0.0, size_nm, kept)
 
 
 class FakeNetwork:
     """A network that says what the test wants."""
 
     joint = "joint1"
-    sigma_scale = (0.5, 0.6, 0.7, 0.8)
+    sigma, rest_nm = OWN, REST_NM
 
-    def __init__(self, answer: Callable[..., float], envelope: Envelope | None = None) -> None:
-        self.answer = answer
+    def __init__(
+        self,
+        answer: Callable[..., float],
+        envelope: Envelope | None = None,
+        quick: tuple[float, float, float] = QUICK_LIMITS,
+    ) -> None:
+        self.answer, self.quick = answer, quick
         self.envelope = envelope or everywhere()
 
     def run_one(self, *x: float) -> float:

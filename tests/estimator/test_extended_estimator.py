@@ -259,7 +259,7 @@ SETS = [*([(row.name, row.parameters)] for row in LAWS), list(ALL.items())]
 @pytest.mark.parametrize("entries", SETS, ids=[*IDS, "all"])
 def test_step_by_step_is_the_whole_run(method: str, entries: list[tuple[str, dict[str, float]]]) -> None:
     joint = extended(fused_joint(), *entries)
-    network, settings = network_for(method), EstimatorSettings(method=method)
+    network, settings = network_for(method), EstimatorSettings(method=method, track_torsion=method == "fused")
     time_s, columns = faulty_run(SEED, COUNT)
     estimator = make_estimator(joint, settings, network)
     given = (
@@ -321,7 +321,9 @@ def test_reset_forgets_the_torque_and_the_filters() -> None:
 @pytest.mark.parametrize("method", METHODS)
 def test_no_float_raises(method: str) -> None:
     joint = extended(fused_joint(), *ALL.items())
-    estimator = make_estimator(joint, EstimatorSettings(method=method), network_for(method))
+    estimator = make_estimator(
+        joint, EstimatorSettings(method=method, track_torsion=method == "fused"), network_for(method)
+    )
     rng = np.random.default_rng(5)
     values = np.array(
         [0.0, -0.0, 1.0, -3.0, 1e-300, 1e30, 1e155, 1e306, -1e308, math.inf, -math.inf, math.nan]

@@ -11,11 +11,11 @@ from jtqd.estimator.decoder import decode
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator, estimate_columns, make_estimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.network import FusedNetwork, Network, TorqueNetwork, load_network
+from jtqd.estimator.network import Network, PathNetwork, TorqueNetwork, load_network
 from jtqd.estimator.run import JointColumns
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import EstimatorSettings, age_ms, recommended
 from tests.estimator.estimator_helpers import joint1, small_network
-from tests.estimator.fused_helpers import fused_joint, fused_network
+from tests.estimator.fused_helpers import TRACKED, fused_joint, fused_network
 
 FUSED = EstimatorSettings(method="fused")
 JOINT = fused_joint()
@@ -35,7 +35,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 def test_networks_of_another_joint_or_kind_are_refused() -> None:
-    ours, paper = FusedNetwork(fused_network().data), TorqueNetwork(small_network().data)
+    ours, paper = PathNetwork(fused_network().data), TorqueNetwork(small_network().data)
     table = np.arange(3) * 0.001, JointColumns(*[np.zeros(3)] * 4)
     other = "joint joint9: found a network of joint 'joint1', expected one of 'joint9'"
     for method, network, joint, words in (
@@ -49,11 +49,27 @@ def test_networks_of_another_joint_or_kind_are_refused() -> None:
         ),
         ("network", paper, replace(JOINT, name="joint9"), other),
     ):
-        settings = EstimatorSettings(method=method)
+        settings = recommended(method)
         with pytest.raises(ConfigError, match=words):
             make_estimator(joint, settings, network)
         with pytest.raises(ConfigError, match=words):
             estimate_columns(joint, settings, network, *table)
+
+
+def test_a_network_of_the_current_path_and_a_torsion_have_one_age() -> None:
+    """The network has no delay; a torsion through a low pass has one, a joint without torsion none."""
+    ours = PathNetwork(fused_network().data)
+    older = replace(JOINT, fused=replace(JOINT.fused, tracking=None))  # type: ignore[type-var]
+    one = replace(JOINT, fused=replace(JOINT.fused, torsion=None, tracking=None))  # type: ignore[type-var]
+    for joint, settings in ((JOINT, FUSED), (older, TRACKED)):
+        with pytest.raises(
+            ConfigError, match=r"found a network of the current path.*expected estimator\.track_torsion"
+        ):
+            make_estimator(joint, settings, ours)
+    assert make_estimator(one, FUSED, ours).with_network
+    assert [age_ms(one, FUSED, network=network) for network in (False, True)] == [5.0, 0.0]
+    paper = EstimatorSettings(method="network")
+    assert age_ms(one, paper, network=True) == 5.0
 
 
 def test_a_subclass_of_a_network_is_of_its_method() -> None:
@@ -75,10 +91,10 @@ def test_a_subclass_of_a_network_is_of_its_method() -> None:
 def test_the_door_gives_the_estimator_of_the_method() -> None:
     ours = load_network("fused", fused_network().data)
     paper = load_network("network", small_network().data)
-    assert isinstance(ours, FusedNetwork)
+    assert isinstance(ours, PathNetwork)
     assert isinstance(paper, TorqueNetwork)
     assert isinstance(make_estimator(JOINT, FUSED), FusedEstimator)
-    assert isinstance(make_estimator(JOINT, FUSED, ours), FusedEstimator)
+    assert isinstance(make_estimator(JOINT, TRACKED, ours), FusedEstimator)
     for method, network in (("tob", None), ("efficiency", None), ("network", paper)):
         assert isinstance(make_estimator(JOINT, EstimatorSettings(method=method), network), JointEstimator)
 

@@ -20,13 +20,14 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from jtqd.estimator import network as network_module
+from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
+from jtqd.estimator.native_network import INPUTS
 from jtqd.estimator.network import (
     FEATURES,
-    FUSED_FEATURES,
     PERCEPTRON,
-    FusedNetwork,
     NetworkError,
+    PathNetwork,
     TorqueNetwork,
     native_of,
 )
@@ -35,7 +36,16 @@ from jtqd.sysid.train.network import Trained, export_network
 from tests.estimator.estimator_helpers import HIGH, LOW, SmallNetwork, joint1, motion, small_network
 from tests.estimator.fused_helpers import HIGH as FUSED_HIGH
 from tests.estimator.fused_helpers import LOW as FUSED_LOW
-from tests.estimator.fused_helpers import everywhere, fused_joint, fused_network
+from tests.estimator.fused_helpers import (
+    OWN,
+    QUICK_LIMITS,
+    REST_NM,
+    TRACKED,
+    FakeNetwork,
+    everywhere,
+    fused_joint,
+    fused_network,
+)
 from tests.paths import ROOT
 
 Change = Callable[[onnx.ModelProto], None]
@@ -103,8 +113,8 @@ def test_one_sample_and_many_agree(kind: str) -> None:
         x = inputs(1500)
     else:
         small = fused_network(5, noise=0.8, size_nm=4.0)
-        network = FusedNetwork(small.data)
-        x = np.random.default_rng(6).uniform(FUSED_LOW, FUSED_HIGH, (1500, 7)) * 1.5
+        network = PathNetwork(small.data)
+        x = np.random.default_rng(6).uniform(FUSED_LOW, FUSED_HIGH, (1500, 28)) * 1.5
     many = network.run_many(x)
     assert np.max(np.abs(many - small.numpy(x))) < 1e-9
     assert np.max(np.abs(many - [network.run_one(*row) for row in x.tolist()])) < 1e-11
@@ -143,7 +153,7 @@ def test_weights_of_the_metadata_and_of_the_graph_are_those_that_onnx_runtime_ev
     for seed in range(4):
         for kind, small, width in (
             (TorqueNetwork, small_network(seed, noise=0.3), 6),
-            (FusedNetwork, fused_network(seed, size_nm=4.0), 7),
+            (PathNetwork, fused_network(seed, size_nm=4.0), 28),
         ):
             x = np.random.default_rng(seed).normal(size=(500, width)) * 3.0
             found = []
@@ -153,19 +163,6 @@ def test_weights_of_the_metadata_and_of_the_graph_are_those_that_onnx_runtime_ev
                 assert network.perceptron.run_many(x) == pytest.approx(network.run_many(x), abs=1e-11)
                 found.append(network.perceptron.run_many(x).tobytes())
             assert found[0] == found[1]
-
-
-def test_a_gated_network_of_the_trainer_is_read_from_either() -> None:
-    rng = np.random.default_rng(9)
-    weights = [(rng.normal(size=(3, 5)), rng.normal(size=5)), (rng.normal(size=(5, 4)), rng.normal(size=4))]
-    trained = Trained(weights, np.zeros(3), np.ones(3), 0.0, 1.0)
-    data = export_network(trained, fused_network().metadata, 4)
-    model = onnx.load_from_string(data)
-    model.metadata_props.remove(entry(model, PERCEPTRON))
-    one, other = FusedNetwork(data), FusedNetwork(model.SerializeToString())
-    assert one.check.metadata[PERCEPTRON] == other.check.metadata[PERCEPTRON]
-    assert one.check.metadata[PERCEPTRON]["gate"] == [3, 4, 5, 6]
-    assert one.native_error_nm < 1e-12
 
 
 def test_weights_as_a_list_of_doubles_are_read_too() -> None:
@@ -244,16 +241,13 @@ def test_a_foreign_graph_gives_the_same_estimates_through_onnx_runtime() -> None
 
 
 def test_a_network_that_raises_is_physics_only() -> None:
-    class Raises:
-        joint, sigma_scale, name = "joint1", (1.0,) * 4, "raises"
-        envelope = FusedNetwork(fused_network().data).envelope
-
+    class Raises(FakeNetwork):
         def run_one(self, *_: float) -> float:
             raise RuntimeError("no memory")
 
     joint, m = fused_joint(), motion(2, 2000)
-    run = FusedEstimator(joint, EstimatorSettings(method="fused"), Raises()).run(*m.arrays())  # type: ignore[arg-type]
-    alone = FusedEstimator(joint, EstimatorSettings(method="fused")).run(*m.arrays())
+    run = FusedEstimator(joint, TRACKED, Raises(lambda *_: 0.0)).run(*m.arrays())  # type: ignore[arg-type]
+    alone = FusedEstimator(joint, TRACKED).run(*m.arrays())
     assert np.array_equal(run.torque_nm, alone.torque_nm, equal_nan=True)
     assert not np.isfinite(run.network_nm).any()
 
@@ -284,14 +278,19 @@ def test_metadata_and_hash(tmp_path: Path) -> None:
     path, ours = tmp_path / "a.onnx", tmp_path / "ours.onnx"
     path.write_bytes(small_network().data)
     ours.write_bytes(fused_network().data)
-    network, fused = TorqueNetwork(path), FusedNetwork(ours)
+    network, fused = TorqueNetwork(path), PathNetwork(ours)
     assert (network.envelope_low, network.envelope_high) == (LOW, HIGH)
     assert (network.sigma_nm, network.joint, network.data_sha256) == (0.31, "joint1", "ab" * 32)
     assert TorqueNetwork(path, sha256=network.sha256.upper()).sha256 == network.sha256
     message = refused(path, sha256="0" * 64)
     assert message.startswith(f"{path}: found SHA-256 {network.sha256}, expected 000")
-    assert (fused.joint, fused.data_sha256, fused.sigma_scale) == ("joint1", "cd" * 32, (0.5, 0.6, 0.7, 0.8))
-    assert (fused.envelope, fused.name, fused.corrects) == (everywhere(), str(ours), True)
+    assert (fused.joint, fused.data_sha256, fused.sigma) == ("joint1", "cd" * 32, OWN)
+    assert (fused.envelope, fused.rest_nm, fused.quick, fused.name) == (
+        everywhere(),
+        REST_NM,
+        QUICK_LIMITS,
+        str(ours),
+    )
 
 
 def test_unreadable_and_corrupt_files(tmp_path: Path) -> None:
@@ -351,7 +350,7 @@ FUSED_KEYS = fused_network().metadata
         ),
         ("network", "data_sha256", 5, "metadata 'data_sha256': found 5"),
         *(("fused", key, ..., f"metadata '{key}': missing") for key in FUSED_KEYS),
-        ("fused", "features", list(FUSED_FEATURES)[::-1], "metadata 'features': found ['sin_4"),
+        ("fused", "features", list(INPUTS)[::-1], "metadata 'features': found ['stop_by_velocity"),
         (
             "fused",
             "envelope",
@@ -359,16 +358,28 @@ FUSED_KEYS = fused_network().metadata
             "metadata 'envelope': distance_nm: found 0",
         ),
         ("fused", "envelope", 7, "metadata 'envelope': found 7, expected a mapping"),
-        ("fused", "sigma_scale", [1.0] * 3, "found [1.0, 1.0, 1.0], expected 4 finite numbers"),
-        ("fused", "sigma_scale", [1.0, 1.0, -0.1, 1.0], "found [1.0, 1.0, -0.1, 1.0], expected numbers"),
-        ("fused", "sigma_scale", [1.0, 1.0, math.nan, 1.0], "expected 4 finite numbers"),
+        ("fused", "sigma", 7, "metadata 'sigma': found 7, expected a mapping"),
+        (
+            "fused",
+            "sigma",
+            plain_values(OWN) | {"scale": [1.0] * 3},
+            "metadata 'sigma': scale: found 3 numbers, expected a list of 4",
+        ),
+        ("fused", "sigma", plain_values(OWN) | {"scale": [1.0, 1.0, -0.1, 1.0]}, "expected 4 numbers > 0"),
+        (
+            "fused",
+            "rest_nm",
+            [0.0],
+            "metadata 'rest_nm', 'quick': found [0.0, 400.0, 80.0, 80.0], expected numbers > 0",
+        ),
+        ("fused", "quick", [1.0, 1.0], "metadata 'quick': found [1.0, 1.0], expected 3 finite numbers"),
         ("fused", "input_low", [0.0] * 8, "metadata 'input_low': found"),
         ("fused", "input_high", [*FUSED_HIGH[:8], math.inf], "metadata 'input_high': found"),
         (
             "fused",
             "input_low",
-            [9.0, *FUSED_LOW[1:]],
-            "range of joint_velocity_rad_s: found input_low 9 above input_high 3.5",
+            [90.0, *FUSED_LOW[1:]],
+            "range of torque_nm: found input_low 90 above input_high 50",
         ),
         ("fused", "joint", 1, "metadata 'joint': found 1, expected a text"),
         ("fused", "data_sha256", None, "metadata 'data_sha256': found None"),
@@ -378,7 +389,7 @@ def test_wrong_metadata(kind: str, key: str, value: object, words: str) -> None:
     if kind == "network":
         message = refused(small_network().with_metadata(**{key: value}).data)
     else:
-        message = refused(fused_network(**{key: value}).data, FusedNetwork)
+        message = refused(fused_network(**{key: value}).data, PathNetwork)
     assert message.startswith("network (bytes): ")
     assert words in message
 
@@ -390,30 +401,20 @@ def test_wrong_metadata(kind: str, key: str, value: object, words: str) -> None:
         ("sigma_nm", "[" * 100_000, "metadata 'sigma_nm': found '[[["),
         (PERCEPTRON, "7", "found no layers"),
         (PERCEPTRON, "{}", "found no layers"),
-        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["?"], "gate": null}', "found no layers"),
-        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["AAAA"], "gate": null}', "buffer size"),
+        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["?"]}', "found no layers"),
+        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["AAAA"]}', "buffer size"),
         (
             PERCEPTRON,
-            '{"widths": [6, 1], "numbers": [], "gate": null}',
+            '{"widths": [6, 1], "numbers": []}',
             "found numbers of 0 layers, expected 1",
         ),
-        (PERCEPTRON, '{"widths": [], "numbers": [], "gate": null}', "at least 2 whole numbers"),
-        (PERCEPTRON, '{"widths": [6, -1], "numbers": [""], "gate": null}', "at least 2 whole numbers"),
-        (PERCEPTRON, '{"widths": [6, 1e9], "numbers": [""], "gate": null}', "at least 2 whole numbers"),
-        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["AAAAAAAA+H8="], "gate": null}', "not finite"),
+        (PERCEPTRON, '{"widths": [], "numbers": []}', "at least 2 whole numbers"),
+        (PERCEPTRON, '{"widths": [6, -1], "numbers": [""]}', "at least 2 whole numbers"),
+        (PERCEPTRON, '{"widths": [6, 1e9], "numbers": [""]}', "at least 2 whole numbers"),
+        (PERCEPTRON, '{"widths": [6, 1], "numbers": ["AAAAAAAA+H8="]}', "not finite"),
         (
             PERCEPTRON,
-            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="], "gate": [1]}',
-            "found gate 1",
-        ),
-        (
-            PERCEPTRON,
-            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="], "gate": ["x"]}',
-            "found no layers",
-        ),
-        (
-            PERCEPTRON,
-            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="], "gate": null}',
+            '{"widths": [1, 1], "numbers": ["AAAAAAAAAAAAAAAAAAAAAA=="]}',
             "found 1 inputs, expected 6",
         ),
     ],
@@ -515,7 +516,7 @@ def test_networks_of_another_width_or_type() -> None:
     meta = small_network().metadata
     seven = export_network(Trained([(np.ones((7, 1)), np.zeros(1))], np.zeros(7), np.ones(7), 0.0, 1.0), meta)
     assert "found input 'x' of shape ['N', 7], expected ['N', 6]" in refused(seven)
-    assert "expected ['N', 7]" in refused(small_network().data, FusedNetwork)
+    assert "expected ['N', 28]" in refused(small_network().data, PathNetwork)
     assert "expected ['N', 6]" in refused(fused_network().data)
     graph = helper.make_graph(
         [helper.make_node("ReduceSum", ["x", "axes"], ["y"])],

@@ -1,9 +1,9 @@
 """Study of a network of the current path: the torque of one encoder on the four plants, with and without the network.
 
 Each plant is driven by a campaign (ordinary runs of excitation and quick ones), and judged on other days and motions. The
-network of `recipe.py` learns from 96, 24 and 12 ordinary runs and as many quick ones in proportion; its teacher is the
-torque sensor, or the fused estimate of a joint file that was fitted to 8 runs with a sensor. It is compared with
-the estimates of the joint file for one encoder and for two, fitted to the ordinary runs. Figures: RMSE against the true
+network of `sysid/train/current_path.py` learns from 96, 24 and 12 ordinary runs and as many quick ones in proportion; its
+teacher is the torque sensor, or the fused estimate of a joint file that was fitted to 8 runs with a sensor. It is compared
+with the estimates of the joint file for one encoder and for two, fitted to the ordinary runs. Figures: RMSE against the true
 torque of the same instant, % of rated, over both joints.
 
 python -m validation current_path --quick --plant typical      fewer runs
@@ -29,7 +29,7 @@ from jtqd.estimator.settings import EstimatorSettings, recommended
 from jtqd.sysid.evaluate.inputs import SETTLE_S
 from jtqd.sysid.planner.campaigns import make_plan
 from jtqd.sysid.planner.plan import Plateau, Rest, Run, Segment
-from validation.current_path.recipe import USUAL, Block, Recipe, Seen, block, estimate_nm, seen, train
+from jtqd.sysid.train.current_path import USUAL, Block, Recipe, block, estimate_nm, seen, train
 from validation.goals.identify import (
     FIT_SEED,
     FULL,
@@ -126,7 +126,7 @@ def driven(plant: PlantFile, scale: Scale, fit_seed: int, seed: int) -> Days:
 class Example:
     """One joint in one run, arrays [n]: what the network sees, the sensor, the truth, when settled, and in motion."""
 
-    known: Seen
+    known: FloatArray
     sensor_nm: FloatArray
     true_nm: FloatArray
     settled: BoolArray
@@ -134,7 +134,7 @@ class Example:
 
 
 def example(run: Driven, number: int, joint: Joint) -> Example:
-    """Return a run as the network sees it with one encoder."""
+    """Return a run as the network sees it with one encoder; joint: with section `fused`."""
     columns = run.columns(number, joint)
     assert columns.torque_nm is not None
     assert columns.motor_velocity_rad_s is not None
@@ -209,8 +209,7 @@ def trained_on(
         block(one.known, teacher, one.settled)
         for one, teacher in zip((*examples, *quick), teachers, strict=True)
     ]
-    order = np.random.default_rng(recipe.seed).permutation(len(blocks))
-    network = train([blocks[k] for k in order], recipe)
+    network = train(blocks, recipe)
     return lambda run, one: estimate_nm(network, one.known)
 
 
@@ -221,8 +220,8 @@ def methods_of(
     joint, two, teacher = files
     number = two.number
     one = fit_one_encoder(joint, number, days.ordinary)
-    ordinary = [example(run, number, joint) for run in days.ordinary]
-    quick = [example(run, number, joint) for run in days.quick]
+    ordinary = [example(run, number, two.joint) for run in days.ordinary]
+    quick = [example(run, number, two.joint) for run in days.quick]
     found: dict[str, Estimate] = {
         "without it, two encoders": lambda run, each: fused_nm(run, number, two.joint),
         "without it, one encoder": lambda run, each: one_encoder_nm(run, number, one),
@@ -252,7 +251,7 @@ def studied(scale: Scale, fit_seed: int, seed: int, recipe: Recipe, plant: Plant
     for joint, two, teacher in zip(joints, *fitted, strict=True):
         number = two.number
         examples = {
-            kind: [example(run, number, joint) for run in runs] for kind, runs in days.judging.items()
+            kind: [example(run, number, two.joint) for run in runs] for kind, runs in days.judging.items()
         }
         for name, estimate in methods_of((joint, two, teacher), days, scale, recipe).items():
             for kind, runs in days.judging.items():

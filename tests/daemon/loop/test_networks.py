@@ -21,7 +21,6 @@ from jtqd.estimator.estimator import FusedEstimator, JointEstimator
 from jtqd.estimator.network import NetworkError, RuntimeCheck
 from tests.estimator.estimator_helpers import small_network
 from tests.estimator.fused_configuration import configured, joint_of, networks
-from tests.estimator.fused_helpers import fused_network
 
 JOINTS = (1, 2)
 
@@ -59,11 +58,6 @@ def notes(config: Config) -> list[str]:
 
 def test_a_joint_that_is_its_physics_alone_is_told(tmp_path: Path) -> None:
     assert notes(load_config(None)) == [f"joint {number}: no network, physics only" for number in JOINTS]
-    nothing = {number: fused_network(joint=f"joint{number}", noise=0.0).data for number in JOINTS}
-    expected = (
-        "joint {0}: no network, physics only (n{0}.onnx has the share 0: envelope and calibration only)"
-    )
-    assert notes(load_config(configured(tmp_path, "fused", nothing))) == [expected.format(n) for n in JOINTS]
     half = load_config(configured(tmp_path, "fused", {1: networks()[1]}))
     assert notes(half) == ["joint 2: no network, physics only"]
 
@@ -98,8 +92,8 @@ def test_a_joint_without_section_fused_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("method", "kind", "found"),
     [
-        ("fused", the_papers, "found input 'x' of shape ['N', 6], expected ['N', 7]"),
-        ("network", networks, "found input 'x' of shape ['N', 7], expected ['N', 6]"),
+        ("fused", the_papers, "found input 'x' of shape ['N', 6], expected ['N', 28]"),
+        ("network", networks, "found input 'x' of shape ['N', 28], expected ['N', 6]"),
     ],
 )
 def test_a_network_of_another_method_is_named(tmp_path: Path, method: str, kind: Any, found: str) -> None:
@@ -219,7 +213,7 @@ def test_refusals_have_the_same_words(tmp_path: Path) -> None:
     for number, (bad, word) in enumerate(
         [
             (b"no model", "not a usable ONNX model"),
-            (small_network().data, "found input 'x' of shape ['N', 6], expected ['N', 7]"),
+            (small_network().data, "found input 'x' of shape ['N', 6], expected ['N', 28]"),
             (files[1], "found a network of joint 'joint1', expected one of 'joint2'"),
         ]
     ):

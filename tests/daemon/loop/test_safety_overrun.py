@@ -24,7 +24,7 @@ from jtqd.daemon.shared.cycle_record import FLAG_NETWORK_SKIPPED, RingReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.estimator import FusedEstimator, make_estimator
 from jtqd.estimator.joint import Effect
-from jtqd.estimator.network import FusedNetwork, load_network
+from jtqd.estimator.network import PathNetwork, load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import DEGRADED, STALE, VALID
 from jtqd.models.files import load_joint, shipped
@@ -45,11 +45,11 @@ from tests.estimator.estimator_helpers import small_network
 from tests.estimator.fused_configuration import joint_of, network_of
 
 PERIOD_NS = 10_000_000
-SETTINGS = EstimatorSettings(method="fused")
+SETTINGS = EstimatorSettings(method="fused", track_torsion=True)
 MS = 1_000_000
 
 
-class SlowNetwork(FusedNetwork):
+class SlowNetwork(PathNetwork):
     """The shipped network; each run takes as long as `spend_ns` says, in exact time."""
 
     def __init__(self, number: int, clock: ExactTime) -> None:
@@ -65,7 +65,7 @@ class SlowNetwork(FusedNetwork):
         self.perceptron = None  # type: ignore[misc]  # evaluated by a call, which takes its time
 
 
-SlowNetwork.__name__ = FusedNetwork.__name__  # a network fits a method by the name of its class
+SlowNetwork.__name__ = PathNetwork.__name__  # a network fits a method by the name of its class
 
 
 @pytest.fixture

@@ -76,7 +76,7 @@ class Spy:
 
 def fused(number: int) -> Estimator:
     network = load_network("fused", network_of(number))
-    return make_estimator(joint_of(number), EstimatorSettings(method="fused"), network)
+    return make_estimator(joint_of(number), EstimatorSettings(method="fused", track_torsion=True), network)
 
 
 def test_each_joint_has_its_own_from_the_cycle_of_its_frame_on(tmp_path: Path) -> None:
@@ -120,15 +120,25 @@ def test_a_temperature_changes_the_estimate_of_a_method_that_knows_it(tmp_path: 
 
 
 def test_without_one_the_joint_is_estimated_all_the_same(tmp_path: Path) -> None:
-    cycle, socket, reader = make(
-        tmp_path, lambda n: coupled(), temperatures=temperatures(), estimators=[fused(1), fused(2)]
-    )
-    turn(cycle, 30)
-    # degraded: the network's training data had temperatures, so that its share of trust is zero without one
-    assert decode(estimates(socket)[-1]).status == (3, 3)
-    joint = cr.joint_of(reader.read().records[-1], 1)
-    assert math.isnan(joint.temperature_c)
-    assert joint.input_flags == 7
+    """The network's training had temperatures: without one it is not trusted, and sigma is wider."""
+    sigmas = []
+    for name, extra in (("without", []), ("with", [tpdo3(1, 250), tpdo3(2, 250)])):
+        (tmp_path / name).mkdir()
+        script = [*coupled(), *extra]
+        cycle, socket, reader = make(
+            tmp_path / name,
+            lambda n, script=script: script,
+            temperatures=temperatures(),
+            estimators=[fused(1), fused(2)],
+        )
+        turn(cycle, 30)
+        assert decode(estimates(socket)[-1]).status == (2, 2)
+        joint = cr.joint_of(reader.read().records[-1], 1)
+        sigmas.append(joint.sigma_nm)
+        if not extra:
+            assert math.isnan(joint.temperature_c)
+            assert joint.input_flags == 7
+    assert sigmas[0] > 1.2 * sigmas[1]
 
 
 def test_it_is_kept_for_its_life_and_then_unknown(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from tests.paths import GOLDEN
 
 ROWS = 1500
 PERIOD_NS = 1_000_000
-SETTINGS = EstimatorSettings(method="fused")
+SETTINGS = EstimatorSettings(method="fused", track_torsion=True)
 
 
 class Counts:

@@ -11,9 +11,10 @@ from typing import Any, Final, TypeVar
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.decoder import plain_values
 from jtqd.estimator.estimator import quadrants
-from jtqd.estimator.joint import AdditiveLoss, Fused, FusedSigma, Joint, LossSide, Torsion
-from jtqd.estimator.network import FUSED_FEATURES
+from jtqd.estimator.joint import AdditiveLoss, Envelope, Fused, FusedSigma, Joint, LossSide, Torsion, Tracking
+from jtqd.estimator.native_network import INPUTS
 from jtqd.estimator.run import RunTable
 from jtqd.estimator.status import VALID
 from jtqd.models.files import load_joint, shipped
@@ -80,12 +81,14 @@ def simple_fused() -> Fused:
     side = LossSide((3.0, 3.0, 5.0, 9.0), (2.0,) * 4, (0.0,) * 4, 0.5)
     loss = AdditiveLoss((-40.0, 0.0, 20.0, 50.0), side, side, 0.05, 3.0, 25.0, 2.0, 0.0)
     torsion = Torsion(12000.0, 0.0, 0.0, (2.0, 4.0), (0.0, 0.0), (0.0, 0.0))
-    return Fused(loss, torsion, FusedSigma(1.0, 0.0, 0.0, 0.5, 0.0, 0.1, (1.0, 1.0, 1.0, 1.0)))
+    sigma = FusedSigma(1.0, 0.0, 0.0, 0.5, 0.0, 0.1, (1.0, 1.0, 1.0, 1.0))
+    known = Envelope(0.25, 5.0, ((1,) * 17,) * 23, 20.0, (20.0, 30.0), 60.0)
+    return Fused(loss, torsion, sigma, envelope=known, tracking=Tracking(400.0, 0.08, 0.17, 160.0, 0.2))
 
 
 def fused_network(joint: str, correction_nm: float = 0.0, **metadata: Any) -> bytes:
     """A network that always adds the same; known up to 2.875 rad/s, 42.5 Nm of motor torque, 20 to 30 degC."""
-    width = len(FUSED_FEATURES)
+    width = len(INPUTS)
     known = [[1] * 17 for _ in range(23)]
     envelope = {
         "velocity_step_rad_s": 0.25,
@@ -95,9 +98,11 @@ def fused_network(joint: str, correction_nm: float = 0.0, **metadata: Any) -> by
         "temperature_c": [20.0, 30.0],
     }
     content = {
-        "features": list(FUSED_FEATURES),
+        "features": list(INPUTS),
         "envelope": envelope,
-        "sigma_scale": [1.0] * 4,
+        "sigma": plain_values(FusedSigma(0.5, 0.0, 0.0, 1.0, 0.0, 0.0, (1.0, 1.0, 1.0, 1.0))),
+        "rest_nm": [1.0],
+        "quick": [1e6] * 3,
         "input_low": [-1.0] * width,
         "input_high": [1.0] * width,
         "joint": joint,
