@@ -236,23 +236,19 @@ class JointSafety:
             self.deviation_cycles = max(1, round(self.settings.deviation_s * 1e9 / period_ns))
         if joint is None or estimator is None:
             return
-        rated_nm = joint.rated_torque_nm
         self.bandwidth_rad_s, self.max_gap_s = bandwidth_of(joint, estimator, network=network), estimator.max_gap_s
         self.torque_limit_nm = min(TORQUE_RANGE_NM, largest_torque_nm(joint, estimator))
-        self.sigma_limit_nm = SIGMA_LIMIT * rated_nm
+        self.sigma_limit_nm = SIGMA_LIMIT * joint.rated_torque_nm
         self.network_limit_nm = largest_difference_nm(joint, estimator)
-        self.sensor_zero_nm = estimator.sensor_zero_nm(rated_nm)
+        self.sensor_zero_nm = estimator.sensor_zero_nm(joint.rated_torque_nm)
         if self.settings.plausibility is not None:
-            limits = self.settings.plausibility
-            self.plausibility = Plausibility(joint, estimator.torque_limit, limits, period_ns * 1e-9)
+            self.plausibility = Plausibility(joint, estimator.torque_limit, self.settings.plausibility, period_ns * 1e-9)
 
 
 def safety_of(config):
     """Return the configured limits and checks of each joint."""
-    return [
-        JointSafety(config.safety, config.estimator, each.joint, config.period_ns, each.network is not None)
-        for each in config.joints
-    ]
+    common = config.safety, config.estimator
+    return [JointSafety(*common, each.joint, config.period_ns, each.network is not None) for each in config.joints]
 
 
 # The rules of docs/safety.md ------------------------------------------------------------------------------------------
