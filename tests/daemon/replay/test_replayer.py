@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from array import array
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,17 +21,26 @@ from jtqd.daemon.replay.logged import SAMPLE, Pdo, decode, offsets, read_runs
 from jtqd.daemon.replay.rows import CycleRows, fields
 from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.estimator.estimator import make_estimator
+from jtqd.estimator.joint import FusedSigma, Joint
 from jtqd.estimator.network import load_network
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STALE
 from tests.daemon.loop.cycle_helpers import ENABLED, PDOS, SCALE
 from tests.daemon.replay.replay_helpers import records
 from tests.estimator.fused_configuration import joint_of, network_of
+from tests.estimator.fused_helpers import SIGMA, fused
 from tests.paths import GOLDEN
 
 ROWS = 1500
 PERIOD_NS = 1_000_000
 SETTINGS = EstimatorSettings(method="fused", track_torsion=True)
+
+
+def calm(number: int) -> Joint:
+    """Joint 1 or 2 whose sigma at rest is below half of the rated torque."""
+    return replace(
+        joint_of(number), fused=fused(sigma=FusedSigma(2.0, 1.0, 0.2, 3.5, 0.15, 1.5, SIGMA.scale))
+    )
 
 
 class Counts:
@@ -45,11 +55,11 @@ def made() -> tuple[Intake, list[JointCycle]]:
         JointCycle(
             n,
             JointInputs(drive_places(2 * n), 4, temperature=n, **SCALE),
-            make_estimator(joint_of(n + 1), SETTINGS, load_network("fused", network_of(n + 1))),
+            make_estimator(calm(n + 1), SETTINGS, load_network("fused", network_of(n + 1))),
             intake=intake,
             snapshot=counts,
             period_ns=PERIOD_NS,
-            safety=JointSafety(None, SETTINGS, joint_of(n + 1), PERIOD_NS),
+            safety=JointSafety(None, SETTINGS, calm(n + 1), PERIOD_NS),
         )
         for n in (0, 1)
     ]
