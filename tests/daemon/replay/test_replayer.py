@@ -70,7 +70,7 @@ def log(seed: int) -> dict[str, Any]:
     """Inputs as a log has them; printed seed, everything that may happen to a cycle in it."""
     rng = np.random.default_rng(seed)
     speed, current = np.full((2, ROWS), 50_000), rng.integers(140, 160, (2, ROWS))
-    speed[:, 1000:1200] = 0
+    speed[:, 350:600] = rng.integers(-5000, 5000, (2, 250))
     speed[:, 1200:], current[:, 1200:] = (
         rng.integers(-60_000, 60_000, (2, 300)),
         rng.integers(-300, 300, (2, 300)),
@@ -90,7 +90,7 @@ def log(seed: int) -> dict[str, Any]:
             *[
                 part
                 for n in (0, 1)
-                for part in ((steps[n], steps[n] // 10 - 20), (speed[n], current[n], word))
+                for part in ((steps[n], steps[n] // 10 - 5), (speed[n], current[n], word))
             ],
             torque,
         ],
