@@ -1,4 +1,4 @@
-"""The campaigns that ship, efficiency, excitation and validate, for the joints of a bus that are moved together or alone.
+"""The campaigns that ship (efficiency, excitation, quick, validate), for joints of a bus that are moved together or alone.
 
 Two joints that share a channel of the torque sensor are on a towing bench, and so are those that --towing names. Every other
 joint is moved alone. Each unit has its runs one after the other.
@@ -25,7 +25,14 @@ import numpy as np
 
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.joint import Joint, MotionLimits
-from jtqd.sysid.motion.setpoints import PERIOD_S, Limits, MotionError, Setpoints
+from jtqd.sysid.motion.setpoints import (
+    PERIOD_S,
+    STEEPEST_CURRENT_A_S,
+    STEEPEST_VELOCITY_RAD_S2,
+    Limits,
+    MotionError,
+    Setpoints,
+)
 from jtqd.sysid.planner.design import (
     HARMONICS,
     SHORTEST_TRAJECTORY_S,
@@ -82,8 +89,10 @@ class Unit:
                 "no efficiency: a second joint on a towing bench must set the load (--towing A,B for two that are on one); "
                 "jtq campaign excitation moves a joint alone"
             )
+        if kind == "quick" and len(self.joints) == 1:
+            return "no quick motions: a second joint on a towing bench must set the load (--towing A,B)"
         if kind != "excitation" and not self.measured:
-            what = "efficiency" if kind == "efficiency" else "validation"
+            what = {"efficiency": "efficiency", "quick": "quick motions"}.get(kind, "validation")
             reference = "without a channel of the torque sensor, which is the reference"
             return f"no {what} {reference}; jtq campaign excitation needs none"
         return ""
@@ -296,6 +305,7 @@ MEDIUM_RAD_S: Final = 1.2
 SLOW_RAD_S: Final = 0.3
 """Most of a trajectory with this peak lies below 0.2 rad/s, where friction dominates."""
 CURRENT_A: Final = 5.0
+_QUICK_A: Final = 4.0
 JOINT_CURRENT_A: Final = 8.0
 """Of the velocity joint, by the model of the design: rated current of the bench's drives, which limit theirs at 9 A."""
 _LIMIT_SHARE: Final = 0.9
@@ -375,6 +385,39 @@ def outside_runs(
     )
     drawn = seed_of("outside", velocity_rad_s, seed)
     return _drawn_runs("outside", wanted, count, run_s, seed=drawn, joints=joints)
+
+
+def quick_runs(limits: Limits, count: int, run_s: float, *, seed: int) -> tuple[Run, ...]:
+    """Return `count` runs that are quicker than a trajectory, in turn: squares of velocity, steps of current at rest, steps
+    of current in motion. A network of the current path that has not seen such motions errs by newton metres in them.
+    """
+    most, load = _LIMIT_SHARE * limits.velocity_rad_s, min(_QUICK_A, _LIMIT_SHARE * limits.current_a)
+
+    def run(k: int) -> Run:
+        rng = np.random.default_rng(seed_of("quick", float(k), seed))
+        speed = (1.0, 0.0, 0.5)[k % 3] * float(rng.uniform(0.3, 1.0)) * min(FULL_RAD_S, most)
+        way = limits.travel_rad / max(4.0 * speed, 1e-9)
+        hold_s = round(min((float(rng.uniform(0.2, 0.8)), 0.5, 0.6)[k % 3], way), 3)
+        number = max(int(run_s / (hold_s + 0.1)), 4)
+        held: list[Segment] = []
+        velocity = current = position = 0.0
+        for n in range(number + 2):
+            turns = (
+                k % 3 == 0 or n >= number or rng.random() < 0.3 or abs(position) > 0.25 * limits.travel_rad
+            )
+            sign = -math.copysign(1.0, position or velocity) if turns else math.copysign(1.0, velocity)
+            before = velocity, current
+            velocity = sign * (speed if speed or n < number else 0.2 * most)
+            current = float(rng.uniform(-load, load))
+            ramps = (
+                abs(velocity - before[0]) / STEEPEST_VELOCITY_RAD_S2,
+                abs(current - before[1]) / STEEPEST_CURRENT_A_S,
+            )
+            held.append(Plateau(velocity, current, hold_s, math.ceil(2e3 * max(ramps)) * 1e-3))
+            position += velocity * hold_s
+        return Run(f"quick_{k + 1:02d}", 1 + k % 2, (Rest(EDGE_S, 0.0), *held, Rest(EDGE_S, 0.3)))
+
+    return tuple(map(run, range(count)))
 
 
 def _drawn_runs(
@@ -598,13 +641,15 @@ def approach(joint: int, start_rad: float, target_rad: float, limits: Limits) ->
 
 # Campaigns ------------------------------------------------------------------------------------------------------
 
-KINDS: Final = ("efficiency", "excitation", "validate")
+KINDS: Final = ("efficiency", "excitation", "quick", "validate")
 _SIZES: Final = {
     "runs": (24, 4),
     "alone runs": (12, 2),
     "hold_s": (HOLD_S, 1.0),
     "excitation seconds": (24.0, 10.0),
     "validate seconds": (12.0, 6.0),
+    "quick runs": (6, 3),
+    "quick seconds": (12.0, 6.0),
     "evaluations": (1000, 160),
 }
 """Of a campaign as in the paper, and of a quick one: every kind of run, few of each."""
@@ -652,6 +697,9 @@ def make_plan(kind: str, scale: Scale, on_progress: OnTried | None = None) -> Pl
         velocities = _QUICK_VELOCITIES if scale.quick else VELOCITIES_RAD_S
         currents = _QUICK_CURRENTS if scale.quick else None
         return Plan(kind, limits, efficiency_runs(velocities, hold_s, currents, limits.travel_rad))
+    if kind == "quick":
+        made = quick_runs(limits, scale.value("runs", kind), scale.value("seconds", kind), seed=scale.seed)
+        return Plan(kind, limits, made)
     count, seconds = scale.value("runs"), scale.value("seconds", kind)
     if kind == "validate":
         drawn = variable_runs(limits, count, seconds, seed=scale.seed, joints=scale.joints)

@@ -327,3 +327,40 @@ def test_the_tighter_limit_holds():
     assert (both.current_a, both.velocity_rad_s, both.position_rad) == (1.0, 1.5, (-1.0, 1.0))
     with pytest.raises(ConfigError, match=r"alone\.travel_rad"):
         tightest(replace(given, position_rad=(3.0, 4.0)), RANGE.limits)
+
+
+def test_quick_runs_have_squares_steps_at_rest_and_steps_in_motion():
+    """What no trajectory has: accelerations and currents near the steepest that a plan may have, in turn in three kinds."""
+    plan = make_plan("quick", Scale(runs=6, seconds=8.0, seed=3))
+    check_plan(plan)
+    assert [run.velocity_joint for run in plan.runs] == [1, 2] * 3
+    for k, run in enumerate(plan.runs):
+        points = expand(run)
+        held = [segment for segment in run.segments if isinstance(segment, Plateau)]
+        speeds = np.array([segment.velocity_rad_s for segment in held[:-2]])
+        assert 8.0 <= len(points) * 1e-3 <= 20.0
+        assert np.abs(np.diff([segment.current_a for segment in held])).max() > 2.0
+        assert np.ptp(np.abs(speeds)) < 1e-9
+        if k % 3 == 0:
+            assert (speeds[1:] == -speeds[:-1]).all()
+            assert np.abs(speeds[0]) > 0.8
+        if k % 3 == 1:
+            assert not speeds.any(), "at rest"
+            assert {np.sign(segment.velocity_rad_s) for segment in held[-2:]} == {-1.0, 1.0}
+        if k % 3 == 2:
+            assert 0.2 < np.abs(speeds[0]) <= 1.5
+            assert (speeds[1:] == speeds[:-1]).mean() > 0.4
+        steepest = np.abs(np.diff(points.velocity_rad_s)).max() * 1e3
+        assert 40.0 < steepest <= 50.0
+
+
+def test_quick_runs_keep_the_limits_and_are_the_same_with_a_seed():
+    tight = replace(DEFAULT_LIMITS, travel_rad=1.0, velocity_rad_s=1.0, current_a=3.0)
+    plan = make_plan("quick", Scale(runs=9, limits=tight))
+    check_plan(plan)
+    assert plan.runs == make_plan("quick", Scale(runs=9, limits=tight)).runs
+    assert plan.runs != make_plan("quick", Scale(runs=9, limits=tight, seed=1)).runs
+    assert len(make_plan("quick", Scale(quick=True)).runs) == 3
+    alone = units_of([None, None], False)
+    with pytest.raises(ConfigError, match="no quick motions"):
+        make_plan_of("quick", alone, [load_joint(shipped(f"joint{n}.yaml")) for n in (1, 2)], Scale())
