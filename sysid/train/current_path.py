@@ -223,7 +223,8 @@ def train_path(
             f"found {counted(len(runs), 'run')}, expected at least {FEWEST_RUNS}: standard deviations need held-out runs"
         )
     known_c = [run.columns.temperature_c for run in runs if run.columns.temperature_c is not None]
-    range_c = (np.min(known_c) - MARGIN_K, np.max(known_c) + MARGIN_K) if known_c else None
+    ends = np.array([(each.min(), each.max()) for each in known_c])
+    range_c = (float(ends.min()) - MARGIN_K, float(ends.max()) + MARGIN_K) if known_c else None
     views = [seen(joint, run.time_s, run.columns, range_c) for run in runs]
     settled = [run.time_s - run.time_s[0] >= SETTLE_S for run in runs]
     trained = train([block(*each) for each in zip(views, map(_sensor, runs), settled, strict=True)], recipe)

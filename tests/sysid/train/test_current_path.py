@@ -57,7 +57,7 @@ def a_run(seed, seconds=6.0, temperature=True):
     return PathRun(f"run{seed}", t, columns)
 
 
-RUNS = [a_run(seed) for seed in range(12)]
+RUNS = [a_run(seed, 6.0 + 0.2 * seed) for seed in range(12)]
 HASHES = {run.name: hashlib.sha256(run.name.encode()).hexdigest() for run in RUNS}
 
 
@@ -162,7 +162,7 @@ def test_runs_that_give_no_network_are_refused():
     with pytest.raises(ValueError, match="run0: found no torque_nm"):
         train_path(blind, ONE, HASHES, SHORT)
     still = [
-        replace_columns(run, motor_velocity_rad_s=np.zeros(6000), motor_position_rad=np.zeros(6000))
+        replace_columns(run, motor_velocity_rad_s=np.zeros(len(run.time_s)), motor_position_rad=np.zeros(len(run.time_s)))
         for run in RUNS
     ]
     with pytest.raises(ValueError, match="found no motion in the runs"):
