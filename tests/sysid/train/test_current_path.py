@@ -162,7 +162,9 @@ def test_runs_that_give_no_network_are_refused():
     with pytest.raises(ValueError, match="run0: found no torque_nm"):
         train_path(blind, ONE, HASHES, SHORT)
     still = [
-        replace_columns(run, motor_velocity_rad_s=np.zeros(len(run.time_s)), motor_position_rad=np.zeros(len(run.time_s)))
+        replace_columns(
+            run, motor_velocity_rad_s=np.zeros(len(run.time_s)), motor_position_rad=np.zeros(len(run.time_s))
+        )
         for run in RUNS
     ]
     with pytest.raises(ValueError, match="found no motion in the runs"):
