@@ -28,7 +28,7 @@ from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, Present, shows_at
 from jtqd.sysid.diagnosis.limits import Prior, Usage
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used
-from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.signals import JointSignals, held_by_spring
 from jtqd.sysid.diagnosis.smoothing import current_rate
 
 _MOST_STEPS: Final = 8
@@ -246,6 +246,7 @@ def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
     bent = [p for p in mine if "torsion_rad" in p.effect.needs]
     stiffness = s.joint.stiffness_nm_per_rad
     total = s.state.torque_nm + _sum(s, [p for p in mine if p not in bent], TORSION)
+    total = held_by_spring(s.joint, total, s.time_s)
     s.state.torsion_rad = total / stiffness
     if not bent:
         return

@@ -22,12 +22,12 @@ the columns is taken out of the normal equations (Fuller 1987, Measurement Error
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass
 from itertools import pairwise
 from types import MappingProxyType
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -40,6 +40,7 @@ from jtqd.sysid.diagnosis.regressors import Index
 Set = frozenset[int]
 """Numbers of entries."""
 Variances = Mapping[object, float]
+Solved = TypeVar("Solved")
 _LESS: Final = 1e-6
 _TRIED: Final = 3
 """Additions that are tried at each step, those of largest gain."""
@@ -364,9 +365,10 @@ class Equations:
         total = self.plain.sum(axis=0)
         out = copy(self)
         out.turned = np.linalg.solve(total[np.ix_(at, at)] + np.eye(len(at)), total[np.ix_(at, f)])
-        out.plain = self.plain.copy()
-        out.plain[:, :, f] -= out.plain[:, :, at] @ out.turned
-        out.plain[:, f, :] -= out.turned.T @ out.plain[:, at, :]
+        out.plain, out.noise = self.plain.copy(), self.noise.copy()
+        for each in (out.plain, out.noise):
+            each[:, :, f] -= each[:, :, at] @ out.turned
+            each[:, f, :] -= out.turned.T @ each[:, at, :]
         out._take_out(self.kappa)
         return out
 
@@ -377,8 +379,12 @@ class Equations:
 
     def sets(self, variances: Variances, chosen: Set = frozenset(), *, resembling: bool = True) -> Sets:
         """Return the sets at these variances, with the discrepancy beside a set; resembling: and what resembles any."""
-        here = self.beside(chosen)
-        gram = here._without_shared(np.sum(here._reduced(variances)[0], axis=0), variances)[0]
+
+        def marginal(e: Equations) -> FloatArray:
+            here = e.beside(chosen)
+            return here._without_shared(np.sum(here._reduced(variances)[0], axis=0), variances)[0]
+
+        gram = self._positive(marginal)
         gram = self._without_resemblance(gram, variances) if resembling else gram
         return Sets(self.entries, gram, self.noisy)
 
@@ -448,22 +454,28 @@ class Equations:
         """Return the means of each recording's nuisances beside a set with these coefficients [r, N]."""
         contrast = np.zeros(len(self._outer))
         contrast[columns_of(self.entries, chosen)], contrast[-1] = -mean, 1.0
-        keep = self.beside(chosen)._reduced(variances)[2]
+        keep = self._positive(lambda e: e.beside(chosen)._reduced(variances)[2])
         return np.array([cho_solve((lower, True), cross @ contrast) for lower, cross in keep])
 
     def expected(
-        self, chosen: Set, variances: Variances, steps: int, *, less: bool = False
+        self, chosen: Set, variances: Variances, steps: int
     ) -> tuple[dict[object, float], float, Means]:
-        """Return the variances after `steps` for a set, -2 log marginal likelihood there, and means. LinAlgError: what is
-        taken out as noise, known to its scatter, leaves no covariance; less: so much less is taken out that it leaves one.
+        """Return the variances after `steps` for a set, -2 log marginal likelihood there, and means."""
+        return self._positive(lambda e: e.beside(chosen)._expected(chosen, variances, steps))
+
+    def _positive(self, solve: Callable[[Equations], Solved]) -> Solved:
+        """Return what these equations give; noise is known to its scatter, so less of it is taken out where no covariance
+        is left.
         """
+        here = self
         while True:
             try:
-                return self.beside(chosen)._expected(chosen, variances, steps)
+                return solve(here)
             except np.linalg.LinAlgError:
-                if not less or self.kappa <= 0.0:
+                if here.kappa <= 0.0:
                     raise
-                self._take_out(0.5 * self.kappa if self.kappa > _LITTLE else 0.0)
+                here = copy(here)
+                here._take_out(0.5 * here.kappa if here.kappa > _LITTLE else 0.0)
 
     def _expected(
         self, chosen: Set, variances: Variances, steps: int

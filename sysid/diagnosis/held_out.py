@@ -93,8 +93,10 @@ def _coefficients(sets: Sets, chosen: Set) -> FloatArray:
 
 def fits_without(solution: Solution) -> list[Sets]:
     """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
-    plain = {g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.found.items()}
-    *without, everything = solution.wide.marginal(plain)
+    plain = {
+        g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.variances.items()
+    }
+    *without, everything = solution.equations.marginal(plain)
     if len(without) == 1:
         without = [everything]
     return [Sets(solution.entries, gram) for gram in (*without, everything)]

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -38,7 +37,7 @@ from jtqd.sysid.diagnosis.regressors import (
     run_sums,
     seen_in_bins,
 )
-from jtqd.sysid.diagnosis.signals import RATE_HZ, TORQUE_HZ, VALUES_HZ, Channel, JointSignals
+from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
 _TURNS: Final = 4
 _ROUNDS: Final = 3
@@ -53,7 +52,6 @@ _STATES: Final = frozenset({"current_a", "current_rate_a_s", "torsion_rad", "tor
 _SETTLING: Final = 6
 _SETTLED: Final = 0.1
 """Standard deviations: smaller changes of a coefficient are none."""
-_TORQUES: Final = frozenset({"torque_nm", "torque_rate_nm_s"})
 _STEP: Final = 0.02
 _RATES_PER_K: Final = (0.003, 0.06)
 _LEAST_SECANT: Final = 1e-3
@@ -76,9 +74,9 @@ def between(
 class Solution:
     """A set with its posterior.
 
-    entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence; values: the
-    same with all that the torques hold, for the values of the set; runs, disturbed: binned, with discrepancy among the
-    nuisances; own_means: of what each recording has of its own; wide, found: equations and variances of `values`.
+    entries: all that competed; chosen: those that are in the set; equations, variances, sets: of the evidence, at the
+    states of the set; runs, disturbed: binned, with discrepancy among the nuisances; own_means: of what each recording has
+    of its own.
     """
 
     dataset: Dataset
@@ -90,10 +88,7 @@ class Solution:
     disturbed: list[RunData]
     own_means: list[FloatArray]
     sets: Sets
-    values: Sets
     columns: int
-    wide: Equations
-    found: Mapping[object, float]
 
     def transform(self) -> FloatArray:
         """Return the weights of scaled coefficients in the library's columns [P, E]."""
@@ -103,13 +98,13 @@ class Solution:
     def covariance(self) -> FloatArray:
         """Of the set's values [q, q], with what calibrations outside of the set may be off by (JCGM 100:2008, type B)."""
         off = [e.prior.calibration and k not in self.chosen for k, e in enumerate(self.entries)]
-        wide = copy(self.wide)
+        wide = copy(self.equations)
         wide.recorded = np.maximum(wide.recorded, np.repeat(off, [e.size for e in self.entries]))
-        return wide.sets(self.found, self.chosen).fit(self.chosen).covariance
+        return wide.sets(self.variances, self.chosen).fit(self.chosen).covariance
 
     def own(self, mean: FloatArray, chosen: Set) -> FloatArray:
         """Return what each recording has of its own beside a set with these coefficients [r, N]."""
-        return self.wide.own(chosen, mean, self.found)
+        return self.equations.own(chosen, mean, self.variances)
 
 
 def transform_of(entries: Sequence[Entry], columns: int) -> FloatArray:
@@ -129,12 +124,12 @@ def recorded(entries: Sequence[Entry], step_s: float) -> FloatArray:
 
 
 class _End(NamedTuple):
-    """A set with variances of its own: -2 log marginal likelihood (inf: it has none), set, variances, means."""
+    """A set with variances of its own: -2 log marginal likelihood, set, variances, means."""
 
     score: float
     chosen: Set
     variances: Mapping[object, float]
-    means: Means | None
+    means: Means
 
 
 class _Search:
@@ -147,12 +142,8 @@ class _Search:
     def own(self, chosen: Set) -> _End:
         """Return a set with variances of its own."""
         if chosen not in self.met:
-            first = self.equations.first()
-            try:
-                variances, score, means = self.equations.expected(chosen, first, _STEPS)
-                self.met[chosen] = _End(score, chosen, variances, means)
-            except np.linalg.LinAlgError:
-                self.met[chosen] = _End(math.inf, chosen, first, None)
+            variances, score, means = self.equations.expected(chosen, self.equations.first(), _STEPS)
+            self.met[chosen] = _End(score, chosen, variances, means)
         return self.met[chosen]
 
     def best(self, starts: Sequence[Set], *, rivals: bool) -> _End:
@@ -202,20 +193,16 @@ def solve(dataset: Dataset) -> Solution:
     residuals = work.first_residuals()
     start = work.file_values()
     for turn in range(_TURNS):
-        last = turn + 1 == _TURNS
         noise = noise_of_channels(residuals, dataset.step_s, limits.FLOOR * dataset.rated_torque_nm)
         equations = work.equations(noise)
         search = _Search(equations)
         starts = [start - equations.noisy, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]
-        best = search.best(starts, rivals=last)
+        best = search.best(starts, rivals=turn + 1 == _TURNS)
         start, variances, means = best.chosen, best.variances, best.means
-        assert means is not None
-        if not last:
-            residuals = work.left(start, means)
-            work.settle(start, means.beta, noise, variances)
-    assert means is not None
-    sets = equations.sets(variances, start)
-    means, wide, found = work.values(start, means, noise, variances)
+        residuals = work.left(start, means)
+        work.settle(start, means.beta, noise, variances)
+    equations = work.equations(noise)  # at the states of the set itself
+    variances, _, means = equations.expected(start, variances, _STEPS)
     return Solution(
         dataset,
         work.entries,
@@ -225,11 +212,8 @@ def solve(dataset: Dataset) -> Solution:
         work.runs,
         work.disturbed,
         means.own,
-        sets,
-        wide.sets(found, start),
+        equations.sets(variances, start),
         work.columns,
-        wide,
-        found,
     )
 
 
@@ -243,7 +227,6 @@ class _Work:
         self.columns = dataset.candidates[-1].columns.stop if dataset.candidates else 0
         rng = np.random.default_rng(0)
         for s in (s for run in (*dataset.signals, *dataset.disturbed) for s in run):
-            s.know_torque(TORQUE_HZ, RATE_HZ)  # as the runs were binned, whatever was solved since
             set_state(s, ())
         self.runs = [replace(run, channels=dict(run.channels)) for run in dataset.runs]
         self.disturbed = binned_runs(dataset.disturbed, dataset.step_s, dataset.candidates, dataset.families)
@@ -386,19 +369,6 @@ class _Work:
                 rest = d.residual - d.regressors @ library[d.index] - d.nuisances @ total[d.families]
                 out[c].append(np.where(d.valid, rest, np.nan))
         return out
-
-    def values(
-        self, chosen: Set, means: Means, noise: Noise, variances: Mapping[object, float]
-    ) -> tuple[Means, Equations, Mapping[object, float]]:
-        """Return means and sets where the torques in the regressors hold all that the response holds: a set is found with
-        less of their noise, its values with more of what they say.
-        """
-        for s in (s for run in (*self.dataset.signals, *self.dataset.disturbed) for s in run):
-            s.know_torque(VALUES_HZ, VALUES_HZ)
-        self.settle(chosen, means.beta, noise, variances, _STATES | _TORQUES)
-        equations = self.equations(noise)
-        found, _, means = equations.expected(chosen, variances, 2, less=True)
-        return means, equations, found
 
     def settle(
         self,

@@ -9,6 +9,7 @@ has no part in the noise of the difference itself.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,6 +34,7 @@ from jtqd.sysid.diagnosis.smoothing import (
     cutoff_hz,
     described,
     first_difference,
+    known_below_hz,
     mean_ahead,
     noise_of,
     reach_of_calm,
@@ -109,6 +111,12 @@ class BaseLoss:
         return (ahead - behind) / (2.0 * wide)
 
 
+def held_by_spring(joint: Joint, torque_nm: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Return what of a torque through the gear [n] its spring holds: the rest is its damping's, D d tau/dt / K."""
+    rate = first_difference(torque_nm, time_s) / joint.stiffness_nm_per_rad
+    return torque_nm - joint.damping_nms_per_rad * rate
+
+
 class Channel(NamedTuple):
     """One balance ("motor" or "torsion") of one joint."""
 
@@ -129,11 +137,8 @@ class Line:
     unit: str = "1/rev"
 
 
-RATE_HZ: Final = 60.0
-VALUES_HZ: Final = 120.0
-"""The same where the set is known and only its values are asked for."""
-TORQUE_HZ: Final = 12.0
-"""Torques in regressors are known below this: what is quicker is noise, which the residual has too."""
+COMPUTED_HZ: Final = 12.0
+"""A torque that is computed from a motion is known below this, as its acceleration was smoothed; a measured one at least."""
 _ALL_VISIBLE: Final = Smoother(1.0)
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
@@ -188,6 +193,7 @@ class JointSignals:
     visible: Smoother = _ALL_VISIBLE
     inertial: Smoother = _ALL_VISIBLE  # of the acceleration in the regressor of an inertia
     believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
+    torque_hz: float = math.inf  # torques in regressors are known below it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
 
     @cached_property
@@ -205,13 +211,6 @@ class JointSignals:
         """Motor torque that the joint file's simulation needs for this motion and load [n], Nm joint side."""
         quick = self.state.torque_nm - self.gear_nm
         return np.asarray(self.nm_per_a * self.current_a - self.motor_nm + self.shared_nm + quick)
-
-    def know_torque(self, torque_hz: float, rate_hz: float) -> None:
-        """Let the torques that effects see be known below torque_hz, their rate below rate_hz."""
-        self.state.torque_nm = below(self.gear_nm, self.step_s, torque_hz)
-        self.state.torque_rate_nm_s = first_difference(
-            below(self.sensor_nm, self.step_s, rate_hz), self.time_s
-        )
 
     def seen(self, balance: str, x: FloatArray) -> FloatArray:
         """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
@@ -443,7 +442,7 @@ def joint_signals(  # noqa: PLR0917
     motion = _motion(time, raw, columns, joint, like)
     step = float(np.median(np.diff(time)))
     if computed and like is None:
-        motion = motion.below(TORQUE_HZ, step)
+        motion = motion.below(COMPUTED_HZ, step)
     velocity = motion.visible(motion.speed) / joint.gear_ratio
     both = raw.two_encoders(joint.gear_ratio)
     link = columns.link_position_rad
@@ -456,7 +455,9 @@ def joint_signals(  # noqa: PLR0917
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
-    slow_torque = below(gear_torque, step, TORQUE_HZ)
+    known = COMPUTED_HZ if computed else max(COMPUTED_HZ, known_below_hz(sensor, step))
+    known = like.torque_hz if like else known
+    slow_torque = below(gear_torque, step, known)
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
@@ -473,8 +474,8 @@ def joint_signals(  # noqa: PLR0917
         temperature_c=np.full(len(time), np.nan) if columns.temperature_c is None else columns.temperature_c,
         time_s=time - time[0],
         torque_nm=slow_torque,
-        torque_rate_nm_s=first_difference(below(sensor, step, RATE_HZ), time),
-        torsion_rad=slow_torque / joint.stiffness_nm_per_rad,
+        torque_rate_nm_s=first_difference(below(sensor, step, known), time),
+        torsion_rad=held_by_spring(joint, slow_torque, time) / joint.stiffness_nm_per_rad,
         torsion_rate_rad_s=np.full(len(time), np.nan),
         velocity_rad_s=velocity,
         coupling_position_rad=link if number != 2 else -link,
@@ -512,6 +513,7 @@ def joint_signals(  # noqa: PLR0917
         },
         visible=motion.visible,
         inertial=motion.inertial,
+        torque_hz=known,
         coarse=motion.coarse,
     )
 

@@ -217,6 +217,17 @@ def noise_of(x: FloatArray) -> FloatArray:
     return out
 
 
+def known_below_hz(x: FloatArray, step_s: float) -> float:
+    """Return the cutoff that leaves all of x [n], sampled every step_s, that has more power than its noise: twice the
+    highest such frequency, as a filter is not steep; 0 where there is none.
+
+    Of differences of x, so that what is slow does not leak (Welch 1967, IEEE Trans. Audio Electroacoust. 15).
+    """
+    hz, power = signal.welch(np.diff(x), 1.0 / step_s, nperseg=min(len(x) - 1, round(0.5 / step_s)))
+    white = 2.0 * step_s * float(np.mean(noise_of(x) ** 2)) * 4.0 * np.sin(np.pi * hz * step_s) ** 2
+    return 2.0 * float(hz[power > 2.0 * white].max(initial=0.0))
+
+
 def _magnitudes(x: FloatArray) -> list[BoolArray]:
     """Return masks of samples between powers of 2 and of 10; one of few samples joins the next larger, the last the one
     before.

@@ -78,8 +78,8 @@ class Judged:
 
 def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
     """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
-    mean = solution.values.fit(solution.chosen).mean
-    found = [(solution.entries[k], mean[at]) for k, at in solution.values.places(solution.chosen).items()]
+    mean = solution.sets.fit(solution.chosen).mean
+    found = [(solution.entries[k], mean[at]) for k, at in solution.sets.places(solution.chosen).items()]
     return present_effects(found), np.array([u[: len(solution.dataset.families)] for u in solution.own_means])
 
 
@@ -93,8 +93,8 @@ def judged(solution: Solution) -> list[Judged]:
     )
     imitating = recorder.sets(solution.variances, chosen)
     sizes = Sizes(fits_without(solution), chosen)
-    values = solution.values.fit(chosen)
-    places = solution.values.places(chosen)
+    values = sets.fit(chosen)
+    places = sets.places(chosen)
     out = []
     for members in sets.effects(chosen):
         found = [(solution.entries[k], values.mean[places[k]]) for k in members]
@@ -244,8 +244,8 @@ def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -
 
 def values_of(solution: Solution, j: Judged) -> dict[str, Value]:
     """Return the parameters of an effect with 95 % intervals, no narrower than what the equations simplify."""
-    fit = solution.values.fit(solution.chosen)
-    places = solution.values.places(solution.chosen)
+    fit = solution.sets.fit(solution.chosen)
+    places = solution.sets.places(solution.chosen)
     half: dict[str, float] = dict.fromkeys(j.present.values, 0.0)
     none: dict[str, float] = {}
     for k in j.members:
@@ -401,7 +401,7 @@ def _minimum(e: Entry, smallest: float) -> dict[str, Value]:
 
 def extended_effects(solution: Solution, prediction: Prediction) -> list[Present]:
     """Return the effects of the extended model with the values that predict."""
-    places = solution.values.places(prediction.chosen)
+    places = solution.sets.places(prediction.chosen)
     return present_effects([(solution.entries[k], prediction.mean[at]) for k, at in places.items()])
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy import signal
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
@@ -83,6 +84,41 @@ def runs_of(true: Joint, seed: int, count: int, rig: Rig = Rig(), loss: Loss | N
             current_a=current + rig.current_noise_a * rng.normal(size=len(t)),
             motor_position_rad=step * np.round(G * q / step),
             torque_nm=tau + rig.sensor_zero_nm + rig.sensor_noise_nm * rng.normal(size=len(t)),
+        )
+        out.append((f"run{k}", RunTable(t, {1: columns})))
+    return out
+
+
+FINE_HZ: float = 10_000.0
+"""Rate at which the spring is integrated."""
+SPRUNG = replace(ARM, stiffness_nm_per_rad=4000.0, damping_nms_per_rad=4.0, rated_torque_nm=30.0)
+"""A gear that its pendulum turns visibly, and that swings with it at 20 to 40 Hz."""
+
+
+def sprung_runs(true: Joint, seed: int, count: int, rig: Rig = Rig(sensor_noise_nm=0.02)) -> Runs:
+    """Runs with an encoder on either side of the gear's spring, K d + D d' = tau, whose load swings quickly, too."""
+    out = []
+    for k in range(count):
+        rng = np.random.default_rng([seed, k])
+        t = np.arange(0.0, rig.seconds, 1.0 / FINE_HZ)
+        q, _, _ = motion(rng, t)
+        w = 2.0 * np.pi * rng.uniform(18.0, 40.0, 3)
+        q = q + (1.2 / (rig.inertia_kgm2 * w**2)) @ np.sin(w[:, None] * t + rng.uniform(0.0, 6.0, 3)[:, None])
+        tau = rig.inertia_kgm2 * np.gradient(np.gradient(q, t), t) + rig.moment_nm * np.sin(q)
+        K, D = true.stiffness_nm_per_rad, true.damping_nms_per_rad
+        top, bottom = signal.bilinear([1.0], [D, K], FINE_HZ)
+        shaft = q + signal.lfilter(top, bottom, tau)
+        v = np.gradient(shaft, t)
+        G, loss = true.gear_ratio, friction_of(true)
+        torque = G**2 * true.rotor_inertia_kgm2 * np.gradient(v, t) + tau + loss(v, tau, G * shaft)
+        kept = slice(round(0.1 * FINE_HZ), None, round(FINE_HZ / rig.rate_hz))
+        t, noise = t[kept] - t[kept][0], rng.normal(size=(2, len(t[kept])))
+        step = 2.0 * np.pi / rig.counts
+        columns = JointColumns(
+            current_a=torque[kept] / (G * true.torque_constant_nm_per_a) + rig.current_noise_a * noise[0],
+            motor_position_rad=step * np.round(G * shaft[kept] / step),
+            link_position_rad=1e-6 * np.round(1e6 * q[kept]),
+            torque_nm=tau[kept] + rig.sensor_noise_nm * noise[1],
         )
         out.append((f"run{k}", RunTable(t, {1: columns})))
     return out

@@ -82,7 +82,7 @@ def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Soluti
         regressors = d.regressors.copy()
         regressors[:, d.index == column] = (sign * noise / float(solution.entries[k].weights[0, 0]))[:, None]
         runs.append(replace(run, channels={MOTOR1: replace(d, regressors=regressors)}))
-    wide = copy(solution.wide)
+    wide = copy(solution.equations)
     wide.grams = wide.grams.copy()
     for gram, sign in zip(wide.grams, signs, strict=True):
         left = np.zeros(len(gram))
@@ -90,7 +90,7 @@ def with_noise_entry(solution: Solution, signs: tuple[int, ...]) -> tuple[Soluti
         turn = np.eye(len(gram))
         turn[:, int(solution.sets.slices[k][0])] = sign * left
         gram[:] = turn.T @ gram @ turn
-    return replace(solution, runs=runs, disturbed=[], wide=wide, chosen=solution.chosen | {k}), k
+    return replace(solution, runs=runs, disturbed=[], equations=wide, chosen=solution.chosen | {k}), k
 
 
 def left_nm2(found: Prediction) -> float:

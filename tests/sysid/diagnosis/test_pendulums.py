@@ -27,11 +27,12 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.limits import PRIORS
 from jtqd.sysid.diagnosis.model import Solution, between, solve
-from jtqd.sysid.diagnosis.signals import TORQUE_HZ
+from jtqd.sysid.diagnosis.signals import COMPUTED_HZ
 from jtqd.sysid.diagnosis.verdict import judged, values_of
 from jtqd.sysid.runs.column_map import motion_of
 from tests.sysid.diagnosis.pendulums import (
     ARM,
+    SPRUNG,
     Rig,
     Runs,
     extended,
@@ -42,6 +43,7 @@ from tests.sysid.diagnosis.pendulums import (
     rms_error,
     runs_of,
     solved,
+    sprung_runs,
 )
 
 KT = ARM.torque_constant_nm_per_a
@@ -343,7 +345,7 @@ def test_of_a_computed_torque_channels_are_compared_as_recorded() -> None:
         usable_signals(runs, {1: ARM}, (1,), known, as_recorded=recorded)[0][0]
         for known, recorded in (({1}, False), ({1}, True), ((), False))
     )
-    assert slow.visible.slowest_hz <= TORQUE_HZ < quick.visible.slowest_hz == measured.visible.slowest_hz
+    assert slow.visible.slowest_hz <= COMPUTED_HZ < quick.visible.slowest_hz == measured.visible.slowest_hz
 
 
 # Runs of a simulation: no noise, and what the equations simplify is all that is left.
@@ -409,8 +411,8 @@ def test_outliers_are_looked_for_as_recorded_and_balances_judged_where_the_torqu
     monkeypatch.setattr(diagnosis, "solve", solution)
     rig = Rig(moment_nm=0.0, counts=2.0**22)
     found = diagnose(computed(runs_of(ARM, 5, 3, rig), rig), {1: ARM}, Scope(known_references=frozenset({1})))
-    assert seen["balance"] <= TORQUE_HZ < seen["outlier"]
-    assert any(f"below {TORQUE_HZ:.0f} Hz" in note for note in found.channel_notes)
+    assert seen["balance"] <= COMPUTED_HZ < seen["outlier"]
+    assert any(f"below {COMPUTED_HZ:.0f} Hz" in note for note in found.channel_notes)
 
 
 @pytest.mark.parametrize(("part", "constant"), [(0.23, 0.95), (0.21, 1.08)])
@@ -448,8 +450,8 @@ def test_an_iteration_that_overshoots_meets_its_fixed_point() -> None:
 def spread(solution: Solution, effect: str) -> tuple[float, float]:
     """Deviations of an entry's coefficient: of these runs alone, and with calibrations outside of the set."""
     [k] = [k for k in solution.chosen if solution.entries[k].effect.name == effect]
-    at = solution.values.places(solution.chosen)[k]
-    alone = solution.values.fit(solution.chosen).covariance
+    at = solution.sets.places(solution.chosen)[k]
+    alone = solution.sets.fit(solution.chosen).covariance
     return math.sqrt(alone[at, at][0, 0]), math.sqrt(solution.covariance[at, at][0, 0])
 
 
@@ -469,5 +471,27 @@ def test_an_interval_holds_the_gain_of_a_sensor_that_is_not_exact() -> None:
     alone, whole = spread(solution, "torque_constant")
     assert whole > 1.5 * alone
     [j] = [j for j in judged(solution) if j.present.effect.name == "torque_constant"]
-    at = solution.values.places(solution.chosen)[j.members[0]]
-    assert j.z == pytest.approx(abs(solution.values.fit(solution.chosen).mean[at][0]) / whole)
+    at = solution.sets.places(solution.chosen)[j.members[0]]
+    assert j.z == pytest.approx(abs(solution.sets.fit(solution.chosen).mean[at][0]) / whole)
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    ("key", "factor", "name"),
+    [
+        ("torque_constant_nm_per_a", 1.075, "torque_constant"),
+        ("stiffness_nm_per_rad", 1.5, "nonlinear_stiffness"),
+    ],
+)
+def test_what_a_quick_load_shows_of_motor_and_spring_has_its_own_name(
+    key: str, factor: float, name: str, seed: int
+) -> None:
+    """A torque that swings at 18 to 40 Hz is in the regressors as it is in the response, and the spring's damping holds its
+    part of it: no inertia, damping, delay or unbalance makes up for either.
+    """
+    file = replace(SPRUNG, **{key: factor * getattr(SPRUNG, key)})
+    found = diagnose(sprung_runs(SPRUNG, seed, 4), {1: file})
+    assert [(c.name, c.grade) for c in found.causes if c.matters] == [(name, "certain")], found.causes
+    value = parameter(found, name, key)
+    assert value.value == pytest.approx(getattr(SPRUNG, key), rel=0.01)
+    assert value.ci95[0] < getattr(SPRUNG, key) < value.ci95[1]

@@ -21,7 +21,7 @@ from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Present
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, SignalsError, about_zero, joint_signals
-from jtqd.sysid.diagnosis.smoothing import second_difference, smooth
+from jtqd.sysid.diagnosis.smoothing import below, known_below_hz, second_difference, smooth
 from jtqd.sysid.runs.checks import on_even_steps
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
@@ -95,6 +95,21 @@ def test_smoothing_is_centred_and_keeps_lines(samples: int) -> None:
     assert out.sum() == pytest.approx(1.0)
     assert out[30] == pytest.approx(1.0 / samples)
     assert np.flatnonzero(out > 1e-12).tolist() == list(range(31 - samples, 30 + samples))
+
+
+@pytest.mark.parametrize("highest_hz", [3.0, 30.0, 90.0])
+def test_a_cutoff_leaves_what_is_above_the_noise_of_a_signal(highest_hz: float) -> None:
+    """White noise of 0.02 over 1000 Hz, and waves of 0.2 up to a highest frequency."""
+    rng = np.random.default_rng(3)
+    t = np.arange(20_000) / 1000.0
+    waves = [
+        0.2 * np.sin(2.0 * np.pi * hz * t + rng.uniform(0.0, 6.0)) for hz in (0.6 * highest_hz, highest_hz)
+    ]
+    noise = 0.02 * rng.normal(size=len(t))
+    cutoff = known_below_hz(2.0 * np.sin(0.9 * t) + sum(waves) + noise, 1e-3)
+    assert 2.0 * highest_hz <= cutoff <= 2.0 * highest_hz + 12.0
+    assert rms(below(sum(waves), 1e-3, cutoff) - sum(waves)) < 0.02 * rms(sum(waves))
+    assert rms(below(noise, 1e-3, cutoff)) < rms(noise)
 
 
 def test_a_run_by_the_equations_leaves_nothing() -> None:

@@ -13,7 +13,7 @@ from jtqd.sysid.diagnosis.dataset import build_dataset, usable_signals
 from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Present
 from jtqd.sysid.diagnosis.regressors import contribution
-from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, held_by_spring, joint_signals
 from jtqd.sysid.diagnosis.unexplained import contributions, remaining
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1, candidates, rigid_run
@@ -35,9 +35,12 @@ def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for
         set_state(s, [Present("nonlinear_stiffness", 1, values)])
         d = s.state.torsion_rad
         spring = values["stiffness_nm_per_rad"] * d + values["cubic_nm_per_rad3"] * d**3
-        assert spring == pytest.approx(s.state.torque_nm, abs=1e-3 * PLAIN.rated_torque_nm)
+        damper = PLAIN.damping_nms_per_rad * np.gradient(d, s.time_s)
+        assert spring + damper == pytest.approx(s.state.torque_nm, abs=2e-3 * PLAIN.rated_torque_nm)
     set_state(s, ())
-    assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / stiffness)
+    d = s.state.torsion_rad
+    damper = PLAIN.damping_nms_per_rad * np.gradient(d, s.time_s)
+    assert stiffness * d + damper == pytest.approx(s.state.torque_nm, abs=1e-6 * PLAIN.rated_torque_nm)
 
 
 @pytest.mark.filterwarnings("error")
@@ -91,7 +94,8 @@ def test_the_torsion_is_that_of_the_changed_spring() -> None:
     s = signals(rigid_run(PLAIN, 0.3))
     softer = {"stiffness_nm_per_rad": 0.8 * PLAIN.stiffness_nm_per_rad, "cubic_nm_per_rad3": 0.0}
     set_state(s, [Present("nonlinear_stiffness", 1, softer)])
-    assert s.state.torsion_rad == pytest.approx(s.state.torque_nm / softer["stiffness_nm_per_rad"], rel=1e-3)
+    held = held_by_spring(PLAIN, s.state.torque_nm, s.time_s)
+    assert s.state.torsion_rad == pytest.approx(held / softer["stiffness_nm_per_rad"], rel=1e-3)
 
 
 def test_what_the_true_effects_leave_is_the_noise() -> None:
