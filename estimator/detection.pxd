@@ -1,6 +1,6 @@
 """Plausibility of the readings, torque rate, load of the link and contacts: parameters and states; detection.pyx."""
 
-from jtqd.estimator.observer cimport FusedObserverLaw, FusedObserverState
+from jtqd.estimator.observer cimport FusedObserverLaw, FusedObserverState, Sample
 
 cdef enum: CONTACT_WAVES = 4  # cos and sin of 1 and 2 per turn of the motor
 cdef enum: CONTACT_DELAY = 4  # samples by which the trend is delayed
@@ -49,6 +49,39 @@ cdef void update_link(
 cdef int fill_contact(ContactLaw *law, double threshold_nm, double period_s) except -1
 cdef void restart_contact(ContactState *s) noexcept nogil
 cdef void detect_contact(const ContactLaw *law, ContactState *s, double external_nm, double angle) noexcept nogil
+
+cdef struct InputLaw:
+    bint used
+    double motor, link, current  # Nm per rad of motor and link, Nm per A: what they are to the torque
+    double acceleration  # largest of a joint [Nm/s2]
+    double tolerance  # [Nm]: below it nothing is doubtful
+    double load_rate  # [Nm/s] of the fastest load
+    double most  # [Nm]
+
+cdef struct Runs:  # of equal samples at rest: length of the last one, mean length, how many have been seen
+    double usual
+    int still, seen
+
+cdef struct Channel:  # an encoder, in Nm of torsion
+    double last, step, rate  # reading, last step, rate in order [Nm/s]
+    double noise  # variance of its second differences
+    double off  # displacement that no motion explains
+    double unseen, current  # while it stands still: motion that the velocity has, current [Nm] when it began
+    Runs runs  # of equal readings
+
+cdef struct InputState:
+    Channel motor, link
+    double velocity, current  # last step by the drive's velocity [Nm]; current [A]
+    double doubt  # [Nm]
+    double strange  # samples out of order lately
+    Runs runs  # of samples that are equal as a whole
+    bint going
+
+cdef int fill_inputs(InputLaw *law, joint, torsion) except -1
+cdef void restart_inputs(InputState *s) noexcept nogil
+cdef void drop_inputs(InputState *s) noexcept nogil
+cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint standing) noexcept nogil
+cdef void bound_inputs(InputState *s, double most) noexcept nogil
 
 cdef class Plausibility:
     cdef double gap_s, per_turn, jump, limit, longest_frozen_s, twist_limit, twist_jump

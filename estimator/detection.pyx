@@ -18,6 +18,19 @@ Nothing is concluded from a value that stands still beside others that stand sti
 the twist is what twice the largest believable torque does to the gear, and `twist_rad` for encoder errors: the
 reference is the first sample, whose own torque is not known. It stays, over gaps too, until `reset()`.
 
+**Encoders that are alive and quiet**, as torques by the stiffness of the torsion: what a reading may be off by widens sigma in
+the same sample. A step of a reading is in order where it continues the last steps, or the drive's velocity:
+
+    |step - last step|, or |step - omega_m dt|  <=  max(NOISE_SIGMAS noise, acceleration of FASTER rated torques dt^2)
+    off    += step beyond that; a reading that steps back brings it back to 0
+    unseen  = sum of omega_m dt while the reading stands still; link encoder: or what the current has changed by
+    longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE); their mean
+              is that of runs at rest, of channels that have been noisy
+    doubt   = max(|off|, |unseen|) - TOLERANCE, or LOAD_HZ longer dt: how far the fastest load may have gone
+
+The noise is learned from steps in order. After STRANGE samples out of order `off` is the sum of noise, and fades. In motion it is
+bounded by what the current path leaves possible.
+
 **Contacts**: a sudden external torque on the link, from the link's momentum. Figures and limits: docs/estimator.md.
 
 Link side of one joint, own frame, without current and friction. k: sample, T: step, q: link position:
@@ -42,7 +55,8 @@ During a contact, neither w nor z adapts: m is the size of the push. The load ma
 when the push ends; a step back is taken from a second trend, of e since the contact began.
 """
 
-from libc.math cimport NAN, cos, fabs, isnan, sin
+from libc.math cimport NAN, cos, fabs, isfinite, isnan, log1p, sin, sqrt
+from libc.string cimport memset
 
 from typing import Final
 
@@ -157,6 +171,137 @@ cdef class Plausibility:
         ):
             faults |= CURRENT_FROZEN
         return faults
+
+
+# Encoders that are alive and quiet ---------------------------------------------------------------------------------------
+
+cdef double NOISE_SIGMAS = 6.5  # of a second difference: once in hours
+cdef double NOISE_S = 1.0  # in which the noise of a channel is learned
+cdef double FASTER = 2.0  # rated torques that accelerate the rotor
+cdef double TOLERANCE = 0.025  # of the rated torque
+cdef double LOAD_HZ = 25.0  # rated torques per second of the fastest load
+cdef double SETTLE_RATE = 1.0 / 0.03  # of the filters behind: doubt fades with it once its cause has gone
+cdef double STRANGE_S = 0.5, UNKNOWN_RATE = 1.0 / 0.05
+cdef double STRANGE = 20.0  # samples out of order, of the last STRANGE_S: the sum of their steps is no displacement
+cdef double MOST = 100.0  # rated torques: no doubt is larger
+cdef int KNOWN_RUNS = 64  # of equal samples: their mean is known, and is a mean of so many
+cdef double CALM = 0.1  # samples out of order, of the last STRANGE_S
+cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current
+# logarithms of how rarely healthy noise gives so long a run of equal samples, of a joint's inputs and of its link encoder alone
+cdef double RARE_EQUAL = 10.0, RARE_STILL = 14.0
+
+
+cdef int fill_inputs(InputLaw *law, joint, torsion) except -1:
+    law.used = torsion is not None
+    if not law.used:
+        return 0
+    law.link = torsion.stiffness_nm_per_rad
+    law.motor = law.link / joint.gear_ratio
+    law.current = joint.gear_ratio * joint.torque_constant_nm_per_a
+    law.acceleration = law.link * FASTER * joint.rated_torque_nm / (joint.rotor_inertia_kgm2 * joint.gear_ratio**2)
+    law.tolerance = TOLERANCE * joint.rated_torque_nm
+    law.most = MOST * joint.rated_torque_nm
+    law.load_rate = LOAD_HZ * joint.rated_torque_nm
+    return 0
+
+
+cdef void restart_inputs(InputState *s) noexcept nogil:
+    memset(s, 0, sizeof(InputState))
+
+
+cdef void drop_inputs(InputState *s) noexcept nogil:
+    """Forget readings that the observer has refused; what is usual stays known."""
+    s.going = False
+    s.motor.off = s.link.off = s.motor.noise = s.link.noise = s.doubt = s.strange = 0.0
+
+
+cdef double _channel(
+    Channel *c, double reading, double expected, double faster, double current, double acceleration, double dt, bint calm
+) noexcept nogil:
+    """Take a reading [Nm]; return what it may be off by [Nm].
+
+    expected: its step by the drive's velocity, and faster: how much more that is than the last; current: as torque [Nm];
+    calm: nothing was out of order lately, so that its noise is that of a healthy channel.
+    """
+    cdef double step = reading - c.last, by_rate = step - c.rate * dt, by_velocity = step - c.unseen - expected
+    cdef double limit = max(acceleration * dt * dt, NOISE_SIGMAS * sqrt(c.noise))
+    c.last = reading
+    if step == 0.0:
+        if c.step != 0.0:
+            c.current = current
+        c.unseen += expected
+        c.step, c.rate = 0.0, expected / dt
+        return max(fabs(c.unseen), fabs(c.off))
+    if fabs(by_rate) <= limit or fabs(by_velocity) <= limit or fabs(step - c.step) <= limit:
+        if calm and c.step != 0.0 and fabs(by_rate) <= limit:
+            c.noise += (by_rate * by_rate - c.noise) * min(dt / NOISE_S, 1.0)
+        c.rate = (step if c.step != 0.0 else expected) / dt
+    else:
+        c.off += by_rate if fabs(by_rate) < fabs(by_velocity) else by_velocity
+        c.rate += faster / dt
+    c.step = step
+    c.unseen = 0.0
+    return fabs(c.off)
+
+
+cdef double _too_long(Runs *r, bint equal, bint standing, double rare) noexcept nogil:
+    """Take a sample that is equal to the last one or not; return by how many the run of equal ones is too long.
+
+    It is where healthy noise gives a longer one with a probability of exp(-rare), by the mean of those at rest so far.
+    """
+    cdef double beyond = 0.0
+    cdef int still = r.still + equal
+    if still and standing and r.seen == KNOWN_RUNS:
+        beyond = still - rare / log1p(1.0 / max(r.usual, 1e-3))
+    r.still = still if equal else 0
+    if equal:
+        return beyond
+    if standing and beyond <= 0.0:
+        r.seen = min(r.seen + 1, KNOWN_RUNS)
+        r.usual += (still - r.usual) / r.seen
+    return 0.0
+
+
+cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint standing) noexcept nogil:
+    """Take a sample; set `doubt`, what the torsion may be off by [Nm], in the same cycle."""
+    cdef double dt = x.dt_s, current = law.current * x.current_a
+    cdef double expected = law.motor * x.motor_velocity_rad_s * dt, faster = expected - s.velocity
+    cdef double motor = law.motor * x.motor_position_rad, link = law.link * x.link_position_rad
+    cdef double doubt, longer, off = s.motor.off + s.link.off
+    cdef bint equal, link_still = link == s.link.last, calm = s.strange < CALM
+    if not s.going or not 0.0 < dt <= LONGEST_STEP_S or not isfinite(motor + link + expected + current):
+        s.going = isfinite(motor + link + expected + current)
+        s.motor.last, s.link.last, s.velocity, s.current = motor, link, expected, x.current_a
+        s.motor.rate = s.link.rate = law.motor * x.motor_velocity_rad_s
+        s.motor.current = s.link.current = current
+        s.motor.runs.still = s.link.runs.still = s.runs.still = 0
+        s.motor.unseen = s.link.unseen = 0.0
+        return
+    equal = link_still and motor == s.motor.last and x.current_a == s.current and expected == s.velocity
+    doubt = _channel(&s.motor, motor, expected, faster, current, law.acceleration, dt, calm)
+    doubt = max(doubt, _channel(&s.link, link, expected, faster, current, law.acceleration, dt, calm))
+    if link_still:
+        doubt = max(doubt, fabs(current - s.link.current) * min((s.link.runs.still + 1) * dt * FOLLOW_RATE, 1.0))
+    doubt -= law.tolerance
+    longer = max(_too_long(&s.runs, equal, standing, RARE_EQUAL), _too_long(&s.link.runs, link_still, standing, RARE_STILL))
+    doubt = max(doubt, law.load_rate * dt * longer)
+    s.velocity, s.current = expected, x.current_a
+    s.strange *= 1.0 - min(dt / STRANGE_S, 1.0)
+    if (
+        s.motor.off + s.link.off != off or longer > 0.0
+        or max(fabs(s.motor.unseen), fabs(s.link.unseen)) > law.tolerance
+    ):
+        s.strange += 1.0
+    if s.strange > STRANGE:
+        s.motor.off *= 1.0 - min(dt * UNKNOWN_RATE, 1.0)
+        s.link.off *= 1.0 - min(dt * UNKNOWN_RATE, 1.0)
+    s.doubt = min(max(doubt, s.doubt * (1.0 - min(dt * SETTLE_RATE, 1.0))), law.most)
+
+
+cdef void bound_inputs(InputState *s, double most) noexcept nogil:
+    """Bound displacements by what the current path of a joint in motion leaves possible [Nm]."""
+    s.motor.off = max(-most, min(most, s.motor.off))
+    s.link.off = max(-most, min(most, s.link.off))
 
 
 # Contacts --------------------------------------------------------------------------------------------------------------

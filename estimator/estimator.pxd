@@ -1,6 +1,6 @@
 """The estimators of a joint; the equations stand in estimator.pyx."""
 
-from jtqd.estimator.detection cimport LinkLaw, LinkState
+from jtqd.estimator.detection cimport InputLaw, InputState, LinkLaw, LinkState
 from jtqd.estimator.observer cimport (
     FusedObserved, FusedObserverLaw, FusedObserverState, GuardLaw, GuardState, Observed, ObserverLaw, ObserverState,
     Sample
@@ -67,6 +67,7 @@ cdef struct FusedLaw:
     OffsetLaw offsets
     AgreementLaw agreement
     LinkLaw link
+    InputLaw inputs
     bint tracked  # the torsion is tracked: noise of what is faster than the motor path
     double tracking_noise, tracking_viscous, tracking_bend  # bend: of the viscous part [s^2/rad^2], 0: none
     double physics_scale[4]
@@ -83,6 +84,7 @@ cdef struct FusedState:
     AgreementState agreement
     LinkState link
     PathState path
+    InputState inputs
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law

@@ -12,7 +12,9 @@
 from libc.math cimport NAN, fabs, fmin, hypot, sqrt
 from libc.string cimport memcmp, memcpy, memset
 
-from jtqd.estimator.detection cimport LinkLoad, fill_link, restart_link, update_link
+from jtqd.estimator.detection cimport (
+    LinkLoad, bound_inputs, check_inputs, drop_inputs, fill_inputs, fill_link, restart_inputs, restart_link, update_link
+)
 from jtqd.estimator.observer cimport (
     FusedObserved, FusedObserverLaw, Observed, Sample, fill_fused_observer, fill_guard, fill_observer, observe,
     observe_fused, restart_guard
@@ -20,7 +22,7 @@ from jtqd.estimator.observer cimport (
 from jtqd.estimator.fusion cimport (
     Fused, Learned, Rest, TURN_WAVES, at_rest, degrades, disagreement, drop_block, early_factor, fading,
     fill_agreement, fill_fusion, fill_offsets, fuse_paths, gather, implausible, known_nm2, local_stiffness,
-    mismatch_variance, offsets_of, pause_turn, report_offsets, restart_agreement, restart_offsets, restart_turn,
+    mismatch_variance, offsets_of, pause_turn, reach, report_offsets, restart_agreement, restart_offsets, restart_turn,
     reweigh, turn_differs, update_difference, update_turn
 )
 from jtqd.estimator.native_network cimport (
@@ -57,6 +59,8 @@ SLOPE_NM: Final = 0.5
 """Step of the motor torque over which the slope of the loss is taken."""
 
 cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, STEP = SLOPE_NM, FOREIGN = FOREIGN_SIGMAS
+cdef double DOUBTFUL = 4.0  # tolerances of the inputs: the status is lowered
+cdef double BOUNDING = 3.0  # standard deviations of the paths' difference
 cdef double LOWERED_S = 0.1  # the status stays degraded for so long after the paths have disagreed: it must not flicker
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
 cdef int LEFT = st.LEFT, APART = st.APART
@@ -326,6 +330,7 @@ cdef class FusedEstimator(Estimator):
         fill_offsets(&self.law.offsets, per_ampere, joint.rated_torque_nm, fused, settings.track_zeros, estimated)
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
+        fill_inputs(&self.law.inputs, joint, fused.torsion)
         physics_scale = fused.zeros.scale if self.law.offsets.spread > 0.0 else fused.sigma.scale
         network_scale = physics_scale if network is None else network.sigma.scale
         for k in range(4):
@@ -355,6 +360,7 @@ cdef class FusedEstimator(Estimator):
         restart_offsets(&self.law.offsets, &self.state.offsets)
         restart_agreement(&self.state.agreement)
         restart_link(&self.state.link)
+        restart_inputs(&self.state.inputs)
 
     @property
     def zeros(self):
@@ -404,6 +410,8 @@ cdef class FusedEstimator(Estimator):
         cdef LinkLoad link
         cdef Sample corrected
         cdef const Sample *read = x
+        if self.law.inputs.used:
+            check_inputs(&self.law.inputs, &self.state.inputs, x, self.state.guard.standing)
         if self.law.offsets.corrected:
             corrected = x[0]
             corrected.link_position_rad -= self.state.offsets.link_rad
@@ -432,6 +440,8 @@ cdef class FusedEstimator(Estimator):
             self.estimate(&seen, x, network_wanted, out)
         else:
             self.state.half = 0.0
+            if out.status == INVALID:
+                drop_inputs(&self.state.inputs)
             drop_block(&self.state.offsets)
             restart_turn(&self.state.agreement)
             restart_link(&self.state.link)
@@ -502,6 +512,8 @@ cdef class FusedEstimator(Estimator):
         s.half = fading(loss.half, s.half, x.dt_s)
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
         degraded = self.inconsistent(&physics, x.dt_s)
+        if out.status == VALID:
+            bound_inputs(&s.inputs, fabs(physics.difference) + reach(&physics, BOUNDING))
         if law.offsets.estimated:
             self.update_path_difference(seen, x, &physics, loss.nm, out.status)
         if law.offsets.spread > 0.0:
@@ -546,6 +558,8 @@ cdef class FusedEstimator(Estimator):
             # an offset estimated while the paths disagree is as uncertain as they are
             mismatch += best.alpha * best.alpha * fmin(known, s.agreement.mismatch)
             out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + mismatch)
+        if s.inputs.doubt > DOUBTFUL * law.inputs.tolerance:
+            s.degraded_s, degraded = LOWERED_S, True
         if degraded:
             out.status = DEGRADED
         elif standing and alone and law.network.used:
@@ -558,6 +572,8 @@ cdef class FusedEstimator(Estimator):
                 + share * law.tracking_noise
                 + share * law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v)
             )
+        if s.inputs.doubt > 0.0:
+            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + s.inputs.doubt * s.inputs.doubt)
         publish_within(out, law.limit)
 
     cdef double half_interval(

@@ -11,6 +11,7 @@ cdef struct FusionLaw:
 cdef struct Fused:
     double alpha, value, sigma
     double difference, variance  # torsion less current, and its variance; 0 and 1 without torsion
+    double half  # part of the difference that the friction interval bounds, in `variance` as its square
 
 cdef int fill_fusion(FusionLaw *law, sigma, bint with_torsion) except -1
 cdef double fading(double half, double before, double dt) noexcept nogil
@@ -26,6 +27,7 @@ cdef Rest at_rest(
     const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
 ) noexcept nogil
 
+cdef double reach(const Fused *fused, double sigmas) noexcept nogil
 cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil
 
 cdef class Fusion:

@@ -156,10 +156,10 @@ cdef Fused fuse_paths(
     cdef double value = raw - loss
     cdef double t, alpha
     if not law.with_torsion:
-        return Fused(0.0, value, sqrt(c + law.reference), 0.0, 1.0)
+        return Fused(0.0, value, sqrt(c + law.reference), 0.0, 1.0, 0.0)
     t = law.torsion + law.torsion_load * torsion * torsion + open_nm * open_nm
     alpha = c / (c + t)
-    return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t)
+    return Fused(alpha, value + alpha * (torsion - value), sqrt(alpha * t + law.reference), torsion - value, c + t, half)
 
 
 cdef void reweigh(Fused *fused, double known) noexcept nogil:
@@ -183,6 +183,11 @@ cdef Rest at_rest(
     cdef double c = law.current + law.viscous * v * v + law.load * raw * raw
     cdef double t = law.torsion + law.torsion_load * torsion * torsion if law.with_torsion else 0.0
     return Rest(sqrt(alpha * alpha * t + rest * rest * c + law.reference), alpha * open_nm + rest * half)
+
+
+cdef double reach(const Fused *fused, double sigmas) noexcept nogil:
+    """Return how far the paths are apart [Nm] at so many standard deviations, with the bound of friction near standstill."""
+    return fused.half + sigmas * sqrt(fmax(fused.variance - fused.half * fused.half, 0.0))
 
 
 cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil:

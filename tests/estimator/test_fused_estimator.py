@@ -55,8 +55,10 @@ def steady(  # noqa: PLR0917 - a state and how it is held
     torsion_nm: float = 5.0,
     temperature_c: float = 25.0,
     count: int = 4,
+    first: int = 0,
 ) -> Estimate:
-    for k in range(count):
+    """Samples `first` and on of a motion with constant speed and torsion."""
+    for k in range(first, first + count):
         link = v * 0.001 * k
         last = e.step(0.001, i, 100.0 * (link + torsion_nm / K), 100.0 * v, link, temperature_c)
     return last
@@ -299,7 +301,7 @@ def test_the_status_stays_lowered_for_a_moment() -> None:
     for _ in range(8):
         agreed = physics(3.0, 1.0, agreed, joint=NARROW)[0]
     steady(e, 3.0, 1.0, torsion_nm=agreed + 20.0, count=40)
-    lowered = [e.step(0.001, 3.0, 100.0 * agreed / K, 100.0, 0.0, 25.0).status for _ in range(400)]
+    lowered = [steady(e, 3.0, 1.0, torsion_nm=agreed, count=1, first=k).status for k in range(40, 440)]
     assert lowered[0] == st.DEGRADED
     assert lowered[-1] == st.VALID
     back = lowered.index(st.VALID)
@@ -340,10 +342,13 @@ def test_no_float_raises_and_no_number_is_published_without_a_status() -> None:
     seen = set()
     for round_ in range(6):
         e = estimator(says(lambda *_: draw()), joint=(PLAIN, fused_joint(round_))[round_ % 2])
-        for _ in range(2000):
+        for k in range(2000):
             calm = rng.random() < 0.7
             dt = 0.001 if calm else draw()
-            got = e.step(dt, *((2.0, 100 * 5 / K, 90.0, 0.0, 25.0) if calm else [draw() for _ in range(5)]))
+            link = 0.9e-3 * k
+            got = e.step(
+                dt, *((2.0, 100 * (link + 5 / K), 90.0, link, 25.0) if calm else [draw() for _ in range(5)])
+            )
             seen.add(got.status)
             published = got.status in st.PUBLISHED
             assert math.isfinite(got.torque_nm) == math.isfinite(got.sigma_nm) == published, (seed, round_)

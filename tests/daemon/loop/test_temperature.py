@@ -54,9 +54,15 @@ def tpdo3(node: int, tenths: int) -> bytes:
     return frame(0x380 + node, struct.pack("<h", tenths))
 
 
-def coupled(velocity: int = 5000) -> list[bytes]:
-    """The inputs with both encoders of a joint at the same angle: its torsion tells no absurd torque."""
-    positions = [frame(0x180 + n, I32.pack(sign * 1000, sign * 100)) for n, sign in ((1, 1), (2, -1))]
+def coupled(velocity: int = 5000, cycle: int = 0) -> list[bytes]:
+    """The inputs with both encoders of a joint at the same angle: its torsion tells no absurd torque.
+
+    cycle: of 10 ms, so that the joints turn with this velocity.
+    """
+    angle = 1000 + velocity * cycle // 10
+    positions = [
+        frame(0x180 + n, I32.pack(sign * angle, sign * (angle // 10))) for n, sign in ((1, 1), (2, -1))
+    ]
     _, one, _, two, sensor = inputs(velocity=velocity)
     return [positions[0], one, positions[1], two, sensor]
 
@@ -124,10 +130,9 @@ def test_without_one_the_joint_is_estimated_all_the_same(tmp_path: Path) -> None
     sigmas = []
     for name, extra in (("without", []), ("with", [tpdo3(1, 250), tpdo3(2, 250)])):
         (tmp_path / name).mkdir()
-        script = [*coupled(), *extra]
         cycle, socket, reader = make(
             tmp_path / name,
-            lambda n, script=script: script,
+            lambda n, extra=extra: [*coupled(cycle=n), *extra],
             temperatures=temperatures(),
             estimators=[fused(1), fused(2)],
         )

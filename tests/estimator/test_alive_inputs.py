@@ -1,0 +1,136 @@
+"""Encoders that jump, turn noisy or stand still: sigma holds the error in the same cycle, and nothing else changes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from jtqd.estimator import status as st
+from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.estimator import make_estimator
+from jtqd.estimator.run import EstimateRun
+from jtqd.estimator.settings import recommended
+from jtqd.models.files import load_joint, shipped
+from jtqd.sim_can.emulated_run import JointCommand, emulate
+from jtqd.sim_can.plant_source import load_any_plant
+
+JOINT = load_joint(shipped("trained/joint1.yaml"))
+RATED = JOINT.rated_torque_nm
+REST = slice(3000, 4000)
+AT = 3400
+
+
+class Inputs(NamedTuple):
+    """Arrays [n] of joint 1, and its true torque."""
+
+    current_a: FloatArray
+    motor_rad: FloatArray
+    motor_rad_s: FloatArray
+    link_rad: FloatArray
+    true_nm: FloatArray
+
+
+@cache
+def inputs() -> Inputs:
+    """A motion both ways up to 2.4 s, then rest under a load that swings by 12 Nm."""
+    t = 1e-3 * np.arange(4500)
+    velocity = 0.8 * np.sin(2 * np.pi * t / 1.2) * (t < 2.4)
+    load = np.where(t < 2.4, 1.0, 2.0 * np.sin(2 * np.pi * (t - 2.4) / 1.2))
+    commands = (
+        JointCommand.velocity(lambda at: float(velocity[min(round(1e3 * at), 4499)])),
+        JointCommand.current(lambda at: float(load[min(round(1e3 * at), 4499)])),
+    )
+    made = emulate(load_any_plant(shipped("campaign_plant.yaml")), commands, 4.5, 5)
+    one = made.table.joints[1]
+    columns = (one.current_a, one.motor_position_rad, one.motor_velocity_rad_s, one.link_position_rad)
+    return Inputs(*map(np.asarray, columns), made.joint_torque_nm[:, 0])
+
+
+def estimated(given: Inputs) -> EstimateRun:
+    n = len(given.true_nm)
+    dt = np.full(n, 1e-3)
+    estimator = make_estimator(JOINT, recommended("fused"))
+    return estimator.run(dt, *given[:4], np.full(n, 25.0))
+
+
+def held(found: EstimateRun, at: slice) -> bool:
+    """No torque is more than 2 Nm and 4 sigma off."""
+    error = np.abs(found.torque_nm - inputs().true_nm)[at]
+    sigma = found.sigma_nm[at]
+    return not np.any((error > 2.0) & (error > 4.0 * sigma))
+
+
+def test_healthy_inputs_are_in_doubt_nowhere_but_for_runs_of_equal_samples() -> None:
+    """The standard deviation is that of a joint whose inputs are not looked at in all but some samples of a thousand."""
+    found = estimated(inputs())
+    at = slice(2500, 4500)
+    assert set(found.status[at].tolist()) == {st.STANDSTILL}
+    assert held(found, slice(100, 4500))
+    assert np.quantile(found.sigma_nm[at], 0.99) < 0.025 * RATED
+
+
+def changed(**columns: Callable[[FloatArray], FloatArray]) -> Inputs:
+    given = inputs()
+    return given._replace(**{name: change(getattr(given, name).copy()) for name, change in columns.items()})
+
+
+def _from(values: FloatArray, error: FloatArray | float, count: int = 600) -> FloatArray:
+    values[AT : AT + count] += error
+    return values
+
+
+def _stopped(values: FloatArray, count: int = 600) -> FloatArray:
+    values[AT : AT + count] = values[AT]
+    return values
+
+
+NOISE = np.random.default_rng(1).uniform(-1.0, 1.0, 600)
+SPIKES = 1.0 * (np.arange(600) % 25 == 7)
+BROKEN = {
+    "link steps": changed(link_rad=lambda x: _from(x, 1e-3)),
+    "motor steps": changed(motor_rad=lambda x: _from(x, -0.2)),
+    "link is noisy": changed(link_rad=lambda x: _from(x, 2e-3 * NOISE)),
+    "motor is noisy": changed(motor_rad=lambda x: _from(x, 0.3 * NOISE)),
+    "link has spikes": changed(link_rad=lambda x: _from(x, 2.5e-3 * SPIKES)),
+    "link stands still": changed(link_rad=_stopped),
+    "all stand still": changed(
+        link_rad=_stopped, motor_rad=_stopped, motor_rad_s=_stopped, current_a=_stopped
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_an_encoder_that_breaks_at_rest_widens_sigma_in_the_same_cycle(name: str) -> None:
+    found = estimated(BROKEN[name])
+    assert held(found, slice(AT - 100, AT + 600)), name
+    assert np.max(found.sigma_nm[AT : AT + 600]) > 0.05 * RATED
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_ends_is_over_within_a_second(name: str) -> None:
+    found, healthy = estimated(BROKEN[name]), estimated(inputs())
+    last = slice(AT + 1000, 4500)
+    np.testing.assert_array_equal(found.status[last], healthy.status[last])
+    assert np.max(found.sigma_nm[last] - healthy.sigma_nm[last]) < 0.05 * RATED
+
+
+def test_channels_without_noise_are_not_stuck() -> None:
+    """Nothing is known of an encoder that has never been seen to be noisy."""
+    still = Inputs(*(np.full(6000, 0.0) for _ in range(5)))
+    found = estimated(still)
+    assert set(found.status[10:].tolist()) == {st.STANDSTILL}
+    assert found.sigma_nm[5999] == pytest.approx(found.sigma_nm[100], rel=1e-3)
+
+
+def test_an_encoder_that_freezes_in_motion_is_in_doubt_at_the_first_sample() -> None:
+    def frozen(values: FloatArray) -> FloatArray:
+        values[300:400] = values[300]
+        return values
+
+    found, healthy = estimated(changed(link_rad=frozen)), estimated(inputs())
+    assert held(found, slice(290, 400))
+    assert found.sigma_nm[302] > 2.0 * healthy.sigma_nm[302]
