@@ -151,6 +151,7 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
         "excitation": ("--runs", "8", "--seconds", "8", "--evaluations", "160")
         if quick
         else ("--runs", "96", "--seconds", "12", "--evaluations", "400"),
+        "quick": ("--runs", "6", "--seconds", "6") if quick else ("--runs", "20", "--seconds", "12"),
         "validate": ("--runs", "2", "--seconds", "6", "--hold", "1.0")
         if quick
         else ("--runs", "96", "--seconds", "8", "--hold", "1.6"),
@@ -165,7 +166,7 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
         arguments = ("--kind", kind, "--plant", str(plant), "--seed", str(days), *where)
         return Step(arguments, module=_EMULATED)
 
-    for kind in ("excitation", "efficiency"):
+    for kind in ("excitation", "quick", "efficiency"):
         yield campaign(kind)
     for n in ("1", "2"):
         first, fitted, last = shipped(f"joint{n}.yaml"), work / f"joint{n}.yaml", models / f"joint{n}.yaml"
@@ -177,9 +178,9 @@ def steps(out: Path, bus: str, quick: bool, seed: int, plant: Path | None = None
         )
     joints = ("--joint", str(models / "joint1.yaml"), "--joint", str(models / "joint2.yaml"))
     short = ("--iterations", "30") if quick else ()
-    for network in ("paper", "ours"):
+    for network, sources in (("paper", ("excitation",)), ("ours", ("excitation", "quick"))):
         yield Step(
-            ("train", str(runs / "excitation"), *joints, "--network", network, "--seed", str(seed),
+            ("train", *(str(runs / kind) for kind in sources), *joints, "--network", network, "--seed", str(seed),
              "--out", str(models), *short),
             network == "ours",  # one that its gate refuses is a result: the configuration then has none
         )  # fmt: skip

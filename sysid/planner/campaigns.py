@@ -401,13 +401,12 @@ def quick_runs(limits: Limits, count: int, run_s: float, *, seed: int) -> tuple[
         number = max(int(run_s / (hold_s + 0.1)), 4)
         held: list[Segment] = []
         velocity = current = position = 0.0
-        for n in range(number + 2):
-            turns = (
-                k % 3 == 0 or n >= number or rng.random() < 0.3 or abs(position) > 0.25 * limits.travel_rad
-            )
+        for n in range(number + 6):
+            turns = k % 3 == 0 or n == number + 3 or (rng.random() < 0.3 and n < number)
+            turns = turns or abs(position) > 0.25 * limits.travel_rad
             sign = -math.copysign(1.0, position or velocity) if turns else math.copysign(1.0, velocity)
             before = velocity, current
-            velocity = sign * (speed if speed or n < number else 0.2 * most)
+            velocity = sign * (speed if speed or n < number else min(0.2 * most, 0.1 * limits.travel_rad))
             current = float(rng.uniform(-load, load))
             ramps = (
                 abs(velocity - before[0]) / STEEPEST_VELOCITY_RAD_S2,

@@ -11,24 +11,14 @@ import pytest
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns
-from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.planner.plan import DEFAULT_LIMITS, expand
+from jtqd.sysid.train.current_path import EVERY, Block, Recipe, block, estimate_nm, seen, train
 from jtqd.sysid.train.network import network_output
-from validation.current_path.recipe import (
-    EVERY,
-    INPUTS,
-    Block,
-    Recipe,
-    Seen,
-    block,
-    estimate_nm,
-    seen,
-    train,
-)
-from validation.current_path.study import Example, load_step_runs, percent, share
+from tests.estimator.fused_helpers import fused_joint
+from validation.current_path.study import Example, Served, load_step_runs, percent, share
 
-JOINT: Joint = load_joint(shipped("joint1.yaml"))
-N = 1500
+JOINT: Joint = fused_joint()
+INPUTS, N = 28, 1500
 TIME: FloatArray = 1e-3 * np.arange(N)
 
 
@@ -51,22 +41,22 @@ def columns(**changes: FloatArray) -> JointColumns:
 
 def test_inputs_are_of_one_encoder_and_of_the_past() -> None:
     found = seen(JOINT, TIME, columns())
-    assert found.inputs.shape == (N, INPUTS)
-    assert np.isfinite(found.inputs).all()
+    assert found.shape == (N, INPUTS)
+    assert np.isfinite(found[1:]).all()
     other = seen(JOINT, TIME, columns(link_position_rad=np.zeros(N), torque_nm=np.zeros(N)))
-    assert np.array_equal(other.inputs, found.inputs), "neither link encoder nor sensor"
+    assert np.array_equal(other, found, equal_nan=True), "neither link encoder nor sensor"
     early = columns().map(lambda name, column: column[:700])
-    assert seen(JOINT, TIME[:700], early).inputs == pytest.approx(found.inputs[:700], abs=1e-12)
-    assert len({each.tobytes() for each in found.inputs.T}) == INPUTS, "no input is there twice"
-    with pytest.raises(ValueError, match="temperature_c"):
-        seen(JOINT, TIME, columns(temperature_c=None))  # type: ignore[arg-type]
+    assert np.array_equal(seen(JOINT, TIME[:700], early), found[:700], equal_nan=True)
+    assert len({each.tobytes() for each in found.T}) == INPUTS, "no input is there twice"
+    with pytest.raises(ValueError, match="current_a"):
+        seen(JOINT, TIME, columns(current_a=None))  # type: ignore[arg-type]
 
 
 def test_the_base_is_the_torque_of_a_rotor_that_accelerates_less_a_low_pass() -> None:
     """Constant current i and acceleration a: G (Kt i - J a) once the low pass of 200 rad/s has settled."""
     omega = 50.0 * TIME
     steady = columns(current_a=np.full(N, 2.0), motor_velocity_rad_s=omega)
-    found = seen(JOINT, TIME, steady).base_nm[-1]
+    found = seen(JOINT, TIME, steady)[-1, 0]
     expected = 100.0 * (JOINT.torque_constant_nm_per_a * 2.0 - JOINT.rotor_inertia_kgm2 * 50.0)
     assert found == pytest.approx(expected, abs=1e-6)
 
@@ -74,15 +64,15 @@ def test_the_base_is_the_torque_of_a_rotor_that_accelerates_less_a_low_pass() ->
 def test_a_stop_operator_has_memory_of_the_last_reversal() -> None:
     """Swung by 0.2 rad a stop of 0.07 rad is at its end, one of 0.8 rad is not."""
     forth = np.concatenate((np.linspace(0.0, 0.2, 500), np.linspace(0.2, 0.16, 1000)))
-    stops = seen(JOINT, TIME, columns(motor_position_rad=forth)).inputs[:, 22:26]
+    stops = seen(JOINT, TIME, columns(motor_position_rad=forth))[:, 22:26]
     assert stops[499, 0] == stops[499, 1] == 1.0
     assert abs(stops[499, 3]) < 0.2
     assert stops[-1, 1] == pytest.approx(1.0 - 0.04 / 0.07, abs=1e-6)
 
 
 def test_only_settled_samples_that_the_teacher_knows_are_learned() -> None:
-    known = Seen(np.arange(240.0)[:, None] * np.ones(INPUTS), np.full(240, 2.0))
-    teacher = np.full(240, 5.0)
+    known = np.arange(240.0)[:, None] * np.ones(INPUTS)
+    teacher = known[:, 0] + 3.0
     teacher[120:] = np.nan
     settled = np.arange(240) >= 24
     found = block(known, teacher, settled)
@@ -109,9 +99,9 @@ def test_it_learns_a_function_and_the_same_one_again() -> None:
     for (w, b), (other_w, other_b) in zip(network.weights, again.weights, strict=True):
         assert np.array_equal(w, other_w)
         assert np.array_equal(b, other_b)
-    known = Seen(fresh[0].inputs, np.full(300, 7.0))
-    assert estimate_nm(network, known) == pytest.approx(7.0 + network_output(network, known.inputs))
-    with pytest.raises(ValueError, match="1 runs"):
+    known = fresh[0].inputs
+    assert estimate_nm(network, known) == pytest.approx(known[:, 0] + network_output(network, known))
+    with pytest.raises(ValueError, match="1 run"):
         train(blocks[:1], QUICK)
 
 
@@ -121,7 +111,7 @@ def test_the_weights_are_those_of_the_epoch_that_was_best_on_runs_left_out() -> 
     blocks = [Block(rng.normal(size=(60, INPUTS)), rng.normal(size=60)) for _ in range(12)]
     recipe = replace(QUICK, epochs=60, hidden=(40,), rate=2e-2)
     network = train(blocks, recipe)
-    held = [each for k, each in enumerate(blocks) if k % recipe.stop == recipe.member]
+    held = [each for each, out in zip(blocks, recipe.held_out(12), strict=True) if out]
     error = np.concatenate([network_output(network, each.inputs) - each.target_nm for each in held])
     scaled = np.abs(error / network.output_std)
     knee = recipe.knee
@@ -132,7 +122,7 @@ def test_the_weights_are_those_of_the_epoch_that_was_best_on_runs_left_out() -> 
 
 def test_figures_count_settled_samples_that_have_a_value() -> None:
     true = np.zeros(4)
-    known = Seen(np.zeros((4, INPUTS)), true)
+    known = np.zeros((4, INPUTS))
     one = Example(known, true, true, np.array([False, True, True, True]), np.array([True, True, True, False]))
     found = share(np.array([99.0, 4.0, np.nan, 8.0]), one, 40.0)
     assert found.moving == (pytest.approx(0.01), 1)
@@ -146,3 +136,8 @@ def test_load_steps_are_steep_and_within_limits() -> None:
         points = expand(run)
         assert np.abs(points.current_a).max() <= DEFAULT_LIMITS.current_a
         assert np.abs(np.diff(points.current_a)).max() > 0.5
+
+
+def test_figures_in_service_are_errors_and_what_intervals_hold() -> None:
+    sums = Served(np.array([4.0, 16.0]), np.array([4.0, 1.0, 200.0, 0.0, 50.0]), np.array([180.0, 0.0, 1.0]))
+    assert sums.text(40.0) == "2.50; 10.00 | 90.0; 0.0 | 2.0"

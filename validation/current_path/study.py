@@ -4,7 +4,8 @@ Each plant is driven by a campaign (ordinary runs of excitation and quick ones),
 network of `sysid/train/current_path.py` learns from 96, 24 and 12 ordinary runs and as many quick ones in proportion; its
 teacher is the torque sensor, or the fused estimate of a joint file that was fitted to 8 runs with a sensor. It is compared
 with the estimates of the joint file for one encoder and for two, fitted to the ordinary runs. Figures: RMSE against the true
-torque of the same instant, % of rated, over both joints.
+torque of the same instant, % of rated, over both joints. A second table has what a joint file gives in service with the
+network of `jtq train` and without one: error, and how often its interval holds.
 
 python -m validation current_path --quick --plant typical      fewer runs
 python -m validation current_path --json current_path.json
@@ -24,12 +25,26 @@ import numpy as np
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import count, natural
 from jtqd.estimator.estimator import estimate_columns
+from jtqd.estimator.fusion import GAUSS
 from jtqd.estimator.joint import Joint
+from jtqd.estimator.network import PathNetwork
+from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import EstimatorSettings, recommended
+from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.sysid.evaluate.inputs import SETTLE_S
 from jtqd.sysid.planner.campaigns import make_plan
 from jtqd.sysid.planner.plan import Plateau, Rest, Run, Segment
-from jtqd.sysid.train.current_path import USUAL, Block, Recipe, block, estimate_nm, seen, train
+from jtqd.sysid.train.current_path import (
+    USUAL,
+    Block,
+    PathRun,
+    Recipe,
+    block,
+    estimate_nm,
+    seen,
+    train,
+    train_path,
+)
 from validation.goals.identify import (
     FIT_SEED,
     FULL,
@@ -191,13 +206,92 @@ class Scored(NamedTuple):
     standing: Mapping[str, float]
 
 
+SERVICE: Final = ("one encoder", "one encoder, network", "two encoders", "two encoders, network")
+
+
+class Served(NamedTuple):
+    """Sums over samples of an estimate in service: in motion, at rest, published in motion, status 6, valid."""
+
+    squares: FloatArray
+    counts: FloatArray
+    held: FloatArray
+
+    def text(self, rated_nm: float) -> str:
+        """Return RMSE [% of rated] in motion; at rest | inside of the interval in motion; at rest | beyond 3 sigma, %."""
+        rmse = 100.0 * np.sqrt(self.squares[:2] / np.maximum(self.counts[:2], 1)) / rated_nm
+        share = 100.0 * self.held / np.maximum(self.counts[2:], 1)
+        return f"{rmse[0]:.2f}; {rmse[1]:.2f} | {share[0]:.1f}; {share[1]:.1f} | {share[2]:.1f}"
+
+
+def served(
+    run: Driven, number: int, joint: Joint, network: PathNetwork | None, columns: JointColumns
+) -> Served:
+    """Return what a joint file gives in a run, with a network or without."""
+    time_s = run.table.time_s
+    found = estimate_columns(joint, _SETTINGS, network, time_s, columns)
+    error = np.abs(found.torque_nm - run.true_nm[:, number - 1])
+    assert columns.motor_velocity_rad_s is not None
+    moves = np.abs(columns.motor_velocity_rad_s) > _MOVES_RAD_S * joint.gear_ratio
+    known = (time_s - time_s[0] >= SETTLE_S) & np.isfinite(error)
+    kinds = (
+        known & moves,
+        known & ~moves,
+        known & np.isin(found.status, (VALID, DEGRADED)),
+        known & (found.status == STANDSTILL),
+        known & (found.status == VALID),
+    )
+    limits = (GAUSS, 1.0, 3.0)
+    return Served(
+        np.array([float(error[kind] @ error[kind]) for kind in kinds[:2]]),
+        np.array([float(np.count_nonzero(kind)) for kind in kinds]),
+        np.array(
+            [
+                float(
+                    np.count_nonzero(
+                        (error > limit * found.sigma_nm if limit == 3.0 else error < limit * found.sigma_nm)
+                        & kind
+                    )
+                )
+                for kind, limit in zip(kinds[2:], limits, strict=True)
+            ]
+        ),
+    )
+
+
+def in_service(
+    joint: Joint, two: Identified, days: Days, recipe: Recipe
+) -> dict[str, dict[str, list[Served]]]:
+    """Return by estimate and kind of runs what both joint files of a joint give, with the network and without."""
+    number = two.number
+    files = {"one encoder": fit_one_encoder(joint, number, days.ordinary), "two encoders": two.joint}
+    found: dict[str, dict[str, list[Served]]] = {}
+    for name, file in files.items():
+
+        def columns(run: Driven, name: str = name) -> JointColumns:
+            each = run.columns(number, joint)
+            return one_encoder(each, joint) if name == "one encoder" else each
+
+        runs = [
+            PathRun(f"{k}", run.table.time_s, columns(run))
+            for k, run in enumerate((*days.ordinary, *days.quick))
+        ]
+        made = train_path(runs, file, {run.name: "0" * 64 for run in runs}, recipe)
+        for title, network in ((name, None), (f"{name}, network", PathNetwork(made.data))):
+            found[title] = {
+                kind: [served(run, number, file, network, columns(run)) for run in some]
+                for kind, some in days.judging.items()
+            }
+    return found
+
+
 @dataclass(frozen=True)
 class Found:
-    """What one plant gave: by method; rated torque [Nm]."""
+    """What one plant gave: by method; rated torque [Nm]; in service, by estimate and kind of runs, as text."""
 
     plant: str
     rated_nm: float
     scores: Mapping[str, Scored]
+    service: Mapping[str, Mapping[str, str]]
     seconds: float
 
 
@@ -247,9 +341,13 @@ def studied(scale: Scale, fit_seed: int, seed: int, recipe: Recipe, plant: Plant
     before = time.process_time()
     days, joints = driven(plant, scale, fit_seed, seed), nominal_joints(plant)
     sums: dict[str, dict[str, list[Share]]] = {}
+    service: dict[str, dict[str, list[Served]]] = {}
     fitted = (fit_physics(joints, runs) for runs in (days.ordinary, days.ordinary[:SENSOR_RUNS]))
     for joint, two, teacher in zip(joints, *fitted, strict=True):
         number = two.number
+        for name, of_kind in in_service(joint, two, days, recipe).items():
+            for kind, each in of_kind.items():
+                service.setdefault(name, {}).setdefault(kind, []).extend(each)
         examples = {
             kind: [example(run, number, two.joint) for run in runs] for kind, runs in days.judging.items()
         }
@@ -265,7 +363,24 @@ def studied(scale: Scale, fit_seed: int, seed: int, recipe: Recipe, plant: Plant
         )
         for name, kinds in sums.items()
     }
-    return Found(plant.name, joints[0].rated_torque_nm, scores, time.process_time() - before)
+    rated_nm = joints[0].rated_torque_nm
+    texts = {
+        name: {
+            kind: Served(*(np.sum(part, axis=0) for part in zip(*each, strict=True))).text(rated_nm)
+            for kind, each in of_kind.items()
+        }
+        for name, of_kind in service.items()
+    }
+    return Found(plant.name, rated_nm, scores, texts, time.process_time() - before)
+
+
+def service_table(found: Found) -> Table:
+    """Return the table of the estimates in service."""
+    kinds = list(next(iter(found.service.values())))
+    title = f"{found.plant}, in service: RMSE, %, in motion; at rest | interval holds, % | valid beyond 3 sigma, %"
+    return Table(
+        (title, *kinds), [(name, *(found.service[name][kind] for kind in kinds)) for name in SERVICE]
+    )
 
 
 def table_of(found: Found) -> Table:
@@ -309,4 +424,5 @@ def run(options: argparse.Namespace) -> Report:
     done = list(in_processes(work, plants, options.jobs, "plants"))
     note = f"{options.size or 'full'}: {sum(each.seconds for each in done):.0f} s of CPU"
     seeds = {"judge": options.seed, "fit": options.fit_seed, "network": options.net_seed}
-    return Report([table_of(each) for each in done], seeds, [note], done)
+    tables = [table for each in done for table in (table_of(each), service_table(each))]
+    return Report(tables, seeds, [note], done)
