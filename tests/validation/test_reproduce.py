@@ -184,6 +184,6 @@ def test_another_plant_needs_no_bus_and_is_judged_on_other_days(tmp_path):
     emulated = [step.arguments for step in made if step.module == "jtqd.sysid.campaign.emulated"]
     assert all(str(plant) in arguments for arguments in emulated)
     seeds = [arguments[arguments.index("--seed") + 1] for arguments in emulated]
-    assert len(emulated) == 4
-    assert seeds[0] == seeds[1]
+    assert len(emulated) == 5
+    assert seeds[0] == seeds[1] == seeds[2]
     assert len({*seeds}) == 3
