@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,11 @@ from typing import Any
 
 import onnx
 import pytest
+import yaml
 from onnx import helper
 
 from jtqd.daemon.config import Config, load_config
+from jtqd.daemon.core.status import safety_of
 from jtqd.daemon.loop import process
 from jtqd.daemon.loop.process import build_estimator, build_estimators, check_networks, loop_filters, warm_up
 from jtqd.drivers.bus_socket import CanFilter
@@ -47,6 +50,22 @@ def test_method_fused_without_networks_is_its_physics(tmp_path: Path) -> None:
     estimator = build_estimator(config, config.joints[1])
     found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0) for n in range(50)][-1]
     assert (found.status, found.torque_nm) == (2, found.physics_nm)
+
+
+def test_a_drive_without_a_link_encoder_may_have_a_network_of_the_current_path(tmp_path: Path) -> None:
+    """Its estimate is that of the network, without delay; the paper's network has the link position among its inputs."""
+    path = configured(tmp_path, "fused", networks(), objects={"link_position": False})
+    for number in JOINTS:
+        file = yaml.safe_load((tmp_path / f"j{number}.yaml").read_text())
+        del file["fused"]["torsion"]
+        (tmp_path / f"j{number}.yaml").write_text(yaml.safe_dump(file))
+    config = load_config(path)
+    (safety, _), estimator = safety_of(config), build_estimator(config, config.joints[0])
+    assert safety.bandwidth_rad_s == math.inf
+    found = [estimator.step(1e-3, 2.0, 0.1 * n, 100.0, 0.001 * n, 25.0) for n in range(50)][-1]
+    assert (found.status, found.torque_nm) == (2, found.network_nm)
+    with pytest.raises(ConfigError, match="uses a network with the link position"):
+        load_config(configured(tmp_path, "network", the_papers(), objects={"link_position": False}))
 
 
 def notes(config: Config) -> list[str]:
