@@ -27,7 +27,7 @@ from jtqd.estimator.run import JointColumns
 from jtqd.estimator.settings import bandwidth_of, recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.text import counted
-from jtqd.sysid.fit.calibration import FEWEST, PathResiduals, conformal_scale, fit_sigma, quantile_by_runs
+from jtqd.sysid.fit.calibration import FEWEST, PathResiduals, conformal_scale, fit_sigma
 from jtqd.sysid.fit.fused import map_of
 from jtqd.sysid.train.network import (
     HIDDEN,
@@ -243,15 +243,16 @@ def train_path(
     every = np.concatenate(inputs)
     low, high = np.quantile(every, [1e-4, 1.0 - 1e-4], axis=0)
     held = [n for n, out in enumerate(recipe.held_out(len(runs))) if out]
-    residuals = [_residuals(runs[n], views[n], settled[n], trained) for n in held]
-    resting = [rest for _, rest in residuals if len(rest) >= FEWEST]
+    residuals = [_residuals(*each, trained) for each in zip(runs, views, settled, strict=True)]
+    # of all runs, the worst one: what steps of current leave at rest is in few of them
+    resting = [float(np.quantile(rest, REST_COVERAGE)) for _, rest in residuals if len(rest) >= FEWEST]
     metadata = {
         "features": list(INPUTS),
         "input_low": low.tolist(),
         "input_high": high.tolist(),
         "envelope": replace(envelope, temperature_c=range_c).to_mapping(),
-        "sigma": plain_values(fit_sigma([each for each, _ in residuals], with_torsion=False)),
-        "rest_nm": [quantile_by_runs(resting, REST_COVERAGE) if resting else 0.1 * joint.rated_torque_nm],
+        "sigma": plain_values(fit_sigma([residuals[n][0] for n in held], with_torsion=False)),
+        "rest_nm": [max(resting, default=0.1 * joint.rated_torque_nm)],
         "quick": (QUICK_MARGIN * np.quantile(np.abs(every[:, _QUICK]), QUICK_SHARE, axis=0)).tolist(),
         **origin(joint, hashes),
     }
