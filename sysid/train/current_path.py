@@ -22,9 +22,8 @@ from jtqd.estimator.estimator import estimate_columns, quadrants
 from jtqd.estimator.joint import Envelope, FusedSigma, Joint
 from jtqd.estimator.native_network import INPUTS
 from jtqd.estimator.network import PathNetwork
-from jtqd.estimator.observer import low_pass
 from jtqd.estimator.run import JointColumns
-from jtqd.estimator.settings import bandwidth_of, recommended
+from jtqd.estimator.settings import recommended
 from jtqd.estimator.status import DEGRADED, STANDSTILL, VALID
 from jtqd.estimator.text import counted
 from jtqd.sysid.fit.calibration import FEWEST, PathResiduals, conformal_scale, fit_sigma
@@ -172,7 +171,7 @@ class PathRun(NamedTuple):
 
 
 class Gate(NamedTuple):
-    """RMSE [Nm] on held-out runs, each of the same weight, in service: with the network, and without."""
+    """RMSE [Nm] to the sensor of the same instant, held-out runs of the same weight: with the network, and without."""
 
     network_rmse_nm: float
     physics_rmse_nm: float
@@ -291,13 +290,11 @@ def _in_service(
     """Return the MSE [Nm^2] of each held-out run in motion, with and without the network, and the scale of sigma with it."""
     scores, errors, sigmas, kinds = {}, [], [], []
     for run in held:
-        dt = np.diff(run.time_s, prepend=run.time_s[0])
         settled = run.time_s - run.time_s[0] >= SETTLE_S
         parts = []
         for each in (network, None):
             found = estimate_columns(joint, _SETTINGS, each, run.time_s, run.columns)
-            rate = bandwidth_of(joint, _SETTINGS, network=each is not None)
-            error = found.torque_nm - low_pass(_sensor(run), dt, rate)
+            error = found.torque_nm - _sensor(run)  # of the same instant: a delay counts as error
             parts.append((found, error, settled & np.isin(found.status, (VALID, DEGRADED))))
         (found, error, use), (_, before, also) = parts
         both = use & also & (found.status != STANDSTILL)
