@@ -81,6 +81,7 @@ cdef int fill_inputs(InputLaw *law, joint, torsion) except -1
 cdef void restart_inputs(InputState *s) noexcept nogil
 cdef void drop_inputs(InputState *s) noexcept nogil
 cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint standing) noexcept nogil
+cdef bint in_order(const InputState *s) noexcept nogil
 cdef void bound_inputs(InputState *s, double most) noexcept nogil
 
 cdef class Plausibility:

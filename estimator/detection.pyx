@@ -185,6 +185,7 @@ cdef double STRANGE_S = 0.5, UNKNOWN_RATE = 1.0 / 0.05
 cdef double STRANGE = 20.0  # samples out of order, of the last STRANGE_S: the sum of their steps is no displacement
 cdef double MOST = 100.0  # rated torques: no doubt is larger
 cdef int KNOWN_RUNS = 64  # of equal samples: their mean is known, and is a mean of so many
+cdef double UNSEEN = 2.5, LONGER = 4.0  # tolerances, samples: beyond what healthy inputs come to
 cdef double CALM = 0.1  # samples out of order, of the last STRANGE_S
 cdef double FOLLOW_RATE = 50.0  # at which the torque follows the current
 # logarithms of how rarely healthy noise gives so long a run of equal samples, of a joint's inputs and of its link encoder alone
@@ -268,7 +269,7 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
     cdef double expected = law.motor * x.motor_velocity_rad_s * dt, faster = expected - s.velocity
     cdef double motor = law.motor * x.motor_position_rad, link = law.link * x.link_position_rad
     cdef double doubt, longer, off = s.motor.off + s.link.off
-    cdef bint equal, link_still = link == s.link.last, calm = s.strange < CALM
+    cdef bint equal, link_still = link == s.link.last, calm = in_order(s)
     if not s.going or not 0.0 < dt <= LONGEST_STEP_S or not isfinite(motor + link + expected + current):
         s.going = isfinite(motor + link + expected + current)
         s.motor.last, s.link.last, s.velocity, s.current = motor, link, expected, x.current_a
@@ -288,14 +289,19 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
     s.velocity, s.current = expected, x.current_a
     s.strange *= 1.0 - min(dt / STRANGE_S, 1.0)
     if (
-        s.motor.off + s.link.off != off or longer > 0.0
-        or max(fabs(s.motor.unseen), fabs(s.link.unseen)) > law.tolerance
+        s.motor.off + s.link.off != off or longer > LONGER
+        or max(fabs(s.motor.unseen), fabs(s.link.unseen)) > UNSEEN * law.tolerance
     ):
         s.strange += 1.0
     if s.strange > STRANGE:
         s.motor.off *= 1.0 - min(dt * UNKNOWN_RATE, 1.0)
         s.link.off *= 1.0 - min(dt * UNKNOWN_RATE, 1.0)
     s.doubt = min(max(doubt, s.doubt * (1.0 - min(dt * SETTLE_RATE, 1.0))), law.most)
+
+
+cdef bint in_order(const InputState *s) noexcept nogil:
+    """Return whether nothing has been out of order lately: what is learned now is not learned from a fault."""
+    return s.strange < CALM
 
 
 cdef void bound_inputs(InputState *s, double most) noexcept nogil:

@@ -5,7 +5,7 @@ from jtqd.estimator.observer cimport (
     FusedObserved, FusedObserverLaw, FusedObserverState, GuardLaw, GuardState, Observed, ObserverLaw, ObserverState,
     Sample
 )
-from jtqd.estimator.fusion cimport AgreementLaw, AgreementState, Fused, FusionLaw, Learned, OffsetLaw, OffsetState
+from jtqd.estimator.fusion cimport AgreementLaw, AgreementState, Checkpoint, Fused, FusionLaw, Learned, OffsetLaw, OffsetState
 from jtqd.estimator.native_network cimport FusedTrustLaw, PathLaw, PathState, PerceptronLaw, TrustLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw, UncertaintyLaw
 
@@ -85,6 +85,7 @@ cdef struct FusedState:
     LinkState link
     PathState path
     InputState inputs
+    Checkpoint checkpoint
 
 cdef class FusedEstimator(Estimator):
     cdef FusedLaw law

@@ -13,15 +13,15 @@ from libc.math cimport NAN, fabs, fmin, hypot, sqrt
 from libc.string cimport memcmp, memcpy, memset
 
 from jtqd.estimator.detection cimport (
-    LinkLoad, bound_inputs, check_inputs, drop_inputs, fill_inputs, fill_link, restart_inputs, restart_link, update_link
+    LinkLoad, bound_inputs, check_inputs, drop_inputs, fill_inputs, fill_link, in_order, restart_inputs, restart_link, update_link
 )
 from jtqd.estimator.observer cimport (
     FusedObserved, FusedObserverLaw, Observed, Sample, fill_fused_observer, fill_guard, fill_observer, observe,
     observe_fused, restart_guard
 )
 from jtqd.estimator.fusion cimport (
-    Fused, Learned, Rest, TURN_WAVES, at_rest, degrades, disagreement, drop_block, early_factor, fading,
-    fill_agreement, fill_fusion, fill_offsets, fuse_paths, gather, implausible, known_nm2, local_stiffness,
+    Checkpoint, Fused, Learned, Rest, TURN_WAVES, at_rest, degrades, disagreement, drop_block, early_factor, fading,
+    fill_agreement, fill_fusion, fill_offsets, fuse_paths, gather, implausible, keep_offsets, known_nm2, local_stiffness,
     mismatch_variance, offsets_of, pause_turn, reach, report_offsets, restart_agreement, restart_offsets, restart_turn,
     reweigh, turn_differs, update_difference, update_turn
 )
@@ -361,6 +361,7 @@ cdef class FusedEstimator(Estimator):
         restart_agreement(&self.state.agreement)
         restart_link(&self.state.link)
         restart_inputs(&self.state.inputs)
+        memset(&self.state.checkpoint, 0, sizeof(Checkpoint))
 
     @property
     def zeros(self):
@@ -456,6 +457,8 @@ cdef class FusedEstimator(Estimator):
         cdef double noise = physics.variance - law.offsets.spread_nm  # the day's offset is a state, no noise
         cdef Loss next
         cdef double wave[TURN_WAVES]
+        if not in_order(&s.inputs):
+            status = DEGRADED  # nothing is learned from a fault
         if law.agreement.with_turn:
             if status == VALID:
                 wave[0], wave[1], wave[2] = seen.cos1, seen.sin1, seen.cos2
@@ -515,6 +518,7 @@ cdef class FusedEstimator(Estimator):
         if out.status == VALID:
             bound_inputs(&s.inputs, fabs(physics.difference) + reach(&physics, BOUNDING))
         if law.offsets.estimated:
+            keep_offsets(&s.checkpoint, &s.offsets, in_order(&s.inputs), x.dt_s)
             self.update_path_difference(seen, x, &physics, loss.nm, out.status)
         if law.offsets.spread > 0.0:
             known = known_nm2(&law.offsets, &s.offsets)

@@ -69,6 +69,16 @@ cdef struct OffsetState:
     uint64_t jumps  # how often a known offset became unknown again
     Block block
 
+cdef struct Estimates:  # of the offsets
+    double x[OFFSET_STATES]
+    double day_x[OFFSET_STATES]
+    double link_rad, current_a
+
+cdef struct Checkpoint:
+    Estimates kept, recent  # the latter is younger, and not yet known to be of a healthy time
+    double calm_s  # without a fault
+
+cdef void keep_offsets(Checkpoint *c, OffsetState *s, bint in_order, double dt) noexcept nogil
 cdef int fill_offsets(
     OffsetLaw *law, double torque_per_ampere, double rated_nm, fused, bint used, bint estimated
 ) except -1

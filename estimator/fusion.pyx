@@ -51,6 +51,9 @@ variance of the torsion in the fusion is s_t^2 - k S_nm^2. The spread of the fus
 on the days of the fit (`correlation_s`). The first filter has noise that includes the day's friction, so that it learns more
 slowly; it judges what exceeds ordinary days, and the agreement of the paths.
 
+**Nothing is learned from a fault.** While an encoder is out of order, and a second longer, nothing is learned; with the begin of
+that the offsets go back to those of CALM_S before. Their covariance stays: an encoder that has slipped is learned again.
+
 **Agreement** of the paths over seconds: differences beyond those on the runs of the fit count as a mismatch of the joint file.
 A changed stiffness, hysteresis, encoder error or friction shows in the difference long before a single sample is implausible.
 The innovation r of a block is split by time scale; each level follows fast upwards and slowly downwards:
@@ -89,7 +92,7 @@ An error that both paths share (gear ratio of both encoders, external load) is n
 """
 
 from libc.math cimport exp, fabs, fmax, sqrt
-from libc.string cimport memset
+from libc.string cimport memcpy, memset
 
 from typing import Final, NamedTuple
 
@@ -269,6 +272,7 @@ cdef double SHRUNK_BELOW = 2.0, KEPT_ABOVE = 4.0, INVERSE_RANGE = 1.0 / (KEPT_AB
 # the file's sigma needs no correction
 cdef double COVERED = 0.5
 cdef double SLEW_S = 0.25, INVERSE_SLEW = 1.0 / SLEW_S
+cdef double CALM_S = 1.0  # without a fault, until what was learned before counts as learned from healthy inputs
 cdef double LARGEST_LINK = 0.3  # prior standard deviation of the link offset as a torque, part of the rated torque
 cdef double CURRENT_SHARE = 0.2  # of the current offset as a torque, part of the current path's: the rest is friction
 cdef double LEAST_GAIN = 0.03  # least one of the gain
@@ -333,6 +337,30 @@ cdef void restart_offsets(const OffsetLaw *law, OffsetState *s) noexcept nogil:
     memset(s, 0, sizeof(OffsetState))
     for n in range(OFFSET_STATES):
         s.p[n][n] = s.day_p[n][n] = law.prior[n]
+
+
+cdef Estimates _estimates(const OffsetState *s) noexcept nogil:
+    cdef Estimates e
+    memcpy(e.x, s.x, sizeof(e.x))
+    memcpy(e.day_x, s.day_x, sizeof(e.day_x))
+    e.link_rad, e.current_a = s.link_rad, s.current_a
+    return e
+
+
+cdef void keep_offsets(Checkpoint *c, OffsetState *s, bint in_order, double dt) noexcept nogil:
+    """Keep offsets of a time that no fault has followed within CALM_S; with the begin of a fault go back to them."""
+    if in_order:
+        c.calm_s += dt
+        if c.calm_s > CALM_S:
+            c.kept, c.recent = c.recent, _estimates(s)
+            c.calm_s = dt
+    elif c.calm_s > 0.0:
+        c.calm_s = 0.0
+        c.recent = c.kept
+        memcpy(s.x, c.kept.x, sizeof(s.x))
+        memcpy(s.day_x, c.kept.day_x, sizeof(s.day_x))
+        s.link_rad, s.current_a = c.kept.link_rad, c.kept.current_a
+        drop_block(s)
 
 
 cdef void drop_block(OffsetState *s) noexcept nogil:

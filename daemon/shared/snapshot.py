@@ -151,7 +151,7 @@ ESTIMATE = struct.Struct(f"<qQqq{MOST_JOINTS}q")
 MEASURED = struct.Struct("<6d")
 INPUT = struct.Struct("<12q")
 """An `InputView`."""
-PAST_WORDS = 248
+PAST_WORDS = 264
 """Room for the state of an estimator."""
 LEARNED = struct.Struct(f"<7d3Q{8 * PAST_WORDS}s")
 """`Zeros`, length of the state [byte], the state."""

@@ -134,3 +134,44 @@ def test_an_encoder_that_freezes_in_motion_is_in_doubt_at_the_first_sample() -> 
     found, healthy = estimated(changed(link_rad=frozen)), estimated(inputs())
     assert held(found, slice(290, 400))
     assert found.sigma_nm[302] > 2.0 * healthy.sigma_nm[302]
+
+
+def moving() -> Inputs:
+    """Eight seconds of a motion both ways under a load."""
+    t = 1e-3 * np.arange(8000)
+    commands = (
+        JointCommand.velocity(lambda at: 0.8 * float(np.sin(2 * np.pi * at / 1.2))),
+        JointCommand.current(lambda at: 2.0 * float(np.sin(2 * np.pi * at / 0.7))),
+    )
+    made = emulate(load_any_plant(shipped("campaign_plant.yaml")), commands, len(t) * 1e-3, 6, day=3)
+    one = made.table.joints[1]
+    columns = (one.current_a, one.motor_position_rad, one.motor_velocity_rad_s, one.link_position_rad)
+    return Inputs(*map(np.asarray, columns), made.joint_torque_nm[:, 0])
+
+
+@pytest.mark.parametrize("error_rad", [2e-4, -3e-4])
+@pytest.mark.parametrize("cycles", [500, 2000])
+def test_nothing_is_learned_from_a_fault(error_rad: float, cycles: int) -> None:
+    """A step of the link encoder that ends: the offset is that of before, within a second."""
+    given = moving()
+    link = given.link_rad.copy()
+    link[4000 : 4000 + cycles] += error_rad
+    zeros = []
+    for columns in (given, given._replace(link_rad=link)):
+        estimator = make_estimator(JOINT, recommended("fused"))
+        for k in range(4000 + cycles + 1000):
+            estimator.step(1e-3, *(float(each[k]) for each in columns[:4]), 25.0)
+        found = estimator.zeros  # type: ignore[attr-defined]
+        zeros.append((found.link_used_rad, found.current_used_a))
+    assert zeros[1][0] == pytest.approx(zeros[0][0], abs=2e-5)
+    assert zeros[1][1] == pytest.approx(zeros[0][1], abs=0.02)
+
+
+def test_an_encoder_that_has_slipped_is_learned() -> None:
+    """What does not end is an offset: the estimate corrects it after a few seconds of motion."""
+    given = moving()
+    link = given.link_rad.copy()
+    link[2000:] += 2.5e-4
+    found = estimated(given._replace(link_rad=link))
+    error = np.abs(found.torque_nm - given.true_nm)
+    assert np.median(error[7500:]) < 0.4 * 2.5e-4 * JOINT.stiffness_nm_per_rad
