@@ -29,7 +29,7 @@ from jtqd.estimator.settings import EstimatorSettings
 from tests.estimator.estimator_helpers import Motion, SmallNetwork, joint1, motion
 
 NODES = (-30.0, -12.0, -4.0, 0.0, 3.0, 9.0, 21.0, 40.0)
-SIZES = (28, 16, 16, 1)
+SIZES = (28, 20, 40, 10, 1)
 HIGH = (50.0, 20.0, 20.0, 20.0, 8.0, 3.5, 3.0, 3.0, 3.0, 60.0, 1.0, 32.0, *([1.0] * 14), 50.0, 1.8)
 LOW = (*(-each for each in HIGH[:11]), 20.0, *(-each for each in HIGH[12:]))
 TRAINED_C = (20.0, 32.0)
@@ -91,7 +91,7 @@ REST_NM, QUICK_LIMITS = 0.8, (400.0, 80.0, 80.0)
 
 
 def fused_network(seed: int = 1, noise: float = 0.4, size_nm: float = 1.0, **metadata: Any) -> SmallNetwork:
-    """28-16-16-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
+    """28-20-40-10-1 of random weights; `size_nm` scales its answer. Metadata `...` leaves a key out."""
     rng = np.random.default_rng(seed)
     layers = tuple((noise * rng.normal(size=(m, n)), noise * rng.normal(size=n)) for m, n in pairwise(SIZES))
     values = {
