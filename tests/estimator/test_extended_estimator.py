@@ -380,6 +380,6 @@ def test_a_correction_that_raises_is_invalid_and_no_repeated_number(monkeypatch:
     run = estimator.run(*m.arrays())
     assert (run.status[599:610] == st.INVALID).all()
     assert np.isnan(run.torque_nm[599:610]).all()
-    assert np.isnan(run.features[599:610]).all()
+    assert np.isnan(run.physics_nm[599:610]).all()
     assert np.isfinite(run.torque_nm[598])
     assert np.isfinite(run.torque_nm[640:]).all()
