@@ -117,7 +117,7 @@ def summary(outcomes: Sequence[Outcome], healthy: Sequence[Baseline], seed: int)
         f"{100.0 * t.beyond / max(t.degraded, 1):.2f} % of its cycles; largest error sent {t.sent:.2f} of rated;",
         f"coverage {100 * share:.1f} % ({100 * low:.1f} to {100 * high:.1f}).",
         "",
-        "Without a fault: valid in motion, status 3, no torque [%]; wrong cycles of status 2 or 6; latched",
+        "Healthy: valid in motion, status 3, none [%]; wrong cycles; latched",
     ]
     lines += [
         f"  {each.plant:9} {100 * each.valid_share:6.2f} {100 * each.degraded_share:6.2f} {100 * each.none_share:6.2f} "
