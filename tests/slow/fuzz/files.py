@@ -328,12 +328,12 @@ def _network(method: str) -> Callable[[Path], None]:
     def read(path: Path) -> None:
         from jtqd.estimator.estimator import make_estimator
         from jtqd.estimator.network import load_network
-        from jtqd.estimator.settings import EstimatorSettings
+        from jtqd.estimator.settings import recommended
         from jtqd.models.files import load_joint
 
         network = load_network(method, path.read_bytes())
         joint = load_joint(shipped("trained/joint1.yaml"))
-        estimator = make_estimator(joint, EstimatorSettings(method=method), network)
+        estimator = make_estimator(joint, recommended(method), network)
         for n in range(5):
             estimator.step(1e-3, 1.0, 0.1 * n, 100.0, 0.001 * n, 25.0)
 

@@ -48,7 +48,7 @@ def test_a_missing_plan_comes_before_a_missing_option(more, capsys):
     [
         (["efficiency"], ["--bus is missing"]),
         (["efficiency", "--bus", "sim"], ["--out is missing"]),
-        (["eficiency", "--dry-run"], ["'eficiency'", "efficiency, excitation, validate"]),
+        (["eficiency", "--dry-run"], ["'eficiency'", "efficiency, excitation, quick, validate"]),
         (["p.yaml", "--dry-run", "--runs", "3"], ["--runs belongs to"]),
         (["p.yaml", "--dry-run", "--hold", "3"], ["--hold belongs to"]),
         (["p.yaml", "--dry-run", "--quick"], ["--quick belongs to"]),
