@@ -65,6 +65,7 @@ cdef struct Runs:  # of equal samples at rest: length of the last one, mean leng
 cdef struct Channel:  # an encoder, in Nm of torsion
     double last, step, rate  # reading, last step, rate in order [Nm/s]
     double noise  # variance of its second differences
+    double quantum  # smallest of them, which is a count
     double off  # displacement that no motion explains
     double unseen, current  # while it stands still: motion that the velocity has, current [Nm] when it began
     Runs runs  # of equal readings

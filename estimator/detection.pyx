@@ -21,7 +21,7 @@ reference is the first sample, whose own torque is not known. It stays, over gap
 **Encoders that are alive and quiet**, as torques by the stiffness of the torsion: what a reading may be off by widens sigma in
 the same sample. A step of a reading is in order where it continues the last steps, or the drive's velocity:
 
-    |step - last step|, or |step - omega_m dt|  <=  max(NOISE_SIGMAS noise, acceleration of FASTER rated torques dt^2)
+    |step - last step|, or |step - omega_m dt|  <=  max(NOISE_SIGMAS noise, COUNTS counts, FASTER rated torques dt^2/inertia)
     off    += step beyond that; a reading that steps back brings it back to 0
     unseen  = sum of omega_m dt while the reading stands still; link encoder: or what the current has changed by
     longer  = samples by which a run of equal ones at rest is longer than healthy noise gives with exp(-RARE); their mean
@@ -176,6 +176,8 @@ cdef class Plausibility:
 # Encoders that are alive and quiet ---------------------------------------------------------------------------------------
 
 cdef double NOISE_SIGMAS = 6.5  # of a second difference: once in hours
+cdef double ROUNDING = 1e-6  # [Nm], of float64: no count is as small
+cdef double COUNTS = 1.5  # of an encoder, by which its steps differ however smooth the motion
 cdef double NOISE_S = 1.0  # in which the noise of a channel is learned
 cdef double FASTER = 2.0  # rated torques that accelerate the rotor
 cdef double TOLERANCE = 0.025  # of the rated torque
@@ -225,15 +227,18 @@ cdef double _channel(
     calm: nothing was out of order lately, so that its noise is that of a healthy channel.
     """
     cdef double step = reading - c.last, by_rate = step - c.rate * dt, by_velocity = step - c.unseen - expected
-    cdef double limit = max(acceleration * dt * dt, NOISE_SIGMAS * sqrt(c.noise))
+    cdef double limit = max(acceleration * dt * dt, NOISE_SIGMAS * sqrt(c.noise)), change = fabs(step - c.step)
+    if change > ROUNDING and (change < c.quantum or c.quantum == 0.0):
+        c.quantum = change
+    limit = max(limit, COUNTS * c.quantum)
     c.last = reading
     if step == 0.0:
         if c.step != 0.0:
             c.current = current
         c.unseen += expected
         c.step, c.rate = 0.0, expected / dt
-        return max(fabs(c.unseen), fabs(c.off))
-    if fabs(by_rate) <= limit or fabs(by_velocity) <= limit or fabs(step - c.step) <= limit:
+        return max(fabs(c.unseen) - COUNTS * c.quantum, fabs(c.off))
+    if fabs(by_rate) <= limit or fabs(by_velocity) <= limit or change <= limit:
         if calm and c.step != 0.0 and fabs(by_rate) <= limit:
             c.noise += (by_rate * by_rate - c.noise) * min(dt / NOISE_S, 1.0)
         c.rate = (step if c.step != 0.0 else expected) / dt
@@ -282,15 +287,21 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
     doubt = _channel(&s.motor, motor, expected, faster, current, law.acceleration, dt, calm)
     doubt = max(doubt, _channel(&s.link, link, expected, faster, current, law.acceleration, dt, calm))
     if link_still:
-        doubt = max(doubt, fabs(current - s.link.current) * min((s.link.runs.still + 1) * dt * FOLLOW_RATE, 1.0))
+        doubt = max(
+            doubt,
+            fabs(current - s.link.current) * min((s.link.runs.still + 1) * dt * FOLLOW_RATE, 1.0) - COUNTS * s.link.quantum,
+        )
     doubt -= law.tolerance
+    # an encoder whose noise is below a count changes or stands still as its angle happens to lie
+    standing = standing and s.link.noise > s.link.quantum * s.link.quantum
     longer = max(_too_long(&s.runs, equal, standing, RARE_EQUAL), _too_long(&s.link.runs, link_still, standing, RARE_STILL))
     doubt = max(doubt, law.load_rate * dt * longer)
     s.velocity, s.current = expected, x.current_a
     s.strange *= 1.0 - min(dt / STRANGE_S, 1.0)
     if (
         s.motor.off + s.link.off != off or longer > LONGER
-        or max(fabs(s.motor.unseen), fabs(s.link.unseen)) > UNSEEN * law.tolerance
+        or fabs(s.motor.unseen) > UNSEEN * law.tolerance + COUNTS * s.motor.quantum
+        or fabs(s.link.unseen) > UNSEEN * law.tolerance + COUNTS * s.link.quantum
     ):
         s.strange += 1.0
     if s.strange > STRANGE:

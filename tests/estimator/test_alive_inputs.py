@@ -126,6 +126,14 @@ def test_channels_without_noise_are_not_stuck() -> None:
     assert found.sigma_nm[5999] == pytest.approx(found.sigma_nm[100], rel=1e-3)
 
 
+def test_a_link_encoder_of_14_bits_is_alive() -> None:
+    """A count is 4.6 Nm: its steps are in order, and it stands still as its angle happens to lie."""
+    count = 2.0 * np.pi / (1 << 14)
+    found = estimated(changed(link_rad=lambda x: np.round(x / count) * count))
+    assert np.quantile(found.sigma_nm[100:], 0.99) < 0.25 * RATED
+    assert np.mean(found.status[2500:] == st.STANDSTILL) > 0.9
+
+
 def test_an_encoder_that_freezes_in_motion_is_in_doubt_at_the_first_sample() -> None:
     def frozen(values: FloatArray) -> FloatArray:
         values[300:400] = values[300]
