@@ -56,9 +56,7 @@ def predict(solution: Solution) -> Prediction:
     values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
     wide = chosen | values - solution.equations.noisy
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
-    mixed = [
-        (1.0 - part) * _coefficients(sets, chosen) + part * _coefficients(sets, wide) for sets in without
-    ]
+    mixed = [_coefficients(sets, chosen) + part * _added(sets, chosen, wide) for sets in without]
     each = _held_out(grams, mixed[:-1])
     squares = {
         c: np.array([(run[c][-1, -1], each[r][c], counts[r][c]) for r, run in enumerate(grams) if c in run])
@@ -76,8 +74,7 @@ def stacked(
     """
     slope = curvature = 0.0
     for run, sets in zip(grams, without[:-1], strict=True):
-        few = _coefficients(sets, chosen)
-        step = _coefficients(sets, wide) - few
+        few, step = _coefficients(sets, chosen), _added(sets, chosen, wide)
         for gram in run.values():
             slope += float(step @ (gram[:-1, -1] - gram[:-1, :-1] @ few))
             curvature += float(step @ gram[:-1, :-1] @ step)
@@ -89,6 +86,13 @@ def _coefficients(sets: Sets, chosen: Set) -> FloatArray:
     out = np.zeros(len(sets.gram) - 1)
     out[sets.columns(chosen)] = sets.fit(chosen).mean
     return out
+
+
+def _added(sets: Sets, chosen: Set, wide: Set) -> FloatArray:
+    """Return what a wide set adds to a set whose entries keep their sizes [E]: those are where simulations settled."""
+    left = np.eye(len(sets.gram))
+    left[:-1, -1] = -_coefficients(sets, chosen)
+    return _coefficients(Sets(sets.entries, left.T @ sets.gram @ left), wide - chosen)
 
 
 def fits_without(solution: Solution) -> list[Sets]:

@@ -106,15 +106,19 @@ def test_values_outside_of_the_set_predict_as_far_as_held_out_runs_want(solution
 
 
 def test_what_predicts_is_the_mixture(solution: Solution, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of the part that held-out runs want: a value outside of the set has this part of what the wide set gives it."""
-    found = {}
+    """Of the part that held-out runs want: a value outside of the set has this part of what the wide set gives it, and the
+    set keeps its own: a motor near full saturation has no simulation a little beside them.
+    """
+    found, kept = {}, {}
     for part in (0.0, 0.25, 1.0):
         monkeypatch.setattr(held_out, "stacked", lambda *_, part=part: part)
         prediction = predict(solution)
         places = solution.sets.places(prediction.chosen)
         found[part] = {k: float(prediction.mean[s][0]) for k, s in places.items() if k not in solution.chosen}
+        kept[part] = {k: float(prediction.mean[s][0]) for k, s in places.items() if k in solution.chosen}
     assert found[0.0] == {}
     assert len(found[1.0]) > 1
+    assert kept[0.0] == kept[0.25] == kept[1.0]
     assert found[0.25] == pytest.approx({k: 0.25 * value for k, value in found[1.0].items()})
 
 
