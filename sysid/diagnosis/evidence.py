@@ -44,8 +44,6 @@ Solved = TypeVar("Solved")
 _LESS: Final = 1e-6
 _TRIED: Final = 3
 """Additions that are tried at each step, those of largest gain."""
-_PAIRED: Final = 8
-"""Entries that share most with the one that goes, and as many of largest gain: their pairs are tried in its place."""
 _RIVAL_STEPS: Final = 12
 _SAME: Final = 0.05
 """Part of a column's energy that others may lack, and still add up to it."""
@@ -196,14 +194,12 @@ class Sets:
         return np.asarray(out + self._odds)
 
     def search(self, start: Set, banned: Set = frozenset(), steps: int = 60) -> Set:
-        """Return the set from which no addition, removal, exchange or exchange of one for two gains."""
+        """Return the set from which no addition, removal or exchange gains."""
         chosen = start
         for _ in range(steps):
             moves = [*self._additions(chosen, banned), *(chosen - {k} for k in chosen)]
             for k in chosen:
-                less = chosen - {k}
-                moves += self._additions(less, banned | {k})
-                moves += [less | pair for pair in self._pairs(less, k, banned)]
+                moves += self._additions(chosen - {k}, banned | {k})
             best = max(moves, key=lambda s: self.fit(s).evidence, default=chosen)
             if self.fit(best).evidence <= self.fit(chosen).evidence + _LESS:
                 break
@@ -262,41 +258,6 @@ class Sets:
         gains = self.gains(chosen)
         gains[list(banned)] = -math.inf
         return [chosen | {k} for k in np.argsort(gains)[-_TRIED:].tolist() if math.isfinite(gains[k])]
-
-    def _pairs(self, less: Set, gone: int, banned: Set) -> list[Set]:
-        """Return pairs of single-column entries that may stand in the place of one: of those that share most with it, and of
-        those that promise most, the pair with most evidence.
-        """
-        if self.entries[gone].size > 1:
-            return []
-        now, at = self.fit(less), self.columns(less)
-        cross = self.gram[:, at]
-        column = self.slices[gone][0]
-        taken = {self.entries[k].slot for k in less}
-        never = banned | self.out | {gone}
-        usable = np.array(
-            [k not in never and self.entries[k].slot not in taken for k in self._single.tolist()], bool
-        )
-        if usable.sum() < 2:
-            return []
-        members, places = self._single[usable], self._place[usable]
-        rest = self.gram[np.ix_(places, places)] - cross[places] @ (now.covariance @ cross[places].T)
-        b = self.gram[places, -1] - cross[places] @ now.mean
-        shared = self.gram[places, column] - cross[places] @ (now.covariance @ cross[column])
-        scale = np.sqrt(np.maximum(np.diag(rest), 0.0) + 1.0)
-        few = np.union1d(
-            np.argsort(np.abs(b) / scale)[-_PAIRED:], np.argsort(np.abs(shared) / scale)[-_PAIRED:]
-        ).astype(np.intp)
-        i, j = np.triu_indices(len(few), 1)
-        i, j = few[i], few[j]
-        p, q, r = rest[i, i] + 1.0, rest[j, j] + 1.0, rest[i, j]
-        determinant = p * q - r * r
-        good = (p >= 1.0) & (q >= 1.0) & (determinant >= 1.0)
-        determinant = np.where(good, determinant, 1.0)
-        value = 0.5 * (q * b[i] ** 2 - 2.0 * r * b[i] * b[j] + p * b[j] ** 2) / determinant
-        value = np.where(good, value - 0.5 * np.log(determinant), -math.inf)
-        best = np.argsort(value)[-2:]
-        return [frozenset((int(members[i[k]]), int(members[j[k]]))) for k in best if math.isfinite(value[k])]
 
     def untold(self, chosen: Set) -> list[int]:
         """Return the entries outside of a set of which these runs say next to nothing: posterior over prior deviation."""

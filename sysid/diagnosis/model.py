@@ -39,7 +39,7 @@ from jtqd.sysid.diagnosis.regressors import (
 )
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
-_TURNS: Final = 4
+_TURNS: Final = 3
 _ROUNDS: Final = 3
 _STEPS: Final = 8
 """Of the variances."""
@@ -148,10 +148,12 @@ class _Search:
 
     def best(self, starts: Sequence[Set], *, rivals: bool) -> _End:
         """Return the set of most evidence of all that searches from these sets meet, and of their neighbours; rivals: also
-        of those that searches without one of its effects end in.
+        of those that searches without one of its effects end in. From each set once as if there were no discrepancy: that of
+        a set which lacks an effect may hide it.
         """
         self.own(frozenset())
-        for start in starts:
+        plain = self.equations.sets(self.equations.first())
+        for start in (*starts, *map(plain.search, starts)):
             now = start
             for _ in range(_ROUNDS):
                 sets = self.equations.sets(self.own(now).variances, now)
