@@ -498,16 +498,19 @@ def _only(run: RunData, columns: Index | None) -> RunData:
 
 
 def _difference(other: RunData, run: RunData) -> RunData:
-    """Return what the noise of a disturbed run adds to residual and columns; nuisances as none."""
+    """Return what the noise of a disturbed run adds to residual and columns; the discrepancy's as none."""
     channels = {}
     for c, d in other.channels.items():
         mine = run.channels[c]
+        nuisances = np.zeros_like(mine.nuisances)
+        own = d.nuisances.shape[1]
+        nuisances[:, :own] = d.nuisances - mine.nuisances[:, :own]
         channels[c] = ChannelData(
             mine.valid,
             d.residual - mine.residual,
             d.regressors - mine.regressors,
             mine.index,
-            np.zeros_like(mine.nuisances),
+            nuisances,
             mine.families,
         )
     return replace(run, channels=channels)

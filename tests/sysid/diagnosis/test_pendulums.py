@@ -495,3 +495,18 @@ def test_what_a_quick_load_shows_of_motor_and_spring_has_its_own_name(
     value = parameter(found, name, key)
     assert value.value == pytest.approx(getattr(SPRUNG, key), rel=0.01)
     assert value.ci95[0] < getattr(SPRUNG, key) < value.ci95[1]
+
+
+@pytest.mark.parametrize(("counts", "viscous", "rate_hz"), [(2.0**8, 20.0, 250.0), (2.0**10, 40.0, 125.0)])
+def test_a_friction_that_is_wrong_in_every_run_is_no_friction_of_the_day(
+    counts: float, viscous: float, rate_hz: float
+) -> None:
+    """Of a coarse encoder the velocity has noise: in the friction's column as in that of a run's own friction."""
+    rig = Rig(rate_hz=rate_hz, counts=counts, days=0.02)
+    runs = runs_of(replace(ARM, friction=Friction(3.2, 5.0)), 5, 6, rig)
+    found = diagnose(runs, {1: replace(ARM, friction=Friction(3.2, viscous))})
+    assert [c.name for c in found.causes if c.matters] == ["viscous_friction"]
+    value = parameter(found, "viscous_friction", "viscous_nms_per_rad")
+    assert value.ci95[0] < 5.0 < value.ci95[1]
+    assert found.gain is not None
+    assert found.gain.rmse_after_nm < 0.1 * found.gain.rmse_before_nm
