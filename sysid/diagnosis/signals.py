@@ -455,7 +455,7 @@ def joint_signals(  # noqa: PLR0917
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
-    known = COMPUTED_HZ if computed else max(COMPUTED_HZ, known_below_hz(sensor, step))
+    known = max(COMPUTED_HZ, known_below_hz(sensor, step))
     known = like.torque_hz if like else known
     slow_torque = below(gear_torque, step, known)
     loss = base.loss(gear_torque, velocity)
