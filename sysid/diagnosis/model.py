@@ -39,7 +39,7 @@ from jtqd.sysid.diagnosis.regressors import (
 )
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
 
-_TURNS: Final = 3
+_TURNS: Final = 4
 _ROUNDS: Final = 3
 _STEPS: Final = 8
 """Of the variances."""
@@ -195,7 +195,8 @@ def solve(dataset: Dataset) -> Solution:
     residuals = work.first_residuals()
     start = work.file_values()
     for turn in range(_TURNS):
-        noise = noise_of_channels(residuals, dataset.step_s, limits.FLOOR * dataset.rated_torque_nm)
+        if turn + 1 < _TURNS:  # the last one compares what the one before has moved, on the same noise
+            noise = noise_of_channels(residuals, dataset.step_s, limits.FLOOR * dataset.rated_torque_nm)
         equations = work.equations(noise)
         search = _Search(equations)
         starts = [start - equations.noisy, *([frozenset[int]()] if turn < _FROM_NOTHING else [])]
