@@ -40,7 +40,7 @@ def runs_of_days(offset_nm: float, within_nm: float = 0.2) -> list[PathResiduals
 
 def fused(sigma: FusedSigma = SIGMA) -> Fused:
     assert NARROW.fused is not None
-    return replace(NARROW.fused, sigma=sigma)
+    return replace(NARROW.fused, sigma=sigma, tracking=None)  # these runs have no tracked torsion
 
 
 def zeros_of(runs: list[PathResiduals], sigma: FusedSigma = SIGMA) -> DayZeros:
