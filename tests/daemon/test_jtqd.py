@@ -187,7 +187,7 @@ def test_a_network_of_another_method_is_refused_in_one_line(
     assert result.returncode == 2, "a file is wrong: systemd does not start it again"
     (line,) = (text for text in no_traceback(result).splitlines() if not text.startswith("bench ready"))
     assert line.startswith(
-        f"jtqd: {tmp_path}/n1.onnx: found input 'x' of shape ['N', 7], expected ['N', 6] ("
+        f"jtqd: {tmp_path}/n1.onnx: found input 'x' of shape ['N', 28], expected ['N', 6] ("
     )
 
 

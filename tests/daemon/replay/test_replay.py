@@ -190,9 +190,11 @@ def test_the_raw_frames_are_what_is_replayed(
         return data[:at] + struct.pack("<h", current + 50) + data[at + 2 :]
 
     status, found, _ = run(capsys, cut(log, tmp_path / "spoilt.mcap", payload=spoil))
-    (one,) = found["identity"]["differences"]
+    one, *later = found["identity"]["differences"]
     assert status == 3
-    assert (one["joint"], one["cycle"]) == (1, target)
+    assert (one["joint"], one["cycle"], one["field"]) == (1, target, "torque_nm")
+    # what the joint has learned from that cycle is in its state as well
+    assert all((d["joint"], d["field"]) == (1, "state") and d["cycle"] > target for d in later)
 
 
 @pytest.mark.native
