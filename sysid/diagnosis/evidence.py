@@ -360,9 +360,13 @@ class Equations:
 
     def marginal(self, variances: Variances) -> list[FloatArray]:
         """Return the equations over [E, response] of all recordings but each in turn, and of all."""
-        parts = np.array(self._reduced(variances)[0])
-        totals = [*(parts.sum(axis=0) - parts), parts.sum(axis=0)]
-        return [self._without_shared(total, variances)[0] for total in totals]
+
+        def marginals(e: Equations) -> list[FloatArray]:
+            parts = np.array(e._reduced(variances)[0])
+            totals = [*(parts.sum(axis=0) - parts), parts.sum(axis=0)]
+            return [e._without_shared(total, variances)[0] for total in totals]
+
+        return self._positive(marginals)
 
     def _without_resemblance(self, gram: FloatArray, variances: Variances) -> FloatArray:
         """Return the equations over [E, response] without what of the discrepancy resembles the entries; of directions in

@@ -382,6 +382,17 @@ def test_of_a_set_that_noise_leaves_no_covariance_less_is_taken_out() -> None:
     assert equations.kappa == 1.0
 
 
+def test_of_a_nuisance_that_noise_leaves_no_variance_less_is_taken_out() -> None:
+    """A friction of the day is made of a noisy velocity: also where each recording is left out in turn."""
+    rng = np.random.default_rng(11)
+    blocks = [np.column_stack((rng.normal(size=(200, 2)), rng.normal(size=200))) for _ in range(3)]
+    equations = equations_of(blocks, [entry()], ("viscous",), noise=np.diag([0.0, 260.0, 0.0]))
+    found = equations.marginal({"viscous": 1.0})
+    assert len(found) == 4
+    assert np.isfinite(found).all()
+    assert np.linalg.eigvalsh(found[-1])[0] > 0.0
+
+
 def test_noise_that_a_column_brings_into_the_discrepancy_is_taken_out_there_as_well() -> None:
     """The discrepancy is what the set's columns do not explain of it, so it has their noise, too. Were that left in, a
     coefficient and a discrepancy that cancel each other would explain noise: of a torque that is in column and response.
