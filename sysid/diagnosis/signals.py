@@ -138,7 +138,7 @@ class Line:
 
 
 COMPUTED_HZ: Final = 12.0
-"""A torque that is computed from a motion is known below this, as its acceleration was smoothed; a measured one at least."""
+"""Cutoff of the motor balance where the torque is computed, as its acceleration was smoothed; least cutoff of any torque."""
 _ALL_VISIBLE: Final = Smoother(1.0)
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
@@ -455,8 +455,7 @@ def joint_signals(  # noqa: PLR0917
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
-    known = max(COMPUTED_HZ, known_below_hz(sensor, step))
-    known = like.torque_hz if like else known
+    known = like.torque_hz if like else max(COMPUTED_HZ, known_below_hz(sensor, step))
     slow_torque = below(gear_torque, step, known)
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2

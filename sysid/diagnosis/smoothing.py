@@ -223,7 +223,8 @@ def known_below_hz(x: FloatArray, step_s: float) -> float:
 
     Of differences of x, so that what is slow does not leak (Welch 1967, IEEE Trans. Audio Electroacoust. 15).
     """
-    hz, power = signal.welch(np.diff(x), 1.0 / step_s, nperseg=min(len(x) - 1, round(0.5 / step_s)))
+    segment = min(len(x) - 1, max(16, round(0.5 / step_s)))
+    hz, power = signal.welch(np.diff(x), 1.0 / step_s, nperseg=segment)
     white = 2.0 * step_s * float(np.mean(noise_of(x) ** 2)) * 4.0 * np.sin(np.pi * hz * step_s) ** 2
     return 2.0 * float(hz[power > 2.0 * white].max(initial=0.0))
 

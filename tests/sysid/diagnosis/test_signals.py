@@ -112,6 +112,13 @@ def test_a_cutoff_leaves_what_is_above_the_noise_of_a_signal(highest_hz: float) 
     assert rms(below(noise, 1e-3, cutoff)) < rms(noise)
 
 
+@pytest.mark.parametrize("step_s", [0.05, 1.0, 5.0])
+def test_a_cutoff_of_slow_recordings_is_one_that_their_samples_have(step_s: float) -> None:
+    x = np.cumsum(np.random.default_rng(4).normal(size=100))
+    assert 0.0 <= known_below_hz(x, step_s) <= 1.0 / step_s
+    assert 0.0 <= known_below_hz(x[:5], step_s) <= 1.0 / step_s
+
+
 def test_a_run_by_the_equations_leaves_nothing() -> None:
     s = signals(rigid_run(PLAIN))
     assert rms(s.motor_nm[s.moving]) < 2e-3
