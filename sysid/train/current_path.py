@@ -52,7 +52,8 @@ QUICK_SHARE: Final = 0.999
 QUICK_MARGIN: Final = 1.1
 REST_COVERAGE: Final = 0.95
 _SETTINGS: Final = recommended("fused")
-_BASE, _VELOCITY, _QUICK = 0, 5, (9, 1, 2)
+_BASE, _VELOCITY = INPUTS.index("torque_nm"), INPUTS.index("velocity_rad_s")
+_QUICK: Final = tuple(map(INPUTS.index, ("acceleration_rad_s2", "torque_800_nm", "torque_50_nm")))
 
 
 class _Probe:
