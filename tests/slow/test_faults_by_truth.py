@@ -8,7 +8,7 @@ import pytest
 
 from tests.paths import ROOT
 from tests.slow.faults import gateway as gw
-from tests.slow.faults.__main__ import SEED, coverage, totals
+from tests.slow.faults.__main__ import SEED, coverage, main, totals
 from tests.slow.faults.gateway import Active, Gateway
 from tests.slow.faults.runs import PLANTS, STATES, runs_of
 from tests.slow.faults.table import ROWS, Draw, pairs, singles
@@ -68,6 +68,18 @@ def test_the_draw_covers_every_plant_and_state() -> None:
     found = [(case.plant, case.state) for case in cases]
     counts = [found.count((plant, state)) for plant in PLANTS for state in STATES]
     assert min(counts) > 0.8 * max(counts)
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--match", "("], ["--match", "no such fault"], ["--match", "noise", "--write"]]
+)
+def test_arguments_that_would_judge_nothing_are_refused(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as refused:
+        main(["--per-row", "1", "--pairs", "0", *arguments])
+    assert refused.value.code == 2
+    assert "error: " in capsys.readouterr().err
 
 
 # The judge ----------------------------------------------------------------------------------------------------------

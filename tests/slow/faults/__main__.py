@@ -162,7 +162,14 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     cases = [*singles(options.seed, options.per_row), *pairs(options.seed, options.pairs)]
     if options.match:
-        cases = [each for each in cases if re.search(options.match, each.injected)]
+        if options.write:
+            parser.error("--match: the tables of the docs are of every case; expected no --write")
+        try:
+            cases = [each for each in cases if re.search(options.match, each.injected)]
+        except re.error as error:
+            parser.error(f"--match: found {options.match!r}, expected a regular expression: {error}")
+    if not cases:
+        parser.error("found no case that matches, expected at least one")
     outcomes = [judge(case) for case in cases]
     if options.list:
         for each in sorted(outcomes, key=lambda one: -one.dangerous_nm):
