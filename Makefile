@@ -5,11 +5,12 @@
 
 VENV := .venv
 BIN := $(VENV)/bin
+RELEASE := build/release
 PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs dist deb test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint style types format clean
+.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -94,12 +95,12 @@ docs: $(VENV)/.created ## the documentation as a site: build/site/index.html
 	$(PIP) install 'mkdocs-material>=9.5,<10'
 	$(BIN)/mkdocs build --strict --quiet
 
-dist: $(VENV)/.installed-dev ## wheel and sdist into dist/
-	$(PIP) install build
-	$(BIN)/python -m build --outdir dist .
-
 deb: $(VENV)/.installed ## Debian package into dist/: jtqd in /opt/jtqd, units, user, configuration
 	$(BIN)/python tools/deb.py --out dist
+
+release: $(RELEASE)/.installed ## wheel, sdist, Debian package, SBOM and SHA256SUMS of the commit into dist/
+	@[ -z "$$(git status --porcelain)" ] || echo "make release: NOT in the release, as not committed: $$(git status --short | tr '\n' ' ')" >&2
+	$(RELEASE)/bin/python -m tools.release
 
 clean: ## remove what make made here; the cached bench kernel stays
 	rm -rf $(VENV) build dist src/*.egg-info .mypy_cache .ruff_cache .pytest_cache .hypothesis
@@ -109,6 +110,16 @@ clean: ## remove what make made here; the cached bench kernel stays
 # Stages of one environment; each stamp is renewed when pyproject.toml changes.
 $(VENV)/.created:
 	@.ci/venv $(VENV)
+	@touch $@
+
+# Of the tools of a release: no development tool gets in, and their versions are fixed.
+$(RELEASE)/.installed: pyproject.toml tools/release.txt
+	@.ci/venv $(RELEASE)
+	@.ci/requirements build release >$(RELEASE)/packages.txt
+	@$(RELEASE)/bin/python -m pip --disable-pip-version-check --quiet install -c tools/release.txt pip -r $(RELEASE)/packages.txt || { \
+	echo "make release: NO RELEASE WITHOUT ITS SBOM: cyclonedx-bom and the fixed build tools are not installed here. With PyPI or a mirror" >&2; \
+	echo "(PIP_INDEX_URL), or with wheels in a directory (PIP_NO_INDEX=1 PIP_FIND_LINKS=DIR):" >&2; \
+	echo "    $(RELEASE)/bin/python -m pip install -c tools/release.txt pip -r $(RELEASE)/packages.txt" >&2; exit 1; }
 	@touch $@
 
 # Every compiled module and what it is made of: a change installs, and so compiles, again.

@@ -10,7 +10,7 @@ Exit status: 0 done, 1 failure.
 from __future__ import annotations
 
 import argparse
-import compileall
+import os
 import re
 import shutil
 import subprocess
@@ -83,6 +83,12 @@ def version() -> str:
     return found[1]
 
 
+def commit_time() -> str:
+    """Time of the commit that is built, in Unix seconds: $SOURCE_DATE_EPOCH (reproducible-builds.org), else git's."""
+    given = os.environ.get("SOURCE_DATE_EPOCH")
+    return given or run("git", "-C", ROOT, "log", "-1", "--format=%ct").strip()
+
+
 def environment(tree: Path, source: Path, wheels: Path | None) -> None:
     """Make the virtual environment in the tree, as if it lay at /opt/jtqd: no path of the build is left in it."""
     target = tree / PREFIX
@@ -92,11 +98,11 @@ def environment(tree: Path, source: Path, wheels: Path | None) -> None:
     pip = (sys.executable, "-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--no-compile")
     run(*pip, *offline, "--target", site, source)
     shutil.rmtree(site / "bin", ignore_errors=True)
-    for origin in site.glob("*.dist-info/direct_url.json"):  # it names the wheel's place
-        origin.unlink()
-        record = origin.with_name("RECORD")
-        kept = [line for line in record.read_text().splitlines() if "direct_url.json" not in line]
-        record.write_text("\n".join([*kept, ""]))
+    for record in site.glob("*.dist-info/RECORD"):
+        record.with_name("direct_url.json").unlink(missing_ok=True)  # it names the wheel's place
+        lines = record.read_text().splitlines()
+        gone = ("../../bin/", f"{record.parent.name}/direct_url.json")
+        record.write_text("\n".join([*(line for line in lines if not line.startswith(gone)), ""]))
     for command, module in (("jtqd", "jtqd.daemon.jtqd"), ("jtq", "jtqd.daemon.jtq")):
         script = target / "bin" / command
         script.write_text(
@@ -110,7 +116,17 @@ def environment(tree: Path, source: Path, wheels: Path | None) -> None:
         activate.unlink()  # they name the place of the build
     config = target / "pyvenv.cfg"
     config.write_text(re.sub(r"(?m)^command = .*\n", "", config.read_text()))
-    compileall.compile_dir(str(site), quiet=2, workers=1, stripdir=str(tree), prependdir="/")
+    touch(tree)  # byte code holds the time of its source
+    # A process of its own: byte code differs with what the compiling interpreter has loaded.
+    compiled = ("-m", "compileall", "-qq", "-s", tree, "-p", "/", "--invalidation-mode", "timestamp")
+    subprocess.run([PYTHON, "-I", *compiled, site], check=False)  # it fails at templates that packages ship
+
+
+def touch(tree: Path) -> None:
+    """Give every file, folder and link of the tree the time of the commit."""
+    time = int(commit_time())
+    for path in (tree, *tree.rglob("*")):
+        os.utime(path, (time, time), follow_symlinks=False)
 
 
 def interpreter() -> tuple[str, str]:
@@ -130,8 +146,7 @@ def build(out: Path, wheels: Path | None, source: Path, name: str) -> Path:
     with tempfile.TemporaryDirectory() as folder:
         tree = Path(folder) / "tree"
         (tree / "DEBIAN").mkdir(parents=True)
-        for directory in (Path(folder), tree):
-            directory.chmod(0o755)
+        tree.chmod(0o755)
         environment(tree, source, wheels)
         for here, there in FILES.items():
             (tree / there).parent.mkdir(parents=True, exist_ok=True)
@@ -144,7 +159,8 @@ def build(out: Path, wheels: Path | None, source: Path, name: str) -> Path:
             ROOT / "models/trained", etc / "trained", ignore=shutil.ignore_patterns("__pycache__")
         )
         conffiles = sorted(f"/{path.relative_to(tree)}" for path in etc.rglob("*") if path.is_file())
-        size = sum(path.lstat().st_size for path in tree.rglob("*") if path.is_file()) // 1024
+        files = (path for path in tree.rglob("*") if path.is_file() and not path.is_symlink())
+        size = sum(path.stat().st_size for path in files) // 1024
         control = (
             f"Package: jtqd\nVersion: {name}\nArchitecture: {architecture}\nSection: science\nPriority: optional\n"
             "Maintainer: jtqd developers <jtqd@localhost>\n"
@@ -160,8 +176,10 @@ def build(out: Path, wheels: Path | None, source: Path, name: str) -> Path:
             (tree / "DEBIAN" / script).write_text(text)
             (tree / "DEBIAN" / script).chmod(0o755)
         for path in tree.rglob("*"):
-            if not path.is_symlink() and not path.is_relative_to(tree / "DEBIAN"):
+            if not path.is_symlink():
                 path.chmod(0o755 if path.is_dir() or path.stat().st_mode & 0o100 else 0o644)
+        touch(tree)
+        os.environ["SOURCE_DATE_EPOCH"] = commit_time()  # dpkg-deb gives it to the archive's own members
         out.mkdir(parents=True, exist_ok=True)
         made = out / f"jtqd_{name}_{architecture}.deb"
         run("dpkg-deb", "--root-owner-group", "--build", tree, made)
