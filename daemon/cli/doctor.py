@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import gzip
+import hashlib
 import json
 import os
 import platform
@@ -16,9 +17,10 @@ import shutil
 import socket
 import subprocess
 import time
+from base64 import urlsafe_b64decode
 from collections.abc import Iterator
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, requires
+from importlib.metadata import PackageNotFoundError, distributions, requires
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from jtqd.drivers.bus_socket import AF_CAN, CAN_RAW
 from jtqd.drivers.frame_socket import BusError, open_frame_socket
 from jtqd.estimator.command_line import command_parser
 from jtqd.estimator.errors import ConfigError
+from jtqd.estimator.files import read_file
 from jtqd.estimator.network import NetworkError
 from jtqd.estimator.text import percent, size
 
@@ -67,6 +70,7 @@ _UNITS = (
     "/lib/systemd/system",
 )
 _UNIT = "jtqd@.service"
+_MD5SUMS = Path("/var/lib/dpkg/info/jtqd.md5sums")
 _USUAL_LOGS = Path("/var/log/jtqd")
 _LOG_FREE = 10 << 30
 """A working day of recording."""
@@ -113,6 +117,7 @@ def _examine(bus: str | None, path: Path | None, log: Path | None) -> Iterator[C
         yield from _files(config)
     yield from check_directories(log, places())
     yield _packages()
+    yield _installed_files(Path(__file__))
     yield _unit()
     yield from _remains(log, find_daemons())
 
@@ -437,6 +442,30 @@ def _packages() -> CheckResult:
     versions = ", ".join(f"{name} {version}" for name, version in found.items())
     hint = "pip install --upgrade jtqd, in its own environment"
     return judge("packages", "; ".join(wrong) or f"jtqd {__version__}, {versions}", (wrong, FAIL, hint))
+
+
+def _installed_files(own: Path) -> CheckResult:
+    """Compare the files of the environment that `own` lies in with the hashes of dpkg, without /etc, or else of pip."""
+    sums = (line.split(maxsplit=1) for line in _read(_MD5SUMS).splitlines())
+    wanted = {Path("/", name): ("md5", bytes.fromhex(digest)) for digest, name in sums if name[:4] != "etc/"}
+    if own not in wanted:
+        found = (each for one in distributions(path=[str(own.parents[3])]) for each in one.files or ())
+        wanted = {
+            Path(str(each.locate())): (each.hash.mode, urlsafe_b64decode(each.hash.value + "=="))
+            for each in found
+            if each.hash and (".." not in each.parts or os.path.exists(each.locate()))  # scripts: optional
+        }
+    if own not in wanted:
+        return CheckResult("installed files", SKIP, "no hashes to compare with (source or editable install)")
+    wrong = []
+    for path, (algorithm, digest) in wanted.items():
+        with suppress(OSError):
+            if hashlib.new(algorithm, read_file(path)).digest() == digest:
+                continue
+        wrong.append(f"{path} {'differs' if path.exists() else 'is missing'}")
+    text = f"{len(wrong)} of {len(wanted)} are not as installed: {'; '.join(wrong[:50])}"
+    hint = "install it again, from files that `sha256sum -c SHA256SUMS` finds right"
+    return judge("installed files", text if wrong else f"{len(wanted)} as installed", (wrong, FAIL, hint))
 
 
 def _unit() -> CheckResult:

@@ -1,5 +1,6 @@
 """`jtq doctor`: what it finds on a machine, in a broken configuration, in directories, and after a crash."""
 
+import base64
 import hashlib
 import json
 import os
@@ -234,3 +235,78 @@ def test_cpu_lists_and_a_cpu_that_is_not_there() -> None:
 def test_requirements(requirement: str, level: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(machine, "requires", lambda name: [requirement])
     assert machine._packages().level == level
+
+
+def environment(tmp_path: Path) -> tuple[Path, Path]:
+    """An environment as pip leaves it, with jtqd and a library; its site-packages and the module of `jtq doctor`."""
+    site = tmp_path / "venv" / "lib" / "site-packages"
+    content = {
+        "jtqd-0.2.0": {
+            "jtqd/daemon/cli/doctor.py": b"own",
+            "jtqd/__init__.py": b"",
+            "../../bin/jtq": b"script",
+        },
+        "library-1.0": {"library/core.so": b"compiled", "../../share/man/library.1": b"page"},
+    }
+    for name, files in content.items():
+        rows = [f"{name}.dist-info/RECORD,,", "jtqd/__pycache__/x.pyc,,"]
+        for place, data in files.items():
+            path = site / place
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            digest = base64.urlsafe_b64encode(hashlib.sha256(data).digest()).rstrip(b"=").decode()
+            rows.append(f"{place},sha256={digest},{len(data)}")
+        (site / f"{name}.dist-info").mkdir()
+        (site / f"{name}.dist-info" / "METADATA").write_text(f"Name: {name.partition('-')[0]}\nVersion: 1\n")
+        (site / f"{name}.dist-info" / "RECORD").write_text("\n".join(rows))
+    return site, site / "jtqd" / "daemon" / "cli" / "doctor.py"
+
+
+def test_installed_files_are_compared_with_what_pip_recorded(tmp_path: Path) -> None:
+    site, own = environment(tmp_path)
+    found = machine._installed_files(own)
+    assert (found.level, found.text) == (GOOD, "5 as installed")
+    (
+        site / "../../share/man/library.1"
+    ).unlink()  # of `pip install --target`: what is no module, lies elsewhere
+    assert machine._installed_files(own).level == GOOD
+    (site / "library" / "core.so").write_bytes(b"Compiled")
+    (site / "jtqd" / "__init__.py").unlink()
+    (site / "../../bin/jtq").write_bytes(b"")
+    found = machine._installed_files(own)
+    assert found.level == FAIL
+    assert found.text.startswith("3 of 4 are not as installed: ")
+    for text in ("library/core.so differs", "jtqd/__init__.py is missing", "bin/jtq differs"):
+        assert text in found.text
+    (site / "library" / "core.so").unlink()
+    os.mkfifo(site / "library" / "core.so")  # is not waited for
+    assert "core.so differs" in machine._installed_files(own).text
+
+
+def test_installed_files_of_the_debian_package_are_compared_with_its_sums(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    site, own = environment(tmp_path)
+    byte_code = site / "jtqd" / "a b.pyc"
+    byte_code.write_bytes(b"code")
+    sums = tmp_path / "jtqd.md5sums"
+    lines = [f"{hashlib.md5(path.read_bytes()).hexdigest()}  {str(path)[1:]}" for path in (own, byte_code)]
+    edited = "0" * 32 + "  etc/jtqd/bench.yaml"
+    sums.write_text("\n".join([*lines, edited]) + "\n")
+    monkeypatch.setattr(machine, "_MD5SUMS", sums)
+    assert machine._installed_files(own).text == "2 as installed"
+    byte_code.write_bytes(b"other")
+    found = machine._installed_files(own)
+    assert (found.level, found.text) == (FAIL, f"1 of 2 are not as installed: {byte_code} differs")
+    sums.write_text(lines[1] + "\n")  # the package is there, and another installation runs
+    assert machine._installed_files(own).text == "5 as installed"
+
+
+def test_a_source_tree_and_an_editable_install_have_no_hashes(tmp_path: Path, doctor: Doctor) -> None:
+    site, own = environment(tmp_path)
+    elsewhere = tmp_path / "tree" / "src" / "jtqd" / "daemon" / "cli" / "doctor.py"
+    assert machine._installed_files(elsewhere).level == SKIP
+    record = site / "jtqd-0.2.0.dist-info" / "RECORD"
+    record.write_text("__editable__.jtqd-0.2.0.pth,sha256=AAAA,3\n")
+    assert machine._installed_files(own).level == SKIP
+    assert "installed files" in doctor("--bus", "sim")[1]
