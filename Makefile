@@ -52,7 +52,7 @@ test-guest:
 test-native:
 	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)"
 
-test-all: lint ## everything
+test-all: lint ## everything: also the long tests, two releases that must be equal, the sanitizers
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	$(BIN)/python -m pytest
 	$(MAKE) --no-print-directory test-sanitized
