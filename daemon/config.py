@@ -323,6 +323,8 @@ class JointSection:
     max_age_ms: Annotated[float, limits("ms", ge=0.1, le=1000.0)] | None = None
     """Longest age of a frame of an acyclic TPDO."""
     network: NetworkSection | None = None
+    shadow_networks: Mapping[str, NetworkSection] = field(default_factory=dict)
+    """Of shadow methods, by method."""
     profile: Text | None = None
     """Of the drive's family: gives the values that the section does not have (`with_profiles`)."""
 
@@ -358,6 +360,13 @@ class SensorSection:
     def __post_init__(self) -> None:
         check_given("sensor", self.given, SENSOR_SCALING_OBJECTS)
         _check_unit_words(self.unit_words)
+
+
+@dataclass(frozen=True, slots=True)
+class _Estimator(EstimatorSettings):
+    """Section `estimator`; shadow: further methods of every joint, computed every cycle and never sent."""
+
+    shadow: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -500,7 +509,7 @@ class ConfigFile:
     sync: _Sync = _Sync()
     inputs: _Inputs = _Inputs()
     nodes: _Nodes = _Nodes()
-    estimator: EstimatorSettings = field(default_factory=EstimatorSettings)
+    estimator: _Estimator = field(default_factory=_Estimator)
     safety: SafetySettings = field(default_factory=SafetySettings)
     sensor: SensorSection | None = None
     realtime: Realtime = field(default_factory=Realtime)
@@ -563,6 +572,11 @@ class ConfigFile:
             users[node] = key
 
     def _wrong_features(self) -> Iterator[tuple[str, object, str]]:
+        sent, shadow = self.estimator.method, self.estimator.shadow
+        others = [name for name in METHODS if name != sent]
+        if not set(shadow) <= set(others) or len(set(shadow)) != len(shadow):
+            expected = f"a list of {', '.join(others)}, each at most once: {sent} is the method that is sent"
+            yield "estimator.shadow", list(shadow), expected
         if self.ros2 is not None:
             sections = [f"joint_{number}" for number in range(1, len(self.joints) + 1)]
             for section in self.ros2.names:
@@ -626,6 +640,7 @@ class JointConfig:
     """TPDOs that carry them: configured ones, and after the boot those in force (`as_booted`)."""
     max_age_ms: float
     """Longest age of a frame of a TPDO with transmission type 0, 254 or 255; 0: such a TPDO is not used."""
+    shadow_networks: Mapping[str, NetworkFile] = field(default_factory=dict)
     joint_data: bytes = field(default=b"", repr=False)
     """The joint file as it was read, for the log."""
     profile: str | None = None
@@ -690,6 +705,21 @@ class Config:
     """None: no ROS 2, unless the command line asks for it."""
     contact: ContactSettings | None = None
     """None: contacts are not detected."""
+    shadow: tuple[str, ...] = ()
+    """Methods of every joint that are computed and never sent."""
+
+    @property
+    def shadows(self) -> tuple[Config, ...]:
+        """Return for each shadow method the configuration that would send it."""
+        return tuple(
+            replace(
+                self,
+                estimator=replace(self.estimator, method=name),
+                joints=tuple(replace(each, network=each.shadow_networks.get(name)) for each in self.joints),
+                shadow=(),
+            )
+            for name in self.shadow
+        )
 
     @property
     def files_sha256(self) -> str:
@@ -756,7 +786,9 @@ def load_config(path: Path | None) -> Config:
         emcy_inhibit_ms=file.nodes.emcy_inhibit_ms,
         boot_timeout_s=file.nodes.boot_timeout_s,
         reset_communication=file.nodes.reset_communication,
-        estimator=file.estimator,
+        estimator=EstimatorSettings(
+            **{each.name: getattr(file.estimator, each.name) for each in fields(EstimatorSettings)}
+        ),
         safety=file.safety,
         joints=joints,
         sensor=None if file.sensor is None else _sensor(file.sensor, file.nodes.sdo_timeout_ms),
@@ -765,6 +797,7 @@ def load_config(path: Path | None) -> Config:
         metrics_file=None if file.metrics is None else Path(file.metrics.file),
         ros2=file.ros2,
         contact=file.contact,
+        shadow=file.estimator.shadow,
     )
 
 
@@ -795,11 +828,11 @@ def _sensor(section: SensorSection, sdo_timeout_ms: int) -> SensorConfig:
 
 
 def _joint(path: Path, number: int, file: ConfigFile) -> JointConfig:
-    """Read the files of a section `joint_N`: the joint file and, where the method uses one, the network.
+    """Read the files of a section `joint_N`: the joint file and the networks of the methods that use one.
 
     Raises FieldError for the section, ConfigError for the files.
     """
-    section, method = file.joints[number - 1], METHODS[file.estimator.method]
+    section, sent = file.joints[number - 1], file.estimator.method
     joint_path = path.parent / section.file
     profile_path = None if section.profile is None else path_of(section.profile, path.parent)
     with below(f"joint_{number}"):
@@ -807,14 +840,19 @@ def _joint(path: Path, number: int, file: ConfigFile) -> JointConfig:
         network = None if section.network is None else _network(section.network, path)
         mapping, data = read_yaml(joint_path)
         joint = Joint.from_mapping(mapping, str(joint_path))
-        because = f"because estimator.method is {file.estimator.method}"
-        if method.network_required and network is None:
-            raise FieldError("joint", "network", MISSING, f"file and sha256 {because}")
-        for needed in method.sections:
-            if getattr(joint, needed) is None:
-                raise ConfigError(f"{joint_path}: key '{needed}': missing, expected {because}")
-        network = network if method.network else None
-        _check_encoders(file.estimator.method, objects, joint, network)
+        network = network if METHODS[sent].network else None
+        shadows = _shadow_networks(section, file.estimator.shadow, path)
+        for name in (sent, *file.estimator.shadow):
+            used = network if name == sent else shadows.get(name)
+            key = "network" if name == sent else f"shadow_networks.{name}"
+            where, verb = ("estimator.method", "is") if name == sent else ("estimator.shadow", "has")
+            because = f"because {where} {verb} {name}"
+            if METHODS[name].network_required and used is None:
+                raise FieldError("joint", key, MISSING, f"file and sha256 {because}")
+            for needed in METHODS[name].sections:
+                if getattr(joint, needed) is None:
+                    raise ConfigError(f"{joint_path}: key '{needed}': missing, expected {because}")
+            _check_encoders(where, name, objects, joint, used)
         tpdos = tpdos_of(
             section.node,
             objects,
@@ -837,6 +875,7 @@ def _joint(path: Path, number: int, file: ConfigFile) -> JointConfig:
         objects=objects,
         tpdos=tpdos,
         max_age_ms=section.max_age_ms or 0.0,
+        shadow_networks=shadows,
         joint_data=data,
         profile=section.profile,
         profile_path=profile_path,
@@ -857,12 +896,23 @@ def _whole(values: Mapping[str, float]) -> dict[str, int]:
     return {name: int(value) for name, value in values.items()}
 
 
-def _check_encoders(method: str, objects: DriveObjects, joint: Joint, network: NetworkFile | None) -> None:
+def _shadow_networks(section: JointSection, shadow: tuple[str, ...], path: Path) -> dict[str, NetworkFile]:
+    """Return the networks of a joint's shadow methods. Raises FieldError for one of a method that uses none."""
+    users = [name for name, method in METHODS.items() if method.network]
+    for name in {*section.shadow_networks} - {*users}:
+        key, expected = f"shadow_networks.{name}", f"one of {', '.join(users)}"
+        raise FieldError("joint", key, Verbatim("a network"), expected)
+    return {name: _network(each, path) for name, each in section.shadow_networks.items() if name in shadow}
+
+
+def _check_encoders(
+    where: str, method: str, objects: DriveObjects, joint: Joint, network: NetworkFile | None
+) -> None:
     """Refuse a method that needs the link position of a drive without one. Raises FieldError."""
     torsion, needs = METHODS[method].torsion_of(joint) is not None, METHODS[method].network_required
     if objects.link_position is None and (torsion or (network is not None and needs)):
         use = "estimates from the torsion of the gear" if torsion else "uses a network with the link position"
-        expected = f"a link position because estimator.method {method} {use}; tob and efficiency do without"
+        expected = f"a link position because {where} {method} {use}; tob and efficiency do without"
         raise FieldError("joint", "objects.link_position", Verbatim("false"), expected)
 
 

@@ -109,9 +109,10 @@ def write_config(path: Path, joint_files: Mapping[int, Path], method: str) -> Pa
     """Write a configuration of jtqd for the bench: these joint files, this method. Raises OSError."""
     path.parent.mkdir(parents=True, exist_ok=True)
     mapping: dict[str, Any] = load_yaml(shipped("bench.yaml"))
-    mapping["estimator"] = {**mapping["estimator"], "method": method}
+    mapping["estimator"] = {**mapping["estimator"], "method": method, "shadow": []}
     for number, file in joint_files.items():
         mapping[f"joint_{number}"]["file"] = str(file.resolve())
+        mapping[f"joint_{number}"].pop("shadow_networks", None)
     path.write_text(yaml.safe_dump(mapping, sort_keys=False), encoding="utf-8")
     return path
 

@@ -1,4 +1,4 @@
-"""`jtq plot`: draw estimate and standard deviation, torque sensor, their difference and contacts of a log."""
+"""`jtq plot`: draw estimate and standard deviation, torque sensor, shadow methods, differences and contacts of a log."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import json
 import math
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jtqd.daemon.logs import LogError, Records, read_topic
+from jtqd.daemon.logs import LogError, Records, read_topic, rmse, shadow_errors, topics_of
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.command_line import check_installed
 from jtqd.estimator.files import whole_file
 from jtqd.estimator.observer import reference_of
-from jtqd.estimator.settings import EstimatorSettings
+from jtqd.estimator.settings import METHODS, EstimatorSettings
 from jtqd.estimator.status import (
     DEGRADED,
     DRIVE_FAULT,
@@ -42,6 +43,7 @@ _SHADES = {
 """By status; a torque was published with the first two only."""
 _OTHER = "#c0c0c0"
 _CONTACT = "#e58fb1"
+_SHADOW_COLOURS = ("#c9930e", "#3b8f5a", "#8a4fb0", "#7a7a7a")
 CONTACT_KNOWN, CONTACT = 64, 128
 """Bits of `input_flags` in a log (schema jtqd_msgs/msg/JointEstimate)."""
 
@@ -71,7 +73,11 @@ def main(argv: list[str]) -> int:
     try:
         check_installed("analysis", "matplotlib")
         check_picture(arguments.out)
-        rmse = draw(read_topic(arguments.log, f"/joint/{joint}/state"), joint, arguments.out)
+        log, shadow = read_topic(arguments.log, f"/joint/{joint}/state"), None
+        if (topic := f"/joint/{joint}/shadow") in topics_of(arguments.log):
+            shadow = read_topic(arguments.log, topic)
+            log, shadow = (a[np.isin(a["cycle"], b["cycle"])] for a, b in ((log, shadow), (shadow, log)))
+        error_nm = draw(log, joint, arguments.out, shadow)
     except (LogError, OSError, ValueError) as error:
         text = (
             f"{error.filename}: {error.strerror}" if isinstance(error, OSError) and error.filename else error
@@ -79,7 +85,10 @@ def main(argv: list[str]) -> int:
         print(f"jtq plot: {text}", file=sys.stderr)
         return 1
     if arguments.json:
-        print(json.dumps({"paths": [str(arguments.out)], "rmse_nm": {f"joint_{joint}": finite(rmse)}}))
+        errors = {} if shadow is None else shadow_errors(log, shadow)
+        shadows = {"shadow_rmse_nm": {name: finite(rmse(error)) for name, error in errors.items()}}
+        rmses = {"rmse_nm": {f"joint_{joint}": finite(error_nm)}, **(shadows if errors else {})}
+        print(json.dumps({"paths": [str(arguments.out)], **rmses}))
     else:
         print(arguments.out)
     return 0
@@ -105,10 +114,21 @@ def contacts(log: Records) -> BoolArray | None:
     return there
 
 
-def draw(log: Records, joint: int, path: Path) -> float:
+def _draw_shadows(above: Any, below: Any, time_s: FloatArray, log: Records, shadow: Records) -> None:
+    """Draw each shadow method into the two panels; its RMSE and age are in the legend."""
+    for (name, error), colour in zip(shadow_errors(log, shadow).items(), _SHADOW_COLOURS, strict=False):
+        title, age = METHODS[name].title if name in METHODS else name, float(shadow[f"{name}_age_ms"].max())
+        if np.isfinite(error).any():
+            title += f"\nRMSE {rmse(error):.2f} Nm, " + (f"{age:.3g} ms old" if age > 0.0 else "now")
+        above.plot(time_s, shadow[f"{name}_torque_nm"], color=colour, linewidth=0.6, label=title)
+        below.plot(time_s, error, color=colour, linewidth=0.4)
+
+
+def draw(log: Records, joint: int, path: Path, shadow: Records | None = None) -> float:
     """Draw panels over time: torque and sensor, then their difference; shaded where the status is not valid.
 
-    Where contacts were watched, two more: the external torque with its contacts shaded, and the torque rate.
+    shadow: shadow methods of the same cycles; each of them is drawn in both panels. Where contacts were watched, two more
+    panels: the external torque with its contacts shaded, and the torque rate.
 
     Returns the RMSE in the title [Nm], over the samples in motion with a valid sensor, both of one age; NaN without any.
     """
@@ -125,12 +145,14 @@ def draw(log: Records, joint: int, path: Path) -> float:
     contact = contacts(log)
     ratios = (3, 1.3) if contact is None else (3, 1.3, 1.3, 1.3)
     figure, axes = plt.subplots(
-        len(ratios), 1, figsize=(11, 1.2 + sum(ratios)), sharex=True, height_ratios=ratios
+        len(ratios), 1, figsize=(11.5, 1.2 + sum(ratios)), sharex=True, height_ratios=ratios
     )
     above, below = axes[:2]
     above.fill_between(
         time_s, torque - sigma, torque + sigma, color="#9ec5e8", linewidth=0, label="estimate ± sigma"
     )
+    if shadow is not None:
+        _draw_shadows(above, below, time_s, log, shadow)
     with_sensor = bool(np.isfinite(sensor).any())
     if with_sensor:
         above.plot(time_s, sensor, color="#222222", linewidth=1.0, label="torque sensor")
@@ -139,10 +161,10 @@ def draw(log: Records, joint: int, path: Path) -> float:
     error = np.where(moving, torque - sensor, np.nan)
     below.plot(time_s, error, color="#b4431f", linewidth=0.6)
     below.axhline(0.0, color="#222222", linewidth=0.6)
-    rmse = float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
+    error_nm = rmse(error)
     when = f"both {age:.3g} ms old" if age > 0.0 else "now"
     title = (
-        f"estimate and sensor, {when}, RMSE {rmse:.2f} Nm in motion"
+        f"estimate and sensor, {when}, RMSE {error_nm:.2f} Nm in motion"
         if with_sensor
         else "estimate; the log has no reference"
     )
@@ -168,9 +190,9 @@ def draw(log: Records, joint: int, path: Path) -> float:
         for code in np.unique(status[status != VALID]):
             label = NAMES.get(int(code), str(code)) if axis is above else None
             shade(axis, time_s, status == code, _SHADES.get(int(code), _OTHER), label)
-    figure.tight_layout(rect=(0.0, 0.0, 0.84, 1.0))
+    figure.tight_layout(rect=(0.0, 0.0, 0.83, 1.0))
     above.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), borderaxespad=0.0, fontsize=8)
     with whole_file(path) as file:
         figure.savefig(file, format=path.suffix[1:].lower(), dpi=110)
     plt.close(figure)
-    return rmse
+    return error_nm

@@ -14,7 +14,7 @@ def shipped_bench(name: str = "bench.yaml") -> dict[str, Any]:
     content: dict[str, Any] = yaml.safe_load(shipped(name).read_text(encoding="utf-8"))
     for number in (1, 2):
         joint = content[f"joint_{number}"]
-        for section in (joint, joint.get("network", {})):
+        for section in (joint, joint.get("network", {}), *joint.get("shadow_networks", {}).values()):
             if "file" in section:
                 section["file"] = str(shipped(section["file"]))
     return content

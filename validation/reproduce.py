@@ -213,10 +213,20 @@ def _write_outside_plan(path: Path, seed: int, count: int) -> None:
 
 
 def write_config(path: Path, name: str) -> None:
-    """Write a shipped configuration beside the models that are there, with the networks of its method, if there are some."""
+    """Write a shipped configuration beside the models that are there, with those networks of its methods that are there."""
     text = shipped(name).read_text(encoding="utf-8").replace(f" {_TRAINED}/", " ")
     text = re.sub(r"  network:\n    file: .*\n    sha256: .*\n", "", text)
     ending = ".fused.onnx" if "  method: fused" in text else ".onnx"
+
+    def with_hash(network: re.Match[str]) -> str:
+        return network[1] + hashlib.sha256((path.parent / network[2]).read_bytes()).hexdigest()
+
+    if all((path.parent / f"joint{number}.onnx").exists() for number in (1, 2)):
+        text = re.sub(r"(      file: (joint\d\.onnx)\n      sha256: )\w+", with_hash, text)
+    else:
+        text = re.sub(r"  shadow_networks:\n(    .*\n)+", "", text).replace(
+            "efficiency, network]", "efficiency]"
+        )
 
     def with_network(joint: re.Match[str]) -> str:
         file = path.parent / f"{joint[1]}{ending}"

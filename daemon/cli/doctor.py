@@ -391,7 +391,9 @@ def _files(config: Config) -> Iterator[CheckResult]:
     for joint in config.joints:
         item = f"joint {joint.number}"
         try:
-            build_estimator(config, joint).step(1e-3, 0.1, 0.0, 1.0, 0.0, 25.0)
+            for each in (config, *config.shadows):
+                built = build_estimator(each, each.joints[joint.number - 1], shadow=each is not config)
+                built.step(1e-3, 0.1, 0.0, 1.0, 0.0, 25.0)
         except (ConfigError, NetworkError) as error:
             yield CheckResult(item, FAIL, str(error), "jtqd will not start with it")
             continue

@@ -357,6 +357,7 @@ def _joint_content(reading: Reading, view: View, earlier: View, n: int) -> dict[
         "error_nm": finite(seen.torque_nm - seen.reference_nm if known else nan),
         "rmse_nm": finite(view.rmse_nm[n]),
         "age_ms": finite(seen.age_ms),
+        "shadow": {name: each.content() for name, each in view.shadows[n].items()},
         "zeros": view.zeros[n].content(),
         "contact": contact_of(seen) if running else None,
         "contact_nm": finite(seen.contact_nm if running else nan),
@@ -428,15 +429,16 @@ def _joints(joints: Sequence[Mapping[str, Any]], *, still: bool) -> Columns:
     for each in joints:
         values = each if each["torque_nm"] is not None else {**each, "age_ms": None}
         published = sum(each["cycles"].get(NAMES[code], 0) for code in PUBLISHED)
-        table.add(
-            f"{each['joint']} {each['name']}",
-            Text(each["status"], style="dim" if still else COLOURS.get(each["status"], _BAD)),
-            *(
-                NOTHING if values[key] is None else f"{number(values[key], decimals)} {unit}"
-                for key, unit, decimals in _QUANTITIES.values()
-            ),
-            percent(published / max(1, sum(each["cycles"].values()))),
-        )
+        share = percent(published / max(1, sum(each["cycles"].values())))
+        style = "dim" if still else COLOURS.get(each["status"], _BAD)
+        shadows = ((f"  {name}", shadow, "dim", "") for name, shadow in each["shadow"].items())
+        for title, of_row, colour, last in (
+            (f"{each['joint']} {each['name']}", values, style, share),
+            *shadows,
+        ):
+            known = ((of_row.get(key), n, unit) for key, unit, n in _QUANTITIES.values())
+            cells = (NOTHING if value is None else f"{number(value, n)} {unit}" for value, n, unit in known)
+            table.add(title, Text(of_row["status"], style=colour), *cells, last)
     return table
 
 
@@ -452,6 +454,13 @@ def _details(
         status, why = each["status"], each["reason"]
         lasting = (f"{status} for {duration(each['since_s'])}", COLOURS.get(status, _BAD))
         yield Text.assemble(f"joint {each['joint']} ", lasting, f": {why}" if why else "")
+    for each in joints:
+        if each["shadow"]:
+            errors = {about.method: each, **each["shadow"]}
+            found = (f"{name} {number(one['rmse_nm'] or nan)}" for name, one in errors.items())
+            yield _line(
+                f"RMSE {each['joint']}", f"{', '.join(found)} Nm, each against the sensor as old as it"
+            )
     for joint, zeros in zip(about.joints, view.zeros, strict=False):
         if zeros.tracked:
             yield _line(f"zeros {joint.number}", zeros.text, "" if zeros.plausible else "yellow")

@@ -46,7 +46,7 @@ cdef struct EstimateBlock:
 cdef class SnapshotWriter:
     cdef uint64_t[::1] counters, work, late, status_cycles, restarts, sequence
     cdef int64_t[::1] node_heard
-    cdef uint8_t[::1] inputs, node_states, unconfigured, learned, estimate
+    cdef uint8_t[::1] inputs, node_states, unconfigured, learned, estimate, shadows
     cdef Intake intake
     cdef FrameSocket bus
     cdef int joints

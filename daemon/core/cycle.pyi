@@ -52,6 +52,7 @@ class Cycle:
         heartbeat_cycles: int,
         grid: Grid,
         contacts: ContactWatch | None = None,
+        shadows: Sequence[Sequence[Estimator]] = (),
     ) -> None: ...
     index: Final[int]
     counter: Final[int]

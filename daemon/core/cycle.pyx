@@ -4,7 +4,7 @@
     gather   one wake-up for all inputs, then wait for missing ones until the deadline
     observe  scale, estimate, decide the status of every joint
     publish  send the estimate PDO, or two of them with more than two joints, and every n-th cycle the heartbeat
-    record   write the cycle to the ring, and every 8th cycle the snapshot
+    record   estimate by the shadow methods; write the cycle to the ring, and every 8th cycle the snapshot
 
 `go_on` goes from slot to slot without the interpreter. No stage raises because of what is on the bus; a bus that is down is a
 counter and a stale estimate.
@@ -19,7 +19,7 @@ from typing import Final
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into
 from jtqd.daemon.core.intake cimport MOST_INPUTS, NODES, NOT_HEARD, Input, Intake
 from jtqd.daemon.core.joint cimport ContactWatch, JointCycle, JointState
-from jtqd.daemon.core.record cimport Header, JointBlock, RecordRing
+from jtqd.daemon.core.record cimport Header, JointBlock, RecordRing, ShadowBlock
 from jtqd.daemon.core.schedule cimport Clock, Grid, NetworkBudget, WakeUp
 from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
@@ -166,6 +166,7 @@ cdef class SnapshotWriter:
         self.unconfigured, self.restarts, self.learned = snapshot.unconfigured, snapshot.restarts, snapshot.learned
         intake.conflict = snapshot.conflict
         self.sequence, self.estimate, self.joints = snapshot.sequence, snapshot.estimate, snapshot.joints
+        self.shadows = snapshot.shadows
         for n in range(MOST_JOINTS):
             self.status[n] = -1
         self.bits_complete = worst_case_bits(1) + (self.joints + 1) // 2 * worst_case_bits(8)
@@ -271,6 +272,8 @@ cdef class SnapshotWriter:
                 s.current_a, s.motor_position_rad, s.motor_velocity_rad_s, s.link_position_rad, s.sensor_torque_nm,
                 s.temperature_c,
             )
+            if joints[n].shadow != NULL:
+                (<ShadowBlock *> &self.shadows[0])[n] = joints[n].shadow[0]
         end_write(&self.sequence[0])
 
 
@@ -348,6 +351,7 @@ cdef class Cycle:
         heartbeat_cycles: cycles between two heartbeats.
         grid: time grid; its slot is the current cycle's.
         contacts: watches for contacts of all joints; None: nobody does.
+        shadows: estimators of each joint's shadow methods; left out: there are none.
 
     Attributes:
         joints: what is kept of each joint.
@@ -374,16 +378,21 @@ cdef class Cycle:
         int64_t heartbeat_cycles,
         Grid grid,
         ContactWatch contacts=None,
+        shadows=(),
     ):
         cdef JointCycle joint
         cdef int n
         joints = list(joints)
+        shadows = shadows or [()] * len(joints)
         if not 1 <= len(joints) <= MOST_JOINTS:
             raise ValueError(f"found {len(joints)} joints, expected 1 to {MOST_JOINTS}")
         limits = safety or [JointSafety() for _ in joints]
         self.intake, self.snapshot, self.grid = intake, snapshot, grid
         self.joints = tuple([
-            JointCycle(n, inputs, each, intake=intake, snapshot=snapshot, period_ns=grid.period_ns, safety=limits[n])
+            JointCycle(
+                n, inputs, each, intake=intake, snapshot=snapshot, period_ns=grid.period_ns, safety=limits[n],
+                shadows=shadows[n]
+            )
             for n, (inputs, each) in enumerate(joints)
         ])
         self.count = len(joints)
@@ -391,7 +400,7 @@ cdef class Cycle:
             joint = self.joints[n]
             self.at[n], self.states[n] = <PyObject *> joint, &joint.now
         self.clock, self.bus = clock, socket_of(socket)
-        self.ring = RecordRing(ring, self.count)
+        self.ring = RecordRing(ring, self.count, any(shadows))
         self.budget, self.wake_up = NetworkBudget(self.count), WakeUp(wait_ns, deadline_ns)
         self.writer = SnapshotWriter(snapshot, intake, self.bus)
         self.counter_overflow, self.heartbeat_cycles = counter_overflow, heartbeat_cycles
@@ -535,10 +544,15 @@ cdef class Cycle:
             self.send(&self.heartbeat_frame)
 
     cpdef int record(self) except -1:
-        """Write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
+        """Estimate by the shadow methods, write the cycle to the ring, update counters and, every n-th cycle, the snapshot."""
         cdef Intake intake = self.intake
         cdef int n
-        cdef int64_t work_ns = self.clock.monotonic() - self.work_start_ns, missed = self.grid.missed
+        cdef int64_t work_ns, missed = self.grid.missed
+        for n in range(self.count):
+            if self.states[n].shadow != NULL:
+                (<JointCycle> self.at[n]).observe_shadows()
+                self.ring.record.shadows[n] = self.states[n].shadow[0]
+        work_ns = self.clock.monotonic() - self.work_start_ns
         self.ring.record.header[0] = Header(
             self.index, self.sync_ns, self.sync_realtime_ns,
             self.flags, min(work_ns, MOST_WORK_NS), min(self.late_ns, MOST_LATE_NS), missed,

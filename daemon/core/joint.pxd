@@ -1,13 +1,15 @@
 """One joint in the loop; joint.pyx."""
 
+from cpython.object cimport PyObject
 from libc.stdint cimport int64_t, uint8_t
 
 from jtqd.daemon.core.estimate_pdo cimport ContactField, Published
 from jtqd.daemon.core.intake cimport Input, Intake
-from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
+from jtqd.daemon.core.record cimport MOST_JOINTS, MOST_METHODS, JointBlock, ShadowBlock
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.estimator.detection cimport ContactLaw, ContactState
 from jtqd.estimator.estimator cimport Estimator
+from jtqd.estimator.observer cimport Reference, Sample
 
 cdef enum:
     MOST_TPDOS = 4  # of a drive
@@ -29,7 +31,22 @@ cdef struct JointState:
     int status, latched  # as published, and at the last estimate
     Published published
     JointBlock sample
+    ShadowBlock *shadow  # NULL without shadow methods
     double load_nm  # of the link, for `contact`
+
+cdef struct ShadowMethod:
+    PyObject *estimator
+    int place  # in `ShadowBlock`
+    double bandwidth, max_gap  # of the sensor as old as its estimate
+    Reference seen
+
+cdef class ShadowMethods:
+    cdef readonly tuple estimators
+    cdef int count
+    cdef ShadowMethod methods[MOST_METHODS]
+    cdef ShadowBlock now
+    cdef double[::1] errors
+    cdef void advance(self, const Sample *sample, const JointBlock *record) noexcept nogil
 
 cdef class JointCycle:
     cdef readonly object inputs, estimator
@@ -53,6 +70,7 @@ cdef class JointCycle:
     cdef double gear_ratio
     cdef Derived derived
     cdef JointState now
+    cdef ShadowMethods shadows  # None without
     cdef int find_inputs(self, inputs) except -1
     cdef int set_scale(self, inputs) except -1
     cpdef void observe(self, int64_t sync_ns, bint starting, bint network_wanted) noexcept nogil
@@ -63,6 +81,7 @@ cdef class JointCycle:
     cdef int64_t on_grid(self, int64_t dt_ns) noexcept nogil
     cdef bint derive(self, int64_t sync_ns) noexcept nogil
     cpdef void withdraw(self, int status) noexcept nogil
+    cpdef void observe_shadows(self) noexcept nogil
 
 cdef class ContactWatch:
     cdef readonly int count

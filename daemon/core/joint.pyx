@@ -9,6 +9,7 @@ Quantities that a drive may not send:
 """
 
 cimport cython
+from cpython.object cimport PyObject
 from libc.math cimport INFINITY, NAN, isnan
 from libc.stdint cimport int64_t, uint8_t
 
@@ -20,7 +21,7 @@ from jtqd.daemon.core.estimate_pdo cimport (
 )
 from jtqd.daemon.core.input_pdos import DRIVE_FACTORS
 from jtqd.daemon.core.intake cimport Input, Intake
-from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
+from jtqd.daemon.core.record cimport MOST_JOINTS, MOST_METHODS, JointBlock, ShadowBlock, ShadowValues
 from jtqd.daemon.core.status cimport JointRules
 from jtqd.daemon.core.status import JointSafety
 from jtqd.daemon.shared import cycle_record as cr
@@ -29,8 +30,9 @@ from jtqd.estimator.detection cimport (
     CONTACT_PRESENT, CONTACT_UNKNOWN, ContactState, detect_contact, fill_contact, restart_contact,
 )
 from jtqd.estimator.estimator cimport Estimator, Values
-from jtqd.estimator.observer cimport Sample
+from jtqd.estimator.observer cimport Sample, follow_reference, restart_reference
 from jtqd.estimator.estimator import PythonEstimator
+from jtqd.estimator.settings import bandwidth_of
 
 STAMP_ACCURACY_NS: Final = 5_000
 """Kernel software stamps differ by a few us from the time on the wire."""
@@ -40,6 +42,7 @@ cdef int64_t ACCURACY_NS = STAMP_ACCURACY_NS
 cdef int POSITION = cr.FLAG_POSITION, MOTION = cr.FLAG_MOTION
 cdef int SENSOR = cr.FLAG_SENSOR, TEMPERATURE = cr.FLAG_TEMPERATURE
 cdef int STARTING = st.STARTING, STALE = st.STALE, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
+cdef int VALID = st.VALID, DEGRADED = st.DEGRADED, OFF = st.OFF
 cdef double UNKNOWN = NAN  # temperature of a joint whose drive sends none
 cdef int NOT_A_REFERENCE = 0x07  # of 6150h: not valid, positive or negative overload
 
@@ -65,13 +68,16 @@ cdef class JointCycle:
         snapshot: counts fallbacks and squared errors.
         period_ns: of the SYNC.
         safety: limits and checks; None for those that need no joint file.
+        shadows: estimators of its shadow methods (`ShadowMethods`).
 
     Attributes:
         published: its fields of the estimate PDO (`estimate_pdo.field`); status: as published.
         sample: its block of the cycle record, a `JointRecord`.
     """
 
-    def __init__(self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None):
+    def __init__(
+        self, int number, inputs, estimator, *, Intake intake, snapshot, int64_t period_ns, safety=None, shadows=()
+    ):
         cdef JointBlock nothing = JointBlock(
             NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, NAN, 0, 0, 0, 0
         )
@@ -88,6 +94,10 @@ cdef class JointCycle:
         self.now.sample = nothing
         self.now.load_nm = NAN
         self.now.published = field_of(NAN, INFINITY, STARTING)
+        self.now.shadow = NULL
+        if shadows:
+            self.shadows = ShadowMethods(number, shadows, snapshot)
+            self.now.shadow = &self.shadows.now
 
     cdef int find_inputs(self, inputs) except -1:
         """Find the drive's PDOs and the numbers in them; the flags of a record count all PDOs of a kind as one."""
@@ -144,6 +154,8 @@ cdef class JointCycle:
         self.now.last_ns = self.derived.last_ns = 0
         self.estimator.reset()
         self.rules.begin_again()
+        for each in () if self.shadows is None else self.shadows.estimators:
+            each.reset()
 
     def reset_latch(self):
         """Release the latched faults and restart with the present encoder positions; return whether there was one."""
@@ -248,6 +260,15 @@ cdef class JointCycle:
         self.now.status = record.status = status
         self.now.latched = self.rules.status.now.latched
 
+    cpdef void observe_shadows(self) noexcept nogil:
+        """Estimate by the shadow methods, after the estimate of this cycle was sent, from the inputs in its record."""
+        cdef const JointBlock *record = &self.now.sample
+        cdef double angle = record.motor_position_rad, link = record.link_position_rad
+        if self.link_count == NULL:
+            link = angle / self.gear_ratio
+        cdef Sample sample = Sample(record.dt_s, record.current_a, angle, record.motor_velocity_rad_s, link, record.temperature_c)
+        self.shadows.advance(&sample, record)
+
     cdef int reference(self) noexcept nogil:
         """Record the sensor's torque and its 6150h in this cycle, NaN and 0 where there is none; return its flag."""
         cdef JointBlock *record = &self.now.sample
@@ -295,6 +316,61 @@ cdef const int64_t *_number_at(Intake intake, place) except NULL:
     """Return where a number lies when its PDO has come (`drivers.drive.Place`); raises ValueError without such an entry."""
     cdef Input *state = _input(intake, place.pdo, place.entry + 1)
     return &state.values[<int> place.entry]
+
+
+# Shadow methods --------------------------------------------------------------------------------------------------------
+
+
+@cython.final
+cdef class ShadowMethods:
+    """Further methods of joint `number` (from 0 on): computed from the same inputs as its estimate, recorded, never sent.
+
+    estimators: one for each method, none of them the joint's own; tally: `shadow_errors` of a `Snapshot`, or an array of that
+    layout, for the squared errors. What an estimator raises is printed, and its values are NaN in that cycle.
+    """
+
+    def __init__(self, int number, estimators, tally):
+        cdef ShadowMethod *method
+        cdef int n
+        self.estimators, self.count = tuple(estimators), len(estimators)
+        self.errors = tally.shadow_errors[3 * MOST_METHODS * number :]
+        if self.count > MOST_METHODS:
+            raise ValueError(f"found {self.count} shadow methods, expected at most {MOST_METHODS}")
+        for n in range(MOST_METHODS):
+            self.now.methods[n], self.now.status[n] = ShadowValues(NAN, NAN, NAN, NAN), OFF
+        for n in range(self.count):
+            each, method = self.estimators[n], &self.methods[n]
+            method.estimator = <PyObject *> (<Estimator?> each)
+            method.place = cr.SHADOW_METHODS.index(each.settings.method)
+            method.bandwidth = bandwidth_of(each.joint, each.settings, network=each.with_network)
+            method.max_gap = each.settings.max_gap_s
+            restart_reference(&method.seen)
+            self.now.methods[method.place].age_ms = 1e3 / method.bandwidth
+
+    cdef void advance(self, const Sample *sample, const JointBlock *record) noexcept nogil:
+        """Estimate from one sample (of step NaN where an input is missing), with the sensor and status in the cycle's record."""
+        cdef bint missing = isnan(sample.dt_s), moving = record.status == VALID or record.status == DEGRADED
+        cdef ShadowMethod *method
+        cdef ShadowValues *to
+        cdef Values e
+        cdef double *sums
+        cdef double error, now
+        cdef int n
+        for n in range(self.count):
+            method = &self.methods[n]
+            to = &self.now.methods[method.place]
+            e = Values(NAN, NAN, NAN, NAN, NAN, NAN, NAN, STALE if missing else INVALID)
+            to.reference_nm = NAN
+            if not missing:
+                (<Estimator> method.estimator).advance(sample, True, &e)
+                to.reference_nm = follow_reference(
+                    &method.seen, method.bandwidth, method.max_gap, sample.dt_s, record.sensor_torque_nm
+                )
+            to.torque_nm, to.sigma_nm, self.now.status[method.place] = e.torque_nm, e.sigma_nm, e.status
+            error, now = e.torque_nm - to.reference_nm, e.torque_nm - record.sensor_torque_nm
+            if moving and error - error == 0.0:
+                sums = &self.errors[3 * method.place]
+                sums[0], sums[1], sums[2] = sums[0] + error * error, sums[1] + now * now, sums[2] + 1.0
 
 
 # Contacts of all joints ------------------------------------------------------------------------------------------------

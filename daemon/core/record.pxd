@@ -7,6 +7,7 @@ from jtqd.drivers.frame_socket cimport Frame
 cdef enum:
     MOST_JOINTS = 4
     MOST_FRAMES = 32  # that a record of any layout holds
+    MOST_METHODS = 4  # of estimation
 
 cdef struct Header:
     uint64_t cycle
@@ -24,15 +25,23 @@ cdef struct JointBlock:
     double torque_rate_nm_s, contact_nm
     uint16_t statusword, status, sensor_status, input_flags
 
+cdef struct ShadowValues:  # of one shadow method
+    double torque_nm, sigma_nm, reference_nm, age_ms
+
+cdef struct ShadowBlock:  # by the order of `cycle_record.SHADOW_METHODS`
+    ShadowValues methods[MOST_METHODS]
+    uint16_t status[MOST_METHODS]
+
 cdef struct Layout:  # `jtqd.daemon.shared.cycle_record.Layout`
     int joints, frame_capacity
-    Py_ssize_t frames_offset, stamps_offset, tail_offset, size
+    Py_ssize_t frames_offset, stamps_offset, shadow_offset, tail_offset, size
 
 cdef struct Record:  # one record in the ring's memory
     Header *header
     JointBlock *joints
     Frame *frames
     int64_t *stamps_ns
+    ShadowBlock *shadows  # not there without shadow methods
     uint64_t *tail
 
 cdef struct KeptFrames:  # of slots without a record

@@ -11,6 +11,7 @@ import sys
 
 from jtqd.drivers.frame_socket cimport Frame
 from jtqd.daemon.shared import cycle_record as cr
+from jtqd.estimator.settings import METHODS
 
 cdef extern from *:
     """
@@ -26,9 +27,9 @@ if sys.byteorder != "little":
 
 def _check_layout():
     """Raise ImportError where C lays the record out in another way than `cycle_record` does."""
-    found = sizeof(Header), sizeof(JointBlock), sizeof(Frame), MOST_JOINTS, MOST_FRAMES
+    found = sizeof(Header), sizeof(JointBlock), sizeof(ShadowBlock), sizeof(Frame), MOST_JOINTS, MOST_FRAMES
     most = cr.layout_of(cr.MOST_JOINTS)
-    expected = cr.HEADER.size, cr.JOINT.size, 16, cr.MOST_JOINTS, most.frame_capacity
+    expected = cr.HEADER.size, cr.JOINT.size, cr.SHADOW.size, 16, cr.MOST_JOINTS, most.frame_capacity
     if found != expected:
         raise ImportError(f"found a cycle record with {found}, expected {expected}")
     fields = Header(1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15), JointBlock(
@@ -37,6 +38,8 @@ def _check_layout():
     named = cr.Header(**fields[0]), cr.JointRecord(**fields[1])
     if named != (tuple(range(1, 16)), tuple(range(1, 21))):
         raise ImportError(f"found a cycle record with the fields {named}")
+    if cr.SHADOW_METHODS != tuple(METHODS) or len(METHODS) != MOST_METHODS:
+        raise ImportError(f"found a cycle record with the methods {cr.SHADOW_METHODS}, expected {tuple(METHODS)}")
 
 
 _check_layout()
@@ -48,11 +51,12 @@ cdef class RecordRing:
     Frames are copied unchanged: `count` are stored in the record, `left_out` found no room.
     """
 
-    def __init__(self, ring, int joints=2):
+    def __init__(self, ring, int joints=2, bint shadow=False):
         cdef Py_ssize_t word = cr.COUNT_WORD
-        found = cr.layout_of(joints)
+        found = cr.layout_of(joints, shadow)
         self.layout = Layout(
-            joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.tail_offset, found.size
+            joints, found.frame_capacity, found.frames_offset, found.stamps_offset, found.shadow_offset,
+            found.tail_offset, found.size
         )
         self.memory = ring
         self.head, self.records, self.slots = ring.words, ring.records, ring.size
@@ -70,6 +74,7 @@ cdef class RecordRing:
             <JointBlock *> (start + sizeof(Header)),
             <Frame *> (start + self.layout.frames_offset),
             <int64_t *> (start + self.layout.stamps_offset),
+            <ShadowBlock *> (start + self.layout.shadow_offset),
             <uint64_t *> (start + self.layout.tail_offset),
         )
         self.count = self.left_out = 0

@@ -58,12 +58,14 @@ class Message(NamedTuple):
 class LiveStream:
     """Thins out the cycles of one run; `events` makes messages of what happens.
 
-    gear_ratios: motor revolutions per joint revolution; None where not known.
+    gear_ratios: motor revolutions per joint revolution; None where not known. shadow: there are shadow methods.
     """
 
-    def __init__(self, names: Sequence[str], gear_ratios: Sequence[float | None]) -> None:
+    def __init__(
+        self, names: Sequence[str], gear_ratios: Sequence[float | None], *, shadow: bool = False
+    ) -> None:
         self._overview = JointStateMessage(names, gear_ratios)
-        self._cycles = CycleMessages(len(names))
+        self._cycles = CycleMessages(len(names), shadow=shadow)
         self._scan = cycle.selection(*SCANNED, len(names)).unpack_from
         self._made: list[Message] = []
         self.events = EventLog(self.add)
@@ -224,8 +226,8 @@ class LiveServer:
     Raises RuntimeError, OSError where it cannot listen at `address`.
     """
 
-    def __init__(self, name: str, address: Address, joints: int = 2) -> None:
-        texts = messages.schemas_of(joints)
+    def __init__(self, name: str, address: Address, joints: int = 2, *, shadow: bool = False) -> None:
+        texts = messages.schemas_of(joints, shadow=shadow)
         self._context = context = foxglove.Context()  # server and channels hold it only weakly
         self._channels = {
             topic.number: foxglove.Channel(
@@ -236,7 +238,7 @@ class LiveServer:
                 ),
                 context=context,
             )
-            for topic in messages.topics_of(joints)
+            for topic in messages.topics_of(joints, shadow=shadow)
         }
         self._server = foxglove.start_server(
             name=name,
@@ -290,7 +292,7 @@ class Source:
 
     def __init__(self, request: dict[str, Any]) -> None:
         self._loop = LoopReader(request)
-        self._stream = LiveStream(self._loop.joints, request["gear_ratios"])
+        self._stream = LiveStream(self._loop.joints, request["gear_ratios"], shadow=request["shadow"])
         self._notices: NoticesReader | None = None
         with suppress(SharedMemoryError):
             self._notices = NoticesReader(Path(request["notices"]))
@@ -347,7 +349,8 @@ def begin(request: dict[str, Any]) -> tuple[str, Callable[[Stop], int]]:
         raise CannotBegin(f"{address.host}:{address.port}: {obstacle}")
     try:
         source = Source(request)
-        server = LiveServer(f"jtqd on {request['bus']}", address, len(request["joint_names"]))
+        count, shadow = len(request["joint_names"]), request["shadow"]
+        server = LiveServer(f"jtqd on {request['bus']}", address, count, shadow=shadow)
     except (SharedMemoryError, RuntimeError, OSError, ValueError) as error:
         raise CannotBegin(f"{address.host}:{address.port}: {error}") from None
     return server.address.url, partial(serve, source, server)

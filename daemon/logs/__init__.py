@@ -15,6 +15,8 @@ from jtqd.daemon.logs.read import (
     read_messages,
     read_topic,
     read_topics,
+    rmse,
+    shadow_errors,
     topics_of,
 )
 
@@ -30,5 +32,7 @@ __all__ = [
     "read_messages",
     "read_topic",
     "read_topics",
+    "rmse",
+    "shadow_errors",
     "topics_of",
 ]

@@ -39,7 +39,7 @@ from mcap.summary import Summary
 from numpy.typing import NDArray
 
 from jtqd.daemon.recording.mcap_file import MAGIC, SealedChunk, attachment_index, bytes_of, seal
-from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS
+from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS, SHADOWS
 from jtqd.daemon.recording.run_files import ACTIVE
 from jtqd.estimator.errors import OneLineError
 from jtqd.estimator.files import open_regular
@@ -439,7 +439,7 @@ _CHUNK_MARK, _CHUNK_MARK_AT = struct.pack("<I4s", 4, b"zstd"), HEAD.size + 28
 _CHUNK_SIZES = struct.Struct("<BQQQ20xQ")
 """Opcode, length, start and end time, and length of the packed bytes of such a chunk."""
 _WINDOW = 1 << 20
-_CYCLE_TOPICS = {CAN_FRAMES.name, *(topic.name for topic in JOINTS)}
+_CYCLE_TOPICS = {topic.name for topic in (CAN_FRAMES, *JOINTS, *SHADOWS)}
 
 
 class IntactChunk(NamedTuple):

@@ -22,6 +22,7 @@ from jtqd.daemon.logs.log_file import MESSAGE_HEAD, Batch, LogError, LogFile, pi
 from jtqd.daemon.recording.messages import FRAMES_NAMES
 from jtqd.daemon.recording.run_files import ACTIVE, PART_PATTERN
 from jtqd.estimator.arrays import FloatArray
+from jtqd.estimator.status import DEGRADED, VALID
 
 Records = NDArray[Any]
 """Messages as rows of a structured array [n]; as an array of the decoder's objects where they have no fixed form."""
@@ -156,6 +157,26 @@ def topics_of(path: Logs) -> dict[str, str]:
                 schema = log.schemas.get(channel.schema_id)
                 found[channel.topic] = "" if schema is None else schema.name
     return found
+
+
+def rmse(error: FloatArray) -> float:
+    """Return the root of the mean square of the known values; NaN without any."""
+    return float(np.sqrt(np.nanmean(error**2))) if np.isfinite(error).any() else float("nan")
+
+
+def shadow_errors(state: Records, shadow: Records) -> dict[str, FloatArray]:
+    """Return the error of each shadow method that was computed, by name: its torque less the sensor as old as it [n].
+
+    state, shadow: /joint/N/state and /joint/N/shadow of the same cycles [n]. NaN but in motion, where the joint published a
+    torque: these are the cycles of its own RMSE.
+    """
+    moving = np.isin(state["status"], (VALID, DEGRADED))
+    names = [name.removesuffix("_age_ms") for name in shadow.dtype.names or () if name.endswith("_age_ms")]
+    return {
+        name: np.where(moving, shadow[f"{name}_torque_nm"] - shadow[f"{name}_reference_nm"], np.nan)
+        for name in names
+        if np.isfinite(shadow[f"{name}_age_ms"]).any()
+    }
 
 
 def _schema(log: LogFile, channel: Channel) -> Schema:

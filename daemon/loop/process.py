@@ -14,7 +14,7 @@ import select
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -129,10 +129,13 @@ def build_estimator(
     joint: JointConfig,
     check: RuntimeCheck | str | None = None,
     notes: list[str] | None = None,
+    *,
+    shadow: bool = False,
 ) -> Estimator:
     """Build the estimator of one joint; notes takes lines for the operator. Raises ConfigError, NetworkError.
 
     check: of its network by `check_networks`, or why it is refused; None: ONNX Runtime checks it in this process.
+    shadow: of a shadow method (`Config.shadows`), whose network must run natively: its time is then bounded.
     """
     method, network = config.estimator.method, None
     try:
@@ -140,12 +143,27 @@ def build_estimator(
             raise NetworkError(check)
         if joint.network is not None:
             network = load_network(method, str(joint.network.path), joint.network.sha256, check)
+        if shadow and network is not None and network.perceptron is None:
+            expected = "expected a graph with weights as jtq train writes them: a shadow method runs natively"
+            raise network.error(f"found a graph that ONNX Runtime must run, {expected}")
         if network is None and METHODS[method].network_optional and notes is not None:
             notes.append(f"joint {joint.number}: no network, physics only")
         return make_estimator(joint.joint, config.estimator, network)
     except (ConfigError, NetworkError) as error:
-        key = f"joint_{joint.number}"
-        raise type(error)(f"{error} ({config.path}: '{key}', estimator.method is {method})") from None
+        key, asks = f"joint_{joint.number}", "estimator.shadow has" if shadow else "estimator.method is"
+        raise type(error)(f"{error} ({config.path}: '{key}', {asks} {method})") from None
+
+
+def build_shadows(config: Config) -> list[list[Estimator]]:
+    """Build the estimators of each joint's shadow methods. Raises ConfigError, NetworkError."""
+    of_methods = [
+        [
+            build_estimator(each, joint, check, shadow=True)
+            for joint, check in zip(each.joints, check_networks(each), strict=True)
+        ]
+        for each in config.shadows
+    ]
+    return [list(of_joint) for of_joint in zip(*of_methods, strict=True)]
 
 
 def loop_filters(config: Config) -> list[CanFilter]:
@@ -206,8 +224,10 @@ def build_cycle(
     report: dict[str, Any],
     socket: FrameSocket,
     estimators: list[Estimator],
+    *,
+    shadows: Sequence[Sequence[Estimator]] = (),
 ) -> tuple[Cycle, Grid]:
-    """Build cycle and grid from configuration and boot report."""
+    """Build cycle and grid from configuration and boot report; shadows: of each joint, empty without."""
     grid = Grid(0, config.period_ns)
     snapshot = Snapshot(
         Path(request["snapshot"]),
@@ -222,7 +242,7 @@ def build_cycle(
         socket,
         intake,
         list(zip(joint_inputs(config, report), estimators, strict=True)),
-        Ring(Path(request["ring"]), config.ring_cycles, layout_of(len(config.joints)).size),
+        Ring(Path(request["ring"]), config.ring_cycles, layout_of(len(config.joints), bool(shadows)).size),
         snapshot,
         safety=safety_of(config),
         node_id=config.node_id,
@@ -232,6 +252,7 @@ def build_cycle(
         heartbeat_cycles=max(1, config.heartbeat_ms * 1_000_000 // config.period_ns),
         grid=grid,
         contacts=contacts_of(config),
+        shadows=shadows,
     )
     return cycle, grid
 
@@ -256,6 +277,8 @@ def serve(request: dict[str, Any]) -> int:
     stop = Stop()
     notes: list[str] = []
     config, estimators = build_estimators(request, notes)
+    shadows = build_shadows(config)
+    warm_up([each for of_joint in shadows for each in of_joint])
     answer(ready=True, notes=notes)
     line = read_line(stop)
     if line is None:
@@ -263,7 +286,7 @@ def serve(request: dict[str, Any]) -> int:
     report = json.loads(line)
     config = as_booted(config, report["nodes"])
     socket = open_frame_socket(request["bus"], loop_filters(config), receive_own=True)
-    cycle, grid = build_cycle(config, request, report, socket, estimators)
+    cycle, grid = build_cycle(config, request, report, socket, estimators, shadows=shadows)
     refused = realtime.prepare(config.realtime.priority, config.realtime.cpu, config.realtime.lock_memory)
     duties = Duties(cycle, LoopWatchdog(Notifier(), cycle.grid.period_ns, watchdog_seconds()))
     realtime.freeze()

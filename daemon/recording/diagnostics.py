@@ -233,7 +233,7 @@ class LoopReader:
 
     def __init__(self, request: Mapping[str, Any]) -> None:
         self.joints: tuple[str, ...] = tuple(request["joint_names"])
-        self.ring = RingReader(Path(request["ring"]), layout_of(len(self.joints)).size)
+        self.ring = RingReader(Path(request["ring"]), layout_of(len(self.joints), request["shadow"]).size)
         nodes = [Node(int(number), str(name)) for number, name in request["nodes"]]
         self._diagnostics = Diagnostics(Path(request["snapshot"]), request["bus"], self.joints, nodes)
         self._diagnosed_ns = 0

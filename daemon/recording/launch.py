@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from jtqd.daemon.config import Config
+from jtqd.daemon.config import Config, JointConfig, NetworkFile
 from jtqd.daemon.recording.dbc import dbc_text
 from jtqd.daemon.recording.run_files import Account, free_run, part_files, read_account
 from jtqd.daemon.shared.events import FILE as NOTICES
@@ -181,6 +181,7 @@ def loop_request(config: Config, runtime: Path, bus: str) -> dict[str, Any]:
         "nodes": nodes,
         "joint_names": [f"joint_{joint.number}" for joint in config.joints],
         "gear_ratios": [joint.joint.gear_ratio for joint in config.joints],
+        "shadow": bool(config.shadow),
     }
 
 
@@ -216,12 +217,17 @@ def recording_request(
     }
 
 
+def _networks_of(joint: JointConfig) -> list[NetworkFile]:
+    """Return the networks of a joint: of the method that is sent, and of shadow methods."""
+    return [*([joint.network] if joint.network else []), *joint.shadow_networks.values()]
+
+
 def _attachment_names(config: Config) -> dict[Path, str]:
     """Return names of joint files, networks and profiles in the log: their own, unless two of them are called the same."""
     names: dict[Path, str] = {}
     for joint in config.joints:
-        network = joint.network.path if joint.network else None
-        for path in (joint.joint_path, network, joint.profile_path):
+        networks = [each.path for each in _networks_of(joint)]
+        for path in (joint.joint_path, *networks, joint.profile_path):
             if path is not None and path not in names:
                 taken = path.name in names.values()
                 names[path] = f"joint_{joint.number}.{path.name}" if taken else path.name
@@ -234,8 +240,8 @@ def _attached_files(config: Config) -> dict[str, tuple[str, bytes]]:
     found: dict[str, tuple[str, bytes]] = {}
     for joint in config.joints:
         found.setdefault(names[joint.joint_path], ("application/yaml", joint.joint_data))
-        if joint.network:
-            found.setdefault(names[joint.network.path], ("application/octet-stream", joint.network.data))
+        for network in _networks_of(joint):
+            found.setdefault(names[network.path], ("application/octet-stream", network.data))
         if joint.profile_path:
             found.setdefault(names[joint.profile_path], ("application/yaml", joint.profile_data))
     return found
@@ -253,6 +259,7 @@ def _provenance(config: Config, report: dict[str, Any]) -> dict[str, Any]:
                 "network": names[joint.network.path] if joint.network else None,
                 "network_sha256": joint.network.sha256 if joint.network else None,
                 **({"profile": names[joint.profile_path]} if joint.profile_path else {}),
+                "shadow_networks": {name: names[each.path] for name, each in joint.shadow_networks.items()},
             }
             for joint in config.joints
         },

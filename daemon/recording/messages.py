@@ -17,12 +17,13 @@ import math
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import IntEnum
+from itertools import accumulate
 from typing import NamedTuple
 
 from mcap.records import Channel, Schema
 
 from jtqd.daemon.shared import cycle_record as cycle
-from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, layout_of
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS, PAIR, SHADOW_FIELDS, layout_of
 from jtqd.daemon.shared.snapshot import PAST_WORDS, View
 from jtqd.estimator.status import NAMES, PAST_LAYOUT, STANDSTILL, STARTING, VALID, Zeros
 from jtqd.estimator.text import counted
@@ -226,17 +227,40 @@ uint64[{PAST_WORDS}] past               # state of the estimator, as it lies in 
 """
 
 
+_SHADOW_MEANINGS = {
+    "torque_nm": "[Nm] estimate of this method; NaN where it has none",
+    "sigma_nm": "[Nm] its standard deviation",
+    "reference_nm": "[Nm] the torque sensor as old as this estimate",
+    "age_ms": "[ms] age of this estimate; NaN: the method is not computed",
+    "status": "of this estimator, before the checks of the loop",
+}
+_SHADOW = """\
+# Shadow methods of one joint in one cycle: estimates from the same inputs that are compared and never sent.
+# tob: observer less friction; efficiency: observer with efficiency lookup; network: the paper's chain, efficiency and
+# network; fused: current path and torsion of the gear.
+
+std_msgs/Header header          # send time of the cycle's SYNC, CLOCK_REALTIME
+uint64 cycle                    # cycles since the start, missed slots included
+int64 sync_monotonic_ns         # [ns] send time of the SYNC, CLOCK_MONOTONIC
+""" + "".join(
+    f"{'uint16' if name.endswith('_status') else 'float64'} {name}".ljust(34)
+    + f"# {_SHADOW_MEANINGS[name.partition('_')[2]]}\n"
+    for name in SHADOW_FIELDS
+)
+
+
 def _complete(text: str, *nested: tuple[str, str]) -> str:
     """Return a definition followed by those it uses, in the notation of `rosidl`."""
     return text + "".join(f"{'=' * 80}\nMSG: {name}\n{body}" for name, body in nested)
 
 
 ZEROS_SCHEMA = "jtqd_msgs/msg/Zeros"
+SHADOW_SCHEMA = "jtqd_msgs/msg/ShadowEstimate"
 _NESTED_HEADER = (("std_msgs/Header", _HEADER), ("builtin_interfaces/Time", _TIME))
 
 
-def schemas_of(joints: int) -> dict[str, str]:
-    """Return the definitions in the log of a bus with so many joints, by name."""
+def schemas_of(joints: int, *, shadow: bool = False) -> dict[str, str]:
+    """Return the definitions in the log of a bus with so many joints, by name; shadow: there are shadow methods."""
     capacity = layout_of(joints).frame_capacity
     frames = _CAN_FRAMES % {"capacity": capacity}
     event = _EVENT % {"numbers": "1 or 2" if joints == 2 else "from 1 on"}
@@ -253,6 +277,7 @@ def schemas_of(joints: int) -> dict[str, str]:
         "jtqd_msgs/msg/Event": _complete(event, *_NESTED_HEADER),
         "rcl_interfaces/msg/Log": _complete(_LOG, ("builtin_interfaces/Time", _TIME)),
         ZEROS_SCHEMA: _complete(_ZEROS, *_NESTED_HEADER),
+        **({SHADOW_SCHEMA: _complete(_SHADOW, *_NESTED_HEADER)} if shadow else {}),
     }
 
 
@@ -289,22 +314,30 @@ ZEROS = tuple(Topic(9 + joint, f"/joint/{joint}/zeros", ZEROS_SCHEMA) for joint 
 """Of the joints that a bus may have; without a message where nothing is tracked."""
 
 
-def topics_of(joints: int) -> tuple[Topic, ...]:
-    """Return all topics in the log of a bus with so many joints."""
+SHADOWS = tuple(
+    Topic(13 + joint, f"/joint/{joint}/shadow", SHADOW_SCHEMA) for joint in range(1, MOST_JOINTS + 1)
+)
+"""Of the joints that a bus may have, where there are shadow methods."""
+
+
+def topics_of(joints: int, *, shadow: bool = False) -> tuple[Topic, ...]:
+    """Return all topics in the log of a bus with so many joints; shadow: there are shadow methods."""
     frames = CAN_FRAMES._replace(schema=frames_name(joints))
-    return *JOINTS[:joints], frames, JOINT_STATES, DIAGNOSTICS, EVENTS, LOG, *ZEROS[:joints]
+    slow = JOINT_STATES, DIAGNOSTICS, EVENTS, LOG, *ZEROS[:joints]
+    return *JOINTS[:joints], frames, *slow, *SHADOWS[: joints * shadow]
 
 
 TOPICS = topics_of(2)
 
 
-def definitions(joints: int = 2) -> tuple[list[Schema], list[Channel]]:
+def definitions(joints: int = 2, *, shadow: bool = False) -> tuple[list[Schema], list[Channel]]:
     """Return the schema and channel records of every topic."""
-    texts = schemas_of(joints)
+    texts = schemas_of(joints, shadow=shadow)
     numbers = {name: number for number, name in enumerate(texts, start=1)}
     records = [Schema(numbers[name], text.encode(), "ros2msg", name) for name, text in texts.items()]
     return records, [
-        Channel(topic.number, topic.name, "cdr", {}, numbers[topic.schema]) for topic in topics_of(joints)
+        Channel(topic.number, topic.name, "cdr", {}, numbers[topic.schema])
+        for topic in topics_of(joints, shadow=shadow)
     ]
 
 
@@ -382,6 +415,8 @@ _TIMING_AND_COUNTERS = slice(24, cycle.HEADER.size)
 _JOINT_CODE = f"4sII16s16s{cycle.JOINT.size}sBB"
 """header.stamp, frame_id with its padding, cycle, sync_monotonic_ns, all of JointRecord, counter, flags."""
 JOINT_ESTIMATE_SIZE = struct.calcsize("<" + _JOINT_CODE)
+_SHADOW_CODE = f"4sII16s16s{cycle.SHADOW.size}s"
+SHADOW_ESTIMATE_SIZE = struct.calcsize("<" + _SHADOW_CODE)
 _FRAME_ID_CAN = _text("can")
 
 
@@ -390,36 +425,41 @@ def _start_of(topic: Topic, size: int) -> bytes:
 
 
 class CycleMessages:
-    """The messages of every cycle: one of each joint, and the frames; as MCAP Message records in a row.
+    """The messages of every cycle: one or two of each joint, and the frames; as MCAP Message records in a row.
 
-    joints: number of them.
+    joints: number of them; shadow: there are shadow methods.
 
     Attributes:
         parts: channel and start of each Message record within the bytes of `block`.
     """
 
-    def __init__(self, joints: int) -> None:
-        layout = cycle.layout_of(joints)
+    def __init__(self, joints: int, *, shadow: bool = False) -> None:
+        layout = cycle.layout_of(joints, shadow)
         capacity = self._capacity = layout.frame_capacity
         self._frames, self._stamps = layout.frames_offset, layout.stamps_offset
         # `s` fills up with zeros what a cycle with fewer frames leaves empty.
         frames_code = f"4sII8s16s{cycle.HEADER.size - 24}s{16 * capacity}s{8 * capacity}s"
         self.frames_size = struct.calcsize("<" + frames_code)
-        packed = struct.Struct("<" + joints * ("11sIqq" + _JOINT_CODE) + "11sIqq" + frames_code)
-        self._pack = packed.pack
+        shadows = SHADOWS[: joints * shadow]
+        codes = joints * [_JOINT_CODE] + len(shadows) * [_SHADOW_CODE] + [frames_code]
+        self._pack = struct.Struct("<" + "".join("11sIqq" + code for code in codes)).pack
         topics = JOINTS[:joints]
-        step = _RECORD_HEAD.size + JOINT_ESTIMATE_SIZE
-        self.parts = tuple((topic.number, n * step) for n, topic in enumerate((*topics, CAN_FRAMES)))
-        self._joints = [
-            (
-                _start_of(topic, JOINT_ESTIMATE_SIZE),
-                _text(f"joint_{n + 1}") + bytes(4),
-                slice(
-                    cycle.HEADER.size + n * cycle.JOINT.size, cycle.HEADER.size + (n + 1) * cycle.JOINT.size
-                ),
-            )
-            for n, topic in enumerate(topics)
-        ]
+        sizes = [_RECORD_HEAD.size + struct.calcsize("<" + code) for code in codes]
+        starts = accumulate(sizes[:-1], initial=0)
+        every = (*topics, *shadows, CAN_FRAMES)
+        self.parts = tuple((topic.number, start) for topic, start in zip(every, starts, strict=True))
+
+        def blocks(
+            topics: Sequence[Topic], size: int, first: int, step: int
+        ) -> list[tuple[bytes, bytes, slice]]:
+            return [
+                (_start_of(topic, size), _text(f"joint_{n + 1}") + bytes(4), slice(at, at + step))
+                for n, topic in enumerate(topics)
+                for at in (first + n * step,)
+            ]
+
+        self._joints = blocks(topics, JOINT_ESTIMATE_SIZE, cycle.HEADER.size, cycle.JOINT.size)
+        self._shadows = blocks(shadows, SHADOW_ESTIMATE_SIZE, layout.shadow_offset, cycle.SHADOW.size)
         self._start_frames = _start_of(CAN_FRAMES, self.frames_size)
 
     def block(
@@ -439,6 +479,8 @@ class CycleMessages:
         values: list[bytes | int] = []
         for start, frame_id, joint in self._joints:
             values += (start, *stamp, frame_id, head, record[joint], *end)
+        for start, frame_id, block in self._shadows:
+            values += (start, *stamp, frame_id, head, record[block])
         return self._pack(
             *values,
             self._start_frames,

@@ -91,6 +91,7 @@ class RecorderRequest:
         nodes: [node-ID, name] of those in /diagnostics.
         joint_names: of the joints, joint 1 first, for /joint_states; there are as many joints as names.
         gear_ratios: of the joints; null where not known.
+        shadow: there are shadow methods.
     """
 
     ring: Path
@@ -114,6 +115,7 @@ class RecorderRequest:
     nodes: tuple[Node, ...] = ()
     joint_names: tuple[str, ...] = ("joint_1", "joint_2")
     gear_ratios: tuple[float | None, ...] = (None, None)
+    shadow: bool = False
 
     def __post_init__(self) -> None:
         checks = [
@@ -229,6 +231,7 @@ class Recording:
         events: what happens becomes messages of the span.
         sink: takes the spans.
         overview: makes /joint_states; it knows the number of joints.
+        shadow: there are shadow methods.
         chunk_ns: length of a span in recorded time [ns].
         account: of an earlier recorder of the same run, or a new one; shared with the sink.
 
@@ -245,6 +248,7 @@ class Recording:
         *,
         chunk_ns: int,
         account: Account,
+        shadow: bool = False,
     ) -> None:
         self.account = account
         self.events = events
@@ -258,7 +262,7 @@ class Recording:
         self._newest_ns = 0
         self._overview_slot = -1
         self._faults = FaultTrigger(overview.joints)
-        self._block = CycleMessages(overview.joints).block
+        self._block = CycleMessages(overview.joints, shadow=shadow).block
         self._scan = cycle.selection(*SCANNED, overview.joints).unpack_from
 
     def add(self, record: bytes) -> None:
@@ -330,11 +334,12 @@ class Session:
         self.account = account
         now_ns = time.time_ns()
         self.run = request.run or free_run(request.directory, request.prefix, now_ns)
-        definitions, channels = messages.definitions(request.joints)
+        definitions, channels = messages.definitions(request.joints, shadow=request.shadow)
+        parts = CycleMessages(request.joints, shadow=request.shadow).parts
         head = Head(definitions, channels, request.load_attachments(warn))
         keep_s = request.flight_recorder_s
         repeat = _REPEAT_EVERY if keep_s is None else _REPEAT_EVERY_IN_MEMORY
-        self._builder = ChunkBuilder(definitions, channels, CycleMessages(request.joints).parts, repeat)
+        self._builder = ChunkBuilder(definitions, channels, parts, repeat)
         self.events = EventLog(self._builder.add, warn)
         self.parts = Parts(request.rules(self.run), head, self._builder, self.events, account)
         self._flight = None if keep_s is None else FlightRecorder(self.parts, self.events, account, keep_s)
@@ -345,6 +350,7 @@ class Session:
             JointStateMessage(request.joint_names, request.gear_ratios),
             chunk_ns=int(request.chunk_s * 1e9),
             account=account,
+            shadow=request.shadow,
         )
         self._diagnostics = Diagnostics(request.snapshot, request.bus, request.joint_names, request.nodes)
         self._zeros_cycle = -1
@@ -540,9 +546,10 @@ class Recorder:
 
     def _open_ring(self) -> RingReader:
         deadline = time.monotonic() + self._request.wait_s
+        size = layout_of(self._request.joints, self._request.shadow).size
         while True:
             try:
-                return RingReader(self._request.ring, layout_of(self._request.joints).size)
+                return RingReader(self._request.ring, size)
             except SharedMemoryError:
                 if time.monotonic() >= deadline or self._signals.stop:
                     raise

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from mcap.records import Channel, Schema
 
-from jtqd.daemon.logs import LogError, LogFile
+from jtqd.daemon.logs import LogError, LogFile, rmse, shadow_errors
 from jtqd.daemon.recording.mcap_file import ChunkBuilder, Head, McapFile, NamedData
 from jtqd.daemon.recording.messages import SCHEMAS, CycleMessages
 from jtqd.daemon.recording.run_files import ACTIVE
@@ -60,6 +60,11 @@ def text(result: Result, *, compared: bool) -> str:
         lines += map(_contacts, same.contacts)
         lines += map(_unknown, same.unknown)
         lines += map(_difference, same.differences)
+    for n, joint in enumerate(result.joints if result.models[0].shadows else (), start=1):
+        found = ", ".join(f"{name} {_nm(rmse(error))}" for name, error in shadow_errors(joint, joint).items())
+        lines.append(
+            f"  joint {n}: shadow methods, rms error in motion against the sensor as old as each: {found}"
+        )
     if compared or same is None:
         for each in result.comparisons:
             lines += _comparison(each, "now" if same is None else "replayed")
@@ -215,7 +220,7 @@ def _messages(result: Result, n: int) -> RecordArray:
     columns |= {name: logged[name] for name in logged.dtype.names or () if name in (out.dtype.names or ())}
     for field, values in (columns | {"stamp": logged["header"]["stamp"]}).items():
         out[field] = values[:, np.newaxis]
-    for field in replayed.dtype.names or ():
+    for field in SAMPLE.names or ():
         out[field][:, 1] = replayed[field]
     return out
 

@@ -30,7 +30,7 @@ import yaml
 from jtqd.daemon.config import Config, as_booted, load_config
 from jtqd.daemon.core.input_pdos import InputPdo, JointInputs, input_pdos, joint_inputs, joint_temperatures
 from jtqd.daemon.logs import LogError, iter_messages, iter_topics, log_parts, read_attachments
-from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS, ZEROS
+from jtqd.daemon.recording.messages import CAN_FRAMES, JOINTS, SHADOWS, ZEROS
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import FLAG_MOTION, FLAG_POSITION, FLAG_SENSOR, MOST_JOINTS
 from jtqd.daemon.shared.snapshot import PAST_WORDS
@@ -49,6 +49,8 @@ SAMPLE = np.dtype(
     ]
 )
 """What the loop records of a joint: the fields of `cycle_record.JointRecord`."""
+SHADOW = np.dtype([(name, "<u2" if name.endswith("_status") else "<f8") for name in cr.SHADOW_FIELDS])
+"""What it records of a joint's shadow methods; behind the fields of SAMPLE where there are any."""
 ADDED = ("reference_nm", "age_ms", "torque_rate_nm_s", "contact_nm")
 """Of these, fields that older logs do not have; they follow from the others."""
 STAMP = np.dtype([("sec", "<i4"), ("nanosec", "<u4")])
@@ -116,12 +118,13 @@ class _Configuration(msgspec.Struct):
 
 
 class _JointFiles(msgspec.Struct):
-    """Names of the attachments of one joint; network None: the method does not use it."""
+    """Names of the attachments of one joint; network None: the method does not use it; shadow_networks: by method."""
 
     file: str
     file_sha256: str | None = None
     profile: str | None = None
     network: str | None = None
+    shadow_networks: dict[str, str] = {}
 
 
 class _Provenance(msgspec.Struct):
@@ -220,6 +223,10 @@ class _Attachments:
                 f"joint_{number}.onnx"  # its hash is in the configuration: load_config checks it
             )
             hashes.append(self._write(str(files.network), network["file"]))
+        for method, shadow in (section.get("shadow_networks") or {}).items():
+            name = files.shadow_networks.get(method, "")
+            shadow["file"] = f"joint_{number}.{method}.onnx"
+            hashes.append(self._write(name, shadow["file"]))
         return hashes
 
     def _write(self, name: str, file: str) -> str:
@@ -658,14 +665,20 @@ def _stretches(
     """Yield joints, inputs and states of the estimators of a run, stretch by stretch. Raises LogError, OSError."""
     count = len(setup.config.joints)
     joints, zeros = [each.name for each in JOINTS[:count]], [each.name for each in ZEROS[:count]]
-    needed = {**dict.fromkeys(joints, JOINT), CAN_FRAMES.name: FRAMES}
+    shadows = [each.name for each in SHADOWS[:count]] if setup.config.shadow else []
+    fields = {name: SHADOW[name] for name in SHADOW.names or ()}
+    needed = {
+        **dict.fromkeys(joints, JOINT),
+        **{name: {"cycle": "<u8", **fields} for name in shadows},
+        CAN_FRAMES.name: FRAMES,
+    }
     pending: dict[str, list[RecordArray]] = {}
     last, made = -1, False
     spans = iter_topics(logs, [*needed, *zeros], least=least)
     while (found := next(spans, None)) is not None:
-        for topic, fields in needed.items():
+        for topic, kinds in needed.items():
             if topic in found:
-                check_fields(found[topic].records, fields, logs[0], topic)
+                check_fields(found[topic].records, kinds, logs[0], topic)
                 pending.setdefault(topic, []).append(found[topic].records)
         states = tuple(
             states_of(found[topic].records, logs[0], topic) if topic in found else NO_STATES
@@ -675,7 +688,9 @@ def _stretches(
         if len(pending) < len(needed):
             continue
         last, tables = _complete(pending, last, logs[0])
-        whole = _common([tables[topic] for topic in joints])
+        every = _common([tables[topic] for topic in (*joints, *shadows)])
+        whole = tuple(map(_with_shadow, every, every[count:])) if shadows else every
+        del every
         frames = _of_cycles(tables.pop(CAN_FRAMES.name), whole[0]["cycle"], logs[0])
         inputs = decode(setup, frames, whole)
         del tables, frames
@@ -725,6 +740,16 @@ def _common(joints: Sequence[RecordArray]) -> tuple[RecordArray, ...]:
         return tuple(joints)
     shared = reduce(np.intersect1d, [each["cycle"] for each in joints])
     return tuple(each[np.isin(each["cycle"], shared)] for each in joints)
+
+
+def _with_shadow(joint: RecordArray, shadow: RecordArray) -> RecordArray:
+    """Return the states of a joint with the fields of its shadow methods of the same cycles behind."""
+    kind = [(name, joint.dtype[name]) for name in joint.dtype.names or ()]
+    out = np.empty(len(joint), [*kind, *SHADOW.descr])
+    for source, names in ((joint, joint.dtype.names), (shadow, SHADOW.names)):
+        for name in names or ():
+            out[name] = source[name]
+    return out
 
 
 def _of_cycles(frames: RecordArray, cycles: npt.NDArray[np.uint64], log: Path) -> RecordArray:

@@ -12,7 +12,7 @@ from jtqd.daemon.core.joint cimport ContactWatch
 from jtqd.daemon.core.estimate_pdo cimport NOBODY, Published, encode_into, field_of
 from jtqd.daemon.core.intake cimport MOST_FIELDS, Intake, Temperature
 from jtqd.daemon.core.joint cimport JointCycle, JointState
-from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock
+from jtqd.daemon.core.record cimport MOST_JOINTS, JointBlock, ShadowBlock
 from jtqd.estimator import status as st
 
 cdef int64_t FIRST_CYCLES = STARTING_CYCLES
@@ -50,7 +50,7 @@ cdef class CycleRows:
         velocity: of each joint, the motor velocity as logged [joints, n], for drives without one; None: derived again.
 
     Attributes:
-        samples: of each joint, blocks of the cycle record [joints, n, bytes].
+        samples: of each joint, blocks of the cycle record [joints, n, bytes], with that of its shadow methods behind.
         estimates: estimate PDOs one after the other [n, 8 * PDOs].
         temperatures_from_log: how often the frames gave another temperature than the log.
 
@@ -100,7 +100,8 @@ cdef class CycleRows:
         self.wanted, self.withdrawn = _checked(wanted, np.uint8, (self.count, n)), _checked(withdrawn, np.uint8, (n,))
         self.with_velocity = velocity is not None
         self.velocity = _checked(np.zeros((self.count, n)) if velocity is None else velocity, np.float64, (self.count, n))
-        self.samples = np.zeros((self.count, n, sizeof(JointBlock)), np.uint8)
+        size = sizeof(JointBlock) + (sizeof(ShadowBlock) if self.states[0].shadow != NULL else 0)
+        self.samples = np.zeros((self.count, n, size), np.uint8)
         self.estimates = np.zeros((n, 8 * self.pdos), np.uint8)
         self.to_samples, self.to_estimates = self.samples, self.estimates
 
@@ -129,6 +130,9 @@ cdef class CycleRows:
                     self.contacts.withdraw(self.states)
             for n in range(self.count):
                 memcpy(&self.to_samples[n, row, 0], &self.states[n].sample, sizeof(JointBlock))
+                if self.states[n].shadow != NULL:
+                    (<JointCycle> at[n]).observe_shadows()
+                    memcpy(&self.to_samples[n, row, sizeof(JointBlock)], self.states[n].shadow, sizeof(ShadowBlock))
             for n in range(self.pdos):
                 second = &self.states[2 * n + 1].published if 2 * n + 1 < self.count else &NOBODY
                 encode_into(

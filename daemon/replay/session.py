@@ -33,6 +33,7 @@ from jtqd.daemon.replay.compare import Comparison, Identity, compare, identity
 from jtqd.daemon.replay.logged import (
     NO_STATES,
     SAMPLE,
+    SHADOW,
     STRETCH_CYCLES,
     EstimatorStates,
     Inputs,
@@ -64,13 +65,15 @@ _Events = defaultdict[int, list[Callable[[], object]]]
 
 @dataclass(frozen=True)
 class Model:
-    """Model of one joint, its estimator without warm-up, and where it comes from: files with hashes, or "as logged"."""
+    """Model of one joint, its estimators without warm-up, and where it comes from: files with hashes, or "as logged"."""
 
     joint: Joint
     settings: EstimatorSettings
     network: AnyNetwork | None
     estimator: Estimator
     source: str
+    shadows: tuple[Estimator, ...] = ()
+    """Of its shadow methods."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,7 @@ class Replayed:
     """Result over n cycles.
 
     Attributes:
-        joints: of each joint, `SAMPLE` [n].
+        joints: of each joint, `SAMPLE` [n], with shadow methods `SHADOW` behind.
         estimate: bytes of the estimate PDOs, one after the other [n, 8 * PDOs].
         temperatures_from_log: cycles whose temperature does not follow from the frames alone.
         states_differ: (joint from 1 on, cycle) after which the log has another state of the estimator than the replay.
@@ -104,7 +107,9 @@ class Replayer:
         self._intake = Intake(input_pdos(config), joint_temperatures(config))
         # Counters of the loop in shared memory; not read here.
         unread = SimpleNamespace(
-            counters=array("Q", [0] * len(COUNTERS)), errors=array("d", [0.0] * 3 * cr.MOST_JOINTS)
+            counters=array("Q", [0] * len(COUNTERS)),
+            errors=array("d", [0.0] * 3 * cr.MOST_JOINTS),
+            shadow_errors=array("d", [0.0] * 3 * cr.MOST_JOINTS * len(cr.SHADOW_METHODS)),
         )
         self._joints = [
             JointCycle(
@@ -117,10 +122,15 @@ class Replayer:
                 safety=JointSafety(
                     config.safety, model.settings, model.joint, config.period_ns, model.network is not None
                 ),
+                shadows=model.shadows,
             )
             for n, (inputs, model) in enumerate(zip(setup.inputs, models, strict=True))
         ]
+        self._kind = np.dtype(SAMPLE.descr + (SHADOW.descr if models[0].shadows else []))
         self._unknown = [True] * len(self._joints)
+        self.lost = (
+            False  # cycles: what shadow methods have learned is not known, the log has no state of them
+        )
         self._states_differ: list[tuple[int, int]] = []
         self._contacts = contacts_of(config)
         self._time_ns = [1 << 60] * len(self._joints)  # any but 0: that is a joint without a sample yet
@@ -169,7 +179,7 @@ class Replayer:
             progress(end)
         if count:
             self._time_ns = times[:, -1].tolist()
-        samples = tuple(each.view(SAMPLE)[:, 0] for each in rows.samples)
+        samples = tuple(each.view(self._kind)[:, 0] for each in rows.samples)
         differ, self._states_differ = tuple(self._states_differ), []
         return Replayed(samples, rows.estimates, rows.temperatures_from_log, differ)
 
@@ -212,7 +222,7 @@ class Replayer:
     def _lose(self, number: int, offset: tuple[int, int]) -> None:
         """Continue behind missing cycles, with these roll-overs of the positions."""
         self._joints[number].resume(*offset)
-        self._unknown[number] = True
+        self._unknown[number] = self.lost = True
 
     def _meet(self, number: int, cycle: int, content: bytes) -> None:
         """Compare the estimator's state with that of the log after `cycle`, and continue from the latter."""
@@ -237,29 +247,32 @@ def models_of(setup: Setup, directory: Path | None = None, method: str | None = 
     Joint files are `jointN.yaml` or `extended.jointN.yaml`, or `extended.joint.yaml` for the joint of that name;
     networks `jointN.fused.onnx` for method fused, `jointN.onnx` for network. Files that are not there stay as logged.
     """
-    settings = setup.config.estimator
-    logged_method = settings.method
-    if method is not None:
-        settings = replace(settings, method=method)
+    logged = setup.config.estimator.method
+    sent = method or logged
+    methods = [sent, *(name for name in setup.config.shadow if name != sent)]
     if directory is not None and not directory.is_dir():
         raise ConfigError(f"{directory}: not a directory, expected one with joint files and networks")
     found = []
     for number, each in enumerate(setup.config.joints, start=1):
-        joint, network, files = each.joint, None, []
+        joint, files = each.joint, []
         path = None if directory is None else _joint_file(directory, number, joint)
         if path is not None:
             joint = load_joint(path)
             files.append(path)
-        ending = METHODS[settings.method].network_ending if METHODS[settings.method].network else None
-        if directory is not None and ending and (directory / f"joint{number}{ending}").is_file():
-            path = directory / f"joint{number}{ending}"
-            network = load_network(settings.method, str(path))
-            files.append(path)
-        elif ending and each.network is not None and settings.method == logged_method:
-            network = load_network(settings.method, str(each.network.path), each.network.sha256)
+        networks: dict[str, AnyNetwork] = {}
+        for name, file in {logged: each.network, **each.shadow_networks}.items():
+            if file is not None and name in methods:
+                networks[name] = load_network(name, str(file.path), file.sha256)
+        for name in (each for each in methods if directory is not None and METHODS[each].network):
+            path = Path(directory or "") / f"joint{number}{METHODS[name].network_ending}"
+            if path.is_file():
+                networks[name] = load_network(name, str(path))
+                files.append(path)
         names = ", ".join(f"{file} ({hashlib.sha256(file.read_bytes()).hexdigest()[:12]})" for file in files)
-        estimator = make_estimator(joint, settings, network)
-        found.append(Model(joint, settings, network, estimator, names or AS_LOGGED))
+        settings = [replace(setup.config.estimator, method=name) for name in methods]
+        estimator, *shadows = (make_estimator(joint, one, networks.get(one.method)) for one in settings)
+        network, source = networks.get(sent), names or AS_LOGGED
+        found.append(Model(joint, settings[0], network, estimator, source, tuple(shadows)))
     if directory is not None and all(each.source == AS_LOGGED for each in found):
         every = [name for number in range(1, len(found) + 1) for name in _joint_names(number)]
         names = ", ".join([*every, _ANY_JOINT])
@@ -299,7 +312,7 @@ class Result:
         temperatures_from_log: the same of temperatures.
         identity: comparison bit for bit, with the logged models only.
         comparisons: of each joint.
-        joints: estimates of each joint, fields as `SAMPLE`.
+        joints: estimates of each joint, fields as in `Replayed`.
     """
 
     run: Run
@@ -427,7 +440,7 @@ def _replay_run(
     replay_s = time.perf_counter() - begun
     same = None
     if not other:
-        compared = run.joints, replayed.joints, steps
+        compared = run.joints, _comparable(replayed.joints, replayer), steps
         pdos = inputs.estimate, replayed.estimate, inputs.recorded
         same = identity(*compared, pdos, replayed.states_differ)
         if not same.explained and any(each.network is not None for each in models):
@@ -452,6 +465,14 @@ def _replay_run(
         tuple(comparisons),
         replayed.joints,
     )
+
+
+def _comparable(joints: tuple[RecordArray, ...], replayer: Replayer) -> tuple[RecordArray, ...]:
+    """Return the replayed fields that must be those of the log: without shadow methods whose state is not known."""
+    shadows = replayer.models[0].shadows if replayer.lost else ()
+    hidden = [f"{each.settings.method}_" for each in shadows if learner_of(each) is not None]
+    names = [*(SAMPLE.names or ()), *(each for each in SHADOW.names or () if not each.startswith((*hidden,)))]
+    return tuple(each[names] for each in joints) if hidden else joints
 
 
 def _accepted_states(run: Run, models: Sequence[Model]) -> Sequence[EstimatorStates]:

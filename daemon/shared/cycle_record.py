@@ -6,6 +6,7 @@ Little endian, no padding decided by a compiler; how long it is depends on the n
     joints   one block for each joint: inputs in SI units and every stage of the estimate
     frames   frames as `struct can_frame` with their kernel stamps, in order of arrival: up to 16 where there are one or two
              joints (712 bytes with two), up to 32 where there are more
+    shadow   one block for each joint, where there are shadow methods
     tail     the index again: a reader that finds head and tail different has met a half-written record
 
 Quantities are NaN where they are not known in that cycle (an input that did not come, a stage that was not computed).
@@ -30,8 +31,18 @@ MOST_JOINTS: Final = 4
 JOINT_FORMAT = "16d4H"
 HEADER_FORMAT = "QqqIIiI8B"
 
+SHADOW_METHODS: Final = ("tob", "efficiency", "network", "fused")
+"""Those of the registry, `estimator.settings.METHODS`: compared with it when `core/record.pyx` is imported."""
+SHADOW_QUANTITIES: Final = ("torque_nm", "sigma_nm", "reference_nm", "age_ms")
+"""Of each shadow method; reference_nm: the torque sensor as old as its torque. NaN for a method that is not computed."""
+SHADOW_FIELDS: Final = (
+    *(f"{method}_{quantity}" for method in SHADOW_METHODS for quantity in SHADOW_QUANTITIES),
+    *(f"{method}_status" for method in SHADOW_METHODS),
+)
+
 HEADER = struct.Struct("<" + HEADER_FORMAT)
 JOINT = struct.Struct("<" + JOINT_FORMAT)
+SHADOW = struct.Struct(f"<{len(SHADOW_METHODS) * len(SHADOW_QUANTITIES)}d{len(SHADOW_METHODS)}H")
 TAIL = struct.Struct("<Q")
 
 
@@ -45,21 +56,23 @@ class Layout(NamedTuple):
     """Frames that a record holds."""
     frames_offset: int
     stamps_offset: int
+    shadow_offset: int
     tail_offset: int
     size: int
     """Bytes of a record."""
 
 
 @cache
-def layout_of(joints: int) -> Layout:
-    """Return the layout for a number of joints. Raises ValueError for any but 1..4."""
+def layout_of(joints: int, shadow: bool = False) -> Layout:
+    """Return the layout for a number of joints, with or without shadow methods. Raises ValueError for any but 1..4."""
     if not 1 <= joints <= MOST_JOINTS:
         raise ValueError(f"found {joints} joints, expected 1 to {MOST_JOINTS}")
     head = struct.Struct("<" + HEADER_FORMAT + joints * JOINT_FORMAT)
     capacity = 16 if joints <= 2 else 32
     stamps = head.size + 16 * capacity
-    tail = stamps + 8 * capacity
-    return Layout(joints, head, capacity, head.size, stamps, tail, tail + TAIL.size)
+    shadows = stamps + 8 * capacity
+    tail = shadows + joints * SHADOW.size * shadow
+    return Layout(joints, head, capacity, head.size, stamps, shadows, tail, tail + TAIL.size)
 
 
 PAIR: Final = layout_of(2)

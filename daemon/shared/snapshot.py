@@ -11,14 +11,15 @@ import struct
 import time
 from collections.abc import Sequence
 from itertools import accumulate
-from math import nan
+from math import isnan, nan
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from jtqd.daemon.shared.counters import COUNTERS, word_of
-from jtqd.daemon.shared.cycle_record import MOST_JOINTS
+from jtqd.daemon.shared.cycle_record import MOST_JOINTS, SHADOW, SHADOW_METHODS, SHADOW_QUANTITIES
 from jtqd.daemon.shared.runtime_dir import SharedMemoryError, mapped, new_memory
-from jtqd.estimator.status import Zeros
+from jtqd.estimator.status import NAMES, Zeros
+from jtqd.estimator.text import finite
 
 STATUS_CODES = 16
 MAX_NODE = 128
@@ -44,6 +45,26 @@ class JointView(NamedTuple):
     age_ms: float = nan
     torque_rate_nm_s: float = nan
     contact_nm: float = nan
+
+
+class ShadowView(NamedTuple):
+    """Last estimate of one shadow method of a joint, as in the cycle record (`SHADOW_QUANTITIES`), and its errors.
+
+    rmse_nm, rmse_now_nm: in motion, where the joint published a torque, against the sensor as old as the estimate, and now.
+    """
+
+    torque_nm: float
+    sigma_nm: float
+    reference_nm: float
+    age_ms: float
+    status: int
+    rmse_nm: float
+    rmse_now_nm: float
+
+    def content(self) -> dict[str, Any]:
+        """Return it as plain data for JSON."""
+        values = {key: finite(value) for key, value in self._asdict().items()}
+        return values | {"status": NAMES.get(self.status, str(self.status))}
 
 
 class Measured(NamedTuple):
@@ -119,6 +140,8 @@ class View(NamedTuple):
     """What the estimator of each joint has learned of its zeros."""
     pasts: tuple[bytes, ...] = ()
     """State of each joint's estimator after this cycle (`FusedEstimator.past`); empty where it learns nothing."""
+    shadows: tuple[dict[str, ShadowView], ...] = ({},) * MOST_JOINTS
+    """Shadow methods of each joint by name."""
     conflict_cob_id: int = 0
     """Of the last frame that `cob_id_conflicts` counted."""
 
@@ -143,7 +166,7 @@ LATE_BINS, LATE_BIN_NS = 250, 4_000
 MAX_INPUTS = 20
 """Four TPDOs of each of four drives and two sensor channels are eighteen."""
 
-_MAGIC = 0x4A54_5144_5354_410C  # "JTQDSTA", layout 12
+_MAGIC = 0x4A54_5144_5354_410D  # "JTQDSTA", layout 13
 _HEAD = struct.Struct("<QQddQ")
 """Magic number, process, period [s], worst load, number of joints."""
 JOINT = struct.Struct("<6dHBBHH4d")
@@ -191,6 +214,9 @@ class _Views:
         )  # s: the `restarts` after which it was last configured
         self.doubts = self._next("B", MAX_NODE)  # s: how often it was found with a changed configuration
         self.learned = self._next("B", MOST_JOINTS * LEARNED.size)
+        # guarded as `estimate` is, and per joint and method errors as in `errors`
+        self.shadows = self._next("B", MOST_JOINTS * SHADOW.size)
+        self.shadow_errors = self._next("d", 3 * MOST_JOINTS * len(SHADOW_METHODS))
 
     def _next(self, code: str, count: int) -> Any:
         """Return the view of the next `count` items of a code of `struct`."""
@@ -209,6 +235,7 @@ class Snapshot(_Views):
         head = _HEAD.pack(_MAGIC, os.getpid(), period_s, worst_load, joints)
         memory = new_memory(path, SIZE, head)
         super().__init__(memoryview(memory))
+        self.shadows[:] = b"\xff" * len(self.shadows)  # NaN: no method has an age
 
     def factors(self, node_id: int) -> tuple[float, ...]:
         """Return the four scaling factors of a node that the supervisor has noted (`note_factors`); zeros where none."""
@@ -280,8 +307,22 @@ class SnapshotReader:
             inputs=tuple(each for each in inputs if any(each)),
             zeros=tuple(Zeros(*each[:9]) for each in learned),
             pasts=tuple(each[10][: each[9]] for each in learned),
+            shadows=tuple(self._shadows(n) for n in joints),
             conflict_cob_id=views.conflict[0],
         )
+
+    def _shadows(self, joint: int) -> dict[str, ShadowView]:
+        """Return the shadow methods of a joint, from 0 on, that are computed."""
+        values = SHADOW.unpack_from(self._views.shadows, joint * SHADOW.size)
+        step, count, found = len(SHADOW_QUANTITIES), len(SHADOW_METHODS), {}
+        for n, method in enumerate(SHADOW_METHODS):
+            torque, sigma, reference, age = values[step * n : step * n + step]
+            at = 3 * (count * joint + n)
+            *errors, samples = self._views.shadow_errors[at : at + 3]
+            rmse, now = ((each / samples) ** 0.5 if samples else nan for each in errors)
+            if not isnan(age):
+                found[method] = ShadowView(torque, sigma, reference, age, values[n - count], rmse, now)
+        return found
 
     def work_us(self, *shares: float) -> list[float]:
         """Return quantiles of the work per cycle [us], upper edge of their bin (1.0: the true maximum); NaN without data."""

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import starmap
 from math import isfinite
 from types import TracebackType
 from typing import Any
@@ -22,7 +23,7 @@ from jtqd.daemon.shared.conditions import CATALOGUE, Occurrences
 from jtqd.daemon.shared.counters import Shown, shown_in
 from jtqd.daemon.shared.events import INFO, OperatorLog, Priority
 from jtqd.daemon.shared.reasons import contact_of, contact_text
-from jtqd.daemon.shared.snapshot import JointView, SnapshotReader, View
+from jtqd.daemon.shared.snapshot import JointView, ShadowView, SnapshotReader, View
 from jtqd.estimator.status import NAMES, PUBLISHED
 from jtqd.estimator.text import counted, finite, number, percent, printable
 
@@ -79,7 +80,11 @@ class LiveTable:
         self._title = title
         self._columns = [name for name in _COLUMNS if contacts or name != _CONTACT]
         self._line = loop_line(reader, previous, view, bitrate, contacts=contacts)
-        self._rows = [_cells(number, joint) for number, joint in enumerate(view.joints, start=1)]
+        self._rows = [
+            cells
+            for number, joint in enumerate(view.joints, start=1)
+            for cells in (_cells(number, joint), *starmap(_shadow_cells, view.shadows[number - 1].items()))
+        ]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         """Render for the width of the terminal (called by rich)."""
@@ -127,6 +132,20 @@ def _cells(joint_number: int, joint: JointView) -> dict[str, str | Text]:
         "error [Nm]": number(joint.torque_nm - joint.reference_nm) if known else "-",
         _CONTACT: Text(touched, style="bold red") if contact_of(joint) else touched,
         "status": Text(name, style=COLOURS.get(name, "bold red")),
+    }
+
+
+def _shadow_cells(method: str, shadow: ShadowView) -> dict[str, str | Text]:
+    """Return the cells of one shadow method, below those of its joint."""
+    name = NAMES.get(shadow.status, str(shadow.status))
+    return {
+        "joint": method,
+        "torque [Nm]": number(shadow.torque_nm),
+        "sigma [Nm]": number(shadow.sigma_nm),
+        "sensor [Nm]": number(shadow.reference_nm),
+        "error [Nm]": number(shadow.torque_nm - shadow.reference_nm),
+        _CONTACT: "",
+        "status": Text(name, style="dim"),
     }
 
 
@@ -215,6 +234,15 @@ class Display:
 
 # The final summary ----
 
+
+def _against_sensor(rmse_nm: float, now_nm: float, age_ms: float) -> str:
+    """Return the RMSE in motion against the sensor as old as the estimate, and against the sensor now."""
+    if not isfinite(rmse_nm):
+        return "no reference"
+    older = f", both {age_ms:.2f} ms old ({now_nm:.3f} Nm against it now)" if age_ms > 0.0 else " now"
+    return f"{rmse_nm:.3f} Nm against the sensor in motion{older}"
+
+
 _LOST = 0.05
 """Share of missed slots beyond which real time is reported as not kept."""
 
@@ -267,6 +295,9 @@ class Summary:
             "late_us": dict(zip(("p50", "p99", "max"), map(finite, self.late_us), strict=True)),
             "rmse_nm": by_joint(map(finite, view.rmse_nm)),
             "rmse_now_nm": by_joint(map(finite, view.rmse_now_nm)),
+            "shadow": by_joint(
+                {name: each.content() for name, each in joint.items()} for joint in view.shadows
+            ),
             "age_ms": by_joint(finite(each.age_ms) for each in view.joints),
             "zeros": by_joint(each.content() for each in view.zeros),
             "contacts": counters["contacts"] if self.contacts else None,
@@ -318,12 +349,10 @@ class Summary:
         view, counters, lines = self.view, self.view.counters, self._timing()
         errors = zip(view.rmse_nm, view.rmse_now_nm, view.joints, strict=False)
         for n, (rmse, now, joint) in enumerate(errors, start=1):
-            shown = "no reference"
-            if isfinite(rmse):
-                age = joint.age_ms
-                older = f", both {age:.2f} ms old ({now:.3f} Nm against it now)" if age > 0.0 else " now"
-                shown = f"{rmse:.3f} Nm against the sensor in motion{older}"
-            lines.append(f"RMSE joint {n}  {shown}")
+            lines.append(f"RMSE joint {n}  {_against_sensor(rmse, now, joint.age_ms)}")
+            for name, shadow in view.shadows[n - 1].items():
+                against = _against_sensor(shadow.rmse_nm, shadow.rmse_now_nm, shadow.age_ms)
+                lines.append(f"  {name:<12}{against}")
         zeros = enumerate(view.zeros, start=1)
         lines += [f"zeros joint {joint} {each.text}" for joint, each in zeros if each.tracked]
         if self.contacts:

@@ -95,7 +95,7 @@ def small_network(number: int) -> SmallNetwork:
 def make_fixture(directory: Path) -> Fixture:
     """Write configuration, networks and boot report into `directory`."""
     mapping = yaml.safe_load(shipped("bench.yaml").read_text(encoding="utf-8"))
-    mapping["estimator"]["method"] = "network"
+    mapping["estimator"] |= {"method": "network", "shadow": []}
     for number in (1, 2):
         joint = mapping[f"joint_{number}"]
         joint["file"] = str(shipped(f"joint{number}.yaml"))  # the same whatever ships as trained

@@ -1,6 +1,8 @@
 """Configuration: what ships is valid, and every mistake is one line that names file, key, found and expected."""
 
+import hashlib
 import os
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +26,10 @@ def write(directory: Path, change: Any) -> Path:
     for joint in ("joint_1", "joint_2", "joint_3", "joint_4"):
         if isinstance(content.get(joint), dict):
             content[joint]["file"] = str(shipped(content[joint].get("file", "joint1.yaml")))
-            network = content[joint].get("network")
-            if isinstance(network, dict) and "file" in network:
-                network["file"] = str(shipped("bench.yaml").parent / network["file"])
+            shadows = content[joint].get("shadow_networks", {}).values()
+            for network in (content[joint].get("network"), *shadows):
+                if isinstance(network, dict) and "file" in network:
+                    network["file"] = str(shipped("bench.yaml").parent / network["file"])
     path = directory / "c.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
@@ -241,7 +244,7 @@ def test_a_number_too_large_for_any_quantity_is_refused(tmp_path: Path) -> None:
 
 def test_a_network_method_needs_a_network(tmp_path: Path) -> None:
     def change(content: dict[str, Any]) -> None:
-        content["estimator"]["method"] = "network"
+        content["estimator"] |= {"method": "network", "shadow": []}
         content["joint_1"].pop("network", None)
 
     with pytest.raises(ConfigError, match=r"joint_1\.network.*missing"):
@@ -344,3 +347,98 @@ def test_the_contact_pdo_is_part_of_the_bus_load_and_fits_beside_a_sensor(tmp_pa
     assert load({}) == pytest.approx(load(None) + 0.095)
     assert load({"pdo": False}) == load(None)
     assert load({}) < LIMIT
+
+
+# Shadow methods
+
+PAPERS_NETWORK = {
+    "file": str(shipped("trained/joint1.onnx")),
+    "sha256": hashlib.sha256(shipped("trained/joint1.onnx").read_bytes()).hexdigest(),
+}
+
+
+def shadows(methods: Any, network: Any = PAPERS_NETWORK) -> Any:
+    """A change of the bench: joint 1 alone, with these shadow methods and network of method `network`."""
+
+    def change(content: dict[str, Any]) -> None:
+        del content["joint_2"]
+        content["estimator"] |= {"method": "fused", "shadow": methods}
+        content["joint_1"].pop("shadow_networks", None)
+        if network is not None:
+            content["joint_1"]["shadow_networks"] = {"network": network}
+
+    return change
+
+
+def test_shadow_methods_are_configurations_that_would_send_them(tmp_path: Path) -> None:
+    config = load_config(write(tmp_path, shadows(["tob", "network"])))
+    assert config.shadow == ("tob", "network")
+    assert [each.estimator for each in config.shadows] == [
+        replace(config.estimator, method=method) for method in ("tob", "network")
+    ]
+    assert config.estimator.method == "fused"
+    assert config.joints[0].network is None
+    tob, network = (each.joints[0].network for each in config.shadows)
+    assert tob is None
+    assert network is not None
+    assert network.data == shipped("trained/joint1.onnx").read_bytes()
+    unused = load_config(write(tmp_path, shadows(["tob"])))
+    assert unused.joints[0].shadow_networks == {}
+
+
+def both(*changes: Any) -> Any:
+    def change(content: dict[str, Any]) -> None:
+        for each in changes:
+            each(content)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (shadows("tob"), ["estimator.shadow", "found 'tob'", "expected a list of texts"]),
+        (
+            shadows(["tob", "magic"]),
+            ["estimator.shadow", "'magic'", "expected a list of tob, efficiency, network"],
+        ),
+        (shadows(["tob", "tob"]), ["estimator.shadow", "'tob', 'tob'", "each at most once"]),
+        (shadows(["fused"]), ["estimator.shadow", "fused is the method that is sent"]),
+        (
+            shadows(["network"], None),
+            ["joint_1.shadow_networks.network", "missing", "file and sha256", "estimator.shadow has network"],
+        ),
+        (
+            shadows(["network"], PAPERS_NETWORK | {"sha256": "00"}),
+            ["joint1.onnx", "sha256", "found", "expected 00"],
+        ),
+        (
+            both(shadows(["tob"]), put("joint_1.shadow_networks", {"tob": PAPERS_NETWORK})),
+            ["joint_1.shadow_networks.tob", "found a network", "expected one of network, fused"],
+        ),
+        (
+            both(
+                shadows(["tob"]),
+                put("estimator", {"method": "tob", "shadow": ["fused"]}),
+                put("joint_1.file", "joint1.yaml"),
+            ),
+            ["joint1.yaml", "key 'fused'", "missing", "estimator.shadow has fused"],
+        ),
+        (
+            both(
+                shadows(["network"]),
+                put("estimator", {"method": "efficiency", "shadow": ["network"]}),
+                put("joint_1.objects", {"link_position": False}),
+            ),
+            ["joint_1.objects.link_position", "estimator.shadow network", "a network with the link position"],
+        ),
+    ],
+)
+def test_mistakes_in_shadow_methods_are_named(tmp_path: Path, change: Any, words: list[str]) -> None:
+    with pytest.raises(ConfigError) as error:
+        load_config(write(tmp_path, change))
+    text = str(error.value)
+    assert "\n" not in text
+    assert str(tmp_path) in text or "joint1" in text
+    for word in words:
+        assert word in text

@@ -72,11 +72,12 @@ def configuration(scene: Scene, directory: Path) -> Path:
     """The shipped configuration with the scene's method and period."""
     name = "bench.yaml" if scene.method == "fused" else "bench_paper.yaml"
     content = yaml.safe_load(shipped(name).read_text())
-    content["estimator"]["method"] = scene.method
+    content["estimator"] |= {"method": scene.method, "shadow": []}
     content["sync"]["period_us"] = scene.period_us
     content["inputs"] = {"wait_us": 500, "deadline_us": 850}
     for number in (1, 2):
         joint = content[f"joint_{number}"]
+        joint.pop("shadow_networks", None)
         for section in (joint, *([joint["network"]] if "network" in joint else [])):
             shutil.copy(
                 shipped(section["file"]), directory

@@ -39,6 +39,7 @@ def log(monkeypatch):
         return table
 
     monkeypatch.setattr(plot_command, "read_topic", read_topic)
+    monkeypatch.setattr(plot_command, "topics_of", lambda path: {})
     return asked
 
 
@@ -60,7 +61,7 @@ def test_without_json_the_path_alone_is_printed(log, tmp_path, capsys):
 
 
 def test_no_reference_at_all_is_null(log, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(plot_command, "draw", lambda records, joint, path: float("nan"))
+    monkeypatch.setattr(plot_command, "draw", lambda *_: float("nan"))
     assert plot_command.main(["run.mcap", "--out", str(tmp_path / "a.png"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["rmse_nm"] == {"joint_1": None}
 
@@ -147,3 +148,33 @@ def test_contacts_have_panels_where_they_were_watched(tmp_path):
     texts = {name: (tmp_path / f"{name}.svg").read_text() for name in ("watched", "not")}
     for words in ("<!-- 2 contacts -->", "<!-- torque rate -->"):
         assert (words in texts["watched"], words in texts["not"]) == (True, False), words
+
+
+def test_shadow_methods_are_in_the_picture_and_their_rmse_is_that_of_motion(
+    log, tmp_path, capsys, monkeypatch
+):
+    """Each against the sensor as old as it; `network` is not computed. The cycle that only one topic has is left out."""
+    names = [
+        f"{name}_{what}" for name in ("tob", "network") for what in ("torque_nm", "reference_nm", "age_ms")
+    ]
+    values = [(3.0, 1.0, 5.0), (6.0, 2.0, 5.0), (9.0, 0.0, 5.0), (np.nan, 5.0, 5.0), (4.0, np.nan, 5.0)]
+    shadow = np.array(
+        [(n, *row, np.nan, np.nan, np.nan) for n, row in enumerate([*values, (99.0, 0.0, 5.0)])],
+        dtype=[("cycle", "i8"), *((name, "f8") for name in names)],
+    )
+    state = plot_command.read_topic("run.mcap", "/joint/1/state")
+    numbered = np.array(
+        [(n, *row) for n, row in enumerate(state.tolist())], dtype=[("cycle", "i8"), *state.dtype.descr]
+    )
+    topics = {"/joint/1/state": numbered, "/joint/1/shadow": shadow}
+    monkeypatch.setattr(plot_command, "read_topic", lambda path, topic: topics[topic])
+    monkeypatch.setattr(plot_command, "topics_of", lambda path: topics)
+    out = tmp_path / "p.svg"
+    assert plot_command.main(["run.mcap", "--out", str(out), "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert content["shadow_rmse_nm"] == {"tob": pytest.approx(10.0**0.5)}
+    assert content["rmse_nm"] == {"joint_1": pytest.approx(2.5**0.5)}
+    drawn = out.read_text()
+    assert "<!-- classical TOB -->" in drawn
+    assert "<!-- RMSE 3.16 Nm, 5 ms old -->" in drawn
+    assert "chain" not in drawn

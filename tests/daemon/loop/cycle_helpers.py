@@ -162,7 +162,7 @@ def build(
     **options: Any,
 ) -> tuple[Cycle, RingReader]:
     """A cycle on memory in this directory."""
-    size = layout_of(len(joints)).size
+    size = layout_of(len(joints), any(options.get("shadows") or ())).size
     cycle = Cycle(
         socket,  # type: ignore[arg-type]
         intake,
@@ -189,8 +189,9 @@ def make(
     safety: Sequence[JointSafety] | None = None,
     slots: int = 64,
     counter_overflow: int = 240,
+    shadows: Sequence[Sequence[Any]] = (),
 ) -> tuple[Cycle, ScriptedSocket, RingReader]:
-    """A cycle with both joints by method efficiency; `temperatures` are of joint 1 and 2, in this order."""
+    """A cycle with both joints by method efficiency; `temperatures` and `shadows` are of joint 1 and 2, in this order."""
     socket = ScriptedSocket(script)
     settings = EstimatorSettings(method="efficiency")
     if estimators is None:
@@ -203,8 +204,9 @@ def make(
         for n in range(2)
     ]
     grid, intake = Grid(time.monotonic_ns(), 10_000_000), Intake(PDOS, temperatures)
+    options = {"safety": safety, "shadows": shadows}
     cycle, reader = build(
-        tmp_path, socket, intake, joints, grid, slots=slots, safety=safety, counter_overflow=counter_overflow
+        tmp_path, socket, intake, joints, grid, slots=slots, counter_overflow=counter_overflow, **options
     )
     return cycle, socket, reader
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import subprocess
@@ -17,7 +18,14 @@ from onnx import helper
 from jtqd.daemon.config import Config, load_config
 from jtqd.daemon.core.status import safety_of
 from jtqd.daemon.loop import process
-from jtqd.daemon.loop.process import build_estimator, build_estimators, check_networks, loop_filters, warm_up
+from jtqd.daemon.loop.process import (
+    build_estimator,
+    build_estimators,
+    build_shadows,
+    check_networks,
+    loop_filters,
+    warm_up,
+)
 from jtqd.drivers.bus_socket import CanFilter
 from jtqd.estimator.errors import ConfigError
 from jtqd.estimator.estimator import FusedEstimator, JointEstimator
@@ -271,3 +279,45 @@ def test_a_check_that_dies_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
             f"{tmp_path}/n{joint.number}.onnx: the check by ONNX Runtime ended with exit status -9 "
             f"({tmp_path}/c.yaml: 'joint_{joint.number}', estimator.method is fused)"
         )
+
+
+def with_shadow(directory: Path, data: bytes) -> Config:
+    """The bench by method tob, with the paper's chain as a shadow of both joints; joint 2 has this network."""
+    path = configured(directory, "tob", {})
+    content = yaml.safe_load(path.read_text())
+    content["estimator"]["shadow"] = ["efficiency", "network"]
+    for number, each in {**the_papers(), 2: data}.items():
+        (directory / f"s{number}.onnx").write_bytes(each)
+        network = {"file": f"s{number}.onnx", "sha256": hashlib.sha256(each).hexdigest()}
+        content[f"joint_{number}"]["shadow_networks"] = {"network": network}
+    path.write_text(yaml.safe_dump(content))
+    return load_config(path)
+
+
+def test_shadow_methods_are_built_by_the_loop_and_checked_by_the_runtime(tmp_path: Path) -> None:
+    built = build_shadows(with_shadow(tmp_path, the_papers()[2]))
+    assert [[each.settings.method for each in of_joint] for of_joint in built] == 2 * [
+        ["efficiency", "network"]
+    ]
+    assert [[each.with_network for each in of_joint] for of_joint in built] == 2 * [[False, True]]
+    assert [each[0].joint.name for each in built] == ["joint1", "joint2"]
+    assert build_shadows(load_config(configured(tmp_path, "tob", {}))) == []
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b"no model", "not a usable ONNX model"),
+        (foreign(the_papers()[2]), "found a graph that ONNX Runtime must run, expected a graph with weights"),
+    ],
+)
+def test_a_network_of_a_shadow_method_that_cannot_be_used_is_refused(
+    tmp_path: Path, data: bytes, words: str
+) -> None:
+    """A foreign graph is right for the method that is sent: it has a budget of time, a shadow method has none."""
+    with pytest.raises(NetworkError) as caught:
+        build_shadows(with_shadow(tmp_path, data))
+    text = str(caught.value)
+    assert f"{tmp_path}/s2.onnx" in text
+    assert words in text
+    assert text.endswith(f"({tmp_path}/c.yaml: 'joint_2', estimator.shadow has network)")

@@ -44,7 +44,7 @@ def arguments(tmp_path, monkeypatch):
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     (tmp_path / "two.yaml").write_text(yaml.safe_dump(PLAN))
     config = shipped_bench()
-    config["estimator"]["method"] = "tob"
+    config["estimator"] |= {"method": "tob", "shadow": []}
     (tmp_path / "bench.yaml").write_text(yaml.safe_dump(config))
     options = ["--config", str(tmp_path / "bench.yaml"), "--bus", "sim:vcan0", "--out", str(tmp_path / "out")]
     yield [str(tmp_path / "two.yaml"), *options, "--json"]

@@ -38,7 +38,7 @@ def patient_config(directory: Path) -> Path:
     """The shipped bench without networks, whose nodes wait 1.5 s for jtqd before they leave operational."""
     content = shipped_bench()
     content["nodes"]["heartbeat_ms"] = 500
-    content["estimator"]["method"] = "tob"
+    content["estimator"] |= {"method": "tob", "shadow": []}
     path = directory / "bench.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
