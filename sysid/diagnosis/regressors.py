@@ -28,7 +28,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, Channel, JointSignals, Line
-from jtqd.sysid.diagnosis.smoothing import second_difference
+from jtqd.sysid.diagnosis.smoothing import Index, second_difference
 
 BIN_S: Final = 0.005
 SAME_RATE: Final = 0.05
@@ -197,10 +197,6 @@ def _edges(count: int, samples: float) -> FloatArray:
     edges = samples * np.arange(count + 1)
     near = np.round(edges)
     return np.where(np.abs(edges - near) < 1e-6, near, edges)
-
-
-Index = np.ndarray[tuple[int], np.dtype[np.intp]]
-"""Numbers of bins, columns or families [n]."""
 
 
 @dataclass

@@ -22,6 +22,9 @@ from scipy import signal
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 
+Index = np.ndarray[tuple[int], np.dtype[np.intp]]
+"""Whole numbers [n]."""
+
 _SMOOTH_S: Final = 0.005
 _CUBIC_S: Final = 0.014
 """So long is the part of a current that is taken for a cubic before its rate is taken."""
@@ -146,6 +149,8 @@ def _even_step(time: FloatArray) -> float | None:
 
 _FEWEST: Final = 200
 """Samples from which steps of a binade are estimated; with fewer it has those of the next."""
+_CHANCE: Final = 2
+"""So many decimals may all end in zero by chance."""
 _SAME: Final = 1e-8
 """Values closer than this part of the largest are one: double precision, or twelve digits of a count."""
 _DIGITS: Final = 9
@@ -184,6 +189,11 @@ def steps_of(x: FloatArray) -> FloatArray:
             _single(values),
             _counts(values, largest, again=len(values) < 0.8 * there.sum()),
         )
+    decade = _decades(np.abs(x))
+    for there in (decade == e for e in np.unique(decade)):  # few beyond a power of ten have ten times the step
+        values = np.unique(x[there])
+        if len(values) > _CHANCE and 2 * len(values) > there.sum():
+            out[there] = np.maximum(out[there], _decimal(values, float(np.max(np.abs(values)))))
     return out
 
 
@@ -234,9 +244,7 @@ def _magnitudes(x: FloatArray) -> list[BoolArray]:
     before.
     """
     size = np.abs(x)
-    order = np.frexp(size)[1].astype(np.int64) * 100 + np.floor(np.log10(np.maximum(size, 1e-30))).astype(
-        np.int64
-    )
+    order = np.frexp(size)[1].astype(np.int64) * 100 + _decades(size)
     out: list[BoolArray] = []
     waiting = np.zeros(len(x), bool)
     for e in np.unique(order):
@@ -247,6 +255,11 @@ def _magnitudes(x: FloatArray) -> list[BoolArray]:
     if waiting.any():
         out.append(waiting if not out else out.pop() | waiting)
     return out
+
+
+def _decades(size: FloatArray) -> Index:
+    """Return the powers of ten of these sizes [n]."""
+    return np.floor(np.log10(np.maximum(size, 1e-30))).astype(np.intp)
 
 
 def _decimal(values: FloatArray, largest: float) -> float:

@@ -59,6 +59,21 @@ def test_steps_of_digits_grow_with_the_value() -> None:
     assert "steps of 0.001 rad beyond 1e+03 rad" in described(x, "rad")
 
 
+def test_a_few_samples_beyond_a_power_of_ten_have_its_steps() -> None:
+    """Ten times the noise on one sample in 200 is more than a third of all noise."""
+    x = digits(ramp(100.5, 4000), 6)
+    few = x >= 100.0
+    assert 5 < few.sum() < 200
+    assert steps_of(x)[few] == pytest.approx(1e-3)
+    assert steps_of(x)[(x > 20.0) & ~few] == pytest.approx(1e-4)
+    assert noise_of(x)[few] == pytest.approx(1e-3 / math.sqrt(12.0), rel=0.2)
+
+
+def test_a_few_values_that_come_again_show_no_steps() -> None:
+    x = np.concatenate((digits(ramp(90.0, 4000), 6), np.full(50, 100.5)))
+    assert steps_of(x)[-1] == pytest.approx(1e-4)
+
+
 def test_a_steady_motion_is_no_grid() -> None:
     rng = np.random.default_rng(0)
     x = 1000.0 + 0.1 * np.arange(400) + 1e-4 * rng.normal(size=400)
