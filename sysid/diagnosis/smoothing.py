@@ -157,14 +157,14 @@ _DIGITS: Final = 9
 """Significant digits from which a decimal is as good as none."""
 _ON_GRID: Final = 0.95
 """Part of the small distances between values that are whole multiples of the least, on a grid."""
-_SIXTH: Final = math.sqrt(924.0)
-"""Rms of a sixth difference of white noise: binomials of six, squared and summed."""
-_CALM: Final = 50
-"""Samples over which the squares of sixth differences are averaged."""
-_CALMEST: Final = 0.2
-"""Part of the time in which no motion has such differences."""
-_OF_NOISE: Final = 0.70
-"""This quantile of these means, of white noise of unit variance."""
+_SEGMENT: Final = 64
+"""Samples of a spectrum."""
+_SLOW: Final = 0.125
+"""Part of the sampling rate below which all is motion."""
+_BANDS: Final = 6
+"""Above it; motion and lines leave one of them."""
+_ALIKE: Final = 1.25
+"""Densities of white noise in two bands differ by less."""
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0
 """No cutoff is lower: there is the motion itself."""
@@ -211,20 +211,23 @@ def described(x: FloatArray, unit: str) -> str:
 
 
 def noise_of(x: FloatArray) -> FloatArray:
-    """Return the standard deviation of the white noise near each sample [n]: of the steps, or what is quicker than most
-    motion (sixth differences) where the motion is calmest, whichever is more.
+    """Return the standard deviation of the white noise near each sample [n]: of the steps, and of as much beside them as the
+    bands of least density show.
+
+    Of sixth differences, so that what is slow does not leak (Welch 1967, IEEE Trans. Audio Electroacoust. 15).
     """
-    steps = steps_of(x)
-    out = np.asarray(steps / math.sqrt(12.0))
-    if len(x) < 7:
-        return out
-    quick = np.pad(np.abs(np.diff(x, 6)), 3, mode="edge") / _SIXTH
-    for there in _magnitudes(x):
-        square = quick[there] ** 2
-        blocks = np.array_split(square, max(1, len(square) // _CALM))
-        calm = np.quantile([b.mean() for b in blocks], _CALMEST) / _OF_NOISE
-        out[there] = np.maximum(out[there], np.sqrt(min(float(calm), float(square.mean()))))
-    return out
+    steps = np.asarray(steps_of(x) / math.sqrt(12.0))
+    quick = np.diff(x, 6) if len(x) >= 2 * _SEGMENT else np.empty(0)
+    if not len(quick):
+        return steps
+    hz, power = signal.welch(quick, nperseg=_SEGMENT, detrend=False, average="median")
+    high = (hz >= _SLOW) & (hz < 0.5)
+    beside = hz[high] + np.array([[-1.0], [0.0], [1.0]]) / _SEGMENT
+    white = np.array([1.0, 4.0, 1.0]) / 6.0 @ (2.0 * (2.0 * np.sin(np.pi * beside)) ** 12)  # of the Hann window
+    variance = power[high] / white
+    bands = np.array([band.mean() for band in np.array_split(variance, _BANDS)])
+    least = float(bands[bands <= _ALIKE * bands.min()].mean())
+    return np.asarray(np.sqrt(steps**2 + max(least - float(np.mean(steps**2)), 0.0)))
 
 
 def known_below_hz(x: FloatArray, step_s: float) -> float:
