@@ -146,8 +146,6 @@ _AFTER_REST_S: Final = 0.03
 """So long after (and before) such a velocity the transients of sticking are still in the torque."""
 _VISIBLE: Final = 1e-3
 """Part of the rated torque (rms) that the noise of an acceleration may be worth; beyond, the balance is filtered."""
-_SHARED: Final = 2e-4
-"""The same in the regressor of an inertia, where the noise of the residual is once more."""
 _REMEMBERED: Final = 1.2
 """Periods of its cutoff after which a filter has forgotten a standstill."""
 _SHOWN_HZ: Final = 10.0
@@ -180,8 +178,7 @@ class JointSignals:
     moving: BoolArray
     sensor_nm: FloatArray
     current_a: FloatArray
-    shared_nm: FloatArray
-    gear_nm: FloatArray
+    quick_nm: FloatArray  # what of the torque that motion and load need is too quick to be known
     per_torque: FloatArray | float = 1.0
     twist_rad: FloatArray | None = None  # theta_m/G - theta_l less its zero, smoothed
     off: BoolArray | None = None
@@ -191,7 +188,6 @@ class JointSignals:
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
     visible: Smoother = _ALL_VISIBLE
-    inertial: Smoother = _ALL_VISIBLE  # of the acceleration in the regressor of an inertia
     believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
     torque_hz: float = math.inf  # torques in regressors are known below it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
@@ -209,8 +205,7 @@ class JointSignals:
     @property
     def demand_nm(self) -> FloatArray:
         """Motor torque that the joint file's simulation needs for this motion and load [n], Nm joint side."""
-        quick = self.state.torque_nm - self.gear_nm
-        return np.asarray(self.nm_per_a * self.current_a - self.motor_nm + self.shared_nm + quick)
+        return np.asarray(self.nm_per_a * self.current_a - self.motor_nm - self.quick_nm)
 
     def seen(self, balance: str, x: FloatArray) -> FloatArray:
         """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
@@ -324,26 +319,23 @@ class SignalsError(ValueError):
 class _Motion:
     """Motion of one motor as it is known, at the motor's shaft.
 
-    speed: as recorded or derived; whole: acceleration at the full rate; visible, inertial: smoothers after which its noise
-    is worth `_VISIBLE` and `_SHARED`; of_position: all is of the position, else of the velocity; coarse: what its noise
-    costs, in words.
+    speed: as recorded or derived; whole: acceleration at the full rate; visible: smoother after which its noise is worth
+    `_VISIBLE`; of_position: all is of the position, else of the velocity; coarse: what its noise costs, in words.
     """
 
     position: FloatArray
     speed: FloatArray
     whole: FloatArray
     visible: Smoother
-    inertial: Smoother
     of_position: bool
     coarse: str
 
     def below(self, hz: float, step_s: float) -> _Motion:
         """Return the motion with accelerations of nothing quicker than hz."""
-        lowest = (min(hz, each.slowest_hz) for each in (self.visible, self.inertial))
-        visible, inertial = (Smoother.of(np.full(len(self.whole), f), step_s, _FINEST_HZ) for f in lowest)
+        lowest = np.full(len(self.whole), min(hz, self.visible.slowest_hz))
         text = f"torque_nm: computed, known below {hz:.0f} Hz; the motor balance is judged below it"
         coarse = self.coarse if self.visible.slowest_hz <= hz else text
-        return replace(self, visible=visible, inertial=inertial, coarse=coarse)
+        return replace(self, visible=Smoother.of(lowest, step_s, _FINEST_HZ), coarse=coarse)
 
 
 def _motion(
@@ -384,16 +376,13 @@ def _known(
     if like is None:
         step = float(np.median(np.diff(time)))
         per_rated = joint.rated_torque_nm / (joint.gear_ratio * joint.rotor_inertia_kgm2)
-        cutoffs = (
-            cutoff_hz(noise, step, part * per_rated, of_velocity=not of_position)
-            for part in (_VISIBLE, _SHARED)
-        )
-        visible, inertial = (Smoother.of(hz, step, _FINEST_HZ) for hz in cutoffs)
+        hz = cutoff_hz(noise, step, _VISIBLE * per_rated, of_velocity=not of_position)
+        visible = Smoother.of(hz, step, _FINEST_HZ)
     else:
-        visible, inertial = like.visible, like.inertial
+        visible = like.visible
     coarse = _cost(joint, time, x, noise, visible, of_position=of_position)
     speed = np.asarray(np.gradient(x, time)) if of_position else x
-    return _Motion(x, speed, whole, visible, inertial, of_position, coarse)
+    return _Motion(x, speed, whole, visible, of_position, coarse)
 
 
 def _better(time: FloatArray, speed: _Motion, position: _Motion) -> bool:
@@ -448,7 +437,7 @@ def joint_signals(  # noqa: PLR0917
     link = columns.link_position_rad
     if link is None:
         link = motion.position / joint.gear_ratio
-    acceleration, shared = motion.visible(motion.whole), motion.inertial(motion.whole)
+    acceleration = motion.visible(motion.whole)
     link_acceleration = acceleration / joint.gear_ratio
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
@@ -460,15 +449,15 @@ def joint_signals(  # noqa: PLR0917
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2
     nm_per_a = joint.gear_ratio * joint.torque_constant_nm_per_a
-    demand = (slow_torque + loss + reflected * shared) / nm_per_a
+    demand = (slow_torque + loss + reflected * acceleration) / nm_per_a
     state = State(
         current_a=demand,
         current_rate_a_s=current_rate(demand, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
-        link_acceleration_rad_s2=link_acceleration + (shared - acceleration) / joint.gear_ratio,
+        link_acceleration_rad_s2=link_acceleration,
         link_position_rad=link,
         link_velocity_rad_s=velocity,
-        motor_acceleration_rad_s2=shared,
+        motor_acceleration_rad_s2=acceleration,
         motor_position_rad=motion.position,
         temperature_c=np.full(len(time), np.nan) if columns.temperature_c is None else columns.temperature_c,
         time_s=time - time[0],
@@ -501,8 +490,7 @@ def joint_signals(  # noqa: PLR0917
         _moving(time, velocity, motion.visible.slowest_hz),
         sensor,
         columns.current_a,
-        reflected * (shared - motion.whole),
-        gear_torque,
+        gear_torque - slow_torque + reflected * (motion.whole - acceleration),
         twist_rad=bent,
         off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
         of_position=motion.of_position,
@@ -511,7 +499,6 @@ def joint_signals(  # noqa: PLR0917
             for name, x in (("current_a", columns.current_a), ("torque_nm", sensor))
         },
         visible=motion.visible,
-        inertial=motion.inertial,
         torque_hz=known,
         coarse=motion.coarse,
     )

@@ -6,8 +6,7 @@ Derivatives are central differences, which look ahead: this is for recorded runs
 1000 rad with seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. Steps of
 digits and of single precision grow with the value, so they are estimated from the values, for each magnitude by itself.
 Where the acceleration would be coarse, its balance is judged below a cutoff only: residual and regressors pass the same
-linear filter (`Smoother`). The regressors of inertias are filtered further, because noise of an acceleration that is in
-residual and regressor alike would be explained by itself.
+linear filter (`Smoother`).
 """
 
 from __future__ import annotations

@@ -378,7 +378,6 @@ def test_the_runs_with_noise_are_filtered_as_the_runs_are() -> None:
         (plain,), (more,) = run, noisy
         assert plain.visible.parts
         assert more.visible is plain.visible
-        assert more.inertial is plain.inertial
         assert more.of_position == plain.of_position
 
 

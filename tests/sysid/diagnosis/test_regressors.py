@@ -44,8 +44,7 @@ def made_up(joint: Joint, seed: int = 1, number: int = 1, both: bool = True) -> 
         moving=nothing == 0.0,
         sensor_nm=s.torque_nm,
         current_a=s.current_a,
-        shared_nm=nothing,
-        gear_nm=s.torque_nm,
+        quick_nm=nothing,
     )
 
 

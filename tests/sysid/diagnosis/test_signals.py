@@ -50,11 +50,7 @@ def test_a_difference_of_two_tables_is_not_one_of_filters() -> None:
     )
     first = signals(clean)
     again = joint_signals("run", noisy, 1, PLAIN, BaseLoss(PLAIN), first)
-    assert (again.visible, again.inertial, again.of_position) == (
-        first.visible,
-        first.inertial,
-        first.of_position,
-    )
+    assert (again.visible, again.of_position) == (first.visible, first.of_position)
     assert signals(noisy).visible != first.visible
 
 
@@ -250,8 +246,7 @@ def zero_signals(true_nm: np.ndarray, velocity: np.ndarray, zero_nm: float) -> J
         moving=np.ones(n, bool),
         sensor_nm=measured,
         current_a=state.current_a,
-        shared_nm=np.zeros(n),
-        gear_nm=measured,
+        quick_nm=np.zeros(n),
     )
 
 

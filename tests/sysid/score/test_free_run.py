@@ -79,8 +79,7 @@ def signals_of(
         moving=np.ones(n, bool),
         sensor_nm=sensor,
         current_a=current,
-        shared_nm=zero,
-        gear_nm=gear,
+        quick_nm=zero,
     )
 
 
