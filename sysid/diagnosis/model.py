@@ -479,7 +479,7 @@ class _Work:
         for channel, columns in made.items():
             d = run.channels[channel]
             place = {int(k): j for j, k in enumerate(d.index)}
-            numbers, values = seen_in_bins(of[channel.joint], channel.balance, columns, run.samples)
+            numbers, values = seen_in_bins(of[channel.joint], columns, run.samples)
             new = np.array([k not in place for k in numbers.tolist()], bool)
             regressors = np.hstack((d.regressors, values[:, new]))
             regressors[:, [place[k] for k in numbers[~new].tolist()]] = values[:, ~new]

@@ -274,7 +274,7 @@ def _with_columns(
         s = of[channel.joint]
         made = [(families + k, column(kind, s, channel.balance)) for k, kind in enumerate(kinds)]
         there = [(k, c) for k, c in made if c is not None]
-        numbers, columns = seen_in_bins(s, channel.balance, there, run.samples)
+        numbers, columns = seen_in_bins(s, there, run.samples)
         channels[channel] = replace(
             d, nuisances=np.hstack((d.nuisances, columns)), families=np.concatenate((d.families, numbers))
         )

@@ -28,7 +28,7 @@ from jtqd.estimator.joint import Joint
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.findings import JointName, shows_at
 from jtqd.sysid.diagnosis.signals import SLOWEST_RAD_S, Channel, JointSignals, Line
-from jtqd.sysid.diagnosis.smoothing import Index, second_difference
+from jtqd.sysid.diagnosis.smoothing import second_difference
 
 BIN_S: Final = 0.005
 SAME_RATE: Final = 0.05
@@ -171,14 +171,14 @@ def binned(x: FloatArray, samples: float) -> FloatArray:
 
 
 def seen_in_bins(
-    s: JointSignals, balance: str, columns: Sequence[tuple[int, FloatArray]], samples: float
+    s: JointSignals, columns: Sequence[tuple[int, FloatArray]], samples: float
 ) -> tuple[Index, FloatArray]:
-    """Return the numbers of columns [p], and the columns as they are seen in a balance, binned [n, p]; some at once, as
+    """Return the numbers of columns [p], and the columns as they are seen, binned [n, p]; some at once, as
     calling a filter takes long.
     """
     out = [np.empty((int(len(s.time_s) / samples), 0))]
     for first in range(0, len(columns), _AT_ONCE):
-        rows = s.seen(balance, np.array([x for _, x in columns[first : first + _AT_ONCE]]))
+        rows = s.seen(np.array([x for _, x in columns[first : first + _AT_ONCE]]))
         out += [binned(x, samples) for x in rows]
     return np.array([k for k, _ in columns], np.intp), np.column_stack(out)
 
@@ -197,6 +197,10 @@ def _edges(count: int, samples: float) -> FloatArray:
     edges = samples * np.arange(count + 1)
     near = np.round(edges)
     return np.where(np.abs(edges - near) < 1e-6, near, edges)
+
+
+Index = np.ndarray[tuple[int], np.dtype[np.intp]]
+"""Numbers of bins, columns or families [n]."""
 
 
 @dataclass
@@ -331,12 +335,12 @@ def run_data(
             channel = Channel(s.number, balance)
             valid, known = (all_in_bin(x, samples) for x in (s.usable(balance), s.known(balance)))
             nuisances = [(k, _nuisance(s, balance, g)) for k, g in enumerate(groups)]
-            index, regressors = seen_in_bins(s, balance, made.get(channel, ()), samples)
-            own, changes = seen_in_bins(s, balance, [(k, c) for k, c in nuisances if c is not None], samples)
+            index, regressors = seen_in_bins(s, made.get(channel, ()), samples)
+            own, changes = seen_in_bins(s, [(k, c) for k, c in nuisances if c is not None], samples)
             worth = binned(s.held_nm[balance], samples) if balance in s.held_nm else np.zeros(len(known))
             channels[channel] = ChannelData(
                 valid,
-                binned(s.seen(balance, residual), samples),
+                binned(s.seen(residual), samples),
                 regressors,
                 index,
                 changes,

@@ -138,7 +138,7 @@ class Line:
 
 
 COMPUTED_HZ: Final = 12.0
-"""Cutoff of the motor balance where the torque is computed, as its acceleration was smoothed; least cutoff of any torque."""
+"""Cutoff of the balances where the torque is computed, as its acceleration was smoothed; least cutoff of any torque."""
 _ALL_VISIBLE: Final = Smoother(1.0)
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
@@ -207,11 +207,11 @@ class JointSignals:
         """Motor torque that the joint file's simulation needs for this motion and load [n], Nm joint side."""
         return np.asarray(self.nm_per_a * self.current_a - self.motor_nm - self.quick_nm)
 
-    def seen(self, balance: str, x: FloatArray) -> FloatArray:
-        """Return what of x [n] can be seen in a balance: of the motor's, what is slow enough for its acceleration to be
-        known (`resolution`). Residuals and all that is to explain them go through it.
+    def seen(self, x: FloatArray) -> FloatArray:
+        """Return what of x [.., n] is slow enough for the motor's acceleration to be known (`resolution`). Residuals of both
+        balances and all that is to explain them go through it.
         """
-        return self.visible(x) if balance == MOTOR else x
+        return self.visible(x)
 
     def usable(self, balance: str) -> BoolArray:
         """Return the samples that a balance is judged at [n]: those of `known` at which no channel of it is held."""
@@ -282,9 +282,7 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """
     if not held:
         return s
-    reach = dict.fromkeys((TORSION, MOTOR), reach_of_calm(s.step_s))
-    if s.visible.parts:
-        reach[MOTOR] = _REMEMBERED / s.visible.slowest_hz
+    reach = _REMEMBERED / s.visible.slowest_hz if s.visible.parts else reach_of_calm(s.step_s)
     out, worth = {}, {}
     for balance, units in (
         (TORSION, {"torque_nm": -1.0}),
@@ -293,7 +291,7 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
         found = [(unit, held[name]) for name, unit in units.items() if name in held]
         if found:
             worth[balance] = np.asarray(sum(unit * h.deviation for unit, h in found))
-            wide = max(1, round(reach[balance] / s.step_s)) + 2  # and that of a second difference
+            wide = max(1, round(reach / s.step_s)) + 2  # and that of a second difference
             out[balance] = _near(np.any([h.rows for _, h in found], axis=0), wide)
     return replace(s, held=out, held_nm=worth)
 
@@ -333,7 +331,7 @@ class _Motion:
     def below(self, hz: float, step_s: float) -> _Motion:
         """Return the motion with accelerations of nothing quicker than hz."""
         lowest = np.full(len(self.whole), min(hz, self.visible.slowest_hz))
-        text = f"torque_nm: computed, known below {hz:.0f} Hz; the motor balance is judged below it"
+        text = f"torque_nm: computed, known below {hz:.0f} Hz; the balances are judged below it"
         coarse = self.coarse if self.visible.slowest_hz <= hz else text
         return replace(self, visible=Smoother.of(lowest, step_s, _FINEST_HZ), coarse=coarse)
 
@@ -518,7 +516,7 @@ def _cost(
     torque = joint.gear_ratio * joint.rotor_inertia_kgm2 * known
     return (
         f"{name}: found {found}: acceleration known to {known:.2g} rad/s2 ({torque:.2g} Nm at the joint) below {hz:.0f} Hz; "
-        "the motor balance is judged below it"
+        "the balances are judged below it"
     )
 
 

@@ -21,9 +21,6 @@ from scipy import signal
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 
-Index = np.ndarray[tuple[int], np.dtype[np.intp]]
-"""Whole numbers [n]."""
-
 _SMOOTH_S: Final = 0.005
 _CUBIC_S: Final = 0.014
 """So long is the part of a current that is taken for a cubic before its rate is taken."""
@@ -189,7 +186,9 @@ def steps_of(x: FloatArray) -> FloatArray:
             _counts(values, largest, again=len(values) < 0.8 * there.sum()),
         )
     decade = _decades(np.abs(x))
-    for there in (decade == e for e in np.unique(decade)):  # few beyond a power of ten have ten times the step
+    for there in (
+        decade == e for e in np.unique(decade)
+    ):  # few beyond a power of ten have ten times the step
         values = np.unique(x[there])
         if len(values) > _CHANCE and 2 * len(values) > there.sum():
             out[there] = np.maximum(out[there], _decimal(values, float(np.max(np.abs(values)))))
@@ -222,7 +221,9 @@ def noise_of(x: FloatArray) -> FloatArray:
     hz, power = signal.welch(quick, nperseg=_SEGMENT, detrend=False, average="median")
     high = (hz >= _SLOW) & (hz < 0.5)
     beside = hz[high] + np.array([[-1.0], [0.0], [1.0]]) / _SEGMENT
-    white = np.array([1.0, 4.0, 1.0]) / 6.0 @ (2.0 * (2.0 * np.sin(np.pi * beside)) ** 12)  # of the Hann window
+    white = (
+        np.array([1.0, 4.0, 1.0]) / 6.0 @ (2.0 * (2.0 * np.sin(np.pi * beside)) ** 12)
+    )  # of the Hann window
     variance = power[high] / white
     bands = np.array([band.mean() for band in np.array_split(variance, _BANDS)])
     least = float(bands[bands <= _ALIKE * bands.min()].mean())
@@ -246,7 +247,7 @@ def _magnitudes(x: FloatArray) -> list[BoolArray]:
     before.
     """
     size = np.abs(x)
-    order = np.frexp(size)[1].astype(np.int64) * 100 + _decades(size)
+    order = 100.0 * np.frexp(size)[1] + _decades(size)
     out: list[BoolArray] = []
     waiting = np.zeros(len(x), bool)
     for e in np.unique(order):
@@ -259,9 +260,9 @@ def _magnitudes(x: FloatArray) -> list[BoolArray]:
     return out
 
 
-def _decades(size: FloatArray) -> Index:
-    """Return the powers of ten of these sizes [n]."""
-    return np.floor(np.log10(np.maximum(size, 1e-30))).astype(np.intp)
+def _decades(size: FloatArray) -> FloatArray:
+    """Return the powers of ten of these sizes [n], whole numbers."""
+    return np.asarray(np.floor(np.log10(np.maximum(size, 1e-30))))
 
 
 def _decimal(values: FloatArray, largest: float) -> float:
