@@ -246,8 +246,8 @@ def _name(node: ast.AST) -> str:
 TIME: Final = "time_s"
 JOINTS: Final = range(1, 8)
 GRAVITY_M_S2: Final = 9.80665
-WINDOW_S: Final = 0.05
-"""Longest window of a position to which a cubic is fitted for its velocity and acceleration."""
+WINDOW_S: Final = 0.1
+"""Longest window of a position to which a quintic is fitted for its velocity and acceleration."""
 _QUIET: Final = 0.02
 _FEWEST_ROWS: Final = 7
 _OUTLIER_RAD: Final = 0.1
@@ -397,7 +397,7 @@ def targets() -> list[str]:
 
 
 def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return velocity and acceleration [n] of the cubic through a window of the position around each row, ends held.
+    """Return velocity and acceleration [n] of the quintic through a window of the position around each row, ends held.
 
     The window is the shortest in which the position's noise is below _QUIET of the motion's largest acceleration, WINDOW_S
     at most: a longer one rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964, doi
@@ -425,10 +425,11 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
 
 
 def _weights(half: int, step: float) -> tuple[FloatArray, FloatArray]:
-    """Return weights [2 half + 1] of a cubic's slope and second derivative in its middle."""
+    """Return weights [2 half + 1] of a quintic's slope and second derivative in its middle."""
     at = np.arange(-half, half + 1) * step
-    cubic = np.linalg.pinv(np.column_stack((np.ones_like(at), at, at * at, at**3)))
-    return cubic[1], 2.0 * cubic[2]
+    reach = at[-1]
+    quintic = np.linalg.pinv(np.vander(at / reach, 6, increasing=True))
+    return quintic[1] / reach, 2.0 * quintic[2] / reach**2
 
 
 def _source_text(value: Any) -> str:

@@ -110,6 +110,17 @@ def test_the_window_follows_the_motion_and_not_the_noise():
     assert short[0].shape == short[1].shape == (3,)
 
 
+@pytest.mark.parametrize(("rate_hz", "noise_rad"), [(100.0, 0.0), (100.0, 1e-5), (1000.0, 1e-5)])
+def test_the_acceleration_of_a_load_is_known_as_far_as_it_is_judged(rate_hz, noise_rad):
+    """Of a swing at 10 Hz of 0.05 rad; a load's torque is judged below 12 Hz."""
+    t = np.arange(0.0, 10.0, 1.0 / rate_hz)
+    swing = 0.05 * np.sin(2.0 * np.pi * 10.0 * t)
+    _, acceleration = motion_of(t, swing + noise_rad * np.random.default_rng(4).normal(size=len(t)))
+    true = -((2.0 * np.pi * 10.0) ** 2) * swing
+    kept = acceleration[20:-20] @ true[20:-20] / (true[20:-20] @ true[20:-20])
+    assert 0.93 < kept < 1.01
+
+
 DRIVE = {"voltage_v": "v", "resistance_ohm": 1.0, "back_emf_vs_per_rad": 0.1}
 
 
