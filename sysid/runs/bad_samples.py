@@ -101,6 +101,18 @@ def outlier_rows(column: FloatArray, least: float) -> BoolArray:
     return out
 
 
+def on_a_cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return y(at) [m] on a cubic Hermite spline through (x, y) [n], x rising; at within x."""
+    slope = np.gradient(y, x)
+    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
+    h = x[k + 1] - x[k]
+    u = np.clip((at - x[k]) / h, 0.0, 1.0)
+    w = 1.0 - u
+    ends = w * w * (1.0 + 2.0 * u) * y[k] + u * u * (1.0 + 2.0 * w) * y[k + 1]
+    result: FloatArray = ends + h * u * w * (w * slope[k] - u * slope[k + 1])
+    return result
+
+
 Limits = Mapping[str, Collection[float]]
 """Sizes at which the columns of a joint saturate."""
 

@@ -24,7 +24,7 @@ from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.joint import Joint
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.runs.bad_samples import Limits, check_held, saturation_limits, without_outliers
+from jtqd.sysid.runs.bad_samples import Limits, check_held, on_a_cubic, saturation_limits, without_outliers
 from jtqd.sysid.runs.channels import (
     MOTION,
     MOVING_RAD_S,
@@ -111,7 +111,7 @@ def _resampled(table: RunTable, time_s: FloatArray, step_s: float) -> RunTable:
     """Return the run on steps of step_s, its rows at these times [n]."""
     grid = np.arange(time_s[0], time_s[-1] + 1e-9, step_s)
     joints = {
-        number: columns.map(lambda _, column: _cubic(grid, time_s, column))
+        number: columns.map(lambda _, column: on_a_cubic(grid, time_s, column))
         for number, columns in table.joints.items()
     }
     return RunTable(grid, joints)
@@ -143,18 +143,6 @@ def _roughness(table: RunTable) -> float:
     positions = [getattr(columns, name) for columns in table.joints.values() for name in _POSITIONS]
     rough = [float(np.std(np.diff(x, 4))) for x in positions if x is not None and np.ptp(x) > 0.0]
     return math.exp(float(np.mean(np.log(rough)))) if rough and min(rough) > 0.0 else math.nan
-
-
-def _cubic(at: FloatArray, x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return y(at) [m] on a cubic Hermite spline through (x, y) [n], x rising; at within x."""
-    slope = np.gradient(y, x)
-    k = np.clip(np.searchsorted(x, at, side="right") - 1, 0, len(x) - 2)
-    h = x[k + 1] - x[k]
-    u = np.clip((at - x[k]) / h, 0.0, 1.0)
-    w = 1.0 - u
-    ends = w * w * (1.0 + 2.0 * u) * y[k] + u * u * (1.0 + 2.0 * w) * y[k + 1]
-    result: FloatArray = ends + h * u * w * (w * slope[k] - u * slope[k + 1])
-    return result
 
 
 def unwrapped(table: RunTable, where: str) -> tuple[RunTable, list[RunIssue]]:
