@@ -50,7 +50,7 @@ from jtqd.estimator.decoder import (
 from jtqd.estimator.errors import Verbatim, shown
 from jtqd.estimator.run import COLUMN_NAMES
 from jtqd.models.files import load_yaml
-from jtqd.sysid.runs.bad_samples import outlier_rows
+from jtqd.sysid.runs.bad_samples import on_a_cubic, outlier_rows
 
 LONGEST: Final = 1000
 DEEPEST: Final = 40
@@ -405,7 +405,7 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
     """
     outliers = outlier_rows(position, _OUTLIER_RAD)
     if outliers.any():
-        position = np.interp(time_s, time_s[~outliers], position[~outliers])
+        position = on_a_cubic(time_s, time_s[~outliers], position[~outliers])
     step = float(np.median(np.diff(time_s)))
     longest = min(max(_FEWEST_ROWS // 2, round(0.5 * WINDOW_S / step)), (len(position) - 1) // 2)
     if longest < 2:
