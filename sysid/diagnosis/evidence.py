@@ -111,11 +111,28 @@ class Means(NamedTuple):
     turned: FloatArray
 
 
+class Noisy(NamedTuple):
+    """What noise puts into the equations over [E, response], summed over so many rows."""
+
+    gram: FloatArray
+    rows: float
+
+    def by_chance(self, at: Index, mean: FloatArray) -> float:
+        """Return by how much the squares that noise leaves with these coefficients may by chance be less than without them:
+        limits.SURE standard deviations of (w'd)(w's), w white, d and s difference and sum of both contrasts.
+        """
+        own = float(mean @ self.gram[np.ix_(at, at)] @ mean)
+        both = own - 4.0 * float(mean @ self.gram[at, -1]) + 4.0 * float(self.gram[-1, -1])
+        return limits.SURE * math.sqrt(2.0 * max(own, 0.0) * max(both, 0.0) / self.rows)
+
+
 class Sets:
     """Sets of entries on marginal normal equations A [E + 1, E + 1], last: the response."""
 
-    def __init__(self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset()) -> None:
-        self.entries, self.gram, self.out = list(entries), gram, out
+    def __init__(
+        self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset(), noise: Noisy | None = None
+    ) -> None:
+        self.entries, self.gram, self.out, self.noise = list(entries), gram, out, noise
         self.slices: list[Index] = [np.arange(s.start, s.stop) for s in slices_of(entries)]
         one = np.array([e.size == 1 for e in entries], bool)
         self._single = np.flatnonzero(one)
@@ -154,6 +171,8 @@ class Sets:
         explained = float(2.0 * mean @ right - mean @ inner @ mean)
         if explained >= self.gram[-1, -1]:  # more than there is: what is taken out as noise is none
             return Fit(mean, covariance, -math.inf)
+        if self.noise is not None:
+            explained -= self.noise.by_chance(at, mean)
         evidence = 0.5 * explained - float(np.sum(np.log(np.diag(factor[0]))))
         return Fit(mean, covariance, evidence + sum(self.entries[k].odds for k in chosen))
 
@@ -290,9 +309,10 @@ class Equations:
         most: Mapping[object, float],
         resemblance: Mapping[object, FloatArray] = MappingProxyType({}),
         recorded: FloatArray | None = None,
+        rows: float = math.inf,
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
-        self.resemblance = resemblance
+        self.resemblance, self.rows = resemblance, rows
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
         self.plain, self.noise = grams, noise
         self.start, self.most = start, most
@@ -347,7 +367,10 @@ class Equations:
 
         gram = self._positive(marginal)
         gram = self._without_resemblance(gram, variances) if resembling else gram
-        return Sets(self.entries, gram, self.noisy)
+        outer = np.append(np.arange(self.E), self.E + self.N)
+        return Sets(
+            self.entries, gram, self.noisy, Noisy(self.noise.sum(axis=0)[np.ix_(outer, outer)], self.rows)
+        )
 
     def deviation(self, variances: Variances) -> FloatArray:
         """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
@@ -466,6 +489,9 @@ class Equations:
             contrast = np.zeros(e + many + 1)
             contrast[q], contrast[-1] = -theta, 1.0
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
+            outer = np.append(np.arange(e), e + self.N)
+            put_in = Noisy(self.noise.sum(axis=0)[np.ix_(outer, outer)], self.rows)
+            score += put_in.by_chance(at, theta[: len(at)])
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse

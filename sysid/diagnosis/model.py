@@ -313,6 +313,7 @@ class _Work:
             self.start,
             self.most,
             self.resemblance(weights),
+            rows=float(sum(d.valid.sum() for run in self.runs for d in run.channels.values())),
         )
 
     def resemblance(self, weights: FloatArray) -> dict[object, FloatArray]:
