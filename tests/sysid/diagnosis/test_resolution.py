@@ -94,6 +94,17 @@ def test_quick_motion_is_no_noise() -> None:
     assert np.median(noise_of(ramp() + noise + ripple)) == pytest.approx(1e-4, rel=0.25)
 
 
+def test_motion_up_to_most_of_the_bandwidth_is_no_noise() -> None:
+    """Rows at 200 Hz, motion up to 60 Hz at all times and a line at half the rate, all ten times the noise and more."""
+    rng = np.random.default_rng(6)
+    spectrum = np.fft.rfft(rng.normal(size=4000))
+    spectrum[1200:] = 0.0
+    motion = np.fft.irfft(spectrum, 4000)
+    line = 0.01 * (-1.0) ** np.arange(4000)
+    noise = 0.01 * rng.normal(size=4000)
+    assert np.median(noise_of(motion + line + noise)) == pytest.approx(0.01, rel=0.15)
+
+
 @pytest.mark.parametrize("of_velocity", [False, True])
 def test_noise_of_an_acceleration_is_what_differences_of_noise_have_below_a_cutoff(of_velocity: bool) -> None:
     rng = np.random.default_rng(2)

@@ -19,8 +19,15 @@ from jtqd.sim_can.plant import JointFriction, LossTable
 from jtqd.sim_can.plant_file import plant_of_joint
 from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Present
-from jtqd.sysid.diagnosis.regressors import contribution
-from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, SignalsError, about_zero, joint_signals
+from jtqd.sysid.diagnosis.regressors import contribution, run_data
+from jtqd.sysid.diagnosis.signals import (
+    BaseLoss,
+    Channel,
+    JointSignals,
+    SignalsError,
+    about_zero,
+    joint_signals,
+)
 from jtqd.sysid.diagnosis.smoothing import below, known_below_hz, second_difference, smooth
 from jtqd.sysid.runs.checks import on_even_steps
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN
@@ -113,6 +120,40 @@ def test_a_cutoff_of_slow_recordings_is_one_that_their_samples_have(step_s: floa
     x = np.cumsum(np.random.default_rng(4).normal(size=100))
     assert 0.0 <= known_below_hz(x, step_s) <= 1.0 / step_s
     assert 0.0 <= known_below_hz(x[:5], step_s) <= 1.0 / step_s
+
+
+def shaken(hz: float) -> RunTable:
+    """A motor with counts of 0.02 rad that swings slowly and at a frequency, both with 400 rad/s2, on a stiff gear."""
+    t = np.arange(0.0, 6.0, 1e-3)
+    swing = 100.0 * np.sin(2.0 * t) + 400.0 / (2.0 * np.pi * hz) ** 2 * np.sin(2.0 * np.pi * hz * t)
+    columns = JointColumns(
+        current_a=np.zeros(len(t)),
+        motor_position_rad=0.02 * np.round(swing / 0.02),
+        link_position_rad=swing / PLAIN.gear_ratio,
+        torque_nm=np.zeros(len(t)),
+    )
+    return RunTable(t, {1: columns})
+
+
+def test_what_a_wrong_inertia_leaves_is_in_its_regressor_as_far_as_the_balance_is_judged() -> None:
+    table = shaken(0.5 * signals(shaken(20.0)).visible.slowest_hz)
+    heavier = replace(PLAIN, rotor_inertia_kgm2=1.3 * PLAIN.rotor_inertia_kgm2)
+    s = signals(table)
+    assert 10.0 < s.visible.slowest_hz < 80.0
+    left = s.seen(s.motor_nm - joint_signals("run", table, 1, heavier, BaseLoss(heavier), s).motor_nm)
+    value = {"rotor_inertia_kgm2": heavier.rotor_inertia_kgm2}
+    column = s.seen(contribution(EFFECTS["rotor_inertia"], value, s)["motor"])
+    assert rms((left - column)[500:-500]) < 0.05 * rms(left[500:-500])
+
+
+def test_both_balances_are_judged_below_the_same_cutoff() -> None:
+    """The link's acceleration is that of the motor, so what is quicker in the spring has nothing to be compared with."""
+    s = signals(shaken(20.0))
+    quick = np.sin(2.0 * np.pi * 4.0 * s.visible.slowest_hz * s.time_s)
+    with_it = replace(s, torsion_nm=s.torsion_nm + quick)
+    [found] = [x.channels[Channel(1, "torsion")] for x in [run_data([with_it], [], 5.0)]]
+    [plain] = [x.channels[Channel(1, "torsion")] for x in [run_data([s], [], 5.0)]]
+    assert rms((found.residual - plain.residual)[100:-100]) < 0.02
 
 
 def test_a_run_by_the_equations_leaves_nothing() -> None:
