@@ -29,7 +29,7 @@ from jtqd.sysid.diagnosis.findings import JointName, Present, shows_at
 from jtqd.sysid.diagnosis.limits import Prior, Usage
 from jtqd.sysid.diagnosis.regressors import EffectCandidate, contribution, fields_used
 from jtqd.sysid.diagnosis.signals import JointSignals, held_by_spring
-from jtqd.sysid.diagnosis.smoothing import current_rate
+from jtqd.sysid.diagnosis.smoothing import first_difference
 
 _MOST_STEPS: Final = 8
 _DRAWS: Final = 20
@@ -239,7 +239,7 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
     for _ in range(_DRAWS if acting else 0):  # damped: a constant twice as large would swing for ever
         drawn = (rest + _sum(s, acting, MOTOR)) / s.nm_per_a
         s.state.current_a = np.clip(0.5 * (s.state.current_a + drawn), -most, most)
-    s.state.current_rate_a_s = current_rate(s.state.current_a, s.time_s)
+    s.state.current_rate_a_s = first_difference(s.state.current_a, s.time_s)
 
 
 def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:

@@ -30,7 +30,6 @@ from jtqd.sysid.diagnosis.smoothing import (
     acceleration_noise,
     below,
     calm,
-    current_rate,
     cutoff_hz,
     described,
     first_difference,
@@ -450,7 +449,7 @@ def joint_signals(  # noqa: PLR0917
     demand = (slow_torque + loss + reflected * acceleration) / nm_per_a
     state = State(
         current_a=demand,
-        current_rate_a_s=current_rate(demand, time),
+        current_rate_a_s=first_difference(demand, time),
         direction=np.where(np.abs(velocity) > 1e-6, np.sign(velocity), 0.0),
         link_acceleration_rad_s2=link_acceleration,
         link_position_rad=link,

@@ -22,8 +22,6 @@ from scipy import signal
 from jtqd.estimator.arrays import BoolArray, FloatArray
 
 _SMOOTH_S: Final = 0.005
-_CUBIC_S: Final = 0.014
-"""So long is the part of a current that is taken for a cubic before its rate is taken."""
 _ENOUGH: Final = 5
 """Samples within _SMOOTH_S from which an average of them holds little of each one's own noise."""
 _NEAR_S: Final = 0.008
@@ -68,22 +66,6 @@ def _neighbours(reach: int) -> FloatArray:
     weights = np.zeros(len(at))
     weights[at != 0] = np.linalg.pinv(np.vander(others / reach, 4, increasing=True))[0]
     return weights
-
-
-def current_rate(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Return the derivative [n] of a current as regressors have it.
-
-    Its noise is a tenth and more of its rate, and makes a delay smaller than it is, where little is smoothed. Cubics through
-    _CUBIC_S of samples take as much of the noise as `calm` does and leave 0.9 of what swings at 50 Hz. Samples that are far
-    apart are interpolated from their neighbours.
-    """
-    step = float(np.median(np.diff(time)))
-    if _smoothed_samples(step) < _ENOUGH:
-        return np.asarray(np.gradient(calm(x, step), time))
-    wide = 2 * round(0.5 * _CUBIC_S / step) + 1
-    if len(x) < wide:
-        return first_difference(x, time)
-    return first_difference(signal.savgol_filter(x, wide, 3, mode="nearest"), time)
 
 
 def slow(x: FloatArray, step_s: float) -> FloatArray:

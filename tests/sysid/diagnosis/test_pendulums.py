@@ -381,6 +381,27 @@ def test_the_runs_with_noise_are_filtered_as_the_runs_are() -> None:
         assert more.of_position == plain.of_position
 
 
+@pytest.mark.parametrize("delay_s", [0.007, 0.012])
+def test_a_delay_between_noisy_channels_has_its_size(delay_s: float) -> None:
+    """Its regressor is a rate, which has more noise than what it is the rate of. With one encoder a late current and an early
+    sensor differ by little.
+    """
+
+    def late(table: RunTable) -> RunTable:
+        columns = table.joints[1]
+        assert columns.current_a is not None
+        current = np.interp(table.time_s - delay_s, table.time_s, columns.current_a)
+        return replace(table, joints={1: replace(columns, current_a=current)})
+
+    recorded = runs_of(ARM, 37, 4, Rig(sensor_noise_nm=0.02))
+    solution = solved(ARM, [(name, late(table)) for name, table in recorded])
+    [delay] = [j for j in judged(solution) if j.present.effect.name == "channel_delay"]
+    value = values_of(solution, delay)["delay_s"]
+    low, high = sorted(abs(end) for end in value.ci95)
+    assert abs(value.value) == pytest.approx(delay_s, rel=0.15)
+    assert low < delay_s < high
+
+
 def test_a_delay_within_a_step_predicts_and_is_no_certain_cause() -> None:
     """A recorder reads its channels at moments within a step: such a delay is there, and may be the recorder's."""
     runs = []

@@ -11,7 +11,7 @@ import pytest
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
-from jtqd.sysid.diagnosis.smoothing import calm, current_rate, mean_ahead, smooth
+from jtqd.sysid.diagnosis.smoothing import calm, mean_ahead, smooth
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 
@@ -82,21 +82,6 @@ def test_a_rate_of_the_sensor_keeps_what_swings_at_40_hz() -> None:
     )
     rate = joint_signals("run", RunTable(t, {1: columns}), 1, PLAIN, BaseLoss(PLAIN)).state.torque_rate_nm_s
     assert np.std(rate[4:-4]) * np.sqrt(2.0) == pytest.approx(0.95 * w, rel=0.03)
-
-
-def test_a_rate_of_the_current_keeps_what_swings_at_50_hz_and_has_no_noise_of_its_own_sample() -> None:
-    """Smoothed as the current itself is, it kept 0.81: a delay of 2.5 ms was found 10 % too large."""
-    t = np.arange(0.0, 2.0, 1e-3)
-    w = 2.0 * np.pi * 50.0
-    assert float(np.std(current_rate(np.sin(w * t), t)[20:-20])) > 0.9 * w / np.sqrt(2.0)
-    assert current_rate(np.where(t == t[1000], 1.0, 0.0), t)[1000] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_a_rate_of_the_current_has_little_of_its_noise() -> None:
-    """A fifth of what differences of the samples have: beside it a delay of 7 ms was found as 5."""
-    t = np.arange(0.0, 20.0, 1e-3)
-    noise = np.random.default_rng(4).normal(size=len(t))
-    assert np.std(current_rate(noise, t)) < 0.25 * np.std(np.gradient(noise, t))
 
 
 @pytest.mark.parametrize("span_s", [-0.004, 2e-5, 0.0073])
