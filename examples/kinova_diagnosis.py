@@ -142,7 +142,7 @@ def _ladder(run: Sequence[JointSignals], samples: int) -> tuple[FloatArray, Floa
     v, a = state.velocity_rad_s, state.motor_acceleration_rad_s2
     load = np.abs(state.torque_nm) * state.direction
     terms = (np.ones(len(s.time_s)), state.direction, v, a, load)
-    columns = np.column_stack([binned(s.seen(term), samples) for term in terms])
+    columns = np.column_stack([binned(s.visible(term), samples) for term in terms])
     return columns[data.valid], data.residual[data.valid], s.run
 
 

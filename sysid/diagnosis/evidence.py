@@ -312,7 +312,7 @@ class Equations:
         rows: float = math.inf,
     ) -> None:
         self.entries, self.groups, self.shared = list(entries), groups, shared
-        self.resemblance, self.rows = resemblance, rows
+        self.resemblance = resemblance
         self.recorded = np.zeros(sum(e.size for e in entries)) if recorded is None else recorded
         self.plain, self.noise = grams, noise
         self.start, self.most = start, most
@@ -321,6 +321,8 @@ class Equations:
         self.member = {g: np.array([k for k, h in enumerate(groups) if h == g], np.intp) for g in self.kinds}
         self._inner = np.arange(self.E, self.E + self.N)
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
+        sides = np.append(np.arange(self.E), self.E + self.N)
+        self.put_in = Noisy(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
         self.noisy = self._noisy()
         self.kappa = 1.0
         self.grams = grams
@@ -367,10 +369,7 @@ class Equations:
 
         gram = self._positive(marginal)
         gram = self._without_resemblance(gram, variances) if resembling else gram
-        outer = np.append(np.arange(self.E), self.E + self.N)
-        return Sets(
-            self.entries, gram, self.noisy, Noisy(self.noise.sum(axis=0)[np.ix_(outer, outer)], self.rows)
-        )
+        return Sets(self.entries, gram, self.noisy, self.put_in)
 
     def deviation(self, variances: Variances) -> FloatArray:
         """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
@@ -489,9 +488,7 @@ class Equations:
             contrast = np.zeros(e + many + 1)
             contrast[q], contrast[-1] = -theta, 1.0
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
-            outer = np.append(np.arange(e), e + self.N)
-            put_in = Noisy(self.noise.sum(axis=0)[np.ix_(outer, outer)], self.rows)
-            score += put_in.by_chance(at, theta[: len(at)])
+            score += self.put_in.by_chance(at, theta[: len(at)])
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse

@@ -178,7 +178,7 @@ def seen_in_bins(
     """
     out = [np.empty((int(len(s.time_s) / samples), 0))]
     for first in range(0, len(columns), _AT_ONCE):
-        rows = s.seen(np.array([x for _, x in columns[first : first + _AT_ONCE]]))
+        rows = s.visible(np.array([x for _, x in columns[first : first + _AT_ONCE]]))
         out += [binned(x, samples) for x in rows]
     return np.array([k for k, _ in columns], np.intp), np.column_stack(out)
 
@@ -340,7 +340,7 @@ def run_data(
             worth = binned(s.held_nm[balance], samples) if balance in s.held_nm else np.zeros(len(known))
             channels[channel] = ChannelData(
                 valid,
-                binned(s.seen(residual), samples),
+                binned(s.visible(residual), samples),
                 regressors,
                 index,
                 changes,

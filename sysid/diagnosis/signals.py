@@ -186,7 +186,9 @@ class JointSignals:
     of_position: bool = True  # the acceleration is a difference of the position, else of the velocity
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
-    visible: Smoother = _ALL_VISIBLE
+    visible: Smoother = (
+        _ALL_VISIBLE  # both balances are judged by what it leaves of them and of all that is to explain them
+    )
     believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
     torque_hz: float = math.inf  # torques in regressors are known below it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
@@ -205,12 +207,6 @@ class JointSignals:
     def demand_nm(self) -> FloatArray:
         """Motor torque that the joint file's simulation needs for this motion and load [n], Nm joint side."""
         return np.asarray(self.nm_per_a * self.current_a - self.motor_nm - self.quick_nm)
-
-    def seen(self, x: FloatArray) -> FloatArray:
-        """Return what of x [.., n] is slow enough for the motor's acceleration to be known (`resolution`). Residuals of both
-        balances and all that is to explain them go through it.
-        """
-        return self.visible(x)
 
     def usable(self, balance: str) -> BoolArray:
         """Return the samples that a balance is judged at [n]: those of `known` at which no channel of it is held."""

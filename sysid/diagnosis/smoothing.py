@@ -127,8 +127,6 @@ def _even_step(time: FloatArray) -> float | None:
 
 _FEWEST: Final = 200
 """Samples from which steps of a binade are estimated; with fewer it has those of the next."""
-_CHANCE: Final = 2
-"""So many decimals may all end in zero by chance."""
 _SAME: Final = 1e-8
 """Values closer than this part of the largest are one: double precision, or twelve digits of a count."""
 _DIGITS: Final = 9
@@ -168,11 +166,10 @@ def steps_of(x: FloatArray) -> FloatArray:
             _counts(values, largest, again=len(values) < 0.8 * there.sum()),
         )
     decade = _decades(np.abs(x))
-    for there in (
-        decade == e for e in np.unique(decade)
-    ):  # few beyond a power of ten have ten times the step
+    for e in np.unique(decade):  # few beyond a power of ten have ten times the step
+        there = decade == e
         values = np.unique(x[there])
-        if len(values) > _CHANCE and 2 * len(values) > there.sum():
+        if len(values) > 2 and 2 * len(values) > there.sum():
             out[there] = np.maximum(out[there], _decimal(values, float(np.max(np.abs(values)))))
     return out
 

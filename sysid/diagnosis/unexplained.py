@@ -45,7 +45,7 @@ def contributions(dataset: Dataset, present: Present) -> list[dict[Channel, Floa
         for s in run:
             if shows_at(present.joint, s.number):
                 for balance, value in contribution(present.effect, present.values, s).items():
-                    found[Channel(s.number, balance)] = binned(s.seen(value), data.samples)
+                    found[Channel(s.number, balance)] = binned(s.visible(value), data.samples)
         out.append(found)
     return out
 
@@ -327,5 +327,5 @@ def traces(left: Remaining) -> tuple[Trace, ...]:
 def _measured(s: JointSignals, balance: str) -> FloatArray:
     """Return what a balance measures [n], Nm joint side: G Kt i of the motor, or the torque of the encoders' twist."""
     if balance == TORSION:
-        return s.seen(s.sensor_nm if s.torsion_nm is None else s.torsion_nm + s.sensor_nm)
-    return s.seen(s.nm_per_a * s.current_a)
+        return s.visible(s.sensor_nm if s.torsion_nm is None else s.torsion_nm + s.sensor_nm)
+    return s.visible(s.nm_per_a * s.current_a)

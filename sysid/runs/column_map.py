@@ -427,9 +427,8 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
 def _weights(half: int, step: float) -> tuple[FloatArray, FloatArray]:
     """Return weights [2 half + 1] of a quintic's slope and second derivative in its middle."""
     at = np.arange(-half, half + 1) * step
-    reach = at[-1]
-    quintic = np.linalg.pinv(np.vander(at / reach, 6, increasing=True))
-    return quintic[1] / reach, 2.0 * quintic[2] / reach**2
+    quintic = np.linalg.pinv(np.vander(at / at[-1], 6, increasing=True))
+    return quintic[1] / at[-1], 2.0 * quintic[2] / at[-1] ** 2
 
 
 def _source_text(value: Any) -> str:

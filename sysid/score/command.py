@@ -130,7 +130,7 @@ def errors_on(
 
     def judged(balance: str, residual: FloatArray) -> FloatArray:
         whole = all_in_bin(moving & signals.usable(balance), samples)
-        return binned(signals.seen(residual), samples)[whole]
+        return binned(signals.visible(residual), samples)[whole]
 
     errors = {MOTOR: _rms(judged(BALANCE_MOTOR, signals.motor_nm))}
     if signals.torsion_nm is not None:

@@ -222,7 +222,7 @@ def unexplained(
         there = contribution(EFFECTS[effect.name], effect.parameters, s)
         residual = residual - there.get(balance, 0.0)
     samples = bin_samples([s])
-    left = binned(s.seen(residual) if visible else residual, samples)
+    left = binned(s.visible(residual) if visible else residual, samples)
     return left[all_in_bin(s.moving, samples)] if balance == "motor" else left - left.mean()
 
 

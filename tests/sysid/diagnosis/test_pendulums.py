@@ -383,9 +383,7 @@ def test_the_runs_with_noise_are_filtered_as_the_runs_are() -> None:
 
 @pytest.mark.parametrize("delay_s", [0.007, 0.012])
 def test_a_delay_between_noisy_channels_has_its_size(delay_s: float) -> None:
-    """Its regressor is a rate, which has more noise than what it is the rate of. With one encoder a late current and an early
-    sensor differ by little.
-    """
+    """Its regressor is a rate, noisier than what it is the rate of. With one encoder the current or the sensor is late."""
 
     def late(table: RunTable) -> RunTable:
         columns = table.joints[1]

@@ -140,9 +140,9 @@ def test_what_a_wrong_inertia_leaves_is_in_its_regressor_as_far_as_the_balance_i
     heavier = replace(PLAIN, rotor_inertia_kgm2=1.3 * PLAIN.rotor_inertia_kgm2)
     s = signals(table)
     assert 10.0 < s.visible.slowest_hz < 80.0
-    left = s.seen(s.motor_nm - joint_signals("run", table, 1, heavier, BaseLoss(heavier), s).motor_nm)
+    left = s.visible(s.motor_nm - joint_signals("run", table, 1, heavier, BaseLoss(heavier), s).motor_nm)
     value = {"rotor_inertia_kgm2": heavier.rotor_inertia_kgm2}
-    column = s.seen(contribution(EFFECTS["rotor_inertia"], value, s)["motor"])
+    column = s.visible(contribution(EFFECTS["rotor_inertia"], value, s)["motor"])
     assert rms((left - column)[500:-500]) < 0.05 * rms(left[500:-500])
 
 
