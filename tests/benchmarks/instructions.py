@@ -38,6 +38,8 @@ STAGES = tuple(
 )
 CYCLE = "cycle"
 """Two joints, method `fused`, of SYNC to the record, per cycle with a torque; what the kernel does is not counted."""
+SHADOWS = {f"{CYCLE} with {method}": method for method in ("tob", "efficiency", "network")}
+"""The same with one shadow method in each joint."""
 SLOTS, PERIOD_US = 200, 20_000
 WAIT_US, DEADLINE_US = 10_000, 18_000
 """Under valgrind a cycle takes some milliseconds, and what answers SYNC waits for a busy machine."""
@@ -52,10 +54,19 @@ class BusyError(RuntimeError):
 
 
 def prepared(method: str) -> bytes:
-    """Return the network of a method, of the paper's form and size or of ours, and ONNX Runtime's check of it, pickled."""
+    """Return the network of a method, of the paper's form and size or of ours, and ONNX Runtime's check of it, pickled.
+
+    Of SHADOWS: the checks of both joints' shipped networks.
+    """
     from tests.benchmarks.fixture import small_network
     from tests.estimator.fused_configuration import network_of
 
+    if method in SHADOWS:
+        from jtqd.daemon.config import load_config
+        from jtqd.daemon.loop.process import check_networks
+
+        shadows = {each.estimator.method: each for each in load_config(None).shadows}
+        return pickle.dumps(check_networks(shadows[SHADOWS[method]]))
     if method not in ("network", "fused"):
         return pickle.dumps(None)
     data = small_network(1).onnx("joint1") if method == "network" else network_of(1)
@@ -78,8 +89,8 @@ def work(method: str, prepared: Path) -> None:
     assert np.isfinite(run.torque_nm[1:]).all()
 
 
-def cycles() -> None:
-    """Go through the loop's own cycle on a unix bus, beside the bench's traffic: what is counted."""
+def cycles(shadow: str | None, prepared: Path) -> None:
+    """Go through the loop's own cycle with this shadow method, on a unix bus, beside the bench's traffic: it is counted."""
     from jtqd.daemon.config import load_config
     from jtqd.daemon.loop import process as loop
     from jtqd.daemon.shared.snapshot import SnapshotReader
@@ -97,18 +108,27 @@ def cycles() -> None:
         for key, us in (("period", PERIOD_US), ("wait", WAIT_US), ("deadline", DEADLINE_US)):
             text, found = re.subn(rf"\b{key}_us: \d+", f"{key}_us: {us}", text)
             assert found == 1, f"found {key}_us {found} times"
+        text, found = re.subn(r"shadow: \[.*\]", f"shadow: [{shadow or ''}]", text)
+        assert found == 1, f"found shadow {found} times"
         configuration = directory / "bench.yaml"
         configuration.write_text(text, encoding="utf-8")
         config = load_config(configuration)
         source = traffic(directory, Cpus(None, None), period_us=PERIOD_US)
         estimators = [loop.build_estimator(config, joint) for joint in config.joints]
+        shadows = [
+            [loop.build_estimator(each, joint, check, shadow=True)]
+            for each in config.shadows
+            for joint, check in zip(each.joints, pickle.loads(prepared.read_bytes()), strict=True)
+        ]
         request = {
             "ring": str(directory / "ring"),
             "snapshot": str(directory / "snapshot"),
             "worst_load": 0.0,
         }
         socket = open_frame_socket(f"unix:{directory / 'bus'}", loop.loop_filters(config), receive_own=True)
-        cycle, grid = loop.build_cycle(config, request, Fixture(directory).report, socket, estimators)
+        cycle, grid = loop.build_cycle(
+            config, request, Fixture(directory).report, socket, estimators, shadows=shadows
+        )
         grid.slot_ns = time.monotonic_ns() + grid.period_ns
         cycle.go_on(SLOTS, 0)
         view = SnapshotReader(directory / "snapshot").read()
@@ -122,7 +142,8 @@ def count(method: str) -> float:
 
     Raises RuntimeError where they cannot be counted, BusyError where the machine was too busy for cycles.
     """
-    counted = [f"--toggle-collect={each}" for each in (STAGES if method == CYCLE else STEPS)]
+    whole = method == CYCLE or method in SHADOWS
+    counted = [f"--toggle-collect={each}" for each in (STAGES if whole else STEPS)]
     if shutil.which("valgrind") is None:
         raise RuntimeError("found no valgrind")
     with tempfile.TemporaryDirectory() as directory:
@@ -135,12 +156,12 @@ def count(method: str) -> float:
         ]
         plain = "glibc.cpu.hwcaps=-AVX2,-AVX2_Usable,-FMA,-FMA_Usable,-FMA4"
         environment = {**os.environ, "GLIBC_TUNABLES": plain}
-        for _ in range(TRIES if method == CYCLE else 1):
+        for _ in range(TRIES if whole else 1):
             done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
             if done.returncode:
                 raise RuntimeError(f"valgrind: {done.stderr[-500:]}")
-            samples = int(done.stdout) if method == CYCLE else SAMPLES
-            if method != CYCLE or samples >= LEAST_TORQUES * SLOTS:
+            samples = int(done.stdout) if whole else SAMPLES
+            if not whole or samples >= LEAST_TORQUES * SLOTS:
                 break
         else:
             raise BusyError(f"found {samples} cycles of {SLOTS} with a torque, {TRIES} times: a busy machine")
@@ -156,24 +177,29 @@ def main() -> int:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--store", metavar="WHY", help="store them, with this reason")
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="count these alone")
     parser.add_argument("--work", nargs=2, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.work:
         method, made = options.work
-        cycles() if method == CYCLE else work(method, Path(made))
+        whole = method == CYCLE or method in SHADOWS
+        cycles(SHADOWS.get(method), Path(made)) if whole else work(method, Path(made))
         return 0
-    counts = {method: round(count(method), 1) for method in (*METHODS, CYCLE)}
+    counts = {method: round(count(method), 1) for method in options.only or (*METHODS, CYCLE, *SHADOWS)}
     stored = json.loads(STORED.read_text())["instructions"] if STORED.exists() else {}
     for method, now in counts.items():
         before = stored.get(method)
-        what = "cycle of two joints" if method == CYCLE else "joint and sample"
+        what = "joint and sample" if method in METHODS else "cycle of two joints"
         change = "" if not before else f"  stored {before:8.1f}  {100.0 * (now / before - 1.0):+.1f} %"
-        print(f"{method:12}{now:10.1f} instructions per {what}{change}")
+        print(f"{method:22}{now:10.1f} instructions per {what}{change}")
+        if method in SHADOWS and CYCLE in counts:
+            cost = (now - counts[CYCLE]) / 2
+            print(f"{'':22}{cost:10.1f} of them the shadow method {SHADOWS[method]} of one joint")
     if options.store:
         compiler = subprocess.run(
             ["cc", "--version"], capture_output=True, text=True, check=True
         ).stdout.splitlines()[0]
-        content = {"compiler": compiler, "why": options.store, "instructions": counts}
+        content = {"compiler": compiler, "why": options.store, "instructions": {**stored, **counts}}
         STORED.write_text(json.dumps(content, indent=2) + "\n")
     return 0
 

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from tests.benchmarks.instructions import CYCLE, METHODS, STORED, BusyError, count
+from tests.benchmarks.instructions import CYCLE, METHODS, SHADOWS, STORED, BusyError, count
 
 WITHIN = 0.05
 
@@ -27,7 +27,7 @@ def compiler() -> str:
     [
         # the cycle has method `fused` of two joints in it
         pytest.param(each, marks=pytest.mark.native if each == CYCLE else pytest.mark.campaign)
-        for each in (*METHODS, CYCLE)
+        for each in (*METHODS, CYCLE, *SHADOWS)
     ],
 )
 def test_a_step_costs_what_it_did(method: str) -> None:

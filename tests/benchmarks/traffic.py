@@ -47,7 +47,7 @@ def cycle_frames(cycle: int, period_s: float = 1e-3) -> list[bytes]:
         motor_counts = round(side * angle * GEAR_RATIO / SCALING["motor_rad_per_count"])
         link_counts = round(side * (angle - twist) / SCALING["link_rad_per_count"])
         units = round(side * velocity * GEAR_RATIO / SCALING["motor_rad_s_per_unit"])
-        amperes = round((current if node == 1 else 0.8 * current + 0.5) / SCALING["ampere_per_unit"])
+        amperes = round(side * current / SCALING["ampere_per_unit"])
         positions.append(pack(0x180 + node, _POSITION.pack(motor_counts, link_counts)))
         motions.append(pack(0x280 + node, _MOTION.pack(units, amperes, _OPERATION_ENABLED)))
     sensor = pack(0x183, _SENSOR.pack(round(torque / SENSOR_NM_PER_UNIT), 0))
