@@ -278,6 +278,7 @@ def serve(request: dict[str, Any]) -> int:
     notes: list[str] = []
     config, estimators = build_estimators(request, notes)
     shadows = build_shadows(config)
+    notes += [f"shadow methods, never sent: {', '.join(config.shadow)}"] if shadows else []
     warm_up([each for of_joint in shadows for each in of_joint])
     answer(ready=True, notes=notes)
     line = read_line(stop)

@@ -17,6 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import yaml
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
@@ -29,6 +30,7 @@ from tests.benchmarks.contender import ROOT
 from tests.benchmarks.measure import mark, table
 from tests.daemon import ring_records as rr
 from tests.processes import of_module
+from tests.shipped_bench import shipped_bench
 
 SIZE_LIMIT_GB, CORE_LIMIT_PERCENT = 1.2, 3.0
 _PARTS_PER_HOUR = 6
@@ -60,6 +62,10 @@ def _daemon(directory: Path, disk: Path, seconds: float) -> tuple[dict[str, Any]
     environment = {key: value for key, value in os.environ.items() if key != "RUNTIME_DIRECTORY"}
     environment |= {"XDG_RUNTIME_DIR": str(directory), "PYTHONPATH": f"{ROOT / 'src'}:{ROOT}"}
     command = [sys.executable, "-P", "-m", "jtqd.daemon.jtqd", "--bus", "sim", "--json"]
+    bench = shipped_bench()
+    bench["estimator"]["shadow"] = []
+    (directory / "bench.yaml").write_text(yaml.safe_dump(bench), encoding="utf-8")
+    command += ["--config", str(directory / "bench.yaml")]
     command += ["--duration", f"{seconds + _SETTLE_S + 1.0:g}", "--record", str(disk / "logs")]
     daemon = subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True

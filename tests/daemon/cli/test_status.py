@@ -18,11 +18,13 @@ from rich.console import Console, Group
 from rich.text import Text
 
 from jtqd.daemon.cli.running import Reading, Watch, find_daemons
-from jtqd.daemon.cli.status import WINDOW_S, Recent, StatusView, histogram, main, paged, sparkline
+from jtqd.daemon.cli.status import WINDOW_S, Recent, StatusView, content, histogram, main, paged, sparkline
 from jtqd.daemon.recording.run_files import Account, ProgressFile
 from jtqd.daemon.shared.conditions import Condition, ConditionsFile
+from jtqd.daemon.shared.cycle_record import SHADOW
 from jtqd.daemon.shared.events import ERROR, WARNING, Notices
 from jtqd.daemon.shared.runtime_dir import start_ticks, write_about
+from jtqd.daemon.shared.snapshot import SnapshotReader
 from tests.daemon.cli.status_daemon import picture, running
 from tests.daemon.supervisor.watch_views import WELL, view
 
@@ -331,3 +333,37 @@ def test_a_histogram_shows_one_cycle_in_a_million():
     assert len(histogram(bins, 4.0, 10)) <= 10 + len("40  136 us")
     assert histogram([0] * 9 + [1], 4.0, 10).endswith("us and more")
     assert histogram([0] * 10, 4.0, 10) == ""
+
+
+def test_shadow_methods_are_rows_below_their_joint_and_their_errors_a_line(tmp_path: Path) -> None:
+    daemon = running(tmp_path)
+    snapshot = SnapshotReader(daemon.directory / "snapshot", supervisor=True)
+    SHADOW.pack_into(
+        snapshot._views.shadows,
+        0,
+        *(-121.5, 2.25, -118.5, 5.0, *4 * (nan,), -118.7, 0.6, -118.5, 5.0, *4 * (nan,), 2, 0, 3, 0),
+    )
+    snapshot._views.shadow_errors[0], snapshot._views.shadow_errors[2] = 36.0, 4.0
+    for width in (80, 140):
+        lines = picture(daemon, width).splitlines()
+        first = next(n for n, line in enumerate(lines) if line.startswith("1 joint1"))
+        assert lines[first + 1].split()[:7] == ["tob", "valid", "-121.50", "Nm", "2.25", "Nm", "-118.50"]
+        assert lines[first + 2].split()[:4] == ["network", "degraded", "-118.70", "Nm"]
+        assert lines[first + 3].startswith("2 joint2")
+        assert sum(line.startswith("RMSE 1    fused -, tob 3.00, network - Nm") for line in lines) == 1
+        assert not any(line.startswith("RMSE 2") for line in lines)
+    watch = Watch(daemon)
+    watch.read()
+    one, two = content(watch.read())["joints"]
+    assert two["shadow"] == {}
+    assert one["shadow"]["tob"]["rmse_nm"] == 3.0
+    assert one["shadow"]["network"] | {"rmse_nm": 0} == {
+        "torque_nm": -118.7,
+        "sigma_nm": 0.6,
+        "reference_nm": -118.5,
+        "age_ms": 5.0,
+        "status": "degraded",
+        "rmse_nm": 0,
+        "rmse_now_nm": None,
+    }
+    json.dumps(one, allow_nan=False)

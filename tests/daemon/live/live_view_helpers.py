@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 from websockets.exceptions import ConnectionClosed
@@ -71,6 +72,7 @@ def request_of(directory, **changes):
         "nodes": [[1, "drive 1"]],
         "joint_names": ["joint_1", "joint_2"],
         "gear_ratios": [100.0, None],
+        "shadow": False,
     }
     return content | changes
 
@@ -85,7 +87,7 @@ class Kept:
         self.memory = Memory(directory)
         self.children, self.capfd, self.text = [], capfd, ""
         self.keeper = make(self._child)
-        self.keeper.start(load_config(None), directory, "vcan7")
+        self.keeper.start(replace(load_config(None), shadow=()), directory, "vcan7")
 
     def _child(self, module, arguments, name):
         self.children.append(Child(module, arguments, name=name))

@@ -14,9 +14,8 @@ from pathlib import Path
 import pytest
 
 from jtqd.daemon.recording.run_files import part_files
-from jtqd.daemon.shared.cycle_record import RingReader
+from jtqd.daemon.shared.cycle_record import RingReader, layout_of
 from jtqd.models.files import shipped
-from tests.daemon import ring_records as rr
 from tests.daemon.recording.recorder_bench import cycles_of, messages_of
 from tests.daemon.test_vcan import INTERFACE, recorder_of, wait_for_estimates
 
@@ -67,7 +66,7 @@ class Daemon:
     def cycles(self) -> int:
         """Cycles that the loop has run."""
         (ring,) = self.directory.glob("*/ring")
-        reader = RingReader(ring, rr.RECORD_SIZE)
+        reader = RingReader(ring, layout_of(2, True).size)
         return reader.position + reader.backlog
 
 

@@ -91,6 +91,19 @@ def test_request_carries_all_that_a_log_must_hold(tmp_path):
     assert provenance["nodes"] == NODES
 
 
+def test_a_log_holds_the_networks_of_shadow_methods(tmp_path):
+    config = load_config(None)
+    request, files, provenance = attached(config, tmp_path)
+    assert request.shadow
+    for joint in config.joints:
+        names = provenance["joints"][str(joint.number)]["shadow_networks"]
+        assert names == {"network": f"joint{joint.number}.onnx"}
+        assert files[names["network"]] == shipped(f"trained/joint{joint.number}.onnx").read_bytes()
+    plain, _, provenance = attached(load_config(shipped("bench_paper.yaml")), tmp_path)
+    assert not plain.shadow
+    assert provenance["joints"]["1"]["shadow_networks"] == {}
+
+
 def test_what_is_attached_is_what_was_read_whatever_becomes_of_the_files(tmp_path):
     """Files edited, or gone, after the configuration was read: a recorder that starts later attaches what is in force."""
     shutil.copytree(shipped("bench.yaml").parent / "trained", tmp_path / "trained")

@@ -18,6 +18,7 @@ import yaml
 
 from jtqd.daemon.logs import read_attachments, read_topic
 from jtqd.daemon.replay.command import main
+from jtqd.daemon.replay.session import replay
 from jtqd.models.files import shipped
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance
 from tests.estimator.fused_configuration import networks
@@ -231,6 +232,49 @@ def test_other_models_and_the_file_with_both(
     assert {"replay.json", "configuration.yaml", "joint1.yaml"} <= read_attachments(target).keys()
     assert main([str(log), "--out", str(target)]) == 2
     assert "exists" in capsys.readouterr().err
+
+
+@pytest.mark.native
+def test_shadow_methods_are_replayed_and_compared(
+    log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The paper's three, as the shipped bench has them: one number that is another in the log is a difference."""
+    assert main([str(log)]) == 0
+    text = capsys.readouterr().out
+    for method in ("tob", "efficiency", "network"):
+        assert text.count(f"{method} ") == 2, text
+    changed = cycles(log)[1000]
+    where = read_topic(log, "/joint/1/shadow").dtype.names.index("tob_torque_nm")
+
+    def spoil(topic: str, cycle: int, data: bytes) -> bytes:
+        if topic != "/joint/1/shadow" or cycle != changed:
+            return data
+        at = VALUES + 8 * (where - 3)
+        return data[:at] + struct.pack("<d", 99.0) + data[at + 8 :]
+
+    status, found, _ = run(capsys, cut(log, tmp_path / "spoilt.mcap", payload=spoil))
+    (difference,) = found["identity"]["differences"]
+    assert status == 3
+    assert (difference["joint"], difference["cycle"], difference["cycles"]) == (1, changed, 1)
+    assert (difference["field"], difference["logged"]) == ("tob_torque_nm", 99.0)
+
+
+@pytest.mark.native
+def test_a_shadow_method_that_is_sent_in_the_replay_has_the_network_of_the_log(
+    log: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (result,) = replay([log], method="network")
+    assert [each.network is not None for each in result.models] == [True, True]
+    assert [[each.settings.method for each in model.shadows] for model in result.models] == 2 * [
+        ["tob", "efficiency"]
+    ]
+    for logged, replayed in zip(result.run.joints, result.joints, strict=True):
+        published = np.isfinite(replayed["torque_nm"]) & np.isfinite(logged["network_torque_nm"])
+        assert published.sum() > 1000
+        np.testing.assert_array_equal(
+            replayed["torque_nm"][published], logged["network_torque_nm"][published]
+        )
+        assert np.isnan(replayed["network_age_ms"]).all()
 
 
 # ---- models and logs that cannot be used: golden logs ----

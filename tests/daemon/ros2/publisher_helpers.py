@@ -28,6 +28,7 @@ def request_of(directory, **changes):
         "bus": "vcan7",
         "nodes": [[1, "drive 1"]],
         "gear_ratios": [100.0, 160.0],
+        "shadow": False,
     }
     return content | changes
 

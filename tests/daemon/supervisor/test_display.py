@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from jtqd.daemon.shared.counters import COUNTERS
-from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN
+from jtqd.daemon.shared.cycle_record import FLAG_CONTACT, FLAG_CONTACT_KNOWN, SHADOW
 from jtqd.daemon.shared.snapshot import JointView, Snapshot, SnapshotReader
 from jtqd.daemon.supervisor.display import LiveTable, Summary, plain_line, summary_of
 from tests.daemon.snapshots import EstimateWriter
@@ -155,3 +156,56 @@ def test_the_summary_as_json(tmp_path: Path, watched: bool, contacts: int | None
         reader, {}, [], None, history=(), began_s=0.0, stolen_s=0.318, contacts=watched
     ).content()
     assert (found["contacts"], found["stolen_s"]) == (contacts, 0.32)
+
+
+# Shadow methods
+
+
+def with_shadows(path: Path) -> SnapshotReader:
+    """Joint 1 has two shadow methods, joint 2 none."""
+    made = Snapshot(path, 1e-3, 0.8)
+    EstimateWriter(made).write(8, 8, 1, (VALID, VALID))
+    unknown = 4 * (NAN,)
+    values = (-121.5, 2.25, -118.5, 5.0, *unknown, -118.7, 0.6, -118.5, 5.0, *unknown, 2, 0, 3, 0)
+    SHADOW.pack_into(made.shadows, 0, *values)
+    made.shadow_errors[:3] = memoryview(struct.pack("<3d", 36.0, 64.0, 4.0)).cast("d")
+    return SnapshotReader(path)
+
+
+def test_shadow_methods_stand_below_their_joint(tmp_path: Path) -> None:
+    reader = with_shadows(tmp_path / "s")
+    for width in (80, 100):
+        lines = [" ".join(line.replace("│", " ").split()) for line in shown(reader, width)]
+        rows = [line.split()[0] for line in lines if line[:1] in "12" or line.startswith(("tob", "network"))]
+        assert rows == ["1", "tob", "network", "2"]
+        (tob,) = (line.split() for line in lines if line.startswith("tob"))
+        (network,) = (line.split() for line in lines if line.startswith("network"))
+        assert (tob[1], tob[2], tob[-2], tob[-1]) == ("-121.50", "2.25", "-3.00", "valid")
+        assert (network[1], network[-2], network[-1]) == ("-118.70", "-0.20", "degraded")
+        assert max(map(len, shown(reader, width))) <= width
+
+
+def test_the_summary_has_the_error_of_each_shadow_method_beside_ours(tmp_path: Path) -> None:
+    view = with_shadows(tmp_path / "s").read()
+    lines = Summary(view, US, US).text().splitlines()
+    at = lines.index("RMSE joint 1  no reference")
+    assert lines[at + 1 : at + 4] == [
+        "  tob         3.000 Nm against the sensor in motion, both 5.00 ms old (4.000 Nm against it now)",
+        "  network     no reference",
+        "RMSE joint 2  no reference",
+    ]
+    content = Summary(view, US, US).content()["shadow"]
+    assert content["joint_2"] == {}
+    assert content["joint_1"]["tob"] | {"status": ""} == {
+        "torque_nm": -121.5,
+        "sigma_nm": 2.25,
+        "reference_nm": -118.5,
+        "age_ms": 5.0,
+        "rmse_nm": 3.0,
+        "rmse_now_nm": 4.0,
+        "status": "",
+    }
+    assert (content["joint_1"]["network"]["status"], content["joint_1"]["network"]["rmse_nm"]) == (
+        "degraded",
+        None,
+    )

@@ -18,9 +18,9 @@ import yaml
 from jtqd.daemon.shared.events import FILE as NOTICES
 from jtqd.daemon.shared.events import NoticesReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
-from jtqd.models.files import shipped
 from tests.paths import ROOT
 from tests.processes import of_module
+from tests.shipped_bench import shipped_bench
 from tests.slow.faults.listener import Ears
 
 _NAMES = {"jtqd.daemon.loop.process": "loop", "jtqd.daemon.recording.recorder": "recorder"}
@@ -152,11 +152,8 @@ class Rig:
 
 def _configuration(directory: Path) -> Path:
     """Write the shipped configuration with a counter in SYNC, by which the account knows what was not heard."""
-    content: dict[str, Any] = yaml.safe_load(shipped("bench.yaml").read_text())
+    content = shipped_bench()
     content["sync"]["counter_overflow"] = OVERFLOW
-    for number in (1, 2):
-        joint = content[f"joint_{number}"]
-        joint["file"] = str(shipped(joint["file"]))
     path = directory / "configuration.yaml"
     path.write_text(yaml.safe_dump(content))
     return path
