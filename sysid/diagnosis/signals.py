@@ -138,6 +138,8 @@ class Line:
 
 COMPUTED_HZ: Final = 12.0
 """Cutoff of the balances where the torque is computed, as its acceleration was smoothed; least cutoff of any torque."""
+_STATIC: Final = 0.5
+"""Part of the frequency at which a link swings on its spring, below which the spring follows the torque."""
 _ALL_VISIBLE: Final = Smoother(1.0)
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
@@ -186,9 +188,7 @@ class JointSignals:
     of_position: bool = True  # the acceleration is a difference of the position, else of the velocity
     noise: Mapping[str, float] = field(default_factory=dict)  # of current and torque as recorded, usual
     sensor_temperature_c: FloatArray | None = None  # None: that of this joint (`with_one_sensor`)
-    visible: Smoother = (
-        _ALL_VISIBLE  # both balances are judged by what it leaves of them and of all that is to explain them
-    )
+    visible: Smoother = _ALL_VISIBLE  # what it leaves of both balances is judged, and of their regressors
     believed: list[Joint] = field(default_factory=list)  # with the values found: effects are relative to it
     torque_hz: float = math.inf  # torques in regressors are known below it
     coarse: str = ""  # what the resolution of the recording costs, "" for nothing
@@ -437,7 +437,9 @@ def joint_signals(  # noqa: PLR0917
         torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
         link_acceleration = link_acceleration - torsion_acceleration
     gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
-    known = like.torque_hz if like else max(COMPUTED_HZ, known_below_hz(sensor, step))
+    swings = math.sqrt(joint.stiffness_nm_per_rad / max(joint.link_inertia_kgm2, 1e-9)) if both else math.inf
+    shown = min(known_below_hz(sensor, step), _STATIC * swings / math.tau)
+    known = like.torque_hz if like else max(COMPUTED_HZ, shown)
     slow_torque = below(gear_torque, step, known)
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2

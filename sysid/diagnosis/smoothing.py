@@ -5,8 +5,7 @@ Derivatives are central differences, which look ahead: this is for recorded runs
 **Resolution.** Recorders keep seven significant digits, single precision, fixed decimals or counts. A motor position beyond
 1000 rad with seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. Steps of
 digits and of single precision grow with the value, so they are estimated from the values, for each magnitude by itself.
-Where the acceleration would be coarse, its balance is judged below a cutoff only: residual and regressors pass the same
-linear filter (`Smoother`).
+Where the acceleration would be coarse, both balances are judged below a cutoff: residuals and regressors pass one filter.
 """
 
 from __future__ import annotations

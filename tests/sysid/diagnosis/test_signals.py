@@ -156,6 +156,19 @@ def test_both_balances_are_judged_below_the_same_cutoff() -> None:
     assert rms((found.residual - plain.residual)[100:-100]) < 0.02
 
 
+def test_a_torque_is_known_up_to_half_of_where_the_link_swings_on_its_spring() -> None:
+    """Of a sensor without noise; one encoder shows no spring."""
+    heavy = replace(PLAIN, link_inertia_kgm2=0.2, stiffness_nm_per_rad=28000.0)
+    table = rigid_run(heavy)
+    columns = table.joints[1]
+    quick = 0.5 * np.sin(2.0 * np.pi * 90.0 * table.time_s)
+    both = RunTable(table.time_s, {1: replace(columns, torque_nm=columns.torque_nm + quick)})
+    assert signals(both, heavy).torque_hz == pytest.approx(0.5 * np.sqrt(28000.0 / 0.2) / (2.0 * np.pi))
+    assert signals(both, replace(heavy, link_inertia_kgm2=0.0)).torque_hz > 150.0
+    one = RunTable(table.time_s, {1: replace(both.joints[1], link_position_rad=None)})
+    assert signals(one, heavy).torque_hz > 150.0
+
+
 def test_a_run_by_the_equations_leaves_nothing() -> None:
     s = signals(rigid_run(PLAIN))
     assert rms(s.motor_nm[s.moving]) < 2e-3
