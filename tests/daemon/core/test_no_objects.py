@@ -66,7 +66,9 @@ def the_loop_s_cycle(config: Config, bus: str, directory: Path) -> Cycle:
     estimators = [loop.build_estimator(config, joint) for joint in config.joints]
     request = {"ring": str(directory / "ring"), "snapshot": str(directory / "snapshot"), "worst_load": 0.0}
     socket = open_frame_socket(bus, loop.loop_filters(config), receive_own=True)
-    cycle, grid = loop.build_cycle(config, request, Fixture(directory).report, socket, estimators)
+    cycle, grid = loop.build_cycle(
+        config, request, Fixture(directory).report, socket, estimators, shadows=loop.build_shadows(config)
+    )
     grid.slot_ns = time.monotonic_ns() + grid.period_ns
     return cycle
 
@@ -85,7 +87,7 @@ def configured(name: str, directory: Path) -> Config:
 def test_cycles_take_nothing_from_python_s_allocators(
     name: str, bus: str, tmp_path: Path, allocations: Count
 ) -> None:
-    """Methods `fused` (zeros, temperatures) and `network`: what 200 slots take is what none takes."""
+    """Methods `fused` (zeros, temperatures), `network` and shadow methods: what 200 slots take is what none takes."""
     cycle = the_loop_s_cycle(configured(name, tmp_path), bus, tmp_path)
     cycle.go_on(SLOTS, 0)
     reader = SnapshotReader(tmp_path / "snapshot")

@@ -49,8 +49,8 @@ class Topics:
     @classmethod
     def of_bus(cls, joints):
         """Those in the log of a bus with so many joints."""
-        made, texts = cls(), messages.schemas_of(joints)
-        for topic in messages.topics_of(joints):
+        made, texts = cls(), messages.schemas_of(joints, shadow=True)
+        for topic in messages.topics_of(joints, shadow=True):
             made.define(topic.name, topic.schema, texts[topic.schema])
         return made
 
