@@ -223,10 +223,12 @@ class _Attachments:
                 f"joint_{number}.onnx"  # its hash is in the configuration: load_config checks it
             )
             hashes.append(self._write(str(files.network), network["file"]))
-        for method, shadow in (section.get("shadow_networks") or {}).items():
-            name = files.shadow_networks.get(method, "")
-            shadow["file"] = f"joint_{number}.{method}.onnx"
-            hashes.append(self._write(name, shadow["file"]))
+        shadows: Any = section.get("shadow_networks")
+        for n, method in enumerate([*shadows] if isinstance(shadows, dict) else ()):
+            name, shadow = files.shadow_networks.get(method), shadows.pop(method)
+            if name is not None and isinstance(shadow, dict):
+                shadows[method] = {**shadow, "file": f"joint_{number}.shadow_{n}.onnx"}
+                hashes.append(self._write(name, shadows[method]["file"]))
         return hashes
 
     def _write(self, name: str, file: str) -> str:
@@ -666,12 +668,9 @@ def _stretches(
     count = len(setup.config.joints)
     joints, zeros = [each.name for each in JOINTS[:count]], [each.name for each in ZEROS[:count]]
     shadows = [each.name for each in SHADOWS[:count]] if setup.config.shadow else []
-    fields = {name: SHADOW[name] for name in SHADOW.names or ()}
-    needed = {
-        **dict.fromkeys(joints, JOINT),
-        **{name: {"cycle": "<u8", **fields} for name in shadows},
-        CAN_FRAMES.name: FRAMES,
-    }
+    of_shadow = {"cycle": "<u8", **{name: SHADOW[name] for name in SHADOW.names or ()}}
+    needed = {**dict.fromkeys(joints, JOINT), CAN_FRAMES.name: FRAMES}
+    needed |= dict.fromkeys(shadows, of_shadow)
     pending: dict[str, list[RecordArray]] = {}
     last, made = -1, False
     spans = iter_topics(logs, [*needed, *zeros], least=least)

@@ -11,13 +11,15 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
-from jtqd.daemon.logs import read_attachments, read_topic
+from jtqd.daemon.logs import LogError, read_attachments, read_topic
 from jtqd.daemon.replay.command import main
+from jtqd.daemon.replay.logged import read_setup
 from jtqd.daemon.replay.session import replay
 from jtqd.models.files import shipped
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance
@@ -297,6 +299,41 @@ def test_wrong_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "joint2.fused.onnx" in one_line(capsys, LOG, "--model", tmp_path)
     assert "needs" in one_line(capsys, LOG, "--method", "network")
     assert "none: found no such directory" in one_line(capsys, LOG, "--out", tmp_path / "none" / "a.mcap")
+
+
+def with_shadow_networks(networks: dict[str, Any], attached: dict[str, str]) -> Change:
+    """Attachments whose configuration names these networks for joint 1, and whose provenance has these attachments."""
+
+    def change(found: dict[str, bytes]) -> dict[str, bytes]:
+        configuration = yaml.safe_load(found["configuration.yaml"])
+        configuration["joint_1"]["shadow_networks"] = networks
+        text, content = yaml.safe_dump(configuration).encode(), json.loads(found["provenance.json"])
+        content["configuration"]["sha256"] = hashlib.sha256(text).hexdigest()
+        content["joints"]["1"]["shadow_networks"] = attached
+        return found | {"configuration.yaml": text, "provenance.json": json.dumps(content).encode()}
+
+    return change
+
+
+def test_a_network_that_no_shadow_method_used_is_not_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    networks = {"network": {"file": "gone.onnx", "sha256": "00"}}
+    log = cut(LOG, tmp_path / "a.mcap", attachments=with_shadow_networks(networks, {}))
+    status, found, _ = run(capsys, log)
+    assert (status, found["identity"]["bit_identical"]) == (0, True)
+
+
+def test_the_name_of_a_shadow_method_names_no_place_on_this_machine(tmp_path: Path) -> None:
+    networks = {"../../evil": {"file": "x", "sha256": "00"}}
+    change = with_shadow_networks(networks, {"../../evil": "bus.dbc"})
+    place = tmp_path / "one" / "two"
+    place.mkdir(parents=True)
+    with pytest.raises(LogError, match=r"shadow_networks\.\.\./\.\./evil.*expected one of network, fused"):
+        read_setup(LOG, change(read_attachments(LOG)), place)
+    assert [each.name for each in tmp_path.iterdir()] == ["one"]
+    assert [each.name for each in (tmp_path / "one").iterdir()] == ["two"]
+    assert (place / "joint_1.shadow_0.onnx").exists()
 
 
 def without(name: str) -> Change:
