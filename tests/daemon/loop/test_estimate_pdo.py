@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from jtqd.daemon.core.estimate_pdo import (
+    CODE_NAMES,
     NO_RATE,
     contact_field,
     decode,
@@ -49,6 +50,16 @@ def test_sigma_is_never_narrower_than_it_was() -> None:
     assert field(0.0, 12.71, 2) == (0, 255, 2)
 
 
+@pytest.mark.parametrize(("steps", "sent"), [(10.0, 10), (10 + 0.5e-9, 10), (10 + 1.5e-9, 11), (10.5, 11)])
+def test_sigma_is_rounded_up_but_for_the_error_of_the_division(steps: float, sent: int) -> None:
+    assert field(0.0, 0.05 * steps, 2)[1] == sent
+
+
+@pytest.mark.parametrize("sigma", [12.71, 12.8, 20.0, 25.4, 1e6, 1.7e308])
+def test_a_sigma_beyond_the_field_is_unknown(sigma: float) -> None:
+    assert field(1.0, sigma, 2) == (100, 255, 2)
+
+
 @pytest.mark.parametrize("sigma", [nan, inf, -inf, -1e-9, -1.0])
 @pytest.mark.parametrize("status", [2, 3, 6])
 def test_a_torque_whose_sigma_is_none_is_none(sigma: float, status: int) -> None:
@@ -80,6 +91,19 @@ def test_what_is_not_known_is_never_a_contact_or_none() -> None:
     assert contact_field(0.0, math.nan, CONTACT_PRESENT) == (0, 1)
     assert contact_field(0.0, 0.1, CONTACT_NONE) == (0, 2)
     assert decode_contact(bytes.fromhex("80801005")) == ((None, None), (0, 1), 5)
+
+
+@pytest.mark.parametrize(
+    ("contact_nm", "code"), [(0.5, "positive"), (0.0, "positive"), (-0.5, "negative"), (nan, "unknown")]
+)
+def test_the_code_of_a_contact_is_the_sign_of_its_torque(contact_nm: float, code: str) -> None:
+    assert CODE_NAMES[contact_field(0.0, contact_nm, CONTACT_PRESENT)[1]] == code
+
+
+def test_contact_codes_have_the_names_of_the_protocol() -> None:
+    names = ["off", "unknown", "none"]
+    assert [CODE_NAMES[each] for each in (CONTACT_OFF, CONTACT_UNKNOWN, CONTACT_NONE)] == names
+    assert sorted(CODE_NAMES) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize(
