@@ -55,7 +55,7 @@ def test_bad_at_once_and_good_after_so_many_cycles(bad: int) -> None:
     assert asked(state, [VALID] * (NEEDED[bad] + 1)) == [bad] * (NEEDED[bad] - 1) + [VALID] * 2
 
 
-@pytest.mark.parametrize("bad", [OFF, STALE, DRIVE_FAULT, INVALID])
+@pytest.mark.parametrize("bad", [OFF, STALE, DRIVE_FAULT, INVALID, DEGRADED])
 def test_the_count_begins_again_with_each_bad_cycle(bad: int) -> None:
     state = settled()
     pattern = [bad, *[VALID] * (NEEDED[bad] - 1)] * 20
@@ -64,6 +64,19 @@ def test_the_count_begins_again_with_each_bad_cycle(bad: int) -> None:
 
 def test_the_start_needs_no_wait() -> None:
     assert asked(JointStatus(SafetySettings()), [STARTING] * 3 + [VALID] * 2) == [STARTING] * 3 + [VALID] * 2
+
+
+@pytest.mark.parametrize("bad", [OFF, STALE, INVALID, DRIVE_FAULT])
+def test_a_joint_whose_first_cycle_is_bad_waits_as_long_as_later(bad: int) -> None:
+    out = asked(JointStatus(SafetySettings()), [bad, *[VALID] * 150])
+    assert out.index(VALID) == NEEDED[bad]
+
+
+def test_a_fall_within_ten_cycles_of_the_start_is_a_relapse() -> None:
+    for cycles, wait in ((9, 2 * NEEDED[STALE]), (10, NEEDED[STALE])):
+        state = JointStatus(SafetySettings())
+        asked(state, [STARTING, *[VALID] * cycles, STALE])
+        assert asked(state, [VALID] * 60).index(VALID) + 1 == wait
 
 
 def test_standstill_comes_and_goes_with_valid_and_degraded() -> None:
@@ -211,6 +224,21 @@ def test_twenty_missed_cycles_in_a_row_latch_where_it_is_configured() -> None:
     assert asked(state, [*[STALE] * 20, *[VALID] * 200])[-1] == STALE
     assert state.latched == faults.STALE
     assert state.reset_latch()
+
+
+@pytest.mark.parametrize("between", [OFF, STARTING, VALID, INVALID, DRIVE_FAULT])
+def test_missed_cycles_are_counted_in_a_row(between: int) -> None:
+    state = settled(SafetySettings(latch=faults.STALE, stale_latch_cycles=20))
+    asked(state, [*[STALE] * 19, between, *[STALE] * 19])
+    assert state.latched == 0
+    asked(state, [STALE])
+    assert state.latched == faults.STALE
+
+
+def test_without_a_limit_missed_cycles_latch_nothing() -> None:
+    state = settled(SafetySettings(latch=faults.STALE, stale_latch_cycles=None))
+    asked(state, [STALE] * 1000)
+    assert state.latched == 0
 
 
 def test_late_cycles_count_as_missed_ones() -> None:
