@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-sanitized test-all bench bench-kernel fuzz soak soak-exact lint style types format clean
+.PHONY: help setup demo hidden-effect docs deb release test test-here test-hidden test-guest test-native test-sanitized test-all mutants bench bench-kernel fuzz soak soak-exact lint style types format clean
 
 help: ## this list
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
@@ -52,13 +52,16 @@ test-guest:
 test-native:
 	$(BIN)/python -m pytest $(SLOWEST) -m "native and not (campaign or socketcan or boots)"
 
-test-all: lint ## everything: also the long tests, two releases that must be equal, the sanitizers
+test-all: lint ## everything: also the long tests, two releases that must be equal, the mutants, the sanitizers
 	$(BIN)/python -m jtqd.sim_can.bench_kernel build --unless-vcan
 	$(BIN)/python -m pytest
 	$(MAKE) --no-print-directory test-sanitized
 
 test-sanitized: $(VENV)/.installed-test ## compiled code with bounds checks, AddressSanitizer and UBSan, a million frames
 	$(BIN)/python -m tests.slow.sanitized
+
+mutants: $(VENV)/.installed-test ## each small change of the code that decides on a number that is sent must fail a test
+	$(BIN)/python -m tests.slow.mutants
 
 lint: style types ## ruff and mypy
 
