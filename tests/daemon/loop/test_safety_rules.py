@@ -21,7 +21,7 @@ from jtqd.daemon.shared.counters import COUNTERS
 from jtqd.daemon.shared.snapshot import SnapshotReader
 from jtqd.estimator.observer import reference_of
 from jtqd.estimator.settings import bandwidth_of, largest_difference_nm, recommended
-from jtqd.estimator.status import DEGRADED, INVALID, VALID, Estimate
+from jtqd.estimator.status import DEGRADED, INVALID, STANDSTILL, VALID, Estimate
 from tests.daemon.loop.cycle_helpers import ExactTime, inputs, make
 from tests.daemon.loop.test_safety_published import GOOD, JOINTS, LIMIT_NM, SETTINGS, Scripted, checked, pdos
 
@@ -140,6 +140,18 @@ def test_an_estimator_that_finds_its_torque_out_of_range_is_reported(
     assert SnapshotReader(tmp_path / "snapshot").read().counters["fault_out_of_range"] == 1
 
 
+@pytest.mark.parametrize("good", [VALID, STANDSTILL, DEGRADED])
+def test_a_published_torque_has_no_fault_in_its_record(tmp_path: Path, clock: ExactTime, good: int) -> None:
+    again = itertools.repeat(GOOD._replace(status=good))
+    cycle, _, reader = checked(tmp_path, itertools.chain([GOOD] * 30, [at(1e300)], again))
+    records = []
+    for _ in range(2):
+        clock.turn(cycle, 50)
+        records += [cr.joint_of(each, 1) for each in reader.read(limit=64).records]
+    assert [each.status for each in records[30:]] == [INVALID] * 50 + [good] * 20
+    assert [each.input_flags >> 8 for each in records[30:]] == [faults.OUT_OF_RANGE] * 50 + [0] * 20
+
+
 @pytest.mark.parametrize("latch", [faults.OUT_OF_RANGE, faults.OUT_OF_RANGE | faults.DRIVE_FAULT])
 def test_the_record_of_a_cycle_without_inputs_shows_what_is_latched(
     tmp_path: Path, clock: ExactTime, latch: int
@@ -204,6 +216,7 @@ def test_errors_against_the_sensor_are_summed_per_joint(tmp_path: Path, clock: E
         pytest.approx(1e3 / bandwidth_of(joint, SETTINGS, network=False)) for joint in JOINTS
     ]
     assert view.rmse_nm == pytest.approx((2.0, 0.5))
+    assert view.rmse_now_nm == pytest.approx((2.0, 0.5))
 
 
 def test_the_reference_is_the_sensor_as_old_as_the_estimate(tmp_path: Path, clock: ExactTime) -> None:
@@ -239,6 +252,14 @@ def test_limits_are_those_of_the_joint_and_the_settings(method: str) -> None:
     assert safety.plausibility is not None
     assert JointSafety(SafetySettings(plausibility=None), estimator, joint).plausibility is None
     assert JointSafety(SafetySettings(), estimator, joint).deviation_cycles == 0
+
+
+@pytest.mark.parametrize(("dt_s", "mismatch_rad"), [(0.04, 0.5), (0.06, 0.0)])
+def test_a_step_of_more_than_five_periods_is_a_gap(dt_s: float, mismatch_rad: float) -> None:
+    checks = JointSafety(SafetySettings(), SETTINGS, JOINTS[0], 10_000_000).plausibility
+    assert checks.step(0.0, 0.0, 0.0, 0.0, 0.1) == 0
+    assert checks.step(dt_s, 0.5, 0.0, 0.5 / JOINTS[0].gear_ratio, 0.2) == 0
+    assert checks.mismatch_rad == mismatch_rad
 
 
 def test_without_a_joint_file_only_the_range_of_the_fields_is_left() -> None:

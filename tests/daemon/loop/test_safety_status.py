@@ -48,6 +48,18 @@ def returns(statuses: Iterable[int]) -> int:
     return sum(a not in PUBLISHED and b in PUBLISHED for a, b in itertools.pairwise(statuses))
 
 
+def test_the_cycles_that_each_status_is_held() -> None:
+    held = {DEGRADED: 100, STARTING: 1, OFF: 20, STALE: 5, INVALID: 50, DRIVE_FAULT: 100}
+    assert held == NEEDED
+
+
+def test_degraded_is_held_as_long_after_relapses() -> None:
+    state = settled()
+    for _ in range(4):
+        asked(state, [STALE, *[VALID] * 25])
+    assert asked(state, [DEGRADED, *[VALID] * 150]).index(VALID) == NEEDED[DEGRADED]
+
+
 @pytest.mark.parametrize("bad", [OFF, STALE, DRIVE_FAULT, INVALID, DEGRADED])
 def test_bad_at_once_and_good_after_so_many_cycles(bad: int) -> None:
     state = settled()
@@ -109,6 +121,26 @@ def test_what_comes_and_goes_waits_longer_and_longer() -> None:
     asked(state, [VALID] * 500)
     asked(state, [STALE])
     assert asked(state, [VALID] * 40).index(VALID) + 1 == 5, "forgiven"
+
+
+@pytest.mark.parametrize("good", [VALID, STANDSTILL, DEGRADED])
+def test_a_relapse_from_every_status_with_a_torque_waits_longer(good: int) -> None:
+    state = JointStatus(SafetySettings())
+    asked(state, [good] * 500)
+    waits = []
+    for _ in range(3):
+        asked(state, [STALE])
+        waits.append(asked(state, [good] * 40).index(good) + 1)
+    assert waits == [5, 10, 20]
+
+
+def test_only_a_torque_lost_is_a_relapse() -> None:
+    state = settled()
+    asked(state, [STALE, *[VALID] * 6, DEGRADED, STALE])
+    assert asked(state, [VALID] * 60).index(VALID) + 1 == 2 * NEEDED[STALE]
+    state = settled()
+    asked(state, [DEGRADED, *[VALID] * (NEEDED[DEGRADED] + 5), STALE])
+    assert asked(state, [VALID] * 60).index(VALID) + 1 == NEEDED[STALE], "degraded has a torque"
 
 
 @settings(max_examples=120, deadline=None)

@@ -36,7 +36,7 @@ def equivalent() -> dict[str, str]:
     return found
 
 
-def run(mutants: dict[int, tuple[list[int], tuple[str, ...]]], tests: list[str]) -> dict[int, str]:
+def run(mutants: dict[int, tuple[list[int], tuple[str, ...] | None]], tests: list[str]) -> dict[int, str]:
     """Run mutants in the copy; return the result of each."""
     memory, job, results = (PLACE / name for name in ("memory", "job.json", "results.json"))
     memory.write_bytes(struct.pack("<i", -1) + bytes(SPAN * len(ROOMS)))
@@ -82,7 +82,13 @@ def main() -> int:
     judged = {number: each for number, each in wanted.items() if each.key not in reasons}
     print(f"{len(wanted)} mutants, {len(wanted) - len(judged)} of them equivalent: compiled after", end=" ")
     print(f"{time.monotonic() - began:.0f} s", flush=True)
-    found = run({number: (sorted(each.acts), each.names) for number, each in judged.items()}, options.tests)
+    found = run(
+        {
+            number: (sorted(each.acts), None if each.function else each.names)
+            for number, each in judged.items()
+        },
+        options.tests,
+    )
     for number, each in judged.items():
         if found.get(number) != "killed":
             print(f"{found.get(number, 'not run').upper()} {number} {each}")

@@ -103,19 +103,23 @@ class Campaign:
         path.write_text(json.dumps(found))
         return 0
 
-    def judge(self, number: int, places: set[int], names: list[str]) -> str:
-        """Return "killed", "survived" or "not reached"; names: of the module, none for a mutant within a function."""
+    def judge(self, number: int, places: set[int], names: list[str] | None) -> str:
+        """Return "killed", "survived" or "not reached"; names: of the module, None for a mutant within a function."""
         mention = re.compile(rf"\b({'|'.join(names)})\b") if names else None
         tests = [
             name
             for name, (_, reached) in self.reached.items()
             if reached & places or (mention and mention.search(self.items[name].path.read_text()))
         ]
+        if names is not None and not tests:  # it may only be seen while the module is loaded
+            tests = list(self.reached)
         tests.sort(key=lambda name: (-self.kills[name], self.reached[name][0]))
         if not tests:
             return "not reached"
         seconds = sum(self.reached[name][0] for name in tests)
-        run = (lambda: self.fresh(tests[:FRESH])) if names else (lambda: self.first_failing(tests))
+        run = (
+            (lambda: self.fresh(tests[:FRESH])) if names is not None else (lambda: self.first_failing(tests))
+        )
         code = self.forked(number, run, PATIENCE_S + 10.0 * seconds)
         if 0 < code <= len(tests):
             self.kills[tests[code - 1]] += 1
