@@ -10,10 +10,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mcap.reader import make_reader
 
 from jtqd.daemon.core.cycle import Cycle
 from jtqd.daemon.core.status import JointSafety
+from jtqd.daemon.logs import export, read_topic, recover, topics_of
 from jtqd.daemon.recording import messages
+from jtqd.daemon.recording.recorder import RecorderRequest, Session
+from jtqd.daemon.recording.run_files import Account
 from jtqd.daemon.shared import cycle_record as cr
 from jtqd.daemon.shared.cycle_record import RingReader
 from jtqd.daemon.shared.snapshot import SnapshotReader
@@ -253,3 +257,35 @@ def test_without_the_key_there_is_no_topic() -> None:
         "/joint/1/shadow",
         "/joint/2/shadow",
     ]
+
+
+def test_the_log_tools_read_the_topic_as_any_other(runs: Runs, tmp_path: Path) -> None:
+    """Recorded, read back and exported: the numbers of the records. A damaged chunk costs all topics its cycles."""
+    _, _, found = runs("fused", both())
+    request = RecorderRequest(ring=tmp_path, directory=tmp_path / "logs", repair=False, shadow=True)
+    session = Session(request, Account(), pytest.fail)
+    for record in found:
+        session.recording.add(record)
+    log = Path(session.finish()["path"])
+    assert {"/joint/1/shadow", "/joint/2/shadow"} <= topics_of(log).keys()
+    read = read_topic(log, "/joint/2/shadow")
+    for name in cr.SHADOW_FIELDS:
+        np.testing.assert_array_equal(read[name], [shadow_of(record, 2)[name] for record in found])
+    table = tmp_path / "shadow.csv"
+    assert export.main(["csv", str(log), "--topic", "/joint/2/shadow", "--out", str(table)]) == 0
+    head, *rows = table.read_text().splitlines()
+    assert set(cr.SHADOW_FIELDS) <= set(head.split(","))
+    assert len(rows) == CYCLES
+    damaged, (topic,) = bytearray(log.read_bytes()), [each.number for each in messages.SHADOWS[:1]]
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    chunks = [each for each in summary.chunk_indexes if topic in each.message_index_offsets]
+    assert len(chunks) > 3
+    damaged[chunks[1].chunk_start_offset + chunks[1].chunk_length // 2] ^= 0xFF
+    broken = tmp_path / "broken.mcap"
+    broken.write_bytes(damaged)
+    assert recover.main([str(broken)]) == 3
+    kept = {topic: read_topic(broken, topic)["cycle"] for topic in ("/joint/1/state", "/joint/1/shadow")}
+    assert 0 < len(kept["/joint/1/state"]) < CYCLES
+    np.testing.assert_array_equal(kept["/joint/1/state"], kept["/joint/1/shadow"])

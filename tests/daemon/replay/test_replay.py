@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +20,8 @@ import yaml
 
 from jtqd.daemon.logs import LogError, read_attachments, read_topic
 from jtqd.daemon.replay.command import main
-from jtqd.daemon.replay.logged import read_setup
-from jtqd.daemon.replay.session import replay
+from jtqd.daemon.replay.logged import read_runs, read_setup
+from jtqd.daemon.replay.session import Replayer, models_of, replay
 from jtqd.models.files import shipped
 from tests.daemon.replay.replay_helpers import cut, cycles, provenance
 from tests.estimator.fused_configuration import networks
@@ -299,6 +300,25 @@ def test_wrong_models(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "joint2.fused.onnx" in one_line(capsys, LOG, "--model", tmp_path)
     assert "needs" in one_line(capsys, LOG, "--method", "network")
     assert "none: found no such directory" in one_line(capsys, LOG, "--out", tmp_path / "none" / "a.mcap")
+
+
+def test_shadow_methods_of_a_replay_are_the_replay_of_these_methods(tmp_path: Path) -> None:
+    """A golden log with a configuration that asks for two: what is sent stays, bit for bit."""
+    log = GOLDEN / "network.mcap"
+    ((run_, inputs),) = read_runs([log], tmp_path)
+    setup = replace(run_.setup, config=replace(run_.setup.config, shadow=("tob", "efficiency")))
+    replayed = Replayer(setup, models_of(setup)).run(run_.joints, inputs, run_.steps()).joints
+    (sent,) = replay([log])
+    for method in setup.config.shadow:
+        (alone,) = replay([log], method=method)
+        for one, other in zip(replayed, alone.joints, strict=True):
+            published = np.isfinite(other["torque_nm"])
+            assert published.sum() > 500
+            for name in ("torque_nm", "sigma_nm"):
+                np.testing.assert_array_equal(one[f"{method}_{name}"][published], other[name][published])
+    for one, other in zip(replayed, sent.joints, strict=True):
+        for name in other.dtype.names:
+            np.testing.assert_array_equal(one[name], other[name])
 
 
 def with_shadow_networks(networks: dict[str, Any], attached: dict[str, str]) -> Change:
