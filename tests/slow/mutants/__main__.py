@@ -92,14 +92,11 @@ def main() -> int:
     for number, each in judged.items():
         if found.get(number) != "killed":
             print(f"{found.get(number, 'not run').upper()} {number} {each}")
-    keys = {each.key for each in everything.values()}
-    gone = [
-        key
-        for key in reasons
-        if key.partition(" | ")[0] in {ROOMS[room] for room in options.room} and key not in keys
-    ]
+    keys = Counter(each.key for each in everything.values())
+    files = {ROOMS[room] for room in options.room}
+    gone = [key for key in reasons if key.partition(" | ")[0] in files and keys[key] != 1]
     for key in gone:
-        print(f"NO SUCH MUTANT, so its line was edited: judge it again: {key}")
+        print(f"EQUIVALENT, but of {keys[key]} mutants: its line was edited, judge it again: {key}")
     for room in options.room:
         counts = Counter(
             found.get(number, "not run") for number, each in judged.items() if each.file == ROOMS[room]

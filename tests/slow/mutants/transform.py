@@ -265,7 +265,9 @@ def variants(clean: Any) -> list[tuple[str, Any]]:
                 for _ in range(depth):
                     part = part.cascade
                 part.operator = operator
-                made.append((f"{link.operator} -> {operator}", other))
+                made.append(
+                    (f"{link.operator} -> {operator}{f' (link {depth + 1})' if depth else ''}", other)
+                )
             link, depth = link.cascade, depth + 1
     elif isinstance(clean, ExprNodes.BoolBinopNode):
         operator = {"and": "or", "or": "and"}[clean.operator]
