@@ -138,8 +138,12 @@ _SLOW: Final = 0.125
 """Part of the sampling rate below which all is motion."""
 _BANDS: Final = 6
 """Above it; motion and lines leave one of them."""
-_ALIKE: Final = 1.25
-"""Densities of white noise in two bands differ by less."""
+_CALMEST: Final = 0.3
+"""Quantile over the segments: in fewer of them a joint reverses or is pushed."""
+_OF_NOISE: Final = 0.595
+"""This quantile of a band's energy, in white noise of unit variance."""
+_ALIKE: Final = 12.0
+"""Over the root of the samples: by this part the densities of white noise in two bands may differ by chance."""
 _ORDER: Final = 3
 _SLOWEST_HZ: Final = 8.0
 """No cutoff is lower: there is the motion itself."""
@@ -188,24 +192,21 @@ def described(x: FloatArray, unit: str) -> str:
 
 def noise_of(x: FloatArray) -> FloatArray:
     """Return the standard deviation of the white noise near each sample [n]: of the steps, and of as much beside them as the
-    bands of least density show.
+    bands of least density show in their calmest moments.
 
     Of sixth differences, so that what is slow does not leak (Welch 1967, IEEE Trans. Audio Electroacoust. 15).
     """
     steps = np.asarray(steps_of(x) / math.sqrt(12.0))
-    quick = np.diff(x, 6) if len(x) >= 2 * _SEGMENT else np.empty(0)
-    if not len(quick):
+    if len(x) < 2 * _SEGMENT:
         return steps
-    hz, power = signal.welch(quick, nperseg=_SEGMENT, detrend=False, average="median")
+    hz, _, power = signal.spectrogram(np.diff(x, 6), 1.0, "hann", _SEGMENT, _SEGMENT // 2, detrend=False)
     high = (hz >= _SLOW) & (hz < 0.5)
-    beside = hz[high] + np.array([[-1.0], [0.0], [1.0]]) / _SEGMENT
-    white = (
-        np.array([1.0, 4.0, 1.0]) / 6.0 @ (2.0 * (2.0 * np.sin(np.pi * beside)) ** 12)
-    )  # of the Hann window
-    variance = power[high] / white
-    bands = np.array([band.mean() for band in np.array_split(variance, _BANDS)])
-    least = float(bands[bands <= _ALIKE * bands.min()].mean())
-    return np.asarray(np.sqrt(steps**2 + max(least - float(np.mean(steps**2)), 0.0)))
+    beside = hz[high, None] + np.array([-1.0, 0.0, 1.0]) / _SEGMENT  # as the window mixes them
+    white = (2.0 * (2.0 * np.sin(np.pi * beside)) ** 12) @ np.array([[1.0], [4.0], [1.0]]) / 6.0
+    bands = np.array_split(power[high] / (_OF_NOISE * white), _BANDS)
+    least = np.array([np.quantile(band.mean(axis=0), _CALMEST) for band in bands])
+    alike = least[least <= (1.0 + _ALIKE / math.sqrt(len(x))) * least.min()]
+    return np.asarray(np.sqrt(steps**2 + max(float(alike.mean() - np.mean(steps**2)), 0.0)))
 
 
 def known_below_hz(x: FloatArray, step_s: float) -> float:
