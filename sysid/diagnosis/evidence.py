@@ -117,13 +117,13 @@ class Noisy(NamedTuple):
     gram: FloatArray
     rows: float
 
-    def by_chance(self, at: Index, mean: FloatArray) -> float:
-        """Return by how much the squares that noise leaves with these coefficients may by chance be less than without them:
+    def by_chance(self, one: FloatArray, other: FloatArray | float = 0.0) -> float:
+        """Return by how much the squares that noise leaves with coefficients may by chance be less than with others [E]:
         limits.SURE standard deviations of (w'd)(w's), w white, d and s difference and sum of both contrasts.
         """
-        own = float(mean @ self.gram[np.ix_(at, at)] @ mean)
-        both = own - 4.0 * float(mean @ self.gram[at, -1]) + 4.0 * float(self.gram[-1, -1])
-        return limits.SURE * math.sqrt(2.0 * max(own, 0.0) * max(both, 0.0) / self.rows)
+        apart, both = np.append(one - other, 0.0), np.append(one + other, -2.0)
+        size = max(float(apart @ self.gram @ apart), 0.0) * max(float(both @ self.gram @ both), 0.0)
+        return limits.SURE * math.sqrt(2.0 * size / self.rows)
 
 
 class Sets:
@@ -132,7 +132,8 @@ class Sets:
     def __init__(
         self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset(), noise: Noisy | None = None
     ) -> None:
-        self.entries, self.gram, self.out, self.noise = list(entries), gram, out, noise
+        self.entries, self.gram, self.out = list(entries), gram, out
+        self.noise = noise or Noisy(np.zeros_like(gram), 1.0)
         self.slices: list[Index] = [np.arange(s.start, s.stop) for s in slices_of(entries)]
         one = np.array([e.size == 1 for e in entries], bool)
         self._single = np.flatnonzero(one)
@@ -151,6 +152,17 @@ class Sets:
     def columns(self, chosen: Set) -> Index:
         """Return the places of a set's coefficients, in order of its entries."""
         return columns_of(self.entries, chosen)
+
+    def lacks(self, chosen: Set, other: Set) -> float:
+        """Return twice the log evidence that another set lacks, less what noise may by chance have made of it."""
+        fits = [self.fit(s) for s in (chosen, other)]
+        apart = self.noise.by_chance(*map(self._spread, (chosen, other), (fit.mean for fit in fits)))
+        return 2.0 * (fits[0].evidence - fits[1].evidence) - apart
+
+    def _spread(self, chosen: Set, mean: FloatArray) -> FloatArray:
+        out = np.zeros(len(self.gram) - 1)
+        out[self.columns(chosen)] = mean
+        return out
 
     def fit(self, chosen: Set) -> Fit:
         """Return the posterior of a set; a coefficient beyond its bound is held at it."""
@@ -171,8 +183,7 @@ class Sets:
         explained = float(2.0 * mean @ right - mean @ inner @ mean)
         if explained >= self.gram[-1, -1]:  # more than there is: what is taken out as noise is none
             return Fit(mean, covariance, -math.inf)
-        if self.noise is not None:
-            explained -= self.noise.by_chance(at, mean)
+        explained -= self.noise.by_chance(self._spread(chosen, mean))
         evidence = 0.5 * explained - float(np.sum(np.log(np.diag(factor[0]))))
         return Fit(mean, covariance, evidence + sum(self.entries[k].odds for k in chosen))
 
@@ -488,7 +499,7 @@ class Equations:
             contrast = np.zeros(e + many + 1)
             contrast[q], contrast[-1] = -theta, 1.0
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
-            score += self.put_in.by_chance(at, theta[: len(at)])
+            score += self.put_in.by_chance(-contrast[: self.E])
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse

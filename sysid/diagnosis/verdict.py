@@ -109,7 +109,7 @@ def judged(solution: Solution) -> list[Judged]:
                 members,
                 present,
                 _rms(solution, present),
-                2.0 * (plain.fit(chosen).evidence - plain.fit(rival).evidence),
+                plain.lacks(chosen, rival),
                 2.0 * imitated,
                 tuple(sets.entries[k] for k in rival - chosen),
                 math.sqrt(max(z2, 0.0)),

@@ -405,14 +405,17 @@ def test_what_noise_gives_a_set_by_chance_is_at_most_what_is_taken_off_its_evide
     change = np.sum((response - size * column) ** 2 - response**2, axis=1)
     gram = 300.0 * np.array([[0.25, 0.25 * shared], [0.25 * shared, 1.0 + 0.25 * shared]])
     noise = Noisy(gram, 300.0)
-    taken = noise.by_chance(np.array([0]), np.array([size]))
+    taken = noise.by_chance(np.array([size]))
     assert 0.6 * taken < SURE * np.std(change) < taken
     plain = gram_of(np.eye(3)[:, :1], np.array([3.0, 0.0, 0.0]))
     sets, sure = Sets([entry()], plain, noise=noise), Sets([entry()], plain)
     chosen = frozenset({0})
     mean = sure.fit(chosen).mean
     lost = sure.fit(chosen).evidence - sets.fit(chosen).evidence
-    assert 2.0 * lost == pytest.approx(noise.by_chance(np.array([0]), mean))
+    assert 2.0 * lost == pytest.approx(noise.by_chance(mean))
+    alike = noise.by_chance(np.array([size]), np.array([size]))
+    assert alike == 0.0
+    assert sets.lacks(chosen, frozenset()) == pytest.approx(sure.lacks(chosen, frozenset()) - 4.0 * lost)
 
 
 def test_noise_that_a_column_brings_into_the_discrepancy_is_taken_out_there_as_well() -> None:
