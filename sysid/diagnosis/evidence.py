@@ -111,8 +111,8 @@ class Means(NamedTuple):
     turned: FloatArray
 
 
-class Noisy(NamedTuple):
-    """What noise puts into the equations over [E, response], summed over so many rows."""
+class Scatter(NamedTuple):
+    """What noise puts into the equations over [E, response], summed over so many rows, and how far that scatters."""
 
     gram: FloatArray
     rows: float
@@ -130,10 +130,10 @@ class Sets:
     """Sets of entries on marginal normal equations A [E + 1, E + 1], last: the response."""
 
     def __init__(
-        self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset(), noise: Noisy | None = None
+        self, entries: Sequence[Entry], gram: FloatArray, out: Set = frozenset(), noise: Scatter | None = None
     ) -> None:
         self.entries, self.gram, self.out = list(entries), gram, out
-        self.noise = noise or Noisy(np.zeros_like(gram), 1.0)
+        self.noise = noise or Scatter(np.zeros_like(gram), 1.0)
         self.slices: list[Index] = [np.arange(s.start, s.stop) for s in slices_of(entries)]
         one = np.array([e.size == 1 for e in entries], bool)
         self._single = np.flatnonzero(one)
@@ -333,7 +333,7 @@ class Equations:
         self._inner = np.arange(self.E, self.E + self.N)
         self._outer = np.concatenate((np.arange(self.E), self.E + shared, [self.E + self.N])).astype(np.intp)
         sides = np.append(np.arange(self.E), self.E + self.N)
-        self.put_in = Noisy(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
+        self.scatter = Scatter(noise.sum(axis=0)[np.ix_(sides, sides)], rows)
         self.noisy = self._noisy()
         self.kappa = 1.0
         self.grams = grams
@@ -380,7 +380,7 @@ class Equations:
 
         gram = self._positive(marginal)
         gram = self._without_resemblance(gram, variances) if resembling else gram
-        return Sets(self.entries, gram, self.noisy, self.put_in)
+        return Sets(self.entries, gram, self.noisy, self.scatter)
 
     def deviation(self, variances: Variances) -> FloatArray:
         """Return the prior deviation of coefficients outside of a set [E]: as the recording makes them and the discrepancy
@@ -499,7 +499,7 @@ class Equations:
             contrast = np.zeros(e + many + 1)
             contrast[q], contrast[-1] = -theta, 1.0
             squares, spread, means = np.zeros(self.N), np.zeros(self.N), []
-            score += self.put_in.by_chance(-contrast[: self.E])
+            score += self.scatter.by_chance(-contrast[: self.E])
             for factor, cross in keep:
                 inverse = np.linalg.inv(factor)
                 inverse = inverse.T @ inverse

@@ -14,7 +14,7 @@ import pytest
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.sysid.diagnosis.entries import Entry
-from jtqd.sysid.diagnosis.evidence import Equations, Noisy, Set, Sets
+from jtqd.sysid.diagnosis.evidence import Equations, Scatter, Set, Sets
 from jtqd.sysid.diagnosis.limits import PRIORS, SURE
 from jtqd.sysid.diagnosis.model import _End, _Search
 
@@ -404,7 +404,7 @@ def test_what_noise_gives_a_set_by_chance_is_at_most_what_is_taken_off_its_evide
     response = rng.normal(size=(2000, 300)) + shared * column
     change = np.sum((response - size * column) ** 2 - response**2, axis=1)
     gram = 300.0 * np.array([[0.25, 0.25 * shared], [0.25 * shared, 1.0 + 0.25 * shared]])
-    noise = Noisy(gram, 300.0)
+    noise = Scatter(gram, 300.0)
     taken = noise.by_chance(np.array([size]))
     assert 0.6 * taken < SURE * np.std(change) < taken
     plain = gram_of(np.eye(3)[:, :1], np.array([3.0, 0.0, 0.0]))
