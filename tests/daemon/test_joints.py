@@ -131,7 +131,7 @@ def test_a_run_and_its_log(tmp_path: Path, joints: int, sensor: bool) -> None:
     assert all((value is not None) == sensor for value in run.summary["rmse_nm"].values())
     assert not [each for each in run.summary["conditions"] if each["name"] in ("sensor_lost", "deviation")]
     topics = topics_of(run.log)
-    own = {f"/joint/{n}/{kind}" for n in numbers for kind in ("state", "zeros")}
+    own = {f"/joint/{n}/{kind}" for n in numbers for kind in ("state", "shadow", "zeros")}
     assert {name for name in topics if name.startswith("/joint/")} == own
     states = read_topics(run.log, [f"/joint/{number}/state" for number in numbers])
     for state in states.values():

@@ -159,7 +159,7 @@ class Viewer:
         self.socket = self._connection.__enter__()
         self.texts, self.channels, self.messages = [], {}, {}
         self._subscribed = {}
-        self._until(lambda: len(self.channels) == len(messages.TOPICS))
+        self._until(lambda: len(self.channels) >= len(messages.TOPICS))  # one message names all
         wanted = [c for c in self.channels.values() if topics is None or c["topic"] in topics]
         self._subscribed = {n: channel["topic"] for n, channel in enumerate(wanted, start=100)}
         self.send(

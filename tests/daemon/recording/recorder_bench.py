@@ -24,7 +24,8 @@ from tests.daemon.recording.cdr_decoder import Definition
 from tests.paths import ROOT
 
 START_NS = 1_700_000_000_000_000_000
-DEFINITIONS = {name: Definition(name, text) for name, text in messages.SCHEMAS.items()}
+SCHEMAS = messages.schemas_of(2, shadow=True)
+DEFINITIONS = {name: Definition(name, text) for name, text in SCHEMAS.items()}
 SYNC = struct.pack("<IB3x8s", 0x080, 1, b"\x01")
 TPDO = struct.pack("<IB3x8s", 0x181, 8, bytes(range(8)))
 
@@ -131,12 +132,12 @@ class RecorderProcess:
 
 def messages_of(*paths):
     """{topic: [(log time, decoded message)]} of finished files, by the library's reader, CRCs checked."""
-    found = {topic.name: [] for topic in messages.TOPICS}
+    found = {topic.name: [] for topic in messages.topics_of(2, shadow=True)}
     for path in paths:
         with open(path, "rb") as file:
             reader = make_reader(file, validate_crcs=True)
             for schema, channel, message in reader.iter_messages(log_time_order=False):
-                assert schema.data.decode() == messages.SCHEMAS[schema.name]
+                assert schema.data.decode() == SCHEMAS[schema.name]
                 found[channel.topic].append((message.log_time, DEFINITIONS[schema.name].decode(message.data)))
     return found
 
