@@ -418,6 +418,25 @@ def test_what_noise_gives_a_set_by_chance_is_at_most_what_is_taken_off_its_evide
     assert sets.lacks(chosen, frozenset()) == pytest.approx(sure.lacks(chosen, frozenset()) - 4.0 * lost)
 
 
+def test_a_score_and_an_evidence_lack_the_same_by_chance() -> None:
+    """Noise is in column and response, so the sign of a coefficient decides how much it is."""
+    rng = np.random.default_rng(14)
+    blocks = [
+        np.column_stack((rng.normal(size=(200, 1)), rng.normal(size=200), np.zeros(200))) for _ in range(3)
+    ]
+    for each in blocks:
+        each[:, -1] = 0.4 * each[:, 0] + 0.1 * rng.normal(size=200)
+    noise = np.array([[20.0, 0.0, 15.0], [0.0, 0.0, 0.0], [15.0, 0.0, 20.0]])
+    equations = equations_of(blocks, [entry()], ("viscous",), noise=noise)
+    chosen, variances = frozenset({0}), {"viscous": 1e-6}
+    _, sure, means = equations.expected(chosen, variances, 0)
+    equations.scatter = equations.scatter._replace(rows=600.0)
+    _, score, _ = equations.expected(chosen, variances, 0)
+    taken = equations.scatter.by_chance(means.beta)
+    assert abs(taken - equations.scatter.by_chance(-means.beta)) > 0.2 * taken
+    assert score - sure == pytest.approx(taken)
+
+
 def test_noise_that_a_column_brings_into_the_discrepancy_is_taken_out_there_as_well() -> None:
     """The discrepancy is what the set's columns do not explain of it, so it has their noise, too. Were that left in, a
     coefficient and a discrepancy that cancel each other would explain noise: of a torque that is in column and response.
