@@ -24,6 +24,10 @@ STUDIES: Final = {
         "validation.current_path.study",
         "a network of the current path: one encoder on four plants",
     ),
+    "payloads": (
+        "validation.goals.payloads",
+        "fitted from two known payloads, without a torque sensor, against fitted with one",
+    ),
     "sources": ("validation.goals.sources", "what the error of the estimate is made of on a bench"),
     "other_plant": ("validation.goals.other_plant", "joint files of another plant: how soon it is flagged"),
     "two_runs": (

@@ -6,6 +6,8 @@ their sources. Arrays are [2, B]: joint, run. Per joint, joint side, J = Jm G^2,
     J dv/dt = G Kt(T) i_r tanh(i/i_r) + cogging(m) - tau (1 + G E'(m)) - F      saturation: i_r far above the rated current
     (J1 + J2) dw/dt = tau_1 - tau_2                                             sensor = tau_1 - J1 dw/dt
 
+Joint 1 may carry a load in place of joint 2: its inertia for J2, its weight for tau_2.
+
 Friction: a bristle of deflection z (Canudas de Wit et al. 1995), fading bristle damping, shear-thinning grease (Eyring):
 
     dz/dt = v - |v| s0 z / g         F = s0 z + s1 exp(-(v/vd)^2) dz/dt + V asinh(v/v0)
@@ -24,7 +26,7 @@ Velocities first, then angles (semi-implicit Euler), all runs of a list side by 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -50,6 +52,14 @@ class Command(NamedTuple):
     leader: int
     velocity_rad_s: Array
     current_a: Array
+
+
+class Load(NamedTuple):
+    """What joint 1 carries in place of joint 2: inertia [kgm2], its weight a sin q + b cos q [Nm] at the link's angle q."""
+
+    inertia_kgm2: float
+    sine_nm: float
+    cosine_nm: float
 
 
 class Recorded(NamedTuple):
@@ -137,11 +147,13 @@ class Bench:
         self.sensor_noise_nm = float(mapping["sensor"]["noise_nm"])
         self.days = Days(**mapping["run_to_run"])
 
-    def record(self, commands: Sequence[Command], seed: int, first_day: int = 0) -> list[Recorded]:
-        """Return the runs, run k on day first_day + k of this seed."""
+    def record(
+        self, commands: Sequence[Command], seed: int, first_day: int = 0, loads: Sequence[Load] = ()
+    ) -> list[Recorded]:
+        """Return the runs, run k on day first_day + k of this seed; loads: one per run, in place of joint 2."""
         days = [self.days.drawn(seed, first_day + k) for k in range(len(commands))]
         day = {name: np.stack([each[name] for each in days], axis=1) for name in days[0]}
-        true = _integrated(self, commands, day)
+        true = _integrated(self, commands, day, loads)
         return [
             _read(
                 self, true, k, len(command.current_a), day, np.random.default_rng([seed, first_day + k, 21])
@@ -331,7 +343,19 @@ class _Warmth:
         )
 
 
-def _integrated(bench: Bench, commands: Sequence[Command], day: Mapping[str, Array]) -> dict[str, Array]:
+def _other_side(bench: Bench, loads: Sequence[Load]) -> tuple[Array | float, Callable[[Array, Array], Array]]:
+    """Return the inertia of all that the links are, and what is against joint 1 at a position, where joint 2 pulls [Nm]."""
+    if not loads:
+        return sum(bench.link_inertia), lambda position, pull: pull
+    inertia, sine, cosine = np.array(loads).T
+    return bench.link_inertia[
+        0
+    ] + inertia, lambda position, pull: sine * np.sin(position) + cosine * np.cos(position)
+
+
+def _integrated(
+    bench: Bench, commands: Sequence[Command], day: Mapping[str, Array], loads: Sequence[Load] = ()
+) -> dict[str, Array]:
     """Return the true signals at 1 kHz, arrays [n, 2, B], by name; sensor [n, B]."""
     drives, friction, gear, warmth = (
         _Drives(bench, commands),
@@ -341,7 +365,7 @@ def _integrated(bench: Bench, commands: Sequence[Command], day: Mapping[str, Arr
     )
     motor_law, ratio = bench.sections["motor"], bench.nominal["gear_ratio"]
     inertia = motor_law["rotor_inertia_kgm2"] * ratio**2
-    both, own = sum(bench.link_inertia), bench.link_inertia[0]
+    own, (both, weight) = bench.link_inertia[0], _other_side(bench, loads)
     n, count, h = drives.velocity.shape[0], len(commands), CYCLE_S / SUBSTEPS
     out = {name: np.empty((n, 2, count)) for name in ("current", "motor", "link", "celsius", "tau")}
     out["sensor"] = np.empty((n, count))
@@ -363,7 +387,7 @@ def _integrated(bench: Bench, commands: Sequence[Command], day: Mapping[str, Arr
     for k in range(n):
         out["current"][k], out["motor"][k], out["link"][k] = drives.flowing, motor, link
         out["celsius"][k], out["tau"][k] = warmth.housing, tau
-        out["sensor"][k] = tau[0] - own / both * (tau[0] - tau[1])
+        out["sensor"][k] = tau[0] - own / both * (tau[0] - weight(position, tau[1]))
         if k % warmth.UPDATE == 0:
             if k:
                 warmth.add(heat / (warmth.UPDATE * SUBSTEPS))
@@ -383,7 +407,7 @@ def _integrated(bench: Bench, commands: Sequence[Command], day: Mapping[str, Arr
             driving = full * knee * np.tanh(current / knee) + ratio * cogging
             v = v + (h / inertia) * (driving - tau * (1.0 + ratio * slope) - rubbing)
             pull = tau * (1.0 - link_slope)
-            w = w + (h / both) * (pull[0] - pull[1])
+            w = w + (h / both) * (pull[0] - weight(position, pull[1]))
             position = position + h * w
             link = SIDE * position
             motor = motor + h * ratio * v
