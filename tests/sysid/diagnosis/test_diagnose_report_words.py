@@ -14,7 +14,6 @@ from jtqd.sysid.diagnosis.findings import (
     CandidateEvidence,
     Findings,
     Gain,
-    Gap,
     Place,
     UnexplainedResidual,
     Untold,
@@ -26,7 +25,6 @@ from jtqd.sysid.diagnosis.report import (
     MOST_ROWS,
     candidate_row,
     effect_title,
-    gap_axes,
     headline,
     in_words,
     parameter_title,
@@ -36,7 +34,7 @@ from jtqd.sysid.diagnosis.report import (
 )
 from tests.sysid.diagnosis import findings_examples as examples
 from tests.sysid.diagnosis.diagnose_helpers import JOINT
-from tests.sysid.diagnosis.findings_parts import gap, value
+from tests.sysid.diagnosis.findings_parts import value
 
 NARROW = "\u00a0"
 INTERVAL = re.compile(r"\[(\S+), (\S+)\]")
@@ -275,27 +273,6 @@ def test_provenance_has_twelve_digits_of_every_hash() -> None:
         to_mapping(replace(examples.one_cause(), provenance=many))["provenance"]["inputs"]["r8.csv"]
         == "8" * 64
     )
-
-
-def test_the_map_puts_axes_by_unevenness_and_marks_what_stands_out() -> None:
-    axes = gap_axes(gap(1, "motor", 0.6, 0.2, {"link_angle": {3: 0.52, 4: 0.21}, "velocity": {6: 0.3}}))
-    assert [a.title for a in axes] == ["link angle", "velocity"]  # the others are even
-    link, velocity = axes
-    assert [k for k, b in enumerate(link.bars) if b.hot] == [3, 4]
-    assert link.bars[3].height == pytest.approx(1.0)
-    assert link.bars[4].height == pytest.approx(0.21 / 0.52)
-    # one scale for all axes: equal density is equal height
-    assert velocity.bars[6].height == pytest.approx((0.3 * 12) / (0.52 * 16))
-    assert link.even == pytest.approx(1.0 / (0.52 * 16))
-    assert link.ends == ("0 rad", "6.28 rad")
-
-
-def test_shares_of_one_axis_are_never_more_than_the_whole() -> None:
-    """Where the gap is small beside the noise, the excess of a bin can be larger than that of all."""
-    bins = tuple(Place("load", f"bin {k}", 1.0, float(k), k + 1.0, "Nm") for k in range(4))
-    (axis,) = gap_axes(Gap(1, "motor", 0.21, 0.2, "repeated runs", (), bins))
-    assert [b.text.replace(NARROW, " ") for b in axis.bars] == [f"bin {k}: 25 %" for k in range(4)]
-    assert gap_axes(Gap(1, "motor", 0.21, 0.2, "repeated runs", ())) == []
 
 
 def test_names_are_words() -> None:
