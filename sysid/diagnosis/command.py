@@ -40,7 +40,7 @@ from jtqd.sysid.diagnosis.findings import (
     shows_at,
     to_mapping,
 )
-from jtqd.sysid.diagnosis.limits import PRIORS, RELEVANCE, Usage
+from jtqd.sysid.diagnosis.limits import PRIORS, RELEVANCE
 from jtqd.sysid.fit.joint_writer import write_joint
 from jtqd.sysid.planner.campaigns import beyond_file, parsed_limits, with_limits
 from jtqd.sysid.planner.plan import Plan
@@ -66,15 +66,14 @@ REPORT: Final = "report.html"
 EXTENDED: Final = "extended.joint.yaml"
 _DIGITS: Final = 7
 """Significant digits of a written value; no interval is a millionth of it."""
-_JOINTS: Final = range(1, 8)
-_ITEM: Final = re.compile(r"(?:(?P<where>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
-_SIZE: Final = re.compile(
-    r"(?P<value>(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)(?![\d.]) *(?P<unit>.*)", re.IGNORECASE
+_OWN: Final = (
+    *(FINDINGS, REPORT, EXTENDED, "extended.joint[1-7].yaml", "next_experiment.plan.yaml"),
+    *("next_experiment.motion.csv", "next_experiment.joint[1-7].motion.csv"),
 )
-_PERCENT: Final = re.compile(r"([\d.]+) %")
-_PREFIXES: Final = {"": 1.0, "m": 1e-3, "u": 1e-6, "µ": 1e-6}
-_USAGES: Final = (Usage(0.1, 5.0), Usage(3.0, 50.0))
-"""Two very different ways to use a joint: a prior whose size differs between them has no size in its unit."""
+"""All names that a diagnosis may write."""
+_ITEM: Final = re.compile(r"(?:(?P<where>[1-7]|sensor)=)?(?P<name>[a-z_]+)")
+_SIZE: Final = re.compile(r"((?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?) *(%|[a-zµ]+)", re.IGNORECASE)
+"""A size with its unit: "1 %", "3 ms"."""
 
 
 def main(argv: list[str]) -> int:
@@ -96,7 +95,7 @@ def _main(argv: list[str]) -> int:
         joints = joints_of(files, runs)
         known = () if columns is None else columns.known_loads
         scope = scope_of(asked, joints, known)
-        trust = trusted(options.trust, joints)
+        trust = trusted(options.trust)
         for run in runs:
             for note in run.notes:
                 print(f"{BY}: {run.name}: {note}", file=sys.stderr)
@@ -131,12 +130,9 @@ def _json(mapping: Mapping[str, Any]) -> str:
     return json.dumps(mapping, indent=1, allow_nan=False)
 
 
-def _own() -> tuple[str, ...]:
-    """Return all names that a diagnosis may write."""
-    from jtqd.sysid.diagnosis.next_experiment import MOTION_FILE, PLAN_FILE, joint_motion_file
-
-    of_joints = (name(number) for number in _JOINTS for name in (extended_file, joint_motion_file))
-    return (FINDINGS, REPORT, PLAN_FILE, MOTION_FILE, EXTENDED, *of_joints)
+def _own(directory: Path) -> list[Path]:
+    """Return the files of a diagnosis in a directory."""
+    return [path for pattern in _OWN for path in directory.glob(pattern)]
 
 
 def _provenance(
@@ -251,8 +247,8 @@ def parser() -> argparse.ArgumentParser:
     option("--without", "[N=]EFFECT", "an effect that is absent (of joint N, or sensor=EFFECT)", **again)
     option("--given", "[N=]EFFECT", "an effect that is as the joint file has it: not questioned", **again)
     trust = (
-        "how far a value may be off, one standard deviation: sensor_gain=5%%, coulomb_friction=2Nm, channel_delay=5ms "
-        "(defaults: priors in the report)"
+        "how far a value may be off, one standard deviation, in the unit of its prior: sensor_gain=5%%, "
+        "channel_delay=5ms (defaults: priors in the report)"
     )
     option("--trust", "NAME=SIZE", trust, **again)
     limits = (
@@ -289,26 +285,24 @@ def asked_effects(without: Iterable[str], given: Iterable[str]) -> list[Asked]:
 
     Raises UsageError for a name that is no effect, and for an effect that is both.
     """
-    absent = [_asked("--without", text) for text in without]
-    known = [_asked("--given", text) for text in given]
-    for one in known:
-        for other in absent:
-            if one.name == other.name and (one.where == other.where or None in (one.where, other.where)):
+    found: list[Asked] = []
+    for option, text in (*(("--without", text) for text in without), *(("--given", text) for text in given)):
+        match = _ITEM.fullmatch(text)
+        if match is None or match["name"] not in EFFECTS:
+            raise UsageError(
+                f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
+                f"{', '.join(sorted(EFFECTS))}"
+            )
+        where = match["where"]
+        new = Asked(option, text, where if where in (None, SENSOR) else int(where), match["name"])
+        for old in found:
+            same = old.name == new.name and (old.where == new.where or None in (old.where, new.where))
+            if same and old.option != option:
                 raise UsageError(
-                    f"--without {other.text}: found it beside --given {one.text}, expected one of them"
+                    f"{old.option} {old.text}: found it beside {option} {text}, expected one of them"
                 )
-    return [*absent, *known]
-
-
-def _asked(option: str, text: str) -> Asked:
-    match = _ITEM.fullmatch(text)
-    if match is None or match["name"] not in EFFECTS:
-        raise UsageError(
-            f"{option} {text}: found no effect of that name, expected NAME, N=NAME or sensor=NAME of "
-            f"{', '.join(sorted(EFFECTS))}"
-        )
-    where = match["where"]
-    return Asked(option, text, where if where in (None, SENSOR) else int(where), match["name"])
+        found.append(new)
+    return found
 
 
 def scope_of(asked: Iterable[Asked], joints: Mapping[int, Joint], known: Iterable[int] = ()) -> Scope:
@@ -332,54 +326,30 @@ def scope_of(asked: Iterable[Asked], joints: Mapping[int, Joint], known: Iterabl
     return Scope(frozenset(out), frozenset(known))
 
 
-def trusted(items: Iterable[str], joints: Mapping[int, Joint]) -> dict[str, float]:
-    """Return the factor on the default size of a prior that option --trust asks for, by the prior's name (`limits.PRIORS`).
+def trusted(items: Iterable[str]) -> dict[str, float]:
+    """Return the factor on the size of a prior that option --trust asks for, by the prior's name (`limits.PRIORS`).
 
-    Items are "NAME=SIZE": how far a value may be off, as a standard deviation. SIZE is in percent where the prior is
-    ("sensor_gain=5%": five times the default of 1 %), of the same thing as the prior, or in the unit of the effect's leading
-    parameter ("coulomb_friction=2Nm", "channel_delay=5ms"), where all joints then have one factor. Raises UsageError.
+    Items are "NAME=SIZE": how far a value may be off, as a standard deviation, in the unit of the prior ("sensor_gain=5%":
+    five times the default of 1 %; "channel_delay=5ms"). Raises UsageError.
     """
     found: dict[str, float] = {}
     for text in items:
-        name, _, size = text.partition("=")
+        name, _, asked = text.partition("=")
         if name not in PRIORS:
             raise UsageError(
                 f"--trust {text}: found {name!r}, expected NAME=SIZE with one of {', '.join(sorted(PRIORS))}"
             )
         if name in found:
             raise UsageError(f"--trust {text}: found {name} twice, expected one size")
-        found[name] = _factor(f"--trust {text}", name, size, joints)
+        default, size = _SIZE.match(PRIORS[name].text), _SIZE.fullmatch(asked.strip())
+        assert default is not None, f"the prior of {name} has no size in a unit"
+        if size is None or not 0.0 < float(size[1]) < math.inf or size[2] != default[2]:
+            raise UsageError(
+                f"--trust {text}: found {asked!r}, expected a number above 0 with the unit {default[2]} (default "
+                f"{PRIORS[name].text})"
+            )
+        found[name] = float(size[1]) / float(default[1])
     return found
-
-
-def _factor(item: str, name: str, asked: str, joints: Mapping[int, Joint]) -> float:
-    """Return the factor on the size of a prior that gives the size asked for. Raises UsageError."""
-    prior, own = PRIORS[name], _unit(name)
-    default = _PERCENT.match(prior.text)
-    fitting = " or ".join(filter(None, ("%" if default else "", own)))
-    expected = f"{fitting} (default {prior.text})"
-    size = _SIZE.fullmatch(asked.strip())
-    if size is None or not 0.0 < float(size["value"]) < math.inf:
-        raise UsageError(f"{item}: found {asked!r}, expected a number above 0 with a unit: {expected}")
-    value, unit = float(size["value"]), size["unit"].replace(" ", "")
-    if unit == "%" and default:
-        return value / float(default[1])
-    scale = _PREFIXES.get(unit.removesuffix(own)) if own and unit.endswith(own) else None
-    if scale is None:
-        raise UsageError(f"{item}: found {unit or 'no unit'!r}, expected {expected}")
-    sizes = [prior.size(joint, use) for joint in joints.values() for use in _USAGES]
-    if not sizes or max(sizes) > (1.0 + 1e-9) * min(sizes):
-        raise UsageError(
-            f"{item}: found {unit}, expected %: the default ({prior.text}) is not one size in {own} for these joints"
-        )
-    return value * scale / sizes[0]
-
-
-def _unit(name: str) -> str:
-    """Return the unit of the parameter that a prior is of, without spaces."""
-    effect, _, parameter = name.partition(".")
-    first, *others = EFFECTS[effect].parameters
-    return next((p.unit for p in others if p.name == parameter), first.unit).replace(" ", "")
 
 
 def motion_limits(text: str) -> dict[str, Any]:
@@ -403,14 +373,15 @@ def _percent(text: str) -> float:
 
 def _check_out(directory: Path, force: bool, inputs: Sequence[Path]) -> None:
     """Make DIR before minutes of work; refuse to overwrite, an input in any case. Raises ConfigError."""
-    own = {(directory / name).resolve() for name in _own()}
+    there = _own(directory)
+    own = {path.resolve() for path in there}
     if used := next((path for path in inputs if path.resolve() in own), None):
         raise ConfigError(f"--out {directory}: found the input {used} there, expected another directory")
     make_directory(directory)
-    there = [name for name in _own() if (directory / name).exists()]
     if there and not force:
+        names = ", ".join(path.name for path in there)
         raise ConfigError(
-            f"--out {directory}: found {', '.join(there)} in it, expected a directory without a diagnosis, or --force"
+            f"--out {directory}: found {names} in it, expected a directory without a diagnosis, or --force"
         )
 
 
@@ -438,8 +409,9 @@ def _write(
         texts[FINDINGS] = f"{_json(mapping)}\n"
         for name, text in texts.items():
             (fresh / name).write_text(text, encoding="utf-8")
-        for name in {*_own()} - {*names, FINDINGS}:
-            (directory / name).unlink(missing_ok=True)
+        for path in _own(directory):
+            if path.name not in {*names, FINDINGS}:
+                path.unlink()
         for name in (*names, FINDINGS):
             write_whole(directory / name, (fresh / name).read_bytes())
     return mapping
@@ -473,11 +445,6 @@ def extended(joint: Joint, number: int, findings: Findings, *, sha256: Mapping[s
     return with_effects_applied(whole)
 
 
-def extended_file(number: int) -> str:
-    """Return the name of the extended file of a joint where there are several."""
-    return f"extended.joint{number}.yaml"
-
-
 def extended_files(joints: Mapping[int, Joint], findings: Findings) -> dict[str, int]:
     """Return names of the files to write and the joint that each holds.
 
@@ -486,7 +453,7 @@ def extended_files(joints: Mapping[int, Joint], findings: Findings) -> dict[str,
     """
     largest_first = [*(c.joint for c in findings.causes), *(g.joint for g in findings.gaps), *sorted(joints)]
     first = next(int(number) for number in largest_first if number in joints)
-    return {EXTENDED: first} | {extended_file(number): number for number in sorted(joints) if len(joints) > 1}
+    return {EXTENDED: first} | {f"extended.joint{n}.yaml": n for n in sorted(joints) if len(joints) > 1}
 
 
 def extended_title(number: int, findings: Findings) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass
 from operator import attrgetter
@@ -353,18 +352,12 @@ class PriorRow(NamedTuple):
 
 def priors(trust: Mapping[str, float]) -> list[PriorRow]:
     """Return the priors in force; trust: factor on the size by name."""
-    scaled = {name: _scaled(prior.text, trust.get(name, 1.0)) for name, prior in PRIORS.items()}
-    return [PriorRow(name, text, name in trust) for name, text in scaled.items()]
-
-
-def _scaled(text: str, factor: float) -> str:
-    """Return the size of a prior in words times a factor: "10 %" by 0.5 is "5 %"."""
-    number = re.match(r"[\d.]+", text)
-    if factor == 1.0:
-        return text
-    if number is None:
-        return f"{factor:.3g} times {text}"
-    return f"{float(number[0]) * factor:.3g}{text[number.end() :]}"
+    rows = []
+    for name, prior in PRIORS.items():
+        size, _, unit = prior.text.partition(" ")
+        text = f"{float(size) * trust[name]:.3g} {unit}" if name in trust else prior.text
+        rows.append(PriorRow(name, text, name in trust))
+    return rows
 
 
 @dataclass(frozen=True)

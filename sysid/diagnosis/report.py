@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, Final, NamedTuple
 
@@ -427,7 +427,11 @@ def render(findings: Findings) -> str:
             (file, motion) for file, (motion, _) in motions_of(findings.next_experiment or {}).items()
         ],
     }
-    filters = {"number": number, "effect_title": effect_title, "in_words": in_words}
+    filters: dict[str, Callable[..., str]] = {
+        "number": number,
+        "effect_title": effect_title,
+        "in_words": in_words,
+    }
     return page.render("jtqd.sysid.diagnosis", TEMPLATE, content, filters)
 
 
