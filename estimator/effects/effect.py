@@ -478,12 +478,6 @@ class Effect:
         """Whether with these parameters it is the motor's encoder that reads wrong: by -G link_rad, motor side."""
         return False
 
-    def largest(self, joint: Joint, p: Values) -> float:
-        """Largest size of its leading parameter, beside the others of p, with which the joint would still move as without
-        it: one that would have to be larger to show is invisible, whatever its columns say of motions without it.
-        """
-        return math.inf
-
     def terms(self, joint: Joint) -> Terms:
         """Ways to look for it, one per column; the best is taken and its parameters refined."""
         return [self._term(column, joint) for column in self.columns]

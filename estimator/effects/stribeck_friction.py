@@ -23,10 +23,6 @@ VELOCITIES_RAD_S = (0.02, 0.035, 0.05, 0.08, 0.12, 0.2)
 """Grid of the search, the joint file's own beside it; the fit refines it."""
 
 _LOW, _HIGH = 1e-3, 3.0
-_HELD_PER_S = 20.0
-"""A third of the bandwidth [rad/s] of a usual velocity loop, so that a peak three times as high is still held."""
-_LEAST_COULOMB = 0.05
-"""Of the rated torque, where the file has an efficiency and hardly any friction beside it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,16 +73,6 @@ class StribeckFriction(Effect):
             old = v / own.stribeck_velocity_rad_s
             peak = peak - own.stribeck_nm * x.exp(-old * old)
         return peak * s.direction
-
-    def largest(self, joint: Joint, p: Values) -> float:
-        """Return the height at which friction falls with velocity as steeply as a drive can hold, peak slope over inertia
-        sqrt(2/e) Fs/(vs J) = _HELD_PER_S, and at most half the Coulomb friction. Beyond, the joint sticks and jumps where it
-        has crept before: the slow samples in which the peak's foot would show are not there any more.
-        """
-        friction, inertia = joint.friction, joint.gear_ratio**2 * joint.rotor_inertia_kgm2
-        velocity = p.get("stribeck_velocity_rad_s", friction.stribeck_velocity_rad_s)
-        held = _HELD_PER_S * inertia * velocity / math.sqrt(2.0 / math.e)
-        return min(held, 0.5 * max(friction.coulomb_nm, _LEAST_COULOMB * joint.rated_torque_nm))
 
     def terms(self, joint: Joint) -> Terms:
         """Return one column per velocity; where the file has a peak itself, its height and a second peak."""

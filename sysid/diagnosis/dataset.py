@@ -15,10 +15,11 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import permutations
+from itertools import permutations, product
 from typing import Any, Final
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 from jtqd.estimator.effects import EFFECTS
@@ -69,6 +70,8 @@ _SAME_HZ: Final = 0.3
 _DRAWS: Final = 6
 """Fixed-point steps to the current that a file with effects draws."""
 _NAMED: Final = re.compile(r"(?P<of>.+) \((?P<piece>\d+) of (?P<all>\d+)\)")
+_ENDS: Final = 5
+"""Samples whose mean is the velocity at an end of a run."""
 _CUT_STEPS: Final = 3.0
 """Sampling steps between two pieces that were cut apart without a loss."""
 _LOST_S: Final = 1.0
@@ -213,11 +216,13 @@ def usable_signals(
             out.append([without_known_effects(s) for s in about_zero(mine, bases)])
     out, apart = with_the_same_joints(out)
     reasons += apart
-    _same_balances(out)
-    out = [with_one_sensor(run) for run in out]
-    if not out:
-        return [], reasons or ["found no usable run"]
-    return out, reasons
+    # what is stacked must be there in all runs
+    lacking = {s.number for run in out for s in run if s.torsion_nm is None}
+    out = [
+        [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
+        for run in out
+    ]
+    return [with_one_sensor(run) for run in out], reasons or ([] if out else ["found no usable run"])
 
 
 def with_the_same_joints(
@@ -257,38 +262,28 @@ def recordings(runs: Sequence[Sequence[JointSignals]]) -> list[int]:
     another ends. Where stamps begin at zero again, two runs are one recording only if the joint moves at the cut: many runs
     begin and end at rest in the same place.
     """
-    root = list(range(len(runs)))
+    names = [_NAMED.fullmatch(run[0].run) for run in runs]
+    joined = np.zeros((len(runs), len(runs)), bool)
     for a, b in permutations(range(len(runs)), 2):
-        names = runs[a][0].run, runs[b][0].run
-        if _same_name(*names) or (_may_follow(*names) and _goes_on(runs[a], runs[b])):
-            old, new = max(root[a], root[b]), min(root[a], root[b])
-            root = [new if r == old else r for r in root]
-    order = sorted(set(root))
-    return [order.index(r) for r in root]
+        one, two = names[a], names[b]
+        same = one is not None and two is not None and one["of"] == two["of"]
+        # of a recording in pieces only the last one ends, and the first begins
+        may_follow = (one is None or one["piece"] == one["all"]) and (two is None or two["piece"] == "1")
+        joined[a, b] = same or (may_follow and _goes_on(runs[a], runs[b]))
+    labels: list[int] = connected_components(joined, directed=False)[1].tolist()
+    return labels
 
 
 def piece_notes(runs: Sequence[Sequence[JointSignals]]) -> list[str]:
     """Return one line per recording that came in pieces."""
-    numbers = recordings(runs)
-    out = []
-    for k in range(max(numbers, default=-1) + 1):
-        names = [run[0].run for run, n in zip(runs, numbers, strict=True) if n == k]
-        if len(names) > 1:
-            out.append(f"{', '.join(names)}: pieces of one recording: they count as one run")
-    return out
-
-
-def _same_name(a: str, b: str) -> bool:
-    one, two = _NAMED.fullmatch(a), _NAMED.fullmatch(b)
-    return one is not None and two is not None and one["of"] == two["of"]
-
-
-def _may_follow(a: str, b: str) -> bool:
-    """Return whether run b may go on where a ends: of a recording in pieces only the last one ends, and the first begins."""
-    one, two = _NAMED.fullmatch(a), _NAMED.fullmatch(b)
-    ends = one is None or one["piece"] == one["all"]
-    begins = two is None or two["piece"] == "1"
-    return ends and begins
+    pieces: dict[int, list[str]] = {}
+    for run, number in zip(runs, recordings(runs), strict=True):
+        pieces.setdefault(number, []).append(run[0].run)
+    return [
+        f"{', '.join(names)}: pieces of one recording: they count as one run"
+        for names in pieces.values()
+        if len(names) > 1
+    ]
 
 
 def _goes_on(before: Sequence[JointSignals], after: Sequence[JointSignals]) -> bool:
@@ -300,7 +295,7 @@ def _goes_on(before: Sequence[JointSignals], after: Sequence[JointSignals]) -> b
     moving = False
     for one, two in zip(before, after, strict=True):
         a, b = one.state, two.state
-        speeds = [_mean(a.velocity_rad_s, -1), _mean(b.velocity_rad_s, 0)]
+        speeds = [float(np.mean(a.velocity_rad_s[-_ENDS:])), float(np.mean(b.velocity_rad_s[:_ENDS]))]
         reach = float(np.ptp(a.velocity_rad_s)) + float(np.ptp(b.velocity_rad_s))
         short = gap <= _CUT_STEPS * step
         if short and abs(speeds[1] - speeds[0]) > _SPEED_CHANGE * reach:
@@ -314,11 +309,6 @@ def _goes_on(before: Sequence[JointSignals], after: Sequence[JointSignals]) -> b
         if np.isfinite(warm) and abs(warm) > _WARMER_K:
             return False
     return stamped or moving
-
-
-def _mean(x: FloatArray, end: int) -> float:
-    """Return the mean of the first (0) or last (-1) five samples."""
-    return float(np.mean(x[:5] if end == 0 else x[-5:]))
 
 
 def too_little(signals: Sequence[Sequence[JointSignals]]) -> str | None:
@@ -350,13 +340,6 @@ def resolution_notes(signals: Sequence[Sequence[JointSignals]]) -> list[str]:
     ]
 
 
-def _same_balances(runs: list[list[JointSignals]]) -> None:
-    """Leave out the torsion balance of a joint that not every run has: what is stacked must be there in all."""
-    lacking = {s.number for run in runs for s in run if s.torsion_nm is None}
-    for run in runs:
-        run[:] = [replace(s, torsion_nm=None, twist_rad=None) if s.number in lacking else s for s in run]
-
-
 def without_known_effects(s: JointSignals) -> JointSignals:
     """Return the signals less what the joint file's own effects explain, at the torsion that the encoders saw and the
     current that the simulation with them draws; the current that other effects see is that of the simulation without them.
@@ -384,8 +367,7 @@ def build_dataset(
     """Return binned residuals, candidates, unknown lines and zero readings of these runs [run][joint]."""
     every = [s for run in signals for s in run]
     step = bin_samples(every) * max(s.step_s for s in every)
-    candidates = library_candidates(signals, joints, scope)
-    candidates += _whole_orders(signals, candidates, scope)
+    candidates = _whole_orders(signals, library_candidates(signals, joints, scope), scope)
     groups = families(signals, unknown_lines(signals, candidates, step))
     no_torque = bool(scope.known_references & set(joints))
     if no_torque:  # a known load has no zero that differs from run to run
@@ -410,25 +392,25 @@ def library_candidates(
 ) -> list[EffectCandidate]:
     """Return every term of every effect of the scope that these runs have the channels for, columns numbered."""
     out: list[EffectCandidate] = []
-    first = 0
-    for effect in EFFECTS.values():
-        for s in signals[0]:
-            n = s.number
-            for term in effect.terms(joints[n]):
-                at_sensor = effect.at_sensor_of(term.basis[0])
-                if at_sensor and n != signals[0][0].number:
-                    continue
-                where: JointName = "sensor" if at_sensor else n
-                if not scope.looks_for(effect.name, where, n) or not _has_channels(effect, signals, n):
-                    continue
-                shown = contribution(effect, term.basis[0], s)
-                size = max((float(np.abs(v).max()) for v in shown.values()), default=0.0)
-                if size > 0.0 and np.isfinite(size):
-                    out.append(
-                        EffectCandidate(effect, where, term, first, effect.largest(joints[n], term.basis[-1]))
-                    )
-                    first += len(term.basis)
+    for effect, s in product(EFFECTS.values(), signals[0]):
+        for term in effect.terms(joints[s.number]):
+            at_sensor = effect.at_sensor_of(term.basis[0])
+            if at_sensor and s is not signals[0][0]:
+                continue
+            where: JointName = "sensor" if at_sensor else s.number
+            if not scope.looks_for(effect.name, where, s.number) or not _has_channels(
+                effect, signals, s.number
+            ):
+                continue
+            shown = contribution(effect, term.basis[0], s)
+            size = max((float(np.abs(v).max()) for v in shown.values()), default=0.0)
+            if size > 0.0 and np.isfinite(size):
+                out.append(EffectCandidate(effect, where, term, _next_column(out)))
     return out
+
+
+def _next_column(candidates: Sequence[EffectCandidate]) -> int:
+    return candidates[-1].columns.stop if candidates else 0
 
 
 def _has_channels(effect: Effect, signals: Sequence[Sequence[JointSignals]], number: int) -> bool:
@@ -444,28 +426,27 @@ def _has_channels(effect: Effect, signals: Sequence[Sequence[JointSignals]], num
 def _whole_orders(
     signals: Sequence[Sequence[JointSignals]], candidates: Sequence[EffectCandidate], scope: Scope
 ) -> list[EffectCandidate]:
-    """Return waves at whole orders that stand out of the residual's order spectrum, of effects that may have any."""
-    first = candidates[-1].columns.stop if candidates else 0
-    out: list[EffectCandidate] = []
+    """Return the candidates and waves at whole orders that stand out of the residual's order spectrum, of effects that may
+    have any.
+    """
+    out = list(candidates)
     coarsest = max(s.step_s for run in signals for s in run)
     step = coarsest * max(1, round(ORDER_STEP_S / coarsest))
     bare = binned_runs(signals, step)
-    for effect in (e for e in EFFECTS.values() if e.whole_orders):
+    for effect, s in product((e for e in EFFECTS.values() if e.whole_orders), signals[0]):
+        if not scope.looks_for(effect.name, s.number, s.number):
+            continue
+        channel = Channel(s.number, "motor")
+        parts = [np.where(r.channels[channel].valid, r.channels[channel].residual, np.nan) for r in bare]
+        mine = (c for c in candidates if c.key == (effect.name, s.number))
+        there = {round(c.term.basis[0]["order_per_motor_rev"]) for c in mine}
         orders = np.array(effect.whole_orders, np.float64)
-        for s in signals[0]:
-            if not scope.looks_for(effect.name, s.number, s.number):
-                continue
-            channel = Channel(s.number, "motor")
-            parts = [np.where(r.channels[channel].valid, r.channels[channel].residual, np.nan) for r in bare]
-            mine = (c for c in candidates if c.key == (effect.name, s.number))
-            there = {round(c.term.basis[0]["order_per_motor_rev"]) for c in mine}
-            for line in order_lines(bare, {channel: parts}, step, orders)[:_MOST_LINES]:
-                order = round(line.order)
-                term = effect.term_of_order(float(order))
-                if term is not None and order not in there:
-                    out.append(EffectCandidate(effect, s.number, term, first))
-                    first += len(term.basis)
-                    there.add(order)
+        for line in order_lines(bare, {channel: parts}, step, orders)[:_MOST_LINES]:
+            order = round(line.order)
+            term = effect.term_of_order(float(order))
+            if term is not None and order not in there:
+                out.append(EffectCandidate(effect, s.number, term, _next_column(out)))
+                there.add(order)
     return out
 
 

@@ -74,15 +74,16 @@ def diagnose(
         )
     applied = {n: with_effects_applied(joint) for n, joint in joints.items()}
     findings = _diagnosed(runs, applied, numbers, scope, relevance, trust)
-    for n in numbers:
-        new = {c.name for c in findings.causes if shows_at(c.joint, n)}
-        kept = tuple(e for e in applied[n].effects if e.name not in new)
-        if len(kept) < len(applied[n].effects):
-            applied[n] = replace(applied[n], effects=kept)
-    if any(len(with_effects_applied(joints[n]).effects) > len(applied[n].effects) for n in numbers):
-        whole = _diagnosed(runs, applied, numbers, scope, relevance, trust)
-        findings = replace(whole, gaps=findings.gaps)
-    return findings
+    kept = {n: _without_found(joint, n, findings) for n, joint in applied.items()}
+    if all(len(kept[n].effects) == len(joint.effects) for n, joint in applied.items()):
+        return findings
+    return replace(_diagnosed(runs, kept, numbers, scope, relevance, trust), gaps=findings.gaps)
+
+
+def _without_found(joint: Joint, number: int, findings: Findings) -> Joint:
+    """Return the joint without those of its effects that have the name of a cause."""
+    names = {c.name for c in findings.causes if shows_at(c.joint, number)}
+    return replace(joint, effects=tuple(e for e in joint.effects if e.name not in names))
 
 
 def _diagnosed(  # noqa: PLR0917
@@ -202,10 +203,9 @@ def one_sensor(runs: Sequence[tuple[str, RunTable]], numbers: Sequence[int]) -> 
     for _, table in runs:
         columns = [table.joints[n].torque_nm for n in numbers if n in table.joints]
         there = [c for c in columns if c is not None]
-        for other in there[1:]:
-            scale = max(float(np.abs(there[0]).max()), 1e-9)
-            if float(np.abs(there[0] - other).max()) > 1e-6 * scale:
-                return False
+        scale = max(float(np.abs(there[0]).max()), 1e-9) if there else 1.0
+        if any(float(np.abs(there[0] - other).max()) > 1e-6 * scale for other in there[1:]):
+            return False
     return True
 
 

@@ -143,11 +143,6 @@ class Cause:
     matters: bool = True  # above the relevance
 
     @property
-    def key(self) -> tuple[object, ...]:
-        """Effect, joint, and what tells several of one effect apart."""
-        return self.name, self.joint, *(v.value for v in self.parameters.values() if not v.fitted)
-
-    @property
     def leading(self) -> str:
         """The parameter that stands for it: the first that is fitted, else the first; "" without one."""
         fitted = [name for name, value in self.parameters.items() if value.fitted]
@@ -220,10 +215,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Gap:
-    """One balance of one joint: residual of the simulation, noise floor, where it lives (largest share first).
-
-    map: all bins of all axes, for the report's picture; localisation holds the few that matter.
-    """
+    """One balance of one joint: residual of the simulation, noise floor, where it lives (largest share first)."""
 
     joint: int
     balance: str
@@ -231,7 +223,6 @@ class Gap:
     noise_floor_nm: float
     floor_from: str  # "repeated runs" or "what no effect and no map can explain"
     localisation: tuple[Place, ...]
-    map: tuple[Place, ...] = field(default=(), repr=False)
 
 
 class RunGain(NamedTuple):
@@ -262,7 +253,7 @@ class Trace:
     """For plots: one run, one joint, one balance, binned; arrays [n].
 
     before_nm, after_nm: measured less simulated, by the joint file and with the entries found; measured_nm: motor torque
-    G Kt i at the joint (motor), or the torque that the twist makes (torsion); velocity_rad_s, torque_nm: of the joint.
+    G Kt i at the joint (motor), or the torque that the twist makes (torsion); velocity_rad_s: of the joint.
     """
 
     run: str
@@ -272,7 +263,6 @@ class Trace:
     before_nm: FloatArray
     after_nm: FloatArray
     velocity_rad_s: FloatArray
-    torque_nm: FloatArray
     measured_nm: FloatArray
 
 

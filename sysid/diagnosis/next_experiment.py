@@ -15,6 +15,7 @@ from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
+from scipy.stats import binned_statistic
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
@@ -105,11 +106,9 @@ def next_experiment(
     one, else the plan does not supervise it; signals: of one joint, its runs so far. Raises ValueError without a joint.
     """
     classes = [tuple(names) for names in classes]
-    if len(joints) == 1:
-        [(number, joint)] = joints.items()
-        return _of_one_joint(classes, number, why, joint, signals)
-    if len(joints) > 2:
-        return each_joint({n: _of_one_joint(classes, n, why, joint, ()) for n, joint in joints.items()})
+    if len(joints) != 2:
+        runs = signals if len(joints) == 1 else ()
+        return each_joint({n: _of_one_joint(classes, n, why, joint, runs) for n, joint in joints.items()})
     kinds, reach = kinds_for(classes), pair_range_of(joints, temperature=temperature)
     plan = Plan("next_" + "_".join(kinds), replace(reach.limits, travel_rad=1e3), pair_runs(kinds, reach))
     travel = 1.1 * max(travel_rad(one) for one in check_plan(plan).values()) + 1.0
@@ -134,7 +133,7 @@ def each_joint(experiments: Mapping[int, Mapping[str, Any]]) -> dict[str, Any]:
     "why", "motion"}, ..], "tables": {number: CSV}}, tables for those with a motion. Raises ValueError without any.
     """
     if not experiments:
-        raise ValueError("found no experiment, expected at least one")
+        raise ValueError("joints: found none, expected at least one")
     if len(experiments) == 1:
         [only] = experiments.values()
         return dict(only)
@@ -246,33 +245,22 @@ def _calm_stretch(
     position: FloatArray, torque: FloatArray, low: float, high: float, bound: float
 ) -> tuple[float, float] | None:
     """Return the longest stretch of low..high in which the runs needed at most `bound`; None: nowhere."""
-    edges = np.linspace(low, high, _BINS + 1)
-    inside = (position >= low) & (position <= high)
-    at = np.minimum(np.searchsorted(edges, position[inside], side="right") - 1, _BINS - 1)
-    peak = np.full(_BINS, -np.inf)
-    np.maximum.at(peak, at, torque[inside])
-    been = np.isfinite(peak)  # a bin that no run has been in is not known to be calm
-    calm = np.concatenate(([0], (been & (peak <= bound)).astype(int), [0]))
-    starts, ends = np.flatnonzero(np.diff(calm) > 0), np.flatnonzero(np.diff(calm) < 0)
+    peak, edges, _ = binned_statistic(position, torque, "max", _BINS, (low, high))
+    # a bin that no run has been in (NaN) is not known to be calm
+    steps = np.diff(np.concatenate(([0], peak <= bound, [0])))
+    starts, ends = np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
     if not len(starts):
         return None
     k = int(np.argmax(ends - starts))
-    if edges[ends[k]] - edges[starts[k]] < _LEAST_TRAVEL_RAD:
-        return None
-    return float(edges[starts[k]]), float(edges[ends[k]])
-
-
-def joint_motion_file(number: int) -> str:
-    """Return the name of the motion of a joint where several have one."""
-    return f"next_experiment.joint{number}.motion.csv"
+    first, last = float(edges[starts[k]]), float(edges[ends[k]])
+    return (first, last) if last - first >= _LEAST_TRAVEL_RAD else None
 
 
 def motions_of(experiment: Mapping[str, Any]) -> dict[str, tuple[Mapping[str, Any], str]]:
     """Return each motion of an experiment and its table by the name of its file."""
     tables = experiment.get("tables") or {}
     made = [(MOTION_FILE, experiment.get("motion"), experiment.get("table", ""))]
-    made += [
-        (joint_motion_file(each["joint"]), each["motion"], tables.get(each["joint"], ""))
-        for each in experiment.get("joints", ())
-    ]
+    for each in experiment.get("joints", ()):
+        n = each["joint"]
+        made.append((f"next_experiment.joint{n}.motion.csv", each["motion"], tables.get(n, "")))
     return {file: (motion, table) for file, motion, table in made if motion}

@@ -174,8 +174,8 @@ class Comparison:
         here: list[int] = []
         off: list[tuple[int, int]] = []
         while blocks and len(here) < _MOST_COLUMNS:
-            falls = explained_each(self.total, here, [block for block, _, _ in blocks])
-            worth = [fall - cost for fall, (_, _, cost) in zip(falls, blocks, strict=True)]
+            before = explained(self.total, here)
+            worth = [explained(self.total, [*here, *block]) - before - cost for block, _, cost in blocks]
             if max(worth) < ENTER:
                 break
             block, new, _ = blocks.pop(int(np.argmax(worth)))
@@ -193,7 +193,7 @@ class Comparison:
     def drop(self, chosen: Sequence[int], off: Sequence[tuple[int, int]], r: int, k: int) -> float:
         """Return by how much deviation k of run r lowers the squared error beside the effects and other runs' deviations."""
         beside = [*chosen, *(self.place(*at) for at in off if at[0] != r)]
-        return explained_each(self.total, beside, [[self.place(r, k)]])[0]
+        return explained(self.total, [*beside, self.place(r, k)]) - explained(self.total, beside)
 
     def explains_what_is_apart(
         self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
@@ -324,38 +324,19 @@ def apart_from_others(own: FloatArray, r: int, usual: float) -> tuple[float, flo
 
 
 def solve(total: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
-    """Return least squares of the first k columns for the last, and its covariance."""
-    covariance = _inverses(total[None, :k, :k])[0]
+    """Return least squares of the first k columns for the last, and its covariance, with a little of the diagonal added."""
+    gram = total[:k, :k]
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-30))
+    scaled = gram * scale[:, None] * scale + _RIDGE * np.eye(k)
+    covariance = np.linalg.inv(scaled) * scale[:, None] * scale
     return covariance @ total[:k, k], covariance
 
 
-def _inverses(grams: FloatArray) -> FloatArray:
-    """Return the inverse of each of these normal equations [m, k, k], with a little of their diagonals added."""
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(grams, axis1=1, axis2=2), 1e-30))
-    scaled = grams * scale[:, :, None] * scale[:, None, :] + _RIDGE * np.eye(grams.shape[1])
-    inverses: FloatArray = np.linalg.inv(scaled) * scale[:, :, None] * scale[:, None, :]
-    return inverses
-
-
-def explained_each(total: FloatArray, chosen: Sequence[int], extras: Sequence[Sequence[int]]) -> list[float]:
-    """Return by how much each of these sets of columns lowers the sum of squares beyond `chosen` (last row: residual); those
-    of one length are solved together, which is several times faster.
-    """
-    [before] = _lowered(total, [list(chosen)])
-    after = [0.0] * len(extras)
-    for length in {len(extra) for extra in extras}:
-        mine = [n for n, extra in enumerate(extras) if len(extra) == length]
-        for n, square in zip(mine, _lowered(total, [[*chosen, *extras[n]] for n in mine]), strict=True):
-            after[n] = square
-    return [square - before for square in after]
-
-
-def _lowered(total: FloatArray, sets: Sequence[Sequence[int]]) -> list[float]:
-    """Return by how much each of these sets of columns, all of one length, lowers the sum of squares."""
-    places = np.array(sets, np.intp)
-    rights = total[places, -1]
-    covariances = _inverses(total[places[:, :, None], places[:, None, :]])
-    return [float((c @ right) @ right) for c, right in zip(covariances, rights, strict=True)]
+def explained(total: FloatArray, columns: Sequence[int]) -> float:
+    """Return by how much these columns lower the sum of squares (last row: residual)."""
+    at = np.array([*columns, -1], np.intp)
+    beta, _ = solve(total[at[:, None], at], len(columns))
+    return float(beta @ total[at[:-1], -1])
 
 
 def within(candidate: EffectCandidate, coefficients: Sequence[float]) -> bool:

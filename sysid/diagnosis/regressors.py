@@ -39,15 +39,12 @@ LONG_S: Final = 600.0
 
 @dataclass(frozen=True)
 class EffectCandidate:
-    """One way in which one effect of one joint (or of the sensor) could be there: columns first..first+size; largest: see
-    `Effect.largest`.
-    """
+    """One way in which one effect of one joint (or of the sensor) could be there: columns first..first+size."""
 
     effect: Effect
     joint: JointName
     term: Term
     first: int
-    largest: float = math.inf
 
     @property
     def size(self) -> int:

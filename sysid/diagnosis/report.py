@@ -198,22 +198,20 @@ def _gain(gain: Gain | None) -> str:
     before, after = gain.rmse_before_nm, gain.rmse_after_nm
     if after >= before:
         return f"the extended model errs by {short(after)} Nm on held-out runs, no less than the joint file"
-    old, new = short(before), short(after)
-    if old == new:
-        old, new = pair(before, after)
+    same = short(before) == short(after)
+    old, new = pair(before, after) if same else (short(before), short(after))
     return f"the extended model errs by {new} instead of {old} Nm on held-out runs"
 
 
 def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:
     found = interval = ""
-    if cause.leading:
-        value = cause.parameters[cause.leading]
-        found, interval = with_interval(value.value, value.ci95, value.unit, in_file(cause, files))
     more = []
     for name, v in cause.parameters.items():
-        if name not in {cause.leading, "channel"}:
-            given = f"{v.value:g} {unit_name(v.unit)}".rstrip()
-            more.append(f"{parameter_title(name)} {rounded(v.value, v.unit) if v.fitted else given}")
+        if name == cause.leading:
+            found, interval = with_interval(v.value, v.ci95, v.unit, in_file(cause, files))
+        elif name != "channel":
+            size = rounded(v.value, v.unit) if v.fitted else f"{v.value:g} {unit_name(v.unit)}".rstrip()
+            more.append(f"{parameter_title(name)} {size}")
     title, share = effect_title(cause.name), _percent(cause.explained_share)
     return Row(place(cause.joint), title, found, interval, share, _grade(cause), ", ".join(more))
 

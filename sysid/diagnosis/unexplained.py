@@ -21,7 +21,7 @@ from jtqd.sysid.diagnosis.entries import set_state
 from jtqd.sysid.diagnosis.findings import Gap, Place, Present, Trace, shows_at
 from jtqd.sysid.diagnosis.regressors import LINE, Index, binned, contribution
 from jtqd.sysid.diagnosis.signals import Channel, JointSignals
-from jtqd.sysid.diagnosis.structure import AXES, Balance, View, autoregression, bins_of, events, pursue
+from jtqd.sysid.diagnosis.structure import AXES, Balance, View, autoregression, events, pursue
 
 _MOST_OF_THE_TIME: Final = 0.1
 """What takes more of the time than this is no event but a condition."""
@@ -224,10 +224,7 @@ def channel_gaps(left: Remaining, found: Unexplained, matters: bool) -> tuple[Ga
         views = found.views.get(channel, ()) if matters else pursue(balance, x)
         ranked = [_places(v, x, noise, max(rmse**2 - noise**2, 1e-30)) for v in views]
         places = (*(each[0] for each in ranked), *(p for each in ranked for p in each[1:]))
-        drawn = [(axis, bins_of(balance, axis, x)) for axis in AXES]
-        every = [p for axis, bins in drawn if bins for p in _bins(axis, *bins, x, noise)]
-        seen = tuple(p for p in every if np.isfinite(p.rms_nm))
-        out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, places, seen))
+        out.append(Gap(channel.joint, channel.balance, rmse, floor, origin, places))
     if matters:  # what is not explained comes first, wherever the gap is largest
         energy = found.by_channel()
         return tuple(sorted(out, key=lambda g: -energy.get(Channel(g.joint, g.balance), 0.0)))
@@ -318,7 +315,7 @@ def traces(left: Remaining) -> tuple[Trace, ...]:
         for c in run.channels:
             axes = run.axes[c.joint]
             measured = binned(_measured(signals[c.joint], c.balance), run.samples)
-            curves = (left.before[c][r], left.after[c][r], axes["velocity"], axes["load"], measured)
+            curves = (left.before[c][r], left.after[c][r], axes["velocity"], measured)
             shown = [x[::every] for x in (run.time_s, *curves)]
             out.append(Trace(run.name, c.joint, c.balance, *shown))
     return tuple(out)

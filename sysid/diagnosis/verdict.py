@@ -1,4 +1,9 @@
-"""Verdict: the entries of the set with grade, interval and size, what remains, and what these runs cannot tell.
+"""Verdict: the values that predict and their gain on held-out runs; the entries of the set with grade, interval and size;
+what remains, and what these runs cannot tell.
+
+Evidence distinguishes sets; what predicts is another estimate, without discrepancy: a mixture of the set and of the set with
+all values of the file, each under its priors (`stacked`). Errors are in Nm. The response of each balance has weight one, so
+an error is that of the current that the simulation needs (as torque, G Kt i) and of the twist.
 
 An entry is *certain* where nothing of `grade_of` speaks against it, *one of* where a set without it has nearly as much
 evidence, else *effective*: it predicts. One relevance decides the verdict, for entries and for what remains alike.
@@ -9,14 +14,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.effects import EFFECTS
-from jtqd.estimator.effects.effect import Effect
+from jtqd.estimator.effects.effect import TORSION, Effect
 from jtqd.sysid.diagnosis import limits
 from jtqd.sysid.diagnosis.dataset import Dataset
 from jtqd.sysid.diagnosis.entries import Entry, present_effects
@@ -32,17 +37,19 @@ from jtqd.sysid.diagnosis.findings import (
     CandidateEvidence,
     Cause,
     Findings,
+    Gain,
     JointName,
     Present,
+    RunGain,
     Scope,
     UnexplainedResidual,
     Untold,
     Value,
     joint_text,
 )
-from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, fits_without, gain_of, predict
 from jtqd.sysid.diagnosis.model import Solution, recorded
 from jtqd.sysid.diagnosis.next_experiment import next_experiment
+from jtqd.sysid.diagnosis.regressors import Index, RunData
 from jtqd.sysid.diagnosis.signals import Channel
 from jtqd.sysid.diagnosis.unexplained import (
     Unexplained,
@@ -55,6 +62,186 @@ from jtqd.sysid.diagnosis.unexplained import (
 )
 
 _Z95: Final = 1.96
+_BOOTSTRAPS: Final = 2000
+_NONE: Final = 1e-12
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The set that predicts: entries, their scaled coefficients, and per channel and recording the sums of squares before
+    and after [Nm^2], each recording with the coefficients of all others, and the count of bins [r, 3].
+    """
+
+    chosen: Set
+    mean: FloatArray
+    squares: dict[Channel, FloatArray]
+
+
+def predict(solution: Solution) -> Prediction:
+    """Return what predicts: between the set and the set with all values of the file what held-out runs want, without entries
+    whose size differs from run to run by more than itself: without these the error is less.
+    """
+    grams, counts = _grams(solution)
+    without = fits_without(solution)
+    chosen = solution.chosen
+    while chosen:
+        sizes = Sizes(without, chosen)
+        places = without[-1].places(chosen)
+        differs = {k: sizes.over_runs(np.arange(s.start, s.stop))[0] for k, s in places.items()}
+        worst = max(differs, key=differs.__getitem__)
+        if not 1.0 < differs[worst] < math.inf:
+            break
+        chosen -= {worst}
+    slots = {solution.entries[k].slot for k in chosen}
+    values = {k for k, e in enumerate(solution.entries) if e.prior.file and e.slot not in slots}
+    wide = chosen | values - solution.equations.noisy
+    part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
+    mixed = [_coefficients(sets, chosen) + part * _added(sets, chosen, wide) for sets in without]
+    contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
+    squares = {
+        c: np.array(
+            [
+                (run[c][-1, -1], max(float(contrast @ run[c] @ contrast), 0.0), count[c])
+                for run, contrast, count in zip(grams, contrasts, counts, strict=True)
+            ]
+        )
+        for c in grams[0]
+    }
+    named = wide if part > 0.0 else chosen
+    return Prediction(named, mixed[-1][without[-1].columns(named)], squares)
+
+
+def stacked(
+    grams: Sequence[dict[Channel, FloatArray]], without: Sequence[Sets], chosen: Set, wide: Set
+) -> float:
+    """Return the part of the wide set, 0 to 1, at which the mixture of two sets errs least on held-out runs (stacking:
+    Wolpert 1992, Neural Networks 5; Yao et al. 2018, Bayesian Analysis 13).
+    """
+    slope = curvature = 0.0
+    for run, sets in zip(grams, without[:-1], strict=True):
+        few, step = _coefficients(sets, chosen), _added(sets, chosen, wide)
+        for gram in run.values():
+            slope += float(step @ (gram[:-1, -1] - gram[:-1, :-1] @ few))
+            curvature += float(step @ gram[:-1, :-1] @ step)
+    return min(max(slope / curvature, 0.0), 1.0) if curvature > 0.0 else 0.0
+
+
+def _coefficients(sets: Sets, chosen: Set) -> FloatArray:
+    """Return the coefficients of all entries with this set [E]."""
+    out = np.zeros(len(sets.gram) - 1)
+    out[sets.columns(chosen)] = sets.fit(chosen).mean
+    return out
+
+
+def _added(sets: Sets, chosen: Set, wide: Set) -> FloatArray:
+    """Return what a wide set adds to a set whose entries keep their sizes [E]: those are where simulations settled."""
+    left = np.eye(len(sets.gram))
+    left[:-1, -1] = -_coefficients(sets, chosen)
+    return _coefficients(Sets(sets.entries, left.T @ sets.gram @ left), wide - chosen)
+
+
+def fits_without(solution: Solution) -> list[Sets]:
+    """Return the sets without each recording in turn, and with all (of one recording: with it); without discrepancy."""
+    plain = {
+        g: v if isinstance(g, tuple) and g[0] == "family" else _NONE for g, v in solution.variances.items()
+    }
+    *without, everything = solution.equations.marginal(plain)
+    if len(without) == 1:
+        without = [everything]
+    return [Sets(solution.entries, gram) for gram in (*without, everything)]
+
+
+class Sizes:
+    """The size of an effect in each recording alone, beside all others of a set with the values of all recordings."""
+
+    def __init__(self, without: Sequence[Sets], chosen: Set) -> None:
+        """Take the sets without each recording in turn, and with all."""
+        everything = without[-1]
+        self._mean = everything.fit(chosen).mean
+        at = np.append(everything.columns(chosen), -1)
+        total = everything.gram[np.ix_(at, at)]
+        self._runs = [total - sets.gram[np.ix_(at, at)] for sets in without[:-1]]
+
+    def over_runs(self, at: Index) -> tuple[float, float]:
+        """Return how much the size of the coefficients at these places of the set differs from recording to recording (rms,
+        each weighted by what it holds of it), and the standard error of its mean, parts of it; inf with one recording.
+        """
+        energy, lacking, count = 0.0, 0.0, 0
+        for gram in self._runs:
+            own = float(self._mean[at] @ gram[np.ix_(at, at)] @ self._mean[at])
+            more = float(self._mean[at] @ (gram[at, -1] - gram[at, :-1] @ self._mean))
+            if own > 0.0:
+                energy, lacking, count = energy + own, lacking + more**2 / own, count + 1
+        if count < 2:
+            return math.inf, math.inf
+        differs = math.sqrt(lacking / energy)
+        return differs, differs / math.sqrt(count - 1)
+
+
+def _grams(solution: Solution) -> tuple[list[dict[Channel, FloatArray]], list[dict[Channel, int]]]:
+    """Return per recording and channel the normal equations over [entries, response] in Nm, less what noise of torques puts
+    into the columns, and the count of bins.
+    """
+    weights = solution.transform()
+    pieces = solution.dataset.recordings
+    channels = list(solution.runs[0].channels)
+    grams = [{c: np.zeros((weights.shape[1] + 1,) * 2) for c in channels} for _ in range(max(pieces) + 1)]
+    counts = [dict.fromkeys(channels, 0) for _ in grams]
+    noisy = {run.name: run for run in solution.disturbed}
+    for r, run in enumerate(solution.runs):
+        for c in channels:
+            x = _rows(run, c, weights)
+            counts[pieces[r]][c] += len(x)
+            grams[pieces[r]][c] += x.T @ x
+            if run.name in noisy:
+                noise = _rows(noisy[run.name], c, weights, run) - x
+                extra = noise.T @ noise
+                extra[-1, -1] = 0.0
+                grams[pieces[r]][c] -= extra
+    return grams, counts
+
+
+def _rows(run: RunData, channel: Channel, weights: FloatArray, valid_of: RunData | None = None) -> FloatArray:
+    """Return columns of entries and response in Nm in the valid bins (of another run, where given)."""
+    d = run.channels[channel]
+    valid = (valid_of or run).channels[channel].valid
+    x = np.column_stack(((d.regressors @ weights[d.index])[valid], d.residual[valid]))
+    return np.asarray(x - x.mean(axis=0) if channel.balance == TORSION and len(x) else x)
+
+
+def gain_of(solution: Solution, prediction: Prediction, seed: int = 0) -> Gain:
+    """Return the error of the simulation's torque before and after, in the balance where most goes away.
+
+    The run's own zero and friction of the day stay in, as in service. ci95: of rmse_before - rmse_after [Nm], bootstrap over
+    recordings.
+    """
+    squares = prediction.squares
+    channel = max(squares, key=lambda c: _rms_of(squares[c], 0) - _rms_of(squares[c], 1))
+    table = squares[channel]
+    rng = np.random.default_rng(seed)
+    picks = rng.integers(0, len(table), size=(_BOOTSTRAPS, len(table)))
+    sums = table[picks].sum(axis=1)
+    drawn = np.sqrt(sums[:, 0] / sums[:, 2]) - np.sqrt(sums[:, 1] / sums[:, 2])
+    low, high = np.percentile(drawn, (2.5, 97.5))
+    pieces = list(solution.dataset.recordings)
+    names = [solution.dataset.runs[pieces.index(r)].name for r in range(len(table))]
+    return Gain(
+        _rms_of(table, 0),
+        _rms_of(table, 1),
+        f"each of {len(table)} runs held out once; {channel.balance} balance of joint {channel.joint}",
+        (float(low), float(high)),
+        joint=channel.joint,
+        balance=channel.balance,
+        runs=tuple(
+            RunGain(name, _rms_of(row, 0), _rms_of(row, 1))
+            for name, row in zip(names, table[:, None, :], strict=True)
+            if row[0, 2] > 0.0
+        ),
+    )
+
+
+def _rms_of(table: FloatArray, column: int) -> float:
+    return float(np.sqrt(table[:, column].sum() / max(table[:, 2].sum(), 1.0)))
 
 
 @dataclass(frozen=True)
@@ -159,22 +346,20 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     left = remaining(dataset, *present_of(solution))
     rest = unexplained_residual(left)
     predicting = extended_effects(solution, prediction)
-    if (
-        _largest(rest, limits_nm) > 1.0
-    ):  # the discrepancy has a part in the set's values, none in those that predict
+    if _largest(rest, limits_nm) > 1.0:
+        # the discrepancy has a part in the set's values, none in those that predict
         own = solution.own(prediction.mean, prediction.chosen)[:, : len(dataset.families)]
         other = remaining(dataset, predicting, own)
         less = unexplained_residual(other)
         if _largest(less, limits_nm) < _largest(rest, limits_nm):
             left, rest = other, less
-    held = held_nm(left)
-    total = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
-    causes = sorted((_cause(solution, j, total, rest) for j in effects), key=lambda c: -c.rms_nm)
-    matter = [c for c in causes if c.rms_nm >= limits_nm[_channel(c, dataset)]]
-    listed = [c for c in causes if c.rms_nm >= limits.LISTED * limits_nm[_channel(c, dataset)]]
-    listed = [c if c in matter else replace(c, matters=False) for c in listed]
-    small = [replace(c, matters=False) for c in causes if all(c.key != x.key for x in listed)]
-    unexplained = _unexplained(rest, held, limits_nm, rated, total)
+    total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
+    unexplained = _unexplained(rest, held_nm(left), limits_nm, rated, total_nm2)
+    found = sorted(
+        (_cause(solution, j, total_nm2, rest, limits_nm) for j in effects), key=lambda x: -x[0].rms_nm
+    )
+    causes = [cause for cause, _ in found]
+    matter = [cause for cause in causes if cause.matters]
     if unexplained.matters:
         verdict = UNEXPLAINED
     elif matter:
@@ -182,22 +367,19 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     else:
         verdict = NO_GAP
     table, untold = entry_table(solution, causes, scope)
-    gaps = channel_gaps(left, rest, unexplained.matters)
-    reasons = rest.reasons if unexplained.matters else []
-    gain = gain_of(solution, prediction) if prediction.chosen else None
     return Findings(
         verdict,
-        tuple(reasons),
+        tuple(rest.reasons if unexplained.matters else ()),
         names,
         tuple(sorted(dataset.joints)),
-        gaps,
-        tuple(listed),
+        channel_gaps(left, rest, unexplained.matters),
+        tuple(cause for cause, size in found if size >= limits.LISTED),
         table,
-        gain,
+        gain_of(solution, prediction) if prediction.chosen else None,
         traces=traces(left),
-        explained_share=1.0 - rest.energy_nm2() / max(total, 1e-30) if causes else math.nan,
+        explained_share=1.0 - rest.energy_nm2() / max(total_nm2, 1e-30) if causes else math.nan,
         unexplained=unexplained,
-        too_small=tuple(small),
+        too_small=tuple(cause for cause, size in found if size < limits.LISTED),
         cannot_be_told=untold,
         predicts=tuple(predicting),
         next_experiment=_next(matter, effects, dataset),
@@ -209,37 +391,38 @@ def _largest(rest: Unexplained, limits_nm: Mapping[Channel, float]) -> float:
     return max((rest.worst_nm.get(c, 0.0) / max(nm, 1e-12) for c, nm in limits_nm.items()), default=0.0)
 
 
-def _channel(cause: Cause, dataset: Dataset) -> Channel:
-    number = cause.joint if isinstance(cause.joint, int) else next(iter(dataset.joints))
-    return Channel(number, cause.balance)
-
-
-def _cause(solution: Solution, j: Judged, total_nm2: float, rest: Unexplained) -> Cause:
+def _cause(
+    solution: Solution, j: Judged, total_nm2: float, rest: Unexplained, limits_nm: Mapping[Channel, float]
+) -> tuple[Cause, float]:
+    """Return an effect as a cause, and its size in parts of its limit, which is that of the first joint for the sensor."""
+    name, joint = j.present.name, j.present.joint
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
-    remains = math.sqrt(rest.by_channel().get(channel, 0.0))
-    grade, doubts = grade_of(j, hidden=remains > j.rms_nm[channel])
-    rivals = tuple(
-        dict.fromkeys(
-            e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != j.present.joint else "")
-            for e in j.rivals
+    size_nm = j.rms_nm[channel]
+    of = joint if isinstance(joint, int) else min(solution.dataset.joints)
+    part = size_nm / max(limits_nm[Channel(of, channel.balance)], 1e-12)
+    grade, doubts = grade_of(j, hidden=math.sqrt(rest.by_channel().get(channel, 0.0)) > size_nm)
+    rivals: tuple[str, ...] = ()
+    if grade == ONE_OF:
+        others = (f" of {joint_text(e.joint)}" if e.joint != joint else "" for e in j.rivals)
+        rivals = tuple(
+            dict.fromkeys(e.effect.name + other for e, other in zip(j.rivals, others, strict=True))
         )
-    )
-    name = j.present.name
-    squares = sum(r * r for r in j.rms_nm.values())
-    return Cause(
+    cause = Cause(
         name,
-        j.present.joint,
-        (name, *(r for r in rivals if r != name)) if grade == ONE_OF else (name,),
+        joint,
+        (name, *(rival for rival in rivals if rival != name)),
         values_of(solution, j),
         j.delta,
-        j.rms_nm[channel],
+        size_nm,
         channel.balance,
-        explained_share=squares / max(total_nm2, 1e-30),
+        explained_share=sum(r * r for r in j.rms_nm.values()) / max(total_nm2, 1e-30),
         grade=grade,
-        rivals=rivals if grade == ONE_OF else (),
+        rivals=rivals,
         given=tuple(dict.fromkeys(solution.entries[k].prior.text for k in j.members)),
         doubts=doubts,
+        matters=part >= 1.0,
     )
+    return cause, part
 
 
 def values_of(solution: Solution, j: Judged) -> dict[str, Value]:

@@ -67,9 +67,7 @@ def test_a_joint_with_a_dead_sensor_is_refused_with_the_reason() -> None:
 def made_up() -> Diagnosed:
     time = np.linspace(0.0, 1.0, 50)
     wave = np.sin(6.0 * time)
-    traces = tuple(
-        Trace(run, 2, "motor", time, wave, 0.3 * wave, wave, 10.0 * wave, 11.0 * wave) for run in ("a", "b")
-    )
+    traces = tuple(Trace(run, 2, "motor", time, wave, 0.3 * wave, wave, 11.0 * wave) for run in ("a", "b"))
     names = ("load_dependent_friction", "torque_constant")
     values = {"load_coefficient": Value(0.07, (0.05, 0.09), "")}
     cause = Cause(names[0], 2, names, values, 40.0, 1.5, "motor")

@@ -103,14 +103,14 @@ def places(hot: Mapping[str, Mapping[int, float]]) -> tuple[Place, ...]:
 
 
 def gap(joint: int, balance: str, rmse: float, floor: float, hot: Mapping[str, Mapping[int, float]]) -> Gap:
-    """A gap with its map; of each axis that `hot` names the largest places."""
+    """A gap; of each axis that `hot` names the largest places."""
     everywhere = places(hot)
     found = [
         each
         for axis in hot
         for each in sorted((p for p in everywhere if p.axis == axis), key=lambda p: -p.share)[:3]
     ]
-    return Gap(joint, balance, rmse, floor, "repeated runs", tuple(found), everywhere)
+    return Gap(joint, balance, rmse, floor, "repeated runs", tuple(found))
 
 
 Gone = Callable[[Any, Any, Any], Any]
@@ -134,4 +134,4 @@ def trace(run: str, joint: int, balance: str, gone: Gone, *, seconds: float = 60
     slow = np.convolve(random.normal(0.0, 1.0, len(time)), np.ones(60) / 60, "same")
     after = noise + 0.9 * slow
     before = after + gone(velocity, torque, angle)
-    return Trace(run, joint, balance, time, before, after, velocity, torque, torque + before)
+    return Trace(run, joint, balance, time, before, after, velocity, torque + before)

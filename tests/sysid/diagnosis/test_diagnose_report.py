@@ -221,9 +221,7 @@ def test_one_sample_that_stands_out_of_a_million_is_in_the_picture() -> None:
     time = np.arange(n) * 0.005
     before = 0.1 * np.sin(time)
     before[150_000] = 5.0
-    trace = Trace(
-        "long", 1, "motor", time, before, 0.1 * np.sin(time), np.sin(time), *(2 * [9 * np.cos(time)])
-    )
+    trace = Trace("long", 1, "motor", time, before, 0.1 * np.sin(time), np.sin(time), 9 * np.cos(time))
     page = render(replace(examples.one_cause(), traces=(trace,)))
     points = peaks(page, "before_2")
     top = points[np.argmin(points[:, 1])]
@@ -272,7 +270,7 @@ def test_ten_long_runs_of_two_joints_stay_a_small_page() -> None:
     random = np.random.default_rng(0)
     time = np.arange(0.0, 60.0, 0.005)
     traces = tuple(
-        Trace(f"run_{k}.csv.gz", j, balance, time, *random.normal(0.0, 1.0, (5, len(time))))
+        Trace(f"run_{k}.csv.gz", j, balance, time, *random.normal(0.0, 1.0, (4, len(time))))
         for k in range(10)
         for j in (1, 2)
         for balance in ("motor", "torsion")

@@ -13,12 +13,11 @@ from scipy.stats import sem
 
 from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.joint import Friction
-from jtqd.sysid.diagnosis import held_out
+from jtqd.sysid.diagnosis import verdict
 from jtqd.sysid.diagnosis.evidence import Sets
 from jtqd.sysid.diagnosis.findings import CERTAIN, EFFECTIVE, ONE_OF
-from jtqd.sysid.diagnosis.held_out import Prediction, Sizes, gain_of, predict, stacked
 from jtqd.sysid.diagnosis.model import Solution
-from jtqd.sysid.diagnosis.verdict import grade_of, judged
+from jtqd.sysid.diagnosis.verdict import Prediction, Sizes, gain_of, grade_of, judged, predict, stacked
 from tests.sysid.diagnosis.diagnose_core_helpers import MOTOR1
 from tests.sysid.diagnosis.pendulums import ARM, Rig, runs_of, solved
 
@@ -111,7 +110,7 @@ def test_what_predicts_is_the_mixture(solution: Solution, monkeypatch: pytest.Mo
     """
     found, kept = {}, {}
     for part in (0.0, 0.25, 1.0):
-        monkeypatch.setattr(held_out, "stacked", lambda *_, part=part: part)
+        monkeypatch.setattr(verdict, "stacked", lambda *_, part=part: part)
         prediction = predict(solution)
         places = solution.sets.places(prediction.chosen)
         found[part] = {k: float(prediction.mean[s][0]) for k, s in places.items() if k not in solution.chosen}

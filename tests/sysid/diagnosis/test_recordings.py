@@ -12,9 +12,9 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.dataset import build_dataset, piece_notes, recordings, usable_signals
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.findings import INSUFFICIENT
-from jtqd.sysid.diagnosis.held_out import predict
 from jtqd.sysid.diagnosis.model import solve
 from jtqd.sysid.diagnosis.signals import JointSignals
+from jtqd.sysid.diagnosis.verdict import predict
 from jtqd.sysid.runs.files import read_runs
 from jtqd.sysid.runs.tables import write_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, bench_run
