@@ -490,18 +490,10 @@ def _summary_lines(fit: EfficiencyFit) -> list[str]:
     like_paper = fit.convention == TABLE_I.convention
     paper = ["paper"] if like_paper else []
     rows = [["quadrant", "plateaus", "distinct", "RMSE", *paper, "RMSE Nm", "condition"]]
-    for name, quadrant in fit.quadrants.items():
-        rows.append(
-            [
-                QUADRANT_TITLES[name],
-                str(quadrant.plateaus),
-                str(quadrant.distinct),
-                f"{quadrant.rmse:.4f}",
-                *([f"{getattr(TABLE_I, name).rmse:.4f}"] if like_paper else []),
-                f"{quadrant.rmse_nm:.3f}",
-                f"{quadrant.condition:.0f}",
-            ]
-        )
+    for name, one in fit.quadrants.items():
+        beside = [f"{getattr(TABLE_I, name).rmse:.4f}"] if like_paper else []
+        errors = [f"{one.rmse:.4f}", *beside, f"{one.rmse_nm:.3f}", f"{one.condition:.0f}"]
+        rows.append([QUADRANT_TITLES[name], str(one.plateaus), str(one.distinct), *errors])
     return table_lines(rows) + list(fit.refused.values())
 
 
@@ -537,13 +529,9 @@ def as_mapping(result: EfficiencyResult) -> dict[str, Any]:
             "current_min_a": result.current_min_a,
             "fits": result.fits,
             "plateaus": [
-                plain_values(point.plateau)
-                | {
-                    "quadrant": point.quadrant,
-                    "joint_over_motor": point.ratio,
-                    "joint_over_motor_se": point.se,
-                }
-                for point in result.points
+                plain_values(p.plateau)
+                | {"quadrant": p.quadrant, "joint_over_motor": p.ratio, "joint_over_motor_se": p.se}
+                for p in result.points
             ],
             "left_out": result.left_out,
             "findings": [item._asdict() for item in result.findings],

@@ -321,13 +321,7 @@ def fit_agreement(runs: Sequence[PathResiduals], fused: Fused, rated_nm: float) 
     def levels_of(agreement: Agreement) -> list[tuple[FloatArray, ...]]:
         usual = replace(fused, agreement=agreement)
         return [
-            levels(
-                usual,
-                rated_nm,
-                *run.difference,
-                fusion.fuse(*run.fusion_inputs).variance_nm2,
-                run.slope,
-            )
+            levels(usual, rated_nm, *run.difference, fusion.fuse(*run.fusion_inputs).variance_nm2, run.slope)
             for run in moving
         ]
 

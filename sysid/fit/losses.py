@@ -166,16 +166,9 @@ def fit_loss(runs: Sequence[RunSignals], friction: Friction) -> LossFit:
                 f"found viscous_per_k {per_k:.3g} 1/K, expected at most {_PER_K_LIMIT} either way"
             )
     speeds = (float(np.abs(run.seen.velocity_rad_s[run.moving]).max(initial=0.1)) for run in runs)
-    loss = AdditiveLoss(
-        LOAD_NODES_NM,
-        _side(w[:_ROWS]),
-        _side(w[_ROWS : 2 * _ROWS]),
-        friction.stribeck_velocity_rad_s,
-        max(speeds),
-        reference,
-        friction.viscous_nms_per_rad,
-        per_k,
-    )
+    sides = _side(w[:_ROWS]), _side(w[_ROWS : 2 * _ROWS])
+    place = friction.stribeck_velocity_rad_s, max(speeds), reference
+    loss = AdditiveLoss(LOAD_NODES_NM, *sides, *place, friction.viscous_nms_per_rad, per_k)
     spread = float(np.sqrt(covariance[_THERMAL, _THERMAL])) / viscous
     return LossFit(loss, _residual(blocks, w), spread, sum(len(block.y) for block in blocks))
 

@@ -122,8 +122,7 @@ def find_plateaus(
         whole = np.array([start_s]), np.array([end_s])
         velocity_mean, current_mean, torque_mean = (
             Mean(
-                float(means_between(time_s, signal, *whole)[0]),
-                standard_error(signal[inside], angle[inside]),
+                float(means_between(time_s, signal, *whole)[0]), standard_error(signal[inside], angle[inside])
             )
             for signal in (speed, current, torque)
         )
@@ -441,9 +440,7 @@ def fit_no_load(plateaus: Sequence[Plateau], joint: Joint) -> NoLoadFit:
             "swapped sign of current, torque or velocity, or a wrong gear ratio"
         )
     friction = replace(
-        joint.friction,
-        coulomb_nm=round(terms[0].value, 4),
-        viscous_nms_per_rad=round(terms[1].value, 4),
+        joint.friction, coulomb_nm=round(terms[0].value, 4), viscous_nms_per_rad=round(terms[1].value, 4)
     )
     rmse = math.sqrt(float(np.mean(residual**2)))
     return NoLoadFit(friction, terms, rmse, len(loss), tuple(warnings))

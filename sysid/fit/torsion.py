@@ -394,11 +394,8 @@ def _refined(torsion: Torsion, found: Mapping[str, FloatArray], knots: Sequence[
     stiffness = float(found["spring"][0])
     motor = _waves(torsion.orders_per_motor_rev, torsion.cos_rad, torsion.sin_rad)
     link = _waves(torsion.link_orders_per_rev, torsion.link_cos_rad, torsion.link_sin_rad)
-    for waves, orders, name in (
-        (motor, _ORDERS, "ripple"),
-        (motor, MOTOR_ORDERS, "motor"),
-        (link, LINK_ORDERS, "link"),
-    ):
+    known = (motor, _ORDERS, "ripple"), (motor, MOTOR_ORDERS, "motor"), (link, LINK_ORDERS, "link")
+    for waves, orders, name in known:
         if name in found:
             for order, (c, s) in zip(orders, found[name].reshape(-1, 2).tolist(), strict=True):
                 cos, sin = waves.get(order, (0.0, 0.0))

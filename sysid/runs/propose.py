@@ -71,7 +71,7 @@ _BLOCK_S: Final = 0.05
 _FEWEST_BLOCKS: Final = 20
 _RATE_HZ: Final = (5.0, 20_000.0)
 _CALLS: Final = {
-    **{"deg": "deg2rad", "deg/s": "deg2rad", "rev": "rev2rad", "rev/s": "rev2rad", "rpm": "rpm2rad_s"},
+    **{"deg": "deg2rad", "deg/s": "deg2rad", "rev": "rev2rad", "rev/s": "rev2rad", "rpm": "rpm2rad_s"}
 }
 _ANGLES: Final = {unit: factor for kind, unit, factor in UNITS.values() if kind == ANGLE and unit != COUNTS}
 _SPEEDS: Final = {unit: factor for kind, unit, factor in UNITS.values() if kind == SPEED}
