@@ -316,7 +316,9 @@ def channel_findings(runs: Sequence[RunFile], number: int, joint: Joint) -> list
     issues: list[RunIssue] = []
     for run in runs:
         issues += [
-            RunIssue("dead_channel", f"{run.name}: {note}") for note in run.notes if f"j{number}." in note
+            RunIssue("dead_channel", f"{run.name}: {note}")
+            for note in run.notes
+            if f"j{number}." in note and "dead channel" in note
         ]
         issues += check_run(run.table, {number: joint}, run.name, known_loads=run.known_loads).refused
     return issues

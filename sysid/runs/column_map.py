@@ -5,12 +5,16 @@
     j1.load: {mass_kg: 1.5, lever_m: 0.2}                  the torque reference is a known load
     j2.load: {inertia_kgm2: 0.03}                          ... or an inertia without weight
     j3.load: {torque_nm: "model_torque - payload_torque"}  ... or a rigid-body model's torque
+    j4.load: {light: {mass_kg: 2, lever_m: 0.3, arm: unknown}, heavy: {..}}   by what the run's path has in it
     j1.drive: {voltage_v: "duty * 12", resistance_ohm: 2.0, back_emf_vs_per_rad: 0.01}
     j1.joint_file: joint1.yaml                             beside the map
 
 A known load is a pendulum on the joint's axis, q its link position [rad], positive along positive current:
 
     torque_nm = inertia d2q/dt2 + mass g lever sin(q - hangs_at)
+
+With `arm: unknown` it hangs on an arm that was not weighed: the run has a known part of the load and no `torque_nm`. A map
+without columns is for the run table's own names; where it has a load, a torque column is not read.
 
 A drive without a current signal has its voltage; the winding's inductance is neglected (it settles within a row):
 
@@ -40,6 +44,8 @@ from jtqd.estimator.decoder import (
     Field,
     FieldError,
     Text,
+    below,
+    choice,
     field_of,
     in_file,
     limits,
@@ -249,6 +255,8 @@ GRAVITY_M_S2: Final = 9.80665
 WINDOW_S: Final = 0.1
 """Longest window of a position to which a quintic is fitted for its velocity and acceleration."""
 _QUIET: Final = 0.02
+SHARP: Final = 0.06
+"""Noise of an acceleration, in parts of the largest: a fit averages it, but not what a long window takes off the ripple."""
 _FEWEST_ROWS: Final = 7
 _OUTLIER_RAD: Final = 0.1
 _SOURCE: Final = (
@@ -270,6 +278,7 @@ class KnownLoad:
     """Load of a joint without a torque sensor: the torque that a model gives (a column or an expression), or a pendulum:
 
     mass [kg] at lever [m] from the axis, inertia about the axis [kg m2], hangs_at: link position at rest [rad].
+    arm: whether what it hangs on is "known" (a part of it, or without mass) or "unknown".
     """
 
     torque_nm: str | None = None
@@ -278,10 +287,11 @@ class KnownLoad:
     inertia_kgm2: float = 0.0
     hangs_at_rad: float = 0.0
     gravity_m_s2: float = GRAVITY_M_S2
+    arm: str = "known"
 
     def torque(self, time_s: FloatArray, position_rad: FloatArray) -> FloatArray:
         """Return the torque of the joint on the pendulum [n, Nm] at link positions [n] of one segment without gaps."""
-        _, acceleration = motion_of(time_s, position_rad)
+        _, acceleration = motion_of(time_s, position_rad, _QUIET if self.arm == "known" else SHARP)
         weight = self.mass_kg * self.gravity_m_s2 * self.lever_m * np.sin(position_rad - self.hangs_at_rad)
         return self.inertia_kgm2 * acceleration + weight
 
@@ -301,28 +311,33 @@ class VoltageDrive:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """Where each target column comes from; known loads, voltage drives and joint files by joint; `where`: the map's file."""
+    """Where each target column comes from; known loads (of each run by a part of its path, "": of all), voltage drives and
+    joint files by joint; `where`: the map's file.
+    """
 
     columns: Mapping[str, Column]
     joint_files: Mapping[int, Path]
     loads: Mapping[int, KnownLoad] | None = None
     drives: Mapping[int, VoltageDrive] | None = None
     where: str = ""
+    loads_of_runs: Mapping[int, Mapping[str, KnownLoad]] | None = None
 
     @classmethod
     def from_mapping(cls, mapping: Mapping[str, object], where: str, folder: Path) -> ColumnMap:
         """Check a column map read from YAML; `TARGET: NAME` is short for `TARGET: {column: NAME}`. Raises ConfigError."""
         with in_file(where):
-            values = read_values(_keys(), mapping)
+            values = read_values(_keys(any(key in mapping for key in targets())), mapping)
             columns = {key: values[key] for key in targets() if key in values}
             loads = {n: values[f"j{n}.load"] for n in JOINTS if f"j{n}.load" in values}
             drives = {n: values[f"j{n}.drive"] for n in JOINTS if f"j{n}.drive" in values}
-            for n, load in loads.items():
-                _check_load(n, load, columns)
+            for n, by_run in loads.items():
+                for load in by_run.values():
+                    _check_load(n, load, columns)
             for n in drives:
                 _check_drive(n, columns)
         files = {n: folder / values[f"j{n}.joint_file"] for n in JOINTS if f"j{n}.joint_file" in values}
-        return cls(columns, files, loads, drives, where)
+        every = {n: by_run[""] for n, by_run in loads.items() if "" in by_run}
+        return cls(columns, files, every, drives, where, loads)
 
     @classmethod
     def load(cls, path: Path) -> ColumnMap:
@@ -333,7 +348,28 @@ class ColumnMap:
     @property
     def known_loads(self) -> tuple[int, ...]:
         """Joints whose reference is a known load, not a sensor."""
-        return tuple(sorted(self.loads or ()))
+        return tuple(sorted({*(self.loads or ()), *(self.loads_of_runs or ())}))
+
+    def of_run(self, path: Path, header: Sequence[str]) -> ColumnMap:
+        """Return the map of one run file with these columns: its loads, and without columns those of the run table's names.
+        Raises ExpressionError.
+        """
+        loads = dict(self.loads or {})
+        for n, by_run in (self.loads_of_runs or {}).items():
+            names = [name for name in by_run if name in str(path)]
+            if len(names) != 1:
+                found = " and ".join(map(repr, names)) or f"none of {', '.join(map(repr, by_run))}"
+                raise ExpressionError(
+                    f"found {found} in the path, expected one, for j{n}.load of {self.where}"
+                )
+            loads[n] = by_run[names[0]]
+        known = {f"j{n}.torque_nm" for n in loads}
+        own = {name: Column(name) for name in targets() if name in header and name not in known}
+        columns = self.columns or own
+        for key in (f"j{n}.link_position_rad" for n, load in loads.items() if load.torque_nm is None):
+            if key not in columns:
+                raise ExpressionError(f"found no column {key!r}, expected the angle of the load")
+        return replace(self, loads=loads, columns=columns)
 
     def sources(self) -> dict[str, Column]:
         """Return every column or expression that is read: targets, `jN.load` (a torque) and `jN.drive` (a voltage)."""
@@ -354,14 +390,18 @@ class ColumnMap:
         return found
 
     def completed(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
-        """Return the targets [n] of one segment without gaps, torques of known loads and currents of voltage drives too."""
+        """Return the targets [n] of one segment without gaps, torques of known loads and currents of voltage drives too.
+
+        `jN.load`: the known part of a load on an unknown arm, in place of `jN.torque_nm`.
+        """
         found = {key: value for key, value in values.items() if key in self.columns}
         time = found[TIME]
         for n, load in (self.loads or {}).items():
             if load.torque_nm is not None:
                 found[f"j{n}.torque_nm"] = values[f"j{n}.load"]
             else:
-                found[f"j{n}.torque_nm"] = load.torque(time, found[f"j{n}.link_position_rad"])
+                key = f"j{n}.torque_nm" if load.arm == "known" else f"j{n}.load"
+                found[key] = load.torque(time, found[f"j{n}.link_position_rad"])
         for n, drive in (self.drives or {}).items():
             speed = found.get(f"j{n}.motor_velocity_rad_s")
             if speed is None:
@@ -378,6 +418,9 @@ class ColumnMap:
                 if load.torque_nm is not None
                 else f"a known load of {load.mass_kg:g} kg at {load.lever_m:g} m and {load.inertia_kgm2:g} kg m2"
             )
+            if load.arm != "known":
+                lines.append(f"j{n} carries {what}, on an unknown arm")
+                continue
             lines.append(
                 f"j{n}.torque_nm is {what}: taken as true, no effect of a torque sensor is looked for; an error of the load "
                 "is taken for the joint's"
@@ -396,10 +439,12 @@ def targets() -> list[str]:
     return [TIME, *(f"j{joint}.{quantity}" for joint in JOINTS for quantity in COLUMN_NAMES)]
 
 
-def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, FloatArray]:
+def motion_of(
+    time_s: FloatArray, position: FloatArray, quiet: float = _QUIET
+) -> tuple[FloatArray, FloatArray]:
     """Return velocity and acceleration [n] of the quintic through a window of the position around each row, ends held.
 
-    The window is the shortest in which the position's noise is below _QUIET of the motion's largest acceleration, WINDOW_S
+    The window is the shortest in which the position's noise is below `quiet` of the motion's largest acceleration, WINDOW_S
     at most: a longer one rounds the reversals off. Rows are taken as even (Savitzky and Golay 1964, doi
     10.1021/ac60214a047). Outlier samples are interpolated.
     """
@@ -418,7 +463,7 @@ def motion_of(time_s: FloatArray, position: FloatArray) -> tuple[FloatArray, Flo
     half = longest
     for half in range(min(_FEWEST_ROWS // 2, longest), longest + 1):
         weights = _weights(half, step)
-        if noise * float(np.linalg.norm(weights[1])) <= _QUIET * largest:
+        if noise * float(np.linalg.norm(weights[1])) <= quiet * largest:
             break
     slope, bend = (np.correlate(position, each, mode="valid") for each in weights)
     return np.pad(slope, half, mode="edge"), np.pad(bend, half, mode="edge")
@@ -462,13 +507,17 @@ class _Model:
     torque_nm: Text
 
 
+_ARM: Final = choice(("known", "unknown"))
+
+
 @dataclass(frozen=True)
 class _Inertia:
     """A load without weight."""
 
-    inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)]
+    inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)] = 0.0
     hangs_at_rad: Annotated[float, limits("rad")] = 0.0
     gravity_m_s2: Annotated[float, limits("m/s2", ge=0.0, le=30.0)] = GRAVITY_M_S2
+    arm: Annotated[str, _ARM] = "known"
 
 
 @dataclass(frozen=True)
@@ -480,13 +529,25 @@ class _Pendulum:
     inertia_kgm2: Annotated[float, limits("kg m2", ge=0.0)] = math.nan
     hangs_at_rad: Annotated[float, limits("rad")] = 0.0
     gravity_m_s2: Annotated[float, limits("m/s2", ge=0.0, le=30.0)] = GRAVITY_M_S2
+    arm: Annotated[str, _ARM] = "known"
+
+
+def _loads(value: Any) -> dict[str, KnownLoad]:
+    """Return the loads by a part of the run's path; "": one for all runs."""
+    if not isinstance(value, dict) or not value or not all(isinstance(each, dict) for each in value.values()):
+        return {"": _load(value)}
+    found = {}
+    for name, each in value.items():
+        with below(str(name)):
+            found[str(name)] = _load(each)
+    return found
 
 
 def _load(value: Any) -> KnownLoad:
     keys = value if isinstance(value, dict) else {}
     if "torque_nm" in keys:
         return KnownLoad(read(_Model, value).torque_nm)
-    if "inertia_kgm2" in keys and "mass_kg" not in keys:
+    if {"inertia_kgm2", "arm"} & set(keys) and "mass_kg" not in keys:
         return KnownLoad(**vars(read(_Inertia, value)))
     load = KnownLoad(**vars(read(_Pendulum, value)))
     if not math.isnan(load.inertia_kgm2):
@@ -495,16 +556,16 @@ def _load(value: Any) -> KnownLoad:
 
 
 @cache
-def _keys() -> tuple[Field, ...]:
+def _keys(needs_time: bool) -> tuple[Field, ...]:
     """Return how every key of a column map is read."""
     column = Annotated[Column, parsed(_column, _SOURCE)]
     section = "a mapping of keys to values"
     kinds = {
         "joint_file": Text,
-        "load": Annotated[KnownLoad, parsed(_load, section)],
+        "load": Annotated[dict[str, KnownLoad], parsed(_loads, section)],
         "drive": Annotated[VoltageDrive, parsed(lambda value: read(VoltageDrive, value), section)],
     }
-    keys = [field_of(key, column, optional=key != TIME) for key in targets()]
+    keys = [field_of(key, column, optional=key != TIME or not needs_time) for key in targets()]
     for joint in JOINTS:
         keys += [field_of(f"j{joint}.{key}", kind, optional=True) for key, kind in kinds.items()]
     return tuple(keys)
@@ -515,7 +576,7 @@ def _check_load(joint: int, load: KnownLoad, columns: Mapping[str, Column]) -> N
     if f"j{joint}.torque_nm" in columns:
         found = Verbatim(f"it beside 'j{joint}.torque_nm'")
         raise FieldError("map", key, found, f"one reference of joint {joint}")
-    if load.torque_nm is None and f"j{joint}.link_position_rad" not in columns:
+    if columns and load.torque_nm is None and f"j{joint}.link_position_rad" not in columns:
         expected = "the angle of the load (from a motor encoder: its column with scale 1/gear_ratio)"
         raise FieldError("map", key, Verbatim(f"no 'j{joint}.link_position_rad'"), expected)
 

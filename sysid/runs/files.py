@@ -84,6 +84,7 @@ def read_runs(
     """
     mapping = ColumnMap.load(columns) if isinstance(columns, Path) else columns
     runs: list[RunFile] = []
+    said: set[str] = set()
     known: list[tuple[str, Windows]] = []
     paths = run_paths(arguments)
     twice = next((path for path in paths if paths.count(path) > 1), None)
@@ -109,9 +110,9 @@ def read_runs(
                     "current agree), expected every run once"
                 )
             known.append((run.name, found))
-        if runs and mapping is not None:  # remarks on the map stand in the notes of the first run only
-            remarks = set(mapping.remarks())
-            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in remarks))
+        if content.columns is not None:  # a remark on the map stands in the notes of the first run only
+            read[0] = replace(read[0], notes=tuple(note for note in read[0].notes if note not in said))
+            said |= set(content.columns.remarks())
         runs += read
     return runs
 

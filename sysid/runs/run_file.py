@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
@@ -30,7 +30,7 @@ class RunError(OneLineError):
 class RunFile:
     """A run as read: name for messages, unique among the runs read together; file, its kind ("csv", "parquet", "mcap") and
     SHA-256 (hex); columns (the segments of one recording keep its time); what is suspicious, one line each; joints whose
-    torque is a known load's or a model's, and no sensor's.
+    torque is a known load's or a model's, and no sensor's; known parts [n, Nm] of loads on an unknown arm, by joint.
     """
 
     name: str
@@ -40,6 +40,7 @@ class RunFile:
     table: RunTable
     notes: tuple[str, ...] = ()
     known_loads: tuple[int, ...] = ()
+    known_parts: Mapping[int, FloatArray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -341,4 +342,5 @@ def _segment(content: Content, cut: slice, name: str, notes: Sequence[str]) -> R
         table = RunTable(time_s=values[TIME], joints=joints)
     except RunTableError as error:  # a scale of the column map that leaves the range of a float
         raise RunError(f"{path}: {error}") from None
-    return RunFile(name, path, content.source, content.sha256, table, tuple(notes), known_loads)
+    parts = {n: values[f"j{n}.load"] for n in known_loads if f"j{n}.torque_nm" not in values}
+    return RunFile(name, path, content.source, content.sha256, table, tuple(notes), known_loads, parts)

@@ -29,7 +29,7 @@ from jtqd.estimator.arrays import FloatArray
 from jtqd.estimator.files import whole_file, write_whole
 from jtqd.estimator.run import COLUMN_NAMES, RunTable
 from jtqd.estimator.text import counted
-from jtqd.sysid.runs.column_map import TIME, Column, ColumnMap, Expression, ExpressionError, targets
+from jtqd.sysid.runs.column_map import TIME, ColumnMap, Expression, ExpressionError
 from jtqd.sysid.runs.run_file import Content, RunError, file_bytes, header_place
 
 _BLANK: Final = ("", "nan", "-nan", "nan(ind)", "-nan(ind)", "null", "none", "na", "n/a")
@@ -136,13 +136,15 @@ class _Wanted:
     def of(cls, header: Sequence[str], path: Path, columns: ColumnMap | None) -> _Wanted:
         """Parse the map for a file with these columns; None: the run table's own names. Raises RunError."""
         place = f"{path}:{header_place(path)}"
-        if columns is None:
-            if TIME not in header:
-                raise RunError(
-                    f"{place} found no column '{TIME}' (first columns: {list(header[:4])}), expected the run table's names "
-                    "or a column map"
-                )
-            columns = ColumnMap({name: Column(name) for name in targets() if name in header}, {})
+        if not (columns and columns.columns) and TIME not in header:
+            raise RunError(
+                f"{place} found no column '{TIME}' (first columns: {list(header[:4])}), expected the run table's names "
+                "or a column map"
+            )
+        try:
+            columns = (columns or ColumnMap({}, {})).of_run(path, header)
+        except ExpressionError as error:
+            raise RunError(f"{place} {error}") from None
         try:
             return cls(path, columns, columns.parsed(list(header), place))
         except ExpressionError as error:

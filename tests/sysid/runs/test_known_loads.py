@@ -16,9 +16,10 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.runs.bad_samples import held_values, saturation_limits
 from jtqd.sysid.runs.channels import Channels, check_channels
-from jtqd.sysid.runs.checks import CheckedRuns, check_runs
+from jtqd.sysid.runs.checks import CheckedRuns, channel_findings, check_runs
 from jtqd.sysid.runs.column_map import ColumnMap
 from jtqd.sysid.runs.files import read_runs
+from jtqd.sysid.runs.tables import write_run
 
 JOINT: Final[Joint] = replace(
     load_joint(shipped("joint1.yaml")), efficiency=None, effects=(), friction=Friction(3.0, 6.0)
@@ -117,3 +118,68 @@ def test_the_reader_keeps_a_known_load_of_zero(tmp_path: Path) -> None:
     assert torque is not None
     assert not torque.any()
     assert not any("dead" in note for note in read.notes)
+
+
+def written(folder: Path, load: str) -> Path:
+    """Two runs of the run table's own names, in folders by payload, and a map with this load alone."""
+    for name, gain in (("light", 1.0), ("heavy", 4.0)):
+        (folder / name).mkdir()
+        write_run(folder / name / "run.csv", replace_link(run(gain * 6.0 * np.sin(Q))))
+    (folder / "map.yaml").write_text(f"j1.load: {load}\n")
+    return folder
+
+
+def replace_link(table: RunTable) -> RunTable:
+    return RunTable(table.time_s, {1: replace(table.joints[1], link_position_rad=Q)})
+
+
+BY_RUN: Final = "{light: {mass_kg: 1, lever_m: 0.3}, heavy: {mass_kg: 5, lever_m: 0.3, arm: unknown}}"
+
+
+def test_each_run_has_the_load_that_its_path_names(tmp_path: Path) -> None:
+    folder = written(tmp_path, BY_RUN)
+    light, heavy = read_runs([folder / "light", folder / "heavy"], folder / "map.yaml")
+    weight = 9.80665 * 0.3 * np.sin(Q)
+    torque = light.table.joints[1].torque_nm
+    assert torque is not None
+    assert torque == pytest.approx(weight + 0.09 * A, abs=0.02)  # not the table's own torque
+    assert light.known_loads == heavy.known_loads == (1,)
+    assert not light.known_parts
+    assert heavy.table.joints[1].torque_nm is None
+    assert heavy.known_parts[1] == pytest.approx(5.0 * weight + 0.45 * A, abs=0.1)
+    assert any("on an unknown arm" in note for note in heavy.notes)
+
+
+def test_a_run_on_an_unknown_arm_is_not_diagnosed(tmp_path: Path) -> None:
+    folder = written(tmp_path, "{mass_kg: 5, lever_m: 0.3, arm: unknown}")
+    read = read_runs([folder / "heavy"], folder / "map.yaml")
+    [line] = check_runs([(each.name, each.table) for each in read], {1: JOINT}, (1,)).refused
+    assert "no valid torque sensor" in line
+
+
+@pytest.mark.parametrize(
+    ("load", "expected"),
+    [
+        (
+            "{empty: {mass_kg: 1, lever_m: 0.3}}",
+            "found none of 'empty' in the path, expected one, for j1.load",
+        ),
+        ("{run: {mass_kg: 1, lever_m: 0.3}, light: {mass_kg: 1, lever_m: 0.3}}", "found 'run' and 'light'"),
+        (
+            "{light: {mass_kg: 1, lever_m: 0.3, arm: none}}",
+            "arm': found 'none', expected one of 'known', 'unknown'",
+        ),
+    ],
+)
+def test_a_load_that_is_not_clear_is_refused_in_one_line(tmp_path: Path, load: str, expected: str) -> None:
+    folder = written(tmp_path, load)
+    with pytest.raises(ValueError, match=r".") as error:
+        read_runs([folder / "light"], folder / "map.yaml")
+    assert expected in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_known_load_is_no_dead_channel(tmp_path: Path) -> None:
+    folder = written(tmp_path, "{inertia_kgm2: 0.0}")
+    read = read_runs([folder / "light"], folder / "map.yaml")
+    assert not channel_findings(read, 1, JOINT)
