@@ -54,7 +54,8 @@ The campaign has a sensor, not the torque. Both paths' run means share the senso
 `reference_nm`: a normal prior, and two normal measurements of it whose variance is the excess of each path's means. The
 posterior's mean is subtracted from a run's error, and its standard deviation is spread over the samples by quantiles of a
 normal distribution (multiple imputation, Rubin 1987): a calibration against the torque, as far as the runs show it. The mean
-of n runs' offsets is in the fitted torques and nothing shows it: reference^2/n counts beside the posterior's variance.
+of n runs' offsets is in the fitted torques and nothing shows it: reference^2/n counts beside the posterior's variance, and
+that of a teacher that is no sensor (`known_load.py`).
 
 The level is unbiased, not the conservative one that guarantees at least COVERAGE. Where a whole run shares its error (its
 offsets), n runs have not shown the largest yet: 8 of them cover 87 % of others.
@@ -101,6 +102,7 @@ NONE: Final = np.zeros(0)
 class PathResiduals(NamedTuple):
     """One held-out run: arrays [n] of its moving samples, [Nm] and [rad/s].
 
+    teacher: standard deviation of what errors are against, 0 for a sensor.
     half: width of the friction interval (`AdditiveLossModel.loss`). open: what the slip leaves open.
     Without torsion torsion_nm, open_nm, torsion_error_nm are 0, and what follows is empty:
     dt_s, direction, slope (dL/draw of the loss): for `fused.agreement`. stiffness (d tau_t/d d): for `fused.zeros`.
@@ -125,6 +127,7 @@ class PathResiduals(NamedTuple):
     stiffness_nm_per_rad: FloatArray = NONE
     loss_nm: FloatArray = NONE
     turn: FloatArray = NONE
+    teacher_nm: FloatArray = NONE
 
     @property
     def apart_nm(self) -> FloatArray:
@@ -157,9 +160,10 @@ def path_residuals(
     loss_nm, wide = (each[keep] for each in loss_and_width(run, loss))
     raw, sensor, velocity = seen.raw_nm[keep], run.sensor_nm[keep], seen.velocity_rad_s[keep]
     current = raw - loss_nm - sensor
+    teacher = np.zeros(len(raw)) if run.teacher_nm is None else run.teacher_nm[keep]
     if torsion is None:
         none = np.zeros(len(raw))
-        return PathResiduals(raw, velocity, wide, none, none, current, none)
+        return PathResiduals(raw, velocity, wide, none, none, current, none, teacher_nm=teacher)
     tau, open_nm = (each[keep] for each in torsion_torque(torsion, run))
     direction = seen.direction[keep]
     more, _ = AdditiveLossModel(loss).loss_many(raw + SLOPE_NM, velocity, seen.temperature_c[keep], direction)
@@ -181,6 +185,7 @@ def path_residuals(
         stiffness_nm_per_rad=local_stiffness(torsion, deflection(torsion, run)[keep]),
         loss_nm=loss_nm,
         turn=np.column_stack((seen.turn, seen.waves))[keep],
+        teacher_nm=teacher,
     )
 
 
@@ -197,7 +202,7 @@ class FusedErrors(NamedTuple):
     """Errors of the estimator in one run, arrays [n] of its samples in motion.
 
     undelayed: with the torsion tracked. spread: standard deviation of the torque, scale 1. more: what the estimator adds to
-    it. known: what the tracked offset takes off the torsion's variance.
+    it. known: what the tracked offset takes off the torsion's variance. teacher: of `PathResiduals`.
     """
 
     error_nm: FloatArray
@@ -207,6 +212,7 @@ class FusedErrors(NamedTuple):
     velocity_rad_s: FloatArray
     quadrant: QuadrantArray
     known_nm2: FloatArray
+    teacher_nm: FloatArray = NONE
 
 
 def fused_errors(
@@ -250,6 +256,7 @@ def fused_errors(
         run.velocity_rad_s,
         quadrants(run.raw_nm, run.velocity_rad_s),
         known,
+        run.teacher_nm,
     )
 
 
@@ -461,8 +468,9 @@ def standing_errors(run: PathResiduals, advance_nm: FloatArray, fused: Fused) ->
     """Return the errors of a held-out run at rest; advance: of its samples, see `low_pass_advance`."""
     fusion = Fusion(replace(fused.sigma, reference_nm=0.0), True)
     spread, bound = fusion.at_rest(*run.fusion_inputs)
-    error = fused_errors(run, fused).error_nm
-    return Standing(error + advance_nm, spread, bound, run.open_nm <= KNOWN * fused.sigma.torsion_nm)
+    error = fused_errors(run, fused).error_nm + advance_nm
+    error = np.hypot(error, run.teacher_nm) if len(run.teacher_nm) else error
+    return Standing(error, spread, bound, run.open_nm <= KNOWN * fused.sigma.torsion_nm)
 
 
 def normal_bound(n: int) -> float:
@@ -578,7 +586,7 @@ def _beyond(
     from scipy.special import ndtri
 
     normal = ndtri((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
-    normal *= doubt_nm / np.sqrt(np.mean(normal**2))
+    normal /= np.sqrt(np.mean(normal**2))
     beyond = []
     for run, offset in zip(runs, offsets, strict=True):
         error, more = run.error_nm, run.more_nm2
@@ -586,6 +594,7 @@ def _beyond(
             error = run.undelayed_nm
             more = more + tracking.sigma_nm**2
             more += tracking.viscous_nms_per_rad**2 * bent_square(run.velocity_rad_s, tracking.bend)
-        error = error - offset + normal[np.arange(len(error)) % _QUANTILES]
+        doubt = np.hypot(doubt_nm, run.teacher_nm) if len(run.teacher_nm) else doubt_nm
+        error = error - offset + doubt * normal[np.arange(len(error)) % _QUANTILES]
         beyond.append(np.sqrt(np.maximum(error**2 - GAUSS**2 * more, 0.0)))
     return beyond

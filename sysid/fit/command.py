@@ -35,9 +35,11 @@ from jtqd.sysid.fit.efficiency import (
 from jtqd.sysid.fit.few_runs import MOST_RUNS, FewRunsFit, fit_few_runs
 from jtqd.sysid.fit.fused import FusedFit, fit_fused
 from jtqd.sysid.fit.joint_writer import with_fit, write_joint
-from jtqd.sysid.fit.losses import PER_K_PRIOR
+from jtqd.sysid.fit.known_load import STIFFNESS_KNOWN, WEIGHT, fit_teacher
+from jtqd.sysid.fit.losses import PER_K_PRIOR, LossFitError
 from jtqd.sysid.fit.plateaus import SHORTEST_S, fit_no_load, mean_temperature, no_load, plateaus_of
-from jtqd.sysid.fit.signals import signals_of_runs, two_encoders
+from jtqd.sysid.fit.signals import RunSignals, signals_of_runs, two_encoders
+from jtqd.sysid.fit.torsion import TorsionError
 from jtqd.sysid.report.page import check_picture
 from jtqd.sysid.runs.checks import channel_findings
 from jtqd.sysid.runs.options import add_columns, add_number, add_runs, runs_of_joint
@@ -80,9 +82,8 @@ def main(argv: list[str]) -> int:
     options = parser().parse_args(argv)
     by = f"jtq fit {options.kind}"
     if options.out is not None and options.out.resolve() == options.joint.resolve():
-        print(
-            f"{by}: --out: found {options.out}, the joint file itself, expected a new file", file=sys.stderr
-        )
+        found = f"found {options.out}, the joint file itself, expected a new file"
+        print(f"{by}: --out: {found}", file=sys.stderr)
         return 2
     try:
         joint = load_joint(options.joint)
@@ -126,33 +127,24 @@ def parser() -> argparse.ArgumentParser:
             epilog=f"examples:\n{kind.examples}",
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
+        add = own.add_argument
         add_runs(own)
-        own.add_argument("--joint", type=Path, required=True, metavar="FILE", help="joint file to start from")
+        add("--joint", type=Path, required=True, metavar="FILE", help="joint file to start from")
         add_number(own)
-        own.add_argument(
-            "--out", type=Path, metavar="FILE", help="joint file to write (default: only the report)"
-        )
+        add("--out", type=Path, metavar="FILE", help="joint file to write (default: only the report)")
         add_columns(own)
-        own.add_argument("--json", action="store_true", help="print the result as JSON")
+        add("--json", action="store_true", help="print the result as JSON")
         kind.options(own)
     return parser
 
 
 def _plateau_options(parser: argparse.ArgumentParser) -> None:
     """Add --min-hold and --min-current, of the fits to plateaus."""
-    parser.add_argument(
-        "--min-hold",
-        type=_positive,
-        default=SHORTEST_S,
-        metavar="S",
-        help="shortest plateau in seconds (default %(default)s)",
-    )
-    parser.add_argument(
-        "--min-current",
-        type=_positive,
-        metavar="A",
-        help="current below which eta is not computed (default: the current that overcomes the joint's own static friction)",
-    )
+    add, eta = parser.add_argument, "current below which eta is not computed"
+    hold = "shortest plateau in seconds (default %(default)s)"
+    usual = f"{eta} (default: the current that overcomes the joint's own static friction)"
+    add("--min-hold", type=_positive, default=SHORTEST_S, metavar="S", help=hold)
+    add("--min-current", type=_positive, metavar="A", help=usual)
 
 
 def _positive(text: str) -> float:
@@ -173,13 +165,7 @@ def _fitted(
     hashes = {run.name: run.sha256 for run in runs}
     today = dt.datetime.now().astimezone().date().isoformat()
     return with_fit(
-        joint,
-        section,
-        by=f"jtq fit {by}",
-        runs=hashes,
-        date=today,
-        temperature_c=temperature_c,
-        notes=notes,
+        joint, section, by=f"jtq fit {by}", runs=hashes, date=today, temperature_c=temperature_c, notes=notes
     )
 
 
@@ -188,23 +174,14 @@ def _fitted(
 
 def _efficiency_options(parser: argparse.ArgumentParser) -> None:
     _plateau_options(parser)
-    parser.add_argument(
-        "--convention",
-        choices=CONVENTIONS,
-        default=CONVENTIONS[0],
-        help="eta = tau_j/(G Kt i) as in Table I (default), or its reciprocal as in Eq. (6)",
-    )
-    parser.add_argument(
-        "--weighted",
-        action="store_true",
-        help="weight plateaus by their standard errors and the sensor's offset",
-    )
-    parser.add_argument(
-        "--allow-missing",
-        action="store_true",
-        help="keep the joint file's coefficients for quadrants that cannot be fitted",
-    )
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="plot like Fig. 6 (png, svg, pdf)")
+    add = parser.add_argument
+    eta = "eta = tau_j/(G Kt i) as in Table I (default), or its reciprocal as in Eq. (6)"
+    weighted = "weight plateaus by their standard errors and the sensor's offset"
+    missing = "keep the joint file's coefficients for quadrants that cannot be fitted"
+    add("--convention", choices=CONVENTIONS, default=CONVENTIONS[0], help=eta)
+    add("--weighted", action="store_true", help=weighted)
+    add("--allow-missing", action="store_true", help=missing)
+    add("--plot", type=Path, metavar="FILE", help="plot like Fig. 6 (png, svg, pdf)")
 
 
 def _fit_efficiency(joint: Joint, number: int, runs: list[RunFile], options: argparse.Namespace) -> Outcome:
@@ -322,20 +299,44 @@ def _fit_losses(joint: Joint, number: int, runs: list[RunFile], options: argpars
         return Outcome(log=[item.text for item in found], status=3)
     two = two_encoders(runs, number, joint)
     signals = signals_of_runs(runs, number, joint)
-    if not two and len(runs) <= MOST_RUNS:
-        few = fit_few_runs(signals, joint)
-        lines, log = _few_lines(few), [ONE_ENCODER, FEW_RUNS]
-        new, unseen = few.joint, [few.held_out_nm]
-        sigma_per_k, samples = PER_K_PRIOR[1], few.samples
-        notes: dict[str, Any] = {"few_runs": few.lines(), "rotor_inertia_kgm2": "fitted, too"}
+    if not any(number in run.known_loads for run in runs):
+        return _losses(joint, signals, runs, [], two=two, few=not two and len(runs) <= MOST_RUNS)
+    try:
+        teacher = fit_teacher(signals, joint, two_encoders=two)
+        if refusal := teacher.refusal(joint):
+            return Outcome(log=[refusal], status=3)
+        signals, said = [teacher.complete(run) for run in signals], teacher.lines(joint, two_encoders=two)
+        two = two and teacher.stiffness_share <= STIFFNESS_KNOWN
+        few = (not two and len(runs) <= MOST_RUNS) or teacher.load_nm < WEIGHT * joint.rated_torque_nm
+        return _losses(joint, signals, runs, said, two=two, few=few)
+    except (LossFitError, TorsionError) as error:
+        return Outcome(log=[str(error)], status=3)
+
+
+def _losses(
+    joint: Joint,
+    signals: Sequence[RunSignals],
+    runs: Sequence[RunFile],
+    said: Sequence[str],
+    *,
+    two: bool,
+    few: bool,
+) -> Outcome:
+    """Return the outcome of a fit to signals with a teacher. said: of known loads; few: with the priors of few runs."""
+    if few:
+        found = fit_few_runs(signals, joint)
+        lines, log = _few_lines(found), [FEW_RUNS] if said else [ONE_ENCODER, FEW_RUNS]
+        new, unseen = found.joint, [found.held_out_nm]
+        sigma_per_k, samples = PER_K_PRIOR[1], found.samples
+        notes: dict[str, Any] = {"few_runs": found.lines(), "rotor_inertia_kgm2": "fitted, too"}
         more = {
-            "effective_samples": few.effective,
-            "terms": [asdict(term) for term in few.terms],
+            "effective_samples": found.effective,
+            "terms": [asdict(term) for term in found.terms],
             "rotor_inertia_kgm2": new.rotor_inertia_kgm2,
         }
     else:
         fit = fit_fused(signals, joint, two_encoders=two)
-        lines, log = _fused_lines(joint, fit), [] if two else [ONE_ENCODER]
+        lines, log = _fused_lines(joint, fit), [] if two or said else [ONE_ENCODER]
         new, unseen = replace(joint, fused=fit.fused), list(fit.held_out_rmse_nm)
         sigma_per_k, samples = fit.loss.viscous_per_k_sigma, fit.loss.samples
         notes, more = {}, {}
@@ -349,9 +350,9 @@ def _fit_losses(joint: Joint, number: int, runs: list[RunFile], options: argpars
         "fused": new.fused.to_mapping(),
     }
     notes = {"unseen_rmse_nm": round(_together(unseen), 4), **notes}
-    return Outcome(
-        lines, mapping, log, _fitted(new, "fused", runs, "losses", new.fused.loss.temperature_c, **notes)
-    )
+    notes |= {"known_loads": list(said)} if said else {}
+    new = _fitted(new, "fused", runs, "losses", new.fused.loss.temperature_c, **notes)
+    return Outcome([*lines, *(f"  {line}" for line in said)], mapping, log, new)
 
 
 def _few_lines(fit: FewRunsFit) -> list[str]:
@@ -370,11 +371,10 @@ def _together(rmse_nm: Sequence[float]) -> float:
 
 
 def _fused_lines(joint: Joint, fit: FusedFit) -> list[str]:
-    fused, rmse = fit.fused, _together(fit.held_out_rmse_nm)
-    sigma, torsion, loss = fused.sigma, fused.torsion, fused.loss
+    fused, rmse, worst = fit.fused, _together(fit.held_out_rmse_nm), max(fit.held_out_rmse_nm)
+    sigma, torsion, loss, share = fused.sigma, fused.torsion, fused.loss, 100 * rmse / joint.rated_torque_nm
     lines = [
-        f"{joint.name}: physics on held-out runs: RMSE {rmse:.3f} Nm "
-        f"({100 * rmse / joint.rated_torque_nm:.2f} % of rated), worst run {max(fit.held_out_rmse_nm):.3f} Nm",
+        f"{joint.name}: physics on held-out runs: RMSE {rmse:.3f} Nm ({share:.2f} % of rated), worst run {worst:.3f} Nm",
         f"  loss: {fit.loss.samples} samples, viscous friction falls {100 * loss.viscous_per_k:.1f} "
         f"+- {196 * fit.loss.viscous_per_k_sigma:.1f} % per kelvin",
         f"  sigma of the current path {sigma.current_nm:.2f} Nm, {sigma.viscous_nms_per_rad:.2f} Nms/rad, "
@@ -385,33 +385,27 @@ def _fused_lines(joint: Joint, fit: FusedFit) -> list[str]:
     lines[-1] += (
         f"; of the torsion {sigma.torsion_nm:.2f} Nm; of the sensor's offset {sigma.reference_nm:.2f} Nm"
     )
-    amplitude = np.hypot(torsion.cos_rad, torsion.sin_rad) * 1e6
+    two, four, *_ = np.hypot(torsion.cos_rad, torsion.sin_rad) * 1e6
     lines.append(
         f"  stiffness {torsion.stiffness_nm_per_rad:.0f} Nm/rad (file: {joint.stiffness_nm_per_rad:.0f}), kinematic "
-        f"error {amplitude[0]:.0f} urad at 2 per motor revolution, {amplitude[1]:.0f} at 4"
+        f"error {two:.0f} urad at 2 per motor revolution, {four:.0f} at 4"
     )
-    if fused.agreement is not None:
-        lines.append(
-            f"  current and torsion differ by up to {fused.agreement.slow_nm:.2f} Nm slowly and "
-            f"{fused.agreement.fast_nm:.2f} Nm over the motor's turn; sigma grows beyond"
-        )
-    if fused.zeros is not None:
-        lines.append(
-            f"  the link encoder's offset differs by {1e6 * fused.zeros.spread_rad:.0f} urad, "
-            f"{fused.zeros.spread_nm:.2f} Nm, from day to day; with track_zeros it is learned"
-        )
+    if (found := fused.agreement) is not None:
+        apart = f"{found.slow_nm:.2f} Nm slowly and {found.fast_nm:.2f} Nm over the motor's turn"
+        lines.append(f"  current and torsion differ by up to {apart}; sigma grows beyond")
+    if (zeros := fused.zeros) is not None:
+        spread = f"{1e6 * zeros.spread_rad:.0f} urad, {zeros.spread_nm:.2f} Nm, from day to day"
+        lines.append(f"  the link encoder's offset differs by {spread}; with track_zeros it is learned")
     if fused.standstill is None:
         lines.append("  too few runs come to rest to calibrate the interval there: 3 standard deviations")
     else:
+        rest = f"{fused.standstill.sigmas:.2f} standard deviations and what slip and friction leave open"
+        lines.append(f"  at rest the interval is {rest}")
+    if (tracking := fused.tracking) is not None:
         lines.append(
-            f"  at rest the interval is {fused.standstill.sigmas:.2f} standard deviations and what slip and friction "
-            "leave open"
-        )
-    if fused.tracking is not None:
-        lines.append(
-            f"  with the torsion tracked, an estimate without delay: {fused.tracking.sigma_nm:.2f} Nm and "
-            f"{fused.tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares, the latter bent above "
-            f"{fused.tracking.saturation_rad_s:g} rad/s"
+            f"  with the torsion tracked, an estimate without delay: {tracking.sigma_nm:.2f} Nm and "
+            f"{tracking.viscous_nms_per_rad:.2f} Nms/rad more, added as squares, the latter bent above "
+            f"{tracking.saturation_rad_s:g} rad/s"
         )
     return lines
 

@@ -81,6 +81,7 @@ _VISCOUS: Final = slice(6, 8)
 _LOSS: Final = slice(0, 8)
 _INERTIA: Final = 8
 _COMMON: Final = 9
+_PHYSICAL: Final = slice(0, 9)
 """c_+ at -R, 0, R, c_- at -R, 0, R, f_+, f_-, J; the offsets of the runs follow."""
 _NAMES: Final = (
     ("Coulomb friction", "Nm"),
@@ -141,13 +142,16 @@ class FewRunsFit:
         ]
 
 
-class _Block(NamedTuple):
-    """Equations of one run: columns x [n, _COMMON], target y [n], speed [n], seconds of motion."""
+class Block(NamedTuple):
+    """Equations of one run: columns x [n, k] of all runs' numbers, target y [n], speed [n], seconds of motion; of that day
+    [n, m].
+    """
 
     x: FloatArray
     y: FloatArray
     v: FloatArray
     motion_s: float
+    day: FloatArray
 
 
 def fit_few_runs(runs: Sequence[RunSignals], joint: Joint) -> FewRunsFit:
@@ -168,10 +172,10 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint) -> FewRunsFit:
         block.motion_s / _LONGEST_S / len(block.y) / (2.0 * _LEAST_RATED * rated) ** 2 for block in blocks
     ]
     for _ in range(_REPETITIONS):
-        w, covariance = _solve(blocks, weights, before)
-        weights = [_weight(block, w, n, rated) for n, block in enumerate(blocks)]
-    w, covariance = _solve(blocks, weights, before)
-    residual = _rms([_error(block, w, n) for n, block in enumerate(blocks)])
+        w, _ = solve(blocks, weights, before)
+        weights = weights_of(blocks, w, _LEAST_RATED * rated)
+    w, covariance = solve(blocks, weights, before, _PHYSICAL)
+    residual = _rms(errors_of(blocks, w))
     held_out = _rms(_held_out_errors(blocks, weights, before))
     speed = max(float(np.abs(block.v).max()) for block in blocks)
     sigma = _sigma(w[_LOSS], covariance[_LOSS, _LOSS], max(held_out, _LEAST_RATED * rated), rated, speed)
@@ -179,28 +183,26 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint) -> FewRunsFit:
     fitted = replace(
         joint, rotor_inertia_kgm2=float(w[_INERTIA]) / joint.gear_ratio**2, fused=Fused(loss, None, sigma)
     )
-    effective = sum(
-        weight * len(block.y) * _variance(block, w, n, rated)
-        for n, (block, weight) in enumerate(zip(blocks, weights, strict=True))
-    )
+    effective = sum(map(_effective, blocks, errors_of(blocks, w)))
     terms = _terms(w, covariance, before, joint)
     return FewRunsFit(fitted, terms, residual, held_out, effective, sum(len(block.y) for block in blocks))
 
 
-def _block(run: RunSignals, joint: Joint) -> _Block:
+def _block(run: RunSignals, joint: Joint) -> Block:
     """Return the equations of a run's moving samples, about 200 per second."""
     seen, friction = run.seen, joint.friction
     step = float(np.median(seen.dt_s[1:])) if len(seen.dt_s) > 1 else _SAMPLE_S
     moving = np.flatnonzero(run.moving & (np.abs(np.nan_to_num(seen.velocity_rad_s)) > _SLOW_RAD_S))
     index = moving[:: max(1, round(_SAMPLE_S / step))]
     if not len(index):
-        return _Block(np.zeros((0, _COMMON)), np.zeros(0), np.zeros(0), 0.0)
+        return Block(np.zeros((0, _COMMON)), np.zeros(0), np.zeros(0), 0.0, np.zeros((0, 1)))
     time_s = np.cumsum(np.maximum(seen.dt_s, 1e-9))
     alpha = np.gradient(np.nan_to_num(seen.velocity_rad_s), time_s)[index]
     raw, v, s = seen.raw_nm[index], seen.velocity_rad_s[index], seen.direction[index]
     peak = friction.stribeck_nm * np.exp(-((v / friction.stribeck_velocity_rad_s) ** 2)) * s
     x = np.column_stack((_columns(raw, v, s, joint.rated_torque_nm), alpha))
-    return _Block(x, raw + _reflected(joint) * alpha - run.sensor_nm[index] - peak, v, step * len(moving))
+    target = raw + _reflected(joint) * alpha - run.sensor_nm[index] - peak
+    return Block(x, target, v, step * len(moving), np.ones((len(index), 1)))
 
 
 def _columns(raw: FloatArray, v: FloatArray, s: FloatArray, rated: float) -> FloatArray:
@@ -231,85 +233,76 @@ def _mixing(rated: float) -> FloatArray:
     return b
 
 
-class _Before(NamedTuple):
-    """The fit's numbers before any run: mean [9], covariance and its inverse [9, 9]; sigma of the runs' offsets [Nm]."""
+class Before(NamedTuple):
+    """The prior: mean [k] and covariance [k, k] of all runs' numbers; standard deviations of those of a day."""
 
     mean: FloatArray
     covariance: FloatArray
-    precision: FloatArray
-    offset_nm: float
+    day: tuple[float, ...]
 
 
-def _before(joint: Joint) -> _Before:
+def _before(joint: Joint) -> Before:
     rated, friction = joint.rated_torque_nm, joint.friction
     viscous = float(np.hypot(_VISCOUS_SHARE * friction.viscous_nms_per_rad, _VISCOUS_RATED * rated))
-    sigmas = np.array(
-        (
-            np.hypot(_COULOMB_SHARE * friction.coulomb_nm, _COULOMB_RATED * rated),
-            _LOAD,
-            viscous,
-            _OFFSET_RATED * rated,
-            _GAIN,
-            _INERTIA_SHARE * _reflected(joint),
-        )
+    coulomb, inertia = (
+        np.hypot(_COULOMB_SHARE * friction.coulomb_nm, _COULOMB_RATED * rated),
+        _reflected(joint),
     )
-    means = np.array(
-        (friction.coulomb_nm, _LOAD_MEAN, friction.viscous_nms_per_rad, 0.0, 0.0, _reflected(joint))
-    )
+    sigmas = np.array((coulomb, _LOAD, viscous, _OFFSET_RATED * rated, _GAIN, _INERTIA_SHARE * inertia))
+    means = np.array((friction.coulomb_nm, _LOAD_MEAN, friction.viscous_nms_per_rad, 0, 0, inertia))
     side = np.array((_CURVED_RATED, _OTHER_WAY_RATED, _CURVED_RATED)) * rated
     own = np.concatenate((side, side, np.full(2, _OTHER_WAY_VISCOUS * viscous), [0.0]))
     b = _mixing(rated)
     covariance = b @ np.diag(sigmas**2) @ b.T + np.diag(own**2)
-    precision = np.asarray(np.linalg.inv(covariance), np.float64)
-    return _Before(b @ means, covariance, precision, _ZERO_RATED * rated)
+    return Before(b @ means, covariance, (_ZERO_RATED * rated,))
 
 
-def _solve(
-    blocks: Sequence[_Block], weights: Sequence[float], before: _Before
+def solve(
+    blocks: Sequence[Block], weights: Sequence[float], before: Before, signed: slice = slice(0)
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the most probable numbers, then offsets of the runs, and their covariance before the bounds."""
-    size = _COMMON + len(blocks)
-    left, right = np.zeros((size, size)), np.zeros(size)
-    left[:_COMMON, :_COMMON] = before.precision
-    right[:_COMMON] = before.precision @ before.mean
-    for n, (block, weight) in enumerate(zip(blocks, weights, strict=True)):
-        at = np.r_[:_COMMON, _COMMON + n]
-        x = np.column_stack((block.x, np.ones(len(block.y))))
+    """Return the most probable numbers, then those of each day, and their covariance before the bounds: `signed` >= 0."""
+    common, ends = len(before.mean), _ends(blocks, len(before.mean))
+    left, right = np.zeros((ends[-1], ends[-1])), np.zeros(ends[-1])
+    left[:common, :common] = np.linalg.inv(before.covariance)
+    right[:common] = left[:common, :common] @ before.mean
+    for block, weight, (first, end) in zip(blocks, weights, pairwise(ends), strict=True):
+        at = np.r_[:common, first:end]
+        x = np.column_stack((block.x, block.day))
         left[np.ix_(at, at)] += weight * (x.T @ x)
-        left[_COMMON + n, _COMMON + n] += before.offset_nm**-2
+        left[at[common:], at[common:]] += np.array(before.day[: end - first]) ** -2
         right[at] += weight * (x.T @ block.y)
     covariance = np.asarray(np.linalg.inv(left), np.float64)
     w = covariance @ right
-    if (w[:_COMMON] < 0.0).any():
-        w = bounded(left, right, slice(0, _COMMON))
-    return w, covariance
+    return (bounded(left, right, signed) if (w[signed] < 0.0).any() else w), covariance
 
 
-def _error(block: _Block, w: FloatArray, run: int) -> FloatArray:
-    error: FloatArray = block.y - block.x @ w[:_COMMON] - w[_COMMON + run]
-    return error
+def _ends(blocks: Sequence[Block], common: int) -> list[int]:
+    return [int(end) for end in np.cumsum([common, *(block.day.shape[1] for block in blocks)])]
 
 
-def _effective(block: _Block, error: FloatArray) -> float:
+def errors_of(blocks: Sequence[Block], w: FloatArray) -> list[FloatArray]:
+    """Return the error [n] of each block."""
+    common = blocks[0].x.shape[1]
+    days = pairwise(_ends(blocks, common))
+    return [b.y - b.x @ w[:common] - b.day @ w[a:end] for b, (a, end) in zip(blocks, days, strict=True)]
+
+
+def _effective(block: Block, error: FloatArray) -> float:
     """Return how many samples of a run count."""
     return min(effective_samples(error), max(2.0, block.motion_s / _LONGEST_S))
 
 
-def _variance(block: _Block, w: FloatArray, run: int, rated: float) -> float:
-    """Return the variance of an effective sample of a run, with the freedom that three numbers of a loss take."""
-    error = _error(block, w, run)
-    effective = _effective(block, error)
-    found = float(np.mean(error**2)) * effective / max(effective - 3.0, 1.0)
-    return max(found, (_LEAST_RATED * rated) ** 2)
+def weights_of(blocks: Sequence[Block], w: FloatArray, least_nm: float) -> list[float]:
+    """Return the weight of each sample of each block: those that count share it. Three numbers of a law take freedom."""
+    weights = []
+    for block, error in zip(blocks, errors_of(blocks, w), strict=True):
+        effective = _effective(block, error)
+        variance = float(np.mean(error**2)) * effective / max(effective - 3.0, 1.0)
+        weights.append(effective / len(error) / max(variance, least_nm**2))
+    return weights
 
 
-def _weight(block: _Block, w: FloatArray, run: int, rated: float) -> float:
-    """Return the weight of each of a run's samples: those that count share the run."""
-    effective = _effective(block, _error(block, w, run))
-    return effective / len(block.y) / _variance(block, w, run, rated)
-
-
-def _held_out_errors(blocks: Sequence[_Block], weights: Sequence[float], before: _Before) -> list[FloatArray]:
+def _held_out_errors(blocks: Sequence[Block], weights: Sequence[float], before: Before) -> list[FloatArray]:
     """Return the errors in each fifth of each run, of a fit without it."""
     found = []
     for n, block in enumerate(blocks):
@@ -317,9 +310,9 @@ def _held_out_errors(blocks: Sequence[_Block], weights: Sequence[float], before:
         for a, b in pairwise(edges):
             keep = np.r_[:a, b : len(block.y)]
             others = [*blocks]
-            others[n] = _Block(block.x[keep], block.y[keep], block.v[keep], block.motion_s)
-            w, _ = _solve(others, weights, before)
-            found.append(_error(block, w, n)[a:b])
+            others[n] = Block(block.x[keep], block.y[keep], block.v[keep], block.motion_s, block.day[keep])
+            w, _ = solve(others, weights, before, _PHYSICAL)
+            found.append(errors_of(blocks, w)[n][a:b])
     return found
 
 
@@ -343,11 +336,9 @@ def _sigma(
     ratio = variance / (a + b * v * v + c * raw * raw)
     at = quadrants(raw, v)
     one, two, three, four = (float(np.sqrt(np.mean(ratio[at == q]))) for q in range(4))
-    current = float(np.sqrt(a))
+    current, viscous, load = (float(np.sqrt(each)) for each in (a, b, c))
     # without torsion the estimator does not read its sigma; the file must have a number above 0
-    return FusedSigma(
-        current, float(np.sqrt(b)), float(np.sqrt(c)), current, 0.0, 0.0, (one, two, three, four)
-    )
+    return FusedSigma(current, viscous, load, current, 0.0, 0.0, (one, two, three, four))
 
 
 def _temperature(runs: Sequence[RunSignals]) -> float:
@@ -357,16 +348,9 @@ def _temperature(runs: Sequence[RunSignals]) -> float:
 
 def _loss(w: FloatArray, joint: Joint, speed: float, temperature_c: float) -> AdditiveLoss:
     rated, friction = joint.rated_torque_nm, joint.friction
-    return AdditiveLoss(
-        (-rated, 0.0, rated),
-        _side(w[:3], w[6], friction),
-        _side(w[3:_NODES], w[7], friction),
-        friction.stribeck_velocity_rad_s,
-        _FASTER * speed,
-        temperature_c,
-        float(np.mean(w[_VISCOUS])),
-        PER_K_PRIOR[0],
-    )
+    sides = _side(w[:3], w[6], friction), _side(w[3:_NODES], w[7], friction)
+    place = friction.stribeck_velocity_rad_s, _FASTER * speed, temperature_c
+    return AdditiveLoss((-rated, 0.0, rated), *sides, *place, float(np.mean(w[_VISCOUS])), PER_K_PRIOR[0])
 
 
 def _side(constant: FloatArray, viscous: float, friction: Friction) -> LossSide:
@@ -374,7 +358,7 @@ def _side(constant: FloatArray, viscous: float, friction: Friction) -> LossSide:
     return LossSide((one, two, three), (float(viscous),) * 3, (0.0,) * 3, friction.stribeck_nm)
 
 
-def _terms(w: FloatArray, covariance: FloatArray, before: _Before, joint: Joint) -> tuple[FewTerm, ...]:
+def _terms(w: FloatArray, covariance: FloatArray, before: Before, joint: Joint) -> tuple[FewTerm, ...]:
     """Return the physical quantities of the report: least squares on the fit's numbers."""
     back = np.linalg.pinv(_mixing(joint.rated_torque_nm))
     back[np.abs(back) < 1e-12] = 0.0  # a prior of 0 is to read 0

@@ -1,9 +1,13 @@
-"""Signals of one joint in one run, as fits of the fused estimator need them: outputs of the observer beside the sensor."""
+"""Signals of one joint in one run, as fits of the fused estimator need them: outputs of the observer beside the teacher.
+
+The teacher is the torque that a fit learns from: a torque sensor, a known load, or the known part of a load on an unknown
+arm, which `few_runs.py` completes. What is called sensor in the fits is the teacher.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -16,6 +20,7 @@ from jtqd.estimator.run import JointColumns, ObservedRun, RunTableError
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.estimator.status import STANDSTILL, VALID
 from jtqd.sysid.progress import progress
+from jtqd.sysid.runs.column_map import SHARP, motion_of
 from jtqd.sysid.runs.run_file import RunFile
 
 UNIT_TORSION: Final = Torsion(1.0, 0.0, 0.0, tuple(map(float, RIPPLE_ORDERS)), (0.0, 0.0), (0.0, 0.0))
@@ -41,6 +46,8 @@ class RunSignals:
     With the delay of the motor path: seen, outputs of the observer, whose `torsion_nm` is the filtered torsion angle [rad];
     sensor_nm, the torque sensor through the same filter, of bandwidth_rad_s.
     Unfiltered: positions and velocity [rad, rad/s] of the encoders, torsion_rad, theta_m/G - theta_l, raw_sensor_nm.
+    arm [n, 3]: what the teacher lacks of a load on an unknown arm: sin, cos, d2/dt2 of the link's angle; None: nothing.
+    teacher_nm: standard deviation of the teacher [Nm]; None: 0.
     """
 
     name: str
@@ -54,6 +61,15 @@ class RunSignals:
     torsion_rad: FloatArray
     raw_sensor_nm: FloatArray
     bandwidth_rad_s: float = EstimatorSettings().bandwidth_rad_s
+    arm: FloatArray | None = None
+    teacher_nm: FloatArray | None = None
+
+    @property
+    def filtered_arm(self) -> FloatArray:
+        """`arm` [n, 3] through the estimator's filter; zeros where nothing is missing."""
+        if self.arm is None:
+            return np.zeros((len(self.sensor_nm), 3))
+        return np.column_stack([low_pass(part, self.seen.dt_s, self.bandwidth_rad_s) for part in self.arm.T])
 
     def waves(self, angle_rad: FloatArray, order: float) -> FloatArray:
         """Return cos and sin [n, 2] of a multiple of an angle [n], through the estimator's filter."""
@@ -67,10 +83,20 @@ class RunSignals:
         return float(known.mean()) if len(known) else float("nan")
 
 
-def run_signals(
-    name: str, joint: Joint, settings: EstimatorSettings, time_s: FloatArray, columns: JointColumns
+def run_signals(  # noqa: PLR0917
+    name: str,
+    joint: Joint,
+    settings: EstimatorSettings,
+    time_s: FloatArray,
+    columns: JointColumns,
+    known_part_nm: FloatArray | None = None,
 ) -> RunSignals:
-    """Observe one joint of a run. Raises ValueError for a missing column or a sensor with NaN."""
+    """Observe one joint of a run; known_part_nm [n]: the teacher, on an unknown arm.
+
+    Raises ValueError for a missing column or a sensor with NaN.
+    """
+    if known_part_nm is not None:
+        columns = replace(columns, torque_nm=known_part_nm)
     needed = {key: getattr(columns, key) for key in _COLUMNS}
     missing = [key for key, column in needed.items() if column is None]
     if missing:
@@ -79,6 +105,9 @@ def run_signals(
     gaps = int((~np.isfinite(sensor)).sum())
     if gaps:
         raise ValueError(f"{name}: joint {joint.name}: torque_nm: found {gaps} gaps, expected finite numbers")
+    arm = None
+    if known_part_nm is not None:
+        arm = np.column_stack((np.sin(link), np.cos(link), motion_of(time_s, link, SHARP)[1]))
     dt = np.diff(time_s, prepend=time_s[0])
     seen = observe_run(
         joint, settings, UNIT_TORSION, dt, current, motor, velocity, link, columns.temperature_c
@@ -98,16 +127,18 @@ def run_signals(
         motor / joint.gear_ratio - link,
         sensor,
         settings.bandwidth_rad_s,
+        arm,
     )
 
 
 def signals_of_runs(runs: Sequence[RunFile], number: int, joint: Joint) -> list[RunSignals]:
     """Return the signals of one joint in all runs, with a progress bar on a terminal."""
-    settings = EstimatorSettings(method="fused")
-    return [
-        run_signals(run.name, joint, settings, run.table.time_s, run.table.joint(number, joint.gear_ratio))
-        for run in progress(runs, f"observing {joint.name}")
-    ]
+    settings, ratio = EstimatorSettings(method="fused"), joint.gear_ratio
+    signals = []
+    for run in progress(runs, f"observing {joint.name}"):
+        table, part = run.table, run.known_parts.get(number)
+        signals.append(run_signals(run.name, joint, settings, table.time_s, table.joint(number, ratio), part))
+    return signals
 
 
 def two_encoders(runs: Sequence[RunFile], number: int, joint: Joint) -> bool:

@@ -479,6 +479,26 @@ def test_the_calibrated_interval_holds_the_torque(tracked: bool) -> None:
     assert np.mean(shares) == pytest.approx(COVERAGE, abs=0.025)
 
 
+@pytest.mark.parametrize("tracked", [False, True])
+def test_the_interval_holds_what_the_teacher_does_not_know(tracked: bool) -> None:
+    """Campaigns whose teacher is off by an error of its own in all runs: they do not show it, its deviation does."""
+    tracking = Tracking(TRACKING_RAD_S, 0.3, 0.0, WAVE_RAD_S) if tracked else None
+    section = replace(fused(), agreement=None, tracking=tracking)
+    section = replace(section, sigma=replace(section.sigma, reference_nm=0.0))
+    runs = [
+        run._replace(teacher_nm=np.full(len(run.raw_nm), 0.7))
+        for run in runs_of_sensor(np.zeros(80), tracked)
+    ]
+    found = calibrated(runs[:60], section, RATED)
+    shares = []
+    for off in np.random.default_rng(15).normal(0.0, 0.7, 200):
+        for run in runs[60:62]:
+            one = fused_errors(run, found)
+            error = (one.undelayed_nm if tracked else one.error_nm) - off
+            shares.append(inside(one, error, found.sigma.scale, 0.3**2 if tracked else 0.0))
+    assert np.mean(shares) == pytest.approx(COVERAGE, abs=0.06)
+
+
 def of_day(known: float, error_nm: float, rng: np.random.Generator) -> tuple[FusedErrors, np.ndarray]:
     """A run whose first half knows nothing of its offset of 0.2 Nm, the second half this part; and its errors."""
     n = 1000
