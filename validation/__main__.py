@@ -28,6 +28,7 @@ STUDIES: Final = {
         "validation.goals.payloads",
         "fitted from two known payloads, without a torque sensor, against fitted with one",
     ),
+    "expect": ("validation.goals.expect", "error and interval to expect of a joint, from its data sheet"),
     "sources": ("validation.goals.sources", "what the error of the estimate is made of on a bench"),
     "other_plant": ("validation.goals.other_plant", "joint files of another plant: how soon it is flagged"),
     "two_runs": (
