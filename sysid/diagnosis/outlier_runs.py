@@ -96,17 +96,14 @@ def outlier_run(dataset: Dataset) -> tuple[list[int], OutlierRun] | None:
         sums = [run_sums(run, noise, columns, len(sigma) + len(kinds)) for run in runs]
         grams = np.zeros((count, *sums[0].gram.shape))
         np.add.at(grams, pieces, np.array([s.gram for s in sums]))
-        each = np.zeros(count)
-        np.add.at(each, pieces, np.array([s.rows for s in sums]))
-        rows = float(each.sum())
+        each = np.bincount(pieces, [s.rows for s in sums]).astype(np.float64)
         comparison = Comparison(without_days(grams, columns, sigma), columns, echoes)
-        chosen, off = comparison.chosen(dataset.candidates, math.log(max(rows, 10.0)))
-        found = [(comparison.drop(chosen, off, *at), at, comparison.far(chosen, at, kinds)) for at in off]
-        far = [
-            (drop, at, size)
-            for drop, at, size in found
-            if size is not None and comparison.explains_what_is_apart(chosen, off, at, each)
-        ]
+        chosen, off = comparison.chosen(dataset.candidates, math.log(max(float(each.sum()), 10.0)))
+        far = []
+        for at in off:
+            size = comparison.far(chosen, at, kinds)
+            if size is not None and comparison.explains_what_is_apart(chosen, off, at, each):
+                far.append((comparison.drop(chosen, off, *at), at, size))
         if not far:
             return None
         leave = set(range(columns)) - set(chosen)
@@ -180,9 +177,8 @@ class Comparison:
                 break
             block, new, _ = blocks.pop(int(np.argmax(worth)))
             if isinstance(new, EffectCandidate):
-                ends = np.array([*here, *block, -1], np.intp)
-                beta, _ = solve(self.total[ends[:, None], ends], len(ends) - 1)
-                if not within(new, [float(x) for x in beta[len(here) :]]):
+                beta, _ = solve(self.total, [*here, *block])
+                if not within(new, beta[len(here) :].tolist()):
                     continue
                 blocks = [b for b in blocks if not isinstance(b[1], EffectCandidate) or b[1].key != new.key]
             else:
@@ -199,8 +195,7 @@ class Comparison:
         self, chosen: Sequence[int], off: Sequence[tuple[int, int]], at: tuple[int, int], rows: FloatArray
     ) -> bool:
         """Return whether a deviation is most of what sets its run apart beside all else that was chosen; rows: per run."""
-        ends = np.array([*chosen, *(self.place(*one) for one in off), -1], np.intp)
-        beta, _ = solve(self.total[ends[:, None], ends], len(ends) - 1)
+        beta, _ = solve(self.total, [*chosen, *(self.place(*one) for one in off)])
         effects = np.append(-beta[: len(chosen)], 1.0)
 
         def square(r: int, own: Sequence[int]) -> float:
@@ -308,7 +303,7 @@ def own_deviations(
         gram[:shared, place] = gram[place, :shared] = run[common, at]
         gram[place, place] = run[at, at] + 1.0 / free**2
         gram[place, size] = run[at, -1]
-    solution, covariance = solve(gram, size)
+    solution, covariance = solve(gram, range(size))
     contrast = (count * np.eye(count) - np.ones((count, count))) / (count - 1.0)
     spread = contrast @ covariance[shared:, shared:] @ contrast.T
     return solution[shared:], np.sqrt(np.maximum(np.diag(spread), 0.0))
@@ -323,20 +318,20 @@ def apart_from_others(own: FloatArray, r: int, usual: float) -> tuple[float, flo
     return float(own[r] - others.mean()), float(np.sqrt(squares / (len(others) + _USUAL_RUNS)))
 
 
-def solve(total: FloatArray, k: int) -> tuple[FloatArray, FloatArray]:
-    """Return least squares of the first k columns for the last, and its covariance, with a little of the diagonal added."""
-    gram = total[:k, :k]
+def solve(total: FloatArray, columns: Sequence[int]) -> tuple[FloatArray, FloatArray]:
+    """Return least squares of these columns for the last, and its covariance, with a little of the diagonal added."""
+    at = np.array(columns, np.intp)
+    gram = total[at[:, None], at]
     scale = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-30))
-    scaled = gram * scale[:, None] * scale + _RIDGE * np.eye(k)
+    scaled = gram * scale[:, None] * scale + _RIDGE * np.eye(len(at))
     covariance = np.linalg.inv(scaled) * scale[:, None] * scale
-    return covariance @ total[:k, k], covariance
+    return covariance @ total[at, -1], covariance
 
 
 def explained(total: FloatArray, columns: Sequence[int]) -> float:
     """Return by how much these columns lower the sum of squares (last row: residual)."""
-    at = np.array([*columns, -1], np.intp)
-    beta, _ = solve(total[at[:, None], at], len(columns))
-    return float(beta @ total[at[:-1], -1])
+    beta, _ = solve(total, columns)
+    return float(beta @ total[np.array(columns, np.intp), -1])
 
 
 def within(candidate: EffectCandidate, coefficients: Sequence[float]) -> bool:

@@ -98,13 +98,9 @@ def predict(solution: Solution) -> Prediction:
     part = stacked(grams, without, chosen, wide) if len(grams) > 1 else 0.0
     mixed = [_coefficients(sets, chosen) + part * _added(sets, chosen, wide) for sets in without]
     contrasts = [np.append(-mean, 1.0) for mean in mixed[:-1]]
+    each = list(zip(grams, contrasts, counts, strict=True))
     squares = {
-        c: np.array(
-            [
-                (run[c][-1, -1], max(float(contrast @ run[c] @ contrast), 0.0), count[c])
-                for run, contrast, count in zip(grams, contrasts, counts, strict=True)
-            ]
-        )
+        c: np.array([(g[c][-1, -1], max(float(x @ g[c] @ x), 0.0), count[c]) for g, x, count in each])
         for c in grams[0]
     }
     named = wide if part > 0.0 else chosen
@@ -266,8 +262,14 @@ class Judged:
 def present_of(solution: Solution) -> tuple[list[Present], FloatArray]:
     """Return the effects of the set, and what each recording has of its own without discrepancy [r, q]."""
     mean = solution.sets.fit(solution.chosen).mean
-    found = [(solution.entries[k], mean[at]) for k, at in solution.sets.places(solution.chosen).items()]
-    return present_effects(found), np.array([u[: len(solution.dataset.families)] for u in solution.own_means])
+    own = np.array([u[: len(solution.dataset.families)] for u in solution.own_means])
+    return effects_of(solution, solution.chosen, mean), own
+
+
+def effects_of(solution: Solution, chosen: Set, mean: FloatArray) -> list[Present]:
+    """Return the effects of a set with these coefficients."""
+    places = solution.sets.places(chosen)
+    return present_effects([(solution.entries[k], mean[at]) for k, at in places.items()])
 
 
 def judged(solution: Solution) -> list[Judged]:
@@ -341,11 +343,11 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
     dataset = solution.dataset
     prediction = predict(solution)
     effects = judged(solution)
-    rated = {n: joint.rated_torque_nm for n, joint in dataset.joints.items()}
-    limits_nm = {c: relevance * rated[c.joint] for c in dataset.runs[0].channels}
+    joints = dataset.joints
+    limits_nm = {c: relevance * joints[c.joint].rated_torque_nm for c in dataset.runs[0].channels}
     left = remaining(dataset, *present_of(solution))
     rest = unexplained_residual(left)
-    predicting = extended_effects(solution, prediction)
+    predicting = effects_of(solution, prediction.chosen, prediction.mean)
     if _largest(rest, limits_nm) > 1.0:
         # the discrepancy has a part in the set's values, none in those that predict
         own = solution.own(prediction.mean, prediction.chosen)[:, : len(dataset.families)]
@@ -354,7 +356,8 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
         if _largest(less, limits_nm) < _largest(rest, limits_nm):
             left, rest = other, less
     total_nm2 = sum(sum(r * r for r in j.rms_nm.values()) for j in effects) + rest.energy_nm2()
-    unexplained = _unexplained(rest, held_nm(left), limits_nm, rated, total_nm2)
+    left_share = rest.energy_nm2() / max(total_nm2, 1e-30)
+    unexplained = _unexplained(rest, held_nm(left), limits_nm, dataset, left_share)
     found = sorted(
         (_cause(solution, j, total_nm2, rest, limits_nm) for j in effects), key=lambda x: -x[0].rms_nm
     )
@@ -371,13 +374,13 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
         verdict,
         tuple(rest.reasons if unexplained.matters else ()),
         names,
-        tuple(sorted(dataset.joints)),
+        tuple(sorted(joints)),
         channel_gaps(left, rest, unexplained.matters),
         tuple(cause for cause, size in found if size >= limits.LISTED),
         table,
         gain_of(solution, prediction) if prediction.chosen else None,
         traces=traces(left),
-        explained_share=1.0 - rest.energy_nm2() / max(total_nm2, 1e-30) if causes else math.nan,
+        explained_share=1.0 - left_share if causes else math.nan,
         unexplained=unexplained,
         too_small=tuple(cause for cause, size in found if size < limits.LISTED),
         cannot_be_told=untold,
@@ -388,7 +391,7 @@ def conclude(solution: Solution, names: tuple[str, ...], scope: Scope, relevance
 
 def _largest(rest: Unexplained, limits_nm: Mapping[Channel, float]) -> float:
     """Return the largest of what remains in parts of its limit."""
-    return max((rest.worst_nm.get(c, 0.0) / max(nm, 1e-12) for c, nm in limits_nm.items()), default=0.0)
+    return max(rest.worst_nm.get(c, 0.0) / nm for c, nm in limits_nm.items())
 
 
 def _cause(
@@ -399,14 +402,10 @@ def _cause(
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
     size_nm = j.rms_nm[channel]
     of = joint if isinstance(joint, int) else min(solution.dataset.joints)
-    part = size_nm / max(limits_nm[Channel(of, channel.balance)], 1e-12)
+    part = size_nm / limits_nm[Channel(of, channel.balance)]
     grade, doubts = grade_of(j, hidden=math.sqrt(rest.by_channel().get(channel, 0.0)) > size_nm)
-    rivals: tuple[str, ...] = ()
-    if grade == ONE_OF:
-        others = (f" of {joint_text(e.joint)}" if e.joint != joint else "" for e in j.rivals)
-        rivals = tuple(
-            dict.fromkeys(e.effect.name + other for e, other in zip(j.rivals, others, strict=True))
-        )
+    rivals = [e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != joint else "") for e in j.rivals]
+    rivals = list(dict.fromkeys(rivals)) if grade == ONE_OF else []
     cause = Cause(
         name,
         joint,
@@ -417,7 +416,7 @@ def _cause(
         channel.balance,
         explained_share=sum(r * r for r in j.rms_nm.values()) / max(total_nm2, 1e-30),
         grade=grade,
-        rivals=rivals,
+        rivals=tuple(rivals),
         given=tuple(dict.fromkeys(solution.entries[k].prior.text for k in j.members)),
         doubts=doubts,
         matters=part >= 1.0,
@@ -473,18 +472,18 @@ def _unexplained(
     rest: Unexplained,
     held: Mapping[Channel, float],
     limits_nm: Mapping[Channel, float],
-    rated: Mapping[int, float],
-    total_nm2: float,
+    dataset: Dataset,
+    share: float,
 ) -> UnexplainedResidual:
-    """Return what remains in the channel where it is most, against its limit."""
+    """Return what remains in the channel where it is most, against its limit; share: of all structure."""
     sizes = {c: max(rest.worst_nm.get(c, 0.0), held.get(c, 0.0)) for c in limits_nm}
-    worst = max(sizes, key=lambda c: sizes[c] / limits_nm[c] if limits_nm[c] > 0.0 else sizes[c])
+    worst = max(sizes, key=lambda c: sizes[c] / limits_nm[c])
     return UnexplainedResidual(
         worst.joint,
         worst.balance,
         sizes[worst],
-        100.0 * (sizes[worst] / rated[worst.joint]),
-        rest.energy_nm2() / max(total_nm2, 1e-30),
+        100.0 * (sizes[worst] / dataset.joints[worst.joint].rated_torque_nm),
+        share,
         limits_nm[worst],
         sizes[worst] > limits_nm[worst],
     )
@@ -530,7 +529,7 @@ def entry_table(
         if name in looked_at:
             continue
         reason, motion = _absent(effect, solution.dataset, scope)
-        if reason and motion is not None:
+        if motion is not None:
             lost.append(Untold(name, first, reason, motion))
         rows.append(CandidateEvidence(name, first, math.nan, {}, reason))
     rows.sort(key=lambda r: -r.delta_bic if math.isfinite(r.delta_bic) else math.inf)
@@ -580,12 +579,6 @@ def _minimum(e: Entry, smallest: float) -> dict[str, Value]:
         for n, v in values.items()
         if v != none.get(n) and n != "phase_rad"
     }
-
-
-def extended_effects(solution: Solution, prediction: Prediction) -> list[Present]:
-    """Return the effects of the extended model with the values that predict."""
-    places = solution.sets.places(prediction.chosen)
-    return present_effects([(solution.entries[k], prediction.mean[at]) for k, at in places.items()])
 
 
 def _next(causes: Sequence[Cause], effects: Sequence[Judged], dataset: Dataset) -> dict[str, Any] | None:
