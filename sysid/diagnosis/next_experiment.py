@@ -22,7 +22,7 @@ from jtqd.estimator.effects import EFFECTS
 from jtqd.estimator.joint import Joint, MotionLimits
 from jtqd.estimator.text import counted
 from jtqd.sysid.diagnosis.signals import JointSignals
-from jtqd.sysid.diagnosis.smoothing import smooth
+from jtqd.sysid.diagnosis.smoothing import below
 from jtqd.sysid.planner.campaigns import allowed_torque, missing_limits
 from jtqd.sysid.planner.experiments import (
     EXPERIMENTS,
@@ -237,7 +237,7 @@ def _acceleration(s: JointSignals) -> float:
     """Return the acceleration of a run [rad/s2], mean over _ACCELERATION_S: single samples are noise of the encoder."""
     v = s.state.velocity_rad_s
     wide = min(max(1, round(_ACCELERATION_S / s.step_s)), len(v) - 1)
-    calm = smooth(v, max(1, wide // 4))
+    calm = below(v, s.step_s, 1.0 / _ACCELERATION_S)
     return float(np.quantile(np.abs(calm[wide:] - calm[:-wide]), _ACCELERATION_QUANTILE)) / (wide * s.step_s)
 
 

@@ -106,7 +106,7 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
                 # the link's acceleration is that of the motor less tau/K (`signals`), so a twist beyond it adds its own, as
                 # far as that of the torque is known: what is quicker turns the spring and not the link. Where it slips with
                 # the encoders' difference, a second difference would be that of their noise
-                bent = joint.link_inertia_kgm2 * second_difference(s.slow_torsion(angle), s.time_s)
+                bent = joint.link_inertia_kgm2 * second_difference(s.as_torque_is_known(angle), s.time_s)
                 add(MOTOR, s.per_torque * bent)
                 add(TORSION, bent)
     if s.torsion_nm is None:

@@ -29,16 +29,13 @@ from jtqd.sysid.diagnosis.smoothing import (
     Smoother,
     acceleration_noise,
     below,
-    calm,
     cutoff_hz,
     described,
     first_difference,
     known_below_hz,
     mean_ahead,
     noise_of,
-    reach_of_calm,
     second_difference,
-    slow,
 )
 from jtqd.sysid.runs.bad_samples import Held
 
@@ -238,9 +235,9 @@ class JointSignals:
             return self.state
         return State(**{name: getattr(self.state, name) for name in State.__slots__} | other)
 
-    def slow_torsion(self, angle: FloatArray) -> FloatArray:
-        """Return the part of a twist [n] that is slow enough for the acceleration of the torsion to hold it."""
-        return angle if self.torsion_nm is None else slow(angle, self.step_s)
+    def as_torque_is_known(self, angle: FloatArray) -> FloatArray:
+        """Return what of a twist [n] is as slow as a torque is known."""
+        return angle if self.torsion_nm is None else below(angle, self.step_s, self.torque_hz)
 
     def visible_share_of(self, order_per_motor_rev: float) -> FloatArray:
         """Return `visible_share` [n] of a wave of this order; that of the last order is kept."""
@@ -277,7 +274,7 @@ def without_held(s: JointSignals, held: Mapping[str, Held]) -> JointSignals:
     """
     if not held:
         return s
-    reach = _REMEMBERED / s.visible.slowest_hz if s.visible.parts else reach_of_calm(s.step_s)
+    reach = _REMEMBERED / min(s.visible.slowest_hz, s.torque_hz)
     out, worth = {}, {}
     for balance, units in (
         (TORSION, {"torque_nm": -1.0}),
@@ -432,14 +429,15 @@ def joint_signals(  # noqa: PLR0917
         link = motion.position / joint.gear_ratio
     acceleration = motion.visible(motion.whole)
     link_acceleration = acceleration / joint.gear_ratio
-    if both:
-        # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
-        torsion_acceleration = second_difference(slow(sensor, step), time) / joint.stiffness_nm_per_rad
-        link_acceleration = link_acceleration - torsion_acceleration
-    gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     swings = math.sqrt(joint.stiffness_nm_per_rad / max(joint.link_inertia_kgm2, 1e-9)) if both else math.inf
     shown = min(known_below_hz(sensor, step), _STATIC * swings / math.tau)
     known = like.torque_hz if like else max(COMPUTED_HZ, shown)
+    slow_sensor = below(sensor, step, known)
+    if both:
+        # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
+        torsion_acceleration = second_difference(slow_sensor, time) / joint.stiffness_nm_per_rad
+        link_acceleration = link_acceleration - torsion_acceleration
+    gear_torque = sensor + joint.link_inertia_kgm2 * link_acceleration
     slow_torque = below(gear_torque, step, known)
     loss = base.loss(gear_torque, velocity)
     reflected = joint.gear_ratio * joint.rotor_inertia_kgm2
@@ -457,7 +455,7 @@ def joint_signals(  # noqa: PLR0917
         temperature_c=np.full(len(time), np.nan) if columns.temperature_c is None else columns.temperature_c,
         time_s=time - time[0],
         torque_nm=slow_torque,
-        torque_rate_nm_s=first_difference(below(sensor, step, known), time),
+        torque_rate_nm_s=first_difference(slow_sensor, time),
         torsion_rad=held_by_spring(joint, slow_torque, time) / joint.stiffness_nm_per_rad,
         torsion_rate_rad_s=np.full(len(time), np.nan),
         velocity_rad_s=velocity,
@@ -472,7 +470,7 @@ def joint_signals(  # noqa: PLR0917
         rate = velocity - np.gradient(link, time)
         zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, gear_torque)
         torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate - gear_torque
-        bent = calm(twist - zero, step) + (gear_torque - calm(gear_torque, step)) / joint.stiffness_nm_per_rad
+        bent = below(twist - zero, step, known) + (gear_torque - slow_torque) / joint.stiffness_nm_per_rad
         state.torsion_rate_rad_s = first_difference(bent, time)
     return JointSignals(
         run,

@@ -1,6 +1,4 @@
-"""Signals and their derivatives as regressors have them: with little of the noise that the same sample has in a residual.
-
-Derivatives are central differences, which look ahead: this is for recorded runs.
+"""Derivatives, noise and filters of recorded signals; all look ahead, none delays.
 
 **Resolution.** Recorders keep seven significant digits, single precision, fixed decimals or counts. A motor position beyond
 1000 rad with seven digits has steps of 1 mrad; their second difference is noise of some newton metres at the joint. Steps of
@@ -20,67 +18,11 @@ from scipy import signal
 
 from jtqd.estimator.arrays import BoolArray, FloatArray
 
-_SMOOTH_S: Final = 0.005
-_ENOUGH: Final = 5
-"""Samples within _SMOOTH_S from which an average of them holds little of each one's own noise."""
-_NEAR_S: Final = 0.008
-"""So far away are the neighbours that tell what a sample is, where there are fewer; two on either side at least."""
-
-
-def calm(x: FloatArray, step_s: float) -> FloatArray:
-    """Return x [n], sampled every step_s, as regressors have it: with little of the noise that the same sample has in a
-    residual.
-
-    Smoothed over _SMOOTH_S where that is enough samples. An average of fewer keeps half of each sample's own noise and more,
-    at 250 Hz all of it. There each sample is the value of the cubic through its neighbours, with none of its own noise. That
-    keeps 0.98 of what swings at 25 Hz and 0.7 of 50 Hz, at 250 Hz as at 500.
-    """
-    if _smoothed_samples(step_s) >= _ENOUGH:
-        return slow(x, step_s)
-    weights = _neighbours(max(2, round(_NEAR_S / step_s)))
-    result: FloatArray = np.convolve(np.pad(x, len(weights) // 2, mode="edge"), weights, "valid")
-    return result
-
 
 def below(x: FloatArray, step_s: float, hz: float) -> FloatArray:
     """Return x [.., n] without what is quicker than hz, without delay."""
     reach = min(x.shape[-1] - 1, max(12, round(1.0 / (hz * step_s))))
     return np.asarray(signal.sosfiltfilt(_low_pass(min(hz * step_s, 0.45)), x, padlen=reach))
-
-
-def reach_of_calm(step_s: float) -> float:
-    """Return how far away samples are, s, of which `calm` makes one."""
-    return _SMOOTH_S if _smoothed_samples(step_s) >= _ENOUGH else max(_NEAR_S, 2.0 * step_s)
-
-
-def _smoothed_samples(step_s: float) -> int:
-    return max(1, round(_SMOOTH_S / max(step_s, 1e-9)))
-
-
-@functools.lru_cache(maxsize=16)
-def _neighbours(reach: int) -> FloatArray:
-    """Return the weights [2 reach + 1] that give the middle of a cubic through the others (least squares)."""
-    at = np.arange(-reach, reach + 1)
-    others = at[at != 0]
-    weights = np.zeros(len(at))
-    weights[at != 0] = np.linalg.pinv(np.vander(others / reach, 4, increasing=True))[0]
-    return weights
-
-
-def slow(x: FloatArray, step_s: float) -> FloatArray:
-    """Return x [n] without what is too quick for the second difference of a torque to be known."""
-    return smooth(x, _smoothed_samples(step_s))
-
-
-def smooth(x: FloatArray, samples: int) -> FloatArray:
-    """Return x twice averaged over `samples` (odd or even, centred together), ends held."""
-    out = x
-    for before in (samples // 2, samples - 1 - samples // 2):
-        padded = np.pad(out, (before, samples - 1 - before), mode="edge")
-        total = np.cumsum(np.concatenate(([0.0], padded)))
-        out = (total[samples:] - total[:-samples]) / samples
-    result: FloatArray = out
-    return result
 
 
 def mean_ahead(time_s: FloatArray, x: FloatArray, span_s: float) -> FloatArray:

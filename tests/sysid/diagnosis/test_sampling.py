@@ -11,7 +11,7 @@ import pytest
 from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.sysid.diagnosis.diagnose import diagnose
 from jtqd.sysid.diagnosis.signals import BaseLoss, joint_signals
-from jtqd.sysid.diagnosis.smoothing import calm, mean_ahead, smooth
+from jtqd.sysid.diagnosis.smoothing import mean_ahead
 from tests.estimator.effects.effect_signals import PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rich_run
 
@@ -40,33 +40,6 @@ def test_a_torque_constant_is_found_as_it_is_whatever_the_rate_of_the_recorder(e
     value = cause.parameters[NAME]
     assert value.ci95[0] <= TRUE_KT <= value.ci95[1]
     assert value.value == pytest.approx(TRUE_KT, abs=0.1 * (TRUE_KT - PLAIN.torque_constant_nm_per_a))
-
-
-@pytest.mark.parametrize("step_s", [0.002, 0.0025, 0.004, 0.01, 0.02])
-def test_a_calm_sample_has_none_of_its_own_noise_and_keeps_a_cubic(step_s: float) -> None:
-    pulse = np.zeros(41)
-    pulse[20] = 1.0
-    weights = calm(pulse, step_s)
-    assert weights[20] == pytest.approx(0.0, abs=1e-12)
-    assert weights == pytest.approx(weights[::-1], abs=1e-12), "no delay"
-    assert np.sum(weights**2) < 1.0
-    t = step_s * np.arange(60)
-    cubic = 3.0 - 20.0 * t + 7.0 * t**2 - 40.0 * t**3
-    assert calm(cubic, step_s)[8:-8] == pytest.approx(cubic[8:-8])
-
-
-def test_a_calm_signal_keeps_what_is_slow_at_every_rate() -> None:
-    for step_s in (0.002, 0.004):
-        t = np.arange(0.0, 1.0, step_s)
-        for hz, part in ((25.0, 0.98), (50.0, 0.7)):
-            swing = np.sin(2.0 * np.pi * hz * t)
-            kept = float(np.std(calm(swing, step_s)[20:-20]) / np.std(swing[20:-20]))
-            assert part - 0.02 < kept < 1.0
-
-
-def test_enough_samples_are_smoothed_as_they_were() -> None:
-    x = np.random.default_rng(3).normal(size=200)
-    assert calm(x, 1e-3).tolist() == smooth(x, 5).tolist()
 
 
 def test_a_rate_of_the_sensor_keeps_what_swings_at_40_hz() -> None:

@@ -28,7 +28,7 @@ from jtqd.sysid.diagnosis.signals import (
     about_zero,
     joint_signals,
 )
-from jtqd.sysid.diagnosis.smoothing import below, known_below_hz, second_difference, smooth
+from jtqd.sysid.diagnosis.smoothing import below, known_below_hz, second_difference
 from jtqd.sysid.runs.checks import on_even_steps
 from tests.estimator.effects.effect_signals import PEAKED, PLAIN
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
@@ -84,20 +84,6 @@ def test_uneven_steps_take_plain_differences() -> None:
     t = np.cumsum(rng.uniform(0.5e-3, 1.5e-3, 500))
     assert second_difference(3.0 * t**2, t)[3:-3] == pytest.approx(np.full(494, 6.0), abs=1e-4)
     assert second_difference(t[:4] ** 2, t[:4]).shape == (4,)
-
-
-@pytest.mark.parametrize("samples", [1, 2, 5, 8])
-def test_smoothing_is_centred_and_keeps_lines(samples: int) -> None:
-    line = 0.3 * np.arange(60.0) - 4.0
-    inner = slice(2 * samples, -2 * samples)
-    assert smooth(line, samples)[inner] == pytest.approx(line[inner])
-    pulse = np.zeros(61)
-    pulse[30] = 1.0
-    out = smooth(pulse, samples)
-    assert out == pytest.approx(out[::-1], abs=1e-12), "no delay"
-    assert out.sum() == pytest.approx(1.0)
-    assert out[30] == pytest.approx(1.0 / samples)
-    assert np.flatnonzero(out > 1e-12).tolist() == list(range(31 - samples, 30 + samples))
 
 
 @pytest.mark.parametrize("highest_hz", [3.0, 30.0, 90.0])
@@ -167,6 +153,24 @@ def test_a_torque_is_known_up_to_half_of_where_the_link_swings_on_its_spring() -
     assert signals(both, replace(heavy, link_inertia_kgm2=0.0)).torque_hz > 150.0
     one = RunTable(table.time_s, {1: replace(both.joints[1], link_position_rad=None)})
     assert signals(one, heavy).torque_hz > 150.0
+
+
+def test_what_a_torque_is_too_quick_to_be_known_for_moves_no_link() -> None:
+    heavy = replace(PLAIN, link_inertia_kgm2=0.2, stiffness_nm_per_rad=28000.0)
+    table = rigid_run(heavy)
+    columns = table.joints[1]
+    rate = 2.0 * np.pi * 90.0
+    quick = 0.5 * np.sin(rate * table.time_s)
+    position = columns.link_position_rad
+    assert position is not None
+    twisted = replace(
+        columns, torque_nm=columns.torque_nm + quick, link_position_rad=position - quick / 28000.0
+    )
+    still = signals(table, heavy)
+    moved = joint_signals("run", RunTable(table.time_s, {1: twisted}), 1, heavy, BaseLoss(heavy), still)
+    change = moved.state.link_acceleration_rad_s2 - still.state.link_acceleration_rad_s2
+    assert rms(change[200:-200]) < 0.01 * rms(rate**2 * quick) / 28000.0
+    assert rms(moved.as_torque_is_known(quick)[200:-200]) < 0.01 * rms(quick)
 
 
 def test_a_run_by_the_equations_leaves_nothing() -> None:
