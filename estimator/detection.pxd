@@ -67,15 +67,15 @@ cdef struct Channel:  # an encoder, in Nm of torsion
     double noise  # variance of its second differences
     double quantum  # smallest of them, which is a count
     double off  # displacement that no motion explains
-    double unseen, current  # while it stands still: motion that the velocity has, current [Nm] when it began
-    Runs runs  # of equal readings
+    double unseen  # while it stands still: motion that the velocity has
 
 cdef struct InputState:
     Channel motor, link
     double velocity, current  # last step by the drive's velocity [Nm]; current [A]
     double doubt  # [Nm]
     double strange  # samples out of order lately
-    Runs runs  # of samples that are equal as a whole
+    double still_nm  # current [Nm] when the link's reading began to stand still
+    Runs runs, link_runs  # of samples that are equal as a whole, and of equal readings of the link
     bint going
 
 cdef int fill_inputs(InputLaw *law, joint, torsion) except -1

@@ -219,12 +219,12 @@ cdef void drop_inputs(InputState *s) noexcept nogil:
 
 
 cdef double _channel(
-    Channel *c, double reading, double expected, double faster, double current, double acceleration, double dt, bint calm
+    Channel *c, double reading, double expected, double faster, double acceleration, double dt, bint calm
 ) noexcept nogil:
     """Take a reading [Nm]; return what it may be off by [Nm].
 
-    expected: its step by the drive's velocity, and faster: how much more that is than the last; current: as torque [Nm];
-    calm: nothing was out of order lately, so that its noise is that of a healthy channel.
+    expected: its step by the drive's velocity, and faster: how much more that is than the last; calm: nothing was out of order
+    lately, so that its noise is that of a healthy channel.
     """
     cdef double step = reading - c.last, by_rate = step - c.rate * dt, by_velocity = step - c.unseen - expected
     cdef double limit = max(acceleration * dt * dt, NOISE_SIGMAS * sqrt(c.noise)), change = fabs(step - c.step)
@@ -233,8 +233,6 @@ cdef double _channel(
     limit = max(limit, COUNTS * c.quantum)
     c.last = reading
     if step == 0.0:
-        if c.step != 0.0:
-            c.current = current
         c.unseen += expected
         c.step, c.rate = 0.0, expected / dt
         return max(fabs(c.unseen) - COUNTS * c.quantum, fabs(c.off))
@@ -279,22 +277,24 @@ cdef void check_inputs(const InputLaw *law, InputState *s, const Sample *x, bint
         s.going = isfinite(motor + link + expected + current)
         s.motor.last, s.link.last, s.velocity, s.current = motor, link, expected, x.current_a
         s.motor.rate = s.link.rate = law.motor * x.motor_velocity_rad_s
-        s.motor.current = s.link.current = current
-        s.motor.runs.still = s.link.runs.still = s.runs.still = 0
+        s.still_nm = current
+        s.link_runs.still = s.runs.still = 0
         s.motor.unseen = s.link.unseen = 0.0
         return
     equal = link_still and motor == s.motor.last and x.current_a == s.current and expected == s.velocity
-    doubt = _channel(&s.motor, motor, expected, faster, current, law.acceleration, dt, calm)
-    doubt = max(doubt, _channel(&s.link, link, expected, faster, current, law.acceleration, dt, calm))
+    if link_still and s.link.step != 0.0:
+        s.still_nm = current
+    doubt = _channel(&s.motor, motor, expected, faster, law.acceleration, dt, calm)
+    doubt = max(doubt, _channel(&s.link, link, expected, faster, law.acceleration, dt, calm))
     if link_still:
         doubt = max(
             doubt,
-            fabs(current - s.link.current) * min((s.link.runs.still + 1) * dt * FOLLOW_RATE, 1.0) - COUNTS * s.link.quantum,
+            fabs(current - s.still_nm) * min((s.link_runs.still + 1) * dt * FOLLOW_RATE, 1.0) - COUNTS * s.link.quantum,
         )
     doubt -= law.tolerance
     # an encoder whose noise is below a count changes or stands still as its angle happens to lie
     standing = standing and s.link.noise > s.link.quantum * s.link.quantum
-    longer = max(_too_long(&s.runs, equal, standing, RARE_EQUAL), _too_long(&s.link.runs, link_still, standing, RARE_STILL))
+    longer = max(_too_long(&s.runs, equal, standing, RARE_EQUAL), _too_long(&s.link_runs, link_still, standing, RARE_STILL))
     doubt = max(doubt, law.load_rate * dt * longer)
     s.velocity, s.current = expected, x.current_a
     s.strange *= 1.0 - min(dt / STRANGE_S, 1.0)

@@ -5,7 +5,9 @@ from jtqd.estimator.observer cimport (
     FusedObserved, FusedObserverLaw, FusedObserverState, GuardLaw, GuardState, Observed, ObserverLaw, ObserverState,
     Sample
 )
-from jtqd.estimator.fusion cimport AgreementLaw, AgreementState, Checkpoint, Fused, FusionLaw, Learned, OffsetLaw, OffsetState
+from jtqd.estimator.fusion cimport (
+    AgreementLaw, AgreementState, Checkpoint, Fused, FusionLaw, Learned, OffsetLaw, OffsetState, ProofLaw, ProofState
+)
 from jtqd.estimator.native_network cimport FusedTrustLaw, PathLaw, PathState, PerceptronLaw, TrustLaw
 from jtqd.estimator.losses cimport AdditiveLaw, EfficiencyLaw, UncertaintyLaw
 
@@ -68,6 +70,7 @@ cdef struct FusedLaw:
     AgreementLaw agreement
     LinkLaw link
     InputLaw inputs
+    ProofLaw proof
     bint tracked  # the torsion is tracked: noise of what is faster than the motor path
     double tracking_noise, tracking_viscous, tracking_bend  # bend: of the viscous part [s^2/rad^2], 0: none
     double physics_scale[4]
@@ -85,6 +88,7 @@ cdef struct FusedState:
     LinkState link
     PathState path
     InputState inputs
+    ProofState proof
     Checkpoint checkpoint
 
 cdef class FusedEstimator(Estimator):

@@ -21,9 +21,9 @@ from jtqd.estimator.observer cimport (
 )
 from jtqd.estimator.fusion cimport (
     Checkpoint, Fused, Learned, Rest, TURN_WAVES, at_rest, degrades, disagreement, drop_block, early_factor, fading,
-    fill_agreement, fill_fusion, fill_offsets, fuse_paths, gather, implausible, keep_offsets, known_nm2, local_stiffness,
-    mismatch_variance, offsets_of, pause_turn, reach, report_offsets, restart_agreement, restart_offsets, restart_turn,
-    reweigh, turn_differs, update_difference, update_turn
+    fill_agreement, fill_fusion, fill_offsets, fill_proof, fuse_paths, gather, implausible, keep_offsets, known_nm2,
+    local_stiffness, mismatch_variance, offsets_of, pause_turn, possible_error, prove, report_offsets, restart_agreement,
+    restart_offsets, restart_proof, restart_turn, reweigh, turn_differs, unproven_nm2, update_difference, update_turn
 )
 from jtqd.estimator.native_network cimport (
     PATH_INPUTS, Perceptron, evaluate, fill_fused_trust, fill_path, fill_trust, follow_path, fused_trust, path_trust,
@@ -60,7 +60,6 @@ SLOPE_NM: Final = 0.5
 
 cdef double STANDSTILL_WIDTH = STANDSTILL_SIGMAS, STEP = SLOPE_NM, FOREIGN = FOREIGN_SIGMAS
 cdef double DOUBTFUL = 4.0  # tolerances of the inputs: the status is lowered
-cdef double BOUNDING = 3.0  # standard deviations of the paths' difference
 cdef double LOWERED_S = 0.1  # the status stays degraded for so long after the paths have disagreed: it must not flicker
 cdef int STARTING = st.STARTING, VALID = st.VALID, DEGRADED = st.DEGRADED, STANDSTILL = st.STANDSTILL, INVALID = st.INVALID
 cdef int LEFT = st.LEFT, APART = st.APART
@@ -331,6 +330,7 @@ cdef class FusedEstimator(Estimator):
         fill_agreement(&self.law.agreement, fused.agreement, joint.rated_torque_nm)
         fill_link(&self.law.link, joint, fused.torsion)
         fill_inputs(&self.law.inputs, joint, fused.torsion)
+        fill_proof(&self.law.proof, joint.rated_torque_nm, fused)
         physics_scale = fused.zeros.scale if self.law.offsets.spread > 0.0 else fused.sigma.scale
         network_scale = physics_scale if network is None else network.sigma.scale
         for k in range(4):
@@ -361,6 +361,7 @@ cdef class FusedEstimator(Estimator):
         restart_agreement(&self.state.agreement)
         restart_link(&self.state.link)
         restart_inputs(&self.state.inputs)
+        restart_proof(&self.law.proof, &self.state.proof)
         memset(&self.state.checkpoint, 0, sizeof(Checkpoint))
 
     @property
@@ -441,6 +442,7 @@ cdef class FusedEstimator(Estimator):
             self.estimate(&seen, x, network_wanted, out)
         else:
             self.state.half = 0.0
+            restart_proof(&self.law.proof, &self.state.proof)
             if out.status == INVALID:
                 drop_inputs(&self.state.inputs)
             drop_block(&self.state.offsets)
@@ -516,7 +518,8 @@ cdef class FusedEstimator(Estimator):
         physics = fuse_paths(&law.fusion, raw, loss.nm, s.half, v, seen.torsion_nm, seen.open_nm)
         degraded = self.inconsistent(&physics, x.dt_s)
         if out.status == VALID:
-            bound_inputs(&s.inputs, fabs(physics.difference) + reach(&physics, BOUNDING))
+            bound_inputs(&s.inputs, possible_error(&physics))
+        prove(&law.proof, &s.proof, &physics, seen, x.dt_s, standing, in_order(&s.inputs))
         if law.offsets.estimated:
             keep_offsets(&s.checkpoint, &s.offsets, in_order(&s.inputs), x.dt_s)
             self.update_path_difference(seen, x, &physics, loss.nm, out.status)
@@ -576,8 +579,11 @@ cdef class FusedEstimator(Estimator):
                 + share * law.tracking_noise
                 + share * law.tracking_viscous * v * v / (1.0 + law.tracking_bend * v * v)
             )
-        if s.inputs.doubt > 0.0:
-            out.sigma_nm = sqrt(out.sigma_nm * out.sigma_nm + s.inputs.doubt * s.inputs.doubt)
+        out.sigma_nm = sqrt(
+            out.sigma_nm * out.sigma_nm
+            + unproven_nm2(&law.proof, &s.proof, best.alpha, s.offsets.link_rad, seen.ahead_nm)
+            + s.inputs.doubt * s.inputs.doubt
+        )
         publish_within(out, law.limit)
 
     cdef double half_interval(

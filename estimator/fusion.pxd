@@ -2,7 +2,7 @@
 
 from libc.stdint cimport uint64_t
 
-from jtqd.estimator.observer cimport FusedObserverLaw
+from jtqd.estimator.observer cimport FusedObserved, FusedObserverLaw
 
 cdef struct FusionLaw:
     double current, viscous, load, torsion, torsion_load, reference  # squares
@@ -27,8 +27,24 @@ cdef Rest at_rest(
     const FusionLaw *law, double alpha, double raw, double half, double v, double torsion, double open_nm
 ) noexcept nogil
 
-cdef double reach(const Fused *fused, double sigmas) noexcept nogil
 cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil
+
+cdef struct ProofLaw:
+    double most, tolerance, stiffness, day  # day: square of the usual correction [Nm^2]
+
+cdef struct ProofState:
+    double unproven  # what the torsion may be off by [Nm]
+    double low, high, torsion_low, torsion_high  # ranges at rest: torsion less motor torque, torsion [Nm]
+
+cdef double possible_error(const Fused *fused) noexcept nogil
+cdef int fill_proof(ProofLaw *law, double rated_nm, fused) except -1
+cdef void restart_proof(const ProofLaw *law, ProofState *s) noexcept nogil
+cdef void prove(
+    const ProofLaw *law, ProofState *s, const Fused *fused, const FusedObserved *seen, double dt, bint standing, bint in_order
+) noexcept nogil
+cdef double unproven_nm2(
+    const ProofLaw *law, const ProofState *s, double alpha, double link_rad, double ahead_nm
+) noexcept nogil
 
 cdef class Fusion:
     cdef FusionLaw law

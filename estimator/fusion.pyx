@@ -16,7 +16,19 @@ the half width of the interval is
     k sd + alpha open + (1 - alpha) half   k: `fused.standstill`; sd: sigma without `half` and `open`, with the same alpha
 
 A disagreement of the paths widens sigma by max(alpha, 1 - alpha) (|tau_t - tau_c| - DISAGREE_SIGMAS sqrt(s_c^2 + s_t^2)),
-where that is above 0: which path is wrong is not known, so the worse case counts.
+where that is above 0: which path is wrong is not known, so the worse case counts. Near standstill `half` is a bound and not
+a part of the standard deviation.
+
+**Proof.** The offset of the torsion is any value up to the rated torque until the paths have shown a smaller one. U: what the
+torsion may be off by, a bound of 3 standard deviations in sigma:
+
+    U <= |tau_t - tau_c| + half + BOUNDING sqrt(s_c^2 + s_t^2)         at every sample
+    U' = -U/PROVING_S                                                  where the paths agree and friction is one-sided
+    U >= |tau_t - tau_c|                                               where they disagree
+    U >= min(range of tau_t, range of tau_t - tau_raw) - tolerance     at rest: the torsion changed, and the current did not
+
+An offset of the link encoder that is beyond DAYS spreads of ordinary days may be one of the current: it counts like U. What the
+torsion has changed by since the sample that the current path is as old as is not compared yet: AHEAD of it counts.
 
 **Offsets** of the link encoder and of the current on one day are states of a small Kalman filter, whose measurement is the
 difference of the torsion path tau_t and the current path tau_c:
@@ -91,7 +103,7 @@ C: covariance of a over the runs of the fit. Above the file's `limit` the status
 An error that both paths share (gear ratio of both encoders, external load) is not in the difference.
 """
 
-from libc.math cimport exp, fabs, fmax, sqrt
+from libc.math cimport INFINITY, exp, fabs, fmax, fmin, sqrt
 from libc.string cimport memcpy, memset
 
 from typing import Final, NamedTuple
@@ -110,6 +122,11 @@ GAUSS: Final = 1.6448536269514722
 """Half width of a normal distribution's 90 % interval in standard deviations: the interval is value +- GAUSS sigma."""
 
 cdef double HOLD = HOLD_S, DISAGREE = DISAGREE_SIGMAS, INTERVAL = 1.0 / GAUSS
+cdef double BOUNDING = 3.0, PER_BOUND = 1.0 / BOUNDING**2  # standard deviations of a bound
+cdef double PROVING_S = 0.1  # in which paths that agree prove the torsion
+cdef double RESTING_SHARE = 0.025  # of the rated torque, by which the torsion changes at rest from noise
+cdef double DAYS = 2.0  # spreads of the link's offset over the days
+cdef double AHEAD = 0.1  # part of what the torsion is ahead by
 cdef double LEAST_VARIANCE = 0.05  # part of the torsion's variance that remains, however well its offset is known
 
 
@@ -196,14 +213,69 @@ cdef double reach(const Fused *fused, double sigmas) noexcept nogil:
 cdef double disagreement(const Fused *fused, double uncorrected_nm) noexcept nogil:
     """Return what a disagreement of the paths adds to sigma [Nm]; uncorrected_nm: known offset that is not corrected yet.
 
-    Both are errors of a known size, not of a known variance: the 90 % interval, not sigma, is to hold them.
+    The offset is an error of a known size, not of a known variance: the 90 % interval, not sigma, is to hold it.
     """
-    cdef double more = fabs(fused.difference) - DISAGREE * sqrt(fused.variance)
-    cdef double offset = fused.alpha * uncorrected_nm
+    cdef double more = fabs(fused.difference) - reach(fused, DISAGREE)
+    cdef double offset = INTERVAL * fused.alpha * uncorrected_nm
     if more > 0.0:
         more *= fmax(fused.alpha, 1.0 - fused.alpha)
-        return INTERVAL * sqrt(more * more + offset * offset)
-    return INTERVAL * offset
+        return sqrt(more * more + offset * offset)
+    return offset
+
+
+cdef double possible_error(const Fused *fused) noexcept nogil:
+    """Return how far the torsion may be from the torque [Nm], by the current path."""
+    return fabs(fused.difference) + reach(fused, BOUNDING)
+
+
+cdef int fill_proof(ProofLaw *law, double rated_nm, fused) except -1:
+    law.most, law.tolerance = rated_nm, RESTING_SHARE * rated_nm
+    law.stiffness = law.day = 0.0
+    if fused.torsion is None:
+        law.most = 0.0
+        return 0
+    law.stiffness = fused.torsion.stiffness_nm_per_rad
+    law.day = (DAYS * max(fused.sigma.torsion_nm, 0.0 if fused.zeros is None else fused.zeros.spread_nm)) ** 2
+    return 0
+
+
+cdef void restart_proof(const ProofLaw *law, ProofState *s) noexcept nogil:
+    s.unproven = law.most
+    _move(s)
+
+
+cdef void _move(ProofState *s) noexcept nogil:
+    s.low = s.torsion_low = INFINITY
+    s.high = s.torsion_high = -INFINITY
+
+
+cdef void prove(
+    const ProofLaw *law, ProofState *s, const Fused *fused, const FusedObserved *seen, double dt, bint standing, bint in_order
+) noexcept nogil:
+    """Take a sample into what the torsion may be off by; in_order: of the readings."""
+    cdef double balance = seen.torsion_nm - seen.raw_nm
+    if standing:
+        s.low, s.high = fmin(s.low, balance), fmax(s.high, balance)
+        s.torsion_low, s.torsion_high = fmin(s.torsion_low, seen.torsion_nm), fmax(s.torsion_high, seen.torsion_nm)
+        s.unproven = fmax(s.unproven, fmin(s.high - s.low, s.torsion_high - s.torsion_low) - law.tolerance)
+    else:
+        _move(s)
+    if fabs(fused.difference) > reach(fused, DISAGREE):
+        s.unproven = fmax(s.unproven, fabs(fused.difference))
+    elif fabs(seen.direction) > ONE_SIDED and in_order and not standing:
+        s.unproven *= PROVING_S / (PROVING_S + dt)
+    s.unproven = fmin(s.unproven, fmin(law.most, possible_error(fused)))
+
+
+cdef double unproven_nm2(
+    const ProofLaw *law, const ProofState *s, double alpha, double link_rad, double ahead_nm
+) noexcept nogil:
+    """Return what is not proven as an addition to sigma^2 [Nm^2] of a value with this share of the torsion.
+
+    link_rad: correction of the link encoder; ahead_nm: change of the torsion that the current path has not seen.
+    """
+    cdef double learned = law.stiffness * link_rad, ahead = AHEAD * ahead_nm
+    return alpha * alpha * (s.unproven * s.unproven + fmax(learned * learned - law.day, 0.0)) * PER_BOUND + ahead * ahead
 
 
 class FusedPaths(NamedTuple):
