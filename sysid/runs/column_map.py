@@ -254,9 +254,9 @@ JOINTS: Final = range(1, 8)
 GRAVITY_M_S2: Final = 9.80665
 WINDOW_S: Final = 0.1
 """Longest window of a position to which a quintic is fitted for its velocity and acceleration."""
-_QUIET: Final = 0.02
+QUIET: Final = 0.02
 SHARP: Final = 0.06
-"""Noise of an acceleration, in parts of the largest: a fit averages it, but not what a long window takes off the ripple."""
+"""Noise of an acceleration, in parts of the largest: a fit of whole runs averages it, but no ripple that is lacking."""
 _FEWEST_ROWS: Final = 7
 _OUTLIER_RAD: Final = 0.1
 _SOURCE: Final = (
@@ -289,9 +289,9 @@ class KnownLoad:
     gravity_m_s2: float = GRAVITY_M_S2
     arm: str = "known"
 
-    def torque(self, time_s: FloatArray, position_rad: FloatArray) -> FloatArray:
+    def torque(self, time_s: FloatArray, position_rad: FloatArray, quiet: float = QUIET) -> FloatArray:
         """Return the torque of the joint on the pendulum [n, Nm] at link positions [n] of one segment without gaps."""
-        _, acceleration = motion_of(time_s, position_rad, _QUIET if self.arm == "known" else SHARP)
+        _, acceleration = motion_of(time_s, position_rad, quiet)
         weight = self.mass_kg * self.gravity_m_s2 * self.lever_m * np.sin(position_rad - self.hangs_at_rad)
         return self.inertia_kgm2 * acceleration + weight
 
@@ -389,7 +389,7 @@ class ColumnMap:
                 raise ExpressionError(f"{file} {error}") from None
         return found
 
-    def completed(self, values: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+    def completed(self, values: Mapping[str, FloatArray], quiet: float = QUIET) -> dict[str, FloatArray]:
         """Return the targets [n] of one segment without gaps, torques of known loads and currents of voltage drives too.
 
         `jN.load`: the known part of a load on an unknown arm, in place of `jN.torque_nm`.
@@ -401,7 +401,7 @@ class ColumnMap:
                 found[f"j{n}.torque_nm"] = values[f"j{n}.load"]
             else:
                 key = f"j{n}.torque_nm" if load.arm == "known" else f"j{n}.load"
-                found[key] = load.torque(time, found[f"j{n}.link_position_rad"])
+                found[key] = load.torque(time, found[f"j{n}.link_position_rad"], quiet)
         for n, drive in (self.drives or {}).items():
             speed = found.get(f"j{n}.motor_velocity_rad_s")
             if speed is None:
@@ -440,7 +440,7 @@ def targets() -> list[str]:
 
 
 def motion_of(
-    time_s: FloatArray, position: FloatArray, quiet: float = _QUIET
+    time_s: FloatArray, position: FloatArray, quiet: float = QUIET
 ) -> tuple[FloatArray, FloatArray]:
     """Return velocity and acceleration [n] of the quintic through a window of the position around each row, ends held.
 

@@ -19,7 +19,7 @@ from jtqd.estimator.errors import OneLineError
 from jtqd.estimator.files import read_file
 from jtqd.estimator.run import COLUMN_NAMES, JointColumns, RunTable, RunTableError
 from jtqd.estimator.text import counted
-from jtqd.sysid.runs.column_map import JOINTS, TIME, ColumnMap
+from jtqd.sysid.runs.column_map import JOINTS, QUIET, SHARP, TIME, ColumnMap
 
 
 class RunError(OneLineError):
@@ -139,7 +139,7 @@ def runs_of(content: Content, *, whole: bool) -> list[RunFile]:
         name = f"{path.name} (run {number} of {len(runs)})" if starts else path.name
         for k, cut in enumerate(each, 1):
             full_name = f"{name} ({k} of {len(each)})" if len(each) > 1 else name
-            read.append(_segment(content, cut, full_name, [] if read else notes))
+            read.append(_segment(content, cut, full_name, [] if read else notes, SHARP if whole else QUIET))
     return read
 
 
@@ -314,13 +314,13 @@ def _check_time(content: Content, run: slice, *, whole: bool) -> list[str]:
     return [f"{gaps} {are} longer than {GAP_NOTED} times the median of {median:.6g} s"] if gaps else []
 
 
-def _segment(content: Content, cut: slice, name: str, notes: Sequence[str]) -> RunFile:
+def _segment(content: Content, cut: slice, name: str, notes: Sequence[str], quiet: float) -> RunFile:
     """Return the run table of the rows of one segment."""
     path, notes = content.path, list(notes)
     known_loads = () if content.columns is None else content.columns.known_loads
     values = {key: value[cut] for key, value in content.values.items()}
     if content.columns is not None:
-        values = content.columns.completed(values)
+        values = content.columns.completed(values, quiet)
     joints: dict[int, JointColumns] = {}
     for joint in JOINTS:
         columns = {q: values.get(f"j{joint}.{q}") for q in COLUMN_NAMES}

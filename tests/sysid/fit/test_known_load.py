@@ -16,7 +16,7 @@ from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.command import main
 from jtqd.sysid.fit.known_load import Teacher, fit_teacher
 from jtqd.sysid.fit.signals import RunSignals, run_signals
-from jtqd.sysid.runs.column_map import KnownLoad
+from jtqd.sysid.runs.column_map import SHARP, KnownLoad
 from jtqd.sysid.runs.tables import write_run
 
 FILE = shipped("joint1.yaml")
@@ -70,7 +70,7 @@ def signals_of(masses: list[float], first: int = 0) -> tuple[list[RunSignals], l
         columns = table.joint(1, JOINT.gear_ratio)
         assert columns.link_position_rad is not None
         load = KnownLoad(None, mass, LEVER_M, mass * LEVER_M**2, arm="unknown")
-        part = load.torque(table.time_s, columns.link_position_rad)
+        part = load.torque(table.time_s, columns.link_position_rad, SHARP)
         signals.append(run_signals(f"{k}", JOINT, SETTINGS, table.time_s, columns, part))
     return signals, [torque for _, torque in made]
 

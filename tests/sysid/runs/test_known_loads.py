@@ -183,3 +183,23 @@ def test_a_known_load_is_no_dead_channel(tmp_path: Path) -> None:
     folder = written(tmp_path, "{inertia_kgm2: 0.0}")
     read = read_runs([folder / "light"], folder / "map.yaml")
     assert not channel_findings(read, 1, JOINT)
+
+
+def test_a_fit_gets_the_ripple_of_an_acceleration_and_its_noise(tmp_path: Path) -> None:
+    folder = written(tmp_path, "{inertia_kgm2: 1.0}")
+    position = Q + 3e-5 * np.sin(2.0 * np.pi * 20.0 * T) + 1e-6 * np.random.default_rng(2).normal(size=len(T))
+    table = run(np.zeros_like(T))
+    write_run(
+        folder / "light" / "run.csv",
+        RunTable(T, {1: replace(table.joints[1], link_position_rad=position)}),
+    )
+    wave = np.sin(2.0 * np.pi * 20.0 * T)[500:-500]
+    ripple = {}
+    for segments in (False, True):
+        [read] = read_runs([folder / "light"], folder / "map.yaml", segments=segments)
+        torque = read.table.joints[1].torque_nm
+        assert torque is not None
+        ripple[segments] = -2.0 * float(np.mean((torque - A)[500:-500] * wave))
+    true = 3e-5 * (2.0 * np.pi * 20.0) ** 2
+    assert ripple[False] > 0.9 * true
+    assert ripple[True] < ripple[False]
