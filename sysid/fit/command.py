@@ -430,6 +430,7 @@ KINDS: Final = {
         "additive loss over load and velocity, from whole runs",
         "Additive loss over load, speed, direction and temperature; torsion; sigma.",
         "  jtq fit losses campaigns/excitation --joint joint1.yaml --out joint1.fused.yaml\n"
+        "  jtq fit losses runs/light runs/heavy --joint joint1.yaml --columns payloads.yaml --out joint1.fused.yaml\n"
         "The runs must excite load, speed and both directions; `jtq campaign excitation` records them.\n"
         f"With one encoder one to {MOST_RUNS} runs will do, with a wider sigma.",
         lambda parser: None,

@@ -76,12 +76,8 @@ _PARTS: Final = 5
 _REPETITIONS: Final = 4
 _FASTER: Final = 3.0
 """The viscous part is linear up to so many times the fastest speed: it is the file's as much as the run's."""
-_NODES: Final = 6
-_VISCOUS: Final = slice(6, 8)
-_LOSS: Final = slice(0, 8)
-_INERTIA: Final = 8
-_COMMON: Final = 9
-_PHYSICAL: Final = slice(0, 9)
+_NODES, _COMMON, _INERTIA = 6, 9, 8
+_VISCOUS, _LOSS, _PHYSICAL = slice(6, 8), slice(0, 8), slice(0, 9)
 """c_+ at -R, 0, R, c_- at -R, 0, R, f_+, f_-, J; the offsets of the runs follow."""
 _NAMES: Final = (
     ("Coulomb friction", "Nm"),
@@ -178,7 +174,9 @@ def fit_few_runs(runs: Sequence[RunSignals], joint: Joint) -> FewRunsFit:
     residual = _rms(errors_of(blocks, w))
     held_out = _rms(_held_out_errors(blocks, weights, before))
     speed = max(float(np.abs(block.v).max()) for block in blocks)
-    sigma = _sigma(w[_LOSS], covariance[_LOSS, _LOSS], max(held_out, _LEAST_RATED * rated), rated, speed)
+    teacher = max((float(run.teacher_nm.max()) for run in runs if run.teacher_nm is not None), default=0.0)
+    least = float(np.hypot(max(held_out, _LEAST_RATED * rated), teacher))
+    sigma = _sigma(w[_LOSS], covariance[_LOSS, _LOSS], least, rated, speed)
     loss = _loss(w, joint, speed, _temperature(runs))
     fitted = replace(
         joint, rotor_inertia_kgm2=float(w[_INERTIA]) / joint.gear_ratio**2, fused=Fused(loss, None, sigma)
@@ -296,9 +294,9 @@ def weights_of(blocks: Sequence[Block], w: FloatArray, least_nm: float) -> list[
     """Return the weight of each sample of each block: those that count share it. Three numbers of a law take freedom."""
     weights = []
     for block, error in zip(blocks, errors_of(blocks, w), strict=True):
-        effective = _effective(block, error)
-        variance = float(np.mean(error**2)) * effective / max(effective - 3.0, 1.0)
-        weights.append(effective / len(error) / max(variance, least_nm**2))
+        n = _effective(block, error)
+        variance = float(np.mean(error**2)) * n / max(n - 3.0, 1.0)
+        weights.append(n / len(error) / max(variance, least_nm**2))
     return weights
 
 
@@ -347,10 +345,10 @@ def _temperature(runs: Sequence[RunSignals]) -> float:
 
 
 def _loss(w: FloatArray, joint: Joint, speed: float, temperature_c: float) -> AdditiveLoss:
-    rated, friction = joint.rated_torque_nm, joint.friction
+    rated, friction, viscous = joint.rated_torque_nm, joint.friction, float(np.mean(w[_VISCOUS]))
     sides = _side(w[:3], w[6], friction), _side(w[3:_NODES], w[7], friction)
     place = friction.stribeck_velocity_rad_s, _FASTER * speed, temperature_c
-    return AdditiveLoss((-rated, 0.0, rated), *sides, *place, float(np.mean(w[_VISCOUS])), PER_K_PRIOR[0])
+    return AdditiveLoss((-rated, 0.0, rated), *sides, *place, viscous, PER_K_PRIOR[0])
 
 
 def _side(constant: FloatArray, viscous: float, friction: Friction) -> LossSide:

@@ -14,6 +14,7 @@ from jtqd.estimator.run import JointColumns, RunTable
 from jtqd.estimator.settings import EstimatorSettings
 from jtqd.models.files import load_joint, shipped
 from jtqd.sysid.fit.command import main
+from jtqd.sysid.fit.few_runs import fit_few_runs
 from jtqd.sysid.fit.known_load import Teacher, fit_teacher
 from jtqd.sysid.fit.signals import RunSignals, run_signals
 from jtqd.sysid.runs.column_map import SHARP, KnownLoad
@@ -176,3 +177,13 @@ def test_nothing_mounted_tells_no_stiffness_and_no_load_friction(
     loss = joint.fused.loss.positive
     assert loss.constant_nm[1] == pytest.approx(2.5, abs=0.3)
     assert joint.fused.sigma.load * max(joint.fused.sigma.scale) > 0.05
+
+
+def test_few_runs_hold_what_the_teacher_does_not_know() -> None:
+    signals, _ = signals_of([1.0, 8.0, 1.0, 8.0])
+    teacher = fit_teacher(signals, JOINT, two_encoders=False)
+    done = [teacher.complete(run) for run in signals]
+    doubtful = [replace(run, teacher_nm=np.full(len(run.sensor_nm), 2.0)) for run in done]
+    sure, unsure = (fit_few_runs(runs, JOINT).fused.sigma for runs in (done, doubtful))
+    assert min(unsure.scale) * unsure.current_nm > 1.5
+    assert unsure.current_nm > 1.5 * sure.current_nm
