@@ -157,7 +157,7 @@ def _gap(one: Diagnosed) -> str:
 
 def _cause(cause: Cause) -> str:
     """Return name, class and parameters of a cause."""
-    others = [name for name in cause.names if name != cause.name]
+    others = cause.names[1:]
     alike = f" (or {', '.join(others)})" if others else ""
     values = []
     for name, value in cause.parameters.items():

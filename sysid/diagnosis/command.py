@@ -481,7 +481,7 @@ def _record(cause: Cause) -> dict[str, Any]:
     """Return a cause for the provenance; an end of an interval that is none is None: NaN would not read back as itself."""
     record: dict[str, Any] = {"name": cause.name, "joint": cause.joint, "grade": cause.grade}
     if len(cause.names) > 1:
-        record["cannot_be_told_from"] = [name for name in cause.names if name != cause.name]
+        record["cannot_be_told_from"] = list(cause.names[1:])
     record["ci95"] = {
         name: [_rounded(end) if math.isfinite(end) else None for end in value.ci95]
         for name, value in cause.parameters.items()

@@ -124,13 +124,12 @@ class Value:
 class Cause:
     """One entry of the set: a value of the file that is wrong, or an effect that is present.
 
-    names: its class, itself first: what these runs cannot distinguish it from. grade: certain, one_of or effective; rivals:
-    of one_of; given: what certainty rests on, the priors of its kind in words; doubts: why it is not certain.
+    grade: certain, one_of or effective; rivals: of one_of, what these runs cannot distinguish it from; given: what certainty
+    rests on, the priors of its kind in words; doubts: why it is not certain.
     """
 
     name: str
     joint: JointName
-    names: tuple[str, ...]
     parameters: Mapping[str, Value]
     delta_evidence: float  # twice the log evidence that the best set without it lacks
     rms_nm: float  # of its contribution over the runs, in the balance where it is largest
@@ -141,6 +140,11 @@ class Cause:
     given: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
     matters: bool = True  # above the relevance
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Its class, itself first."""
+        return (self.name, *(rival for rival in self.rivals if rival != self.name))
 
     @property
     def leading(self) -> str:

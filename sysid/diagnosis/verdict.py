@@ -398,7 +398,7 @@ def _cause(
     solution: Solution, j: Judged, total_nm2: float, rest: Unexplained, limits_nm: Mapping[Channel, float]
 ) -> tuple[Cause, float]:
     """Return an effect as a cause, and its size in parts of its limit, which is that of the first joint for the sensor."""
-    name, joint = j.present.name, j.present.joint
+    joint = j.present.joint
     channel = max(j.rms_nm, key=lambda c: j.rms_nm[c])
     size_nm = j.rms_nm[channel]
     of = joint if isinstance(joint, int) else min(solution.dataset.joints)
@@ -407,9 +407,8 @@ def _cause(
     rivals = [e.effect.name + (f" of {joint_text(e.joint)}" if e.joint != joint else "") for e in j.rivals]
     rivals = list(dict.fromkeys(rivals)) if grade == ONE_OF else []
     cause = Cause(
-        name,
+        j.present.name,
         joint,
-        (name, *(rival for rival in rivals if rival != name)),
         values_of(solution, j),
         j.delta,
         size_nm,

@@ -33,7 +33,7 @@ PLAN = {"why": "", "plan": {}}
 def cause(name: str, joint: int | str, *others: str, **values: tuple[float, float, float]) -> Cause:
     parameters = {k: Value(v, (low, high), "") for k, (v, low, high) in values.items()}
     grade = ONE_OF if others else CERTAIN
-    return Cause(name, joint, (name, *others), parameters, 50.0, 0.3, "motor", grade=grade)
+    return Cause(name, joint, parameters, 50.0, 0.3, "motor", grade=grade, rivals=others)
 
 
 def findings(verdict: str, *causes: Cause, **more: Any) -> Findings:

@@ -38,7 +38,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[Recorder]:
         runs: Sequence[Columns], joints: Mapping[int, Mapping[str, Any]], recorder: Recorder, seed: int
     ) -> Findings:
         calls.append(recorder)
-        cause = Cause("current_offset", 1, ("current_offset",), {}, 100.0, 1.0, "motor")
+        cause = Cause("current_offset", 1, {}, 100.0, 1.0, "motor")
         return Findings("cause", (), ("run1.csv",), (1,), causes=(cause,))
 
     monkeypatch.setattr(benches, "judged", instead)
@@ -193,7 +193,7 @@ def test_what_the_recorder_does_itself_is_no_wrong_name(
     asked: list[Recorder], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def late(runs: Any, joints: Any, recorder: Recorder, seed: int) -> Findings:
-        cause = Cause("channel_delay", "sensor", ("channel_delay",), {}, 100.0, 1.0, "motor")
+        cause = Cause("channel_delay", "sensor", {}, 100.0, 1.0, "motor")
         return Findings("cause", (), ("run1.csv",), (1,), causes=(cause,))
 
     monkeypatch.setattr(benches, "judged", late)

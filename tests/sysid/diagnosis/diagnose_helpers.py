@@ -63,8 +63,8 @@ def value(number: float, half: float = 0.1, unit: str = "Nm") -> Value:
     return Value(number, (number - half, number + half), unit)
 
 
-def cause(name: str, joint: int | str, parameters: Mapping[str, Value], names: tuple[str, ...] = ()) -> Cause:
-    return Cause(name, joint, names or (name,), parameters, 120.0, 0.5, "motor")
+def cause(name: str, joint: int | str, parameters: Mapping[str, Value], *rivals: str) -> Cause:
+    return Cause(name, joint, parameters, 120.0, 0.5, "motor", rivals=rivals)
 
 
 def findings(verdict: str = "cause", causes: tuple[Cause, ...] = (), **parts: Any) -> Findings:

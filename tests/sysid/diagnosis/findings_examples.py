@@ -66,10 +66,10 @@ def one_cause() -> Findings:
             ),
             gap(1, "torsion", 0.152, 0.149, {}),
         ),
-        causes=(Cause("torque_ripple", 1, ("torque_ripple",), ripple, 4312.0, 0.296, "motor", 0.94),),
+        causes=(Cause("torque_ripple", 1, ripple, 4312.0, 0.296, "motor", 0.94),),
         too_small=(
             Cause(
-                *("current_offset", 1, ("current_offset",), {"offset_a": value(0.0123, 0.001, "A")}),
+                *("current_offset", 1, {"offset_a": value(0.0123, 0.001, "A")}),
                 *(40.0, 0.03, "motor", 0.01),
             ),
         ),
@@ -149,18 +149,9 @@ def two_causes() -> Findings:
             gap(2, "torsion", 0.211, 0.21, {}),
         ),
         causes=(
-            Cause("viscous_friction", 1, ("viscous_friction",), viscous, 8210.0, 0.81, "motor", 0.91),
+            Cause("viscous_friction", 1, viscous, 8210.0, 0.81, "motor", 0.91),
             Cause(
-                *(
-                    "link_inertia",
-                    1,
-                    ("link_inertia", "channel_delay"),
-                    inertia,
-                    4.0,
-                    0.22,
-                    "torsion",
-                    0.08,
-                ),
+                *("link_inertia", 1, inertia, 4.0, 0.22, "torsion", 0.08),
                 grade="one_of",
                 rivals=("channel_delay",),
             ),
@@ -265,7 +256,6 @@ def sensor() -> Findings:
             Cause(
                 "sensor_gain",
                 "sensor",
-                ("sensor_gain",),
                 {"gain": value(1.0481, 0.0017, "1")},
                 5120.0,
                 0.79,

@@ -43,7 +43,7 @@ INTERVAL = re.compile(r"\[(\S+), (\S+)\]")
 def with_value(name: str, parameter: str, found: Value) -> Findings:
     """One cause with one parameter, beside the joint file that ships."""
     base = examples.one_cause()
-    one = replace(base.causes[0], name=name, names=(name,), parameters={parameter: found})
+    one = replace(base.causes[0], name=name, parameters={parameter: found})
     return replace(base, causes=(one,), joint_files={1: JOINT}, too_small=())
 
 

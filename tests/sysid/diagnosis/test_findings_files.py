@@ -58,7 +58,7 @@ def test_the_contract_s_keys_are_there_in_every_verdict() -> None:
 
 def test_values_are_those_of_the_findings_and_what_is_not_finite_is_null() -> None:
     made = findings(
-        causes=(replace(RIPPLE, names=("torque_ripple", "cogging")), OFFSET),
+        causes=(replace(RIPPLE, rivals=("cogging",)), OFFSET),
         candidates=(
             CandidateEvidence("hysteresis", 1, -3.0, {"torque_nm": Value(math.inf, (0, 0), "Nm")}, "x"),
         ),
@@ -155,9 +155,7 @@ def test_an_effect_is_replaced_and_the_same_twice_is_the_same_once() -> None:
 
 
 def test_a_class_is_written_with_what_it_cannot_be_told_from() -> None:
-    unclear = cause(
-        "current_offset", 1, {"offset_a": value(0.02, 0.001, "A")}, ("current_offset", "friction_asymmetry")
-    )
+    unclear = cause("current_offset", 1, {"offset_a": value(0.02, 0.001, "A")}, "friction_asymmetry")
     joint = extended(JOINT, 1, findings("ambiguous", causes=(unclear,)), **ORIGIN)
     assert joint.provenance["diagnosis"]["effects"][0]["cannot_be_told_from"] == ["friction_asymmetry"]
     assert joint.provenance["diagnosis"]["verdict"] == "ambiguous"
