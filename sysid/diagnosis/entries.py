@@ -243,9 +243,11 @@ def set_state(s: JointSignals, present: Sequence[Present]) -> None:
 
 
 def _set_torsion(s: JointSignals, mine: Sequence[Present]) -> None:
-    bent = [p for p in mine if "torsion_rad" in p.effect.needs]
+    """Set the twist of the spring: errors of teeth and encoders are between the encoders, too, and load it with nothing."""
+    loading = [p for p in mine if "link_rad" not in p.effect.hooks and not p.effect.geometric]
+    bent = [p for p in loading if "torsion_rad" in p.effect.needs]
     stiffness = s.joint.stiffness_nm_per_rad
-    total = s.state.torque_nm + _sum(s, [p for p in mine if p not in bent], TORSION)
+    total = s.state.torque_nm + _sum(s, [p for p in loading if p not in bent], TORSION)
     total = held_by_spring(s.joint, total, s.time_s)
     s.state.torsion_rad = total / stiffness
     if not bent:

@@ -85,7 +85,10 @@ def contribution(effect: Effect, p: Values, s: JointSignals) -> dict[str, FloatA
         add(MOTOR, s.nm_per_a * effect.current_a(p, state, own, x))
     for hook, sign in (("load_nm", 1.0), ("sensor_nm", -1.0)):
         if hook in hooks:
-            value = sign * getattr(effect, hook)(p, state, own, x)
+            value = sign * getattr(effect, hook)(p, state, own, x) * np.ones(len(s.time_s))
+            if s.torsion_nm is not None:  # the spring twists by it, too, and the link lags by that
+                twist = s.as_torque_is_known(value / joint.stiffness_nm_per_rad)
+                value -= joint.link_inertia_kgm2 * second_difference(twist, s.time_s)
             add(MOTOR, s.per_torque * value)
             add(TORSION, value)
     for hook in ("twist_rad", "link_rad"):

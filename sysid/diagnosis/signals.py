@@ -135,8 +135,10 @@ class Line:
 
 COMPUTED_HZ: Final = 12.0
 """Cutoff of the balances where the torque is computed, as its acceleration was smoothed; least cutoff of any torque."""
-_STATIC: Final = 0.5
-"""Part of the frequency at which a link swings on its spring, below which the spring follows the torque."""
+_STATIC: Final = 1.0 / 3.0
+"""Part of the frequency at which a link swings on its spring, up to which both balances are judged: there the spring follows
+the torque but for a tenth of it, whatever the stiffness is.
+"""
 _ALL_VISIBLE: Final = Smoother(1.0)
 SLOWEST_RAD_S: Final = 0.03
 """Below it the direction of friction, and so its value, is not known from a velocity measurement."""
@@ -222,11 +224,13 @@ class JointSignals:
 
     def state_of(self, effect: Effect, p: Values) -> State:
         """Return what the hooks of an effect with parameters p use: the one sensor has one temperature, for every joint's
-        balances; rates are means over the age of a reading.
+        balances, and its torque is what it reads; rates are means over the age of a reading.
         """
         other: dict[str, FloatArray] = {}
-        if self.sensor_temperature_c is not None and effect.at_sensor_of(p):
-            other["temperature_c"] = self.sensor_temperature_c
+        if effect.at_sensor_of(p):
+            other["torque_nm"] = self.reading_nm
+            if self.sensor_temperature_c is not None:
+                other["temperature_c"] = self.sensor_temperature_c
         if effect.follows_torsion and self.twist_rad is not None:
             other["torsion_rad"] = self.twist_rad
         if age := effect.age_s(p):
@@ -234,6 +238,11 @@ class JointSignals:
         if not other:
             return self.state
         return State(**{name: getattr(self.state, name) for name in State.__slots__} | other)
+
+    @cached_property
+    def reading_nm(self) -> FloatArray:
+        """What the sensor reads [n], as far as a torque is known."""
+        return below(self.sensor_nm, self.step_s, self.torque_hz)
 
     def as_torque_is_known(self, angle: FloatArray) -> FloatArray:
         """Return what of a twist [n] is as slow as a torque is known."""
@@ -320,10 +329,10 @@ class _Motion:
     of_position: bool
     coarse: str
 
-    def below(self, hz: float, step_s: float) -> _Motion:
-        """Return the motion with accelerations of nothing quicker than hz."""
+    def below(self, hz: float, step_s: float, why: str) -> _Motion:
+        """Return the motion with accelerations of nothing quicker than hz, below which the torque is known."""
         lowest = np.full(len(self.whole), min(hz, self.visible.slowest_hz))
-        text = f"torque_nm: computed, known below {hz:.0f} Hz; the balances are judged below it"
+        text = f"torque_nm: {why}, known below {hz:.0f} Hz; the balances are judged below it"
         coarse = self.coarse if self.visible.slowest_hz <= hz else text
         return replace(self, visible=Smoother.of(lowest, step_s, _FINEST_HZ), coarse=coarse)
 
@@ -421,17 +430,18 @@ def joint_signals(  # noqa: PLR0917
     motion = _motion(time, raw, columns, joint, like)
     step = float(np.median(np.diff(time)))
     if computed and like is None:
-        motion = motion.below(COMPUTED_HZ, step)
-    velocity = motion.visible(motion.speed) / joint.gear_ratio
+        motion = motion.below(COMPUTED_HZ, step, "computed")
     both = raw.two_encoders(joint.gear_ratio)
+    shown = known_below_hz(sensor, step)
+    known = like.torque_hz if like else max(COMPUTED_HZ, shown)
+    if like is None and both and (static := max(COMPUTED_HZ, _STATIC * _swings_hz(joint))) < shown:
+        motion = motion.below(static, step, "quicker than the spring follows")
+    velocity = motion.visible(motion.speed) / joint.gear_ratio
     link = columns.link_position_rad
     if link is None:
         link = motion.position / joint.gear_ratio
     acceleration = motion.visible(motion.whole)
     link_acceleration = acceleration / joint.gear_ratio
-    swings = math.sqrt(joint.stiffness_nm_per_rad / max(joint.link_inertia_kgm2, 1e-9)) if both else math.inf
-    shown = min(known_below_hz(sensor, step), _STATIC * swings / math.tau)
-    known = like.torque_hz if like else max(COMPUTED_HZ, shown)
     slow_sensor = below(sensor, step, known)
     if both:
         # not of the link encoder, whose noise is K times over in the torsion balance; the spring's part is small
@@ -461,6 +471,8 @@ def joint_signals(  # noqa: PLR0917
         velocity_rad_s=velocity,
         coupling_position_rad=link if number != 2 else -link,
     )
+    too_quick = motion.whole - acceleration  # of the motor: the balances hold it until they are filtered
+    link_quick = joint.link_inertia_kgm2 * too_quick / joint.gear_ratio
     motor_torque = joint.gear_ratio * (
         joint.torque_constant_nm_per_a * columns.current_a - joint.rotor_inertia_kgm2 * motion.whole
     )
@@ -469,7 +481,8 @@ def joint_signals(  # noqa: PLR0917
         twist = motion.position / joint.gear_ratio - link
         rate = velocity - np.gradient(link, time)
         zero = _zero(twist - gear_torque / joint.stiffness_nm_per_rad, gear_torque)
-        torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate - gear_torque
+        torsion = joint.stiffness_nm_per_rad * (twist - zero) + joint.damping_nms_per_rad * rate
+        torsion -= gear_torque + link_quick
         bent = below(twist - zero, step, known) + (gear_torque - slow_torque) / joint.stiffness_nm_per_rad
         state.torsion_rate_rad_s = first_difference(bent, time)
     return JointSignals(
@@ -478,12 +491,12 @@ def joint_signals(  # noqa: PLR0917
         joint,
         time,
         state,
-        motor_torque - loss - gear_torque,
+        motor_torque - loss - gear_torque - link_quick,
         torsion,
         _moving(time, velocity, motion.visible.slowest_hz),
         sensor,
         columns.current_a,
-        gear_torque - slow_torque + reflected * (motion.whole - acceleration),
+        gear_torque - slow_torque + link_quick + reflected * too_quick,
         twist_rad=bent,
         off=None if columns.enabled is None else np.asarray(columns.enabled < 0.5),
         of_position=motion.of_position,
@@ -495,6 +508,12 @@ def joint_signals(  # noqa: PLR0917
         torque_hz=known,
         coarse=motion.coarse,
     )
+
+
+def _swings_hz(joint: Joint) -> float:
+    """Return the frequency at which the link swings on its spring while the motor stands, inf without a link."""
+    inertia = joint.link_inertia_kgm2
+    return math.sqrt(joint.stiffness_nm_per_rad / inertia) / math.tau if inertia > 0.0 else math.inf
 
 
 def _cost(

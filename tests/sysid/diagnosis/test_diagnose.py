@@ -25,6 +25,7 @@ from jtqd.sysid.diagnosis.findings import (
 )
 from jtqd.sysid.diagnosis.regressors import contribution
 from jtqd.sysid.diagnosis.signals import BaseLoss, JointSignals, joint_signals
+from jtqd.sysid.diagnosis.smoothing import Smoother
 from tests.estimator.effects.effect_signals import PLAIN, extended
 from tests.sysid.diagnosis.diagnose_core_helpers import rigid_run
 from tests.sysid.diagnosis.diagnose_helpers import JOINT, RIPPLE, bench_run, cause, findings, value
@@ -45,14 +46,17 @@ FOLDED = (
 
 def test_an_effect_for_a_value_of_the_file_is_that_value() -> None:
     """Residuals of the joint with the value are those of the file less what the effect leaves."""
-    s = signals(rigid_run(PLAIN, noise=0.1))
+    table = rigid_run(PLAIN, noise=0.1)
+    bare = replace(signals(table), visible=Smoother(1e-3))  # no filter
+    s = joint_signals("run", table, 1, PLAIN, BaseLoss(PLAIN), bare)
     joint = extended(PLAIN, *FOLDED)
     other = with_effects_applied(joint)
     assert other.effects == ()
     assert (other.friction.viscous_nms_per_rad, other.friction.coulomb_nm) == (4.5, 3.1)
     assert other.rotor_inertia_kgm2 == 8e-5
     left = s.motor_nm - sum(contribution(EFFECTS[n], p, s)["motor"] for n, p in FOLDED)
-    assert signals(rigid_run(PLAIN, noise=0.1), other).motor_nm == pytest.approx(left, abs=1e-9)
+    found = joint_signals("run", table, 1, other, BaseLoss(other), s)
+    assert found.motor_nm == pytest.approx(left, abs=1e-9)
 
 
 def test_effects_that_are_more_than_a_value_stay() -> None:

@@ -36,7 +36,9 @@ def test_the_torsion_of_a_spring_that_hardens_by_its_own_stiffness_is_solved_for
         d = s.state.torsion_rad
         spring = values["stiffness_nm_per_rad"] * d + values["cubic_nm_per_rad3"] * d**3
         damper = PLAIN.damping_nms_per_rad * np.gradient(d, s.time_s)
-        assert spring + damper == pytest.approx(s.state.torque_nm, abs=2e-3 * PLAIN.rated_torque_nm)
+        inner = slice(100, -100)  # a filter knows nothing beyond the ends
+        expected = s.state.torque_nm[inner]
+        assert (spring + damper)[inner] == pytest.approx(expected, abs=2e-3 * PLAIN.rated_torque_nm)
     set_state(s, ())
     d = s.state.torsion_rad
     damper = PLAIN.damping_nms_per_rad * np.gradient(d, s.time_s)
