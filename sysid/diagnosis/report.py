@@ -31,7 +31,6 @@ from jtqd.sysid.diagnosis.findings import (
     CandidateEvidence,
     Cause,
     Findings,
-    Gain,
     Gap,
     JointName,
     Place,
@@ -172,7 +171,7 @@ def headline(findings: Findings) -> tuple[str, ...]:
     if not causes:
         where = _joined(", ", rest, _remaining_places(findings, 1)) if rest else ""
         return (f"{_joined(': ', 'No entry explains the gap', where)}.",)
-    second = _joined(", but ", _gain(findings.gain), f"{rest} remain unexplained" if rest else "")
+    second = _joined(", but ", _gain(findings), f"{rest} remain unexplained" if rest else "")
     found = _headline_causes(causes, findings.joint_files)
     return (found, f"{_capital(second)}.") if second else (found,)
 
@@ -192,15 +191,16 @@ def _headline_causes(causes: Sequence[Cause], files: Mapping[int, Joint]) -> str
     return f"{text}."
 
 
-def _gain(gain: Gain | None) -> str:
+def _gain(findings: Findings) -> str:
+    gain = findings.gain
     if gain is None or not math.isfinite(gain.rmse_before_nm + gain.rmse_after_nm):
         return ""
     before, after = gain.rmse_before_nm, gain.rmse_after_nm
+    where = f" at joint {gain.joint}" if len(findings.joints) > 1 and gain.joint else ""
     if after >= before:
-        return f"the extended model errs by {short(after)} Nm on held-out runs, no less than the joint file"
-    same = short(before) == short(after)
-    old, new = pair(before, after) if same else (short(before), short(after))
-    return f"the extended model errs by {new} instead of {old} Nm on held-out runs"
+        return f"the extended model errs by {short(after)} Nm{where} on held-out runs, no less than the joint file"
+    old, new = pair(before, after) if short(before) == short(after) else (short(before), short(after))
+    return f"the extended model errs by {new} instead of {old} Nm{where} on held-out runs"
 
 
 def _row(cause: Cause, files: Mapping[int, Joint]) -> Row:

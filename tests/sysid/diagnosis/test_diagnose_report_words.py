@@ -194,6 +194,8 @@ def test_no_gap_and_too_little_are_one_sentence() -> None:
 def test_a_gain_that_is_a_loss_is_stated_as_one() -> None:
     worse = replace(examples.one_cause(), gain=Gain(0.2, 0.4, "split", (-0.3, -0.1)))
     assert "errs by 0.40 Nm on held-out runs, no less than the joint file" in headline(worse)[1]
+    both = replace(worse, joints=(1, 2), gain=Gain(0.4, 0.2, "split", (0.1, 0.3), joint=2))
+    assert "by 0.20 instead of 0.40 Nm at joint 2 on held-out runs" in headline(both)[1]
     close = replace(worse, gain=Gain(0.2049, 0.2041, "split", (0.0, 0.1)))
     assert "by 0.2041 instead of 0.2049 Nm" in headline(close)[1]
     unknown = replace(worse, gain=Gain(math.nan, math.nan, "split", (math.nan, math.nan)))
