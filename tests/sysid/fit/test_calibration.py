@@ -167,6 +167,10 @@ def test_value_and_sigma_are_those_of_the_estimator(track_zeros: bool) -> None:
     scale = np.array((joint.fused.zeros if track_zeros and joint.fused.zeros else joint.fused.sigma).scale)
     late = np.flatnonzero(run.moving)[2000:]
 
+    # near a reversal and after rest, sigma in service holds as well what nothing has proven of the torsion yet
+    proven = plain.half_nm[2000:] < 0.01
+    assert 0.5 < proven.mean() < 1.0
+
     def off(run: FusedErrors) -> FloatArray:
         """By what part the estimator's sigma is larger."""
         missed = 0.1**2 + 0.3**2 * bent_square(run.velocity_rad_s, tracking.bend)
@@ -174,9 +178,11 @@ def test_value_and_sigma_are_those_of_the_estimator(track_zeros: bool) -> None:
         return np.asarray(got.sigma_nm[late] / sigma[2000:] - 1.0)
 
     assert one.more_nm2[2000:].max() > 0.1
-    assert off(one).min() > -0.06, "larger by what nothing has proven about the torsion, in service alone"
-    assert np.quantile(np.abs(off(one)), 0.75) < 0.02
-    assert np.quantile(np.abs(off(low_pass_view)), 0.9) > 0.01, "the paths differ by the tracked torsion"
+    assert off(one).min() > -0.06
+    assert off(one)[~proven].max() > 0.1
+    assert np.abs(off(one)[proven]).max() < 0.06
+    assert np.quantile(np.abs(off(one)[proven]), 0.9) < 0.02
+    assert np.quantile(np.abs(off(low_pass_view)[proven]), 0.9) > 0.01, "the paths differ by the tracked torsion"
     assert np.abs(one.undelayed_nm[2000:] - got.torque_nm[late]).max() < 0.02
     assert set(got.status[late]) <= {st.VALID, st.DEGRADED}
 
