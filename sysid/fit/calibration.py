@@ -243,8 +243,8 @@ def fused_errors(
     share = np.maximum(alpha, 1.0 - alpha)
     more = (doubt + (gain * (run.torsion_nm + torsion)) ** 2) * share**2 + alpha**2 * np.minimum(known, doubt)
     if fused.torsion is not None:
-        apart = np.maximum(np.abs(e_t - e_c) - DISAGREE_SIGMAS * np.sqrt(variance), 0.0)
-        more += (share * apart / GAUSS) ** 2
+        near = run.half_nm + DISAGREE_SIGMAS * np.sqrt(np.maximum(variance - run.half_nm**2, 0.0))
+        more += (share * np.maximum(np.abs(e_t - e_c) - near, 0.0)) ** 2
     undelayed = NONE
     if len(run.tracked_nm):
         undelayed = run.tracked_nm + torsion + (1.0 - alpha) * (e_c - run.delayed_nm - torsion)
