@@ -182,7 +182,9 @@ def test_value_and_sigma_are_those_of_the_estimator(track_zeros: bool) -> None:
     assert off(one)[~proven].max() > 0.1
     assert np.abs(off(one)[proven]).max() < 0.06
     assert np.quantile(np.abs(off(one)[proven]), 0.9) < 0.02
-    assert np.quantile(np.abs(off(low_pass_view)[proven]), 0.9) > 0.01, "the paths differ by the tracked torsion"
+    assert np.quantile(np.abs(off(low_pass_view)[proven]), 0.9) > 0.01, (
+        "the paths differ by the tracked torsion"
+    )
     assert np.abs(one.undelayed_nm[2000:] - got.torque_nm[late]).max() < 0.02
     assert set(got.status[late]) <= {st.VALID, st.DEGRADED}
 
